@@ -1,0 +1,67 @@
+"""Everything this toolkit raises on purpose.
+
+* CrosscueError              one line for a person: what, where, what to do
+    * UsageError             the command or call cannot mean anything (exit status 2)
+    * LogError               a recording cannot be read as asked (exit status 4)
+        * LogFormatError     the bytes do not say what the format promises
+        * LogTooLargeError   a declared or produced size is over the limit
+        * UnknownFormatError no reader knows this file or folder
+    * SchemaError            a message type, DBC or truth file cannot be understood
+    * VehicleError           the vehicle file is wrong or lacks a role
+    * RunError               a run folder is missing, locked, damaged or of another version
+    * OutputError            a result cannot be written (disk full, no permission)
+
+A wrong argument from the caller's own code stays a ``ValueError``.
+"""
+
+
+class CrosscueError(Exception):
+    """Catch this to catch all of ours and nothing else.
+
+    The message is one line: what happened, where (file, topic, time), what was expected, what
+    to do.
+    """
+
+    exit_status: int = 1
+
+
+class UsageError(CrosscueError):
+    """The command or call cannot mean anything."""
+
+    exit_status = 2
+
+
+class LogError(CrosscueError):
+    """A recording cannot be read as asked."""
+
+    exit_status = 4
+
+
+class LogFormatError(LogError):
+    """The bytes do not say what the format promises."""
+
+
+class LogTooLargeError(LogError):
+    """A declared or produced size is over the limit."""
+
+
+class UnknownFormatError(LogError):
+    """No reader knows this file or folder."""
+
+
+class SchemaError(CrosscueError):
+    """A message type, DBC or truth file cannot be understood."""
+
+
+class VehicleError(CrosscueError):
+    """The vehicle file is wrong or lacks a role."""
+
+    exit_status = 2
+
+
+class RunError(CrosscueError):
+    """A run folder is missing, locked, damaged or of another version."""
+
+
+class OutputError(CrosscueError):
+    """A result cannot be written."""

@@ -1,0 +1,174 @@
+"""The account of what became of every message of a log.
+
+For every topic: ``in file = used + skipped (by reason) + lost (by reason)``.
+
+* *found*: rows that a reader met in the file's bytes and could tell apart;
+* *skipped*: of those, the ones not handed on or not decodable, each with a reason;
+* *used*: found less skipped;
+* *lost*: rows that must have been in the file (a declared count, a damaged chunk whose index
+  says what it held, a cut record) but could not be read.
+
+A loss whose extent nobody can know (a cut file without statistics) is a ``Loss`` with count None:
+the log is then not whole, and the summary says "at least".
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+DETAILS_KEPT: Final = 1000
+"""Single skips and losses kept with time and text; counts are exact beyond it."""
+
+NOT_ASKED_TIME: Final = "outside --from/--to"
+NOT_ASKED_TOPIC: Final = "topic not asked for"
+
+
+@dataclass(frozen=True, slots=True)
+class Detail:
+    """One thing skipped or lost, for ``skipped.parquet``.
+
+    Attributes:
+        topic: Topic name, or empty where the damage hides it.
+        reason: The same short text as in the counts.
+        detail: Where and why: byte offset, declared against found, the library's words.
+        t_ns: Log time where known.
+        count: Rows concerned; None if that cannot be known.
+        is_loss: Lost, not merely skipped.
+    """
+
+    topic: str
+    reason: str
+    detail: str
+    t_ns: int | None
+    count: int | None
+    is_loss: bool
+
+
+@dataclass(slots=True)
+class TopicAccount:
+    """Counts of one topic; see the module's text for the terms."""
+
+    declared: int | None = None
+    found: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
+    lost: Counter[str] = field(default_factory=Counter)
+    lost_unknown: list[str] = field(default_factory=list)
+
+    @property
+    def used(self) -> int:
+        """Rows handed on and understood."""
+        return self.found - self.skipped.total()
+
+    @property
+    def in_file(self) -> int:
+        """Rows that are or must have been in the file."""
+        return self.found + self.lost.total()
+
+    @property
+    def is_whole(self) -> bool:
+        """Nothing lost; skips are choices or bad messages, not losses."""
+        return not self.lost.total() and not self.lost_unknown
+
+
+@dataclass(slots=True)
+class Ledger:
+    """One log's account, filled by its reader and by the decoders.
+
+    Attributes:
+        log: Path as the user gave it.
+        integrity: In plain words, which checksums were verified, or that the format has none.
+        accounts: By topic name; the empty name holds what cannot be attributed.
+        details: The first ``DETAILS_KEPT`` single skips and losses.
+        notices: Plain sentences about the log that are no loss (no index, clock reset, ...).
+    """
+
+    log: str
+    integrity: str = "not checked"
+    accounts: dict[str, TopicAccount] = field(default_factory=dict)
+    details: list[Detail] = field(default_factory=list)
+    notices: list[str] = field(default_factory=list)
+
+    def topic(self, name: str) -> TopicAccount:
+        """The account of ``name``, opened when first asked for."""
+        return self.accounts.setdefault(name, TopicAccount())
+
+    def declare(self, topic: str, count: int | None) -> None:
+        """What the format itself says it holds of ``topic``."""
+        self.topic(topic).declared = count
+
+    def find(self, topic: str, count: int) -> None:
+        """``count`` rows met in the bytes."""
+        self.topic(topic).found += count
+
+    def skip(
+        self, topic: str, reason: str, count: int = 1, detail: str = "", t_ns: int | None = None
+    ) -> None:
+        """``count`` of the rows found are not used.
+
+        Args:
+            topic: Topic name.
+            reason: Short and the same for all of a kind; numbers belong in ``detail``.
+            count: Rows.
+            detail: Where and why.
+            t_ns: Log time of the first one.
+        """
+        if count:
+            self.topic(topic).skipped[reason] += count
+            if reason not in (NOT_ASKED_TIME, NOT_ASKED_TOPIC):
+                self._keep(Detail(topic, reason, detail, t_ns, count, is_loss=False))
+
+    def lose(
+        self,
+        topic: str,
+        reason: str,
+        count: int | None,
+        detail: str = "",
+        t_ns: int | None = None,
+    ) -> None:
+        """Rows that were in the file and could not be read; ``count`` None if nobody can know."""
+        if count == 0:
+            return
+        account = self.topic(topic)
+        if count is None:
+            account.lost_unknown.append(reason)
+        else:
+            account.lost[reason] += count
+        self._keep(Detail(topic, reason, detail, t_ns, count, is_loss=True))
+
+    def notice(self, sentence: str) -> None:
+        """Say something about the log once; a repeated sentence is kept once."""
+        if sentence not in self.notices:
+            self.notices.append(sentence)
+
+    def settle(self, topic: str, reason: str = "declared by the format, not in its bytes") -> None:
+        """Compare with the declared count at the end of a full pass.
+
+        Fewer found than declared: the rest is lost. More: a notice, since the bytes are the truth.
+        """
+        account = self.topic(topic)
+        if account.declared is None:
+            return
+        missing = account.declared - account.in_file
+        if missing > 0:
+            detail = f"declared {account.declared}, found {account.found}"
+            self.lose(topic, reason, missing, detail)
+        elif missing < 0:
+            self.notice(
+                f"{topic}: the file declares {account.declared} messages, holds {account.in_file}"
+            )
+
+    @property
+    def is_whole(self) -> bool:
+        """Nothing is known to be lost."""
+        return all(account.is_whole for account in self.accounts.values())
+
+    def losses(self) -> Iterator[Detail]:
+        """The details that are losses."""
+        return (d for d in self.details if d.is_loss)
+
+    def _keep(self, detail: Detail) -> None:
+        if len(self.details) < DETAILS_KEPT:
+            self.details.append(detail)

@@ -1,0 +1,1 @@
+"""One file a format; ``crosscue.replay.log.FORMATS`` is the table that names them."""
