@@ -42,7 +42,7 @@ class Topic:
         type_name: Message type (``sensor_msgs/msg/Imu``, ``foxglove.CompressedImage``), or one of
             our own: ``crosscue/CanFrames``, ``crosscue/Table``, ``crosscue/Images``.
         encoding: How messages are coded: ``cdr``, ``ros1``, ``protobuf``, ``json``; ``columns``
-            when the reader gives ``CanFrames``, ``Table`` or ``Images`` itself; else the log's word.
+            when the reader gives ``CanFrames``, ``Table`` or ``Images`` itself; else as stored.
         schema: The message definition, as stored.
         schema_encoding: ``ros2msg``, ``ros1msg``, ``ros2idl``, ``protobuf``, ``jsonschema``
             or empty.
