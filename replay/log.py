@@ -70,8 +70,8 @@ class Log(Protocol):
         the reasons ``NOT_ASKED_TIME`` and ``NOT_ASKED_TOPIC``; an index may be used to avoid
         reading them, and the declared counts then say how many were skipped. Once exhausted,
         declared counts have been settled and ``ledger.integrity`` is set. Damage never raises here
-        after the log was opened: what is readable is given, the rest is ``ledger.lose``-d. A row whose
-        bytes are known to be damaged is never given.
+        after the log was opened: what is readable is given, the rest is ``ledger.lose``-d. A row
+        whose bytes are known to be damaged is never given.
         """
         ...
 

@@ -1,0 +1,142 @@
+"""What several commands share: which logs, which part of them, and how results are printed."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from crosscue.replay.errors import UsageError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Log, Selection
+
+T = TypeVar("T")
+
+
+def add_log_arguments(parser: argparse.ArgumentParser) -> None:
+    """``LOG...``, ``--from``, ``--to`` and ``--topics``."""
+    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recordings of one drive")
+    add_part_arguments(parser)
+
+
+def add_part_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--from``, ``--to`` and ``--topics``."""
+    parser.add_argument(
+        "--from", dest="start", metavar="T",
+        help="begin here: seconds after the log's first row (12.5) or absolute nanoseconds (...ns)",
+    )  # fmt: skip
+    parser.add_argument("--to", dest="end", metavar="T", help="end before this time")
+    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="only these topics")
+
+
+def selection_of(args: argparse.Namespace, logs: Sequence[Log]) -> Selection:
+    """The part asked for by ``--from``, ``--to`` and ``--topics``.
+
+    Raises:
+        UsageError: A time that cannot be read, an empty span, or a topic that no log has.
+    """
+    topics = None
+    if args.topics:
+        known = {topic.name for log in logs for topic in log.topics}
+        for name in args.topics:
+            if name not in known:
+                raise UsageError(
+                    f"--topics {name}: no such topic; there are: {', '.join(sorted(known))}"
+                )
+        topics = frozenset(args.topics)
+    if args.start is None and args.end is None:
+        return Selection(topics)
+    start_ns = _time_ns("--from", args.start, logs)
+    end_ns = _time_ns("--to", args.end, logs)
+    if start_ns is not None and end_ns is not None and end_ns <= start_ns:
+        raise UsageError(f"--to {args.end}: not after --from {args.start}; give a later time")
+    return Selection(topics, start_ns, end_ns)
+
+
+def _time_ns(flag: str, text: str | None, logs: Sequence[Log]) -> int | None:
+    if text is None:
+        return None
+    if re.fullmatch(r"-?\d+ns", text):
+        return int(text[:-2])
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise UsageError(
+            f"{flag} {text}: want seconds after the start (12.5) or absolute time (17...ns)"
+        )
+    return first_ns(logs) + round(seconds * 1e9)
+
+
+def first_ns(logs: Sequence[Log]) -> int:
+    """Log time of the first stored row of the earliest log.
+
+    Raises:
+        UsageError: No log holds a single row.
+    """
+    starts: list[int] = []
+    for log in logs:
+        for block in log.read(Ledger(str(log.path))):
+            if len(block):
+                starts.append(int(block.log_ns.min()))
+                break
+    if not starts:
+        raise UsageError("--from, --to: the log holds no row, so it has no start; leave them out")
+    return min(starts)
+
+
+def print_json(value: object) -> None:
+    """Strict JSON on stdout: sorted keys, NaN and infinities as null."""
+    print(to_json(value))
+
+
+def to_json(value: object) -> str:
+    """Strict JSON text: sorted keys, NaN and infinities as null."""
+    return json.dumps(_finite(value), sort_keys=True, indent=2, allow_nan=False)
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(k): _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return value
+
+
+def with_progress(
+    items: Iterable[T], done_share: Callable[[], float], args: argparse.Namespace, what: str
+) -> Iterator[T]:
+    """Yield ``items``; on a terminal, keep one line with share done and time left on stderr.
+
+    Args:
+        items: What is worked through.
+        done_share: Asked at most five times a second; gives the share done, 0 to 1.
+        args: With ``quiet``.
+        what: The word before the bar.
+    """
+    if args.quiet or not sys.stderr.isatty():
+        yield from items
+        return
+    began = shown = time.monotonic()
+    try:
+        for item in items:
+            yield item
+            now = time.monotonic()
+            if now - shown > 0.2:
+                shown = now
+                share = min(max(done_share(), 1e-6), 1.0)
+                left_s = (now - began) * (1.0 - share) / share
+                sys.stderr.write(f"\r{what} {100 * share:3.0f} %  {left_s:5.0f} s left \x1b[K")
+                sys.stderr.flush()
+    finally:
+        sys.stderr.write("\r\x1b[K")
+        sys.stderr.flush()
