@@ -1,0 +1,248 @@
+"""The vehicle file: which stream plays which role, how sensors are mounted, how noisy they are.
+
+TOML, versioned, checked with pydantic. Unknown keys, wrong units and missing roles are refused with
+the line in the file and a suggestion. Units stand last in every name (SI); frames are ISO 8855 /
+REP-103: x forward, y left, heading counter-clockwise. Every default is written to the manifest.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from .errors import VehicleError
+
+VERSION: Final = 1
+DEGREE: Final = math.pi / 180.0
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Signal = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
+"""``MESSAGE.SIGNAL`` as the DBC file spells them."""
+
+
+class Section(BaseModel):
+    """What all sections share: unknown keys are refused, nothing changes after reading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class Topics(Section):
+    """Which topic plays which role; a role left out goes to the only topic of a fitting type."""
+
+    camera: str | None = None
+    imu: str | None = None
+    magnetometer: str | None = None
+    heading: str | None = None
+    """Topic with a column ``heading_rad``, or an inertial unit whose orientation is trusted."""
+    gnss: str | None = None
+    odometry: str | None = None
+
+
+class WheelSpeeds(Section):
+    """Signals with the speed of each wheel; the rear two alone are enough."""
+
+    front_left: Signal | None = None
+    front_right: Signal | None = None
+    rear_left: Signal
+    rear_right: Signal
+    unit: Literal["km/h", "m/s", "mph"] | None = None
+    """Overrides the unit that the DBC file gives, or gives it where the file is silent."""
+
+
+class AngleSignal(Section):
+    """One signal with an angle or an angular rate, counter-clockwise positive."""
+
+    signal: Signal
+    unit: Literal["deg", "rad", "deg/s", "rad/s"] | None = None
+    sign: Literal[1, -1] = 1
+
+
+class Can(Section):
+    """The bus with the car's own signals and how to decode it."""
+
+    bus: str | None = None
+    """Topic of the bus; may be left out where the log has only one."""
+    dbc: tuple[str, ...] = ()
+    """Files, relative to the vehicle file's folder."""
+    wheel_speeds: WheelSpeeds | None = None
+    yaw_rate: AngleSignal | None = None
+    steering: AngleSignal | None = None
+
+
+class Mobileye(Section):
+    """The Mobileye's bus, protocol and mounting."""
+
+    bus: str | None = None
+    revision: Literal["auto", "classic", "2.32"] = "auto"
+    slots: Literal[10, 13] = 10
+    x_m: Finite = 0.0
+    """Reference point ahead of the rear axle."""
+    y_m: Finite = 0.0
+    yaw_rad: Finite = 0.0
+
+
+class Odometry(Section):
+    """Wheels and gyro."""
+
+    wheel_scale: Positive = 1.0
+    track_width_m: Positive = 1.55
+    wheelbase_m: Positive = 2.7
+    steering_ratio: Positive = 15.0
+    gyro_bias_radps: Finite = 0.0
+    speed_sd_mps: Positive = 0.1
+    slip_share: NotNegative = 0.01
+    yaw_rate_sd_radps: Positive = 0.01
+    accel_sd_mps2: Positive = 1.0
+    heading_from: Literal["auto", "yaw_rate", "steering", "wheels"] = "auto"
+    """Which signal turns the pose; ``auto`` takes the first of these three that the log has."""
+
+
+class Compass(Section):
+    """From a magnetometer's reading to a heading; ``crosscue fit compass`` writes this section."""
+
+    use: bool = True
+    mounting_yaw_rad: Finite = 0.0
+    hard_iron_t: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    soft_iron: tuple[
+        tuple[Finite, Finite, Finite], tuple[Finite, Finite, Finite], tuple[Finite, Finite, Finite]
+    ] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    declination_rad: Finite = 0.0
+    """East positive."""
+    heading_sd_rad: Positive = 15.0 * DEGREE
+    decorrelation_s: NotNegative = 1.0
+    """Readings closer in time than this share their error; the filter weighs them as one."""
+
+
+class Start(Section):
+    """The pose at the log's first row, in the map frame (x east, y north)."""
+
+    x_m: Finite = 0.0
+    y_m: Finite = 0.0
+    position_sd_m: Positive = 1.0
+    heading_rad: Finite | None = None
+    """Left out: taken from the first compass readings."""
+    heading_sd_rad: Positive = 5.0 * DEGREE
+
+
+class Camera(Section):
+    """Pinhole camera and where it sits."""
+
+    x_m: Finite = 0.0
+    """Ahead of the rear axle."""
+    y_m: Finite = 0.0
+    z_m: Finite = 1.2
+    focal_px: Positive | None = None
+    center_px: tuple[Finite, Finite] | None = None
+
+
+class Vehicle(Section):
+    """A whole vehicle file."""
+
+    version: Literal[1]
+    name: str = "unnamed"
+    topics: Topics = Topics()
+    can: Can = Can()
+    mobileye: Mobileye = Mobileye()
+    odometry: Odometry = Odometry()
+    compass: Compass = Compass()
+    start: Start = Start()
+    camera: Camera = Camera()
+    lost_above_m: Positive = 100.0
+    """The pose counts as lost while the 2-sigma ellipse's full major axis exceeds this."""
+
+
+def load(path: Path) -> Vehicle:
+    """Read and check a vehicle file.
+
+    Raises:
+        VehicleError: Not there, not TOML, or a key or value that does not fit; with the line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise VehicleError(f"{path}: {why}; make one with: crosscue vehicle init LOG") from None
+    vehicle = parse(text, str(path))
+    can = vehicle.can
+    files = tuple(str((path.parent / name).resolve()) for name in can.dbc)
+    return vehicle.model_copy(update={"can": can.model_copy(update={"dbc": files})})
+
+
+def parse(text: str, where: str) -> Vehicle:
+    """Check the text of a vehicle file; ``where`` names it in errors.
+
+    Raises:
+        VehicleError: As in ``load``.
+    """
+    try:
+        tree = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise VehicleError(f"{where}: not TOML: {error}; mend that line") from None
+    try:
+        return Vehicle.model_validate(_tuples(tree))
+    except ValidationError as error:
+        raise VehicleError(_explain(error, text, where)) from None
+
+
+def _tuples(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+def _explain(error: ValidationError, text: str, where: str) -> str:
+    first, *others = error.errors(include_url=False)
+    keys = [str(part) for part in first["loc"]]
+    more = f" (and {len(others)} more)" if others else ""
+    place = f"{where}:{_line_of(keys, text)}: {'.'.join(keys)}"
+    if first["type"] == "extra_forbidden":
+        return f"{place}: no such key; {_suggestion(keys)}{more}"
+    if first["type"] == "missing":
+        return f"{place}: missing; add it{more}"
+    return f"{place}: {first['msg'].lower()}, got {first['input']!r}; mend the value{more}"
+
+
+def _suggestion(keys: list[str]) -> str:
+    section: type[BaseModel] | None = Vehicle
+    for key in keys[:-1]:
+        section = _section_of(section, key) if section else None
+    known = sorted(section.model_fields) if section else []
+    close = difflib.get_close_matches(keys[-1], known, n=1, cutoff=0.6)
+    return f"did you mean {close[0]}?" if close else f"there are: {', '.join(known)}"
+
+
+def _section_of(section: type[BaseModel], key: str) -> type[BaseModel] | None:
+    field = section.model_fields.get(key)
+    if field is None:
+        return None
+    kinds = (field.annotation, *getattr(field.annotation, "__args__", ()))
+    return next((k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)), None)
+
+
+def _line_of(keys: list[str], text: str) -> int:
+    """Line of the deepest of ``keys`` that the text spells out; 1 where none is."""
+    names = [key for key in keys if not key.isdigit()]
+    table: list[str] = []
+    best, best_depth = 1, 0
+    for number, line in enumerate(text.splitlines(), 1):
+        header = re.match(r"\s*\[+\s*([^\]]+?)\s*\]+", line)
+        entry = re.match(r"\s*([\w.\"'-]+)\s*=", line)
+        if header:
+            table = [part.strip("\"' ") for part in header[1].split(".")]
+            here = table
+        elif entry:
+            here = table + [part.strip("\"' ") for part in entry[1].split(".")]
+        else:
+            continue
+        depth = len(here)
+        if here == names[:depth] and depth > best_depth:
+            best, best_depth = number, depth
+    return best
