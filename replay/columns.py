@@ -32,6 +32,9 @@ DATA: Final = 0
 REMOTE: Final = 1
 ERROR: Final = 2
 
+LENGTH_UNKNOWN: Final = 255
+"""``CanFrames.length`` where the log does not keep it; the bytes are then padded with zeros."""
+
 
 @dataclass(frozen=True, slots=True)
 class Topic:
@@ -99,7 +102,8 @@ class CanFrames:
         arbitration_id: Shape (N,), uint32, 11 or 29 bits, without flag bits.
         is_extended: Shape (N,), bool: 29-bit identifier.
         kind: Shape (N,), uint8: ``DATA``, ``REMOTE`` or ``ERROR``.
-        length: Shape (N,), uint8: payload bytes that the frame really carries (not the DLC code).
+        length: Shape (N,), uint8: payload bytes that the frame really carries (not the DLC code),
+            or ``LENGTH_UNKNOWN``.
         data: Shape (N, W), uint8, W = 8 or 64; bytes from ``length`` on are zero.
         is_fd: Shape (N,), bool: CAN FD frame.
     """

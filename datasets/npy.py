@@ -1,0 +1,69 @@
+"""NumPy's .npy files read as far as they go, without pickle and without trusting their header."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.lib import format as npy_format
+from numpy.typing import NDArray
+
+from crosscue.replay.errors import LogFormatError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Column:
+    """The readable rows of one array file.
+
+    Attributes:
+        path: The file.
+        rows: Shape (N, ...): the rows whose bytes are all there; mapped from the file where
+            its layout allows.
+        declared: Rows that the header promises.
+    """
+
+    path: Path
+    rows: NDArray[np.generic]
+    declared: int
+
+    @property
+    def missing(self) -> int:
+        """Rows promised but not there."""
+        return self.declared - len(self.rows)
+
+
+def read_column(path: Path) -> Column:
+    """Map an array file; a cut one gives its whole rows.
+
+    Raises:
+        LogFormatError: Not an .npy file, or one of Python objects.
+    """
+    try:
+        with path.open("rb") as file:
+            version = npy_format.read_magic(file)
+            if version == (1, 0):
+                shape, by_columns, dtype = npy_format.read_array_header_1_0(file)
+            elif version == (2, 0):
+                shape, by_columns, dtype = npy_format.read_array_header_2_0(file)
+            else:
+                raise ValueError(f"version {version}")
+            offset = file.tell()
+    except (ValueError, UnicodeDecodeError, SyntaxError, TypeError, EOFError) as error:
+        raise LogFormatError(f"{path}: not a NumPy array file ({error}); copy it again") from None
+    if dtype.hasobject or not shape or dtype.itemsize == 0 or any(side < 0 for side in shape):
+        raise LogFormatError(f"{path}: want an array of plain numbers, got {dtype} {shape}")
+    width = int(np.prod(shape[1:], dtype=np.int64))
+    cells = max(0, path.stat().st_size - offset) // dtype.itemsize
+    present = min(shape[0], cells // width if width else 0)
+    if by_columns and len(shape) > 1:
+        # Stored column after column, a row is whole only where the last column has it.
+        present = max(0, min(shape[0], cells - (width - 1) * shape[0]))
+    if present == 0:
+        return Column(path, np.empty((0, *shape[1:]), dtype), shape[0])
+    if by_columns and len(shape) > 1:
+        flat = np.memmap(path, dtype, "r", offset, ((width - 1) * shape[0] + present,))
+        by_column = [flat[i * shape[0] : i * shape[0] + present] for i in range(width)]
+        return Column(path, np.stack(by_column, axis=1).reshape(present, *shape[1:]), shape[0])
+    mapped = np.memmap(path, dtype, "r", offset, (present, *shape[1:]))
+    return Column(path, mapped, shape[0])
