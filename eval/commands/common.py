@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import re
 import sys
@@ -15,6 +14,7 @@ from typing import TypeVar
 from crosscue.replay.errors import UsageError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.run_folder import strict_json
 
 T = TypeVar("T")
 
@@ -94,22 +94,7 @@ def first_ns(logs: Sequence[Log]) -> int:
 
 def print_json(value: object) -> None:
     """Strict JSON on stdout: sorted keys, NaN and infinities as null."""
-    print(to_json(value))
-
-
-def to_json(value: object) -> str:
-    """Strict JSON text: sorted keys, NaN and infinities as null."""
-    return json.dumps(_finite(value), sort_keys=True, indent=2, allow_nan=False)
-
-
-def _finite(value: object) -> object:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {str(k): _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return value
+    print(strict_json(value))
 
 
 def with_progress(

@@ -1,0 +1,314 @@
+"""The run folder: where stages meet on disk.
+
+Files get their final name only when whole: written under a temporary name in the same folder,
+flushed to the disk, renamed. One lock file names the process at work. Tables are Parquet with page
+checksums, verified when read.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import math
+import os
+import shutil
+import socket
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from .errors import OutputError, RunError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MANIFEST: Final = "manifest.json"
+LOCK: Final = ".lock"
+FORMAT_VERSION: Final = 1
+PARTIAL: Final = ".partial"
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """A run's folder; make one with ``create`` or ``open_run``."""
+
+    path: Path
+
+    def file(self, name: str) -> Path:
+        """Path of one of its files."""
+        return self.path / name
+
+    def manifest(self) -> dict[str, Any]:
+        """The manifest as read.
+
+        Raises:
+            RunError: Not there, damaged, or of another version of crosscue.
+        """
+        path = self.file(MANIFEST)
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise RunError(
+                f"{self.path}: no {MANIFEST}: not a run folder, or its run was cut short; "
+                "run crosscue replay again"
+            ) from None
+        except (OSError, ValueError) as error:
+            raise RunError(f"{path}: unreadable ({error}); run crosscue replay again") from None
+        version = found.get("format_version") if isinstance(found, dict) else None
+        if version != FORMAT_VERSION:
+            raise RunError(
+                f"{path}: format {version!r}, this crosscue reads {FORMAT_VERSION}; replay again"
+            )
+        return dict(found)
+
+    def table(self, name: str, columns: list[str] | None = None) -> pa.Table:
+        """Rows of ``NAME.parquet``, its page checksums verified.
+
+        Raises:
+            RunError: Not there or damaged.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        path = self.file(f"{name}.parquet")
+        try:
+            with path.open("rb") as file:
+                return pq.read_table(file, columns=columns, page_checksum_verification=True)
+        except FileNotFoundError:
+            raise RunError(f"{path}: not there; run crosscue replay again") from None
+        except (OSError, pa.ArrowException) as error:
+            raise RunError(f"{path}: damaged ({error}); run crosscue replay again") from None
+
+
+def create(path: Path, *, overwrite: bool) -> RunFolder:
+    """An empty run folder.
+
+    Raises:
+        RunError: It exists and is not empty, or is no folder, and ``overwrite`` is not given.
+        OutputError: It cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        leftovers = [entry for entry in path.iterdir() if entry.name != LOCK]
+    except FileExistsError:
+        raise RunError(f"{path}: is a file; give a folder for the run") from None
+    except OSError as error:
+        raise OutputError(f"{path}: {error.strerror}; choose a folder you may write to") from None
+    if leftovers and not overwrite:
+        raise RunError(f"{path}: holds files already; give another folder or --overwrite")
+    if leftovers and not _looks_like_run(leftovers):
+        names = ", ".join(sorted(entry.name for entry in leftovers)[:3])
+        raise RunError(f"{path}: holds files that are no run's ({names}); give another folder")
+    return RunFolder(path)
+
+
+def clear(run: RunFolder) -> None:
+    """Delete an earlier run's files; the lock stays. Call it while holding the lock."""
+    for entry in run.path.iterdir():
+        if entry.name == LOCK:
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink()
+
+
+def open_run(path: Path) -> RunFolder:
+    """An existing run folder, its manifest checked.
+
+    Raises:
+        RunError: As ``RunFolder.manifest``.
+    """
+    run = RunFolder(path)
+    run.manifest()
+    return run
+
+
+def _looks_like_run(entries: list[Path]) -> bool:
+    ours = {MANIFEST, "score", "view"}
+    return all(
+        e.name in ours or e.suffix in (".parquet", ".rrd", ".json", PARTIAL) for e in entries
+    )
+
+
+@contextmanager
+def locked(run: RunFolder) -> Iterator[None]:
+    """Hold the folder for this process.
+
+    Raises:
+        RunError: Another living process holds it; it is named.
+    """
+    path = run.file(LOCK)
+    me = f"{os.getpid()} {socket.gethostname()} {_boot_id()}"
+    for _ in range(2):
+        try:
+            handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+            break
+        except FileExistsError:
+            _refuse_if_alive(path)
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(f"{run.path}: {error.strerror}; cannot lock the run folder") from None
+    else:
+        raise RunError(f"{run.path}: another process took the folder; run again")
+    with os.fdopen(handle, "w") as file:
+        file.write(me)
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def _refuse_if_alive(path: Path) -> None:
+    try:
+        pid, host, boot = path.read_text().split(" ", 2)
+    except (OSError, ValueError):
+        return
+    if host != socket.gethostname():
+        raise RunError(f"{path}: held by process {pid} on {host}; delete the file if that is over")
+    alive = boot == _boot_id() and Path(f"/proc/{pid}").exists() and int(pid) != os.getpid()
+    if alive:
+        raise RunError(f"{path.parent}: process {pid} on {host} is writing it; wait or stop that")
+
+
+def _boot_id() -> str:
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return "unknown"
+
+
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Let ``write`` fill a temporary file, then give it its final name.
+
+    Raises:
+        OutputError: The disk is full or the folder cannot be written; nothing half is left.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}{PARTIAL}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(partial)
+        _sync(partial)
+        partial.replace(path)
+        _sync(path.parent)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise cannot_write(path, error) from None
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def cannot_write(path: Path, error: OSError) -> OutputError:
+    """The error to raise when writing ``path`` failed with ``error``."""
+    if error.errno == errno.ENOSPC:
+        try:
+            free = shutil.disk_usage(path.parent).free // (1 << 20)
+        except OSError:
+            free = 0
+        return OutputError(f"{path}: the disk is full ({free} MiB free); make room and run again")
+    return OutputError(f"{path}: {error.strerror or error}; choose a place you may write to")
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all."""
+    write_whole(path, lambda partial: partial.write_text(text, encoding="utf-8"))
+
+
+def write_manifest(run: RunFolder, content: Mapping[str, object]) -> None:
+    """Write the manifest, last of all: a folder that has one is a finished run."""
+    whole = {"format_version": FORMAT_VERSION, **content}
+    write_text(run.file(MANIFEST), strict_json(whole) + "\n")
+
+
+def strict_json(value: object) -> str:
+    """JSON text with sorted keys; NaN and infinities become null."""
+    return json.dumps(_finite(value), sort_keys=True, indent=2, allow_nan=False)
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value
+
+
+class TableSink:
+    """A Parquet file written a batch at a time and named when whole; a context manager."""
+
+    def __init__(self, run: RunFolder, name: str, schema: pa.Schema) -> None:
+        """Begin ``NAME.parquet``."""
+        import pyarrow.parquet as pq
+
+        self._path: Final = run.file(f"{name}.parquet")
+        self._partial: Final = self._path.with_name(f".{name}.{os.getpid()}{PARTIAL}")
+        self._schema: Final = schema
+        try:
+            self._file: Final = self._partial.open("wb")
+        except OSError as error:
+            raise cannot_write(self._path, error) from None
+        self._writer: Final = pq.ParquetWriter(
+            self._file, schema, compression="zstd", write_page_checksum=True
+        )
+
+    def write(self, columns: Mapping[str, object]) -> None:
+        """Append rows given as columns.
+
+        Raises:
+            OutputError: The disk is full.
+        """
+        import pyarrow as pa
+
+        try:
+            self._writer.write_table(pa.table(dict(columns), schema=self._schema))
+        except OSError as error:
+            raise cannot_write(self._path, error) from None
+
+    def __enter__(self) -> TableSink:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+        if kind is not None:
+            self._file.close()
+            self._partial.unlink(missing_ok=True)
+            return
+        try:
+            self._writer.close()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            self._partial.replace(self._path)
+        except OSError as error:
+            self._partial.unlink(missing_ok=True)
+            raise cannot_write(self._path, error) from None
+
+
+def sha256_of(path: Path) -> dict[str, str]:
+    """SHA-256 of a file, or of every file below a folder, by relative name.
+
+    Raises:
+        OSError: A file cannot be read.
+    """
+    if path.is_file():
+        return {path.name: _sha256(path)}
+    files = sorted(entry for entry in path.rglob("*") if entry.is_file())
+    return {entry.relative_to(path).as_posix(): _sha256(entry) for entry in files}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
