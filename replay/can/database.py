@@ -1,0 +1,266 @@
+"""Reads CAN databases (DBC, KCD, ARXML, SYM) and says what is doubtful about them.
+
+cantools parses; what it lets pass in silence is looked for here: files that end too early, one
+identifier defined twice, signals that overlap or do not fit, text in another encoding.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from crosscue.replay.errors import LogTooLargeError, SchemaError
+from crosscue.replay.limits import DEFAULT, Limits
+
+from .layout import CanMessage, CanSignal, layout_problem, overlaps
+from .sources import DatabaseText, doubts, read_text, refuse_bombs
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message, Signal
+    from cantools.database.can.internal_database import InternalDatabase
+
+FORMATS: Final = ("dbc", "kcd", "arxml", "sym")
+
+
+@dataclass(frozen=True, slots=True)
+class Conflict:
+    """Two definitions of one identifier.
+
+    Attributes:
+        kept: The one that is used: the first met.
+        other: The one that is not.
+        is_harmless: Both decode every frame to the same columns.
+    """
+
+    kept: CanMessage
+    other: CanMessage
+    is_harmless: bool
+
+    def __str__(self) -> str:
+        return (
+            f"{spell_id(*self.kept.key)} is defined as {self.kept.name} ({self.kept.source}) "
+            f"and as {self.other.name} ({self.other.source})"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class CanDatabase:
+    """The messages of one bus.
+
+    Attributes:
+        messages: One for each identifier, in the order of the files.
+        notices: Plain sentences about what is doubtful in the files.
+        conflicts: Identifiers that were defined more than once.
+    """
+
+    messages: tuple[CanMessage, ...]
+    notices: tuple[str, ...] = ()
+    conflicts: tuple[Conflict, ...] = ()
+
+    @classmethod
+    def load(
+        cls,
+        paths: Sequence[Path | str],
+        limits: Limits = DEFAULT,
+        *,
+        keep_first: bool = False,
+    ) -> CanDatabase:
+        """Read database files that together describe one bus.
+
+        Args:
+            paths: Files ending in .dbc, .kcd, .arxml or .sym.
+            limits: No file may be larger than ``message_bytes``.
+            keep_first: Where files define one identifier differently, use the first definition
+                instead of refusing.
+
+        Raises:
+            SchemaError: A file is missing, does not parse, or contradicts another.
+            LogTooLargeError: A file, or a size that it declares, is over the limit.
+        """
+        found: list[CanMessage] = []
+        notices: list[str] = []
+        for path in map(Path, paths):
+            messages, doubtful = _load_file(path, limits)
+            found += messages
+            notices += doubtful
+        return cls.of(found, notices, keep_first=keep_first)
+
+    @classmethod
+    def of(
+        cls,
+        messages: Iterable[CanMessage],
+        notices: Iterable[str] = (),
+        *,
+        keep_first: bool = False,
+    ) -> CanDatabase:
+        """Put messages together, looking for identifiers and names that occur twice.
+
+        Raises:
+            SchemaError: Two messages of one identifier differ, and ``keep_first`` is not set.
+        """
+        by_key: dict[tuple[int, bool], CanMessage] = {}
+        conflicts: list[Conflict] = []
+        for message in messages:
+            kept = by_key.setdefault(message.key, message)
+            if kept is not message:
+                conflicts.append(Conflict(kept, message, kept.same_layout(message)))
+        said = [*notices, *(_notice_of(conflict) for conflict in conflicts)]
+        harmful = [conflict for conflict in conflicts if not conflict.is_harmless]
+        if harmful and not keep_first:
+            more = f" (and {len(harmful) - 1} more)" if len(harmful) > 1 else ""
+            raise SchemaError(
+                f"{harmful[0]}{more}, with different signals; expected one definition for each "
+                "identifier; give only the file of this bus, or ask to keep the first"
+            )
+        named, renamed = _with_topics(by_key.values())
+        return cls(named, tuple(said + renamed), tuple(conflicts))
+
+    def find(self, arbitration_id: int, is_extended: bool) -> CanMessage | None:
+        """The message with this identifier; 11-bit and 29-bit ones are never mixed up."""
+        wanted = (arbitration_id, is_extended)
+        return next((m for m in self.messages if m.key == wanted), None)
+
+    def named(self, name: str) -> CanMessage:
+        """The message called ``name``, or with that ``topic_name``.
+
+        Raises:
+            ValueError: No such message, or several; the error says which there are.
+        """
+        fitting = [m for m in self.messages if name in (m.name, m.topic_name)]
+        if len(fitting) == 1:
+            return fitting[0]
+        if fitting:
+            names = ", ".join(m.topic_name for m in fitting)
+            raise ValueError(f"{len(fitting)} messages are called {name!r}; say which: {names}")
+        near = difflib.get_close_matches(name, [m.topic_name for m in self.messages], n=3)
+        hint = f"; did you mean {' or '.join(near)}" if near else ""
+        raise ValueError(f"no message {name!r} among {len(self.messages)}{hint}")
+
+
+def spell_id(arbitration_id: int, is_extended: bool) -> str:
+    """An identifier as people write it: three hexadecimal digits, or eight if extended."""
+    return f"0x{arbitration_id:08X} (extended)" if is_extended else f"0x{arbitration_id:03X}"
+
+
+def _notice_of(conflict: Conflict) -> str:
+    result = "both alike" if conflict.is_harmless else "the first is used"
+    return f"{conflict}: {result}"
+
+
+def _with_topics(messages: Iterable[CanMessage]) -> tuple[tuple[CanMessage, ...], list[str]]:
+    """Messages with distinct topics: identifiers tell apart those that share a name."""
+    messages = list(messages)
+    uses = Counter(message.name for message in messages)
+    repeated = {name for name, n in uses.items() if n > 1}
+    notices = [
+        f"{uses[name]} messages are called {name}; their topics end in their identifiers"
+        for name in sorted(repeated)
+    ]
+    named = tuple(
+        replace(m, topic=f"{m.name}_0x{m.arbitration_id:X}{'x' if m.is_extended else ''}")
+        if m.name in repeated
+        else replace(m, topic=m.name)
+        for m in messages
+    )
+    return named, notices
+
+
+def _load_file(path: Path, limits: Limits) -> tuple[list[CanMessage], list[str]]:
+    form = path.suffix.lower().removeprefix(".")
+    if form not in FORMATS:
+        known = " ".join(f".{suffix}" for suffix in FORMATS)
+        raise SchemaError(f"{path}: no CAN database; expected a file ending in one of {known}")
+    source = read_text(path, limits)
+    refuse_bombs(source, form)
+    parsed = _parse(source, form)
+    messages = [_message(m, source, form, _says_fd(parsed, form)) for m in parsed.messages]
+    if not messages:
+        raise SchemaError(f"{path}: defines no message; check that the file is whole")
+    notices = [*source.notices, *doubts(source, form, [m.name for m in messages])]
+    for message in messages:
+        notices += _doubts_of(message)
+    return messages, notices
+
+
+def _parse(source: DatabaseText, form: str) -> InternalDatabase:
+    from cantools.database.can.formats import arxml, dbc, kcd, sym
+
+    load: Callable[[str, bool], InternalDatabase]
+    load = {"dbc": dbc, "kcd": kcd, "arxml": arxml, "sym": sym}[form].load_string
+    try:
+        # Not strict: one bad message would cost the whole file. Each is checked afterwards.
+        return load(source.text, False)
+    except (RecursionError, MemoryError) as error:
+        raise LogTooLargeError(
+            f"{source.path}: too large or too deeply nested to parse ({type(error).__name__})"
+        ) from None
+    except Exception as error:  # cantools documents none; whatever a damaged file provokes
+        words = " ".join(str(error).split()) or type(error).__name__
+        line = source.line_of_error(str(error))
+        raise SchemaError(
+            f"{source.path}:{line}: not a readable {form.upper()} file: {words[:300]}; "
+            "correct that line or get a whole copy of the file"
+        ) from None
+
+
+def _says_fd(parsed: InternalDatabase, form: str) -> bool:
+    """Whether the file tells CAN FD frames from classic ones at all."""
+    if form == "dbc":
+        return parsed.dbc is not None and "VFrameFormat" in parsed.dbc.attribute_definitions
+    return form == "arxml"
+
+
+def _message(parsed: Message, source: DatabaseText, form: str, says_fd: bool) -> CanMessage:
+    line = source.line_of_message(parsed.name, parsed.frame_id, parsed.is_extended_frame)
+    message = CanMessage(
+        name=parsed.name,
+        arbitration_id=parsed.frame_id,
+        is_extended=parsed.is_extended_frame,
+        length=parsed.length,
+        signals=tuple(_signal(s) for s in parsed.signals),
+        is_fd=parsed.is_fd if says_fd else None,
+        source=f"{source.path.name}:{line}" if line else source.path.name,
+    )
+    if parsed.is_container:
+        return replace(message, problem="container message, not supported")
+    return replace(message, problem=layout_problem(message))
+
+
+def _signal(parsed: Signal) -> CanSignal:
+    conversion = parsed.conversion
+    return CanSignal(
+        name=parsed.name,
+        start=parsed.start,
+        length=parsed.length,
+        is_big_endian=parsed.byte_order == "big_endian",
+        is_signed=parsed.is_signed,
+        is_float=conversion.is_float,
+        scale=conversion.scale,
+        offset=conversion.offset,
+        unit=parsed.unit or "",
+        minimum=parsed.minimum,
+        maximum=parsed.maximum,
+        choices={int(raw): str(name) for raw, name in (conversion.choices or {}).items()},
+        is_multiplexer=parsed.is_multiplexer,
+        multiplexer=parsed.multiplexer_signal,
+        branches=frozenset(parsed.multiplexer_ids or ()),
+    )
+
+
+def _doubts_of(message: CanMessage) -> list[str]:
+    where = f"{message.source}: {message.name}"
+    if message.problem:
+        return [f"{where} cannot be decoded: {message.problem}"]
+    notices = [f"{where}: signals {a} and {b} share bits" for a, b in overlaps(message)]
+    for signal in message.signals:
+        if signal.is_multiplexer and (signal.scale != 1 or signal.offset != 0):
+            notices.append(
+                f"{where}: multiplexer {signal.name} is scaled; its physical value picks the branch"
+            )
+        if signal.multiplexer is not None and not signal.branches:
+            notices.append(f"{where}: no multiplexer value brings {signal.name}; it never occurs")
+    return notices

@@ -1,0 +1,312 @@
+"""Bits of many payloads at once into columns, with NumPy.
+
+A payload is read as 64-bit words: word ``k`` holds bytes ``8 k`` to ``8 k + 7``, as the number
+that they make in the signal's byte order. A signal lies in one word, or in one and the next.
+Signals that lie alike (same word, byte order and kind) are taken out together, as one array of
+shape (signals, rows), since a call into NumPy costs more than the work on a few hundred rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .layout import Arithmetic, CanMessage, CanSignal, is_whole
+
+Words: TypeAlias = NDArray[np.uint64]
+"""Shape (N, W / 8): payloads as little-endian words."""
+Column: TypeAlias = NDArray[Any]
+
+PRESENT_SUFFIX: Final = "_is_present"
+"""Ends the name of the companion column of a signal that may be absent and cannot be NaN."""
+
+_FLOATS: Final = {16: (np.uint16, np.float16), 32: (np.uint32, np.float32)}
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """What signals taken out together have in common."""
+
+    is_big_endian: bool
+    word: int
+    is_split: bool
+    is_signed: bool
+    is_float: bool
+    float_bits: int
+    arithmetic: str
+
+
+def _place(signal: CanSignal) -> _Place:
+    word, bit = divmod(signal.first_bit, 64)
+    return _Place(
+        signal.is_big_endian,
+        word,
+        bit + signal.length > 64,
+        signal.is_signed and not signal.is_float,
+        signal.is_float,
+        signal.length if signal.is_float else 0,
+        signal.arithmetic.name,
+    )
+
+
+class _Together:
+    """Signals of one place, with their shifts as columns of shape (S, 1)."""
+
+    def __init__(self, place: _Place, signals: list[CanSignal]) -> None:
+        self.place = place
+        self.signals = signals
+        bit = np.array([s.first_bit % 64 for s in signals], dtype=np.uint64)[:, None]
+        length = np.array([s.length for s in signals], dtype=np.uint64)[:, None]
+        self._drop = np.uint64(64) - length
+        # Shifted left until only the wanted bits are left of it; then right, with sign or not.
+        self._left = bit if place.is_big_endian else np.uint64(64) - (bit + length)
+        self._taken = np.uint64(64) - bit  # bits of a split signal in its first word
+        self._short = bool((length < 64).all())
+        scales, offsets = [s.scale for s in signals], [s.offset for s in signals]
+        self._scale = None if all(x == 1 for x in scales) else _factors(scales)
+        self._offset = None if not any(offsets) else _factors(offsets)
+
+    def __call__(self, words: Words) -> Column:
+        """Physical values, shape (S, N)."""
+        raw = self._split(words) if self.place.is_split else self._whole(words)
+        if self.place.is_float:
+            return self._scaled(_as_float(raw, self.place.float_bits))
+        if self.place.arithmetic == Arithmetic.FLOAT.name:
+            return self._scaled(raw.astype(np.float64))
+        if self.place.arithmetic == Arithmetic.BIG.name:
+            return _big(raw, self.signals)
+        return self._scaled_integers(raw)
+
+    def _word(self, words: Words, k: int) -> Words:
+        word = words[:, k]
+        return word.byteswap() if self.place.is_big_endian else word
+
+    def _whole(self, words: Words) -> NDArray[np.int64] | NDArray[np.uint64]:
+        raw = self._word(words, self.place.word) << self._left
+        if self.place.is_signed:
+            return np.right_shift(raw.view(np.int64), self._drop.view(np.int64))
+        raw >>= self._drop
+        # Conversion from int64 is the faster one; without the top bit both mean the same.
+        return raw.view(np.int64) if self._short else raw
+
+    def _split(self, words: Words) -> NDArray[np.int64] | NDArray[np.uint64]:
+        first = self._word(words, self.place.word)
+        second = self._word(words, self.place.word + 1)
+        if self.place.is_big_endian:
+            raw = (first << (np.uint64(64) - self._taken)) | (second >> self._taken)
+        else:
+            raw = (first >> (np.uint64(64) - self._taken)) | (second << self._taken)
+            raw = raw << self._drop
+        if self.place.is_signed:
+            return np.right_shift(raw.view(np.int64), self._drop.view(np.int64))
+        return raw >> self._drop
+
+    def _scaled(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self._scale is not None:
+            values *= self._scale
+        if self._offset is not None:
+            values += self._offset
+        return values
+
+    def _scaled_integers(self, raw: Column) -> Column:
+        # Sums and products modulo 2**64 are right whenever the result fits, and it does.
+        values: Column = raw.view(np.uint64).copy()
+        values *= _modulo([int(s.scale) for s in self.signals])
+        values += _modulo([int(s.offset) for s in self.signals])
+        return values.view(np.int64) if self.place.arithmetic == Arithmetic.INT64.name else values
+
+
+def _factors(numbers: list[float]) -> NDArray[np.float64]:
+    return np.array([float(x) for x in numbers])[:, None]
+
+
+def _modulo(numbers: list[int]) -> NDArray[np.uint64]:
+    return np.array([x % 2**64 for x in numbers], dtype=np.uint64)[:, None]
+
+
+def _as_float(raw: Column, bits: int) -> NDArray[np.float64]:
+    if bits == 64:
+        return raw.view(np.float64).copy()
+    whole, real = _FLOATS[bits]
+    return raw.astype(whole).view(real).astype(np.float64)
+
+
+def _big(raw: Column, signals: list[CanSignal]) -> NDArray[np.float64]:
+    """Value by value in Python's unbounded integers: rare, and right to the last digit."""
+    rows = [
+        [float(value * _plain(s.scale) + _plain(s.offset)) for value in row.tolist()]
+        for s, row in zip(signals, raw, strict=True)
+    ]
+    return np.array(rows, dtype=np.float64).reshape(raw.shape)
+
+
+def _plain(number: float) -> float:
+    return int(number) if is_whole(number) else number
+
+
+class _Flat:
+    """Signals that are all there in every row."""
+
+    def __init__(self, signals: Iterable[CanSignal]) -> None:
+        ordered = sorted(((_place(s), s) for s in signals), key=lambda pair: str(pair[0]))
+        self._parts = [
+            _Together(place, [s for _, s in pairs])
+            for place, pairs in groupby(ordered, key=lambda pair: pair[0])
+        ]
+
+    def __call__(self, words: Words) -> dict[str, Column]:
+        """From signal name to its values, shape (N,)."""
+        columns: dict[str, Column] = {}
+        for part in self._parts:
+            columns.update(zip((s.name for s in part.signals), part(words), strict=True))
+        return columns
+
+
+@dataclass(frozen=True, slots=True)
+class _Branch:
+    values: tuple[int, ...]
+    node: _Node
+
+
+@dataclass(frozen=True, slots=True)
+class _Switch:
+    """One multiplexer: which of its values are known, and what they bring."""
+
+    name: str
+    known: tuple[int, ...]
+    branches: tuple[_Branch, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Node:
+    """Signals that come together, and the multiplexers among them."""
+
+    flat: _Flat
+    switches: tuple[_Switch, ...]
+
+
+class Extractor:
+    """From payloads of one message to the columns of some of its signals.
+
+    A signal that a row's multiplexers do not bring is NaN there; if its column is int64 or uint64
+    it is 0 there, and a companion bool column ``SIGNAL_is_present`` says where it is real.
+    """
+
+    def __init__(self, message: CanMessage, wanted: Collection[str] | None = None) -> None:
+        """Plan the extraction.
+
+        Args:
+            message: A message without ``problem``.
+            wanted: Names of the signals to give, or None for all.
+        """
+        names = {s.name for s in message.signals} if wanted is None else set(wanted)
+        self.message = message
+        self.signals = tuple(s for s in message.signals if s.name in names)
+        self.is_multiplexed = any(_switches_on(message, s) for s in message.signals)
+        needed = [s for s in message.signals if s.name in names or s.is_multiplexer]
+        self._root = _node(message, [s for s in needed if s.multiplexer is None], needed)
+
+    def __call__(self, words: Words) -> tuple[dict[str, Column], NDArray[np.bool_] | None]:
+        """Decode N payloads.
+
+        Args:
+            words: Shape (N, W / 8); at least as many bytes as the message has.
+
+        Returns:
+            Columns of length N in the database's order, and which rows hold a multiplexer value
+            without a branch (their values mean nothing), or None if no row does.
+        """
+        if not self.is_multiplexed:
+            columns = self._root.flat(words)
+            return {s.name: columns[s.name] for s in self.signals}, None
+        filled = {s.name: _Filled(s, len(words)) for s in self.signals}
+        strange = np.zeros(len(words), dtype=np.bool_)
+        _descend(self._root, words, np.arange(len(words)), filled, strange)
+        columns = {}
+        for name, column in filled.items():
+            columns[name] = column.values
+            if column.present is not None:
+                columns[name + PRESENT_SUFFIX] = column.present
+        return columns, strange if strange.any() else None
+
+
+class _Filled:
+    """A column of a multiplexed message, filled branch by branch."""
+
+    def __init__(self, signal: CanSignal, n: int) -> None:
+        arithmetic = signal.arithmetic
+        is_integer = arithmetic in (Arithmetic.INT64, Arithmetic.UINT64)
+        self.values: Column = (
+            np.zeros(n, dtype=arithmetic.value) if is_integer else np.full(n, np.nan)
+        )
+        needs_companion = is_integer and signal.may_be_absent
+        self.present = np.zeros(n, dtype=np.bool_) if needs_companion else None
+
+    def put(self, rows: NDArray[np.intp], values: Column) -> None:
+        self.values[rows] = values
+        if self.present is not None:
+            self.present[rows] = True
+
+
+def _descend(
+    node: _Node,
+    words: Words,
+    rows: NDArray[np.intp],
+    filled: dict[str, _Filled],
+    strange: NDArray[np.bool_],
+) -> None:
+    columns = node.flat(words[rows])
+    for name, values in columns.items():
+        if name in filled:
+            filled[name].put(rows, values)
+    for switch in node.switches:
+        selector = columns[switch.name]
+        strange[rows[~_is_one_of(selector, switch.known)]] = True
+        for branch in switch.branches:
+            there = rows[_is_one_of(selector, branch.values)]
+            if len(there):
+                _descend(branch.node, words, there, filled, strange)
+
+
+def _is_one_of(selector: Column, values: tuple[int, ...]) -> NDArray[np.bool_]:
+    if selector.dtype == np.float64:
+        return np.isin(np.trunc(selector), np.array(values, dtype=np.float64))
+    limits = np.iinfo(selector.dtype)
+    fitting = [v for v in values if limits.min <= v <= limits.max]
+    return np.isin(selector, np.array(fitting, dtype=selector.dtype))
+
+
+def known_values(message: CanMessage, multiplexer: CanSignal) -> frozenset[int]:
+    """The values that have a branch: those of its signals, and those with a name."""
+    values = set(multiplexer.choices)
+    for signal in message.signals:
+        if signal.multiplexer == multiplexer.name:
+            values |= signal.branches
+    return frozenset(values)
+
+
+def _switches_on(message: CanMessage, signal: CanSignal) -> bool:
+    return signal.is_multiplexer and bool(known_values(message, signal))
+
+
+def _node(message: CanMessage, here: list[CanSignal], needed: list[CanSignal]) -> _Node:
+    switches = []
+    for multiplexer in here:
+        if not _switches_on(message, multiplexer):
+            continue
+        below: dict[frozenset[int], list[CanSignal]] = {}
+        for signal in needed:
+            if signal.multiplexer == multiplexer.name:
+                below.setdefault(signal.branches, []).append(signal)
+        branches = [
+            _Branch(tuple(sorted(values)), _node(message, signals, needed))
+            for values, signals in below.items()
+        ]
+        known = tuple(sorted(known_values(message, multiplexer)))
+        switches.append(_Switch(multiplexer.name, known, tuple(branches)))
+    return _Node(_Flat(here), tuple(switches))

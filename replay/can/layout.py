@@ -1,0 +1,255 @@
+"""What a CAN message carries and where its bits lie, whatever file said so.
+
+Bits are counted as DBC files count them. A little-endian signal starts at its least significant
+bit, bit ``8 * byte + bit_in_byte``; a big-endian one at its most significant bit, with the same
+numbers, and runs down to bit 0 of a byte and on to bit 7 of the next.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Final
+
+EXACT_IN_FLOAT64: Final = 2**53
+MAX_FRAME_BYTES: Final = 64
+_FD_LENGTHS: Final = (12, 16, 20, 24, 32, 48, 64)
+
+
+class Arithmetic(Enum):
+    """How raw bits become a physical value without losing a digit.
+
+    * ``FLOAT``: in float64; every value that can occur is exact, or the scale is a fraction.
+    * ``INT64``, ``UINT64``: whole numbers that may pass 2**53 and fit the type.
+    * ``BIG``: whole numbers that pass 64 bits on the way; the column is their nearest float64.
+    """
+
+    FLOAT = "float64"
+    INT64 = "int64"
+    UINT64 = "uint64"
+    BIG = "float64 of big integers"
+
+
+@dataclass(frozen=True, slots=True)
+class CanSignal:
+    """One signal of a message: ``value = raw * scale + offset``.
+
+    Attributes:
+        name: As the database spells it.
+        start: First bit, counted as the module's text says.
+        length: Bits, 1 to 64.
+        is_big_endian: Motorola byte order.
+        is_signed: Two's complement.
+        is_float: The bits are an IEEE 754 number of 16, 32 or 64 bits.
+        scale: Physical units per raw step; an int where the file wrote a whole number.
+        offset: Physical value of raw zero; an int likewise.
+        unit: As the database spells it; empty if it has none.
+        minimum: Smallest meaningful physical value as declared, or None. Not enforced.
+        maximum: Largest one.
+        choices: From raw value to its name.
+        is_multiplexer: Its value says which other signals are there.
+        multiplexer: Name of the signal that says whether this one is there; None if it always is.
+        branches: The multiplexer's values with which it is there; empty without a multiplexer.
+    """
+
+    name: str
+    start: int
+    length: int
+    is_big_endian: bool = False
+    is_signed: bool = False
+    is_float: bool = False
+    scale: float = 1
+    offset: float = 0
+    unit: str = ""
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: Mapping[int, str] = field(default_factory=dict, hash=False)
+    is_multiplexer: bool = False
+    multiplexer: str | None = None
+    branches: frozenset[int] = frozenset()
+
+    @property
+    def first_bit(self) -> int:
+        """The start, counted in the direction in which the signal runs.
+
+        Little endian: from the lowest bit of byte 0 upwards, the place of the least significant
+        bit. Big endian: from the highest bit of byte 0 downwards, that of the most significant.
+        """
+        if self.is_big_endian:
+            return 8 * (self.start // 8) + 7 - self.start % 8
+        return self.start
+
+    @property
+    def end_bit(self) -> int:
+        """One past the last bit, counted like ``first_bit``."""
+        return self.first_bit + self.length
+
+    @property
+    def raw_range(self) -> tuple[int, int]:
+        """Smallest and largest raw integer; meaningless for floats."""
+        if self.is_signed:
+            return -(1 << (self.length - 1)), (1 << (self.length - 1)) - 1
+        return 0, (1 << self.length) - 1
+
+    @property
+    def is_integral(self) -> bool:
+        """Every physical value is a whole number."""
+        return not self.is_float and is_whole(self.scale) and is_whole(self.offset)
+
+    @property
+    def arithmetic(self) -> Arithmetic:
+        """How its values are computed, which also decides the column's type."""
+        if self.is_float or not is_whole(self.scale):
+            return Arithmetic.FLOAT
+        products = [raw * int(self.scale) for raw in self.raw_range]
+        if not is_whole(self.offset):
+            small = _largest([*self.raw_range, *products]) <= EXACT_IN_FLOAT64
+            return Arithmetic.FLOAT if small else Arithmetic.BIG
+        values = [product + int(self.offset) for product in products]
+        if _largest([*self.raw_range, *products, *values]) <= EXACT_IN_FLOAT64:
+            return Arithmetic.FLOAT
+        if min(values) >= -(2**63) and max(values) < 2**63:
+            return Arithmetic.INT64
+        if min(values) >= 0 and max(values) < 2**64:
+            return Arithmetic.UINT64
+        return Arithmetic.BIG
+
+    @property
+    def may_be_absent(self) -> bool:
+        """Whether a row may lack it: it hangs on a multiplexer."""
+        return self.multiplexer is not None
+
+
+@dataclass(frozen=True, slots=True)
+class CanMessage:
+    """One message of a database.
+
+    Attributes:
+        name: As the database spells it; not always unique.
+        arbitration_id: 11 or 29 bits.
+        is_extended: 29-bit identifier; the same number as an 11-bit one is another message.
+        length: Payload bytes.
+        signals: In the database's order.
+        is_fd: CAN FD frame, or None where the database does not say.
+        topic: What its decoded rows are called: ``name``, or ``name_0xID`` where several messages
+            have one name.
+        problem: Why its frames cannot be decoded, or empty.
+        source: File and line that define it.
+    """
+
+    name: str
+    arbitration_id: int
+    is_extended: bool
+    length: int
+    signals: tuple[CanSignal, ...]
+    is_fd: bool | None = None
+    topic: str = ""
+    problem: str = ""
+    source: str = ""
+
+    @property
+    def key(self) -> tuple[int, bool]:
+        """Identifier and its kind."""
+        return self.arbitration_id, self.is_extended
+
+    @property
+    def topic_name(self) -> str:
+        """``topic``, or the name where none was given."""
+        return self.topic or self.name
+
+    def signal(self, name: str) -> CanSignal:
+        """The signal called ``name``.
+
+        Raises:
+            ValueError: There is none; the message lists those there are.
+        """
+        for signal in self.signals:
+            if signal.name == name:
+                return signal
+        there = ", ".join(signal.name for signal in self.signals)
+        raise ValueError(f"{self.name} has no signal {name!r}; there are: {there}")
+
+    def same_layout(self, other: CanMessage) -> bool:
+        """Both decode every frame to the same columns."""
+        return (self.name, self.length, self.signals) == (other.name, other.length, other.signals)
+
+    def longest_frame(self, is_fd: bool) -> int:
+        """Most payload bytes of a frame that carries it.
+
+        A CAN FD frame has only some lengths, so a message of 10 bytes travels in 12.
+        """
+        if not is_fd or self.length <= 8:
+            return self.length
+        return next((n for n in _FD_LENGTHS if n >= self.length), self.length)
+
+
+def is_whole(number: float) -> bool:
+    """A whole number, whatever its type."""
+    return isinstance(number, int) or number.is_integer()
+
+
+def layout_problem(message: CanMessage) -> str:
+    """Why no frame of ``message`` can be decoded, or an empty text."""
+    if not message.signals:
+        return "message has no signals"
+    twice = [name for name, n in Counter(s.name for s in message.signals).items() if n > 1]
+    if twice:
+        return f"message names a signal twice: {twice[0]}"
+    for signal in message.signals:
+        if not 1 <= signal.length <= 64:
+            return f"signal {signal.name} has {signal.length} bits, more than 64 or none"
+        if signal.is_float and signal.length not in (16, 32, 64):
+            return f"signal {signal.name} is a float of {signal.length} bits"
+        if signal.start < 0 or signal.end_bit > 8 * message.length:
+            return f"signal {signal.name} does not fit into {message.length} bytes"
+    return _multiplexing_problem(message)
+
+
+def _multiplexing_problem(message: CanMessage) -> str:
+    by_name = {signal.name: signal for signal in message.signals}
+    for signal in message.signals:
+        seen = {signal.name}
+        above = signal.multiplexer
+        while above is not None:
+            if above not in by_name or not by_name[above].is_multiplexer:
+                return f"signal {signal.name} hangs on {above}, which is no multiplexer"
+            if above in seen:
+                return f"multiplexers depend on each other in a ring: {above}"
+            seen.add(above)
+            above = by_name[above].multiplexer
+    return ""
+
+
+def overlaps(message: CanMessage) -> Iterator[tuple[str, str]]:
+    """Pairs of signals that share a bit though both can be there in one frame."""
+    owner: dict[int, list[CanSignal]] = {}
+    told: set[tuple[str, str]] = set()
+    for signal in message.signals:
+        for bit in range(signal.first_bit, signal.end_bit):
+            place = bit if not signal.is_big_endian else 8 * (bit // 8) + 7 - bit % 8
+            for other in owner.setdefault(place, []):
+                pair = (other.name, signal.name)
+                if pair not in told and _can_meet(message, other, signal):
+                    told.add(pair)
+                    yield pair
+            owner[place].append(signal)
+
+
+def _can_meet(message: CanMessage, a: CanSignal, b: CanSignal) -> bool:
+    """No multiplexer forbids that both are in one frame."""
+    needs_a, needs_b = _needs(message, a), _needs(message, b)
+    return all(needs_a[name] & needs_b[name] for name in needs_a.keys() & needs_b.keys())
+
+
+def _needs(message: CanMessage, signal: CanSignal) -> dict[str, frozenset[int]]:
+    needs: dict[str, frozenset[int]] = {}
+    while signal.multiplexer is not None:
+        needs[signal.multiplexer] = signal.branches
+        signal = message.signal(signal.multiplexer)
+    return needs
+
+
+def _largest(numbers: list[int]) -> int:
+    return max(abs(number) for number in numbers)

@@ -1,0 +1,173 @@
+"""The text of a CAN database file: its encoding, its lines, and signs that it was cut."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+from typing import Final
+
+from crosscue.replay.errors import LogTooLargeError, SchemaError
+from crosscue.replay.limits import Limits
+
+_MOST_BITS: Final = 8 * 2048
+"""No message is longer: 1785 bytes is the longest multi-packet message there is."""
+_MOST_BRANCHES: Final = 1_000_000
+
+_BYTE_ORDER_MARKS: Final = (
+    (b"\xef\xbb\xbf", "utf-8"),
+    (b"\xff\xfe", "utf-16-le"),
+    (b"\xfe\xff", "utf-16-be"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class DatabaseText:
+    """One file as text.
+
+    Attributes:
+        path: Where it lies.
+        text: Decoded, with the line ends of the file.
+        notices: What was doubtful about its encoding.
+    """
+
+    path: Path
+    text: str
+    notices: tuple[str, ...] = ()
+
+    def line_at(self, position: int) -> int:
+        """Number of the line that holds the character at ``position``, from 1."""
+        return self.text.count("\n", 0, position) + 1
+
+    def line_of_message(self, name: str, arbitration_id: int, is_extended: bool) -> int:
+        """Line that defines a message, or 0 if it cannot be told."""
+        stored = arbitration_id | (0x8000_0000 if is_extended else 0)
+        for pattern in (
+            rf"^[ \t]*BO_\s+{stored}\b",
+            rf"^\[{re.escape(name)}\]",
+            rf"\b(?:name=\"|<SHORT-NAME>){re.escape(name)}\b",
+        ):
+            if match := re.search(pattern, self.text, re.MULTILINE):
+                return self.line_at(match.end())
+        return 0
+
+    def line_of_error(self, words: str) -> int:
+        """Line that a parser's error speaks of; the last line if it names none."""
+        if match := re.search(r"\bline (\d+)", words):
+            return int(match[1])
+        for name in re.findall(r"(?:VAL_|SIG_VALTYPE_) (\d+ \w+)|message (\w+)", words):
+            pattern = r"\b" + r"\s+".join(re.escape(part) for part in max(name).split()) + r"\b"
+            if match := re.search(pattern, self.text):
+                return self.line_at(match.end())
+        return self.line_at(len(self.text.rstrip()))
+
+
+def read_text(path: Path, limits: Limits) -> DatabaseText:
+    """Read a file whose encoding nobody declares.
+
+    UTF-8 if it is valid, else Windows-1252, which DBC editors write; XML and byte order marks say
+    for themselves.
+
+    Raises:
+        SchemaError: It cannot be read, is empty or is binary.
+        LogTooLargeError: It is larger than ``limits.message_bytes``.
+    """
+    try:
+        if not path.is_file():
+            raise SchemaError(f"{path}: no such file; give a CAN database")
+        with path.open("rb") as file:
+            stored = file.read(limits.message_bytes + 1)
+    except OSError as error:
+        raise SchemaError(f"{path}: {error.strerror or error}; check the path") from None
+    if len(stored) > limits.message_bytes:
+        raise LogTooLargeError(f"{path}: larger than {limits.message_bytes} bytes; not a database")
+    text, notices = _decode(path, stored)
+    if not text.strip():
+        raise SchemaError(f"{path}:1: empty; expected a CAN database")
+    if "\0" in text:
+        line = text.count("\n", 0, text.index("\0")) + 1
+        raise SchemaError(f"{path}:{line}: holds zero bytes, so it is damaged or no text file")
+    return DatabaseText(path, text, notices)
+
+
+def _decode(path: Path, stored: bytes) -> tuple[str, tuple[str, ...]]:
+    for mark, encoding in _BYTE_ORDER_MARKS:
+        if stored.startswith(mark):
+            return stored[len(mark) :].decode(encoding, errors="replace"), ()
+    declared = re.match(rb"""\s*<\?xml[^>]*encoding=["']([\w.-]+)["']""", stored[:400])
+    candidates = ["utf-8", "cp1252"]
+    if declared:
+        candidates.insert(0, declared[1].decode("ascii"))
+    for encoding in candidates:
+        try:
+            return stored.decode(encoding), ()
+        except (UnicodeDecodeError, LookupError):
+            continue
+    return stored.decode("cp1252", errors="replace"), (
+        f"{path.name}: neither UTF-8 nor Windows-1252; unknown characters were replaced",
+    )
+
+
+def refuse_bombs(source: DatabaseText, form: str) -> None:
+    """Refuse numbers that would make the parser take memory without end.
+
+    Raises:
+        LogTooLargeError: A message or signal is declared thousands of bytes long, or a multiplexer
+            range has more than a million values.
+    """
+    if form == "dbc":
+        _refuse_over(source, r"^[ \t]*SG_\b[^:\n]*:\s*(\d{5,})\s*\|", "start bit")
+        _refuse_over(source, r"^[ \t]*SG_\b[^:\n]*:\s*\d+\s*\|\s*(\d{5,})", "signal length")
+        _refuse_over(source, r"^[ \t]*BO_\s+\d+\s+\w+\s*:\s*(\d{4,})", "message length", 8)
+        _refuse_ranges(source)
+    elif form == "kcd":
+        _refuse_over(source, r"\b(?:offset|length)\s*=\s*[\"'](\d{5,})[\"']", "offset or length")
+    elif form == "sym":
+        _refuse_over(source, r"\b(?:Var|Sig|Mux|Len|DLC)\b[^\n]*?\b(\d{5,})\b", "bit number")
+
+
+def _refuse_over(source: DatabaseText, pattern: str, what: str, bits_each: int = 1) -> None:
+    for match in re.finditer(pattern, source.text, re.MULTILINE):
+        digits = match[1]
+        if len(digits) > 9 or int(digits) * bits_each > _MOST_BITS:
+            raise LogTooLargeError(
+                f"{source.path}:{source.line_at(match.start(1))}: {what} {digits[:20]} is larger "
+                "than any CAN message; correct that line"
+            )
+
+
+def _refuse_ranges(source: DatabaseText) -> None:
+    total = 0
+    for match in re.finditer(r"^[ \t]*SG_MUL_VAL_[^;]*", source.text, re.MULTILINE):
+        for low, high in re.findall(r"(\d+)\s*-\s*(\d+)", match[0]):
+            total += int(high[:30]) - int(low[:30])
+        if total > _MOST_BRANCHES:
+            raise LogTooLargeError(
+                f"{source.path}:{source.line_at(match.start())}: multiplexer ranges of more than "
+                f"{_MOST_BRANCHES} values; correct that line"
+            )
+
+
+def doubts(source: DatabaseText, form: str, names: list[str]) -> list[str]:
+    """Signs that a file that parses was cut.
+
+    Only DBC and SYM files can be cut and still parse: their message definitions have no end mark.
+    """
+    if form not in ("dbc", "sym"):
+        return []
+    text, name = source.text, source.path.name
+    notices = []
+    if form == "dbc" and not text.rstrip().endswith(";"):
+        last = names[-1]
+        notices.append(
+            f"{name}: ends with the definition of message {last} and has no closing section; "
+            "if messages are missing, the file was cut"
+        )
+    if not text.endswith(("\n", "\r")) and not text.endswith(";"):
+        line = list(accumulate(text.splitlines(), lambda _, b: b))[-1].strip()
+        notices.append(
+            f"{name}:{source.line_at(len(text))}: the last line has no end ({line[-60:]!r}); "
+            "it may have been cut"
+        )
+    return notices
