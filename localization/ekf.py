@@ -1,0 +1,451 @@
+"""Extended Kalman filter on the pose of a car, as pure functions from belief to belief.
+
+State ``[x_m, y_m, heading_rad, speed_mps]``: the centre of the rear axle in a planar map frame
+(x east, y north), heading counter-clockwise from +x (REP-103), speed negative in reverse.
+Motion is the source's bicycle model (eq. 5 and 6): an arc of length d that turns by dtheta,
+
+    dx = d sin(dtheta) / dtheta,    dy = d (1 - cos(dtheta)) / dtheta    (in the car's frame),
+
+which is rho sin(dtheta) and rho (1 - cos(dtheta)) without the division by a steering angle of
+zero. Filter equations: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking
+and Navigation*, section 10.3 (EKF) and eq. 5.2.3-18 (Joseph form).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from crosscue.replay.columns import Floats
+
+from .angles import wrap
+
+X: Final = 0
+Y: Final = 1
+HEADING: Final = 2
+SPEED: Final = 3
+
+LOST_M: Final = 100.0
+"""Full major axis of the 2-sigma ellipse above which the source calls the car lost."""
+
+_SMALL_RAD: Final = 1e-2
+_ROUNDING: Final = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseBelief:
+    """A Gaussian over pose and speed.
+
+    Attributes:
+        t_ns: Log time.
+        mean: Shape (4,): x in metres, y in metres, heading in radians in (-pi, pi], speed in m/s.
+        cov: Shape (4, 4), symmetric, in the products of those units.
+    """
+
+    t_ns: int
+    mean: Floats
+    cov: Floats
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be a Gaussian.
+
+        Raises:
+            ValueError: Wrong shape, a value that is not finite, or a negative variance.
+        """
+        if self.mean.shape != (4,) or self.cov.shape != (4, 4):
+            raise ValueError(f"want mean (4,), cov (4, 4); got {self.mean.shape}, {self.cov.shape}")
+        if not (np.isfinite(self.mean).all() and np.isfinite(self.cov).all()):
+            raise ValueError(f"belief at {self.t_ns} ns: want finite numbers, got {self.mean}")
+        if (np.diagonal(self.cov) < -_ROUNDING).any():
+            raise ValueError(f"cov: want variances >= 0, got {np.diagonal(self.cov)}")
+
+
+@dataclass(frozen=True, slots=True)
+class MotionNoise:
+    """The car's geometry and how far its inputs are off, as standard deviations of one step.
+
+    Attributes:
+        wheelbase_m: Distance between the axles.
+        accel_mps2: Of the acceleration.
+        steering_rad: Of the road-wheel angle.
+        yaw_rate_radps: Of the yaw rate.
+        slip_per_sqrt_m: Of the travelled distance after one metre; grows with its root.
+    """
+
+    wheelbase_m: float
+    accel_mps2: float = 0.0
+    steering_rad: float = 0.0
+    yaw_rate_radps: float = 0.0
+    slip_per_sqrt_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse impossible values.
+
+        Raises:
+            ValueError: Wheelbase not positive or a negative standard deviation.
+        """
+        if not self.wheelbase_m > 0.0:
+            raise ValueError(f"wheelbase_m: want > 0, got {self.wheelbase_m}")
+        for name in ("accel_mps2", "steering_rad", "yaw_rate_radps", "slip_per_sqrt_m"):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"{name}: want >= 0, got {getattr(self, name)}")
+
+
+class Arc(NamedTuple):
+    """A step along a circle in the car's frame, with its derivatives.
+
+    Attributes:
+        dx_m: Forward.
+        dy_m: To the left.
+        dx_by_distance: Derivative of ``dx_m`` by the arc's length.
+        dy_by_distance: Of ``dy_m`` by the arc's length.
+        dx_by_turn: Of ``dx_m`` by the angle turned, m/rad.
+        dy_by_turn: Of ``dy_m`` by the angle turned, m/rad.
+    """
+
+    dx_m: float
+    dy_m: float
+    dx_by_distance: float
+    dy_by_distance: float
+    dx_by_turn: float
+    dy_by_turn: float
+
+
+class Motion(NamedTuple):
+    """One step of the motion model.
+
+    Attributes:
+        mean: Shape (4,): the state after it.
+        by_state: Shape (4, 4): its Jacobian by the state before.
+        by_input: Shape (4, 2): its Jacobian by the two inputs.
+    """
+
+    mean: Floats
+    by_state: Floats
+    by_input: Floats
+
+
+class Updated(NamedTuple):
+    """What became of one measurement.
+
+    Attributes:
+        belief: The posterior; the prior unchanged where the gate refused the measurement.
+        is_accepted: Inside the gate.
+        innovation: Shape (m,): measured less expected, angles wrapped.
+        nis: Normalised innovation squared; chi-square with m degrees of freedom.
+    """
+
+    belief: PoseBelief
+    is_accepted: bool
+    innovation: Floats
+    nis: float
+
+
+def arc(distance_m: float, turn_rad: float) -> Arc:
+    """Follow a circle for ``distance_m`` while turning by ``turn_rad`` (eq. 6)."""
+    t, t2 = turn_rad, turn_rad * turn_rad
+    if abs(t) < _SMALL_RAD:
+        along = 1.0 - t2 / 6.0 * (1.0 - t2 / 20.0)
+        across = t / 2.0 * (1.0 - t2 / 12.0 * (1.0 - t2 / 30.0))
+        along_by_turn = -t / 3.0 * (1.0 - t2 / 10.0 * (1.0 - t2 / 28.0))
+        across_by_turn = 0.5 - t2 / 8.0 * (1.0 - t2 / 18.0 * (1.0 - t2 / 40.0))
+    else:
+        sine = math.sin(t)
+        along = sine / t
+        across = 2.0 * math.sin(t / 2.0) ** 2 / t
+        along_by_turn = (math.cos(t) - along) / t
+        across_by_turn = (sine - across) / t
+    return Arc(
+        distance_m * along,
+        distance_m * across,
+        along,
+        across,
+        distance_m * along_by_turn,
+        distance_m * across_by_turn,
+    )
+
+
+def bicycle(
+    mean: Floats, accel_mps2: float, steering_rad: float, dt_s: float, wheelbase_m: float
+) -> Motion:
+    """Equations 5 and 6 with their Jacobians by state and by (acceleration, steering).
+
+    The source's curvature is steering / wheelbase, without the tangent.
+    """
+    distance_m = mean[SPEED] * dt_s + 0.5 * accel_mps2 * dt_s**2
+    curvature = steering_rad / wheelbase_m
+    distance_by = np.array([dt_s, 0.5 * dt_s**2, 0.0])
+    turn_by = np.array([curvature * dt_s, 0.5 * curvature * dt_s**2, distance_m / wheelbase_m])
+    return _drive(mean, accel_mps2, dt_s, distance_m, distance_m * curvature, distance_by, turn_by)
+
+
+def turning(mean: Floats, accel_mps2: float, yaw_rate_radps: float, dt_s: float) -> Motion:
+    """The same arc with the yaw rate given; Jacobians by state and by (acceleration, yaw rate)."""
+    distance_m = mean[SPEED] * dt_s + 0.5 * accel_mps2 * dt_s**2
+    distance_by = np.array([dt_s, 0.5 * dt_s**2, 0.0])
+    turn_by = np.array([0.0, 0.0, dt_s])
+    return _drive(mean, accel_mps2, dt_s, distance_m, yaw_rate_radps * dt_s, distance_by, turn_by)
+
+
+def predict(
+    belief: PoseBelief, accel_mps2: float, steering_rad: float, dt_s: float, noise: MotionNoise
+) -> PoseBelief:
+    """Drive for ``dt_s`` with the given acceleration and road-wheel angle (eq. 5 and 6).
+
+    Raises:
+        ValueError: An input is not finite or ``dt_s`` is negative.
+    """
+    _check_inputs(dt_s, accel_mps2=accel_mps2, steering_rad=steering_rad)
+    motion = bicycle(belief.mean, accel_mps2, steering_rad, dt_s, noise.wheelbase_m)
+    return _predicted(belief, motion, dt_s, accel_mps2, noise, noise.steering_rad)
+
+
+def predict_yaw_rate(
+    belief: PoseBelief, accel_mps2: float, yaw_rate_radps: float, dt_s: float, noise: MotionNoise
+) -> PoseBelief:
+    """Drive for ``dt_s`` with the given acceleration and yaw rate.
+
+    Raises:
+        ValueError: An input is not finite or ``dt_s`` is negative.
+    """
+    _check_inputs(dt_s, accel_mps2=accel_mps2, yaw_rate_radps=yaw_rate_radps)
+    motion = turning(belief.mean, accel_mps2, yaw_rate_radps, dt_s)
+    return _predicted(belief, motion, dt_s, accel_mps2, noise, noise.yaw_rate_radps)
+
+
+def predict_odometry(
+    belief: PoseBelief,
+    distance_m: float,
+    turn_rad: float,
+    distance_var_m2: float,
+    turn_var_rad2: float,
+    dt_s: float,
+    accel_var_m2ps3: float,
+) -> PoseBelief:
+    """Follow the arc that odometry measured; speed keeps its mean and grows less sure.
+
+    Args:
+        belief: Before the interval.
+        distance_m: Travelled by the rear axle, negative in reverse.
+        turn_rad: Change of heading.
+        distance_var_m2: Variance of the distance.
+        turn_var_rad2: Variance of the change of heading.
+        dt_s: Length of the interval.
+        accel_var_m2ps3: Growth of the speed's variance per second.
+
+    Raises:
+        ValueError: An input is not finite, or a variance or ``dt_s`` is negative.
+    """
+    _check_inputs(dt_s, distance_m=distance_m, turn_rad=turn_rad)
+    if not (distance_var_m2 >= 0.0 and turn_var_rad2 >= 0.0 and accel_var_m2ps3 >= 0.0):
+        raise ValueError(f"variances: want >= 0, got {distance_var_m2}, {turn_var_rad2}")
+    none = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    motion = _drive(belief.mean, 0.0, dt_s, distance_m, turn_rad, *none)
+    by_input = motion.by_input.copy()
+    by_input[SPEED] = 0.0
+    inputs = np.diag([distance_var_m2, turn_var_rad2])
+    cov = motion.by_state @ belief.cov @ motion.by_state.T + by_input @ inputs @ by_input.T
+    cov[SPEED, SPEED] += accel_var_m2ps3 * dt_s
+    return _belief(belief.t_ns + round(dt_s * 1e9), motion.mean, cov)
+
+
+def coast(
+    belief: PoseBelief, dt_s: float, accel_var_m2ps3: float, turn_var_rad2ps: float
+) -> PoseBelief:
+    """Go on blindly, straight and at the same speed, ever less sure of both.
+
+    Acceleration and yaw rate are white noise of the given power, so that two short coasts make
+    one long one (Bar-Shalom, Li, Kirubarajan, section 6.2.2).
+
+    Raises:
+        ValueError: ``dt_s`` or a variance is negative or not finite.
+    """
+    _check_inputs(dt_s, accel_var_m2ps3=accel_var_m2ps3, turn_var_rad2ps=turn_var_rad2ps)
+    if accel_var_m2ps3 < 0.0 or turn_var_rad2ps < 0.0:
+        raise ValueError(f"variances: want >= 0, got {accel_var_m2ps3}, {turn_var_rad2ps}")
+    motion = turning(belief.mean, 0.0, 0.0, dt_s)
+    heading, distance_m = belief.mean[HEADING], belief.mean[SPEED] * dt_s
+    along = np.array([math.cos(heading), math.sin(heading), 0.0, 0.0])
+    across = np.array([-math.sin(heading), math.cos(heading), 0.0, 0.0])
+    faster, turned = np.eye(4)[SPEED], np.eye(4)[HEADING]
+    cov = motion.by_state @ belief.cov @ motion.by_state.T
+    cov += accel_var_m2ps3 * _walk(along * dt_s, faster, dt_s)
+    cov += turn_var_rad2ps * _walk(across * distance_m, turned, dt_s)
+    return _belief(belief.t_ns + round(dt_s * 1e9), motion.mean, cov)
+
+
+def update_speed(
+    belief: PoseBelief, speed_mps: float, var_m2ps2: float, gate_nis: float | None = None
+) -> Updated:
+    """Weigh in a measured speed.
+
+    Args:
+        belief: The prior.
+        speed_mps: Of the rear axle, negative in reverse.
+        var_m2ps2: The reading's variance.
+        gate_nis: Refuse the reading when its NIS is larger; None accepts everything.
+
+    Raises:
+        ValueError: The reading is not finite or its variance not positive.
+    """
+    innovation = np.array([speed_mps - belief.mean[SPEED]])
+    return _update(belief, (SPEED,), innovation, np.array([[var_m2ps2]]), gate_nis)
+
+
+def update_heading(
+    belief: PoseBelief, heading_rad: float, var_rad2: float, gate_nis: float | None = None
+) -> Updated:
+    """Weigh in a compass heading; the innovation is taken the shorter way round.
+
+    Raises:
+        ValueError: The reading is not finite or its variance not positive.
+    """
+    innovation = np.array([_wrapped(heading_rad - belief.mean[HEADING])])
+    return _update(belief, (HEADING,), innovation, np.array([[var_rad2]]), gate_nis)
+
+
+def update_position(
+    belief: PoseBelief, xy_m: Floats, cov_m2: Floats, gate_nis: float | None = None
+) -> Updated:
+    """Weigh in a measured position with its own covariance, such as a matched landmark's.
+
+    Args:
+        belief: The prior.
+        xy_m: Shape (2,).
+        cov_m2: Shape (2, 2), positive definite.
+        gate_nis: Refuse the position when its NIS is larger; None accepts everything.
+
+    Raises:
+        ValueError: Wrong shape, not finite, or ``cov_m2`` not positive definite.
+    """
+    if xy_m.shape != (2,):
+        raise ValueError(f"xy_m: want (2,), got {xy_m.shape}")
+    return _update(belief, (X, Y), xy_m - belief.mean[:2], cov_m2, gate_nis)
+
+
+def major_axis_m(belief: PoseBelief) -> float:
+    """Full major axis of the 2-sigma position ellipse: four standard deviations."""
+    return axis_of(belief.cov[X, X], belief.cov[X, Y], belief.cov[Y, Y])
+
+
+def axis_of(var_x_m2: float, cov_xy_m2: float, var_y_m2: float) -> float:
+    """The same from the three entries of a position covariance."""
+    half_sum = 0.5 * (var_x_m2 + var_y_m2)
+    radius = math.hypot(0.5 * (var_x_m2 - var_y_m2), cov_xy_m2)
+    return 4.0 * math.sqrt(max(half_sum + radius, 0.0))
+
+
+def is_lost(belief: PoseBelief, lost_m: float = LOST_M) -> bool:
+    """Is the major axis longer than ``lost_m``?"""
+    return major_axis_m(belief) > lost_m
+
+
+def _drive(
+    mean: Floats,
+    accel_mps2: float,
+    dt_s: float,
+    distance_m: float,
+    turn_rad: float,
+    distance_by: Floats,
+    turn_by: Floats,
+) -> Motion:
+    """Lay the arc into the map; ``*_by`` are derivatives by speed and by the two inputs."""
+    step = arc(distance_m, turn_rad)
+    heading = mean[HEADING]
+    cosine, sine = math.cos(heading), math.sin(heading)
+    rotation = np.array([[cosine, -sine], [sine, cosine]])
+    moved = rotation @ np.array([step.dx_m, step.dy_m])
+    arc_by = rotation @ np.array(
+        [[step.dx_by_distance, step.dx_by_turn], [step.dy_by_distance, step.dy_by_turn]]
+    )
+    pose_by = np.vstack([arc_by @ np.vstack([distance_by, turn_by]), turn_by])
+    by_state = np.eye(4)
+    by_state[:2, HEADING] = -moved[1], moved[0]
+    by_state[:3, SPEED] = pose_by[:, 0]
+    by_input = np.vstack([pose_by[:, 1:], [dt_s, 0.0]])
+    after = np.array(
+        [
+            mean[X] + moved[0],
+            mean[Y] + moved[1],
+            wrap(heading + turn_rad),
+            mean[SPEED] + accel_mps2 * dt_s,
+        ]
+    )
+    return Motion(after, by_state, by_input)
+
+
+def _walk(summed: Floats, walked: Floats, dt_s: float) -> Floats:
+    """Covariance of a random walk and of its integral over ``dt_s``, per unit of power."""
+    both = np.outer(summed, walked)
+    return dt_s * (
+        np.outer(summed, summed) / 3.0 + (both + both.T) / 2.0 + np.outer(walked, walked)
+    )
+
+
+def _predicted(
+    belief: PoseBelief,
+    motion: Motion,
+    dt_s: float,
+    accel_mps2: float,
+    noise: MotionNoise,
+    turn_input_sd: float,
+) -> PoseBelief:
+    inputs = np.diag([noise.accel_mps2**2, turn_input_sd**2])
+    cov = motion.by_state @ belief.cov @ motion.by_state.T
+    cov += motion.by_input @ inputs @ motion.by_input.T
+    distance_m = abs(belief.mean[SPEED] * dt_s + 0.5 * accel_mps2 * dt_s**2)
+    along = np.array([math.cos(belief.mean[HEADING]), math.sin(belief.mean[HEADING])])
+    cov[:2, :2] += noise.slip_per_sqrt_m**2 * distance_m * np.outer(along, along)
+    return _belief(belief.t_ns + round(dt_s * 1e9), motion.mean, cov)
+
+
+def _update(
+    belief: PoseBelief,
+    measured: tuple[int, ...],
+    innovation: Floats,
+    cov: Floats,
+    gate_nis: float | None,
+) -> Updated:
+    """Kalman update of directly measured states, in Joseph form."""
+    _check_measurement(innovation, cov)
+    observe = np.eye(4)[list(measured)]
+    spread = observe @ belief.cov @ observe.T + cov
+    weighed = np.linalg.solve(spread, innovation)
+    nis = float(innovation @ weighed)
+    if gate_nis is not None and nis > gate_nis:
+        return Updated(belief, False, innovation, nis)
+    gain = np.linalg.solve(spread, observe @ belief.cov).T
+    keep = np.eye(4) - gain @ observe
+    posterior = keep @ belief.cov @ keep.T + gain @ cov @ gain.T
+    mean = belief.mean + gain @ innovation
+    mean[HEADING] = wrap(mean[HEADING])
+    return Updated(_belief(belief.t_ns, mean, posterior), True, innovation, nis)
+
+
+def _belief(t_ns: int, mean: Floats, cov: Floats) -> PoseBelief:
+    return PoseBelief(t_ns, mean, 0.5 * (cov + cov.T))
+
+
+def _wrapped(angle_rad: float) -> float:
+    return wrap(angle_rad) if math.isfinite(angle_rad) else angle_rad
+
+
+def _check_inputs(dt_s: float, **inputs: float) -> None:
+    if not (math.isfinite(dt_s) and dt_s >= 0.0):
+        raise ValueError(f"dt_s: want finite and >= 0, got {dt_s}")
+    for name, value in inputs.items():
+        if not math.isfinite(value):
+            raise ValueError(f"{name}: want a finite number, got {value}")
+
+
+def _check_measurement(innovation: Floats, cov: Floats) -> None:
+    m = len(innovation)
+    if cov.shape != (m, m):
+        raise ValueError(f"measurement covariance: want ({m}, {m}), got {cov.shape}")
+    if not (np.isfinite(innovation).all() and np.isfinite(cov).all()):
+        raise ValueError("measurement: want finite numbers, got NaN or infinity")
+    if (np.linalg.eigvalsh(cov) <= 0.0).any() or not np.allclose(cov, cov.T):
+        raise ValueError(f"measurement covariance: want positive definite, got {cov.tolist()}")

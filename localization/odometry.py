@@ -1,0 +1,480 @@
+"""Distance and change of heading between wheel-speed samples, with variances.
+
+Dead reckoning for the centre of the rear axle. Change of heading comes from the best source
+there is: a yaw rate, else the steering angle, else the difference between left and right wheels.
+All noise is stated so that it does not depend on the sampling rate: errors that grow with the
+root of distance or time, besides the wheel sensors' rounding. A wheel scale, track width or gyro
+bias that is wrong all drive long is none of these: fit it first.
+
+Long drives go in windows. Cut every column at one common time and pass that time as ``until_ns``:
+rows whose interval cannot be closed yet wait in ``Pending``, and the increments are the same, bit
+for bit, as in one piece.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields, replace
+from typing import Final, Literal, NamedTuple, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats, Int64s
+
+Bools: TypeAlias = NDArray[np.bool_]
+TurnKind: TypeAlias = Literal["yaw rate", "steering"]
+
+BY_YAW_RATE: Final = 0
+BY_STEERING: Final = 1
+BY_WHEELS: Final = 2
+
+
+@dataclass(frozen=True, slots=True)
+class OdometrySettings:
+    """Geometry, corrections and noise of one car's odometry.
+
+    Attributes:
+        track_width_m: Between left and right wheels.
+        wheelbase_m: Between the axles; needed for steering and for the front wheels.
+        wheel_scale: True speed per reported speed.
+        use_front_wheels: Average all four wheels where there are four; else the rear two.
+        wheel_step_mps: One bit of the reported wheel speed; readings are off by up to half of it.
+        slip_per_sqrt_m: S.d. of the distance after one metre.
+        yaw_rate_scale: True yaw rate per reported yaw rate.
+        gyro_bias_radps: Reported yaw rate at rest, taken off before scaling.
+        gyro_noise_rad_per_sqrt_s: S.d. of the heading after one second.
+        steering_ratio: Steering-wheel angle per road-wheel angle; 1 for road-wheel angles.
+        steering_offset_rad: Reported angle when driving straight, before the ratio.
+        steering_noise_rad_sqrt_m: Noise density of the road-wheel angle along the way; its s.d.
+            times the root of the distance over which its error persists.
+        wheel_turn_rad_per_sqrt_m: S.d. of the heading by wheel difference after one metre.
+        turn_per_turn: S.d. of the change of heading as a share of that change.
+        max_gap_s: Samples further apart are a gap: counted, and the variances grow.
+        gap_accel_mps2: How fast the speed may have changed, unseen, inside a gap.
+        gap_yaw_accel_radps2: How fast the yaw rate may have changed inside a gap.
+    """
+
+    track_width_m: float
+    wheelbase_m: float | None = None
+    wheel_scale: float = 1.0
+    use_front_wheels: bool = False
+    wheel_step_mps: float = 0.0
+    slip_per_sqrt_m: float = 0.02
+    yaw_rate_scale: float = 1.0
+    gyro_bias_radps: float = 0.0
+    gyro_noise_rad_per_sqrt_s: float = 1e-3
+    steering_ratio: float = 1.0
+    steering_offset_rad: float = 0.0
+    steering_noise_rad_sqrt_m: float = 0.01
+    wheel_turn_rad_per_sqrt_m: float = 0.01
+    turn_per_turn: float = 0.0
+    max_gap_s: float = 0.5
+    gap_accel_mps2: float = 3.0
+    gap_yaw_accel_radps2: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse values that mean nothing.
+
+        Raises:
+            ValueError: Naming the field and the value.
+        """
+        for name in ("track_width_m", "wheelbase_m", "wheel_scale", "max_gap_s"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name}: want > 0, got {value}")
+        if not math.isfinite(self.steering_ratio) or self.steering_ratio == 0.0:
+            raise ValueError(f"steering_ratio: want finite and not 0, got {self.steering_ratio}")
+        noises = [f.name for f in fields(self) if "_per_" in f.name or f.name.startswith("gap_")]
+        for name in (*noises, "wheel_step_mps", "steering_noise_rad_sqrt_m"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name}: want >= 0, got {value}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WheelSpeeds:
+    """N samples of two rear or of all four wheels.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        wheels_mps: Shape (N, 2) rear left, rear right; or (N, 4) front left, front right, rear
+            left, rear right. Signed where the sensor knows the direction.
+        is_reverse: Shape (N,), bool: the speeds have no sign and the car backs; or None.
+    """
+
+    t_ns: Int64s
+    wheels_mps: Floats
+    is_reverse: Bools | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse columns that do not line up.
+
+        Raises:
+            ValueError: Naming the column, the shape wanted and the shape given.
+        """
+        n = len(self.t_ns)
+        if self.wheels_mps.shape not in ((n, 2), (n, 4)):
+            raise ValueError(f"wheels_mps: want ({n}, 2) or ({n}, 4), got {self.wheels_mps.shape}")
+        if self.is_reverse is not None and self.is_reverse.shape != (n,):
+            raise ValueError(f"is_reverse: want ({n},), got {self.is_reverse.shape}")
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def signed_mps(self) -> Floats:
+        """Wheel speeds with the sign of the direction of travel."""
+        if self.is_reverse is None:
+            return self.wheels_mps
+        return np.where(self.is_reverse[:, None], -np.abs(self.wheels_mps), self.wheels_mps)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnSignal:
+    """N samples of what tells how the car turns.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        values: Shape (N,): yaw rate in rad/s, or steering angle in rad; positive to the left.
+        kind: Which of the two.
+    """
+
+    t_ns: Int64s
+    values: Floats
+    kind: TurnKind
+
+    def __post_init__(self) -> None:
+        """Refuse columns that do not line up.
+
+        Raises:
+            ValueError: Naming the shape wanted and the shape given.
+        """
+        if self.values.shape != self.t_ns.shape or self.t_ns.ndim != 1:
+            raise ValueError(f"values: want {self.t_ns.shape}, got {self.values.shape}")
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryCounts:
+    """What became of the rows; counts add up over windows.
+
+    Attributes:
+        rows: Wheel rows given.
+        not_finite: Dropped: a wheel that is used is NaN or infinite.
+        repeated: Dropped: same time as the row before.
+        out_of_order: Dropped: earlier than a row before.
+        turn_rows: Yaw-rate or steering rows given.
+        turn_dropped: Of those, dropped for any of the three reasons.
+        intervals: Increments made.
+        gaps: Increments longer than the settings allow.
+        turn_missing: Increments whose turn signal had a gap, so that wheels gave the heading.
+    """
+
+    rows: int = 0
+    not_finite: int = 0
+    repeated: int = 0
+    out_of_order: int = 0
+    turn_rows: int = 0
+    turn_dropped: int = 0
+    intervals: int = 0
+    gaps: int = 0
+    turn_missing: int = 0
+
+    def __add__(self, other: Self) -> Self:
+        names = [f.name for f in fields(self)]
+        return type(self)(**{name: getattr(self, name) + getattr(other, name) for name in names})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Increments:
+    """N intervals between consecutive wheel samples.
+
+    Attributes:
+        start_ns: Shape (N,), int64.
+        stop_ns: Shape (N,), int64.
+        distance_m: Shape (N,): of the rear axle, negative in reverse.
+        turn_rad: Shape (N,): change of heading, positive to the left.
+        distance_var_m2: Shape (N,).
+        turn_var_rad2: Shape (N,).
+        speed_mps: Shape (N,): of the rear axle at the end.
+        speed_var_m2ps2: Shape (N,).
+        turn_source: Shape (N,), uint8: ``BY_YAW_RATE``, ``BY_STEERING`` or ``BY_WHEELS``.
+        is_gap: Shape (N,), bool: longer than the settings allow.
+    """
+
+    start_ns: Int64s
+    stop_ns: Int64s
+    distance_m: Floats
+    turn_rad: Floats
+    distance_var_m2: Floats
+    turn_var_rad2: Floats
+    speed_mps: Floats
+    speed_var_m2ps2: Floats
+    turn_source: NDArray[np.uint8]
+    is_gap: Bools
+
+    def __len__(self) -> int:
+        return len(self.start_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pending:
+    """Rows that wait for the next window; start with ``Pending()``.
+
+    Attributes:
+        t_ns: Shape (N,): wheel rows, the last one used first.
+        axle_mps: Shape (N,): speed of the rear axle.
+        yaw_radps: Shape (N,): yaw rate by wheel difference.
+        turn_t_ns: Shape (M,): turn rows from the last one used on.
+        turn_values: Shape (M,).
+    """
+
+    t_ns: Int64s = field(default_factory=lambda: np.empty(0, np.int64))
+    axle_mps: Floats = field(default_factory=lambda: np.empty(0))
+    yaw_radps: Floats = field(default_factory=lambda: np.empty(0))
+    turn_t_ns: Int64s = field(default_factory=lambda: np.empty(0, np.int64))
+    turn_values: Floats = field(default_factory=lambda: np.empty(0))
+
+
+class Odometry(NamedTuple):
+    """One window's result."""
+
+    increments: Increments
+    pending: Pending
+    counts: OdometryCounts
+
+
+class _Clean(NamedTuple):
+    keep: Bools
+    not_finite: int
+    repeated: int
+    out_of_order: int
+
+
+def integrate(
+    wheels: WheelSpeeds,
+    settings: OdometrySettings,
+    turn: TurnSignal | None = None,
+    pending: Pending | None = None,
+    until_ns: int | None = None,
+) -> Odometry:
+    """Distance and change of heading from one wheel row to the next.
+
+    Args:
+        wheels: The window's wheel rows, stored order.
+        settings: The car.
+        turn: The window's yaw rate or steering; None where the car has neither (the same choice
+            in every window).
+        pending: What the window before left over.
+        until_ns: All rows before this time have been given. None: nothing more will come.
+
+    Raises:
+        ValueError: A length that the chosen source needs is missing from the settings.
+    """
+    pending = pending or Pending()
+    _check_geometry(settings, turn)
+    axle_mps, yaw_radps = _at_rear_axle(wheels, settings)
+    clean = _clean(wheels.t_ns, axle_mps, pending.t_ns)
+    t_ns = np.concatenate([pending.t_ns, wheels.t_ns[clean.keep]])
+    axle_mps = np.concatenate([pending.axle_mps, axle_mps[clean.keep]])
+    yaw_radps = np.concatenate([pending.yaw_radps, yaw_radps[clean.keep]])
+    joined, turn_dropped = _join_turn(turn, pending)
+
+    ready = len(t_ns)
+    if joined is not None and until_ns is not None:
+        ready = _ready(t_ns, joined.t_ns, round(settings.max_gap_s * 1e9), until_ns)
+    made = _increments(t_ns[:ready], axle_mps[:ready], yaw_radps[:ready], joined, settings)
+    counts = OdometryCounts(
+        rows=len(wheels),
+        not_finite=clean.not_finite,
+        repeated=clean.repeated,
+        out_of_order=clean.out_of_order,
+        turn_rows=0 if turn is None else len(turn),
+        turn_dropped=turn_dropped,
+        intervals=len(made),
+        gaps=int(made.is_gap.sum()),
+        turn_missing=0 if joined is None else int((made.turn_source != joined.source).sum()),
+    )
+    last = max(ready - 1, 0)
+    rest = Pending(t_ns[last:], axle_mps[last:], yaw_radps[last:])
+    return Odometry(made, rest if joined is None else _keep_turn(rest, joined), counts)
+
+
+def _check_geometry(settings: OdometrySettings, turn: TurnSignal | None) -> None:
+    needs_base = settings.use_front_wheels or (turn is not None and turn.kind == "steering")
+    if needs_base and settings.wheelbase_m is None:
+        raise ValueError("wheelbase_m: wanted for steering and for front wheels, got None")
+
+
+def _at_rear_axle(wheels: WheelSpeeds, settings: OdometrySettings) -> tuple[Floats, Floats]:
+    """Speed of the rear axle's centre and yaw rate by the difference of left and right."""
+    speeds = wheels.signed_mps() * settings.wheel_scale
+    left, right = speeds[:, -2], speeds[:, -1]
+    if settings.use_front_wheels and speeds.shape[1] == 4 and settings.wheelbase_m is not None:
+        front_sideways_mps = (right - left) / settings.track_width_m * settings.wheelbase_m
+        left = 0.5 * (left + _along_body(speeds[:, 0], front_sideways_mps))
+        right = 0.5 * (right + _along_body(speeds[:, 1], front_sideways_mps))
+    return 0.5 * (left + right), (right - left) / settings.track_width_m
+
+
+def _along_body(front_mps: Floats, sideways_mps: Floats) -> Floats:
+    """A steered wheel rolls along its own direction: the part along the car's axis."""
+    return np.sign(front_mps) * np.sqrt(np.maximum(front_mps**2 - sideways_mps**2, 0.0))
+
+
+def _clean(t_ns: Int64s, values: Floats, before_ns: Int64s) -> _Clean:
+    """Rows that are finite and later than every row kept before them."""
+    finite = np.isfinite(values)
+    floor = before_ns[-1] if len(before_ns) else np.iinfo(np.int64).min
+    times = np.where(finite, t_ns, floor)
+    latest = np.maximum.accumulate(np.concatenate([[floor], times]))[:-1]
+    later = t_ns > latest
+    keep = finite & later
+    repeated = finite & (t_ns == latest)
+    n_repeated = int(repeated.sum())
+    return _Clean(keep, int((~finite).sum()), n_repeated, int((finite & ~later).sum()) - n_repeated)
+
+
+def _join_turn(turn: TurnSignal | None, pending: Pending) -> tuple[_Turn | None, int]:
+    if turn is None:
+        return None, 0
+    keep = _clean(turn.t_ns, turn.values, pending.turn_t_ns).keep
+    t_ns = np.concatenate([pending.turn_t_ns, turn.t_ns[keep]])
+    values = np.concatenate([pending.turn_values, turn.values[keep]])
+    return _Turn(t_ns, values, turn.kind), int((~keep).sum())
+
+
+def _keep_turn(rest: Pending, turn: _Turn) -> Pending:
+    """Add the turn rows from the last one at or before the first wheel row that waits."""
+    used = len(turn.t_ns)
+    if len(rest.t_ns):
+        used = int(np.searchsorted(turn.t_ns, rest.t_ns[0], side="right"))
+    first = max(used - 1, 0)
+    return replace(rest, turn_t_ns=turn.t_ns[first:], turn_values=turn.values[first:])
+
+
+def _ready(t_ns: Int64s, turn_t_ns: Int64s, max_gap_ns: int, until_ns: int) -> int:
+    """How many wheel rows can be closed: up to the turn signal, or all if that has a gap here."""
+    if len(turn_t_ns) == 0 or until_ns - turn_t_ns[-1] > max_gap_ns:
+        return len(t_ns)
+    return int(np.searchsorted(t_ns, turn_t_ns[-1], side="right"))
+
+
+def _increments(
+    t_ns: Int64s,
+    axle_mps: Floats,
+    yaw_radps: Floats,
+    turn: _Turn | None,
+    settings: OdometrySettings,
+) -> Increments:
+    dt_s = np.diff(t_ns) * 1e-9
+    is_gap = np.diff(t_ns) > round(settings.max_gap_s * 1e9)
+    distance_m = _trapezoid(axle_mps, dt_s)
+    by_slip = settings.slip_per_sqrt_m**2 * np.abs(distance_m)
+    # Neighbouring intervals share a sample, so each carries a whole sample's rounding.
+    by_step = 0.5 * settings.wheel_step_mps**2 / 12.0
+    unseen_s2 = np.where(is_gap, 0.25 * dt_s**2, 0.0)
+    turn_rad, turn_var = _turn_by_wheels(yaw_radps, dt_s, distance_m, unseen_s2, settings)
+    source = np.full(len(dt_s), BY_WHEELS, np.uint8)
+    if turn is not None:
+        made_rad, made_var = turn.over(t_ns, distance_m, settings)
+        covered = turn.covers(t_ns, settings)
+        turn_rad = np.where(covered, made_rad, turn_rad)
+        turn_var = np.where(covered, made_var, turn_var)
+        source[covered] = turn.source
+    return Increments(
+        start_ns=t_ns[:-1],
+        stop_ns=t_ns[1:],
+        distance_m=distance_m,
+        turn_rad=turn_rad,
+        distance_var_m2=by_slip + by_step * dt_s**2 + (settings.gap_accel_mps2 * unseen_s2) ** 2,
+        turn_var_rad2=turn_var + (settings.turn_per_turn * turn_rad) ** 2,
+        speed_mps=axle_mps[1:],
+        speed_var_m2ps2=by_step + by_slip / dt_s**2,
+        turn_source=source,
+        is_gap=is_gap,
+    )
+
+
+def _trapezoid(rate: Floats, dt_s: Floats) -> Floats:
+    return 0.5 * (rate[:-1] + rate[1:]) * dt_s
+
+
+def _turn_by_wheels(
+    yaw_radps: Floats,
+    dt_s: Floats,
+    distance_m: Floats,
+    unseen_s2: Floats,
+    settings: OdometrySettings,
+) -> tuple[Floats, Floats]:
+    by_step = 2.0 * settings.wheel_step_mps**2 / 12.0 / settings.track_width_m**2
+    variance = (
+        settings.wheel_turn_rad_per_sqrt_m**2 * np.abs(distance_m)
+        + by_step * dt_s**2
+        + (settings.gap_yaw_accel_radps2 * unseen_s2) ** 2
+    )
+    return _trapezoid(yaw_radps, dt_s), variance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Turn:
+    """A turn signal over the whole window, rows of the window before included."""
+
+    t_ns: Int64s
+    values: Floats
+    kind: TurnKind
+
+    @property
+    def source(self) -> int:
+        return BY_YAW_RATE if self.kind == "yaw rate" else BY_STEERING
+
+    def covers(self, t_ns: Int64s, settings: OdometrySettings) -> Bools:
+        """Between which wheel rows is the signal without a gap?"""
+        if len(self.t_ns) == 0:
+            return np.zeros(max(len(t_ns) - 1, 0), np.bool_)
+        is_gap = np.diff(self.t_ns) > round(settings.max_gap_s * 1e9)
+        gaps_before = np.concatenate([[0], np.cumsum(is_gap)])
+        last = len(self.t_ns) - 1
+        first_row = np.searchsorted(self.t_ns, t_ns[:-1], side="right") - 1
+        last_row = np.searchsorted(self.t_ns, t_ns[1:], side="left")
+        is_inside = (first_row >= 0) & (last_row <= last)
+        gaps = gaps_before[np.minimum(last_row, last)] - gaps_before[np.maximum(first_row, 0)]
+        is_whole: Bools = gaps == 0
+        return is_inside & is_whole
+
+    def over(
+        self, t_ns: Int64s, distance_m: Floats, settings: OdometrySettings
+    ) -> tuple[Floats, Floats]:
+        """Change of heading from row to row, and its variance; of no meaning where not covered."""
+        dt_s = np.diff(t_ns) * 1e-9
+        area = self._integral(t_ns)
+        if self.kind == "yaw rate":
+            turn_rad = settings.yaw_rate_scale * (area - settings.gyro_bias_radps * dt_s)
+            return turn_rad, settings.gyro_noise_rad_per_sqrt_s**2 * dt_s
+        assert settings.wheelbase_m is not None
+        angle_rad = (area / dt_s - settings.steering_offset_rad) / settings.steering_ratio
+        curvature = np.tan(angle_rad) / settings.wheelbase_m
+        by_angle = (1.0 + np.tan(angle_rad) ** 2) / settings.wheelbase_m
+        variance = (settings.steering_noise_rad_sqrt_m * by_angle) ** 2 * np.abs(distance_m)
+        return distance_m * curvature, variance
+
+    def _integral(self, t_ns: Int64s) -> Floats:
+        """Area below the signal, linear between its samples, from wheel row to wheel row."""
+        n = max(len(t_ns) - 1, 0)
+        if n == 0 or len(self.t_ns) == 0:
+            return np.zeros(n)
+        inside = self.t_ns[(self.t_ns > t_ns[0]) & (self.t_ns < t_ns[-1])]
+        knots = np.union1d(t_ns, inside)
+        pieces = _trapezoid(self._at(knots), np.diff(knots) * 1e-9)
+        interval = np.searchsorted(t_ns, knots[:-1], side="right") - 1
+        return np.bincount(interval, weights=pieces, minlength=n).astype(np.float64)
+
+    def _at(self, at_ns: Int64s) -> Floats:
+        before = np.clip(np.searchsorted(self.t_ns, at_ns, side="right") - 1, 0, None)
+        after = np.minimum(before + 1, len(self.t_ns) - 1)
+        span_ns = np.maximum(self.t_ns[after] - self.t_ns[before], 1)
+        share: Floats = (at_ns - self.t_ns[before]) / span_ns
+        rise: Floats = self.values[after] - self.values[before]
+        return self.values[before] + share * rise

@@ -1,0 +1,548 @@
+"""A pose track from odometry and compass: the filter of ``ekf`` run over columns.
+
+Events are taken in order of time: the end of an odometry interval, then a heading, then a wanted
+row. An interval that a heading or a wanted row falls into is driven in parts, distance, turn and
+variances by share of its time. The numbers are those of ``predict_odometry``, ``update_speed``
+and ``update_heading``, written out in plain floats because a drive has millions of steps; tests
+hold the two equal.
+
+Compass errors last (a bridge, a lorry, the car's own current), so ten readings a second do not
+tell ten times as much as one. A filter told otherwise is soon far too sure of itself. Here a
+reading counts only once the car has gone ``heading_interval_m`` and ``heading_interval_s`` have
+passed since the last one that counted: the source's compass of variance r every ds metres.
+``fit_compass`` tells the time over which a compass's error persists; twice that is a good
+``heading_interval_s``.
+
+Long drives go in windows: hand each call's ``TrackState`` to the next. Headings and wanted rows
+later than the odometry given so far wait in it, and the track is the same, bit for bit, as in one
+piece. A landmark found meanwhile is weighed in by ``replace(state, belief=...)``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Final, NamedTuple, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats, Int64s
+
+from .angles import wrap
+from .ekf import PoseBelief, arc, axis_of, coast
+from .odometry import Increments
+
+ACCEPTED: Final = 0
+REJECTED: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class TrackSettings:
+    """How headings are weighed and how the speed wanders.
+
+    Attributes:
+        heading_interval_m: Least distance travelled between two headings that count.
+        heading_interval_s: Least time between two headings that count.
+        heading_gate_nis: Refuse a heading whose normalised innovation squared is larger (10.8: one
+            good reading in a thousand); None accepts all.
+        accel_var_m2ps3: Growth of the speed's variance per second between readings.
+        coast_turn_var_rad2ps: Growth of the heading's variance per second without odometry.
+    """
+
+    heading_interval_m: float = 1.0
+    heading_interval_s: float = 0.0
+    heading_gate_nis: float | None = 10.8
+    accel_var_m2ps3: float = 1.0
+    coast_turn_var_rad2ps: float = 0.01
+
+    def __post_init__(self) -> None:
+        """Refuse values that mean nothing.
+
+        Raises:
+            ValueError: Naming the field and the value.
+        """
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if value is not None and not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{f.name}: want >= 0, got {value}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Headings:
+    """N compass readings.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        heading_rad: Shape (N,): counter-clockwise from +x of the map.
+        var_rad2: Shape (N,).
+    """
+
+    t_ns: Int64s
+    heading_rad: Floats
+    var_rad2: Floats
+
+    def __post_init__(self) -> None:
+        """Refuse columns that do not line up.
+
+        Raises:
+            ValueError: Naming the column, the shape wanted and the shape given.
+        """
+        for name in ("heading_rad", "var_rad2"):
+            if getattr(self, name).shape != self.t_ns.shape:
+                raise ValueError(f"{name}: want {self.t_ns.shape}, got {getattr(self, name).shape}")
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+NO_HEADINGS: Final = Headings(np.empty(0, np.int64), np.empty(0), np.empty(0))
+NO_TIMES: Final[Int64s] = np.empty(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackCounts:
+    """What became of the measurements; counts add up over windows.
+
+    Attributes:
+        intervals: Odometry intervals driven.
+        intervals_late: Skipped: they end before the belief's time.
+        coasts: Stretches without odometry, driven blind.
+        coast_ns: Their length together.
+        headings: Compass readings that came up.
+        headings_accepted: Weighed in.
+        headings_thinned: Not counted: too soon after the last one that counted.
+        headings_rejected: Refused by the gate.
+        headings_late: Skipped: before the belief's time.
+        headings_bad: Skipped: not finite, or variance not positive.
+        rows_late: Wanted rows before the belief's time: not given.
+    """
+
+    intervals: int = 0
+    intervals_late: int = 0
+    coasts: int = 0
+    coast_ns: int = 0
+    headings: int = 0
+    headings_accepted: int = 0
+    headings_thinned: int = 0
+    headings_rejected: int = 0
+    headings_late: int = 0
+    headings_bad: int = 0
+    rows_late: int = 0
+
+    def __add__(self, other: Self) -> Self:
+        names = [f.name for f in fields(self)]
+        return type(self)(**{name: getattr(self, name) + getattr(other, name) for name in names})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackState:
+    """Everything that one window hands to the next; start with ``TrackState(belief)``.
+
+    Attributes:
+        belief: At the end of the odometry driven so far.
+        travelled_m: Distance driven so far, forth and back both counted.
+        counted_ns: Time of the last heading that counted, or None.
+        counted_m: ``travelled_m`` then.
+        waiting: Headings later than the belief.
+        waiting_rows_ns: Wanted rows later than the belief.
+    """
+
+    belief: PoseBelief
+    travelled_m: float = 0.0
+    counted_ns: int | None = None
+    counted_m: float = 0.0
+    waiting: Headings = NO_HEADINGS
+    waiting_rows_ns: Int64s = field(default_factory=lambda: NO_TIMES)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseColumns:
+    """N rows of a pose track.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        x_m: Shape (N,).
+        y_m: Shape (N,).
+        heading_rad: Shape (N,), in (-pi, pi].
+        speed_mps: Shape (N,), negative in reverse.
+        cov_xyh: Shape (N, 6): covariance of x, y, heading: xx, xy, xh, yy, yh, hh.
+        major_axis_m: Shape (N,): full major axis of the 2-sigma position ellipse.
+        travelled_m: Shape (N,): distance driven so far.
+    """
+
+    t_ns: Int64s
+    x_m: Floats
+    y_m: Floats
+    heading_rad: Floats
+    speed_mps: Floats
+    cov_xyh: Floats
+    major_axis_m: Floats
+    travelled_m: Floats
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadingColumns:
+    """N headings that reached the filter.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        innovation_rad: Shape (N,): measured less expected, wrapped.
+        nis: Shape (N,): normalised innovation squared, chi-square with one degree of freedom.
+        outcome: Shape (N,), uint8: ``ACCEPTED`` or ``REJECTED`` by the gate.
+    """
+
+    t_ns: Int64s
+    innovation_rad: Floats
+    nis: Floats
+    outcome: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+class Advance(NamedTuple):
+    """One window's result."""
+
+    state: TrackState
+    poses: PoseColumns
+    headings: HeadingColumns
+    counts: TrackCounts
+
+
+def start_belief(
+    t_ns: int,
+    x_m: float,
+    y_m: float,
+    heading_rad: float,
+    speed_mps: float = 0.0,
+    position_sd_m: float = 0.0,
+    heading_sd_rad: float = 0.0,
+    speed_sd_mps: float = 10.0,
+) -> PoseBelief:
+    """A belief whose errors are independent of each other."""
+    mean = np.array([x_m, y_m, wrap(heading_rad), speed_mps])
+    sd = np.array([position_sd_m, position_sd_m, heading_sd_rad, speed_sd_mps])
+    return PoseBelief(t_ns, mean, np.diag(sd**2))
+
+
+def advance(
+    state: TrackState,
+    increments: Increments,
+    settings: TrackSettings,
+    headings: Headings = NO_HEADINGS,
+    rows_ns: Int64s | None = None,
+) -> Advance:
+    """Drive along the increments, weighing in headings by time.
+
+    Args:
+        state: What the window before left.
+        increments: From ``odometry.integrate``, in order.
+        settings: How.
+        headings: The window's compass readings in any order; those later than the odometry wait.
+        rows_ns: Shape (M,): times at which rows are wanted. None: after every interval. Make the
+            same choice in every window.
+
+    Returns:
+        The state for the next window, the rows, what became of each heading that reached the
+        filter, and counts.
+    """
+    headings = _by_time(_joined(state.waiting, headings))
+    wanted = None
+    if rows_ns is not None:
+        wanted = np.sort(np.concatenate([state.waiting_rows_ns, rows_ns]))
+    run = _Run(state, settings, headings, wanted)
+    for start, stop, *interval in zip(
+        increments.start_ns.tolist(),
+        increments.stop_ns.tolist(),
+        increments.distance_m.tolist(),
+        increments.turn_rad.tolist(),
+        increments.distance_var_m2.tolist(),
+        increments.turn_var_rad2.tolist(),
+        increments.speed_mps.tolist(),
+        increments.speed_var_m2ps2.tolist(),
+        strict=True,
+    ):
+        run.drive(start, stop, *interval)
+    return run.result()
+
+
+_State: TypeAlias = tuple[
+    float, float, float, float,
+    float, float, float, float, float, float, float, float, float, float,
+]  # fmt: skip
+"""x, y, heading, speed; then the covariance's upper triangle, row by row."""
+
+_NEVER: Final = np.iinfo(np.int64).max
+_HEADING_ROW: Final = (2, 5, 7, 8)
+_SPEED_ROW: Final = (3, 6, 8, 9)
+
+
+class _Run:
+    """One call of ``advance`` under way."""
+
+    def __init__(
+        self, state: TrackState, settings: TrackSettings, headings: Headings, rows: Int64s | None
+    ) -> None:
+        self.settings = settings
+        self.t_ns = state.belief.t_ns
+        self.state = _packed(state.belief)
+        self.travelled_m = state.travelled_m
+        self.counted_ns = state.counted_ns
+        self.counted_m = state.counted_m
+        usable = np.isfinite(headings.heading_rad) & (headings.var_rad2 > 0.0)
+        usable &= np.isfinite(headings.var_rad2)
+        late = usable & (headings.t_ns < self.t_ns)
+        self.headings = _picked(headings, usable & ~late)
+        self.heading_rows = list(
+            zip(
+                self.headings.t_ns.tolist(),
+                self.headings.heading_rad.tolist(),
+                self.headings.var_rad2.tolist(),
+                strict=True,
+            )
+        )
+        self.every_interval = rows is None
+        self.rows = NO_TIMES if rows is None else rows[rows >= self.t_ns]
+        self.row_times = self.rows.tolist()
+        self.next_heading = 0
+        self.next_row = 0
+        self.event_ns = 0
+        self.poses: list[tuple[float, ...]] = []
+        self.pose_times: list[int] = []
+        self.used: list[tuple[int, float, float, int]] = []
+        self.tally = dict.fromkeys((f.name for f in fields(TrackCounts)), 0)
+        self.tally["headings_bad"] = int((~usable).sum())
+        self.tally["headings_late"] = int(late.sum())
+        self.tally["rows_late"] = 0 if rows is None else len(rows) - len(self.rows)
+        self._find_event()
+
+    def drive(
+        self,
+        start_ns: int,
+        stop_ns: int,
+        distance_m: float,
+        turn_rad: float,
+        distance_var: float,
+        turn_var: float,
+        speed_mps: float,
+        speed_var: float,
+    ) -> None:
+        if stop_ns <= self.t_ns:
+            self.tally["intervals_late"] += 1
+            return
+        if start_ns > self.t_ns:
+            self._coast(start_ns)
+        self.tally["intervals"] += 1
+        per_ns = 1.0 / (stop_ns - start_ns)
+        while True:
+            to_ns = min(self.event_ns, stop_ns)
+            if to_ns > self.t_ns:
+                share = (to_ns - self.t_ns) * per_ns
+                self._move(
+                    to_ns, share * distance_m, share * turn_rad, share * distance_var,
+                    share * turn_var,
+                )  # fmt: skip
+            if to_ns == stop_ns:
+                break
+            self._handle_events()
+        innovation = speed_mps - self.state[3]
+        self.state = _weighed(self.state, 3, _SPEED_ROW, innovation, speed_var)
+        if self.event_ns == stop_ns:
+            self._handle_events()
+        if self.every_interval:
+            self._keep_row()
+
+    def _move(
+        self, to_ns: int, distance_m: float, turn_rad: float, distance_var: float, turn_var: float
+    ) -> None:
+        speed_var = self.settings.accel_var_m2ps3 * ((to_ns - self.t_ns) * 1e-9)
+        self.state = _driven(self.state, distance_m, turn_rad, distance_var, turn_var, speed_var)
+        self.travelled_m += abs(distance_m)
+        self.t_ns = to_ns
+
+    def _coast(self, stop_ns: int) -> None:
+        self.tally["coasts"] += 1
+        self.tally["coast_ns"] += stop_ns - self.t_ns
+        while self.t_ns < stop_ns:
+            to_ns = min(self.event_ns, stop_ns)
+            before = _unpacked(self.t_ns, self.state)
+            dt_s = (to_ns - self.t_ns) * 1e-9
+            after = coast(
+                before, dt_s, self.settings.accel_var_m2ps3, self.settings.coast_turn_var_rad2ps
+            )
+            self.travelled_m += abs(self.state[3]) * dt_s
+            self.state, self.t_ns = _packed(after), to_ns
+            if to_ns < stop_ns:
+                self._handle_events()
+
+    def _handle_events(self) -> None:
+        """Take what falls on the present time: headings first, so that rows show them."""
+        rows = self.heading_rows
+        while self.next_heading < len(rows) and rows[self.next_heading][0] == self.t_ns:
+            self._weigh_heading(*rows[self.next_heading][1:])
+            self.next_heading += 1
+        while self.next_row < len(self.row_times) and self.row_times[self.next_row] == self.t_ns:
+            self._keep_row()
+            self.next_row += 1
+        self._find_event()
+
+    def _find_event(self) -> None:
+        heading_ns, row_ns = _NEVER, _NEVER
+        if self.next_heading < len(self.heading_rows):
+            heading_ns = self.heading_rows[self.next_heading][0]
+        if self.next_row < len(self.row_times):
+            row_ns = self.row_times[self.next_row]
+        self.event_ns = min(heading_ns, row_ns)
+
+    def _weigh_heading(self, heading_rad: float, var_rad2: float) -> None:
+        self.tally["headings"] += 1
+        if not self._is_due():
+            self.tally["headings_thinned"] += 1
+            return
+        innovation = wrap(heading_rad - self.state[2])
+        nis = innovation * innovation / (self.state[11] + var_rad2)
+        gate = self.settings.heading_gate_nis
+        outcome = ACCEPTED if gate is None or nis <= gate else REJECTED
+        self.used.append((self.t_ns, innovation, nis, outcome))
+        if outcome == REJECTED:
+            self.tally["headings_rejected"] += 1
+            return
+        self.tally["headings_accepted"] += 1
+        self.counted_ns, self.counted_m = self.t_ns, self.travelled_m
+        self.state = _weighed(self.state, 2, _HEADING_ROW, innovation, var_rad2)
+
+    def _is_due(self) -> bool:
+        if self.counted_ns is None:
+            return True
+        gone_m = self.travelled_m - self.counted_m
+        passed_s = (self.t_ns - self.counted_ns) * 1e-9
+        settings = self.settings
+        return gone_m >= settings.heading_interval_m and passed_s >= settings.heading_interval_s
+
+    def _keep_row(self) -> None:
+        x, y, heading, speed, xx, xy, xh, _, yy, yh, _, hh, _, _ = self.state
+        self.pose_times.append(self.t_ns)
+        axis = axis_of(xx, xy, yy)
+        self.poses.append((x, y, heading, speed, xx, xy, xh, yy, yh, hh, axis, self.travelled_m))
+
+    def result(self) -> Advance:
+        poses = np.array(self.poses).reshape(-1, 12)
+        used = np.array(self.used, dtype=np.float64).reshape(-1, 4)
+        state = TrackState(
+            belief=_unpacked(self.t_ns, self.state),
+            travelled_m=self.travelled_m,
+            counted_ns=self.counted_ns,
+            counted_m=self.counted_m,
+            waiting=_picked(self.headings, slice(self.next_heading, None)),
+            waiting_rows_ns=self.rows[self.next_row :],
+        )
+        columns = PoseColumns(
+            np.array(self.pose_times, np.int64), poses[:, 0], poses[:, 1], poses[:, 2],
+            poses[:, 3], poses[:, 4:10], poses[:, 10], poses[:, 11],
+        )  # fmt: skip
+        headings = HeadingColumns(
+            np.array([t for t, *_ in self.used], np.int64),
+            used[:, 1],
+            used[:, 2],
+            used[:, 3].astype(np.uint8),
+        )
+        return Advance(state, columns, headings, TrackCounts(**self.tally))
+
+
+def _driven(
+    state: _State,
+    distance_m: float,
+    turn_rad: float,
+    distance_var: float,
+    turn_var: float,
+    speed_var: float,
+) -> _State:
+    """``predict_odometry`` in plain floats."""
+    x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
+    step = arc(distance_m, turn_rad)
+    c, s = math.cos(heading), math.sin(heading)
+    mx, my = c * step.dx_m - s * step.dy_m, s * step.dx_m + c * step.dy_m
+    dx = c * step.dx_by_distance - s * step.dy_by_distance
+    dy = s * step.dx_by_distance + c * step.dy_by_distance
+    tx = c * step.dx_by_turn - s * step.dy_by_turn
+    ty = s * step.dx_by_turn + c * step.dy_by_turn
+    return (
+        x + mx,
+        y + my,
+        wrap(heading + turn_rad),
+        speed,
+        xx - 2.0 * my * xh + my * my * hh + dx * dx * distance_var + tx * tx * turn_var,
+        xy + mx * xh - my * yh - mx * my * hh + dx * dy * distance_var + tx * ty * turn_var,
+        xh - my * hh + tx * turn_var,
+        xv - my * hv,
+        yy + 2.0 * mx * yh + mx * mx * hh + dy * dy * distance_var + ty * ty * turn_var,
+        yh + mx * hh + ty * turn_var,
+        yv + mx * hv,
+        hh + turn_var,
+        hv,
+        vv + speed_var,
+    )
+
+
+def _weighed(
+    state: _State, i: int, row: tuple[int, int, int, int], innovation: float, var: float
+) -> _State:
+    """Joseph update of the directly measured state ``i`` in plain floats.
+
+    ``row`` says where the covariance's row ``i`` lies behind the mean.
+    """
+    x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
+    px, py, ph, pv = (state[4 + k] for k in row)
+    spread = (px, py, ph, pv)[i] + var
+    kx, ky, kh, kv = px / spread, py / spread, ph / spread, pv / spread
+    return (
+        x + kx * innovation,
+        y + ky * innovation,
+        wrap(heading + kh * innovation),
+        speed + kv * innovation,
+        xx - 2.0 * kx * px + kx * kx * spread,
+        xy - kx * py - ky * px + kx * ky * spread,
+        xh - kx * ph - kh * px + kx * kh * spread,
+        xv - kx * pv - kv * px + kx * kv * spread,
+        yy - 2.0 * ky * py + ky * ky * spread,
+        yh - ky * ph - kh * py + ky * kh * spread,
+        yv - ky * pv - kv * py + ky * kv * spread,
+        hh - 2.0 * kh * ph + kh * kh * spread,
+        hv - kh * pv - kv * ph + kh * kv * spread,
+        vv - 2.0 * kv * pv + kv * kv * spread,
+    )
+
+
+def _packed(belief: PoseBelief) -> _State:
+    p = belief.cov
+    numbers = (*belief.mean, *p[0], *p[1, 1:], *p[2, 2:], p[3, 3])
+    x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = map(float, numbers)
+    return x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv
+
+
+def _unpacked(t_ns: int, state: _State) -> PoseBelief:
+    x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
+    cov = np.array([[xx, xy, xh, xv], [xy, yy, yh, yv], [xh, yh, hh, hv], [xv, yv, hv, vv]])
+    return PoseBelief(t_ns, np.array([x, y, heading, speed]), cov)
+
+
+def _joined(first: Headings, second: Headings) -> Headings:
+    if not len(first):
+        return second
+    return Headings(
+        np.concatenate([first.t_ns, second.t_ns]),
+        np.concatenate([first.heading_rad, second.heading_rad]),
+        np.concatenate([first.var_rad2, second.var_rad2]),
+    )
+
+
+def _by_time(headings: Headings) -> Headings:
+    return _picked(headings, np.argsort(headings.t_ns, kind="stable"))
+
+
+def _picked(headings: Headings, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Headings:
+    return Headings(headings.t_ns[index], headings.heading_rad[index], headings.var_rad2[index])

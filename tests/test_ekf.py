@@ -1,0 +1,361 @@
+"""Laws of the pose filter, and filterpy beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.localization.angles import wrap, wrap_all
+from crosscue.localization.ekf import (
+    MotionNoise,
+    PoseBelief,
+    arc,
+    bicycle,
+    coast,
+    is_lost,
+    major_axis_m,
+    predict,
+    predict_odometry,
+    predict_yaw_rate,
+    turning,
+    update_heading,
+    update_position,
+    update_speed,
+)
+from crosscue.replay.columns import Floats
+
+NOISE = MotionNoise(
+    wheelbase_m=2.7, accel_mps2=0.3, steering_rad=0.02, yaw_rate_radps=0.01, slip_per_sqrt_m=0.05
+)
+HEADINGS = st.floats(-math.pi, math.pi)
+SPEEDS = st.floats(-15.0, 40.0)
+STEERINGS = st.floats(-0.6, 0.6)
+
+
+def belief(
+    x: float = 3.0, y: float = -2.0, heading: float = 0.4, speed: float = 8.0, seed: int = 1
+) -> PoseBelief:
+    root = np.random.default_rng(seed).normal(size=(4, 4)) * [[1.0], [1.0], [0.05], [0.5]]
+    return PoseBelief(1_000, np.array([x, y, heading, speed]), root @ root.T)
+
+
+def slope(function: Callable[[Floats], Floats], at: Floats) -> Floats:
+    """Central differences, angles taken the shorter way."""
+    columns = []
+    for i in range(len(at)):
+        step = np.zeros(len(at))
+        step[i] = 1e-5
+        rise = function(at + step) - function(at - step)
+        rise[2] = wrap(rise[2])
+        columns.append(rise / 2e-5)
+    return np.column_stack(columns)
+
+
+def test_a_quarter_circle_ends_where_geometry_says() -> None:
+    radius_m = 10.0
+    start = PoseBelief(0, np.array([0.0, 0.0, 0.0, 5.0]), np.zeros((4, 4)))
+    dt_s = radius_m * math.pi / 2 / 5.0
+    after = predict(start, 0.0, 2.7 / radius_m, dt_s, MotionNoise(wheelbase_m=2.7))
+
+    np.testing.assert_allclose(after.mean, [10.0, 10.0, math.pi / 2, 5.0], atol=1e-12)
+    assert after.t_ns == round(dt_s * 1e9)
+
+
+def test_backing_along_the_same_circle_returns_to_the_start() -> None:
+    start = PoseBelief(0, np.array([4.0, 1.0, 2.9, 6.0]), np.zeros((4, 4)))
+    noise = MotionNoise(wheelbase_m=2.7)
+    there = predict(start, 0.0, 0.3, 1.5, noise)
+    turned_back = PoseBelief(there.t_ns, there.mean * [1, 1, 1, -1], there.cov)
+    back = predict(turned_back, 0.0, 0.3, 1.5, noise)
+
+    np.testing.assert_allclose(back.mean[:3], start.mean[:3], atol=1e-12)
+
+
+def test_acceleration_from_rest() -> None:
+    start = PoseBelief(0, np.array([0.0, 0.0, 0.0, 0.0]), np.zeros((4, 4)))
+    after = predict(start, 2.0, 0.0, 3.0, NOISE)
+
+    np.testing.assert_allclose(after.mean, [9.0, 0.0, 0.0, 6.0], atol=1e-12)
+
+
+@given(turn=st.floats(-3.0, 3.0), distance=st.floats(-50.0, 50.0))
+@settings(max_examples=60, deadline=None)
+def test_one_arc_is_two_half_arcs(turn: float, distance: float) -> None:
+    whole, half = arc(distance, turn), arc(distance / 2, turn / 2)
+    c, s = math.cos(turn / 2), math.sin(turn / 2)
+
+    assert whole.dx_m == pytest.approx(half.dx_m * (1 + c) - half.dy_m * s, abs=1e-10)
+    assert whole.dy_m == pytest.approx(half.dy_m * (1 + c) + half.dx_m * s, abs=1e-10)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-12, 9.999e-3, 1.0001e-2, -9.999e-3, 0.5, -2.0])
+def test_an_arc_is_smooth_through_zero_turn(turn: float) -> None:
+    here = arc(7.0, turn)
+    ahead, behind = arc(7.0, turn + 1e-6), arc(7.0, turn - 1e-6)
+
+    assert here.dx_by_turn == pytest.approx((ahead.dx_m - behind.dx_m) / 2e-6, abs=1e-8)
+    assert here.dy_by_turn == pytest.approx((ahead.dy_m - behind.dy_m) / 2e-6, abs=1e-8)
+    assert here.dx_by_distance == pytest.approx(here.dx_m / 7.0, abs=1e-14)
+    assert here.dy_by_distance == pytest.approx(here.dy_m / 7.0, abs=1e-14)
+
+
+def test_series_and_closed_form_meet() -> None:
+    below, above = arc(1.0, math.nextafter(1e-2, 0.0)), arc(1.0, 1e-2)
+
+    np.testing.assert_allclose(below, above, rtol=0, atol=1e-13)
+
+
+@given(heading=HEADINGS, speed=SPEEDS, accel=st.floats(-5.0, 5.0), steering=STEERINGS)
+@settings(max_examples=60, deadline=None)
+def test_bicycle_jacobians_are_the_slopes(
+    heading: float, speed: float, accel: float, steering: float
+) -> None:
+    mean, inputs = np.array([2.0, -1.0, heading, speed]), np.array([accel, steering])
+    motion = bicycle(mean, accel, steering, 0.1, 2.7)
+    by_state = slope(lambda m: bicycle(m, accel, steering, 0.1, 2.7).mean, mean)
+    by_input = slope(lambda u: bicycle(mean, u[0], u[1], 0.1, 2.7).mean, inputs)
+
+    np.testing.assert_allclose(motion.by_state, by_state, atol=1e-7)
+    np.testing.assert_allclose(motion.by_input, by_input, atol=1e-7)
+
+
+@given(heading=HEADINGS, speed=SPEEDS, yaw_rate=st.floats(-1.0, 1.0))
+@settings(max_examples=60, deadline=None)
+def test_yaw_rate_jacobians_are_the_slopes(heading: float, speed: float, yaw_rate: float) -> None:
+    mean, inputs = np.array([2.0, -1.0, heading, speed]), np.array([0.7, yaw_rate])
+    motion = turning(mean, 0.7, yaw_rate, 0.1)
+    by_state = slope(lambda m: turning(m, 0.7, yaw_rate, 0.1).mean, mean)
+    by_input = slope(lambda u: turning(mean, u[0], u[1], 0.1).mean, inputs)
+
+    np.testing.assert_allclose(motion.by_state, by_state, atol=1e-7)
+    np.testing.assert_allclose(motion.by_input, by_input, atol=1e-7)
+
+
+@given(heading=HEADINGS, speed=SPEEDS, steering=STEERINGS)
+@settings(max_examples=40, deadline=None)
+def test_steering_and_the_yaw_rate_it_makes_drive_the_same_arc(
+    heading: float, speed: float, steering: float
+) -> None:
+    start = belief(heading=heading, speed=speed)
+    noise = MotionNoise(wheelbase_m=2.7)
+    steered = predict(start, 0.0, steering, 0.2, noise)
+    turned = predict_yaw_rate(start, 0.0, speed * steering / 2.7, 0.2, noise)
+
+    np.testing.assert_allclose(turned.mean, steered.mean, atol=1e-12)
+
+
+def test_odometry_drives_the_same_arc_too() -> None:
+    start = belief()
+    turned = predict_yaw_rate(start, 0.0, 0.3, 0.5, NOISE)
+    counted = predict_odometry(start, 8.0 * 0.5, 0.15, 0.0, 0.0, 0.5, 0.0)
+
+    np.testing.assert_allclose(counted.mean, turned.mean, atol=1e-12)
+
+
+@given(heading=HEADINGS, turn=st.floats(-1.0, 1.0), seed=st.integers(0, 50))
+@settings(max_examples=30, deadline=None)
+def test_a_turned_map_turns_the_belief_with_it(heading: float, turn: float, seed: int) -> None:
+    start = belief(heading=heading, seed=seed)
+    c, s = math.cos(turn), math.sin(turn)
+    rotation = np.eye(4)
+    rotation[:2, :2] = [[c, -s], [s, c]]
+
+    def rotated(b: PoseBelief) -> PoseBelief:
+        mean = rotation @ b.mean
+        mean[2] = wrap(mean[2] + turn)
+        return PoseBelief(b.t_ns, mean, rotation @ b.cov @ rotation.T)
+
+    first = predict(rotated(start), 0.4, 0.2, 0.3, NOISE)
+    last = rotated(predict(start, 0.4, 0.2, 0.3, NOISE))
+    np.testing.assert_allclose(first.cov, last.cov, atol=1e-9)
+    np.testing.assert_allclose(wrap_all(first.mean - last.mean), 0.0, atol=1e-9)
+
+
+def test_two_short_coasts_are_one_long_one() -> None:
+    start = belief(speed=9.0)
+    long = coast(start, 2.0, 0.5, 0.01)
+    short = coast(coast(start, 0.7, 0.5, 0.01), 1.3, 0.5, 0.01)
+
+    np.testing.assert_allclose(short.mean, long.mean, atol=1e-12)
+    np.testing.assert_allclose(short.cov, long.cov, rtol=1e-9, atol=1e-9)
+
+
+def test_a_heading_across_the_seam_pulls_the_shorter_way() -> None:
+    start = belief(heading=math.radians(179.0))
+    updated = update_heading(start, math.radians(-179.0), 1e-12)
+
+    assert updated.innovation[0] == pytest.approx(math.radians(2.0))
+    assert updated.belief.mean[2] == pytest.approx(math.radians(-179.0), abs=1e-6)
+
+
+def test_equally_sure_speeds_meet_in_the_middle() -> None:
+    start = PoseBelief(0, np.array([0.0, 0.0, 0.0, 10.0]), np.diag([1.0, 1.0, 0.1, 4.0]))
+    after = update_speed(start, 12.0, 4.0).belief
+
+    assert after.mean[3] == pytest.approx(11.0)
+    assert after.cov[3, 3] == pytest.approx(2.0)
+
+
+def test_a_position_is_worth_as_much_as_its_covariance_says() -> None:
+    start = PoseBelief(0, np.zeros(4), np.diag([4.0, 9.0, 0.1, 1.0]))
+    after = update_position(start, np.array([2.0, 3.0]), np.diag([4.0, 9.0])).belief
+
+    np.testing.assert_allclose(after.mean[:2], [1.0, 1.5])
+    np.testing.assert_allclose(np.diagonal(after.cov)[:2], [2.0, 4.5])
+
+
+def test_order_of_measurements_at_one_time_does_not_matter() -> None:
+    start = belief()
+    xy, cov = np.array([3.5, -2.5]), np.array([[2.0, 0.4], [0.4, 1.0]])
+    one = update_heading(update_position(start, xy, cov).belief, 0.5, 0.01).belief
+    other = update_position(update_heading(start, 0.5, 0.01).belief, xy, cov).belief
+
+    np.testing.assert_allclose(one.mean, other.mean, atol=1e-12)
+    np.testing.assert_allclose(one.cov, other.cov, atol=1e-12)
+
+
+def test_the_gate_refuses_and_tells() -> None:
+    start = belief(heading=0.0)
+    refused = update_heading(start, 2.0, 1e-4, gate_nis=10.8)
+    taken = update_heading(start, 2.0, 1e-4)
+
+    assert not refused.is_accepted
+    assert refused.belief is start
+    assert refused.nis == taken.nis > 10.8
+    assert taken.is_accepted
+
+
+@given(seed=st.integers(0, 500), steps=st.integers(1, 30))
+@settings(max_examples=25, deadline=None)
+def test_covariance_stays_symmetric_and_positive(seed: int, steps: int) -> None:
+    rng = np.random.default_rng(seed)
+    now = belief(seed=seed)
+    for _ in range(steps):
+        now = predict(now, rng.normal(), rng.normal(0.0, 0.3), 0.1, NOISE)
+        now = update_heading(now, rng.uniform(-3.0, 3.0), 1e-6).belief
+        now = update_speed(now, rng.normal(5.0, 5.0), 1e-6).belief
+        now = update_position(now, rng.normal(size=2), np.diag([1e-6, 1e4])).belief
+
+        np.testing.assert_array_equal(now.cov, now.cov.T)
+        assert np.linalg.eigvalsh(now.cov).min() > -1e-9
+        assert -math.pi < now.mean[2] <= math.pi
+
+
+def test_major_axis_is_four_sigma_whatever_the_direction() -> None:
+    c, s = math.cos(0.7), math.sin(0.7)
+    turned = np.array([[c, -s], [s, c]])
+    cov = np.eye(4)
+    cov[:2, :2] = turned @ np.diag([25.0**2, 3.0**2]) @ turned.T
+    at_limit = PoseBelief(0, np.zeros(4), cov)
+
+    assert major_axis_m(at_limit) == pytest.approx(100.0)
+    assert is_lost(at_limit, lost_m=99.9)
+    assert not is_lost(at_limit, lost_m=100.1)
+
+
+def test_straight_driving_grows_lateral_variance_as_the_range_law_says() -> None:
+    """A compass of variance r every ds metres: lateral variance r * ds * D."""
+    r, ds_m, distance_m = math.radians(15.0) ** 2, 1.0, 2_000
+    now = PoseBelief(0, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros((4, 4)))
+    for _ in range(distance_m):
+        now = predict_odometry(now, ds_m, 0.0, 0.0, 1e-4, 1.0, 0.0)
+        now = update_heading(now, 0.0, r).belief
+
+    assert now.cov[1, 1] == pytest.approx(r * ds_m * distance_m, rel=0.05)
+
+
+def test_same_inputs_same_numbers_as_filterpy() -> None:
+    from filterpy.kalman import ExtendedKalmanFilter
+
+    def observe(rows: list[int]) -> Callable[[Floats], Floats]:
+        return lambda _state: np.eye(4)[rows]
+
+    def measured(rows: list[int]) -> Callable[[Floats], Floats]:
+        return lambda state: state[rows]
+
+    def apart(z: Floats, expected: Floats) -> Floats:
+        return wrap_all(z - expected)
+
+    rng = np.random.default_rng(3)
+    ours = belief(heading=3.0)
+    theirs = ExtendedKalmanFilter(dim_x=4, dim_z=1)
+    theirs.x, theirs.P = ours.mean.copy(), ours.cov.copy()
+    for step in range(200):
+        accel, steering = rng.normal(0.0, 1.0), rng.normal(0.05, 0.2)
+        motion = bicycle(theirs.x, accel, steering, 0.1, NOISE.wheelbase_m)
+        along = np.array([math.cos(theirs.x[2]), math.sin(theirs.x[2]), 0.0, 0.0])
+        distance_m = abs(theirs.x[3] * 0.1 + 0.005 * accel)
+        inputs = np.diag([NOISE.accel_mps2**2, NOISE.steering_rad**2])
+        theirs.F = motion.by_state
+        theirs.Q = motion.by_input @ inputs @ motion.by_input.T
+        theirs.Q = theirs.Q + 0.05**2 * distance_m * np.outer(along, along)
+        theirs.predict_x = lambda _u, after=motion.mean: setattr(theirs, "x", after)
+        theirs.predict()
+        ours = predict(ours, accel, steering, 0.1, NOISE)
+
+        speed, heading, xy = rng.normal(8, 1), rng.uniform(-9, 9), rng.normal(0, 20, 2)
+        theirs.update(np.array([speed]), observe([3]), measured([3]), R=0.1)
+        ours = update_speed(ours, speed, 0.1).belief
+        theirs.update(np.array([heading]), observe([2]), measured([2]), R=0.3, residual=apart)
+        theirs.x[2] = wrap(theirs.x[2])
+        ours = update_heading(ours, heading, 0.3).belief
+        if step % 20 == 0:
+            cov = np.array([[4.0, 1.0], [1.0, 2.0]])
+            theirs.update(xy, observe([0, 1]), measured([0, 1]), R=cov)
+            theirs.x[2] = wrap(theirs.x[2])
+            ours = update_position(ours, xy, cov).belief
+
+        np.testing.assert_allclose(ours.mean, theirs.x, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(ours.cov, theirs.P, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: predict(belief(), math.nan, 0.0, 0.1, NOISE), "accel_mps2: want a finite"),
+        (lambda: predict(belief(), 0.0, math.inf, 0.1, NOISE), "steering_rad: want a finite"),
+        (lambda: predict(belief(), 0.0, 0.0, -0.1, NOISE), "dt_s: want finite and >= 0, got -0.1"),
+        (lambda: predict_yaw_rate(belief(), 0.0, math.nan, 0.1, NOISE), "yaw_rate_radps"),
+        (lambda: predict_odometry(belief(), 1.0, 0.0, -1.0, 0.0, 0.1, 0.0), "variances: want >= 0"),
+        (lambda: coast(belief(), 1.0, -1.0, 0.0), "variances: want >= 0"),
+        (lambda: update_heading(belief(), math.nan, 0.1), "measurement: want finite"),
+        (lambda: update_heading(belief(), math.inf, 0.1), "measurement: want finite"),
+        (lambda: update_speed(belief(), 1.0, 0.0), "want positive definite"),
+        (lambda: update_speed(belief(), 1.0, math.nan), "measurement: want finite"),
+        (lambda: update_position(belief(), np.zeros(3), np.eye(2)), r"xy_m: want \(2,\)"),
+        (
+            lambda: update_position(belief(), np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]])),
+            "want positive definite",
+        ),
+        (lambda: MotionNoise(wheelbase_m=0.0), "wheelbase_m: want > 0, got 0.0"),
+        (lambda: MotionNoise(wheelbase_m=2.7, accel_mps2=-1.0), "accel_mps2: want >= 0"),
+        (lambda: PoseBelief(0, np.zeros(3), np.eye(3)), r"want mean \(4,\)"),
+        (lambda: PoseBelief(0, np.full(4, np.nan), np.eye(4)), "want finite"),
+        (lambda: PoseBelief(0, np.zeros(4), -np.eye(4)), "want variances >= 0"),
+    ],
+)
+def test_nonsense_is_refused_by_name(call: Callable[[], object], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        call()
+
+
+@given(angle=st.floats(-1e6, 1e6))
+@settings(max_examples=100, deadline=None)
+def test_wrapping_keeps_the_direction(angle: float) -> None:
+    wrapped = wrap(angle)
+
+    assert -math.pi - 1e-9 < wrapped <= math.pi + 1e-9
+    assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-8)
+    assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-8)
+    assert wrap_all(np.array([angle]))[0] == wrapped
+
+
+def test_wrapping_leaves_half_a_turn_alone() -> None:
+    assert wrap(math.pi) == math.pi
+    assert wrap(-math.pi) == pytest.approx(math.pi)
+    assert wrap(0.3) == 0.3
