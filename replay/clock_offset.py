@@ -26,9 +26,9 @@ JUMP_FLOOR_NS: Final = 10_000_000
 JUMP_WINDOW_NS: Final = 2_000_000_000
 _JUMP_OVER_WAIT: Final = 6
 _SHARP_ROWS: Final = 4
-_WINDOW_ROWS: Final = (16, 8192)
-_ROWS_BESIDE: Final = 8
-"""Rows that must lie on either side of a jump."""
+_ROWS_BESIDE: Final = 16
+"""Rows that must lie on either side of a jump; fewer could not tell it from a ramp."""
+_WINDOW_ROWS: Final = (_ROWS_BESIDE, 8192)
 _ENVELOPE_BINS: Final = 1024
 _FIRST_BIN_NS: Final = 1_000_000
 _FIT_GROUPS: Final = 128
