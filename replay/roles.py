@@ -41,6 +41,7 @@ BY_TYPE: Final[Mapping[str, Role]] = {
     "sensor_msgs/msg/MagneticField": Role.MAGNETOMETER,
     "sensor_msgs/msg/NavSatFix": Role.GNSS,
     "foxglove.LocationFix": Role.GNSS,
+    "crosscue/WheelSpeeds": Role.WHEELS,
     "nav_msgs/msg/Odometry": Role.ODOMETRY,
     "geometry_msgs/msg/PoseStamped": Role.POSE,
 }

@@ -15,7 +15,7 @@ import os
 import shutil
 import socket
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -283,6 +283,9 @@ class TableSink:
 
     def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
         if kind is not None:
+            # The disk may be full: what matters is that nothing half stays and the cause is kept.
+            with suppress(OSError, ValueError):
+                self._writer.close()
             self._file.close()
             self._partial.unlink(missing_ok=True)
             return

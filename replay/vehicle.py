@@ -90,19 +90,26 @@ class Mobileye(Section):
 
 
 class Odometry(Section):
-    """Wheels and gyro."""
+    """Wheels, gyro and steering; the terms are those of ``crosscue.localization.odometry``."""
 
-    wheel_scale: Positive = 1.0
     track_width_m: Positive = 1.55
     wheelbase_m: Positive = 2.7
-    steering_ratio: Positive = 15.0
-    gyro_bias_radps: Finite = 0.0
-    speed_sd_mps: Positive = 0.1
-    slip_share: NotNegative = 0.01
-    yaw_rate_sd_radps: Positive = 0.01
-    accel_sd_mps2: Positive = 1.0
+    wheel_scale: Positive = 1.0
+    use_front_wheels: bool = False
+    wheel_step_mps: NotNegative = 0.0028
+    slip_per_sqrt_m: NotNegative = 0.02
     heading_from: Literal["auto", "yaw_rate", "steering", "wheels"] = "auto"
     """Which signal turns the pose; ``auto`` takes the first of these three that the log has."""
+    yaw_rate_scale: Positive = 1.0
+    gyro_bias_radps: Finite = 0.0
+    gyro_noise_rad_per_sqrt_s: NotNegative = 0.002
+    steering_ratio: Positive = 15.0
+    steering_offset_rad: Finite = 0.0
+    steering_noise_rad_sqrt_m: NotNegative = 0.01
+    wheel_turn_rad_per_sqrt_m: NotNegative = 0.01
+    turn_per_turn: NotNegative = 0.0
+    max_gap_s: Positive = 0.5
+    accel_var_m2ps3: NotNegative = 1.0
 
 
 class Compass(Section):
@@ -117,8 +124,12 @@ class Compass(Section):
     declination_rad: Finite = 0.0
     """East positive."""
     heading_sd_rad: Positive = 15.0 * DEGREE
-    decorrelation_s: NotNegative = 1.0
-    """Readings closer in time than this share their error; the filter weighs them as one."""
+    interval_m: NotNegative = 1.0
+    """A reading counts once the car has gone this far since the last that counted."""
+    interval_s: NotNegative = 2.0
+    """And this long: twice the time over which the compass's error persists."""
+    gate_nis: Positive | None = 10.8
+    """Refuse readings whose normalised innovation squared is larger."""
 
 
 class Start(Section):

@@ -14,7 +14,7 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import DATA, ERROR, REMOTE, Block, CanFrames, Table
+from crosscue.replay.columns import DATA, ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Table
 from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
 
 from .database import CanDatabase, spell_id
@@ -274,7 +274,8 @@ class _LengthLimits:
         if frames.is_fd.any():
             longest = np.where(frames.is_fd, self._longest[1][slot], longest)
         good: NDArray[np.bool_] = frames.length >= self.shortest[slot]
-        good &= frames.length <= longest
+        # Where the log keeps no lengths there is nothing to hold against the database.
+        good &= (frames.length <= longest) | ((frames.length == LENGTH_UNKNOWN) & (longest >= 0))
         good &= frames.kind == DATA
         return good
 

@@ -1,0 +1,178 @@
+"""The pose part of the one loop: windows of signals in, rows of the pose track out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from typing import Final
+
+import numpy as np
+
+from crosscue.localization import compass, odometry, pose_track
+from crosscue.localization.odometry import OdometrySettings, Pending, TurnSignal, WheelSpeeds
+from crosscue.localization.pose_track import (
+    NO_HEADINGS,
+    Headings,
+    PoseColumns,
+    TrackCounts,
+    TrackSettings,
+    TrackState,
+)
+from crosscue.replay.columns import Floats
+from crosscue.replay.signals import Plan, Samples, Signal
+from crosscue.replay.vehicle import Vehicle
+from crosscue.replay.windows import Window
+
+UNKNOWN_HEADING_SD_RAD: Final = 1.8
+"""About the s.d. of an angle of which nothing is known."""
+
+
+def turn_signal_of(planned: Plan, vehicle: Vehicle) -> Signal | None:
+    """Which signal turns the pose; None leaves it to the wheels' difference."""
+    wish = vehicle.odometry.heading_from
+    offers = {"yaw_rate": Signal.YAW_RATE, "steering": Signal.STEERING}
+    if wish == "auto":
+        return next((s for s in offers.values() if planned.source_of(s) is not None), None)
+    return offers.get(wish)
+
+
+def odometry_settings(vehicle: Vehicle) -> OdometrySettings:
+    """The vehicle file's odometry section as the integrator takes it."""
+    fields = vehicle.odometry.model_dump(exclude={"heading_from", "accel_var_m2ps3"})
+    return OdometrySettings(**fields)
+
+
+def track_settings(vehicle: Vehicle) -> TrackSettings:
+    """The vehicle file's filter settings."""
+    return TrackSettings(
+        heading_interval_m=vehicle.compass.interval_m,
+        heading_interval_s=vehicle.compass.interval_s,
+        heading_gate_nis=vehicle.compass.gate_nis,
+        accel_var_m2ps3=vehicle.odometry.accel_var_m2ps3,
+    )
+
+
+@dataclass(slots=True)
+class PoseStage:
+    """Carries belief and pending rows from window to window.
+
+    Attributes:
+        vehicle: The vehicle file.
+        turn: What turns the pose, from ``turn_signal_of``.
+        notices: Plain sentences about the start, for the manifest.
+        odometry_counts: What became of wheel rows.
+        track_counts: What became of headings and intervals.
+    """
+
+    vehicle: Vehicle
+    turn: Signal | None
+    notices: list[str] = field(default_factory=list)
+    odometry_counts: odometry.OdometryCounts = field(default_factory=odometry.OdometryCounts)
+    track_counts: TrackCounts = field(default_factory=TrackCounts)
+    _pending: Pending = field(default_factory=Pending)
+    _state: TrackState | None = None
+    _last_ns: int | None = None
+
+    def __call__(self, window: Window) -> Iterator[PoseColumns]:
+        """Rows that this window completes."""
+        yield from self._advance(window, window.end_ns)
+
+    def finish(self) -> Iterator[PoseColumns]:
+        """Rows that waited for more odometry."""
+        if self._state is not None and self._last_ns is not None:
+            yield from self._advance(Window(self._last_ns, self._last_ns, {}), None)
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """What became of every odometry row and heading, for the manifest."""
+        return {"odometry": asdict(self.odometry_counts), "track": asdict(self.track_counts)}
+
+    def _advance(self, window: Window, until_ns: int | None) -> Iterator[PoseColumns]:
+        wheels = window.samples.get(Signal.WHEEL_SPEEDS)
+        headings = self._headings(window)
+        if self._state is None:
+            if wheels is None:
+                self._missed(headings)
+                return
+            headings = self._start(int(wheels.t_ns[0]), headings)
+        assert self._state is not None
+        self._last_ns = window.end_ns
+        step = odometry.integrate(
+            _wheels(wheels), odometry_settings(self.vehicle), self._turn(window), self._pending,
+            until_ns,
+        )  # fmt: skip
+        self._pending = step.pending
+        self.odometry_counts += step.counts
+        made = pose_track.advance(
+            self._state, step.increments, track_settings(self.vehicle), headings
+        )
+        self._state = made.state
+        self.track_counts += made.counts
+        if len(made.poses):
+            yield made.poses
+
+    def _start(self, t_ns: int, headings: Headings) -> Headings:
+        """Fix the first belief; the headings used for it are not used again."""
+        start = self.vehicle.start
+        heading_rad, sd_rad = start.heading_rad, start.heading_sd_rad
+        if heading_rad is None and len(headings):
+            mean = np.exp(1j * headings.heading_rad).mean()
+            heading_rad, sd_rad = float(np.angle(mean)), float(np.sqrt(headings.var_rad2[0]))
+            self.notices.append(
+                f"start heading {np.rad2deg(heading_rad):.1f} deg from the first "
+                f"{len(headings)} compass readings"
+            )
+            headings = NO_HEADINGS
+        elif heading_rad is None:
+            heading_rad, sd_rad = 0.0, UNKNOWN_HEADING_SD_RAD
+            self.notices.append(
+                "no start heading and no compass: the map's x axis points where the car did"
+            )
+        belief = pose_track.start_belief(
+            t_ns, start.x_m, start.y_m, heading_rad,
+            position_sd_m=start.position_sd_m, heading_sd_rad=sd_rad,
+        )  # fmt: skip
+        self._state = TrackState(belief)
+        return headings
+
+    def _missed(self, headings: Headings) -> None:
+        self.track_counts += TrackCounts(headings=len(headings), headings_late=len(headings))
+
+    def _turn(self, window: Window) -> TurnSignal | None:
+        if self.turn is None:
+            return None
+        kind: odometry.TurnKind = "yaw rate" if self.turn is Signal.YAW_RATE else "steering"
+        found = window.samples.get(self.turn)
+        if found is None:
+            return TurnSignal(np.empty(0, np.int64), np.empty(0), kind)
+        return TurnSignal(found.t_ns, found.values, kind)
+
+    def _headings(self, window: Window) -> Headings:
+        variance = self.vehicle.compass.heading_sd_rad**2
+        found = window.samples.get(Signal.HEADING)
+        if found is not None:
+            return Headings(found.t_ns, found.values, np.full(len(found.t_ns), variance))
+        found = window.samples.get(Signal.MAGNETIC_FIELD)
+        if found is None:
+            return NO_HEADINGS
+        heading_rad = compass.heading(found.values, compass_settings(self.vehicle))
+        return Headings(found.t_ns, heading_rad, np.full(len(found.t_ns), variance))
+
+
+def compass_settings(vehicle: Vehicle) -> compass.CompassSettings:
+    """The vehicle file's compass section as the compass takes it."""
+    section = vehicle.compass
+    return compass.CompassSettings(
+        mounting_yaw_rad=section.mounting_yaw_rad,
+        hard_iron_t=section.hard_iron_t,
+        soft_iron=section.soft_iron,
+        declination_rad=section.declination_rad,
+    )
+
+
+def _wheels(found: Samples | None) -> WheelSpeeds:
+    if found is None:
+        return WheelSpeeds(np.empty(0, np.int64), np.empty((0, 4)))
+    speeds: Floats = found.values
+    if np.isnan(speeds[:, :2]).all():
+        speeds = speeds[:, 2:]
+    return WheelSpeeds(found.t_ns, speeds)

@@ -1,0 +1,102 @@
+"""One boundary for errors: one line, the right exit status, no traceback without -v."""
+
+import argparse
+import subprocess
+import sys
+from types import ModuleType
+
+import pytest
+
+from crosscue.eval import cli
+from crosscue.replay.errors import CrosscueError, LogError, UsageError
+
+
+def _command(monkeypatch: pytest.MonkeyPatch, error: BaseException | None) -> None:
+    module = ModuleType("crosscue.eval.commands.fake", "A command for the test.")
+
+    def add_arguments(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--number", type=int, default=0)
+
+    def run(args: argparse.Namespace) -> int:
+        if error is not None:
+            raise error
+        return int(args.number)
+
+    module.__dict__.update(add_arguments=add_arguments, run=run)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setitem(cli.COMMANDS, "fake", ("fake", "for the test"))
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (LogError("a.mcap: cut; copy it again"), 4),
+        (UsageError("no such topic"), 2),
+        (CrosscueError("failed"), 1),
+        (KeyboardInterrupt(), 130),
+        (OSError(28, "No space left on device"), 1),
+        (ZeroDivisionError("a bug"), 1),
+        (MemoryError(), 1),
+    ],
+)
+def test_every_error_is_one_line_and_a_status(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: BaseException,
+    status: int,
+) -> None:
+    _command(monkeypatch, error)
+
+    assert cli.run(["fake"]) == status
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("crosscue: ")
+    assert captured.err.count("\n") == 1
+
+
+def test_hostile_bytes_in_an_error_are_shown_not_executed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _command(monkeypatch, LogError("\x1b[31mred\x07 /t\udcff"))
+    cli.run(["fake"])
+
+    assert capsys.readouterr().err == "crosscue: \\x1b[31mred\\x07 /t\\udcff\n"
+
+
+@pytest.mark.parametrize(
+    ("argv", "status"),
+    [([], 2), (["--help"], 0), (["fake", "--number", "3"], 3), (["fake", "--nubmer", "3"], 2),
+     (["fake", "--help"], 0), (["replya"], 2), (["--version"], 0)],
+)  # fmt: skip
+def test_usage(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    argv: list[str],
+    status: int,
+) -> None:
+    _command(monkeypatch, None)
+
+    assert cli.run(argv) == status
+    capsys.readouterr()
+
+
+def test_a_slip_of_the_pen_gets_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["replya"]) == 2
+    assert "did you mean 'replay'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
+def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run([*name.split(), "--help"]) == 0
+    said = capsys.readouterr().out
+    assert "example" in said
+    assert "exit status" in said
+
+
+def test_the_overview_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from crosscue.eval import cli; cli.run(['--help']);"
+        "heavy = {'numpy', 'torch', 'rerun', 'pyarrow', 'pydantic'} & set(sys.modules);"
+        "sys.exit(f'imported: {heavy}' if heavy else 0)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
