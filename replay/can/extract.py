@@ -37,6 +37,7 @@ class _Place:
     is_split: bool
     is_signed: bool
     is_float: bool
+    is_plain: bool
     float_bits: int
     arithmetic: str
 
@@ -49,6 +50,7 @@ def _place(signal: CanSignal) -> _Place:
         bit + signal.length > 64,
         signal.is_signed and not signal.is_float,
         signal.is_float,
+        signal.scale == 1 and signal.offset == 0,
         signal.length if signal.is_float else 0,
         signal.arithmetic.name,
     )
@@ -68,14 +70,15 @@ class _Together:
         self._taken = np.uint64(64) - bit  # bits of a split signal in its first word
         self._short = bool((length < 64).all())
         scales, offsets = [s.scale for s in signals], [s.offset for s in signals]
-        self._scale = None if all(x == 1 for x in scales) else _factors(scales)
-        self._offset = None if not any(offsets) else _factors(offsets)
+        self._scale = None if place.is_plain else _factors(scales)
+        self._offset = None if place.is_plain else _factors(offsets)
 
     def __call__(self, words: Words) -> Column:
         """Physical values, shape (S, N)."""
         raw = self._split(words) if self.place.is_split else self._whole(words)
         if self.place.is_float:
-            return self._scaled(_as_float(raw, self.place.float_bits))
+            with np.errstate(all="ignore"):  # whatever numbers the bits make
+                return self._scaled(_as_float(raw, self.place.float_bits))
         if self.place.arithmetic == Arithmetic.FLOAT.name:
             return self._scaled(raw.astype(np.float64))
         if self.place.arithmetic == Arithmetic.BIG.name:
@@ -207,7 +210,7 @@ class Extractor:
         names = {s.name for s in message.signals} if wanted is None else set(wanted)
         self.message = message
         self.signals = tuple(s for s in message.signals if s.name in names)
-        self.is_multiplexed = any(_switches_on(message, s) for s in message.signals)
+        self.is_multiplexed = any(switches_on(message, s) for s in message.signals)
         needed = [s for s in message.signals if s.name in names or s.is_multiplexer]
         self._root = _node(message, [s for s in needed if s.multiplexer is None], needed)
 
@@ -266,14 +269,15 @@ def _descend(
             filled[name].put(rows, values)
     for switch in node.switches:
         selector = columns[switch.name]
-        strange[rows[~_is_one_of(selector, switch.known)]] = True
+        strange[rows[~is_one_of(selector, switch.known)]] = True
         for branch in switch.branches:
-            there = rows[_is_one_of(selector, branch.values)]
+            there = rows[is_one_of(selector, branch.values)]
             if len(there):
                 _descend(branch.node, words, there, filled, strange)
 
 
-def _is_one_of(selector: Column, values: tuple[int, ...]) -> NDArray[np.bool_]:
+def is_one_of(selector: Column, values: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Rows whose multiplexer has one of ``values``, shape (N,)."""
     if selector.dtype == np.float64:
         return np.isin(np.trunc(selector), np.array(values, dtype=np.float64))
     limits = np.iinfo(selector.dtype)
@@ -290,14 +294,15 @@ def known_values(message: CanMessage, multiplexer: CanSignal) -> frozenset[int]:
     return frozenset(values)
 
 
-def _switches_on(message: CanMessage, signal: CanSignal) -> bool:
+def switches_on(message: CanMessage, signal: CanSignal) -> bool:
+    """Whether ``signal`` rules signals in or out; a multiplexer of nothing does not."""
     return signal.is_multiplexer and bool(known_values(message, signal))
 
 
 def _node(message: CanMessage, here: list[CanSignal], needed: list[CanSignal]) -> _Node:
     switches = []
     for multiplexer in here:
-        if not _switches_on(message, multiplexer):
+        if not switches_on(message, multiplexer):
             continue
         below: dict[frozenset[int], list[CanSignal]] = {}
         for signal in needed:

@@ -1,0 +1,182 @@
+"""Columns of physical values to payloads, by the same layouts that decode them.
+
+A value that its bits cannot hold is refused, never clipped: a simulated drive must not look
+plausible where it is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .extract import PRESENT_SUFFIX, is_one_of, known_values, switches_on
+from .layout import Arithmetic, CanMessage, CanSignal, overlaps
+
+Column: TypeAlias = NDArray[Any]
+
+_REALS: Final = {16: (np.float16, np.uint16), 32: (np.float32, np.uint32)}
+
+
+def encode(message: CanMessage, columns: Mapping[str, Column]) -> NDArray[np.uint8]:
+    """Payloads of N frames of one message.
+
+    Args:
+        message: Its layout.
+        columns: From signal name to N physical values; all signals that no multiplexer rules out in
+            every row. Values in rows where the multiplexers rule a signal out are ignored.
+            Companion columns ``SIGNAL_is_present``, as decoding gives them, are ignored too.
+
+    Returns:
+        Shape (N, message.length), uint8; bits of no signal are zero.
+
+    Raises:
+        ValueError: A column is missing, unknown, of another length or not numeric; a value is out
+            of its signal's range, not a number, or a multiplexer's value has no branch; or the
+            message's layout contradicts itself.
+    """
+    n = _checked_length(message, columns)
+    present = _presence(message, columns, n)
+    size = -(-message.length // 8)
+    little, big = np.zeros((2, n, size), dtype=np.uint64)
+    for signal in message.signals:
+        rows = present[signal.name]
+        if rows.any():
+            raw = np.zeros(n, dtype=np.uint64)
+            raw[rows] = _raw(message, signal, _column(message, columns, signal)[rows])
+            _place(big if signal.is_big_endian else little, signal, raw)
+    packed = little.astype("<u8").view(np.uint8) | big.astype(">u8").view(np.uint8)
+    return packed[:, : message.length]
+
+
+def _checked_length(message: CanMessage, columns: Mapping[str, Column]) -> int:
+    if message.problem:
+        raise ValueError(f"{message.name}: {message.problem}")
+    for a, b in overlaps(message):
+        raise ValueError(f"{message.name}: signals {a} and {b} share bits; cannot hold both")
+    known = {signal.name for signal in message.signals}
+    for name in columns:
+        if name not in known and name.removesuffix(PRESENT_SUFFIX) not in known:
+            raise ValueError(f"{message.name} has no signal {name!r}; there are: {sorted(known)}")
+    lengths = {name: np.shape(column) for name, column in columns.items()}
+    shapes = set(lengths.values())
+    if len(shapes) != 1 or len(next(iter(shapes))) != 1:
+        raise ValueError(f"{message.name}: want columns of one length (N,), got {lengths}")
+    return int(next(iter(shapes))[0])
+
+
+def _column(message: CanMessage, columns: Mapping[str, Column], signal: CanSignal) -> Column:
+    if signal.name not in columns:
+        raise ValueError(f"{message.name}: no column for signal {signal.name}")
+    column = np.asarray(columns[signal.name])
+    if column.dtype.kind not in "biuf":
+        raise ValueError(f"{message.name}.{signal.name}: want numbers, got {column.dtype}")
+    return column
+
+
+def _presence(
+    message: CanMessage, columns: Mapping[str, Column], n: int
+) -> dict[str, NDArray[np.bool_]]:
+    """Which rows hold each signal, as the multiplexers' values say."""
+    present: dict[str, NDArray[np.bool_]] = {}
+    waiting = list(message.signals)
+    while waiting:
+        signal = waiting.pop(0)
+        if signal.multiplexer is None:
+            rows = np.ones(n, dtype=np.bool_)
+        elif signal.multiplexer not in present:
+            waiting.append(signal)
+            continue
+        else:
+            above = message.signal(signal.multiplexer)
+            rows = present[above.name].copy()
+            if rows.any():
+                selector = _column(message, columns, above)
+                rows &= is_one_of(selector, tuple(signal.branches))
+        present[signal.name] = rows
+        if switches_on(message, signal) and rows.any():
+            _refuse_strange(message, signal, _column(message, columns, signal)[rows])
+    return present
+
+
+def _refuse_strange(message: CanMessage, multiplexer: CanSignal, selector: Column) -> None:
+    known = tuple(sorted(known_values(message, multiplexer)))
+    strange = ~is_one_of(selector, known)
+    if strange.any():
+        raise ValueError(
+            f"{message.name}.{multiplexer.name}: {selector[strange][0]} has no branch; "
+            f"there are: {known[:20]}"
+        )
+
+
+def _raw(message: CanMessage, signal: CanSignal, values: Column) -> NDArray[np.uint64]:
+    """Raw bits, right-aligned; bits above the signal's length may be set."""
+    where = f"{message.name}.{signal.name}"
+    if signal.is_float:
+        return _raw_real(where, signal, values.astype(np.float64))
+    if signal.arithmetic in (Arithmetic.INT64, Arithmetic.UINT64) and values.dtype.kind in "biu":
+        return _raw_whole(where, signal, values)
+    low, high = signal.raw_range
+    steps = np.rint((values.astype(np.float64) - float(signal.offset)) / float(signal.scale))
+    # Both limits are powers of two, hence exact in float64; NaN is in no range.
+    _refuse_outside(where, signal, values, (steps >= float(low)) & (steps < float(high + 1)))
+    return steps.astype(np.int64).view(np.uint64) if signal.is_signed else steps.astype(np.uint64)
+
+
+def _raw_real(where: str, signal: CanSignal, values: NDArray[np.float64]) -> NDArray[np.uint64]:
+    if signal.scale != 1 or signal.offset != 0:
+        values = (values - float(signal.offset)) / float(signal.scale)
+    if signal.length == 64:
+        return values.view(np.uint64)
+    real, whole = _REALS[signal.length]
+    with np.errstate(over="ignore"):
+        narrow = values.astype(real)
+    _refuse_outside(where, signal, values, np.isinf(narrow) <= np.isinf(values))
+    return narrow.view(whole).astype(np.uint64)
+
+
+def _raw_whole(where: str, signal: CanSignal, values: Column) -> NDArray[np.uint64]:
+    """Without floating point: the differences are right modulo 2**64, and fit."""
+    scale, offset = int(signal.scale), int(signal.offset)
+    ends = [raw * scale + offset for raw in signal.raw_range]
+    _refuse_outside(where, signal, values, (values >= min(ends)) & (values <= max(ends)))
+    wide = values.astype(np.uint64 if values.dtype.kind in "bu" else np.int64).view(np.uint64)
+    steps = wide - np.uint64(offset % 2**64)
+    if scale < 0:
+        steps = np.uint64(0) - steps
+    size = abs(scale)
+    whole: Column = steps.view(np.int64) if signal.is_signed else steps
+    quotient, rest = np.divmod(whole, whole.dtype.type(size))
+    left = whole.dtype.type(size) - rest
+    quotient += (rest > left) | ((rest == left) & (quotient % 2 == 1))
+    raw: NDArray[np.uint64] = quotient.view(np.uint64)
+    return raw
+
+
+def _refuse_outside(
+    where: str, signal: CanSignal, values: Column, is_inside: NDArray[np.bool_]
+) -> None:
+    if is_inside.all():
+        return
+    row = int(np.argmin(is_inside))
+    ends = sorted(raw * signal.scale + signal.offset for raw in signal.raw_range)
+    span = f"{signal.length}-bit floats" if signal.is_float else f"{ends[0]} to {ends[1]}"
+    raise ValueError(f"{where}: {values[row]} does not fit its bits, which hold {span}")
+
+
+def _place(words: NDArray[np.uint64], signal: CanSignal, raw: NDArray[np.uint64]) -> None:
+    """Put the raw bits into words of shape (N, W) that count bits in the signal's direction."""
+    word, bit = divmod(signal.first_bit, 64)
+    raw = raw & np.uint64(2**signal.length - 1)
+    over = bit + signal.length - 64
+    if not signal.is_big_endian:
+        words[:, word] |= raw << np.uint64(bit)
+        if over > 0:
+            words[:, word + 1] |= raw >> np.uint64(64 - bit)
+    elif over <= 0:
+        words[:, word] |= raw << np.uint64(-over)
+    else:
+        words[:, word] |= raw >> np.uint64(over)
+        words[:, word + 1] |= raw << np.uint64(64 - over)

@@ -1,0 +1,216 @@
+"""Columns equal what cantools decodes frame by frame, on random payloads of random layouts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cantools.database.can import Message
+from cantools.database.can.formats import dbc
+from cantools.database.errors import DecodeError
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.can.decode import BusDecoder, DecodeSettings, Engine
+from crosscue.replay.can.encode import encode
+from crosscue.replay.can.extract import PRESENT_SUFFIX
+from crosscue.replay.can.layout import Arithmetic, CanMessage, CanSignal
+from crosscue.replay.columns import Block, Table
+from crosscue.replay.ledger import Ledger
+from support.can_layouts import block_of, dbc_text, frames_of, messages
+
+ENGINES: tuple[Engine, ...] = ("numpy", "numba")
+LAYOUTS = st.one_of(messages(), messages(multiplexed=True))
+SEEDS = st.integers(0, 2**32 - 1)
+ROWS = 24
+
+varied = partial(
+    settings,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
+
+
+def payloads(message: CanMessage, seed: int) -> NDArray[np.uint8]:
+    """Random bytes, and the two extremes."""
+    drawn = np.random.default_rng(seed).integers(0, 256, (ROWS, message.length), dtype=np.uint8)
+    drawn[0], drawn[1] = 0, 255
+    return drawn
+
+
+def read_back(message: CanMessage, folder: Path) -> tuple[CanDatabase, Message]:
+    """The message as our reader and cantools understand the DBC text that defines it."""
+    text = dbc_text([message])
+    path = folder / "layout.dbc"
+    path.write_text(text, encoding="utf-8")
+    (theirs,) = dbc.load_string(text, strict=True).messages
+    return CanDatabase.load([path]), theirs
+
+
+def decode_all(
+    database: CanDatabase, message: CanMessage, payload: NDArray[np.uint8], engine: Engine
+) -> tuple[Block | None, BusDecoder, Ledger]:
+    ledger = Ledger("made up")
+    ledger.find("can0", len(payload))
+    decode = BusDecoder(database, "can0", ledger, None, DecodeSettings(engine=engine))
+    blocks = decode(block_of(frames_of(payload, message.arbitration_id, message.is_extended)))
+    assert len(blocks) <= 1
+    return (blocks[0] if blocks else None), decode, ledger
+
+
+def by_cantools(message: Message, payload: NDArray[np.uint8]) -> list[dict[str, Any] | None]:
+    """What cantools makes of each row; None where it refuses a multiplexer's value."""
+    rows: list[dict[str, Any] | None] = []
+    for row in payload:
+        try:
+            rows.append(dict(message.decode_simple(row.tobytes(), decode_choices=False)))
+        except DecodeError:
+            rows.append(None)
+    return rows
+
+
+def row_of(table: Table, i: int) -> dict[str, Any]:
+    """One row as Python numbers, without the signals that are not in it."""
+    columns = table.columns
+    row = {name: column[i].item() for name, column in columns.items()}
+    for name in columns:
+        if name.endswith(PRESENT_SUFFIX) and not row.pop(name):
+            del row[name.removesuffix(PRESENT_SUFFIX)]
+    return row
+
+
+def assert_same_values(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
+    for name, value in theirs.items():
+        if math.isnan(value):
+            assert math.isnan(ours[name])
+        elif isinstance(ours[name], int):
+            assert ours[name] == value
+        else:
+            assert ours[name] == float(value)
+    assert all(math.isnan(ours[name]) for name in ours.keys() - theirs.keys())
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@given(message=LAYOUTS, seed=SEEDS)
+@varied(max_examples=60)
+def test_every_value_equals_cantools(
+    message: CanMessage, seed: int, engine: Engine, tmp_path: Path
+) -> None:
+    database, theirs = read_back(message, tmp_path)
+    payload = payloads(message, seed)
+
+    block, decoder, ledger = decode_all(database, message, payload, engine)
+
+    expected = by_cantools(theirs, payload)
+    good = [i for i, row in enumerate(expected) if row is not None]
+    assert sum(decoder.counts.values()) == len(payload) - len(good)
+    assert ledger.topic("can0").used == len(good) == (len(block) if block else 0)
+    if block is None:
+        return
+    assert block.log_ns.tolist() == [i * 1_000_000 for i in good]
+    assert isinstance(block.rows, Table)
+    for at, i in enumerate(good):
+        row = expected[i]
+        assert row is not None
+        assert_same_values(row_of(block.rows, at), row)
+    dtypes = {name: column.dtype for name, column in block.rows.columns.items()}
+    assert dtypes == decoder.columns_of("Random")
+
+
+def invertible(message: CanMessage) -> CanMessage:
+    """The same bits, scaled so that float64 can tell neighbouring values apart."""
+    return replace(
+        message,
+        signals=tuple(
+            replace(s, scale=1, offset=0)
+            if s.arithmetic is Arithmetic.BIG
+            or (not s.is_integral and (s.length > 40 or abs(s.offset) > 1000))
+            else s
+            for s in message.signals
+        ),
+    )
+
+
+@given(message=LAYOUTS.map(invertible), seed=SEEDS)
+@varied(max_examples=60)
+def test_encoding_gives_back_the_bits_and_equals_cantools(
+    message: CanMessage, seed: int, tmp_path: Path
+) -> None:
+    database, theirs = read_back(message, tmp_path)
+    (ours,) = database.messages
+    payload = payloads(message, seed)
+    block, _, _ = decode_all(database, message, payload, "numpy")
+    if block is None:
+        return
+    assert isinstance(block.rows, Table)
+
+    encoded = encode(ours, block.rows.columns)
+
+    again, decoder, _ = decode_all(database, message, encoded, "numpy")
+    assert not decoder.counts
+    assert again is not None
+    assert isinstance(again.rows, Table)
+    for name, column in block.rows.columns.items():
+        np.testing.assert_array_max_ulp(column.astype(float), again.rows[name].astype(float), 4)
+    good = [row for row in by_cantools(theirs, payload) if row is not None]
+    for values, row in zip(good, encoded, strict=True):
+        if not any(math.isnan(v) or math.isinf(v) for v in values.values()):
+            assert theirs.encode(values, strict=False) == row.tobytes()
+
+
+WIDE = CanMessage(
+    name="Wide",
+    arbitration_id=1,
+    is_extended=False,
+    length=8,
+    signals=(CanSignal("counter", start=0, length=64),),
+)
+
+
+def test_64_bit_counters_keep_their_last_digit() -> None:
+    top = 2**64 - 1
+    column = np.array([0, 2**53 + 1, top - 1, top], dtype=np.uint64)
+
+    payload = encode(WIDE, {"counter": column})
+
+    block, _, _ = decode_all(CanDatabase.of([WIDE]), WIDE, payload, "numpy")
+    assert block is not None
+    assert isinstance(block.rows, Table)
+    assert block.rows["counter"].tolist() == [0, 2**53 + 1, top - 1, top]
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (-1.0, "-1.0 does not fit its bits, which hold 0.0 to 25.5"),
+        (25.6, "25.6 does not fit"),
+        (float("nan"), "nan does not fit"),
+        (float("inf"), "inf does not fit"),
+    ],
+)
+def test_values_out_of_range_are_refused_not_clipped(value: float, words: str) -> None:
+    signal = CanSignal("speed", start=0, length=8, scale=0.1)
+    message = replace(WIDE, signals=(signal,))
+
+    with pytest.raises(ValueError, match=rf"Wide\.speed: {words}"):
+        encode(message, {"speed": np.array([1.0, value])})
+
+
+def test_whole_numbers_beyond_64_bits_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"Wide\.counter: -1 does not fit"):
+        encode(WIDE, {"counter": np.array([5, -1], dtype=np.int64)})
+
+
+def test_encoding_asks_for_every_signal_and_knows_no_other() -> None:
+    with pytest.raises(ValueError, match="no signal 'count'; there are"):
+        encode(WIDE, {"count": np.array([1])})
+    pair = replace(WIDE, signals=(CanSignal("a", 0, 8), CanSignal("b", 8, 8)))
+    with pytest.raises(ValueError, match="no column for signal b"):
+        encode(pair, {"a": np.array([1])})
