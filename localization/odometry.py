@@ -29,6 +29,14 @@ BY_YAW_RATE: Final = 0
 BY_STEERING: Final = 1
 BY_WHEELS: Final = 2
 
+_POSITIVE: Final = (
+    "track_width_m",
+    "wheelbase_m",
+    "wheel_scale",
+    "right_wheel_scale",
+    "max_gap_s",
+)
+
 
 @dataclass(frozen=True, slots=True)
 class OdometrySettings:
@@ -38,6 +46,8 @@ class OdometrySettings:
         track_width_m: Between left and right wheels.
         wheelbase_m: Between the axles; needed for steering and for the front wheels.
         wheel_scale: True speed per reported speed.
+        right_wheel_scale: Further scale of the right-hand wheels. A tyre a thousandth larger than
+            the other turns the wheels' heading by half a radian in a kilometre.
         use_front_wheels: Average all four wheels where there are four; else the rear two.
         wheel_step_mps: One bit of the reported wheel speed; readings are off by up to half of it.
         slip_per_sqrt_m: S.d. of the distance after one metre.
@@ -58,6 +68,7 @@ class OdometrySettings:
     track_width_m: float
     wheelbase_m: float | None = None
     wheel_scale: float = 1.0
+    right_wheel_scale: float = 1.0
     use_front_wheels: bool = False
     wheel_step_mps: float = 0.0
     slip_per_sqrt_m: float = 0.02
@@ -79,7 +90,7 @@ class OdometrySettings:
         Raises:
             ValueError: Naming the field and the value.
         """
-        for name in ("track_width_m", "wheelbase_m", "wheel_scale", "max_gap_s"):
+        for name in _POSITIVE:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name}: want > 0, got {value}")
@@ -310,7 +321,8 @@ def _check_geometry(settings: OdometrySettings, turn: TurnSignal | None) -> None
 
 def _at_rear_axle(wheels: WheelSpeeds, settings: OdometrySettings) -> tuple[Floats, Floats]:
     """Speed of the rear axle's centre and yaw rate by the difference of left and right."""
-    speeds = wheels.signed_mps() * settings.wheel_scale
+    sides = np.tile([1.0, settings.right_wheel_scale], wheels.wheels_mps.shape[1] // 2)
+    speeds = wheels.signed_mps() * settings.wheel_scale * sides
     left, right = speeds[:, -2], speeds[:, -1]
     if settings.use_front_wheels and speeds.shape[1] == 4 and settings.wheelbase_m is not None:
         front_sideways_mps = (right - left) / settings.track_width_m * settings.wheelbase_m

@@ -1,0 +1,299 @@
+"""Laws of dead reckoning from wheel speeds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.localization.odometry import (
+    BY_STEERING,
+    BY_WHEELS,
+    BY_YAW_RATE,
+    OdometryCounts,
+    OdometrySettings,
+    Pending,
+    TurnSignal,
+    WheelSpeeds,
+    integrate,
+)
+from crosscue.replay.columns import Floats, Int64s
+from support.simulated_drive import BASE_M, TRACK_M, drive, gyro, wheels
+
+CAR = OdometrySettings(track_width_m=TRACK_M, wheelbase_m=BASE_M)
+
+
+def times(n: int, period_ns: int = 20_000_000) -> Int64s:
+    return np.arange(n, dtype=np.int64) * period_ns
+
+
+def both_wheels(speed_mps: float, n: int = 101) -> WheelSpeeds:
+    return WheelSpeeds(times(n), np.full((n, 2), speed_mps))
+
+
+def on_circle(radius_m: float, speed_mps: float, n: int = 101) -> WheelSpeeds:
+    """Four wheels rolling without slip about a point beside the rear axle, to the left."""
+    yaw = speed_mps / radius_m
+    left, right = radius_m - TRACK_M / 2, radius_m + TRACK_M / 2
+    front = [math.hypot(left, BASE_M) * yaw, math.hypot(right, BASE_M) * yaw]
+    return WheelSpeeds(times(n), np.tile([*front, left * yaw, right * yaw], (n, 1)))
+
+
+@given(speed=st.floats(-20.0, 40.0), scale=st.floats(0.9, 1.1))
+@settings(max_examples=30, deadline=None)
+def test_straight_distance_is_speed_times_time_times_scale(speed: float, scale: float) -> None:
+    made = integrate(both_wheels(speed), replace(CAR, wheel_scale=scale)).increments
+
+    assert made.distance_m.sum() == pytest.approx(2.0 * speed * scale, abs=1e-9)
+    assert made.turn_rad.sum() == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("use_front_wheels", [False, True])
+def test_a_left_circle_turns_left_by_its_own_angle(use_front_wheels: bool) -> None:
+    car = replace(CAR, use_front_wheels=use_front_wheels)
+    made = integrate(on_circle(8.0, 4.0), car).increments
+
+    assert made.distance_m.sum() == pytest.approx(8.0)
+    assert made.turn_rad.sum() == pytest.approx(1.0)
+    assert set(made.turn_source) == {BY_WHEELS}
+
+
+def test_wheels_steering_and_gyro_agree_on_a_circle() -> None:
+    speeds = on_circle(12.0, 3.0)
+    n = len(speeds)
+    steering = TurnSignal(times(n), np.full(n, 15.0 * math.atan(BASE_M / 12.0) + 0.1), "steering")
+    rate = TurnSignal(times(n), np.full(n, (3.0 / 12.0) / 0.98 + 0.03), "yaw rate")
+    car = replace(
+        CAR,
+        steering_ratio=15.0,
+        steering_offset_rad=0.1,
+        gyro_bias_radps=0.03,
+        yaw_rate_scale=0.98,
+    )
+    by_wheels = integrate(speeds, car).increments
+    by_steering = integrate(speeds, car, steering).increments
+    by_gyro = integrate(speeds, car, rate).increments
+
+    np.testing.assert_allclose(by_steering.turn_rad, by_wheels.turn_rad, rtol=1e-9)
+    np.testing.assert_allclose(by_gyro.turn_rad, by_wheels.turn_rad, rtol=1e-9)
+    assert set(by_steering.turn_source) == {BY_STEERING}
+    assert set(by_gyro.turn_source) == {BY_YAW_RATE}
+
+
+def test_backing_with_wheels_to_the_left_turns_the_car_right() -> None:
+    backwards = WheelSpeeds(times(51), -on_circle(10.0, 2.0, 51).wheels_mps)
+    steering = TurnSignal(times(51), np.full(51, 0.2), "steering")
+
+    made = integrate(backwards, CAR, steering).increments
+    assert (made.distance_m < 0).all()
+    assert (made.turn_rad < 0).all()
+    assert (integrate(backwards, CAR).increments.turn_rad < 0).all()
+
+
+def test_a_reverse_flag_is_a_minus_sign() -> None:
+    forward = on_circle(10.0, 2.0, 51)
+    flagged = WheelSpeeds(forward.t_ns, forward.wheels_mps, np.ones(51, np.bool_))
+    signed = WheelSpeeds(forward.t_ns, -forward.wheels_mps)
+
+    ours, theirs = integrate(flagged, CAR).increments, integrate(signed, CAR).increments
+    np.testing.assert_array_equal(ours.distance_m, theirs.distance_m)
+    np.testing.assert_array_equal(ours.turn_rad, theirs.turn_rad)
+
+
+def test_mirrored_wheels_mirror_the_turn() -> None:
+    speeds = on_circle(9.0, 3.0)
+    mirrored = WheelSpeeds(speeds.t_ns, speeds.wheels_mps[:, [1, 0, 3, 2]])
+    car = replace(CAR, use_front_wheels=True)
+
+    ours, theirs = integrate(speeds, car).increments, integrate(mirrored, car).increments
+    np.testing.assert_allclose(ours.turn_rad, -theirs.turn_rad)
+    np.testing.assert_allclose(ours.distance_m, theirs.distance_m)
+
+
+def test_a_larger_right_tyre_is_corrected() -> None:
+    turning = np.tile([10.0, 10.0 / 1.001], (101, 1))
+    made = integrate(WheelSpeeds(times(101), turning), replace(CAR, right_wheel_scale=1.001))
+
+    np.testing.assert_allclose(made.increments.turn_rad, 0.0, atol=1e-15)
+
+
+def test_a_gyro_faster_than_the_wheels_is_integrated_not_sampled() -> None:
+    """A bump between two wheel rows, seen by the gyro alone, is not lost."""
+    bump = np.zeros(11)
+    bump[5] = 1.0
+    rate = TurnSignal(times(11, 10_000_000), bump, "yaw rate")
+    slow = WheelSpeeds(times(2, 100_000_000), np.zeros((2, 2)))
+
+    assert integrate(slow, CAR, rate).increments.turn_rad[0] == pytest.approx(0.01)
+
+
+def test_a_hole_in_the_gyro_is_bridged_by_the_wheels_and_counted() -> None:
+    speeds = on_circle(20.0, 5.0)
+    has = np.abs(times(101) - 1_000_000_000) >= 300_000_000
+    rate = TurnSignal(times(101)[has], np.full(int(has.sum()), 0.25), "yaw rate")
+    made = integrate(speeds, CAR, rate)
+
+    by_wheels = made.increments.turn_source == BY_WHEELS
+    assert made.counts.turn_missing == by_wheels.sum() == 30
+    assert made.increments.turn_rad.sum() == pytest.approx(0.5)
+    assert (made.increments.turn_var_rad2[by_wheels] > made.increments.turn_var_rad2[0]).all()
+
+
+def test_bad_rows_are_dropped_and_counted() -> None:
+    t_ns = np.array([0, 10, 10, 5, 20, 30, 40], np.int64) * 1_000_000
+    speeds = np.full((7, 2), 3.0)
+    speeds[4, 1] = np.nan
+    speeds[5, 0] = np.inf
+    made = integrate(WheelSpeeds(t_ns, speeds), CAR)
+
+    assert made.counts == OdometryCounts(
+        rows=7, not_finite=2, repeated=1, out_of_order=1, intervals=2
+    )
+    assert made.increments.start_ns.tolist() == [0, 10_000_000]
+    assert made.increments.stop_ns.tolist() == [10_000_000, 40_000_000]
+
+
+def test_bad_turn_rows_are_dropped_and_counted() -> None:
+    t_ns = np.array([0, 50, 50, 40, 60, 100], np.int64) * 1_000_000
+    values = np.array([0.1, 0.1, 9.0, 9.0, np.nan, 0.1])
+    speeds = WheelSpeeds(times(6, 20_000_000), np.zeros((6, 2)))
+    made = integrate(speeds, CAR, TurnSignal(t_ns, values, "yaw rate"))
+
+    assert (made.counts.turn_rows, made.counts.turn_dropped) == (6, 3)
+    assert made.increments.turn_rad.sum() == pytest.approx(0.01)
+
+
+def test_a_gap_is_told_and_makes_unsure() -> None:
+    t_ns = np.array([0, 100, 200, 3_200, 3_300], np.int64) * 1_000_000
+    made = integrate(WheelSpeeds(t_ns, np.full((5, 2), 10.0)), CAR)
+
+    assert made.increments.is_gap.tolist() == [False, False, True, False]
+    assert made.counts.gaps == 1
+    assert made.increments.distance_var_m2[2] > 6.0**2
+    assert made.increments.distance_var_m2[3] < 0.1**2
+
+
+def test_a_gap_contains_what_a_car_may_do_meanwhile() -> None:
+    """Brake at the limit and speed up again: within three of the stated deviations."""
+    t_ns = np.array([0, 4_000], np.int64) * 1_000_000
+    made = integrate(WheelSpeeds(t_ns, np.full((2, 2), 15.0)), CAR).increments
+    true_m = 15.0 * 4.0 - 3.0 * 2.0**2
+
+    assert abs(made.distance_m[0] - true_m) < 3.0 * math.sqrt(made.distance_var_m2[0])
+
+
+@pytest.mark.parametrize("kind", ["wheels", "yaw rate", "steering"])
+def test_variances_do_not_depend_on_the_sampling_rate(kind: str) -> None:
+    def sums(rate_hz: float) -> Floats:
+        truth = drive(np.random.default_rng(4), seconds=40.0, rate_hz=rate_hz)
+        speeds = wheels(truth, CAR)
+        turn = None
+        if kind == "yaw rate":
+            turn = gyro(truth, CAR)
+        elif kind == "steering":
+            turn = TurnSignal(truth.t_ns, 0.3 * truth.yaw_radps, "steering")
+        made = integrate(speeds, CAR, turn).increments
+        return np.array([made.distance_var_m2.sum(), made.turn_var_rad2.sum()])
+
+    np.testing.assert_allclose(sums(100.0), sums(25.0), rtol=0.01)
+
+
+def test_rounding_of_the_wheel_speed_is_in_the_variance() -> None:
+    """Simulated: random true speeds, rounded; the distance is off by as much as claimed."""
+    rng = np.random.default_rng(8)
+    car = replace(CAR, wheel_step_mps=0.5, slip_per_sqrt_m=0.0)
+    misses, claims = [], []
+    for _ in range(300):
+        true = rng.uniform(5.0, 15.0, (60, 2))
+        rounded = np.round(true / 0.5) * 0.5
+        exact = integrate(WheelSpeeds(times(60), true), car).increments
+        made = integrate(WheelSpeeds(times(60), rounded), car).increments
+        misses.append((made.distance_m - exact.distance_m).sum())
+        claims.append(made.distance_var_m2.sum())
+
+    assert np.mean(np.square(misses)) == pytest.approx(np.mean(claims), rel=0.25)
+
+
+def test_nothing_in_nothing_out() -> None:
+    empty = WheelSpeeds(np.empty(0, np.int64), np.empty((0, 4)))
+    one = WheelSpeeds(times(1), np.ones((1, 2)))
+    no_turn = TurnSignal(np.empty(0, np.int64), np.empty(0), "yaw rate")
+
+    assert len(integrate(empty, CAR).increments) == 0
+    assert len(integrate(empty, CAR, no_turn).increments) == 0
+    assert len(integrate(one, CAR).increments) == 0
+    assert integrate(both_wheels(2.0), CAR, no_turn).counts.turn_missing == 100
+
+
+@given(
+    cuts=st.lists(st.integers(-10, 2_100), max_size=5),
+    turn_period=st.integers(3, 90),
+    lag=st.integers(-400, 400),
+)
+@settings(max_examples=60, deadline=None)
+def test_windows_give_the_same_increments_bit_for_bit(
+    cuts: list[int], turn_period: int, lag: int
+) -> None:
+    rng = np.random.default_rng(0)
+    speeds = WheelSpeeds(times(101), rng.normal(5.0, 1.0, (101, 2)))
+    turn_t = times(2_000 // turn_period, turn_period * 1_000_000) + lag * 1_000_000
+    turn = TurnSignal(turn_t, rng.normal(size=len(turn_t)), "yaw rate")
+    car = replace(CAR, max_gap_s=0.08)
+    whole = integrate(speeds, car, turn)
+
+    edges = [-(10**10), *sorted(c * 1_000_000 for c in cuts), 10**10]
+    pending, counts, parts = Pending(), OdometryCounts(), []
+    for low, high in pairwise(edges):
+        w = slice(*np.searchsorted(speeds.t_ns, [low, high]))
+        g = slice(*np.searchsorted(turn_t, [low, high]))
+        made = integrate(
+            WheelSpeeds(speeds.t_ns[w], speeds.wheels_mps[w]),
+            car,
+            TurnSignal(turn_t[g], turn.values[g], "yaw rate"),
+            pending,
+            None if high == edges[-1] else high,
+        )
+        pending, counts = made.pending, counts + made.counts
+        parts.append(made.increments)
+
+    for name in ("start_ns", "stop_ns", "distance_m", "turn_rad", "turn_var_rad2", "turn_source"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(joined, getattr(whole.increments, name))
+    assert counts == whole.counts
+
+
+def test_waiting_rows_stay_few() -> None:
+    """A window's rest is what the next one needs, however long the drive."""
+    pending = Pending()
+    for k in range(50):
+        t_ns = times(100) + k * 2_000_000_000
+        window = WheelSpeeds(t_ns, np.ones((100, 2)))
+        turn = TurnSignal(t_ns, np.zeros(100), "yaw rate")
+        pending = integrate(window, CAR, turn, pending, int(t_ns[-1]) + 1).pending
+        assert len(pending.t_ns) + len(pending.turn_t_ns) <= 2
+
+
+def test_nonsense_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"wheels_mps: want \(3, 2\) or \(3, 4\), got \(3, 3\)"):
+        WheelSpeeds(times(3), np.zeros((3, 3)))
+    with pytest.raises(ValueError, match=r"is_reverse: want \(3,\), got \(2,\)"):
+        WheelSpeeds(times(3), np.zeros((3, 2)), np.zeros(2, np.bool_))
+    with pytest.raises(ValueError, match=r"values: want \(3,\), got \(2,\)"):
+        TurnSignal(times(3), np.zeros(2), "steering")
+    with pytest.raises(ValueError, match="track_width_m: want > 0, got 0"):
+        OdometrySettings(track_width_m=0.0)
+    with pytest.raises(ValueError, match="slip_per_sqrt_m: want >= 0, got -1"):
+        OdometrySettings(track_width_m=1.6, slip_per_sqrt_m=-1.0)
+    with pytest.raises(ValueError, match="steering_ratio: want finite and not 0"):
+        OdometrySettings(track_width_m=1.6, steering_ratio=0.0)
+    with pytest.raises(ValueError, match="wheelbase_m: wanted for steering"):
+        integrate(
+            both_wheels(1.0),
+            OdometrySettings(track_width_m=1.6),
+            TurnSignal(times(2), np.zeros(2), "steering"),
+        )
