@@ -1,5 +1,57 @@
-"""Messages to columns: one decoder per way of coding, one table from message type to role.
+"""Messages to columns: one decoder per way of coding, one table from message type to columns.
 
 ``decoder_for(topic)`` gives a function from a block of ``Messages`` to a block of ``CanFrames``,
 ``Table`` or ``Images`` with ``header_ns``; what cannot be decoded is skipped in the ledger.
 """
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Final, Protocol, cast
+
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.ledger import Ledger
+
+__all__ = ["Decoder", "decoder_for"]
+
+
+class Decoder(Protocol):
+    """From a block as read to a block of columns of the rows that could be decoded."""
+
+    def __call__(self, block: Block, ledger: Ledger, /) -> Block:
+        """Decode; blocks that are columns already come back as they are.
+
+        Messages that do not fit are skipped in ``ledger`` with reason, count and time.
+        """
+        ...
+
+
+BY_ENCODING: Final[Mapping[str, str]] = {
+    "columns": "crosscue.replay.decode:_as_it_is",
+    "cdr": "crosscue.replay.decode.ros:ros_decoder",
+    "ros1": "crosscue.replay.decode.ros:ros_decoder",
+}
+"""From message encoding to ``module:function`` from topic to decoder or None."""
+
+
+def decoder_for(topic: Topic) -> Decoder | None:
+    """The decoder of ``topic``, or None if nobody here knows its encoding or type.
+
+    Raises:
+        SchemaError: The log defines the type, but the definition is damaged, too large, or lies.
+    """
+    maker = BY_ENCODING.get(topic.encoding)
+    if maker is None:
+        return None
+    module, _, function = maker.partition(":")
+    make = cast("Callable[[Topic], Decoder | None]", getattr(import_module(module), function))
+    return make(topic)
+
+
+def _as_it_is(topic: Topic) -> Decoder:
+    return _unchanged
+
+
+def _unchanged(block: Block, ledger: Ledger) -> Block:
+    return block

@@ -1,0 +1,147 @@
+"""The values of walked messages, gathered when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Bytes, Int64s
+
+from .plan import Plan, Value
+from .walk import Bools, Found, Rows, gather
+
+
+@dataclass(slots=True, eq=False)
+class Part:
+    """Messages of one byte order.
+
+    Attributes:
+        found: Where their fields lie.
+        rows: Shape (M,): the messages of the part that fit.
+    """
+
+    found: Found
+    rows: Rows
+
+
+@dataclass(slots=True, eq=False)
+class Fields:
+    """Columns of the M messages that fit their definition.
+
+    Attributes:
+        plan: Of their type.
+        buffer: All bytes.
+        parts: By byte order; nearly always one.
+        order: Brings rows of all parts, one part after the other, into the block's order.
+    """
+
+    plan: Plan
+    buffer: Bytes
+    parts: tuple[Part, ...]
+    order: Rows | None
+
+    def __len__(self) -> int:
+        return sum(len(part.rows) for part in self.parts)
+
+    def number(self, path: str) -> NDArray[np.generic]:
+        """Values at ``path``, native byte order: shape (M,), or (M, k) for an array of k.
+
+        Times and durations come as int64 nanoseconds.
+        """
+        value = self.plan.values[path]
+        return self._joined(lambda part: _numbers(part, value, is_cdr=self.plan.is_cdr))
+
+    def text_ranges(self, path: str) -> tuple[Int64s, Int64s]:
+        """First byte and length of the string at ``path``, each of shape (M,)."""
+        first = self._joined(lambda part: part.found.texts[path][0][part.rows])
+        length = self._joined(lambda part: part.found.texts[path][1][part.rows])
+        return first.astype(np.int64, copy=False), length.astype(np.int64, copy=False)
+
+    def texts(self, path: str) -> tuple[str, ...]:
+        """Strings at ``path``; one object per different string in a row."""
+        first, length = self.text_ranges(path)
+        out: list[str] = []
+        last, text = b"", ""
+        for begin, size in zip(first.tolist(), length.tolist(), strict=True):
+            raw = self.buffer[begin : begin + size].tobytes()
+            if raw != last:
+                last, text = raw, raw.decode("utf-8")
+            out.append(text)
+        return tuple(out)
+
+    def items(self, path: str) -> tuple[Int64s, Int64s]:
+        """First byte and number of items of the sequence at ``path``, each of shape (M,)."""
+        first = self._joined(lambda part: part.found.sequences[path][0][part.rows])
+        count = self._joined(lambda part: part.found.sequences[path][1][part.rows])
+        return first.astype(np.int64, copy=False), count.astype(np.int64, copy=False)
+
+    def padded(self, path: str, width: int) -> NDArray[np.float64]:
+        """Sequences of numbers as shape (M, k), k <= ``width``, filled up with NaN."""
+        code = self.plan.sequences[path].code
+
+        def of(part: Part) -> NDArray[np.generic]:
+            first, count = (each[part.rows] for each in part.found.sequences[path])
+            out = np.full((len(first), width), np.nan)
+            for k in range(min(int(count.max(initial=0)), width)):
+                has = count > k
+                place = first[has] + k * int(code[1])
+                out[has, k] = gather(part.found.buffer, _ordered(code, part.found), 0, place)
+            return out
+
+        _, count = self.items(path)
+        joined = self._joined(of).astype(np.float64, copy=False)
+        return joined[:, : min(int(count.max(initial=0)), width)]
+
+    def _joined(self, of: Callable[[Part], NDArray[np.generic]]) -> NDArray[np.generic]:
+        if len(self.parts) == 1:
+            return of(self.parts[0])
+        joined = np.concatenate([of(part) for part in self.parts])
+        return joined if self.order is None else joined[self.order]
+
+    def take(self, keep: Bools) -> Fields:
+        """The messages picked."""
+        if keep.all():
+            return self
+        if self.order is not None:
+            inverse = np.argsort(self.order)
+            keep = keep[inverse]
+        parts, at = [], 0
+        for part in self.parts:
+            size = len(part.rows)
+            parts.append(Part(part.found, part.rows[keep[at : at + size]]))
+            at += size
+        order = None
+        if self.order is not None:
+            order = np.argsort(inverse[keep])
+        return Fields(self.plan, self.buffer, tuple(parts), order)
+
+
+def _ordered(code: str, found: Found) -> str:
+    return ("<" if found.little else ">") + code
+
+
+def _numbers(part: Part, value: Value, *, is_cdr: bool) -> NDArray[np.generic]:
+    found = part.found
+    begin, modulo, offsets = found.places[value.path]
+    if len(part.rows) == len(found.ok):
+        place = begin + offsets[modulo]
+    else:
+        place = begin[part.rows] + offsets[modulo[part.rows]]
+    if value.code in ("time", "duration"):
+        return _nanoseconds(found, place, value.code, is_cdr=is_cdr)
+    got = gather(found.buffer, _ordered(value.code, found), value.count, place)
+    if value.is_bool:
+        return got.astype(np.bool_)
+    return got if found.little else got.astype(value.code)
+
+
+def _nanoseconds(found: Found, place: Int64s, code: str, *, is_cdr: bool) -> Int64s:
+    """ROS 1 seconds are unsigned, ROS 2 seconds signed; only ROS 1 durations have signed rests."""
+    seconds = "i4" if is_cdr or code == "duration" else "u4"
+    rest = "i4" if not is_cdr and code == "duration" else "u4"
+    whole = gather(found.buffer, _ordered(seconds, found), 0, place).astype(np.int64)
+    fraction = gather(found.buffer, _ordered(rest, found), 0, place + 4).astype(np.int64)
+    return whole * 1_000_000_000 + fraction

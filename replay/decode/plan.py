@@ -1,0 +1,284 @@
+"""From a message definition to the steps in which its bytes are walked.
+
+Nested messages are flattened, so that a plan is a short list of three kinds of step: a *run* of
+fields whose sizes are fixed, a string, and a sequence. Inside a run the place of every field
+depends only on where the run begins modulo 8 (CDR aligns each value to its own size), so a table
+of eight rows gives all places at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Final, TypeAlias
+
+import numpy as np
+
+from crosscue.replay.columns import Int64s
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.limits import DEFAULT, Limits
+
+from .definition import DURATION, PRIMITIVES, TIME, Definitions, Field, Shape, well_known
+
+MAX_DEPTH: Final = 32
+MAX_STEPS: Final = 20_000
+FILLER: Final = "structure_needs_at_least_one_member"
+"""The byte that stands for an empty message on the wire; it holds no value."""
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A number, a time or a fixed array inside a run.
+
+    Attributes:
+        path: Dotted name from the message's root.
+        code: NumPy code without byte order (``f8``), ``time`` or ``duration``.
+        count: Length of an array, 0 for a single value.
+        is_bool: Stored as a byte, true unless zero.
+    """
+
+    path: str
+    code: str
+    count: int = 0
+    is_bool: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """Neighbouring fields of fixed size.
+
+    Attributes:
+        values: K of them.
+        place: Shape (8, K), int64: offset of each value from the run's begin, by begin modulo 8.
+        size: Shape (8,), int64: bytes from the run's begin to its end, by begin modulo 8.
+    """
+
+    values: tuple[Value, ...]
+    place: Int64s
+    size: Int64s
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A string."""
+
+    path: str
+    bound: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Items:
+    """A sequence, or an array of things that are not fixed in size or too many to name.
+
+    Attributes:
+        path: Dotted name.
+        item: Steps of one item.
+        count: Length of an array; None for a sequence, whose length precedes it.
+        bound: Most items, 0 for no bound.
+        code: NumPy code of a sequence of numbers, else empty.
+        jumps: Shape (K, 8): bytes that 2**k items take, by begin modulo 8; None where items vary.
+        item_bytes: Least bytes of one item.
+    """
+
+    path: str
+    item: tuple[Step, ...]
+    count: int | None
+    bound: int
+    code: str
+    jumps: Int64s | None
+    item_bytes: int
+
+
+Step: TypeAlias = Run | Text | Items
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """How to walk one message type.
+
+    Attributes:
+        type_name: For error messages.
+        is_cdr: CDR with alignment and terminated strings; else ROS 1.
+        steps: In wire order.
+        values: Every named value, by path.
+        texts: Paths of strings outside sequences.
+        sequences: Sequences and arrays outside other sequences, by path.
+    """
+
+    type_name: str
+    is_cdr: bool
+    steps: tuple[Step, ...]
+    values: Mapping[str, Value]
+    texts: frozenset[str]
+    sequences: Mapping[str, Items]
+
+
+def plan_of(type_name: str, known: Definitions, *, is_cdr: bool, limits: Limits = DEFAULT) -> Plan:
+    """Plan the walk through ``type_name``.
+
+    Raises:
+        SchemaError: A type is missing or contains itself, or a message could never fit the limits.
+    """
+    steps = _Planner(type_name, known, is_cdr, limits).message(type_name, "", 0)
+    runs = [step for step in steps if isinstance(step, Run)]
+    return Plan(
+        type_name,
+        is_cdr,
+        steps,
+        {value.path: value for run in runs for value in run.values},
+        frozenset(step.path for step in steps if isinstance(step, Text)),
+        {step.path: step for step in steps if isinstance(step, Items)},
+    )
+
+
+_Piece: TypeAlias = tuple[Value, int, int] | Text | Items
+"""A step, or a value with its alignment and size that is still to be put into a run."""
+
+
+@dataclass(slots=True)
+class _Planner:
+    root: str
+    known: Definitions
+    is_cdr: bool
+    limits: Limits
+    made: int = field(default=0)
+
+    def message(self, name: str, prefix: str, depth: int) -> tuple[Step, ...]:
+        return tuple(_in_runs(self._pieces(name, prefix, depth)))
+
+    def _pieces(self, name: str, prefix: str, depth: int) -> Iterator[_Piece]:
+        if depth > MAX_DEPTH:
+            raise SchemaError(f"{self.root}: {name} is nested deeper than {MAX_DEPTH} levels")
+        if name in (TIME, DURATION):
+            code = "time" if name == TIME else "duration"
+            yield self._value(Value(prefix or "stamp", code), 4, 8)
+            return
+        fields = self._fields(name)
+        if not fields and self.is_cdr:
+            # An empty message still takes one byte on the wire.
+            yield self._value(Value(f"{prefix}.{FILLER}".lstrip("."), "u1"), 1, 1)
+        for each in fields:
+            path = f"{prefix}.{each.name}" if prefix else each.name
+            yield from self._field(each, path, depth)
+
+    def _fields(self, name: str) -> tuple[Field, ...]:
+        fields = self.known.get(name)
+        if fields is None and self.is_cdr:
+            fields = (well_known(name) or {}).get(name)
+        if fields is None:
+            raise SchemaError(f"{self.root}: its definition lacks the type {name}")
+        return fields
+
+    def _field(self, each: Field, path: str, depth: int) -> Iterator[_Piece]:
+        if each.shape is Shape.ONE:
+            yield from self._one(each, path, depth)
+            return
+        if each.shape is Shape.ARRAY:
+            if each.size < 1:
+                raise SchemaError(f"{self.root}: array {path} of length {each.size}")
+            if each.type_name in PRIMITIVES:
+                yield self._number(each, path, each.size)
+                return
+        yield self._items(each, path, depth)
+
+    def _one(self, each: Field, path: str, depth: int) -> Iterator[_Piece]:
+        if each.type_name in PRIMITIVES:
+            yield self._number(each, path, 0)
+        elif each.type_name == "string":
+            self._count()
+            yield Text(path, each.text_bound)
+        elif "/" in each.type_name:
+            yield from self._pieces(each.type_name, path, depth + 1)
+        else:
+            raise SchemaError(f"{self.root}: {path} has the type {each.type_name}, not supported")
+
+    def _number(self, each: Field, path: str, count: int) -> _Piece:
+        code = PRIMITIVES[each.type_name]
+        width = int(code[1])
+        value = Value(path, code, count, each.type_name == "bool")
+        return self._value(value, width, width * max(count, 1))
+
+    def _value(self, value: Value, align: int, size: int) -> tuple[Value, int, int]:
+        self._count()
+        if size > self.limits.message_bytes:
+            raise SchemaError(
+                f"{self.root}: {value.path} alone takes {size} bytes, over the limit of "
+                f"{self.limits.message_bytes} for a message"
+            )
+        return value, align if self.is_cdr else 1, size
+
+    def _items(self, each: Field, path: str, depth: int) -> Items:
+        self._count()
+        one = Field(each.name, each.type_name, text_bound=each.text_bound)
+        item = tuple(_in_runs(self._one(one, path, depth)))
+        least = sum(_least(step) for step in item)
+        fixed = all(isinstance(step, Run) for step in item)
+        is_array = each.shape is Shape.ARRAY
+        if is_array and least * each.size > self.limits.message_bytes:
+            raise SchemaError(
+                f"{self.root}: {path} alone takes {least * each.size} bytes, over the limit of "
+                f"{self.limits.message_bytes} for a message"
+            )
+        return Items(
+            path,
+            item,
+            each.size if is_array else None,
+            0 if is_array else each.size,
+            PRIMITIVES.get(each.type_name, ""),
+            _jumps(item) if fixed else None,
+            least,
+        )
+
+    def _count(self) -> None:
+        self.made += 1
+        if self.made > MAX_STEPS:
+            raise SchemaError(f"{self.root}: its definition unfolds to over {MAX_STEPS} fields")
+
+
+def _least(step: Step) -> int:
+    if isinstance(step, Run):
+        return int(step.size.min())
+    if isinstance(step, Text):
+        return 4
+    return 4 if step.count is None else step.count * step.item_bytes
+
+
+def _in_runs(pieces: Iterator[_Piece]) -> Iterator[Step]:
+    waiting: list[tuple[Value, int, int]] = []
+    for piece in pieces:
+        if isinstance(piece, tuple):
+            waiting.append(piece)
+            continue
+        if waiting:
+            yield _run(waiting)
+            waiting = []
+        yield piece
+    if waiting:
+        yield _run(waiting)
+
+
+def _run(pieces: list[tuple[Value, int, int]]) -> Run:
+    place = np.zeros((8, len(pieces)), np.int64)
+    size = np.zeros(8, np.int64)
+    for begin in range(8):
+        at = begin
+        for k, (_, align, width) in enumerate(pieces):
+            at = -(-at // align) * align
+            place[begin, k] = at - begin
+            at += width
+        size[begin] = at - begin
+    return Run(tuple(value for value, _, _ in pieces), place, size)
+
+
+def _jumps(item: tuple[Step, ...]) -> Int64s:
+    """Bytes that 1, 2, 4, ... 2**31 items take, by begin modulo 8: powers by squaring."""
+    one = np.zeros(8, np.int64)
+    begin = np.arange(8)
+    for step in item:
+        assert isinstance(step, Run)
+        one += step.size[(begin + one) & 7]
+    jumps = [one]
+    for _ in range(31):
+        last = jumps[-1]
+        jumps.append(last + last[(begin + last) & 7])
+    return np.stack(jumps)

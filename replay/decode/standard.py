@@ -1,0 +1,267 @@
+"""What becomes of each message type of the contract: one line a type.
+
+Everything else becomes a table of all its numbers under dotted names (``pose.position.x``), with
+``<name>.length`` for every sequence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import (
+    DATA,
+    ERROR,
+    REMOTE,
+    CanFrames,
+    ImageCoding,
+    Images,
+    Int64s,
+    Messages,
+    Table,
+)
+from crosscue.replay.errors import SchemaError
+
+from .coding import MAGIC_BYTES, STREAMS, coding_of
+from .fields import Fields
+from .plan import FILLER, Plan
+from .walk import Bools
+
+Decoded: TypeAlias = CanFrames | Table | Images
+Doubt: TypeAlias = tuple[Bools, str]
+"""Messages that fit their definition but cannot be used, and the reason for the ledger."""
+
+MAX_SIDE_PX: Final = 65_535
+LENS_COEFFICIENTS: Final = 14
+"""OpenCV's largest distortion model."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """How one message type is decoded.
+
+    Attributes:
+        needs: What the definition must have: ``path`` a number, ``path:9`` an array of nine,
+            ``path$`` a string, ``path[u1]`` a sequence of that NumPy code; ``|`` for or.
+        build: From the fields of usable messages to rows.
+        doubts: Which messages are not usable, and why.
+    """
+
+    needs: tuple[str, ...]
+    build: Callable[[Fields], Decoded]
+    doubts: Callable[[Fields], Iterator[Doubt]] | None = None
+
+    def check(self, plan: Plan) -> None:
+        """Refuse a definition that lacks what its type's name promises.
+
+        Raises:
+            SchemaError: Naming the field.
+        """
+        known = {f"{path}:{value.count}" for path, value in plan.values.items()}
+        known |= {f"{path}$" for path in plan.texts}
+        known |= {f"{path}[{items.code}]" for path, items in plan.sequences.items()}
+        for need in self.needs:
+            choices = [
+                each if each[-1] in "$]" or ":" in each else f"{each}:0" for each in need.split("|")
+            ]
+            if not known.intersection(choices):
+                raise SchemaError(
+                    f"{plan.type_name}: its definition lacks the field {need}; "
+                    "the log's definition and the type's name do not agree"
+                )
+
+
+def _table(**sources: str) -> Kind:
+    """A table whose columns come from one field each; ``path:9`` is an array of nine."""
+
+    def build(fields: Fields) -> Table:
+        return Table({name: fields.number(path.split(":")[0]) for name, path in sources.items()})
+
+    return Kind(tuple(sources.values()), build)
+
+
+def _xyz(columns: str, path: str) -> dict[str, str]:
+    return {columns.format(axis): f"{path}.{axis}" for axis in "xyz"}
+
+
+def _quat(path: str) -> dict[str, str]:
+    return {f"quat_{axis}": f"{path}.{axis}" for axis in "xyzw"}
+
+
+def _can_frame(fields: Fields) -> CanFrames:
+    remote = fields.number("is_rtr").astype(np.bool_)
+    error = fields.number("is_error").astype(np.bool_)
+    length = np.where(remote & ~error, 0, fields.number("dlc")).astype(np.uint8)
+    payload = fields.number("data").astype(np.uint8)
+    payload[np.arange(8) >= length[:, None]] = 0
+    return CanFrames(
+        fields.number("id").astype(np.uint32),
+        fields.number("is_extended").astype(np.bool_),
+        np.where(error, ERROR, np.where(remote, REMOTE, DATA)).astype(np.uint8),
+        length,
+        payload,
+        np.zeros(len(fields), np.bool_),
+    )
+
+
+def _can_doubts(fields: Fields) -> Iterator[Doubt]:
+    identifier = fields.number("id").astype(np.int64)
+    extended = fields.number("is_extended").astype(np.bool_)
+    error = fields.number("is_error").astype(np.bool_)
+    most = np.where(extended | error, 0x1FFF_FFFF, 0x7FF)
+    yield identifier > most, "identifier has more bits than its frame kind"
+    yield fields.number("dlc").astype(np.int64) > 8, "data length code over 8"
+
+
+def _picture_ranges(fields: Fields) -> Messages:
+    first, size = fields.items("data")
+    return Messages(fields.buffer, first, first + size)
+
+
+def _codings(fields: Fields) -> list[ImageCoding | None]:
+    pictures = _picture_ranges(fields)
+    return [
+        coding_of(pictures.payload(i)[:MAGIC_BYTES].tobytes(), label)
+        for i, label in enumerate(fields.texts("format"))
+    ]
+
+
+def _compressed(fields: Fields) -> Images:
+    return Images(_picture_ranges(fields), tuple(c for c in _codings(fields) if c is not None))
+
+
+def _compressed_doubts(fields: Fields) -> Iterator[Doubt]:
+    yield fields.items("data")[1] == 0, "empty picture"
+    yield np.array([c is None for c in _codings(fields)], np.bool_), "image coding not known"
+
+
+def _video(fields: Fields) -> Images:
+    labels = fields.texts("format")
+    return Images(_picture_ranges(fields), tuple(STREAMS[label.lower()] for label in labels))
+
+
+def _video_doubts(fields: Fields) -> Iterator[Doubt]:
+    yield fields.items("data")[1] == 0, "empty picture"
+    known = [label.lower() in STREAMS for label in fields.texts("format")]
+    yield ~np.array(known, np.bool_), "video coding not known"
+
+
+def _raw(fields: Fields) -> Images:
+    return Images(
+        _picture_ranges(fields),
+        ("raw",) * len(fields),
+        width_px=fields.number("width").astype(np.int32),
+        height_px=fields.number("height").astype(np.int32),
+        step_bytes=fields.number("step").astype(np.int32),
+        pixel_format=fields.texts("encoding"),
+    )
+
+
+def _raw_doubts(fields: Fields) -> Iterator[Doubt]:
+    width, height, step = (
+        fields.number(name).astype(np.int64) for name in ("width", "height", "step")
+    )
+    size = fields.items("data")[1]
+    yield size == 0, "empty picture"
+    sides = np.stack([width, height])
+    yield ((sides < 1) | (sides > MAX_SIDE_PX)).any(axis=0), "picture size not plausible"
+    yield (step < width) | (size < step * height), "picture has fewer bytes than its size needs"
+    big = fields.number("is_bigendian").astype(np.bool_)
+    deep = np.array(["16" in each or "32" in each for each in fields.texts("encoding")], np.bool_)
+    yield big & deep, "big-endian pixels not supported"
+
+
+def _camera_info(fields: Fields) -> Table:
+    names = fields.plan.values
+    lens = "d" if "d" in fields.plan.sequences else "D"
+    columns: dict[str, NDArray[np.generic]] = {
+        "width_px": fields.number("width"),
+        "height_px": fields.number("height"),
+        "k": fields.number("k" if "k" in names else "K"),
+        "p": fields.number("p" if "p" in names else "P"),
+        "d": fields.padded(lens, LENS_COEFFICIENTS),
+    }
+    return Table(columns)
+
+
+def _camera_info_doubts(fields: Fields) -> Iterator[Doubt]:
+    lens = "d" if "d" in fields.plan.sequences else "D"
+    yield fields.items(lens)[1] > LENS_COEFFICIENTS, "over 14 lens coefficients"
+
+
+_POSE: Final = _xyz("{}_m", "pose.position") | _quat("pose.orientation")
+_POSE_COV: Final = _xyz("{}_m", "pose.pose.position") | _quat("pose.pose.orientation")
+
+BY_TYPE: Final[Mapping[str, Kind]] = {
+    "can_msgs/msg/Frame": Kind(
+        ("id", "is_rtr", "is_extended", "is_error", "dlc", "data:8"), _can_frame, _can_doubts
+    ),
+    "sensor_msgs/msg/CompressedImage": Kind(
+        ("format$", "data[u1]"), _compressed, _compressed_doubts
+    ),
+    "foxglove_msgs/msg/CompressedImage": Kind(
+        ("format$", "data[u1]"), _compressed, _compressed_doubts
+    ),
+    "foxglove_msgs/msg/CompressedVideo": Kind(("format$", "data[u1]"), _video, _video_doubts),
+    "sensor_msgs/msg/Image": Kind(
+        ("width", "height", "step", "encoding$", "is_bigendian", "data[u1]"), _raw, _raw_doubts
+    ),
+    "sensor_msgs/msg/CameraInfo": Kind(
+        ("width", "height", "k:9|K:9", "p:12|P:12", "d[f8]|D[f8]"),
+        _camera_info,
+        _camera_info_doubts,
+    ),
+    "sensor_msgs/msg/Imu": _table(
+        **_xyz("accel_{}_mps2", "linear_acceleration"),
+        **_xyz("gyro_{}_radps", "angular_velocity"),
+        **_quat("orientation"),
+        orientation_covariance="orientation_covariance:9",
+    ),
+    "sensor_msgs/msg/MagneticField": _table(**_xyz("mag_{}_t", "magnetic_field")),
+    "sensor_msgs/msg/NavSatFix": _table(
+        latitude_deg="latitude",
+        longitude_deg="longitude",
+        altitude_m="altitude",
+        status="status.status",
+        covariance_m2="position_covariance:9",
+        covariance_type="position_covariance_type",
+    ),
+    "nav_msgs/msg/Odometry": _table(
+        **_POSE_COV,
+        speed_x_mps="twist.twist.linear.x",
+        speed_y_mps="twist.twist.linear.y",
+        yaw_rate_radps="twist.twist.angular.z",
+    ),
+    "geometry_msgs/msg/PoseStamped": _table(**_POSE),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _table(**_POSE_COV),
+}
+
+
+def generic(fields: Fields) -> Table:
+    """All numbers of a message under their dotted names, and the length of every sequence."""
+    columns: dict[str, NDArray[np.generic]] = {
+        path: fields.number(path) for path in fields.plan.values if not path.endswith(FILLER)
+    }
+    for path, items in fields.plan.sequences.items():
+        if items.count is None:
+            columns[f"{path}.length"] = fields.items(path)[1]
+    if not columns:
+        columns["present"] = np.ones(len(fields), np.bool_)
+    return Table(columns)
+
+
+STAMPS: Final = ("header.stamp", "timestamp", "stamp")
+"""Where a message keeps its sensor's time, first found first taken."""
+
+
+def header_ns(fields: Fields) -> Int64s | None:
+    """The sensor's own time, shape (M,), or None for a type without one."""
+    values = fields.plan.values
+    for path in STAMPS:
+        if path in values and values[path].code == "time":
+            return fields.number(path).astype(np.int64, copy=False)
+    return None

@@ -1,0 +1,466 @@
+"""Our walk through ROS messages says what rosbags says, and refuses what rosbags refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
+from crosscue.replay.decode import Decoder, decoder_for
+from crosscue.replay.decode.fields import Fields
+from crosscue.replay.decode.ros import MISFIT, WRONG_CODING, RosDecoder
+from crosscue.replay.decode.standard import Kind, generic
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
+from support.ros_messages import (
+    block_of,
+    messages_of,
+    numbers_in,
+    random_definition,
+    random_message,
+    ros1_store,
+    ros1_topic,
+    ros2_store,
+    ros2_topic,
+)
+
+SEEDS = st.integers(0, 2**32 - 1)
+QUICK = settings(max_examples=40, deadline=None)
+
+
+def must_decode(topic: Topic) -> Decoder:
+    decoder = decoder_for(topic)
+    assert decoder is not None
+    return decoder
+
+
+def plain(topic: Topic) -> RosDecoder:
+    """The generic decoder even of a type that has standard columns."""
+    decoder = must_decode(topic)
+    assert isinstance(decoder, RosDecoder)
+    return replace(decoder, kind=Kind((), generic))
+
+
+def serialised(store: Typestore, message: object, name: str, *, little: bool = True) -> bytes:
+    if store is ros1_store():
+        return bytes(store.serialize_ros1(message, name))
+    return bytes(store.serialize_cdr(message, name, little_endian=little))
+
+
+def same_values(table: Table, messages: list[object], store: Typestore, name: str) -> None:
+    wanted = [dict(numbers_in(message, store, name)) for message in messages]
+    for path in wanted[0] if wanted else ():
+        want = np.array([np.asarray(each[path]) for each in wanted])
+        np.testing.assert_array_equal(table[path], want, err_msg=f"{name}: {path}")
+
+
+@pytest.mark.parametrize(
+    ("store", "topic_of"), [(ros2_store(), ros2_topic), (ros1_store(), ros1_topic)], ids=["2", "1"]
+)
+def test_every_standard_type_has_the_values_that_rosbags_reads(
+    store: Typestore, topic_of: Callable[[str, str], Topic]
+) -> None:
+    rng = np.random.default_rng(5)
+    compared = 0
+    for name in sorted(store.fielddefs):
+        if "/msg/" not in name or name.startswith(("rcl_interfaces/", "builtin_")):
+            continue
+        messages = [random_message(rng, store, name) for _ in range(4)]
+        payloads = [serialised(store, each, name) for each in messages]
+        ledger = Ledger("made")
+        table = plain(topic_of("/t", name))(block_of("/t", payloads), ledger).rows
+        assert not ledger.details, name
+        assert isinstance(table, Table)
+        same_values(table, messages, store, name)
+        compared += 1
+    assert compared > 100
+
+
+@given(seed=SEEDS, is_cdr=st.booleans())
+@QUICK
+def test_made_up_types_have_the_values_that_rosbags_reads(seed: int, is_cdr: bool) -> None:
+    rng = np.random.default_rng(seed)
+    text = random_definition(rng, "made_msgs/Root")
+    store = get_typestore(Stores.ROS2_HUMBLE if is_cdr else Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(text, "made_msgs/msg/Root"))
+    name = "made_msgs/msg/Root"
+    messages = [random_message(rng, store, name) for _ in range(6)]
+    mixed = rng.random() < 0.3
+    payloads = [
+        bytes(store.serialize_cdr(each, name, little_endian=not (mixed and rng.random() < 0.5)))
+        if is_cdr
+        else bytes(store.serialize_ros1(each, name))
+        for each in messages
+    ]
+    topic = (ros2_topic if is_cdr else ros1_topic)("/t", name, text)
+    ledger = Ledger("made")
+
+    decoded = plain(topic)(block_of("/t", payloads, gap=int(rng.integers(0, 9))), ledger)
+
+    assert not ledger.details
+    assert isinstance(decoded.rows, Table)
+    same_values(decoded.rows, messages, store, name)
+
+
+@given(seed=SEEDS, is_cdr=st.booleans())
+@QUICK
+def test_damaged_messages_are_refused_where_rosbags_refuses_and_the_rest_kept(
+    seed: int, is_cdr: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    name = str(
+        rng.choice(
+            [
+                "sensor_msgs/msg/JointState",
+                "diagnostic_msgs/msg/DiagnosticArray",
+                "sensor_msgs/msg/PointCloud2",
+                "nav_msgs/msg/Path",
+                "sensor_msgs/msg/Imu",
+            ]
+        )
+    )
+    store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
+    payloads, accepted = [], []
+    for _ in range(24):
+        raw = bytearray(serialised(store, random_message(rng, store, name), name))
+        match int(rng.integers(0, 5)):
+            case 0:
+                raw = raw[: int(rng.integers(0, len(raw)))]
+            case 1:
+                raw += bytes(int(rng.integers(1, 9)))
+            case 2 | 3:
+                for _ in range(int(rng.integers(1, 4))):
+                    raw[int(rng.integers(0, len(raw)))] = int(rng.integers(0, 256))
+            case _:
+                pass
+        payloads.append(bytes(raw))
+        accepted.append(_rosbags_reads(store, bytes(raw), name, is_cdr))
+    ledger = Ledger("made")
+    ledger.find("/t", len(payloads))
+
+    decoded = plain(topic_of("/t", name))(block_of("/t", payloads), ledger)
+
+    want_ns = block_of("/t", payloads).log_ns[np.array([each is not None for each in accepted])]
+    np.testing.assert_array_equal(decoded.log_ns, want_ns)
+    assert ledger.topic("/t").used == len(decoded)
+    assert isinstance(decoded.rows, Table)
+    same_values(decoded.rows, [each for each in accepted if each is not None], store, name)
+
+
+def _rosbags_reads(store: Typestore, raw: bytes, name: str, is_cdr: bool) -> object | None:
+    try:
+        read = store.deserialize_cdr if is_cdr else store.deserialize_ros1
+        return read(memoryview(raw), name)
+    except SerdeError:
+        return None
+
+
+def test_a_message_that_lies_about_a_length_is_skipped_with_field_and_time() -> None:
+    store = ros2_store()
+    good = store.types["std_msgs/msg/String"]("abc")
+    raw = serialised(store, good, "std_msgs/msg/String")
+    lying = raw[:4] + b"\x32" + raw[5:]
+    ledger = Ledger("made")
+
+    decoded = must_decode(ros2_topic("/s", "std_msgs/msg/String"))(
+        block_of("/s", [raw, lying, raw]), ledger
+    )
+
+    assert len(decoded) == 2
+    assert ledger.topic("/s").skipped == {MISFIT: 1}
+    assert ledger.details[0].t_ns == 1_000_000
+    assert "string data passes the end" in ledger.details[0].detail
+
+
+@pytest.mark.parametrize("head", [b"\x00\x06", b"\x00\x07", b"\x00\x03", b"\x01\x00", b"\xff\xff"])
+def test_other_representations_than_plain_cdr_are_refused_by_name(head: bytes) -> None:
+    store = ros2_store()
+    raw = serialised(store, store.types["std_msgs/msg/Float64"](1.5), "std_msgs/msg/Float64")
+    ledger = Ledger("made")
+
+    decoded = must_decode(ros2_topic("/f", "std_msgs/msg/Float64"))(
+        block_of("/f", [head + raw[2:], raw]), ledger
+    )
+
+    assert len(decoded) == 1
+    assert ledger.topic("/f").skipped == {WRONG_CODING: 1}
+
+
+def test_both_byte_orders_in_one_block_keep_their_order() -> None:
+    store, name = ros2_store(), "geometry_msgs/msg/PointStamped"
+    rng = np.random.default_rng(3)
+    messages = [random_message(rng, store, name) for _ in range(9)]
+    payloads = [serialised(store, m, name, little=i % 3 != 1) for i, m in enumerate(messages)]
+    ledger = Ledger("made")
+
+    decoded = must_decode(ros2_topic("/p", name))(block_of("/p", payloads), ledger)
+
+    assert isinstance(decoded.rows, Table)
+    same_values(decoded.rows, messages, store, name)
+    assert decoded.header_ns is not None
+    np.testing.assert_array_equal(decoded.header_ns, decoded.rows["header.stamp"])
+
+
+def test_picking_rows_of_both_byte_orders_picks_the_same_rows() -> None:
+    store, name = ros2_store(), "std_msgs/msg/Int32"
+    payloads = [serialised(store, store.types[name](i), name, little=i % 2 == 0) for i in range(10)]
+    keep = np.array([i % 3 == 0 for i in range(10)])
+
+    decoder = plain(ros2_topic("/i", name))
+    fields, _ = decoder._walked(block_of("/i", payloads), messages_of(payloads), Ledger("made"))
+    assert isinstance(fields, Fields)
+
+    np.testing.assert_array_equal(fields.number("data"), np.arange(10))
+    np.testing.assert_array_equal(fields.take(keep).number("data"), [0, 3, 6, 9])
+
+
+def test_can_frames_come_as_columns() -> None:
+    store, name = ros2_store(), "can_msgs/msg/Frame"
+    header = store.types["std_msgs/msg/Header"]
+    time = store.types["builtin_interfaces/msg/Time"]
+
+    def frame(identifier: int, dlc: int, **flags: bool) -> bytes:
+        message = store.types[name](
+            header(time(7, 5), "can0"),
+            identifier,
+            flags.get("remote", False),
+            flags.get("extended", False),
+            flags.get("error", False),
+            dlc,
+            np.arange(1, 9, dtype=np.uint8),
+        )
+        return serialised(store, message, name)
+
+    payloads = [
+        frame(0x123, 3),
+        frame(0x1FFF_FFFF, 8, extended=True),
+        frame(0x7FF, 4, remote=True),
+        frame(0x20, 8, error=True),
+        frame(0x800, 8),
+        frame(0x100, 9),
+    ]
+    ledger = Ledger("made")
+
+    decoded = must_decode(ros2_topic("/can", name))(block_of("/can", payloads), ledger)
+
+    frames = decoded.rows
+    assert isinstance(frames, CanFrames)
+    assert frames.arbitration_id.tolist() == [0x123, 0x1FFF_FFFF, 0x7FF, 0x20]
+    assert frames.kind.tolist() == [0, 0, 1, 2]
+    assert frames.length.tolist() == [3, 8, 0, 8]
+    assert frames.data[0].tolist() == [1, 2, 3, 0, 0, 0, 0, 0]
+    assert frames.is_extended.tolist() == [False, True, False, False]
+    assert decoded.header_ns is not None
+    assert decoded.header_ns.tolist() == [7_000_000_005] * 4
+    assert ledger.topic("/can").skipped == {
+        "identifier has more bits than its frame kind": 1,
+        "data length code over 8": 1,
+    }
+
+
+def test_pictures_come_as_ranges_of_the_log_itself() -> None:
+    store, name = ros2_store(), "sensor_msgs/msg/CompressedImage"
+    pictures = [b"\xff\xd8" + bytes(50), b"\x89PNG\r\n\x1a\n" + bytes(9), b"????", b""]
+    labels = ["rgb8; jpeg compressed bgr8", "jpeg", "16UC1; compressedDepth png", "jpeg"]
+    header = store.types["std_msgs/msg/Header"](
+        store.types["builtin_interfaces/msg/Time"](1, 0), "cam"
+    )
+    payloads = [
+        serialised(store, store.types[name](header, label, np.frombuffer(p, np.uint8)), name)
+        for label, p in zip(labels, pictures, strict=True)
+    ]
+    block, ledger = block_of("/cam", payloads), Ledger("made")
+
+    images = must_decode(ros2_topic("/cam", name))(block, ledger).rows
+
+    assert isinstance(images, Images)
+    assert images.coding == ("jpeg", "png")
+    assert [images.bytes_.payload(i).tobytes() for i in range(2)] == pictures[:2]
+    assert np.shares_memory(images.bytes_.buffer, block.rows.buffer)  # type: ignore[union-attr]
+    assert ledger.topic("/cam").skipped == {"image coding not known": 1, "empty picture": 1}
+
+
+def test_raw_pictures_must_have_the_bytes_that_their_size_needs() -> None:
+    store, name = ros2_store(), "sensor_msgs/msg/Image"
+    header = store.types["std_msgs/msg/Header"](
+        store.types["builtin_interfaces/msg/Time"](1, 0), "cam"
+    )
+
+    def image(size: int) -> bytes:
+        pixels = np.zeros(size, np.uint8)
+        return serialised(store, store.types[name](header, 2, 3, "rgb8", 0, 9, pixels), name)
+
+    ledger = Ledger("made")
+    images = must_decode(ros2_topic("/cam", name))(block_of("/cam", [image(18), image(17)]), ledger)
+
+    assert isinstance(images.rows, Images)
+    assert images.rows.pixel_format == ("rgb8",)
+    assert images.rows.width_px is not None
+    assert images.rows.width_px.tolist() == [3]
+    assert ledger.topic("/cam").skipped == {"picture has fewer bytes than its size needs": 1}
+
+
+STANDARD_COLUMNS = {
+    "sensor_msgs/msg/Imu": {
+        "accel_x_mps2": "linear_acceleration.x",
+        "gyro_z_radps": "angular_velocity.z",
+        "quat_w": "orientation.w",
+    },
+    "sensor_msgs/msg/MagneticField": {"mag_y_t": "magnetic_field.y"},
+    "sensor_msgs/msg/NavSatFix": {
+        "latitude_deg": "latitude",
+        "altitude_m": "altitude",
+        "status": "status.status",
+        "covariance_m2": "position_covariance",
+    },
+    "nav_msgs/msg/Odometry": {
+        "x_m": "pose.pose.position.x",
+        "speed_x_mps": "twist.twist.linear.x",
+        "yaw_rate_radps": "twist.twist.angular.z",
+    },
+    "geometry_msgs/msg/PoseStamped": {"z_m": "pose.position.z", "quat_x": "pose.orientation.x"},
+}
+
+
+@pytest.mark.parametrize("is_cdr", [True, False])
+@pytest.mark.parametrize("name", sorted(STANDARD_COLUMNS))
+def test_standard_columns_hold_the_field_that_they_are_named_for(name: str, is_cdr: bool) -> None:
+    rng = np.random.default_rng(11)
+    store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
+    messages = [random_message(rng, store, name) for _ in range(5)]
+    payloads = [serialised(store, each, name) for each in messages]
+
+    table = must_decode(topic_of("/t", name))(block_of("/t", payloads), Ledger("made")).rows
+
+    assert isinstance(table, Table)
+    wanted = [dict(numbers_in(message, store, name)) for message in messages]
+    for column, path in STANDARD_COLUMNS[name].items():
+        want = np.array([np.asarray(each[path]) for each in wanted])
+        np.testing.assert_array_equal(table[column], want)
+
+
+@pytest.mark.parametrize("is_cdr", [True, False])
+def test_camera_info_keeps_matrices_and_lens(is_cdr: bool) -> None:
+    store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
+    name = "sensor_msgs/msg/CameraInfo"
+    message = random_message(np.random.default_rng(1), store, name)
+    lens = "d" if is_cdr else "D"
+    setattr(message, lens, np.arange(5.0))
+    payloads = [serialised(store, message, name)]
+
+    table = must_decode(topic_of("/t", name))(block_of("/t", payloads), Ledger("made")).rows
+
+    assert isinstance(table, Table)
+    assert table["k"].shape == (1, 9)
+    assert table["p"].shape == (1, 12)
+    np.testing.assert_array_equal(table["d"], [np.arange(5.0)])
+
+
+def test_sqlite_bags_without_definitions_use_the_well_known_ones() -> None:
+    store, name = ros2_store(), "sensor_msgs/msg/MagneticField"
+    message = random_message(np.random.default_rng(2), store, name)
+    payloads = [serialised(store, message, name)]
+
+    table = must_decode(Topic("/mag", name, "cdr"))(block_of("/mag", payloads), Ledger("x")).rows
+
+    assert isinstance(table, Table)
+    assert table["mag_x_t"][0] == message.magnetic_field.x  # type: ignore[attr-defined]
+    assert decoder_for(Topic("/x", "unknown_msgs/msg/Thing", "cdr")) is None
+    assert decoder_for(Topic("/x", "sensor_msgs/Imu", "ros1")) is None
+    assert decoder_for(Topic("/x", "anything", "flatbuffer")) is None
+
+
+def test_columns_pass_as_they_are() -> None:
+    block = Block("/t", np.zeros(2, np.int64), Table({"a": np.zeros(2)}))
+
+    assert must_decode(Topic("/t", "crosscue/Table", "columns"))(block, Ledger("x")) is block
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("float64 x\n\x00\x01 y\n", "cannot read the line"),
+        ("Other o\n", "lacks the type made_msgs/msg/Other"),
+        ("Root again\n", "nested deeper"),
+        ("uint8[20000000000] x\n", "cannot read the line|alone takes"),
+        ("uint8[2000000000] x\n", "alone takes 2000000000 bytes"),
+        ("A[1000] a\n" + "=" * 80 + "\nMSG: made_msgs/A\nuint8[1000000] x\n", "alone takes"),
+        ("wstring w\n", "lacks the type|not supported"),
+        ("uint8[0] x\n", "array x of length 0"),
+        ("int32 x\n" * 30_000, "unfolds to over"),
+        ("x" * (2 << 20), "over the limit"),
+    ],
+)
+def test_a_definition_that_cannot_be_is_refused_in_one_line(text: str, complaint: str) -> None:
+    topic = Topic("/t", "made_msgs/msg/Root", "cdr", text.encode(), "ros2msg")
+
+    with pytest.raises(SchemaError, match=complaint) as caught:
+        decoder_for(topic)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+def test_definitions_that_unfold_without_end_are_refused_at_once() -> None:
+    levels = [
+        f"MSG: made_msgs/L{i}\n" + "".join(f"L{i + 1} f{k}\n" for k in range(10)) for i in range(9)
+    ]
+    text = ("=" * 80 + "\n").join(["L0 a\n", *levels, "MSG: made_msgs/L9\nint8 x\n"])
+
+    with pytest.raises(SchemaError, match="unfolds to over"):
+        decoder_for(Topic("/t", "made_msgs/msg/Root", "cdr", text.encode(), "ros2msg"))
+
+
+def test_a_lying_schema_for_a_known_type_is_refused() -> None:
+    topic = Topic("/imu", "sensor_msgs/msg/Imu", "cdr", b"float64 x\n", "ros2msg")
+
+    with pytest.raises(SchemaError, match=r"/imu: .*lacks the field linear_acceleration\.x"):
+        decoder_for(topic)
+
+
+def test_sequences_of_sequences_cannot_hold_us_up() -> None:
+    text = "Row[] rows\n" + "=" * 80 + "\nMSG: made_msgs/Row\nstring s\n"
+    count = 1_000_000
+    payload = count.to_bytes(4, "little") + bytes(4 * count)
+    ledger = Ledger("made")
+
+    decoded = must_decode(Topic("/t", "made_msgs/Root", "ros1", text.encode(), "ros1msg"))(
+        block_of("/t", [payload]), ledger
+    )
+
+    assert len(decoded) == 0
+    assert "nested items" in ledger.details[0].detail
+
+
+def test_idl_definitions_read_the_same_as_msg() -> None:
+    idl = """module geometry_msgs { module msg {
+      struct Vector3 { double x; double y; double z; };
+      struct Made { geometry_msgs::msg::Vector3 at; sequence<int16> counts; float w[3]; string s; };
+    }; };"""
+    text = (
+        "Vector3 at\nint16[] counts\nfloat32[3] w\nstring s\n"
+        + "=" * 80
+        + ("\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n")
+    )
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    name = "geometry_msgs/msg/Made"
+    store.register(get_types_from_msg("Vector3 at\nint16[] counts\nfloat32[3] w\nstring s\n", name))
+    rng = np.random.default_rng(4)
+    payloads = [serialised(store, random_message(rng, store, name), name) for _ in range(5)]
+    tables = []
+    for schema, encoding in ((idl, "ros2idl"), (text, "ros2msg")):
+        topic = Topic("/m", name, "cdr", schema.encode(), encoding)
+        rows = must_decode(topic)(block_of("/m", payloads), Ledger("x")).rows
+        assert isinstance(rows, Table)
+        tables.append(rows)
+
+    assert tables[0].columns.keys() == tables[1].columns.keys()
+    for column in tables[0].columns:
+        np.testing.assert_array_equal(tables[0][column], tables[1][column])
