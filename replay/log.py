@@ -118,7 +118,9 @@ FORMATS: Final[dict[str, Format]] = {
         "crosscue.replay.readers.rosbag2:open_folder",
         "ROS 2 bag folder",
     ),
-    "candump": Format((".log",), (), "crosscue.replay.readers.candump:open_candump", "candump log"),
+    "candump": Format(
+        (".log", ".candump"), (), "crosscue.replay.readers.candump:open_candump", "candump log"
+    ),
     "asc": Format((".asc",), (), "crosscue.replay.readers.asc:open_asc", "Vector ASC log"),
     "blf": Format((".blf",), (), "crosscue.replay.readers.blf:open_blf", "Vector BLF log"),
     "trc": Format((".trc",), (), "crosscue.replay.readers.trc:open_trc", "PEAK TRC log"),

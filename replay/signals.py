@@ -277,9 +277,11 @@ class Extractor:
         if can.wheel_speeds is not None:
             wheels = can.wheel_speeds
             names = (wheels.front_left, wheels.front_right, wheels.rear_left, wheels.rear_right)
+            scales = dict(SPEED_UNITS)
+            if wheels.wheel_radius_m is not None:
+                scales["rad/s"] = wheels.wheel_radius_m
             columns = [
-                _column(tables, name, wheels.unit, SPEED_UNITS, "can.wheel_speeds")
-                for name in names
+                _column(tables, name, wheels.unit, scales, "can.wheel_speeds") for name in names
             ]
             yield from _wheel_samples(columns)
         for section, signal, key in (
@@ -358,10 +360,9 @@ def _column(
     found = unit or part.rows.units.get(signal, "")
     scale = scales.get(found.strip().lower())
     if scale is None:
-        raise VehicleError(
-            f"{key}: {name} has unit {found!r}; set unit in that section to one of "
-            f"{', '.join(sorted(scales))}"
-        )
+        turning = found.strip().lower() == "rad/s"
+        remedy = "wheel_radius_m" if turning else f"unit to one of {', '.join(sorted(scales))}"
+        raise VehicleError(f"{key}: {name} has unit {found!r}; set {remedy} in that section")
     return _Column(part.log_ns, np.asarray(part.rows[signal], np.float64) * scale)
 
 

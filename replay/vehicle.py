@@ -53,8 +53,10 @@ class WheelSpeeds(Section):
     front_right: Signal | None = None
     rear_left: Signal
     rear_right: Signal
-    unit: Literal["km/h", "m/s", "mph"] | None = None
+    unit: Literal["km/h", "m/s", "mph", "rad/s"] | None = None
     """Overrides the unit that the DBC file gives, or gives it where the file is silent."""
+    wheel_radius_m: Positive | None = None
+    """Rolling radius, for signals in rad/s."""
 
 
 class AngleSignal(Section):
