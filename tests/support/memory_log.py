@@ -1,0 +1,65 @@
+"""A log whose blocks are given, for tests of what stands on readers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from crosscue.replay.columns import Block, Floats, Table, Topic
+from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.log import EVERYTHING, Selection
+
+WHEELS = Topic("wheels", "crosscue/WheelSpeeds", "columns")
+GYRO = Topic("gyro", "sensor_msgs/msg/Imu", "columns")
+MAGNETOMETER = Topic("mag", "sensor_msgs/msg/MagneticField", "columns")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MemoryLog:
+    """Blocks in stored order."""
+
+    topics: tuple[Topic, ...]
+    blocks: Sequence[Block]
+    path: Path = Path("memory")
+    format: str = "memory"
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """All blocks of the topics wanted."""
+        for block in self.blocks:
+            ledger.find(block.topic, len(block))
+            if selection.wants(block.topic):
+                yield block
+            else:
+                ledger.skip(block.topic, NOT_ASKED_TOPIC, len(block))
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def wheel_block(t_ns: Sequence[int], speed_mps: Sequence[float]) -> Block:
+    """Four equal wheels."""
+    speed = np.asarray(speed_mps, np.float64)
+    names = ("front_left_mps", "front_right_mps", "rear_left_mps", "rear_right_mps")
+    return Block("wheels", np.asarray(t_ns, np.int64), Table(dict.fromkeys(names, speed)))
+
+
+def gyro_block(t_ns: Sequence[int], yaw_rate_radps: Sequence[float]) -> Block:
+    """Yaw rate."""
+    column: Floats = np.asarray(yaw_rate_radps, np.float64)
+    return Block("gyro", np.asarray(t_ns, np.int64), Table({"gyro_z_radps": column}))
