@@ -1,5 +1,7 @@
 """Windows hold every sample once, in order of time, however the logs are cut into blocks."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -68,10 +70,7 @@ def test_a_sensor_that_falls_silent_does_not_hold_up_the_rest() -> None:
     blocks += [wheel_block([s * SECOND], [1.0]) for s in seconds]
     read: list[int] = []
 
-    class Counting(MemoryLog):
-        __slots__ = ()
-
-    log = Counting((WHEELS, GYRO), _Watched(blocks, read))
+    log = MemoryLog((WHEELS, GYRO), _Watched(blocks, read))
     vehicle = Vehicle(version=1)
     planned = plan([(0, WHEELS), (0, GYRO)], vehicle)
     first = next(
@@ -89,8 +88,8 @@ class _Watched(list[Block]):
         super().__init__(blocks)
         self._read = read
 
-    def __iter__(self):  # type: ignore[no-untyped-def]
-        for i, block in enumerate(list.__iter__(self)):
+    def __iter__(self) -> Iterator[Block]:
+        for i, block in enumerate(super().__iter__()):
             self._read.append(i)
             yield block
 
