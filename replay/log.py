@@ -108,7 +108,9 @@ class Format:
 
 FORMATS: Final[dict[str, Format]] = {
     "mcap": Format((".mcap",), (), "crosscue.replay.readers.mcap:open_mcap", "MCAP"),
-    "rosbag1": Format((".bag",), (), "crosscue.replay.readers.rosbag1:open_bag", "ROS 1 bag"),
+    "rosbag1": Format(
+        (".bag", ".active"), (), "crosscue.replay.readers.rosbag1:open_bag", "ROS 1 bag"
+    ),
     "rosbag2-sqlite3": Format(
         (".db3",), (), "crosscue.replay.readers.sqlite3:open_db3", "ROS 2 bag (sqlite3)"
     ),

@@ -1,0 +1,104 @@
+"""Opaque messages of many topics in one buffer, sorted into a block per topic."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import BLOCK_ROWS, Block, Bytes, Int64s, Messages
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import Selection
+
+TOO_LARGE: Final = "message over the size limit"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MixedRows:
+    """N messages of several topics as ranges of one buffer, in stored order.
+
+    Attributes:
+        buffer: Shape (B,), uint8.
+        topic: Shape (N,), int64: which of the names that go with these rows.
+        log_ns: Shape (N,), int64.
+        start: Shape (N,), int64: first byte of each message.
+        stop: Shape (N,), int64: one past its last byte.
+    """
+
+    buffer: Bytes
+    topic: Int64s
+    log_ns: Int64s
+    start: Int64s
+    stop: Int64s
+
+    def __len__(self) -> int:
+        return len(self.topic)
+
+
+def blocks_of(
+    rows: MixedRows, names: Sequence[str], selection: Selection, limits: Limits, ledger: Ledger
+) -> Iterator[Block]:
+    """A block or more for each topic, stored order kept within a topic; every row accounted for.
+
+    Args:
+        rows: What was read.
+        names: Topic names, by the numbers in ``rows.topic``.
+        selection: Rows outside it are counted as skipped.
+        limits: A message over ``message_bytes`` is skipped.
+        ledger: Takes the counts.
+    """
+    order = np.argsort(rows.topic, kind="stable")
+    ordered = rows.topic[order]
+    edges = np.flatnonzero(np.diff(ordered)) + 1
+    for picked in np.split(order, edges):
+        if len(picked):
+            name = names[int(rows.topic[picked[0]])]
+            yield from _one_topic(rows, picked, name, selection, limits, ledger)
+
+
+def _one_topic(
+    rows: MixedRows,
+    picked: NDArray[np.intp],
+    name: str,
+    selection: Selection,
+    limits: Limits,
+    ledger: Ledger,
+) -> Iterator[Block]:
+    ledger.find(name, len(picked))
+    if not selection.wants(name):
+        ledger.skip(name, NOT_ASKED_TOPIC, len(picked))
+        return
+    picked = _within_time(rows, picked, name, selection, ledger)
+    length = rows.stop[picked] - rows.start[picked]
+    if len(length) and length.max() > limits.message_bytes:
+        large = length > limits.message_bytes
+        detail = f"{int(length.max())} bytes, limit {limits.message_bytes}"
+        ledger.skip(name, TOO_LARGE, int(large.sum()), detail, int(rows.log_ns[picked][large][0]))
+        picked = picked[~large]
+    for first in range(0, len(picked), BLOCK_ROWS):
+        part = picked[first : first + BLOCK_ROWS]
+        messages = Messages(rows.buffer, rows.start[part], rows.stop[part])
+        yield Block(name, rows.log_ns[part], messages)
+
+
+def _within_time(
+    rows: MixedRows,
+    picked: NDArray[np.intp],
+    name: str,
+    selection: Selection,
+    ledger: Ledger,
+) -> NDArray[np.intp]:
+    if selection.start_ns is None and selection.end_ns is None:
+        return picked
+    log_ns = rows.log_ns[picked]
+    inside = np.ones(len(picked), dtype=np.bool_)
+    if selection.start_ns is not None:
+        inside &= log_ns >= selection.start_ns
+    if selection.end_ns is not None:
+        inside &= log_ns < selection.end_ns
+    ledger.skip(name, NOT_ASKED_TIME, int(len(picked) - inside.sum()))
+    return picked[inside]

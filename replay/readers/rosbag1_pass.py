@@ -1,0 +1,354 @@
+"""One pass over a ROS 1 bag: blocks out, every message accounted for."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Block, Int64s, Topic
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import Selection
+
+from .mixed import MixedRows, blocks_of
+from .rosbag1_chunk import CUT, TOO_LARGE, ChunkRows, Inflated, inflate, read_chunk
+from .rosbag1_index import ChunkUnit, Contents, Gap, units
+from .rosbag1_records import (
+    CHUNK_INFO,
+    CONNECTION,
+    MESSAGE,
+    BagFile,
+    Connection,
+    Record,
+    connection_of,
+)
+
+BATCH_BYTES: Final = BLOCK_BYTES // 2
+"""Inflated bytes gathered from several chunks before they become blocks."""
+
+OTHER_TYPE: Final = "another message type on the same topic"
+NO_CONNECTION: Final = "message of an unknown connection"
+TWO_RECORDS: Final = "the records of a connection differ"
+
+
+class Roster:
+    """Which connection carries which topic; grows when a chunk brings a new one."""
+
+    def __init__(self, contents: Contents) -> None:
+        self._contents = contents
+        self._topics: dict[str, Topic] = {}
+        self._first: dict[str, Connection] = {}
+        for number in sorted(contents.connections):
+            self.add(contents.connections[number])
+
+    def add(self, connection: Connection) -> None:
+        """Take in a connection; the first one of a topic decides its type."""
+        self._contents.connections[connection.conn] = connection
+        if connection.topic in self._topics:
+            return
+        self._first[connection.topic] = connection
+        self._topics[connection.topic] = Topic(
+            connection.topic,
+            connection.type_name,
+            encoding="ros1",
+            schema=connection.definition,
+            schema_encoding="ros1msg",
+        )
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """All topics known so far, with the counts that the index section declares."""
+        counts = self._declared()
+        return tuple(
+            Topic(t.name, t.type_name, t.encoding, t.schema, t.schema_encoding, counts.get(t.name))
+            for t in self._topics.values()
+        )
+
+    def topic_of(self, conn: int) -> str:
+        """Topic of a connection; empty if unknown."""
+        connection = self._contents.connections.get(conn)
+        return connection.topic if connection is not None else ""
+
+    def fits_topic(self, conn: int) -> bool:
+        """Has the connection the type that its topic was first met with?"""
+        connection = self._contents.connections[conn]
+        first = self._first[connection.topic]
+        return (connection.type_name, connection.md5sum) == (first.type_name, first.md5sum)
+
+    def knows(self, conn: int) -> bool:
+        """Was there a record of this connection?"""
+        return conn in self._contents.connections
+
+    def _declared(self) -> dict[str, int]:
+        if not self._contents.is_complete:
+            return {}
+        counts: Counter[str] = Counter(dict.fromkeys(self._topics, 0))
+        for info in self._contents.infos.values():
+            for conn, count in info.counts.items():
+                counts[self.topic_of(conn)] += count
+        return dict(counts)
+
+
+@dataclass(slots=True)
+class _Checked:
+    """How many chunks could be checked, by how."""
+
+    bz2: int = 0
+    lz4: int = 0
+    unchecked: int = 0
+
+    def words(self) -> str:
+        """The sentence for ``Ledger.integrity``."""
+        said = [
+            f"{name} checksums verified in {count} chunks"
+            for name, count in (("bz2", self.bz2), ("lz4", self.lz4))
+            if count
+        ]
+        if self.unchecked:
+            said.append(
+                f"{self.unchecked} chunks carry no checksum: a changed payload byte in them cannot "
+                "be seen"
+            )
+        return "; ".join(said) or "no chunk read, nothing to check"
+
+
+@dataclass(slots=True)
+class _Batch:
+    """Rows of several chunks waiting to become blocks."""
+
+    raws: list[bytes] = field(default_factory=list)
+    conn: list[Int64s] = field(default_factory=list)
+    log_ns: list[Int64s] = field(default_factory=list)
+    start: list[Int64s] = field(default_factory=list)
+    stop: list[Int64s] = field(default_factory=list)
+    size: int = 0
+    count: int = 0
+
+    def add(self, raw: bytes, rows: ChunkRows) -> None:
+        self.raws.append(raw)
+        self.conn.append(rows.conn)
+        self.log_ns.append(rows.log_ns)
+        self.start.append(rows.start + self.size)
+        self.stop.append(rows.stop + self.size)
+        self.size += len(raw)
+        self.count += len(rows.conn)
+
+
+class Pass:
+    """The state of one ``read``."""
+
+    def __init__(
+        self,
+        file: BagFile,
+        first: int,
+        contents: Contents,
+        roster: Roster,
+        limits: Limits,
+        ledger: Ledger,
+        selection: Selection,
+    ) -> None:
+        self._file = file
+        self._first = first
+        self._contents = contents
+        self._roster = roster
+        self._limits = limits
+        self._ledger = ledger
+        self._selection = selection
+        self._batch = _Batch()
+        self._checked = _Checked()
+
+    def blocks(self, index_at: int) -> Iterator[Block]:
+        """Everything, in stored order.
+
+        Args:
+            index_at: Where the bag header says that the index section begins, or 0.
+        """
+        for topic in self._roster.topics:
+            self._ledger.declare(topic.name, topic.declared)
+        known = sorted(self._contents.infos)
+        try:
+            for unit in units(self._file, self._first, known, self._limits):
+                if isinstance(unit, ChunkUnit):
+                    self._chunk(unit)
+                elif isinstance(unit, Gap):
+                    self._gap(unit, index_at)
+                else:
+                    self._record(unit)
+                if self._batch.size >= BATCH_BYTES or self._batch.count >= BLOCK_ROWS:
+                    yield from self._flush()
+        except OSError as error:
+            self._ledger.lose("", "file cannot be read on", None, str(error.strerror or error))
+        yield from self._flush()
+        for name in [t.name for t in self._roster.topics]:
+            self._ledger.settle(name)
+        self._ledger.integrity = self._checked.words()
+
+    def _record(self, record: Record) -> None:
+        if record.op == MESSAGE:
+            if record.size > self._limits.message_bytes:
+                self._ledger.lose(
+                    self._roster.topic_of(record.u32(b"conn")),
+                    "message over the size limit",
+                    1,
+                    f"{record.size} bytes at byte {record.at}",
+                )
+                return
+            raw = self._file.bytes_at(record.body, record.end)
+            conn, log_ns, start, stop = (
+                np.array([value], dtype=np.int64)
+                for value in (record.u32(b"conn"), record.time_ns(b"time"), 0, len(raw))
+            )
+            self._batch.add(raw, ChunkRows(conn, log_ns, start, stop))
+        elif record.op == CONNECTION and record.size <= 2 * self._limits.schema_bytes:
+            body = self._file.bytes_at(record.body, record.end)
+            connection = connection_of(record, body, self._limits.schema_bytes)
+            if connection is not None:
+                self._meet(connection, is_checked=False)
+        elif record.op == CHUNK_INFO and record.u64(b"chunk_pos") not in self._contents.infos:
+            self._ledger.notice(f"damaged chunk info at byte {record.at}; it is only an index")
+
+    def _meet(self, connection: Connection, is_checked: bool) -> None:
+        known = self._contents.connections.get(connection.conn)
+        if known is None:
+            self._roster.add(connection)
+        elif known != connection:
+            detail = (
+                f"connection {connection.conn}: {known.topic} ({known.type_name}) and "
+                f"{connection.topic} ({connection.type_name})"
+            )
+            if is_checked:
+                self._roster.add(connection)
+                self._ledger.notice(f"{TWO_RECORDS}, the one with a checksum was used: {detail}")
+            else:
+                self._ledger.lose(known.topic, TWO_RECORDS, None, detail)
+
+    def _gap(self, gap: Gap, index_at: int) -> None:
+        where = f"bytes {gap.at} to {gap.stop}"
+        if self._contents.infos and self._contents.is_complete:
+            missing: Counter[int] = Counter()
+            for info in self._contents.infos.values():
+                if gap.at <= info.at < gap.stop:
+                    missing.update(info.counts)
+            self._lose(missing, "damaged record", where)
+        elif 0 < index_at <= gap.at:
+            self._ledger.notice(f"the index section is damaged: {where}")
+        else:
+            reason = CUT if gap.stop == self._file.size else "damaged record"
+            self._ledger.lose("", reason, None, where)
+
+    def _lose(self, missing: Counter[int], reason: str, detail: str) -> None:
+        """Account for a known number of rows by connection; none at all is only a notice."""
+        for conn, count in missing.items():
+            self._ledger.lose(self._roster.topic_of(conn), reason, max(count, 0), detail)
+        if not any(count > 0 for count in missing.values()):
+            self._ledger.notice(f"{reason}, no message lost: {detail}")
+
+    def _chunk(self, unit: ChunkUnit) -> None:
+        if self._is_skipped(unit):
+            return
+        size = unit.record.u32(b"size")
+        where = f"chunk at byte {unit.record.at}"
+        if max(size, unit.stored_stop - unit.record.body) > self._limits.chunk_bytes and (
+            unit.is_framed or size > self._limits.chunk_bytes
+        ):
+            detail = f"{where}: {size} bytes, limit {self._limits.chunk_bytes}"
+            self._short(unit, Counter(), TOO_LARGE, detail)
+            return
+        stop = min(unit.stored_stop, unit.record.body + self._limits.chunk_bytes)
+        stored = self._file.bytes_at(unit.record.body, stop)
+        inflated = inflate(unit.record.fields[b"compression"], stored, size, unit.is_framed)
+        limits = self._limits
+        rows = read_chunk(inflated, unit.entries, limits.schema_bytes, limits.records_per_chunk)
+        for connection in rows.connections:
+            self._meet(connection, inflated.is_checked)
+        self._count_check(unit, inflated)
+        self._compare(unit, inflated, rows, where)
+        self._batch.add(inflated.raw, rows)
+
+    def _count_check(self, unit: ChunkUnit, inflated: Inflated) -> None:
+        if not inflated.is_checked:
+            self._checked.unchecked += 1
+        elif unit.record.fields[b"compression"] == b"bz2":
+            self._checked.bz2 += 1
+        else:
+            self._checked.lz4 += 1
+
+    def _compare(self, unit: ChunkUnit, inflated: Inflated, rows: ChunkRows, where: str) -> None:
+        found = Counter(rows.counts())
+        if rows.fault:
+            inside = f", byte {rows.fault_at} of it" if rows.fault_at >= 0 else ""
+            self._short(unit, found, rows.fault, where + inside)
+            return
+        if unit.entries is not None and unit.entries.counts() != found:
+            self._ledger.notice(f"the index behind the {where} is damaged; it was not used")
+            if not inflated.is_checked:
+                self._lose(Counter(unit.entries.counts()) - found, "listed in the index", where)
+
+    def _short(self, unit: ChunkUnit, found: Counter[int], reason: str, detail: str) -> None:
+        """Account for what a damaged chunk must have held beyond what was found in it."""
+        expected: Counter[int] = Counter()
+        info = self._contents.infos.get(unit.record.at)
+        if info is not None:
+            expected |= Counter(info.counts)
+        if unit.entries is not None:
+            expected |= Counter(unit.entries.counts())
+        if expected:
+            self._lose(expected - found, reason, detail)
+        else:
+            self._ledger.lose("", reason, None, detail)
+
+    def _is_skipped(self, unit: ChunkUnit) -> bool:
+        """Leave the chunk compressed if both of its indexes agree that nothing in it is wanted."""
+        asked = self._selection
+        info = self._contents.infos.get(unit.record.at)
+        entries = unit.entries
+        if info is None or entries is None or not len(entries) or not unit.is_framed:
+            return False
+        first, last = int(entries.log_ns.min()), int(entries.log_ns.max())
+        if (first, last, entries.counts()) != (info.start_ns, info.end_ns, info.counts):
+            return False
+        if not all(self._roster.knows(conn) for conn in info.counts):
+            return False
+        is_outside = (asked.start_ns is not None and last < asked.start_ns) or (
+            asked.end_ns is not None and first >= asked.end_ns
+        )
+        names = {conn: self._roster.topic_of(conn) for conn in info.counts}
+        if not is_outside and any(asked.wants(name) for name in names.values()):
+            return False
+        for conn, count in info.counts.items():
+            reason = NOT_ASKED_TIME if asked.wants(names[conn]) else NOT_ASKED_TOPIC
+            self._ledger.find(names[conn], count)
+            self._ledger.skip(names[conn], reason, count)
+        return True
+
+    def _flush(self) -> Iterator[Block]:
+        batch, self._batch = self._batch, _Batch()
+        if not batch.count:
+            return
+        conn = np.concatenate(batch.conn)
+        numbers, which = np.unique(conn, return_inverse=True)
+        names: list[str] = []
+        place = np.full(len(numbers), -1, dtype=np.int64)
+        counts = np.bincount(which, minlength=len(numbers))
+        for i, number in enumerate(numbers):
+            name = self._roster.topic_of(int(number))
+            if not self._roster.knows(int(number)):
+                self._ledger.lose("", NO_CONNECTION, int(counts[i]), f"connection {number}")
+            elif not self._roster.fits_topic(int(number)):
+                self._ledger.find(name, int(counts[i]))
+                self._ledger.skip(name, OTHER_TYPE, int(counts[i]), f"connection {number}")
+            else:
+                if name not in names:
+                    names.append(name)
+                place[i] = names.index(name)
+        topic = place[which]
+        keep = topic >= 0
+        raw = batch.raws[0] if len(batch.raws) == 1 else b"".join(batch.raws)
+        columns = (np.concatenate(c) for c in (batch.log_ns, batch.start, batch.stop))
+        log_ns, start, stop = (column[keep] for column in columns)
+        rows = MixedRows(np.frombuffer(raw, dtype=np.uint8), topic[keep], log_ns, start, stop)
+        yield from blocks_of(rows, names, self._selection, self._limits, self._ledger)

@@ -1,0 +1,218 @@
+"""Small ROS bags of known content, damaged copies of them, and a judge of what a reader gave."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+import lz4.frame
+import numpy as np
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import EVERYTHING, Log, Selection, open_log
+
+START_NS: Final = 1_700_000_000_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One message as a reader or a writer sees it."""
+
+    topic: str
+    log_ns: int
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What one pass over a log gave."""
+
+    rows: tuple[Row, ...]
+    ledger: Ledger
+    log: Log
+
+
+TOPICS: Final = (
+    ("/imu/data", "sensor_msgs/msg/Imu", 120),
+    ("/can", "std_msgs/msg/String", 24),
+    ("/camera/image", "sensor_msgs/msg/CompressedImage", 900),
+    ("/gps/fix", "sensor_msgs/msg/NavSatFix", 60),
+)
+"""Name, type and payload bytes of the topics in the made-up bags."""
+
+
+def rows_of(
+    count: int, seed: int = 7, topics: Sequence[tuple[str, str, int]] = TOPICS
+) -> list[Row]:
+    """``count`` messages of made-up bytes, most of them on ``/can``, in time order."""
+    rng = np.random.default_rng(seed)
+    which = rng.choice(len(topics), size=count, p=np.array([2, 6, 1, 1]) / 10)
+    steps = rng.integers(1, 2_000_000, size=count)
+    times = START_NS + np.cumsum(steps)
+    made = []
+    for i, topic in enumerate(which):
+        name, _, size = topics[topic]
+        # ROS 2 payloads begin with the CDR header; ROS 1 readers see opaque bytes.
+        body = rng.integers(0, 256, size=size - 4 + int(rng.integers(0, 9)), dtype=np.uint8)
+        made.append(Row(name, int(times[i]), b"\x00\x01\x00\x00" + body.tobytes()))
+    return made
+
+
+def write_bag(
+    path: Path, rows: Sequence[Row], compression: str = "none", chunk_bytes: int = 8192
+) -> Path:
+    """A ROS 1 bag holding ``rows``, written by rosbags."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    writer = Writer1(path)
+    if compression == "lz4 checked":
+        # The ROS recorder writes a content checksum into its lz4 frames; rosbags does not.
+        writer.compression_format = "lz4"
+        writer.compressor = lambda raw: bytes(lz4.frame.compress(raw, content_checksum=True))
+    elif compression != "none":
+        writer.set_compression(Writer1.CompressionFormat[compression.upper()])
+    writer.chunk_threshold = chunk_bytes
+    with writer:
+        links: dict[str, Connection] = {}
+        for row in rows:
+            if row.topic not in links:
+                type_name = next(t for name, t, _ in TOPICS if name == row.topic)
+                links[row.topic] = writer.add_connection(row.topic, type_name, typestore=store)
+            writer.write(links[row.topic], row.log_ns, row.payload)
+    return path
+
+
+def unclosed(bag: bytes) -> bytes:
+    """The bag as a killed recorder leaves it: no index section, and no word of one."""
+    at = bag.index(b"index_pos=") + len(b"index_pos=")
+    index_at = int.from_bytes(bag[at : at + 8], "little")
+    return bag[:at] + bytes(8) + bag[at + 8 : index_at]
+
+
+def write_folder(
+    path: Path,
+    rows: Sequence[Row],
+    storage: Literal["sqlite3", "mcap"] = "sqlite3",
+    compression: Literal["none", "file", "message"] = "none",
+) -> Path:
+    """A ROS 2 bag folder holding ``rows``, written by rosbags."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    writer = Writer2(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    if compression != "none":
+        writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
+    with writer:
+        links: dict[str, Connection] = {}
+        for row in rows:
+            if row.topic not in links:
+                type_name = next(t for name, t, _ in TOPICS if name == row.topic)
+                links[row.topic] = writer.add_connection(row.topic, type_name, typestore=store)
+            writer.write(links[row.topic], row.log_ns, row.payload)
+    return path
+
+
+def read_rows(path: Path, selection: Selection = EVERYTHING) -> Reading:
+    """Everything our reader gives of ``path``."""
+    ledger = Ledger(str(path))
+    rows: list[Row] = []
+    with open_log(path) as log:
+        for block in log.read(ledger, selection):
+            for i in range(len(block)):
+                payload = bytes(block.rows.payload(i))  # type: ignore[union-attr]
+                rows.append(Row(block.topic, int(block.log_ns[i]), payload))
+    return Reading(tuple(rows), ledger, log)
+
+
+def by_topic(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Rows of each topic, in the order given."""
+    sorted_rows: dict[str, list[Row]] = {}
+    for row in rows:
+        sorted_rows.setdefault(row.topic, []).append(row)
+    return sorted_rows
+
+
+Verdict = Literal[
+    "refused", "same", "told", "wrong, told", "undetectable", "SILENT LOSS", "SILENT WRONG"
+]
+
+
+def judge(path: Path, truth: Sequence[Row], calm: frozenset[str] = frozenset()) -> Verdict:
+    """Read a damaged copy and say how the reader did against the truth.
+
+    Args:
+        path: The copy.
+        truth: Rows of the undamaged file.
+        calm: Notices that the undamaged file gives too.
+    """
+    try:
+        reading = read_rows(path)
+    except CrosscueError:
+        return "refused"
+    ledger = reading.ledger
+    _check_identity(ledger, reading.rows)
+    was_told = not ledger.is_whole or bool(set(ledger.notices) - calm)
+    was_told = was_told or any(account.skipped for account in ledger.accounts.values())
+    if by_topic(reading.rows) == by_topic(truth):
+        return "same"
+    strange = Counter(reading.rows) - Counter(truth)
+    if not strange:
+        return "told" if was_told else "SILENT LOSS"
+    if _only_payloads_differ(reading.rows, truth, strange):
+        assert "cannot be seen" in ledger.integrity
+        return "undetectable"
+    return "wrong, told" if was_told else "SILENT WRONG"
+
+
+def _only_payloads_differ(rows: Sequence[Row], truth: Sequence[Row], strange: Counter[Row]) -> bool:
+    """Every strange row has the topic, time and length of a row that is missing."""
+    missing = Counter(truth) - Counter(rows)
+    places = Counter((r.topic, r.log_ns, len(r.payload)) for r in missing.elements())
+    wanted = Counter((r.topic, r.log_ns, len(r.payload)) for r in strange.elements())
+    return not wanted - places
+
+
+def _check_identity(ledger: Ledger, rows: Sequence[Row]) -> None:
+    """In file = used + skipped + lost, and used is what was handed on."""
+    given = Counter(row.topic for row in rows)
+    for name, account in ledger.accounts.items():
+        assert account.used == given.get(name, 0), (name, account)
+        assert account.in_file == account.used + account.skipped.total() + account.lost.total()
+    assert not given.keys() - ledger.accounts.keys()
+
+
+def damaged_copies(whole: bytes, cuts: int, flips: int, seed: int) -> Iterator[tuple[str, bytes]]:
+    """Seeded damage: what was done, and the damaged bytes."""
+    rng = np.random.default_rng(seed)
+    for at in rng.integers(0, len(whole), size=cuts):
+        yield f"cut at {at}", whole[: int(at)]
+    for _ in range(flips):
+        length = int(rng.choice([1, 1, 2, 4, 8, 16, 32, 64]))
+        at = int(rng.integers(0, max(1, len(whole) - length)))
+        kind = ("noise", "zeros", "bit")[int(rng.integers(0, 3))]
+        copy = bytearray(whole)
+        if kind == "bit":
+            copy[at] ^= 1 << int(rng.integers(0, 8))
+        elif kind == "zeros":
+            copy[at : at + length] = bytes(length)
+        else:
+            copy[at : at + length] = rng.integers(0, 256, size=length, dtype=np.uint8).tobytes()
+        yield f"{kind} {length} at {at}", bytes(copy)
+
+
+def header_field(name: bytes, value: bytes) -> bytes:
+    """One field of a ROS 1 record header."""
+    return struct.pack("<I", len(name) + 1 + len(value)) + name + b"=" + value
+
+
+def record(body: bytes, **fields: bytes) -> bytes:
+    """One ROS 1 record."""
+    header = b"".join(header_field(name.encode(), value) for name, value in fields.items())
+    return struct.pack("<I", len(header)) + header + struct.pack("<I", len(body)) + body
