@@ -11,6 +11,7 @@ from .clocks import MAX_OFFSET_NS, Clock, ClockReport, StampReport
 
 SECOND_NS: Final = 1_000_000_000
 DRIFT_WORTH_TELLING_PPM: Final = 50.0
+DRIFT_ERRORS_WORTH_TELLING: Final = 5.0
 DUPLICATES_WORTH_TELLING: Final = 0.01
 APART_NS: Final = SECOND_NS
 """Topics whose times lie this far from each other share no clock."""
@@ -143,7 +144,7 @@ def _of_other(
     if abs(line.offset_ns) > MAX_OFFSET_NS:
         yield f"{clock.value} {_offset_words(line.offset_ns, line.start_log_ns)}"
     if line.drift_ppm is not None and line.drift_error_ppm is not None:
-        told = max(DRIFT_WORTH_TELLING_PPM, 3.0 * line.drift_error_ppm)
+        told = max(DRIFT_WORTH_TELLING_PPM, DRIFT_ERRORS_WORTH_TELLING * line.drift_error_ppm)
         if abs(line.drift_ppm) > told:
             way = "fast" if line.drift_ppm > 0 else "slow"
             yield (

@@ -331,6 +331,7 @@ def _gap_limit(order: OrderWatch) -> tuple[int | None, bool]:
     median_ns = order.periods.quantile_ns(0.5)
     if median_ns is None or order.periods.count < _PERIODS_FOR_GAPS:
         return None, True
-    is_steady = (order.periods.quantile_ns(0.9) or 0) <= _STEADY_RATIO * median_ns
-    usual_ns = median_ns if is_steady else order.periods.quantile_ns(0.99) or 0
-    return GAP_PERIODS * usual_ns, is_steady
+    # Where most rows come in bursts at one instant the median says nothing.
+    is_steady = 0 < (order.periods.quantile_ns(0.9) or 0) <= _STEADY_RATIO * median_ns
+    usual_ns = median_ns if is_steady else order.periods.quantile_ns(0.99)
+    return (GAP_PERIODS * usual_ns if usual_ns else None), is_steady

@@ -1,0 +1,203 @@
+"""What a log holds: topics, counts, rates, gaps, clocks, and what is wrong with it.
+
+examples:
+  crosscue info drive.mcap
+  crosscue info drive.mcap can0.log --json > drive.json
+  crosscue info --quick drive.bag      only what the file declares, without reading it
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from enum import Enum
+from pathlib import Path
+
+from crosscue.eval.log_summary import (
+    LogSummary,
+    Together,
+    TopicSummary,
+    quick_summary,
+    rows_of_clocks,
+    span_sentence,
+    summarise,
+    together,
+)
+from crosscue.eval.plain_text import table, terminal_width, visible, wrapped
+from crosscue.replay.columns import Block
+from crosscue.replay.log import open_logs
+
+from .common import print_json, with_progress
+
+LOSSES_SHOWN = 10
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recordings to look at")
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    parser.add_argument(
+        "--quick", action="store_true", help="only what the log declares; do not read its body"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Look at each log and print what it holds.
+
+    Returns:
+        0 when all logs are whole, 3 when something is lost.
+    """
+    logs = open_logs(args.logs)
+    try:
+        if args.quick:
+            summaries = [quick_summary(log) for log in logs]
+        else:
+            summaries = [summarise(log, _progress(args)) for log in logs]
+    finally:
+        for log in logs:
+            log.close()
+    common = together(summaries) if len(summaries) > 1 and not args.quick else None
+    if args.json:
+        print_json({"logs": [plain(s) for s in summaries], "together": plain(common)})
+    else:
+        width = terminal_width()
+        for summary in summaries:
+            print("\n".join(lines_of(summary, width)))
+        if common is not None:
+            print("\n".join(_lines_together(common, width)))
+    return 0 if all(summary.is_whole for summary in summaries) else 3
+
+
+def plain(value: object) -> object:
+    """A dataclass as dictionaries, lists and scalars, with texts made visible."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Enum):
+        return plain(value.value)
+    if isinstance(value, Mapping):
+        return {visible(str(key)): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return visible(value) if isinstance(value, str) else value
+
+
+def lines_of(summary: LogSummary, width: int) -> Iterator[str]:
+    """A summary as lines of text no wider than ``width``, as far as its numbers allow."""
+    yield wrapped(f"{summary.path} ({summary.format})", width, "")
+    if not summary.is_quick:
+        yield wrapped(span_sentence(summary.start_ns, summary.end_ns), width, "  time       ")
+        yield wrapped(summary.integrity, width, "  integrity  ")
+    yield ""
+    yield from _topics(summary, width)
+    if not summary.is_quick:
+        yield from _clocks(summary, width)
+        yield from _account(summary, width)
+        yield from _can_ids(summary, width)
+    yield from _bullets("findings", summary.findings, width)
+    yield from _bullets("notices", summary.notices, width)
+    yield from _losses(summary, width)
+
+
+def _topics(summary: LogSummary, width: int) -> Iterator[str]:
+    counted = "declared" if summary.is_quick else "count"
+    rows = [
+        (
+            t.name,
+            t.type_name,
+            t.used_as or "-",
+            _or_dash(t.declared if summary.is_quick else t.used),
+            "-" if t.rate_hz is None else f"{t.rate_hz:.4g}",
+        )
+        for t in summary.topics
+    ]
+    head = ("topic", "type", "used as", counted, "rate Hz")
+    n = 4 if summary.is_quick else 5
+    yield from table(head[:n], [row[:n] for row in rows], width, (0, 1, 2))
+    yield ""
+
+
+def _clocks(summary: LogSummary, width: int) -> Iterator[str]:
+    rows = list(rows_of_clocks(summary.topics))
+    if rows:
+        head = ("topic", "clock", "period", "gaps", "longest", "offset", "drift ppm")
+        yield from table(head, rows, width, (0, 1))
+        yield ""
+
+
+def _account(summary: LogSummary, width: int) -> Iterator[str]:
+    rows = [
+        (
+            t.name,
+            _or_dash(t.declared),
+            str(t.found),
+            str(t.used),
+            str(sum(t.skipped.values())),
+            ">= " * bool(t.lost_unknown) + str(sum(t.lost.values())),
+        )
+        for t in summary.topics
+    ]
+    if summary.unattributed_lost or summary.unattributed_unknown:
+        unknown = ">= " * bool(summary.unattributed_unknown)
+        lost = f"{unknown}{sum(summary.unattributed_lost.values())}"
+        rows.append(("(topic not known)", "-", "-", "-", "-", lost))
+    yield from table(("topic", "declared", "found", "used", "skipped", "lost"), rows, width, (0,))
+    for topic in summary.topics:
+        for reason, count in sorted(topic.skipped.items()):
+            yield wrapped(f"{topic.name}: {count} skipped: {reason}", width, "  ")
+    yield ""
+
+
+def _can_ids(summary: LogSummary, width: int) -> Iterator[str]:
+    buses = [topic for topic in summary.topics if topic.can_ids]
+    for bus in buses:
+        yield wrapped(f"{bus.name}: {_ids_in_words(bus)}", width, "")
+    if buses:
+        yield ""
+
+
+def _ids_in_words(bus: TopicSummary) -> str:
+    named = ", ".join(
+        f"0x{i.arbitration_id:X}{'x' * i.is_extended}"
+        + (f" {i.rate_hz:.3g} Hz" if i.rate_hz else f" {i.count} times")
+        for i in bus.can_ids
+    )
+    most = "most frequent: " if bus.can_id_count > len(bus.can_ids) else ""
+    return f"{bus.can_id_count} ids; {most}{named}"
+
+
+def _losses(summary: LogSummary, width: int) -> Iterator[str]:
+    texts = []
+    for loss in summary.losses[:LOSSES_SHOWN]:
+        count = "an unknown number" if loss.count is None else str(loss.count)
+        begin_ns = summary.start_ns or 0
+        at = "" if loss.t_ns is None else f" at {(loss.t_ns - begin_ns) * 1e-9:.2f} s"
+        detail = f" ({loss.detail})" if loss.detail else ""
+        texts.append(f"{count} of {loss.topic or 'unknown topics'}{at}: {loss.reason}{detail}")
+    if len(summary.losses) > LOSSES_SHOWN:
+        texts.append(f"and {len(summary.losses) - LOSSES_SHOWN} more; --json lists them")
+    yield from _bullets("losses", texts, width)
+
+
+def _lines_together(common: Together, width: int) -> Iterator[str]:
+    if common.start_ns is None:
+        yield wrapped("no time in common", width, "together   ")
+    else:
+        yield wrapped(span_sentence(common.start_ns, common.end_ns), width, "together   ")
+    yield from (wrapped(sentence, width) for sentence in common.findings)
+
+
+def _bullets(title: str, sentences: Iterable[str], width: int) -> Iterator[str]:
+    lines = [wrapped(sentence, width) for sentence in sentences]
+    if lines:
+        yield from (title, *lines, "")
+
+
+def _or_dash(count: int | None) -> str:
+    return "-" if count is None else str(count)
+
+
+def _progress(
+    args: argparse.Namespace,
+) -> Callable[[Iterable[Block], Callable[[], float]], Iterable[Block]]:
+    return lambda blocks, share: with_progress(blocks, share, args, "reading")

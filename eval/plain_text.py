@@ -1,0 +1,94 @@
+"""Tables and lines for a terminal that cannot be fooled by what a log holds."""
+
+from __future__ import annotations
+
+import shutil
+import textwrap
+import unicodedata
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+_HARMFUL: Final = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
+"""Unicode categories that are invisible, reorder text, or drive a terminal."""
+_NARROWEST: Final = 8
+_CUT: Final = "~"
+
+
+def visible(text: str) -> str:
+    """``text`` with control characters, reordering marks and undecodable bytes as escapes."""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(
+        c.encode("unicode_escape").decode() if unicodedata.category(c) in _HARMFUL else c
+        for c in text
+    )
+
+
+def cells(text: str) -> int:
+    """How many columns of a terminal ``text`` takes."""
+    if text.isascii():
+        return len(text)
+    return sum(
+        0 if unicodedata.combining(c) else 2 if unicodedata.east_asian_width(c) in "WF" else 1
+        for c in text
+    )
+
+
+def terminal_width() -> int:
+    """Columns to fill: the terminal's or ``COLUMNS``, else 100."""
+    return max(shutil.get_terminal_size(fallback=(100, 24)).columns, 40)
+
+
+def table(
+    head: Sequence[str], rows: Sequence[Sequence[str]], width: int, text_columns: Sequence[int]
+) -> Iterator[str]:
+    """Lines of a table no wider than ``width`` as long as its numbers fit.
+
+    Args:
+        head: Column names.
+        rows: Cells; made visible here.
+        width: Columns of the terminal.
+        text_columns: Which columns hold text: left-aligned, and cut in the middle to make room;
+            the others are right-aligned and whole.
+    """
+    shown = [[visible(cell) for cell in row] for row in [head, *rows]]
+    widths = [max(cells(row[i]) for row in shown) for i in range(len(head))]
+    over = sum(widths) + 2 * (len(widths) - 1) - width
+    while over > 0:
+        widest = max(text_columns, key=lambda i: widths[i])
+        if widths[widest] <= _NARROWEST:
+            break
+        widths[widest] -= 1
+        over -= 1
+    for row in shown:
+        padded = [_fitted(cell, widths[i], left=i in text_columns) for i, cell in enumerate(row)]
+        yield "  ".join(padded).rstrip()
+
+
+def wrapped(sentence: str, width: int, lead: str = "- ") -> str:
+    """One bullet point over as many lines as it takes."""
+    return textwrap.fill(
+        visible(sentence),
+        width,
+        initial_indent=lead,
+        subsequent_indent=" " * len(lead),
+        break_on_hyphens=False,
+    )
+
+
+def _fitted(cell: str, width: int, *, left: bool) -> str:
+    if cells(cell) > width:
+        # Ends tell topics apart more often than beginnings, so two thirds go to the end.
+        head = max((width - 1) // 3, 1)
+        cell = _first(cell, head) + _CUT + _first(cell[::-1], width - 1 - head)[::-1]
+    room = " " * (width - cells(cell))
+    return cell + room if left else room + cell
+
+
+def _first(text: str, width: int) -> str:
+    taken = ""
+    for c in text:
+        if cells(taken) + cells(c) > width:
+            break
+        taken += c
+    return taken
