@@ -1,0 +1,136 @@
+"""What all readers of CAN logs share: bus names and handing rows on, bus by bus."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import BLOCK_ROWS, Block, CanFrames, Int64s, Topic
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.log import Selection
+
+BUSES_MAX: Final = 256
+"""Most buses of one log; more names than that are damage, not buses."""
+
+FD_LENGTHS: Final = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64], np.int64)
+"""Payload bytes by DLC code (ISO 11898-1)."""
+IS_FD_LENGTH: Final = np.isin(np.arange(65), FD_LENGTHS)
+"""May a CAN FD frame carry that many bytes?"""
+
+
+def bus_name(spelled: str) -> str:
+    """Topic name of a bus: as the log spells it, a bare number ``1`` as ``can/1``."""
+    return f"can/{int(spelled)}" if spelled.isascii() and spelled.isdigit() else spelled
+
+
+def bus_topic(name: str, declared: int | None = None) -> Topic:
+    """The topic of one bus."""
+    return Topic(name, "crosscue/CanFrames", "columns", declared=declared)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameRows:
+    """N frames of several buses, in stored order.
+
+    Attributes:
+        place: Shape (N,), int64, ascending: line in its chunk, or byte offset.
+        bus: Shape (N,), int64: index into the reader's bus names.
+        log_ns: Shape (N,), int64.
+        frames: N frames.
+    """
+
+    place: Int64s
+    bus: Int64s
+    log_ns: Int64s
+    frames: CanFrames
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> FrameRows:
+        """The rows picked by ``index``."""
+        return FrameRows(
+            self.place[index], self.bus[index], self.log_ns[index], self.frames.take(index)
+        )
+
+
+def joined(first: FrameRows, second: FrameRows) -> FrameRows:
+    """Both, by place."""
+    if not len(second):
+        return first
+    if not len(first):
+        return second
+    a, b = first.frames, second.frames
+    width = max(a.data.shape[1], b.data.shape[1])
+    frames = CanFrames(
+        np.concatenate((a.arbitration_id, b.arbitration_id)),
+        np.concatenate((a.is_extended, b.is_extended)),
+        np.concatenate((a.kind, b.kind)),
+        np.concatenate((a.length, b.length)),
+        np.concatenate((widened(a.data, width), widened(b.data, width))),
+        np.concatenate((a.is_fd, b.is_fd)),
+    )
+    rows = FrameRows(
+        np.concatenate((first.place, second.place)),
+        np.concatenate((first.bus, second.bus)),
+        np.concatenate((first.log_ns, second.log_ns)),
+        frames,
+    )
+    return rows.take(np.argsort(rows.place, kind="stable"))
+
+
+def widened(payload: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    """``payload`` of shape (N, W) with zero columns up to ``width``."""
+    missing = width - payload.shape[1]
+    return np.pad(payload, ((0, 0), (0, missing))) if missing else payload
+
+
+def blocks_by_bus(
+    rows: FrameRows, names: Sequence[str], ledger: Ledger, selection: Selection
+) -> Iterator[Block]:
+    """Account for ``rows`` and give the wanted ones, a bus and at most ``BLOCK_ROWS`` at a time."""
+    for bus, name in enumerate(names):
+        is_here = rows.bus == bus
+        if not bool(is_here.any()):
+            continue
+        here = rows if bool(is_here.all()) else rows.take(is_here)
+        ledger.find(name, len(here))
+        if not selection.wants(name):
+            ledger.skip(name, NOT_ASKED_TOPIC, len(here))
+            continue
+        inside = in_time(here.log_ns, selection)
+        if inside is not None:
+            ledger.skip(name, NOT_ASKED_TIME, len(here) - int(np.count_nonzero(inside)))
+            here = here.take(inside)
+        for k in range(0, len(here), BLOCK_ROWS):
+            part = here.take(slice(k, k + BLOCK_ROWS))
+            yield Block(name, part.log_ns, narrowed(part.frames))
+
+
+def in_time(log_ns: Int64s, selection: Selection) -> NDArray[np.bool_] | None:
+    """Which times lie in the half-open span asked for; None for all of them."""
+    inside: NDArray[np.bool_] | None = None
+    if selection.start_ns is not None:
+        inside = log_ns >= selection.start_ns
+    if selection.end_ns is not None:
+        before = log_ns < selection.end_ns
+        inside = before if inside is None else inside & before
+    return inside
+
+
+def narrowed(frames: CanFrames) -> CanFrames:
+    """With eight payload columns when no frame is CAN FD."""
+    if frames.data.shape[1] == 8 or bool(frames.is_fd.any()):
+        return frames
+    return CanFrames(
+        frames.arbitration_id,
+        frames.is_extended,
+        frames.kind,
+        frames.length,
+        np.ascontiguousarray(frames.data[:, :8]),
+        frames.is_fd,
+    )

@@ -1,0 +1,421 @@
+"""Reading CAN logs that are text: whole chunks in columns, odd lines one by one, none dropped.
+
+A ``Dialect`` knows one format. Its ``fast`` takes the lines of a chunk that follow the common
+pattern, as columns; every other line that is not blank goes through ``slow``, which says what it
+is: a frame, a line that is no frame, a mark such as a header, or damage. So each line ends up
+used, skipped or lost.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import ClassVar, Final, NamedTuple, Self, TypeAlias
+
+import numpy as np
+
+from crosscue.replay.columns import Block, Bytes, CanFrames, Int64s, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import EVERYTHING, Selection
+
+from .can_lines import Lines, Overlong, Tail, lines_of
+from .can_rows import (
+    BUSES_MAX,
+    FrameRows,
+    blocks_by_bus,
+    bus_name,
+    bus_topic,
+    joined,
+    widened,
+)
+from .digits import Bools, payload8, payload64, spaced8
+
+HEAD_BYTES: Final = 64 << 10
+LINE_MAX: Final = 8192
+"""Longest line that ``slow`` is asked about."""
+_EXCERPT: Final = 60
+
+
+class Frame(NamedTuple):
+    """One frame from an odd line; ``t_ns`` as the line spells it, before ``Dialect.clock``."""
+
+    bus: str
+    t_ns: int
+    arbitration_id: int
+    is_extended: bool
+    kind: int
+    length: int
+    payload: bytes = b""
+    is_fd: bool = False
+
+
+class Other(NamedTuple):
+    """A good line that is no frame: counted under its reason, and under its bus if it has one."""
+
+    reason: str
+    t_ns: int | None = None
+    bus: str = ""
+
+
+class Damage(NamedTuple):
+    """A line that nobody can read.
+
+    ``taints`` says that the line before may have been cut off by the same damage.
+    """
+
+    reason: str
+    taints: bool = False
+
+
+class Mark(NamedTuple):
+    """A header or comment line; ``clock`` gets those that change the meaning of times.
+
+    A mark with ``stops`` ends the reading, for the reason it gives.
+    """
+
+    origin_ns: int | None = None
+    stops: str = ""
+
+
+Outcome: TypeAlias = Frame | Other | Damage | Mark | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fast:
+    """What ``Dialect.fast`` found: ``rows.bus`` indexes ``names``, ``rows.place`` is the line."""
+
+    rows: FrameRows
+    names: tuple[str, ...]
+
+
+class Dialect(ABC):
+    """One text format; holds what a reading pass must remember, so each pass has its own."""
+
+    format: ClassVar[str]
+    says: ClassVar[str]
+    integrity: ClassVar[str]
+
+    @abstractmethod
+    def fast(self, lines: Lines) -> Fast:
+        """The lines that follow the common pattern."""
+
+    @abstractmethod
+    def slow(self, line: bytes) -> Outcome:
+        """One line that does not."""
+
+    @abstractmethod
+    def last(self, line: bytes) -> Outcome:
+        """The last line when it has no line end, so that it may be cut."""
+
+    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, Mark]]) -> Int64s:
+        """Log times from the times that lines spell.
+
+        Args:
+            place: Line of every time, ascending; all lines with a time, frames or not.
+            t_ns: The times.
+            marks: The marks of this chunk with their lines.
+        """
+        del place, marks
+        return t_ns
+
+    def finish(self, ledger: Ledger) -> None:
+        """Say what the whole file showed, once it is read."""
+        del ledger
+
+
+NO_FRAMES: Final = CanFrames(
+    np.zeros(0, np.uint32),
+    np.zeros(0, np.bool_),
+    np.zeros(0, np.uint8),
+    np.zeros(0, np.uint8),
+    np.zeros((0, 8), np.uint8),
+    np.zeros(0, np.bool_),
+)
+_NO_INTS: Final = np.zeros(0, np.int64)
+NO_ROWS: Final = FrameRows(_NO_INTS, _NO_INTS, _NO_INTS, NO_FRAMES)
+
+
+class TextCanLog:
+    """An open CAN log in text form (``Log``)."""
+
+    def __init__(self, path: Path, limits: Limits, dialect: Callable[[], Dialect]) -> None:
+        """Look at the first chunk.
+
+        Raises:
+            LogFormatError: The file is empty, or its first chunk holds lines but no frame, no
+                header and nothing else of this format.
+        """
+        del limits  # the chunk size bounds everything here
+        self._path, self._dialect = path, dialect
+        self._names: dict[str, int] = {}
+        one = dialect()
+        self._format = one.format
+        self._peek(one)
+
+    @property
+    def path(self) -> Path:
+        """Where it lies."""
+        return self._path
+
+    @property
+    def format(self) -> str:
+        """Short name of the format."""
+        return self._format
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The buses seen so far: those of the first chunk, and after a pass all of them."""
+        return tuple(bus_topic(name) for name in self._names)
+
+    def close(self) -> None:
+        """Nothing stays open between passes."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """All frames, chunk by chunk; see ``Log.read``."""
+        scribe = _Scribe(self._dialect(), self._names, ledger)
+        size = self._path.stat().st_size
+        try:
+            for piece in lines_of(self._path):
+                rows = scribe.rows(piece)
+                yield from blocks_by_bus(rows, tuple(self._names), ledger, selection)
+                if scribe.stopped:
+                    break
+        except OSError as error:
+            ledger.lose("", "file cannot be read on", None, error.strerror or str(error))
+        for name in self._names:
+            ledger.topic(name)
+        if self._path.stat().st_size != size:
+            ledger.lose("", "file changed while it was read", None, f"had {size} bytes before")
+        scribe.dialect.finish(ledger)
+        ledger.integrity = scribe.dialect.integrity
+
+    def _peek(self, dialect: Dialect) -> None:
+        ledger = Ledger(str(self._path))
+        scribe = _Scribe(dialect, self._names, ledger)
+        for piece in lines_of(self._path, HEAD_BYTES):
+            found = len(scribe.rows(piece))
+            if isinstance(piece, Lines) or found or scribe.knows_it:
+                break
+        if not self._names and not scribe.knows_it:
+            why = next((d.detail for d in ledger.losses()), "it is empty")
+            raise LogFormatError(
+                f"{self._path}: no frame of a {dialect.says} in its beginning ({why}); "
+                "check that it is one, and whole"
+            )
+
+
+class _Scribe:
+    """Turns chunks into rows and writes the rest into the ledger."""
+
+    def __init__(self, dialect: Dialect, names: dict[str, int], ledger: Ledger) -> None:
+        self.dialect = dialect
+        self.stopped = False
+        self.knows_it = False
+        self._names, self._ledger = names, ledger
+
+    def rows(self, piece: Lines | Overlong | Tail) -> FrameRows:
+        """The frames of one piece of the file, with log times."""
+        if isinstance(piece, Lines):
+            return self._lines(piece)
+        if isinstance(piece, Tail):
+            return self._tail(piece)
+        detail = f"line {piece.number}: at least {piece.byte_count} bytes without a line end"
+        self._ledger.lose("", "stretch without line ends", None, detail)
+        return NO_ROWS
+
+    def _tail(self, tail: Tail) -> FrameRows:
+        odd = _Odd()
+        outcome = self.dialect.last(tail.text) if len(tail.text) <= LINE_MAX else None
+        if outcome is None:
+            if tail.text.strip():
+                outcome = Damage("last line has no line end, may be cut")
+        elif isinstance(outcome, Frame):
+            detail = f"line {tail.number} is complete but has no line end"
+            self._ledger.lose("", "file may be cut after its last frame", None, detail)
+        self._sort_in(odd, 0, tail.number, tail.text, outcome)
+        return self._timed(NO_ROWS, odd)
+
+    def _lines(self, lines: Lines) -> FrameRows:
+        fast = self.dialect.fast(lines)
+        rows = self._renamed(fast)
+        is_odd = lines.stop > lines.start
+        is_odd[rows.place] = False
+        odd = _Odd()
+        for i in np.flatnonzero(is_odd).tolist():
+            line = lines.text(i)
+            outcome = self.dialect.slow(line) if len(line) <= LINE_MAX else Damage("line too long")
+            if isinstance(outcome, Damage) and outcome.taints and i > 0:
+                odd.tainted.append(i - 1)
+            if i >= lines.done:
+                break
+            self._sort_in(odd, i, lines.first_number + i, line, outcome)
+            if self.stopped:
+                return self._timed(rows.take(rows.place < i), odd)
+        if lines.done < len(lines):
+            rows = rows.take(slice(0, int(np.searchsorted(rows.place, lines.done))))
+        return self._untainted(self._timed(rows, odd), odd.tainted, lines)
+
+    def _sort_in(self, odd: _Odd, i: int, number: int, line: bytes, outcome: Outcome) -> None:
+        match outcome:
+            case Frame():
+                code = self._code(outcome.bus)
+                if code < 0:
+                    self._lost("", "more buses than a log can have", number, line)
+                else:
+                    odd.frames.append((i, code, outcome))
+            case Other():
+                self.knows_it = True
+                self._ledger.find(outcome.bus, 1)
+                self._ledger.skip(outcome.bus, outcome.reason, 1, f"line {number}", outcome.t_ns)
+                if outcome.t_ns is not None:
+                    odd.times.append((i, outcome.t_ns))
+            case Damage():
+                self._lost("", outcome.reason, number, line)
+            case Mark():
+                self.knows_it = True
+                odd.marks.append((i, outcome))
+                if outcome.stops:
+                    self.stopped = True
+                    self._ledger.lose("", outcome.stops, None, f"from line {number} on")
+            case None:
+                pass
+
+    def _lost(self, topic: str, reason: str, number: int, line: bytes) -> None:
+        excerpt = line[:_EXCERPT].decode("ascii", "backslashreplace")
+        dots = "..." if len(line) > _EXCERPT else ""
+        self._ledger.lose(topic, reason, 1, f"line {number}: {excerpt!r}{dots}")
+
+    def _untainted(self, rows: FrameRows, tainted: list[int], lines: Lines) -> FrameRows:
+        if not tainted:
+            return rows
+        is_bad = np.isin(rows.place, tainted)
+        names = tuple(self._names)
+        for k in np.flatnonzero(is_bad).tolist():
+            i = int(rows.place[k])
+            reason = "followed by a broken line, may be cut"
+            self._lost(names[rows.bus[k]], reason, lines.first_number + i, lines.text(i))
+        return rows.take(~is_bad)
+
+    def _timed(self, rows: FrameRows, odd: _Odd) -> FrameRows:
+        """Fast and odd rows together, with log times."""
+        rows = joined(rows, odd.rows())
+        place, t_ns = rows.place, rows.log_ns
+        if odd.times:
+            at, values = (np.array(column, np.int64) for column in zip(*odd.times, strict=True))
+            place, t_ns = np.concatenate((place, at)), np.concatenate((t_ns, values))
+        order = np.argsort(place, kind="stable") if odd.times else slice(None)
+        log_ns = np.empty_like(t_ns)
+        log_ns[order] = self.dialect.clock(place[order], t_ns[order], odd.marks)
+        return FrameRows(rows.place, rows.bus, log_ns[: len(rows)], rows.frames)
+
+    def _renamed(self, fast: Fast) -> FrameRows:
+        rows = fast.rows
+        if not len(rows):
+            return rows
+        uses = np.bincount(rows.bus, minlength=len(fast.names)).tolist()
+        named = zip(fast.names, uses, strict=True)
+        codes = np.array([self._code(name) if used else -1 for name, used in named], np.int64)
+        bus = codes[rows.bus]
+        renamed = FrameRows(rows.place, bus, rows.log_ns, rows.frames)
+        return renamed.take(bus >= 0) if bool((bus < 0).any()) else renamed
+
+    def _code(self, spelled: str) -> int:
+        name = bus_name(spelled)
+        if name not in self._names:
+            if len(self._names) >= BUSES_MAX:
+                return -1
+            self._names[name] = len(self._names)
+        return self._names[name]
+
+
+class _Odd:
+    """What the odd lines of one chunk came to."""
+
+    def __init__(self) -> None:
+        self.frames: list[tuple[int, int, Frame]] = []
+        self.times: list[tuple[int, int]] = []
+        self.marks: list[tuple[int, Mark]] = []
+        self.tainted: list[int] = []
+
+    def rows(self) -> FrameRows:
+        if not self.frames:
+            return NO_ROWS
+        place, bus, frames = zip(*self.frames, strict=True)
+        width = 64 if any(f.is_fd or len(f.payload) > 8 for f in frames) else 8
+        payload = b"".join(f.payload.ljust(width, b"\0") for f in frames)
+        return FrameRows(
+            np.array(place, np.int64),
+            np.array(bus, np.int64),
+            np.array([f.t_ns for f in frames], np.int64),
+            CanFrames(
+                np.array([f.arbitration_id for f in frames], np.uint32),
+                np.array([f.is_extended for f in frames], np.bool_),
+                np.array([f.kind for f in frames], np.uint8),
+                np.array([f.length for f in frames], np.uint8),
+                np.frombuffer(payload, np.uint8).reshape(-1, width).copy(),
+                np.array([f.is_fd for f in frames], np.bool_),
+            ),
+        )
+
+
+def head_of(path: Path) -> bytes:
+    """The first 64 KiB, as a format's header needs them.
+
+    Raises:
+        LogFormatError: It is empty, compressed or UTF-16, with what to do about it.
+    """
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    if not head:
+        raise LogFormatError(f"{path}: empty file; expected a CAN log, check how it was copied")
+    for magic, what, todo in (
+        (b"\x1f\x8b", "compressed with gzip", "unpack it first (gzip -d)"),
+        (b"\xff\xfe", "UTF-16 text", "save it as UTF-8"),
+        (b"\xfe\xff", "UTF-16 text", "save it as UTF-8"),
+        (b"PK\x03\x04", "a zip archive", "unpack it first"),
+    ):
+        if head.startswith(magic):
+            raise LogFormatError(f"{path}: {what}, expected plain text; {todo}")
+    return head
+
+
+def payloads(
+    lines: Lines, start: Int64s, length: Int64s, is_fd: Bools, gap: int | None
+) -> tuple[Bytes, Bools]:
+    """Payload bytes of frames written as hexadecimal pairs, with ``gap`` between them or nothing.
+
+    Returns:
+        Bytes of shape (N, 8), or (N, 64) when a frame is CAN FD, and whether all were readable.
+    """
+    if gap is None:
+        payload, ok = payload8(lines.words, start, length)
+    else:
+        payload, ok = spaced8(lines.words, start, length, gap)
+    if not bool(is_fd.any()):
+        return payload, ok
+    payload = widened(payload, 64)
+    long = np.flatnonzero(length > 8)
+    payload[long], ok[long] = payload64(lines.buffer, start[long], length[long], gap)
+    return payload, ok
+
+
+def picked(keep: Bools, place: Int64s, bus: Int64s, t_ns: Int64s, frames: CanFrames) -> FrameRows:
+    """The rows that passed every check of ``fast``."""
+    rows = FrameRows(place, bus, t_ns, frames)
+    return rows if bool(keep.all()) else rows.take(keep)

@@ -1,0 +1,269 @@
+"""Text to numbers for many fields at once: eight characters of a field are one 64-bit word.
+
+A field is a range of one buffer. Its characters are fetched as unaligned little-endian words, the
+ones outside the field replaced by ``0``, and all fields are then checked and converted with a
+dozen integer operations on the column of words ("SIMD within a register", Knuth TAOCP 7.1.3).
+Nothing passes through floating point, so decimal times come out exact.
+
+The buffer must hold ``FRONT`` bytes before the first field and ``BACK`` bytes after the last.
+"""
+
+from __future__ import annotations
+
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Bytes, Int64s
+
+Words: TypeAlias = NDArray[np.uint64]
+Bools: TypeAlias = NDArray[np.bool_]
+
+FRONT: Final = 32
+BACK: Final = 256
+NANOS: Final = 1_000_000_000
+SECONDS_MAX: Final = 9_223_372_035
+"""Largest whole second whose nanoseconds, and the second after it, fit in int64."""
+
+
+def _u(value: int) -> np.uint64:
+    return np.uint64(value)
+
+
+_ALL: Final = (1 << 64) - 1
+_KEEP_LAST: Final = np.array([_ALL << 8 * (8 - k) & _ALL for k in range(9)], np.uint64)
+_KEEP_FIRST: Final = np.array([(1 << 8 * k) - 1 for k in range(9)], np.uint64)
+_ZEROS: Final = _u(0x3030303030303030)
+_POWER: Final = np.array([10**k for k in range(10)], np.int64)
+
+
+def words_of(buffer: Bytes) -> Words:
+    """Every eight consecutive bytes of ``buffer`` as a word; shape (len - 7,), not copied."""
+    words: Words = np.ndarray((len(buffer) - 7,), np.dtype("<u8"), buffer.data, strides=(1,))
+    return words
+
+
+def _decimal8(word: Words) -> tuple[Words, Bools]:
+    high = _u(0xF0F0F0F0F0F0F0F0)
+    sixes = _u(0x0606060606060606)
+    ok = ((word & high) | (((word + sixes) & high) >> _u(4))) == _u(0x3333333333333333)
+    value = ((word & _u(0x0F0F0F0F0F0F0F0F)) * _u(2561)) >> _u(8)
+    value = ((value & _u(0x00FF00FF00FF00FF)) * _u(6553601)) >> _u(16)
+    value = ((value & _u(0x0000FFFF0000FFFF)) * _u(42949672960001)) >> _u(32)
+    return value, ok
+
+
+def _nibbles8(word: Words) -> tuple[Words, Bools]:
+    """Eight hexadecimal characters as eight bytes of four bits, and whether all were such.
+
+    Each nibble is spelled again and compared, which refuses every other byte value.
+    """
+    ones = _u(0x0101010101010101)
+    nibble = (word & (ones * _u(15))) + ((word >> _u(6)) & (ones * _u(3))) * _u(9)
+    letter = ((nibble + ones * _u(6)) >> _u(4)) & ones
+    spelled = nibble + _ZEROS + letter * _u(39)
+    ok = (spelled == (word | (letter << _u(5)))) & ((nibble & (ones * _u(0xF0))) == 0)
+    return nibble, ok
+
+
+def _filled(word: Words, table: Words, count: Int64s, fewest: int, most: int) -> Words:
+    """Each word with only ``count`` of its characters, clipped to 0..8, and ``0`` elsewhere."""
+    if fewest >= 8:
+        return word
+    if fewest == most:
+        keep = table[max(fewest, 0)]
+        filled: Words = (word & keep) | (_ZEROS & ~keep)
+        return filled
+    keeps = table[np.minimum(np.maximum(count, 0), 8)]
+    return ((word ^ _ZEROS) & keeps) ^ _ZEROS
+
+
+def decimal(words: Words, stop: Int64s, count: Int64s) -> tuple[Int64s, Bools]:
+    """Unsigned decimal fields of 1 to 16 digits that end before ``stop``.
+
+    Returns:
+        Values, shape (N,), int64, and whether each field was all digits; a value that is not ok
+        means nothing.
+    """
+    if not len(count):
+        return np.zeros(0, np.int64), np.zeros(0, np.bool_)
+    fewest, most = int(count.min()), int(count.max())
+    value, ok = _decimal8(_filled(words[stop - 8], _KEEP_LAST, count, fewest, most))
+    if fewest < 1 or most > 16:
+        ok &= (count > 0) & (count <= 16)
+    if most > 8:
+        word = _filled(words[stop - 16], _KEEP_LAST, count - 8, fewest - 8, most - 8)
+        high, high_ok = _decimal8(word)
+        value = value + high * _u(100_000_000)
+        ok &= high_ok
+    return value.view(np.int64), ok
+
+
+def hexadecimal(words: Words, stop: Int64s, count: Int64s) -> tuple[Int64s, Bools]:
+    """Hexadecimal fields of 1 to 8 digits that end before ``stop``, as ``decimal``."""
+    if not len(count):
+        return np.zeros(0, np.int64), np.zeros(0, np.bool_)
+    fewest, most = int(count.min()), int(count.max())
+    nibble, ok = _nibbles8(_filled(words[stop - 8], _KEEP_LAST, count, fewest, most))
+    value = _packed(nibble).astype(np.uint32).byteswap().astype(np.int64)
+    return value, ok & (count > 0) & (count <= 8)
+
+
+def _packed(nibble: Words) -> Words:
+    """Eight nibbles as four bytes, the first two nibbles in the lowest byte."""
+    pair = ((nibble << _u(4)) | (nibble >> _u(8))) & _u(0x00FF00FF00FF00FF)
+    pair = (pair | (pair >> _u(8))) & _u(0x0000FFFF0000FFFF)
+    return (pair | (pair >> _u(16))) & _u(0xFFFFFFFF)
+
+
+def seconds_ns(buffer: Bytes, words: Words, start: Int64s, stop: Int64s) -> tuple[Int64s, Bools]:
+    """Decimal numbers such as ``12.000345`` or ``12,000345``, times 10**9, exactly.
+
+    One to nine digits after the mark and one to ten before it; anything else is not ok.
+
+    Args:
+        buffer: What ``words`` is a view of.
+        words: From ``words_of``.
+        start: Shape (N,): first character of each number.
+        stop: Shape (N,): one past its last.
+    """
+    places = _places(buffer, start, stop)
+    fraction, fraction_ok = decimal(words, stop, places)
+    whole, whole_ok = decimal(words, stop - 1 - places, stop - 1 - places - start)
+    ok = fraction_ok & whole_ok & (whole <= SECONDS_MAX)
+    return whole * NANOS + fraction * _POWER[9 - places], ok
+
+
+def _places(buffer: Bytes, start: Int64s, stop: Int64s) -> Int64s:
+    """How many decimals each number has; nearly always all have as many as the first one."""
+    first = _first_places(buffer, start, stop)
+    places = np.full(len(stop), first, np.int64)
+    here = _has_mark(buffer, start, stop, first)
+    if bool(here.all()):
+        return places
+    open_ = np.flatnonzero(~here)
+    for k in range(1, 10):
+        here = _has_mark(buffer, start[open_], stop[open_], k)
+        places[open_[here]] = k
+        open_ = open_[~here]
+    places[open_] = 0
+    return places
+
+
+def _has_mark(buffer: Bytes, start: Int64s, stop: Int64s, places: int) -> Bools:
+    at = stop - (1 + places)
+    mark = buffer[at]
+    found: Bools = ((mark == ord(".")) | (mark == ord(","))) & (at > start)
+    return found
+
+
+def _first_places(buffer: Bytes, start: Int64s, stop: Int64s) -> int:
+    if not len(stop):
+        return 6
+    text = buffer[int(start[0]) : int(stop[0])].tobytes()
+    mark = max(text.rfind(b"."), text.rfind(b","))
+    return min(max(len(text) - 1 - mark, 1), 9) if mark >= 0 else 6
+
+
+def payload8(words: Words, start: Int64s, length: Int64s) -> tuple[Bytes, Bools]:
+    """Up to eight bytes written as hexadecimal digits without spaces (``DEADBEEF``).
+
+    Returns:
+        Bytes, shape (N, 8), zero from ``length`` on, and whether all digits were such.
+    """
+    if not len(length):
+        return np.zeros((0, 8), np.uint8), np.zeros(0, np.bool_)
+    digits = 2 * length
+    fewest, most = int(digits.min()), int(digits.max())
+    low, ok = _nibbles8(_filled(words[start], _KEEP_FIRST, digits, fewest, most))
+    word = _filled(words[start + 8], _KEEP_FIRST, digits - 8, fewest - 8, most - 8)
+    high, high_ok = _nibbles8(word)
+    ok &= high_ok
+    if most > 16:
+        ok &= length <= 8
+    return _rows8(_packed(low), _packed(high)), ok
+
+
+_GAPS: Final = np.array([0, 0xFF0000, 0xFF0000FF0000], np.uint64)
+
+
+def spaced8(words: Words, start: Int64s, length: Int64s, gap: int) -> tuple[Bytes, Bools]:
+    """Up to eight bytes with one character ``gap`` between them (``DE AD BE EF``)."""
+    gaps = _u(gap) * _u(0x010000010000)
+    ok = length <= 8
+    halves = []
+    for k in range(2):
+        fours = []
+        for j in (2 * k, 2 * k + 1):
+            word = words[start + 6 * j]
+            between = _GAPS[np.clip(length - 1 - 2 * j, 0, 2)]
+            ok &= (word & between) == (gaps & between)
+            fours.append((word & _u(0xFFFF)) | ((word >> _u(8)) & _u(0xFFFF0000)))
+        keep = _KEEP_FIRST[np.clip(2 * length - 8 * k, 0, 8)]
+        digits = fours[0] | (fours[1] << _u(32))
+        nibble, half_ok = _nibbles8((digits & keep) | (_ZEROS & ~keep))
+        halves.append(_packed(nibble))
+        ok &= half_ok
+    return _rows8(halves[0], halves[1]), ok
+
+
+def _rows8(low: Words, high: Words) -> Bytes:
+    return (low | (high << _u(32))).astype("<u8").view(np.uint8).reshape(-1, 8)
+
+
+_NIBBLE: Final = np.full(256, 0x80, np.uint8)
+for _value, _digits in enumerate(zip(b"0123456789abcdef", b"0123456789ABCDEF", strict=True)):
+    _NIBBLE[list(_digits)] = _value
+
+
+def is_hex(characters: Bytes) -> Bools:
+    """Which characters are hexadecimal digits."""
+    found: Bools = _NIBBLE[characters] < 0x80
+    return found
+
+
+def payload64(buffer: Bytes, start: Int64s, length: Int64s, gap: int | None) -> tuple[Bytes, Bools]:
+    """Up to 64 bytes, with the character ``gap`` between them or nothing; shape (N, 64)."""
+    step = 2 if gap is None else 3
+    text = sliding_window_view(buffer, 64 * step)[start].reshape(-1, 64, step)
+    high, low = _NIBBLE[text[:, :, 0]], _NIBBLE[text[:, :, 1]]
+    inside = np.arange(64) < length[:, None]
+    ok = ~np.any(((high | low) >= 0x80) & inside, axis=1) & (length <= 64)
+    if gap is not None:
+        between = np.arange(64) < length[:, None] - 1
+        ok &= ~np.any((text[:, :, 2] != gap) & between, axis=1)
+    return np.where(inside, (high << 4) | (low & 15), np.uint8(0)), ok
+
+
+LABEL_MAX: Final = 16
+"""Longest name, in bytes, that ``labels`` can tell apart."""
+_NAMES_MAX: Final = 64
+
+
+def labels(words: Words, start: Int64s, count: Int64s) -> tuple[Int64s, tuple[bytes, ...]]:
+    """Number the different names among fields of 1 to 16 bytes, in order of appearance.
+
+    Returns:
+        Shape (N,): which name each field holds, or -1 beyond 64 different names; and the names.
+    """
+    low = words[start] & _KEEP_FIRST[np.clip(count, 0, 8)]
+    high = words[start + 8] & _KEEP_FIRST[np.clip(count - 8, 0, 8)]
+    if not len(start):
+        return np.zeros(0, np.int64), ()
+    names = [_spelled(int(low[0]), int(high[0]), int(count[0]))]
+    is_first = (low == low[0]) & (high == high[0])
+    codes = np.where(is_first, 0, -1)
+    open_ = np.flatnonzero(~is_first)
+    while len(open_) and len(names) < _NAMES_MAX:
+        first = open_[0]
+        same = (low[open_] == low[first]) & (high[open_] == high[first])
+        codes[open_[same]] = len(names)
+        names.append(_spelled(int(low[first]), int(high[first]), int(count[first])))
+        open_ = open_[~same]
+    return codes, tuple(names)
+
+
+def _spelled(low: int, high: int, count: int) -> bytes:
+    return (low | high << 64).to_bytes(16, "little")[:count]
