@@ -1,0 +1,60 @@
+"""A run in Rerun: open its viewer, or write the recording.
+
+examples:
+  crosscue view runs/drive                    open Rerun's viewer
+  crosscue view runs/drive --save drive.rrd   write the recording, open nothing
+  crosscue view runs/drive --web              serve the viewer to a browser on this machine
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from crosscue.eval.recording import TruthTrack, save
+from crosscue.eval.score_pose import truth_track
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.run_folder import RunFolder, open_run
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--save", type=Path, metavar="X.rrd", help="write the recording only")
+    how.add_argument("--web", action="store_true", help="serve it on 127.0.0.1 for a browser")
+    parser.add_argument("--truth", type=Path, metavar="T.json", help="draw the true track too")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write drive.rrd into the run, or where asked, and open it."""
+    folder = open_run(args.run)
+    path = args.save or folder.file("drive.rrd")
+    save(folder, path, _truth(args, folder))
+    if args.save is not None:
+        if not args.quiet:
+            print(path)
+        return 0
+    return _open(path, args.web)
+
+
+def _truth(args: argparse.Namespace, folder: RunFolder) -> TruthTrack | None:
+    return truth_track(args.truth, folder) if args.truth is not None else None
+
+
+def _open(path: Path, web: bool) -> int:
+    # Rerun's Python calls listen on every address; only its command can be bound to this machine.
+    command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(path)]
+    if web:
+        command.append("--serve-web")
+    environment = {**os.environ, "RERUN_ANALYTICS": "0"}
+    try:
+        status = subprocess.run(command, env=environment, check=False).returncode
+    except OSError as error:
+        raise CrosscueError(f"rerun: cannot be started ({error.strerror}); open {path}") from None
+    if status:
+        raise CrosscueError(f"rerun: ended with status {status}; open {path} with another viewer")
+    return 0
