@@ -1,0 +1,88 @@
+"""A file's bytes by position, read (never mapped) so that a shrinking file is a short read."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from pathlib import Path
+from threading import Event
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Bytes
+
+from .mcap_records import BrokenRecordError
+
+WINDOW: Final = 64 << 10
+PIECE: Final = 1 << 20
+
+
+class ByteFile:
+    """An open file. ``peek`` is for one thread; ``read`` and ``crc`` are for any."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb", buffering=0)
+        self.size = os.fstat(self._file.fileno()).st_size
+        self._window = b""
+        self._window_at = 0
+
+    def peek(self, at: int, size: int) -> memoryview:
+        """Up to ``size`` bytes at ``at``, from a window that is read ahead; shorter at the end.
+
+        Raises:
+            BrokenRecordError: The disk reports an error.
+        """
+        return self.window(at, size)[:size]
+
+    def window(self, at: int, least: int) -> memoryview:
+        """What is at hand from ``at`` on: at least ``least`` bytes, less only at the end."""
+        begin = at - self._window_at
+        if begin < 0 or begin + least > len(self._window):
+            self._window = self._pread(at, max(least, WINDOW))
+            self._window_at, begin = at, 0
+        return memoryview(self._window)[begin:]
+
+    def read(self, at: int, size: int) -> Bytes:
+        """Up to ``size`` bytes at ``at``, as a new array of shape (size,) or less at the end.
+
+        Raises:
+            BrokenRecordError: The disk reports an error.
+        """
+        size = max(0, min(size, self.size - at))
+        array = np.empty(size, dtype=np.uint8)
+        view, done = array.data, 0
+        while done < size:
+            try:
+                step = os.preadv(self._file.fileno(), [view[done:]], at + done)
+            except OSError as error:
+                raise BrokenRecordError(f"the disk says: {error.strerror}") from None
+            if not step:
+                break
+            done += step
+        return array[:done]
+
+    def crc(self, begin: int, end: int, stop: Event | None = None) -> int | None:
+        """CRC-32 of the bytes from ``begin`` to ``end``; None if they cannot all be read."""
+        value, at = 0, begin
+        while at < end:
+            if stop is not None and stop.is_set():
+                return None
+            try:
+                piece = self._pread(at, min(PIECE, end - at))
+            except BrokenRecordError:
+                return None
+            if not piece:
+                return None
+            value, at = zlib.crc32(piece, value), at + len(piece)
+        return value
+
+    def close(self) -> None:
+        """Release the file; later reads raise ValueError."""
+        self._file.close()
+
+    def _pread(self, at: int, size: int) -> bytes:
+        try:
+            return os.pread(self._file.fileno(), size, at)
+        except OSError as error:
+            raise BrokenRecordError(f"the disk says: {error.strerror}") from None

@@ -1,0 +1,83 @@
+"""What was verified in one pass, and how to say it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from crosscue.replay.ledger import Ledger
+
+
+@dataclass(slots=True)
+class Tally:
+    """How often something happened, and the first case in words."""
+
+    count: int = 0
+    first: str = ""
+
+    def add(self, case: str) -> None:
+        """Once more."""
+        self.count += 1
+        self.first = self.first or case
+
+
+@dataclass(slots=True)
+class Checks:
+    """Counts of checks over all recordings of a file."""
+
+    chunks: int = 0
+    chunks_right: int = 0
+    chunks_bare: int = 0
+    chunks_unread: int = 0
+    rows_bare: int = 0
+    sections_right: int = 0
+    sections_wrong: int = 0
+    sections_unread: int = 0
+    summaries_right: int = 0
+    attachments: int = 0
+    attachments_right: int = 0
+    bad_attachments: Tally = field(default_factory=Tally)
+    bad_indexes: Tally = field(default_factory=Tally)
+    bad_heads: Tally = field(default_factory=Tally)
+    bad_definitions: Tally = field(default_factory=Tally)
+    ignored: Tally = field(default_factory=Tally)
+
+    def report(self, ledger: Ledger) -> None:
+        """Say it in the ledger."""
+        ledger.integrity = self._integrity()
+        if self.chunks_bare and self.chunks_right:
+            ledger.notice(
+                f"{self.chunks_bare} of {self.chunks} chunks carry no checksum while others do"
+            )
+        for tally, sentence in (
+            (self.bad_indexes, "message indexes that do not fit their chunks, which were scanned"),
+            (self.bad_heads, "chunks that match their checksum but not what is said of them"),
+            (self.bad_attachments, "attachments that do not match their checksum"),
+            (self.bad_definitions, "schemas or channels that cannot be read or contradict"),
+            (self.ignored, "records of unknown kinds, passed over"),
+        ):
+            if tally.count:
+                ledger.notice(f"{tally.count} {sentence}; the first: {tally.first}")
+
+    def _integrity(self) -> str:
+        right: list[str] = []
+        if self.chunks:
+            right.append(f"{self.chunks_right} of {self.chunks} chunks")
+        if self.sections_right:
+            right.append("the data section")
+        if self.summaries_right:
+            right.append("the summary")
+        if self.attachments:
+            right.append(f"{self.attachments_right} of {self.attachments} attachments")
+        has_any = self.chunks_right + self.sections_right + self.summaries_right
+        parts = [f"CRC-32 verified: {', '.join(right)}"] if has_any else []
+        if self.chunks_bare or self.rows_bare:
+            what = [f"{self.chunks_bare} chunks"] if self.chunks_bare else []
+            what += [f"{self.rows_bare} messages outside chunks"] if self.rows_bare else []
+            parts.append(f"no checksum covers {' and '.join(what)}")
+        if self.chunks_unread:
+            parts.append(f"{self.chunks_unread} chunks not asked for and not read")
+        if self.sections_unread:
+            parts.append("the data section's checksum was not needed")
+        if self.sections_wrong:
+            parts.append("the data section's checksum is wrong")
+        return "; ".join(parts) or "the file carries no checksums"

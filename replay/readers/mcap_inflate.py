@@ -1,0 +1,141 @@
+"""Chunks decompressed to no more than they declare, with their checksum verified."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Bytes
+
+from .mcap_records import BrokenRecordError, ChunkHead
+
+UNKNOWN_SIZES: Final = (-1, 0)
+"""What zstandard and lz4 say when a frame does not declare its size."""
+
+
+def inflate(body: Bytes, head: ChunkHead) -> Bytes:
+    """The records of a chunk, their size and checksum as the chunk declares.
+
+    Args:
+        body: Shape (B,), the chunk's records as stored.
+        head: What the chunk says of them.
+
+    Returns:
+        Shape (``head.size``,), uint8.
+
+    Raises:
+        BrokenRecordError: Something is not as declared; nothing beyond the declared size was
+            allocated.
+    """
+    if len(body) != head.body_size:
+        raise BrokenRecordError(f"holds {len(body)} of {head.body_size} bytes")
+    records = _WHOLE[head.compression](body, head.size) if len(body) else body
+    if len(records) != head.size:
+        raise BrokenRecordError(f"decompressed to {len(records)} bytes, declared {head.size}")
+    if head.crc and zlib.crc32(records.data) != head.crc:
+        raise BrokenRecordError("does not match its checksum")
+    return records
+
+
+def inflate_prefix(body: Bytes, head: ChunkHead) -> Bytes:
+    """As much of a cut chunk as its first bytes give; at most ``head.size`` bytes, unverified."""
+    if head.compression == "" or not len(body):
+        return body[: head.size]
+    give = _zstd_prefix if head.compression == "zstd" else _lz4_prefix
+    records = give(body, head.size)
+    if len(records) == head.size and head.crc and zlib.crc32(records.data) != head.crc:
+        raise BrokenRecordError("does not match its checksum")
+    return records
+
+
+def _plain(body: Bytes, size: int) -> Bytes:
+    return body
+
+
+def _zstd(body: Bytes, size: int) -> Bytes:
+    import zstandard
+
+    try:
+        declared = zstandard.frame_content_size(body.data)
+        if declared == size and size > 0:
+            whole = zstandard.ZstdDecompressor().decompress(body.data, allow_extra_data=False)
+            return np.frombuffer(whole, dtype=np.uint8)
+        # A frame that does not say its size, or several in a row: never more than `size` bytes.
+        if declared > size:
+            raise BrokenRecordError(f"its zstd frame declares {declared} bytes, the chunk {size}")
+        records = np.empty(size + 1, dtype=np.uint8)
+        done = 0
+        with zstandard.ZstdDecompressor().stream_reader(
+            body.data, read_across_frames=True
+        ) as stream:
+            while done <= size:
+                step = stream.readinto(records.data[done:])
+                if not step:
+                    break
+                done += step
+    except zstandard.ZstdError as error:
+        raise BrokenRecordError(f"zstd says: {error}") from None
+    if done > size:
+        raise BrokenRecordError(f"decompresses to more than the {size} bytes it declares")
+    return records[:done]
+
+
+def _lz4(body: Bytes, size: int) -> Bytes:
+    import lz4.frame
+
+    stream = lz4.frame.LZ4FrameDecompressor()
+    try:
+        declared = lz4.frame.get_frame_info(body)["content_size"]
+        if declared not in (*UNKNOWN_SIZES, size):
+            raise BrokenRecordError(f"its lz4 frame declares {declared} bytes, the chunk {size}")
+        whole = stream.decompress(body, max_length=max(size, 1))
+    except (RuntimeError, ValueError, EOFError) as error:
+        raise BrokenRecordError(f"lz4 says: {error}") from None
+    if not stream.eof:
+        raise BrokenRecordError(f"its lz4 frame does not end after the {size} bytes it declares")
+    return np.frombuffer(whole, dtype=np.uint8)
+
+
+def _zstd_prefix(body: Bytes, size: int) -> Bytes:
+    import zstandard
+
+    records, done = np.empty(size, dtype=np.uint8), 0
+    with zstandard.ZstdDecompressor().stream_reader(body.data, read_across_frames=True) as stream:
+        try:
+            while done < size:
+                step = stream.readinto(records.data[done : done + (128 << 10)])
+                if not step:
+                    break
+                done += step
+        except zstandard.ZstdError:
+            pass  # what came before it stands
+    return records[:done]
+
+
+def _lz4_prefix(body: Bytes, size: int) -> Bytes:
+    import lz4.frame
+
+    stream = lz4.frame.LZ4FrameDecompressor()
+    got: list[bytes] = []
+    left, piece = size, body.tobytes()
+    try:
+        while left > 0:
+            step = stream.decompress(piece, max_length=min(left, 4 << 20))
+            got.append(step)
+            left -= len(step)
+            piece = b""
+            if stream.eof or not step:
+                break
+    except (RuntimeError, ValueError, EOFError):
+        pass  # what came before it stands
+    return np.frombuffer(b"".join(got), dtype=np.uint8)
+
+
+_WHOLE: Final[dict[str, Callable[[Bytes, int], Bytes]]] = {
+    "": _plain,
+    "lz4": _lz4,
+    "zstd": _zstd,
+}

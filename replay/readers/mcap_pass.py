@@ -1,0 +1,357 @@
+"""One pass over a recording: blocks out, and the account of every message."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Final
+
+from crosscue.replay.columns import Block, Bytes
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import EVERYTHING, Selection
+
+from .mcap_bytes import ByteFile
+from .mcap_checks import Checks
+from .mcap_give import Giver
+from .mcap_load import Loader
+from .mcap_records import PREFIX, BrokenRecordError
+from .mcap_rows import NEVER_IN_A_CHUNK, Rows, contradicts, rows_by_index, rows_by_scan
+from .mcap_scan import Scanner
+from .mcap_segments import Segment, Summary
+from .mcap_topics import Declarations, TopicBook
+from .mcap_walk import Attachment, Chunk, End, Gap, How, Ignored, Item, Oversized, Run, Stray, Walk
+
+DAMAGED_CHUNK: Final = "damaged chunk"
+DAMAGED_RECORD: Final = "damaged record"
+DAMAGED_SECTION: Final = "only the data section's checksum covers it, which is wrong"
+MISSING: Final = "declared by the format, not in its bytes"
+CUT: Final = "the file is cut"
+DETAILS_JOINED: Final = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """Something that may have held messages.
+
+    Attributes:
+        reason: Short, as in the ledger.
+        detail: Where and why.
+        t_ns: When, if known.
+        counts: By channel number, what it held if only its index can be believed.
+    """
+
+    reason: str
+    detail: str
+    t_ns: int | None = None
+    counts: Mapping[int, int] = field(default_factory=dict)
+
+
+def read_segments(
+    file: ByteFile,
+    segments: Sequence[Segment],
+    book: TopicBook,
+    limits: Limits,
+    ledger: Ledger,
+    selection: Selection,
+) -> Iterator[Block]:
+    """All blocks of a file; afterwards the ledger is settled."""
+    checks, scanner = Checks(), Scanner()
+    if len(segments) > 1:
+        ledger.notice(f"the file holds {len(segments)} recordings in a row; all are read")
+    declared: Counter[str] | None = Counter()
+    for segment in segments:
+        where = "" if len(segments) == 1 else f"recording at byte {segment.base}: "
+        with Loader(file, limits) as loader:
+            part = SegmentPass(
+                file, segment, book, limits, ledger, selection, checks, scanner, loader, where
+            )
+            yield from part.blocks()
+            counts = part.settle()
+        declared = None if declared is None or counts is None else declared + counts
+    for sentence in book.notices:
+        ledger.notice(sentence)
+    for topic in book.topics:
+        if declared is not None:
+            ledger.declare(topic.name, declared[topic.name])
+            ledger.settle(topic.name)
+        else:
+            ledger.declare(topic.name, None)
+    checks.report(ledger)
+
+
+class SegmentPass:
+    """Reads one recording of a file once."""
+
+    def __init__(
+        self,
+        file: ByteFile,
+        segment: Segment,
+        book: TopicBook,
+        limits: Limits,
+        ledger: Ledger,
+        selection: Selection,
+        checks: Checks,
+        scanner: Scanner,
+        loader: Loader,
+        where: str,
+    ) -> None:
+        self._file = file
+        self._segment = segment
+        self._summary = segment.summary or Summary()
+        self._limits = limits
+        self._ledger = ledger
+        self._may_skip = selection != EVERYTHING
+        self._checks = checks
+        self._scanner = scanner
+        self._loader = loader
+        self._where = where
+        self._damages: list[Damage] = []
+        self._section: Future[int | None] | None = None
+        self._attachments: list[tuple[int, int, Future[int | None]]] = []
+        schemas, channels = self._summary.schemas.values(), self._summary.channels.values()
+        self._declarations = Declarations(book, schemas, channels)
+        self._planned = Declarations(book, schemas, channels)
+        self._giver = Giver(ledger, selection, limits, self._declarations)
+
+    def blocks(self) -> Iterator[Block]:
+        """Its blocks."""
+        segment = self._segment
+        for notice in segment.notices:
+            self._notice(notice)
+        if segment.has_end and segment.summary is None:
+            self._notice("it has no summary that can be used; topics were found by reading")
+        self._checks.summaries_right += self._summary.is_verified
+        if segment.data_crc and not self._may_skip:
+            self._section = self._loader.section_crc(segment)
+        walk = Walk(
+            self._file, segment.begin, segment.end, segment.rail, self._limits, self._scanner
+        )
+        for item, records in self._loader.ahead(iter(walk), self._is_wanted):
+            if isinstance(item, Chunk):
+                yield from self._chunk(item, records)
+            elif isinstance(item, Run):
+                yield from self._run(item)
+            else:
+                self._note(item)
+        self._finish_checks()
+
+    def _is_wanted(self, chunk: Chunk) -> bool:
+        """Must the chunk be read? Only a chunk whose indexes all agree may be passed over."""
+        index, head = chunk.index, chunk.head
+        if not self._may_skip or index is None or head is None or not chunk.messages:
+            return True
+        if chunk.fault or chunk.differs or chunk.index_fault or chunk.is_cut:
+            return True
+        filled = [m for m in chunk.messages if len(m.entries)]
+        ids = {m.channel_id for m in filled}
+        if ids != index.channels or not ids <= self._summary.channels.keys():
+            return True
+        if not filled or min(int(m.entries["log"].min()) for m in filled) != head.start:
+            return True
+        if max(int(m.entries["log"].max()) for m in filled) != head.end:
+            return True
+        return any(self._giver.wants(m) for m in filled)
+
+    def _chunk(self, chunk: Chunk, records: Future[Bytes] | None) -> Iterator[Block]:
+        self._checks.chunks += 1
+        if records is None and not any(self._giver.wants(m) for m in chunk.messages):
+            self._checks.chunks_unread += 1
+            for index in chunk.messages:
+                self._giver.pass_over(index)
+            return
+        try:
+            # Not wanted when looked at first, wanted now: a channel was given another meaning.
+            buffer = records.result() if records is not None else self._loader.load(chunk)
+            rows = self._cut_rows(chunk, buffer) if chunk.is_cut else self._rows(chunk, buffer)
+        except BrokenRecordError as error:
+            self._lose_chunk(chunk, str(error))
+            return
+        yield from self._giver.give(rows, self._checks, chunk.at)
+
+    def _rows(self, chunk: Chunk, buffer: Bytes) -> Rows:
+        """The messages of a chunk, all that can be checked being checked.
+
+        Raises:
+            BrokenRecordError: Something is wrong, or there are too many.
+        """
+        most = self._limits.records_per_chunk
+        if sum(len(index.entries) for index in chunk.messages) > most:
+            raise BrokenRecordError(f"its index names more than {most} messages")
+        rows = rows_by_index(buffer, chunk.messages) if chunk.messages else None
+        if rows is None:
+            if chunk.messages or chunk.index_fault:
+                self._checks.bad_indexes.add(f"that of the chunk at byte {chunk.at}")
+            rows = rows_by_scan(buffer, self._scanner, NEVER_IN_A_CHUNK, most)
+            if rows.end != len(buffer):
+                raise BrokenRecordError(f"its records break off at {rows.end} of {len(buffer)}")
+        self._vouch(chunk, rows)
+        return rows
+
+    def _vouch(self, chunk: Chunk, rows: Rows) -> None:
+        """Count who vouches for a chunk's bytes.
+
+        Raises:
+            BrokenRecordError: Nobody does, and something speaks against them.
+        """
+        head = chunk.head
+        assert head is not None, "a chunk with rows has a head"
+        log = rows.head["log"]
+        strays = len(log) and not head.start <= log.min() <= log.max() <= head.end
+        doubt = chunk.differs
+        if strays and (head.start or head.end):
+            doubt = doubt or "its messages lie outside the time span it declares"
+        if head.crc or (self._segment.data_crc and self._section_is_right()):
+            self._checks.chunks_right += 1
+            if doubt:
+                self._checks.bad_heads.add(f"the chunk at byte {chunk.at}: {doubt}")
+            return
+        if self._segment.data_crc:
+            raise BrokenRecordError(DAMAGED_SECTION)
+        self._checks.chunks_bare += 1
+        if doubt or contradicts(rows, chunk.messages):
+            doubt = doubt or "its message index names other messages"
+            raise BrokenRecordError(f"has no checksum, and {doubt}")
+
+    def _cut_rows(self, chunk: Chunk, buffer: Bytes) -> Rows:
+        rows = rows_by_scan(buffer, self._scanner, NEVER_IN_A_CHUNK, self._limits.records_per_chunk)
+        head = chunk.head
+        assert head is not None, "a chunk with rows has a head"
+        has = self._file.size - chunk.body_at
+        self._damages.append(
+            Damage(
+                CUT,
+                f"the chunk at byte {chunk.at} ends after {has} of {head.body_size} bytes; of its "
+                f"beginning {len(rows)} messages are given, which no checksum covers",
+                head.start if head.start < 1 << 63 else None,
+            )
+        )
+        self._checks.rows_bare += len(rows)
+        return rows
+
+    def _lose_chunk(self, chunk: Chunk, why: str) -> None:
+        source = chunk.index or chunk.head
+        t_ns = None if source is None or source.start >= 1 << 63 else source.start
+        span = "" if source is None else f"; log times {source.start} to {source.end}"
+        detail = f"{self._where}chunk at byte {chunk.at}: {why}{span}"
+        reason = CUT if chunk.is_cut else DAMAGED_CHUNK
+        counts = {m.channel_id: len(m.entries) for m in chunk.messages if len(m.entries)}
+        for channel_id, count in counts.items():
+            self._giver.lose_of_channel(channel_id, reason, count, detail, t_ns)
+        held = chunk.index.channels if chunk.index is not None else frozenset[int]()
+        if not counts or chunk.index_fault or not held <= counts.keys():
+            self._damages.append(Damage(reason, detail, t_ns))
+
+    def _run(self, run: Run) -> Iterator[Block]:
+        """Messages, schemas and channels outside chunks."""
+        rows = run.rows
+        if not self._segment.data_crc:
+            self._checks.rows_bare += len(rows)
+        elif not self._section_is_right():
+            self._giver.lose(rows, DAMAGED_SECTION, f"{self._where}records from byte {run.at} on")
+            return
+        yield from self._giver.give(rows, self._checks, run.at)
+
+    def _section_is_right(self) -> bool:
+        """Does the data section match its checksum? Waits until that is known."""
+        if self._section is None:
+            self._section = self._loader.section_crc(self._segment)
+        return self._section.result() == self._segment.data_crc
+
+    def _note(self, item: Item) -> None:
+        """Account for what holds no messages that could be given."""
+        match item:
+            case Gap(at, to, why):
+                self._damages.append(
+                    Damage(DAMAGED_RECORD, f"{self._where}bytes {at} to {to}: {why}")
+                )
+            case Stray(at, index):
+                detail = f"{self._where}message index at byte {at}: no chunk stands before it"
+                counts = {index.channel_id: len(index.entries)}
+                self._damages.append(Damage(DAMAGED_CHUNK, detail, None, counts))
+            case End(at, how):
+                self._end(at, how)
+            case Oversized(at, size, channel_id, log):
+                self._giver.pass_over_large(channel_id, log, size, at)
+            case Ignored(at, opcode):
+                self._checks.ignored.add(f"kind {opcode:#04x} at byte {at}")
+            case Attachment(at, crc_at, crc):
+                self._checks.attachments += 1
+                if crc:
+                    content_at = at + PREFIX.size
+                    self._attachments.append((at, crc, self._loader.crc(content_at, crc_at)))
+            case _:
+                raise AssertionError(f"{type(item).__name__} is read, not noted")
+
+    def _end(self, at: int, how: How) -> None:
+        if how is How.CUT:
+            detail = f"{self._where}the record at byte {at} goes beyond the end of the file"
+            self._damages.append(Damage(CUT, detail))
+        elif how is How.BARE:
+            detail = f"{self._where}it ends at byte {at} without a data end record and a footer"
+            self._damages.append(Damage(CUT, detail))
+        elif how is How.FOOTER:
+            self._notice("it has no data end record")
+
+    def _finish_checks(self) -> None:
+        for at, told, found in self._attachments:
+            if found.result() == told:
+                self._checks.attachments_right += 1
+            else:
+                self._checks.bad_attachments.add(f"at byte {at}")
+        if not self._segment.data_crc:
+            return
+        if self._section is None:
+            self._checks.sections_unread += 1
+        elif self._section_is_right():
+            self._checks.sections_right += 1
+        else:
+            self._checks.sections_wrong += 1
+            self._notice(
+                "its data section does not match its checksum; what chunks with a checksum of "
+                "their own hold was given, the rest was not"
+            )
+
+    def settle(self) -> Counter[str] | None:
+        """Compare with the statistics, and tell what is lost; declared counts by topic."""
+        statistics = self._summary.statistics
+        if statistics is None:
+            for damage in self._damages:
+                self._tell(damage)
+            return None
+        met = self._giver.met + self._giver.lost
+        if self._summary.counts_channels:
+            missing = Counter(statistics.by_channel) - met
+        else:
+            missing = Counter({-1: max(statistics.message_count - met.total(), 0)})
+        for damage in self._damages:
+            ending = "" if missing.total() else "; by the statistics no message is missing"
+            self._notice(f"{damage.reason}: {damage.detail}{ending}")
+        self._lose_missing(missing, statistics.message_count)
+        if self._declarations.redefined or not self._summary.counts_channels:
+            return None
+        declared: Counter[str] = Counter()
+        for channel_id, topic in self._declarations.topics():
+            declared[topic] += statistics.by_channel.get(channel_id, 0)
+        return declared
+
+    def _lose_missing(self, missing: Counter[int], declared: int) -> None:
+        reason = self._damages[0].reason if self._damages else MISSING
+        details = [damage.detail for damage in self._damages[:DETAILS_JOINED]]
+        detail = "; ".join(details) or f"the statistics declare {declared} messages in all"
+        t_ns = self._damages[0].t_ns if self._damages else None
+        for channel_id, count in sorted(missing.items()):
+            self._giver.lose_of_channel(channel_id, reason, count, detail, t_ns)
+
+    def _tell(self, damage: Damage) -> None:
+        if not damage.counts:
+            self._ledger.lose("", damage.reason, None, damage.detail, damage.t_ns)
+        for channel_id, count in damage.counts.items():
+            self._giver.lose_of_channel(
+                channel_id, damage.reason, count, damage.detail, damage.t_ns
+            )
+
+    def _notice(self, sentence: str) -> None:
+        self._ledger.notice(self._where + sentence)

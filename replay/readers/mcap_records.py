@@ -1,0 +1,281 @@
+r"""MCAP records as plain values, for the few that a reader must take apart one by one.
+
+Field names and layouts are those of the MCAP specification, version 0. A string that is not UTF-8
+is kept with its bad bytes written as ``\xNN``, so that it can be printed. Records may be longer
+than their fields (the format may grow); a record shorter than its fields is broken.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import LogFormatError
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+
+HEADER: Final = 0x01
+FOOTER: Final = 0x02
+SCHEMA: Final = 0x03
+CHANNEL: Final = 0x04
+MESSAGE: Final = 0x05
+CHUNK: Final = 0x06
+MESSAGE_INDEX: Final = 0x07
+CHUNK_INDEX: Final = 0x08
+ATTACHMENT: Final = 0x09
+ATTACHMENT_INDEX: Final = 0x0A
+STATISTICS: Final = 0x0B
+METADATA: Final = 0x0C
+METADATA_INDEX: Final = 0x0D
+SUMMARY_OFFSET: Final = 0x0E
+DATA_END: Final = 0x0F
+
+PREFIX: Final = struct.Struct("<BQ")
+"""What every record begins with: operation code, length of the content."""
+FOOTER_SIZE: Final = PREFIX.size + 20
+DATA_END_SIZE: Final = PREFIX.size + 4
+COMPRESSIONS: Final = frozenset({"", "lz4", "zstd"})
+
+MESSAGE_HEAD: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log", "<u8"),
+        ("publish", "<u8"),
+    ]
+)
+"""The first 31 bytes of a message record, as they lie in the file."""
+INDEX_ENTRY: Final = np.dtype([("log", "<u8"), ("offset", "<u8")])
+MESSAGE_FIXED: Final = MESSAGE_HEAD.itemsize - PREFIX.size
+CHUNK_FIXED: Final = 40
+"""Bytes of a chunk record's content, besides its compression's name and its records."""
+
+
+class BrokenRecordError(LogFormatError):
+    """A record's content does not fit its own lengths; readers turn it into a told loss."""
+
+
+class Fields:
+    """Takes the fields of one record's content from front to back."""
+
+    def __init__(self, content: bytes | memoryview) -> None:
+        self.content = content
+        self.at = 0
+
+    def take(self, size: int) -> memoryview:
+        """The next ``size`` bytes.
+
+        Raises:
+            BrokenRecordError: There are fewer.
+        """
+        end = self.at + size
+        if end > len(self.content):
+            raise BrokenRecordError(
+                f"a field needs {end} bytes, the record has {len(self.content)}"
+            )
+        taken = memoryview(self.content)[self.at : end]
+        self.at = end
+        return taken
+
+    def number(self, size: int) -> int:
+        """The next unsigned integer of ``size`` bytes."""
+        return int.from_bytes(self.take(size), "little")
+
+    def text(self) -> str:
+        """The next length-prefixed string."""
+        return bytes(self.take(self.number(4))).decode("utf-8", "backslashreplace")
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """A message definition."""
+
+    id: int
+    name: str
+    encoding: str
+    text: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A stream of messages; its free-form metadata is not kept."""
+
+    id: int
+    schema_id: int
+    topic: str
+    message_encoding: str
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkHead:
+    """What a chunk record says before its records.
+
+    Attributes:
+        start: Earliest log time in it, nanoseconds, as stored (unsigned).
+        end: Latest log time in it.
+        size: Bytes of its records once decompressed.
+        crc: CRC-32 of those bytes, 0 for none.
+        compression: ``""``, ``lz4``, ``zstd`` or something this reader does not know.
+        body_at: Bytes from the start of the content to the (compressed) records.
+        body_size: Bytes of the (compressed) records.
+    """
+
+    start: int
+    end: int
+    size: int
+    crc: int
+    compression: str
+    body_at: int
+    body_size: int
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkIndex:
+    """What the summary says of one chunk; offsets are those of the file, counted from its start."""
+
+    start: int
+    end: int
+    at: int
+    length: int
+    channels: frozenset[int]
+    index_length: int
+    compression: str
+    body_size: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MessageIndex:
+    """Log times and offsets of one channel's messages within a chunk; shape (N,), INDEX_ENTRY."""
+
+    channel_id: int
+    entries: NDArray[np.void]
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """Counts of a whole file; ``by_channel`` is empty where the writer did not count."""
+
+    message_count: int
+    chunk_count: int
+    by_channel: Mapping[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Footer:
+    """Where the summary lies, counted from the file's start; 0 for none."""
+
+    summary_at: int
+    summary_offset_at: int
+    crc: int
+
+
+def read_schema(content: bytes | memoryview) -> Schema:
+    """A Schema record."""
+    fields = Fields(content)
+    schema_id, name, encoding = fields.number(2), fields.text(), fields.text()
+    return Schema(schema_id, name, encoding, bytes(fields.take(fields.number(4))))
+
+
+def read_channel(content: bytes | memoryview) -> Channel:
+    """A Channel record."""
+    fields = Fields(content)
+    channel = Channel(fields.number(2), fields.number(2), fields.text(), fields.text())
+    fields.take(fields.number(4))
+    return channel
+
+
+def read_chunk_head(content: bytes | memoryview) -> ChunkHead:
+    """The first fields of a Chunk record; ``content`` may end right after them.
+
+    Raises:
+        BrokenRecordError: Also for a compression name of more than 32 bytes.
+    """
+    fields = Fields(content)
+    start, end, size, crc = (fields.number(n) for n in (8, 8, 8, 4))
+    name_length = fields.number(4)
+    if name_length > 32:
+        raise BrokenRecordError(f"a compression name of {name_length} bytes")
+    compression = bytes(fields.take(name_length)).decode("utf-8", "backslashreplace")
+    body_size = fields.number(8)
+    return ChunkHead(start, end, size, crc, compression, fields.at, body_size)
+
+
+def read_message_index(content: bytes | memoryview) -> MessageIndex:
+    """A MessageIndex record."""
+    fields = Fields(content)
+    channel_id, size = fields.number(2), fields.number(4)
+    if size % INDEX_ENTRY.itemsize:
+        raise BrokenRecordError(f"a message index of {size} bytes is no whole number of entries")
+    return MessageIndex(channel_id, np.frombuffer(fields.take(size), dtype=INDEX_ENTRY))
+
+
+def read_chunk_index(content: bytes | memoryview, base: int = 0) -> ChunkIndex:
+    """A ChunkIndex record; ``base`` is where its file begins within a concatenated one."""
+    fields = Fields(content)
+    start, end, at, length = (fields.number(8) for _ in range(4))
+    size = fields.number(4)
+    if size % 10:
+        raise BrokenRecordError(f"a map of {size} bytes is no whole number of entries")
+    pairs = np.frombuffer(fields.take(size), dtype=np.dtype([("id", "<u2"), ("at", "<u8")]))
+    channels = frozenset(pairs["id"].tolist())
+    index_length, compression = fields.number(8), fields.text()
+    body_size, size = fields.number(8), fields.number(8)
+    return ChunkIndex(
+        start, end, base + at, length, channels, index_length, compression, body_size, size
+    )
+
+
+def read_statistics(content: bytes | memoryview) -> Statistics:
+    """A Statistics record."""
+    fields = Fields(content)
+    message_count = fields.number(8)
+    fields.take(2 + 4 + 4 + 4)
+    chunk_count = fields.number(4)
+    fields.take(8 + 8)
+    size = fields.number(4)
+    if size % 10:
+        raise BrokenRecordError(f"a map of {size} bytes is no whole number of entries")
+    pairs = np.frombuffer(fields.take(size), dtype=np.dtype([("id", "<u2"), ("n", "<u8")]))
+    by_channel = dict(zip(pairs["id"].tolist(), pairs["n"].tolist(), strict=True))
+    return Statistics(message_count, chunk_count, by_channel)
+
+
+def read_footer(content: bytes | memoryview) -> Footer:
+    """A Footer record."""
+    fields = Fields(content)
+    return Footer(fields.number(8), fields.number(8), fields.number(4))
+
+
+def check_metadata(content: bytes | memoryview) -> None:
+    """Raise BrokenRecordError unless ``content`` is a Metadata record."""
+    fields = Fields(content)
+    fields.text()
+    entries = Fields(fields.take(fields.number(4)))
+    while entries.at < len(entries.content):
+        entries.text()
+
+
+def overlapping_heads(buffer: Bytes, offsets: NDArray[np.int64]) -> NDArray[np.void]:
+    """The message heads at ``offsets``, gathered in one step.
+
+    Args:
+        buffer: Shape (B,), contiguous.
+        offsets: Shape (N,), each at most B - 31.
+
+    Returns:
+        Shape (N,), dtype MESSAGE_HEAD.
+    """
+    size = MESSAGE_HEAD.itemsize
+    if not len(offsets):
+        return np.empty(0, dtype=MESSAGE_HEAD)
+    every = np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer, strides=(1,))
+    return every[offsets].view(MESSAGE_HEAD)

@@ -1,0 +1,401 @@
+"""Where the parts of an MCAP file lie, and what its summary says.
+
+A file is one segment, or several when recordings were joined with ``cat``. The footer at the end of
+the file leads to the summary; where it does not, the file is walked from its beginning.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final
+
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.limits import Limits
+
+from .mcap_bytes import PIECE, ByteFile
+from .mcap_inflate import inflate
+from .mcap_records import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_FIXED,
+    CHUNK_INDEX,
+    DATA_END,
+    DATA_END_SIZE,
+    FOOTER,
+    FOOTER_SIZE,
+    HEADER,
+    MAGIC,
+    PREFIX,
+    SCHEMA,
+    STATISTICS,
+    BrokenRecordError,
+    Channel,
+    ChunkIndex,
+    Schema,
+    Statistics,
+    read_channel,
+    read_chunk_index,
+    read_footer,
+    read_schema,
+    read_statistics,
+)
+from .mcap_rows import NEVER_IN_A_CHUNK, Definition, rows_by_scan
+from .mcap_scan import Scanner
+from .mcap_topics import Declarations, TopicBook
+from .mcap_walk import Chunk, End, How, Run, Walk
+
+SMALLEST_CHUNK: Final = PREFIX.size + CHUNK_FIXED
+HEADER_MOST: Final = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """A summary section.
+
+    Attributes:
+        schemas: By number.
+        channels: By number.
+        statistics: Counts, or None.
+        chunks: By offset from the beginning of the whole file.
+        is_verified: Its checksum is there and right.
+    """
+
+    schemas: Mapping[int, Schema] = field(default_factory=dict)
+    channels: Mapping[int, Channel] = field(default_factory=dict)
+    statistics: Statistics | None = None
+    chunks: Mapping[int, ChunkIndex] = field(default_factory=dict)
+    is_verified: bool = False
+
+    @property
+    def counts_channels(self) -> bool:
+        """Do its statistics count by channel?"""
+        counted = self.statistics
+        return counted is not None and (bool(counted.by_channel) or not counted.message_count)
+
+    @property
+    def names_all(self) -> bool:
+        """Does it name every channel that its own counts or indexes mention?"""
+        mentioned = set[int]().union(*(chunk.channels for chunk in self.chunks.values()))
+        if self.statistics is not None:
+            mentioned |= self.statistics.by_channel.keys()
+            if self.statistics.message_count and not self.channels:
+                return False
+        return bool(self.channels) and mentioned <= self.channels.keys()
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """One recording within a file.
+
+    Attributes:
+        base: Where its magic bytes stand.
+        begin: Its first record after the header.
+        end: Its data end record if ``has_end``, else the end of the file.
+        has_end: Its data section is closed.
+        data_crc: CRC-32 of the bytes from ``base`` to ``end``, 0 for none.
+        summary: What its summary says, or None.
+        notices: What is to be said about it.
+    """
+
+    base: int
+    begin: int
+    end: int
+    has_end: bool
+    data_crc: int = 0
+    summary: Summary | None = None
+    notices: tuple[str, ...] = ()
+
+    @property
+    def rail(self) -> Mapping[int, ChunkIndex] | None:
+        """The chunks known, for a walk; None where not even the end is known."""
+        if not self.has_end:
+            return None
+        return self.summary.chunks if self.summary is not None else {}
+
+
+def find_segments(
+    file: ByteFile, path: Path, book: TopicBook, limits: Limits
+) -> tuple[Segment, ...]:
+    """The recordings in a file; their topics are entered into ``book``.
+
+    Raises:
+        LogFormatError: Not MCAP, or no readable record in it.
+    """
+    if not file.size:
+        raise LogFormatError(f"{path}: an empty file; nothing was recorded, or the copy failed")
+    if bytes(file.peek(0, len(MAGIC))) != MAGIC:
+        raise LogFormatError(
+            f"{path}: does not begin like MCAP (89 4d 43 41 50 30 0d 0a); check the file type"
+        )
+    segment = _by_footer(file, limits)
+    if segment is not None and segment.summary is not None and segment.summary.names_all:
+        _enter(Declarations(book, *_declared(segment.summary)))
+        return (segment,)
+    segments = (
+        (_survey_named(file, segment, book, limits),)
+        if segment is not None
+        else _survey(file, book, limits)
+    )
+    if not book.topics and not segments[0].has_end and not _has_header(file, 0):
+        raise LogFormatError(
+            f"{path}: not one readable record after the first 8 bytes; the file was cut"
+        )
+    return segments
+
+
+def _by_footer(file: ByteFile, limits: Limits) -> Segment | None:
+    """The only segment, if the footer and the summary before it are as they should be."""
+    footer_at = file.size - FOOTER_SIZE - len(MAGIC)
+    if footer_at < len(MAGIC) + DATA_END_SIZE:
+        return None
+    raw = bytes(file.peek(footer_at, FOOTER_SIZE + len(MAGIC)))
+    opcode, length = PREFIX.unpack_from(raw)
+    if (opcode, length) != (FOOTER, FOOTER_SIZE - PREFIX.size) or not raw.endswith(MAGIC):
+        return None
+    footer = read_footer(raw[PREFIX.size : FOOTER_SIZE])
+    data_end_at = footer.summary_at - DATA_END_SIZE
+    if not len(MAGIC) <= data_end_at <= footer_at - DATA_END_SIZE:
+        return None
+    data_crc = _data_end(file, data_end_at)
+    if data_crc is None:
+        return None
+    try:
+        summary = _read_summary(file, 0, footer.summary_at, footer_at, footer.crc, limits)
+    except BrokenRecordError:
+        return None
+    return Segment(0, _begin(file, 0), data_end_at, True, data_crc, summary)
+
+
+def _data_end(file: ByteFile, at: int) -> int | None:
+    """The checksum in the data end record at ``at``; None if there is no such record."""
+    raw = bytes(file.peek(at, DATA_END_SIZE))
+    if len(raw) < DATA_END_SIZE:
+        return None
+    opcode, length = PREFIX.unpack_from(raw)
+    if (opcode, length) != (DATA_END, DATA_END_SIZE - PREFIX.size):
+        return None
+    return int.from_bytes(raw[PREFIX.size :], "little")
+
+
+def _has_header(file: ByteFile, base: int) -> bool:
+    return _begin(file, base) > base + len(MAGIC)
+
+
+def _begin(file: ByteFile, base: int) -> int:
+    """The first record after the header; right after the magic if the header is broken."""
+    at = base + len(MAGIC)
+    raw = file.peek(at, PREFIX.size)
+    if len(raw) < PREFIX.size:
+        return at
+    opcode, length = PREFIX.unpack(raw)
+    after = at + PREFIX.size + length
+    return after if opcode == HEADER and length <= HEADER_MOST and after <= file.size else at
+
+
+def _read_summary(
+    file: ByteFile, base: int, begin: int, footer_at: int, crc: int, limits: Limits
+) -> Summary:
+    """The summary between ``begin`` and the footer.
+
+    Raises:
+        BrokenRecordError: Its checksum is wrong, its records do not fit, or it is too large.
+    """
+    if footer_at - begin > limits.chunk_bytes:
+        raise BrokenRecordError(f"a summary of {footer_at - begin} bytes")
+    raw = file.read(begin, footer_at + FOOTER_SIZE - begin).tobytes()
+    records, checked = raw[: footer_at - begin], raw[: footer_at - begin + FOOTER_SIZE - 4]
+    if crc and zlib.crc32(checked) != crc:
+        raise BrokenRecordError("the summary does not match its checksum")
+    summary = _parse_summary(records, base)
+    chunks = summary.chunks if crc else _confirmed(file, summary.chunks)
+    return replace(summary, chunks=chunks, is_verified=bool(crc))
+
+
+def _parse_summary(records: bytes, base: int) -> Summary:
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    chunks: dict[int, ChunkIndex] = {}
+    statistics: Statistics | None = None
+    view, at = memoryview(records), 0
+    while at < len(records):
+        if at + PREFIX.size > len(records):
+            raise BrokenRecordError("the summary ends within a record")
+        opcode, length = PREFIX.unpack_from(records, at)
+        content = view[at + PREFIX.size : at + PREFIX.size + length]
+        if len(content) < length or not opcode:
+            raise BrokenRecordError("the summary's records do not fit")
+        if opcode == SCHEMA:
+            schema = read_schema(content)
+            schemas[schema.id] = schema
+        elif opcode == CHANNEL:
+            channel = read_channel(content)
+            channels[channel.id] = channel
+        elif opcode == STATISTICS:
+            statistics = read_statistics(content)
+        elif opcode == CHUNK_INDEX:
+            index = read_chunk_index(content, base)
+            if index.length >= SMALLEST_CHUNK:
+                chunks[index.at] = index
+        at += PREFIX.size + length
+    return Summary(schemas, channels, statistics, dict(sorted(chunks.items())))
+
+
+def _confirmed(file: ByteFile, chunks: Mapping[int, ChunkIndex]) -> dict[int, ChunkIndex]:
+    """Of an index without checksum, the entries that point to a chunk of the length they say."""
+    confirmed: dict[int, ChunkIndex] = {}
+    for at, index in chunks.items():
+        raw = file.peek(at, PREFIX.size)
+        if len(raw) == PREFIX.size and PREFIX.unpack(raw) == (CHUNK, index.length - PREFIX.size):
+            confirmed[at] = replace(index, index_length=0)
+    return confirmed
+
+
+def _declared(summary: Summary) -> tuple[list[Schema], list[Channel]]:
+    return list(summary.schemas.values()), list(summary.channels.values())
+
+
+def _enter(declarations: Declarations) -> None:
+    """Enter all topics declared so far, in the order of their channels' numbers."""
+    for _ in declarations.topics():
+        pass
+
+
+def _survey_named(file: ByteFile, segment: Segment, book: TopicBook, limits: Limits) -> Segment:
+    """A segment whose summary does not name all channels: find them in its data section."""
+    scanner = Scanner()
+    walk = Walk(file, segment.begin, segment.end, segment.rail, limits, scanner)
+    summary = segment.summary or Summary()
+    _collect(file, walk, Declarations(book, *_declared(summary)), limits, scanner)
+    return segment
+
+
+def _survey(file: ByteFile, book: TopicBook, limits: Limits) -> tuple[Segment, ...]:
+    """All segments, found by walking over the file's outer records."""
+    segments: list[Segment] = []
+    scanner, base = Scanner(), 0
+    while base < file.size:
+        begin = _begin(file, base)
+        walk = Walk(file, begin, file.size, None, limits, scanner)
+        declarations = Declarations(book)
+        end = _collect(file, walk, declarations, limits, scanner)
+        segment, after = _close(file, base, begin, end, limits)
+        if segment.summary is not None:
+            _enter(Declarations(book, *_declared(segment.summary)))
+        segments.append(segment)
+        if after is None:
+            break
+        if bytes(file.peek(after, len(MAGIC))) != MAGIC:
+            if after < file.size:
+                left = f"{file.size - after} bytes follow the end of the recording; not read"
+                segments[-1] = replace(segment, notices=(*segment.notices, left))
+            break
+        base = after
+    return tuple(segments)
+
+
+def _collect(
+    file: ByteFile, walk: Walk, declarations: Declarations, limits: Limits, scanner: Scanner
+) -> End:
+    """Walk to the end, entering the topics met; chunks are read only where a channel is new."""
+    for item in walk:
+        if isinstance(item, End):
+            _enter(declarations)
+            return item
+        if isinstance(item, Run):
+            _take(declarations, item.rows.definitions)
+        elif isinstance(item, Chunk) and not _is_known(item, declarations):
+            _take(declarations, _definitions_in(file, item, limits, scanner))
+    raise AssertionError("a walk ends with an End")
+
+
+def _is_known(chunk: Chunk, declarations: Declarations) -> bool:
+    ids = {index.channel_id for index in chunk.messages}
+    return bool(ids) and ids <= declarations.channel_ids
+
+
+def _definitions_in(
+    file: ByteFile, chunk: Chunk, limits: Limits, scanner: Scanner
+) -> list[Definition]:
+    """Schemas and channels of a chunk; none if it cannot be read."""
+    head = chunk.head
+    if head is None or chunk.fault or chunk.is_cut:
+        return []
+    if max(head.size, head.body_size) > limits.chunk_bytes:
+        return []
+    try:
+        buffer = inflate(file.read(chunk.body_at, head.body_size), head)
+        rows = rows_by_scan(buffer, scanner, NEVER_IN_A_CHUNK, limits.records_per_chunk)
+    except BrokenRecordError:
+        return []
+    return list(rows.definitions)
+
+
+def _take(declarations: Declarations, definitions: Sequence[Definition]) -> None:
+    for definition in definitions:
+        try:
+            if declarations.changed_by(definition):
+                _enter(declarations)
+            declarations.declare(definition)
+        except BrokenRecordError:
+            continue  # told when it is met again in reading
+
+
+def _close(
+    file: ByteFile, base: int, begin: int, end: End, limits: Limits
+) -> tuple[Segment, int | None]:
+    """A segment whose data section ends at ``end``, and where the next might begin."""
+    if end.how not in (How.DATA_END, How.FOOTER):
+        return Segment(base, begin, file.size, has_end=False), None
+    data_crc = _data_end(file, end.at) or 0
+    summary_at = end.at + (DATA_END_SIZE if end.how is How.DATA_END else 0)
+    segment = Segment(base, begin, end.at, True, data_crc)
+    footer_at = _footer_after(file, summary_at)
+    if footer_at is None:
+        notice = "the file is cut or damaged within its summary, which is not used"
+        return replace(segment, notices=(notice,)), _next_magic(file, summary_at)
+    summary: Summary | None = None
+    notices: list[str] = []
+    if footer_at > summary_at:
+        footer = read_footer(file.peek(footer_at + PREFIX.size, FOOTER_SIZE - PREFIX.size))
+        try:
+            summary = _read_summary(file, base, summary_at, footer_at, footer.crc, limits)
+        except BrokenRecordError as error:
+            notices.append(f"its summary is not used: {error}")
+    after = footer_at + FOOTER_SIZE
+    if bytes(file.peek(after, len(MAGIC))) != MAGIC:
+        notices.append("it does not end with the magic bytes of MCAP")
+    segment = replace(segment, summary=summary, notices=tuple(notices))
+    return segment, after + len(MAGIC)
+
+
+def _footer_after(file: ByteFile, at: int) -> int | None:
+    """Where the footer stands that ends the summary beginning at ``at``, if it can be reached."""
+    while True:
+        raw = file.peek(at, PREFIX.size)
+        if len(raw) < PREFIX.size:
+            return None
+        opcode, length = PREFIX.unpack(raw)
+        if opcode == FOOTER:
+            return (
+                at
+                if length == FOOTER_SIZE - PREFIX.size and at + FOOTER_SIZE <= file.size
+                else None
+            )
+        if not opcode:
+            return None
+        at += PREFIX.size + length
+
+
+def _next_magic(file: ByteFile, at: int) -> int | None:
+    """Where, after ``at``, another recording begins."""
+    wanted = MAGIC + bytes([HEADER])
+    while at < file.size:
+        window = bytes(file.window(at, PIECE))
+        found = window.find(wanted)
+        if found >= 0:
+            return at + found
+        at += max(len(window) - len(wanted) + 1, 1)
+    return None

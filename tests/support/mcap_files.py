@@ -1,0 +1,251 @@
+"""MCAP files made record by record, right or wrong on purpose, and what a reader made of them."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeAlias
+
+import lz4.frame
+import zstandard
+
+from crosscue.replay.columns import Messages
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.readers.mcap import open_mcap
+
+MAGIC = b"\x89MCAP0\r\n"
+Message: TypeAlias = tuple[int, int, bytes]
+"""Log time, publish time, payload."""
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    """One record."""
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def text(string: str | bytes) -> bytes:
+    """A length-prefixed string."""
+    raw = string.encode() if isinstance(string, str) else string
+    return struct.pack("<I", len(raw)) + raw
+
+
+def mapping(pairs: Iterable[bytes]) -> bytes:
+    """A length-prefixed map of entries already coded."""
+    return text(b"".join(pairs))
+
+
+def header(profile: str = "", library: str = "") -> bytes:
+    """A Header record."""
+    return record(1, text(profile) + text(library))
+
+
+def schema(
+    number: int, name: str | bytes = "a/B", encoding: str = "ros2msg", body: bytes = b"int32 x"
+) -> bytes:
+    """A Schema record."""
+    return record(3, struct.pack("<H", number) + text(name) + text(encoding) + text(body))
+
+
+def channel(number: int, schema_id: int, topic: str | bytes, encoding: str = "cdr") -> bytes:
+    """A Channel record."""
+    return record(
+        4, struct.pack("<HH", number, schema_id) + text(topic) + text(encoding) + mapping([])
+    )
+
+
+def message(number: int, log: int, payload: bytes = b"", publish: int | None = None) -> bytes:
+    """A Message record."""
+    stamps = struct.pack("<HIQQ", number, 0, log, log if publish is None else publish)
+    return record(5, stamps + payload)
+
+
+def message_index(number: int, entries: Sequence[tuple[int, int]]) -> bytes:
+    """A MessageIndex record of (log time, offset) pairs."""
+    coded = b"".join(struct.pack("<QQ", *entry) for entry in entries)
+    return record(7, struct.pack("<H", number) + text(coded))
+
+
+def attachment(name: str, body: bytes, crc: int | None = None) -> bytes:
+    """An Attachment record with its right checksum unless another is given."""
+    content = struct.pack("<QQ", 0, 0) + text(name) + text("x/y") + struct.pack("<Q", len(body))
+    content += body
+    return record(9, content + struct.pack("<I", zlib.crc32(content) if crc is None else crc))
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkOf:
+    """A chunk to be written, right in every way unless a field says otherwise.
+
+    Attributes:
+        records: Its records, each coded.
+        compression: "", "lz4" or "zstd".
+        crc: Its checksum, if not the right one.
+        size: Its declared size, if not the right one.
+        is_indexed: Message indexes follow it.
+        times: Its declared span, if not the right one.
+    """
+
+    records: Sequence[bytes]
+    compression: str = ""
+    crc: int | None = None
+    size: int | None = None
+    is_indexed: bool = True
+    times: tuple[int, int] | None = None
+
+    def entries(self) -> dict[int, list[tuple[int, int]]]:
+        """Log time and offset of its messages by channel number."""
+        entries: dict[int, list[tuple[int, int]]] = {}
+        at = 0
+        for one in self.records:
+            if one[0] == 5 and len(one) >= 31:
+                number, log = struct.unpack_from("<H4xQ", one, 9)
+                entries.setdefault(number, []).append((log, at))
+            at += len(one)
+        return entries
+
+    def span(self) -> tuple[int, int]:
+        """Earliest and latest log time."""
+        logs = [log for found in self.entries().values() for log, _ in found] or [0]
+        return self.times or (min(logs), max(logs))
+
+    def body(self) -> bytes:
+        """Its records as stored."""
+        raw = b"".join(self.records)
+        if self.compression == "zstd":
+            return zstandard.compress(raw)
+        return lz4.frame.compress(raw) if self.compression == "lz4" else raw
+
+    def coded(self) -> bytes:
+        """The Chunk record."""
+        raw, body = b"".join(self.records), self.body()
+        size = len(raw) if self.size is None else self.size
+        crc = zlib.crc32(raw) if self.crc is None else self.crc
+        fixed = struct.pack("<QQQI", *self.span(), size, crc)
+        return record(6, fixed + text(self.compression) + struct.pack("<Q", len(body)) + body)
+
+
+@dataclass(slots=True)
+class McapFile:
+    """A file being put together; every part may be left out.
+
+    Attributes:
+        parts: What the data section holds, in order: coded records or chunks.
+        data_crc: With the data section's checksum.
+        summary: With a summary section, of these parts:
+        repeats: the schemas and channels again,
+        statistics: counts,
+        chunk_index: an index of the chunks.
+        summary_crc: With the summary's checksum.
+    """
+
+    parts: Sequence[bytes | ChunkOf] = field(default_factory=list)
+    data_crc: bool = False
+    summary: bool = True
+    repeats: bool = True
+    statistics: bool = True
+    chunk_index: bool = True
+    summary_crc: bool = True
+
+    def coded(self) -> bytes:
+        """The whole file."""
+        out = bytearray(MAGIC + header())
+        indexes: list[bytes] = []
+        definitions: dict[bytes, None] = {}
+        counts: dict[int, int] = {}
+        logs: list[int] = []
+        for part in self.parts:
+            at = len(out)
+            if isinstance(part, bytes):
+                out += part
+                inner = [part]
+            else:
+                out += part.coded()
+                length, offsets = len(out) - at, {}
+                for number, entries in part.entries().items() if part.is_indexed else ():
+                    offsets[number] = len(out)
+                    out += message_index(number, entries)
+                indexes.append(_chunk_index(part, at, length, offsets, len(out) - at - length))
+                inner = list(part.records)
+            for one in inner:
+                if one[0] in (3, 4):
+                    definitions[one] = None
+                elif one[0] == 5 and len(one) >= 31:
+                    number, log = struct.unpack_from("<H4xQ", one, 9)
+                    counts[number] = counts.get(number, 0) + 1
+                    logs.append(log)
+        out += record(15, struct.pack("<I", zlib.crc32(out) if self.data_crc else 0))
+        summary = bytearray()
+        if self.summary and self.repeats:
+            summary += b"".join(sorted(definitions, key=lambda one: one[0]))
+        if self.summary and self.statistics:
+            summary += _statistics(counts, logs, len(indexes))
+        if self.summary and self.chunk_index:
+            summary += b"".join(indexes)
+        footer = struct.pack("<BQQQ", 2, 20, len(out) if summary else 0, 0)
+        crc = zlib.crc32(bytes(summary) + footer) if self.summary_crc else 0
+        return bytes(out + summary + footer + struct.pack("<I", crc) + MAGIC)
+
+
+def _chunk_index(
+    chunk: ChunkOf, at: int, length: int, offsets: Mapping[int, int], index_length: int
+) -> bytes:
+    found = mapping(struct.pack("<HQ", *pair) for pair in offsets.items())
+    fixed = struct.pack("<QQQQ", *chunk.span(), at, length) + found
+    fixed += struct.pack("<Q", index_length) + text(chunk.compression)
+    return record(8, fixed + struct.pack("<QQ", len(chunk.body()), len(b"".join(chunk.records))))
+
+
+def _statistics(counts: Mapping[int, int], logs: Sequence[int], chunks: int) -> bytes:
+    fixed = struct.pack("<QHIIII", len(logs), 1, len(counts), 0, 0, chunks)
+    fixed += struct.pack("<QQ", min(logs, default=0), max(logs, default=0))
+    return record(11, fixed + mapping(struct.pack("<HQ", *pair) for pair in counts.items()))
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """All that came out of one pass.
+
+    Attributes:
+        messages: By topic, in the order given.
+        ledger: The account.
+        names: The topics listed before reading.
+    """
+
+    messages: Mapping[str, list[Message]]
+    ledger: Ledger
+    names: tuple[str, ...]
+
+    def count(self) -> int:
+        """Messages given."""
+        return sum(len(found) for found in self.messages.values())
+
+    def adds_up(self) -> bool:
+        """Is every topic's given count what the account says was used?"""
+        accounts = self.ledger.accounts
+        return all(
+            len(self.messages.get(name, ())) == account.used for name, account in accounts.items()
+        ) and set(self.messages) <= set(accounts)
+
+
+def read_back(path: Path, selection: Selection = EVERYTHING, limits: Limits = DEFAULT) -> Reading:
+    """Read a file to its end, as plain tuples."""
+    given: dict[str, list[Message]] = {}
+    ledger = Ledger(str(path))
+    with open_mcap(path, limits) as log:
+        names = tuple(topic.name for topic in log.topics)
+        for block in log.read(ledger, selection):
+            assert isinstance(block.rows, Messages)
+            assert block.publish_ns is not None
+            rows = block.rows
+            given.setdefault(block.topic, []).extend(
+                (log_ns, publish_ns, bytes(rows.payload(i)))
+                for i, (log_ns, publish_ns) in enumerate(
+                    zip(block.log_ns.tolist(), block.publish_ns.tolist(), strict=True)
+                )
+            )
+    return Reading(given, ledger, names)
