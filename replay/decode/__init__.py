@@ -31,6 +31,8 @@ BY_ENCODING: Final[Mapping[str, str]] = {
     "columns": "crosscue.replay.decode:_as_it_is",
     "cdr": "crosscue.replay.decode.ros:ros_decoder",
     "ros1": "crosscue.replay.decode.ros:ros_decoder",
+    "protobuf": "crosscue.replay.decode.protobuf:protobuf_decoder",
+    "json": "crosscue.replay.decode.json_text:json_decoder",
 }
 """From message encoding to ``module:function`` from topic to decoder or None."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,12 +36,14 @@ class Fields:
         buffer: All bytes.
         parts: By byte order; nearly always one.
         order: Brings rows of all parts, one part after the other, into the block's order.
+        seen: Numbers gathered already.
     """
 
     plan: Plan
     buffer: Bytes
     parts: tuple[Part, ...]
     order: Rows | None
+    seen: dict[str, NDArray[np.generic]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return sum(len(part.rows) for part in self.parts)
@@ -51,8 +53,10 @@ class Fields:
 
         Times and durations come as int64 nanoseconds.
         """
-        value = self.plan.values[path]
-        return self._joined(lambda part: _numbers(part, value, is_cdr=self.plan.is_cdr))
+        if path not in self.seen:
+            value, is_cdr = self.plan.values[path], self.plan.is_cdr
+            self.seen[path] = self._joined(lambda part: _numbers(part, value, is_cdr=is_cdr))
+        return self.seen[path]
 
     def text_ranges(self, path: str) -> tuple[Int64s, Int64s]:
         """First byte and length of the string at ``path``, each of shape (M,)."""
@@ -126,10 +130,10 @@ def _ordered(code: str, found: Found) -> str:
 def _numbers(part: Part, value: Value, *, is_cdr: bool) -> NDArray[np.generic]:
     found = part.found
     begin, modulo, offsets = found.places[value.path]
-    if len(part.rows) == len(found.ok):
-        place = begin + offsets[modulo]
-    else:
-        place = begin[part.rows] + offsets[modulo[part.rows]]
+    if len(part.rows) != len(found.ok):
+        begin = begin[part.rows]
+        modulo = modulo if isinstance(modulo, int) else modulo[part.rows]
+    place = begin + offsets[modulo]
     if value.code in ("time", "duration"):
         return _nanoseconds(found, place, value.code, is_cdr=is_cdr)
     got = gather(found.buffer, _ordered(value.code, found), value.count, place)

@@ -92,12 +92,16 @@ def _quat(path: str) -> dict[str, str]:
     return {f"quat_{axis}": f"{path}.{axis}" for axis in "xyzw"}
 
 
+_CARRIED: Final = np.where(np.arange(8) < np.arange(9)[:, None], 255, 0).astype(np.uint8)
+"""By length: all bits of the bytes that a frame carries."""
+
+
 def _can_frame(fields: Fields) -> CanFrames:
     remote = fields.number("is_rtr").astype(np.bool_)
     error = fields.number("is_error").astype(np.bool_)
     length = np.where(remote & ~error, 0, fields.number("dlc")).astype(np.uint8)
     payload = fields.number("data").astype(np.uint8)
-    payload[np.arange(8) >= length[:, None]] = 0
+    payload &= _CARRIED[length]
     return CanFrames(
         fields.number("id").astype(np.uint32),
         fields.number("is_extended").astype(np.bool_),
@@ -167,8 +171,8 @@ def _raw_doubts(fields: Fields) -> Iterator[Doubt]:
     )
     size = fields.items("data")[1]
     yield size == 0, "empty picture"
-    sides = np.stack([width, height])
-    yield ((sides < 1) | (sides > MAX_SIDE_PX)).any(axis=0), "picture size not plausible"
+    small, large = np.minimum(width, height), np.maximum(width, height)
+    yield (small < 1) | (large > MAX_SIDE_PX), "picture size not plausible"
     yield (step < width) | (size < step * height), "picture has fewer bytes than its size needs"
     big = fields.number("is_bigendian").astype(np.bool_)
     deep = np.array(["16" in each or "32" in each for each in fields.texts("encoding")], np.bool_)

@@ -48,8 +48,8 @@ class Found:
         little: Numbers are little endian.
         ok: Shape (N,): the message fits; places of others mean nothing.
         refused: Why not.
-        places: From a value's path to the table of its run: absolute begin (N,), begin modulo 8
-            (N,), offsets by that (8,).
+        places: From a value's path to its run's absolute begin (N,), that begin's alignment
+            (N,), or one number where all are equal, and the value's offset by alignment (8,).
         texts: From a string's path to its first byte (N,) and length without terminator (N,).
         sequences: From a sequence's path to its first item (N,) and length (N,).
     """
@@ -58,14 +58,9 @@ class Found:
     little: bool
     ok: Bools
     refused: list[Refused] = field(default_factory=list)
-    places: dict[str, tuple[Int64s, Int64s, Int64s]] = field(default_factory=dict)
+    places: dict[str, tuple[Int64s, Int64s | int, Int64s]] = field(default_factory=dict)
     texts: dict[str, tuple[Int64s, Int64s]] = field(default_factory=dict)
     sequences: dict[str, tuple[Int64s, Int64s]] = field(default_factory=dict)
-
-    def place(self, path: str) -> Int64s:
-        """First byte of the value at ``path`` in each message, shape (N,)."""
-        begin, modulo, offsets = self.places[path]
-        return begin + offsets[modulo]
 
 
 def gather(buffer: Bytes, code: str, count: int, place: Int64s) -> NDArray[np.generic]:
@@ -148,7 +143,7 @@ class _Walker:
                 self._items(step, cursor, keep)
 
     def _run(self, run: Run, cursor: _Cursor, keep: bool) -> None:
-        modulo = cursor.at & 7
+        modulo = _same(cursor.at & 7)
         begin = cursor.origin + cursor.at
         cursor.at = cursor.at + run.size[modulo]
         self.refuse(cursor, cursor.at > cursor.stop, f"{run.values[0].path} passes the end")
@@ -248,6 +243,13 @@ class _Walker:
             inner = cursor.pick(active)
             self.steps(items.item, inner, keep=False)
             cursor.at[active] = inner.at
+
+
+def _same(column: Int64s) -> Int64s | int:
+    """The one number that a column repeats, or the column: most logs repeat one layout."""
+    if len(column) and (column == column[0]).all():
+        return int(column[0])
+    return column
 
 
 def are_utf8(buffer: Bytes, first: Int64s, length: Int64s) -> Bools:

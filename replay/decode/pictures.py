@@ -1,0 +1,106 @@
+"""Pictures found one by one in protobuf or JSON messages, made into columns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Block, Bytes, ImageCoding, Images, Messages
+from crosscue.replay.ledger import Ledger
+
+from .coding import STREAMS, coding_of
+from .foxglove import Picture
+from .ros import MISFIT
+from .standard import MAX_SIDE_PX
+
+_NO_TIME: Final = 0
+
+
+@dataclass(frozen=True, slots=True)
+class PictureRow:
+    """One picture message.
+
+    Attributes:
+        stamp_ns: The sensor's own time, or None.
+        start: First byte in the buffer.
+        stop: One past the last.
+        magic: Its first bytes.
+        label: ``format`` or, of a raw picture, ``encoding``.
+        width_px: Of a raw picture.
+        height_px: Of a raw picture.
+        step_bytes: Of a raw picture.
+    """
+
+    stamp_ns: int | None
+    start: int
+    stop: int
+    magic: bytes
+    label: str
+    width_px: int = 0
+    height_px: int = 0
+    step_bytes: int = 0
+
+
+def images_of(
+    block: Block,
+    buffer: Bytes,
+    picture: Picture,
+    rows: list[PictureRow | str],
+    ledger: Ledger,
+) -> Block:
+    """A block of the pictures among ``rows``; the others, and texts saying why, are skipped.
+
+    Args:
+        block: As read; for its times.
+        buffer: What ``start`` and ``stop`` count in.
+        picture: Which kind they are.
+        rows: One for each row of the block; a text for a message that did not fit.
+        ledger: Takes the skips.
+    """
+    kept: list[int] = []
+    good: list[PictureRow] = []
+    codings: list[ImageCoding] = []
+    for i, row in enumerate(rows):
+        coding, reason, why = _judge(row, picture)
+        if coding is None or isinstance(row, str):
+            ledger.skip(block.topic, reason, 1, why, int(block.log_ns[i]))
+            continue
+        kept.append(i)
+        good.append(row)
+        codings.append(coding)
+    start = np.array([row.start for row in good], np.int64)
+    stop = np.array([row.stop for row in good], np.int64)
+    images = Images(Messages(buffer, start, stop), tuple(codings))
+    if picture is Picture.RAW:
+        images = replace(
+            images,
+            width_px=np.array([row.width_px for row in good], np.int32),
+            height_px=np.array([row.height_px for row in good], np.int32),
+            step_bytes=np.array([row.step_bytes for row in good], np.int32),
+            pixel_format=tuple(row.label for row in good),
+        )
+    stamps = [row.stamp_ns for row in good]
+    header_ns = None
+    if all(stamp is not None for stamp in stamps):
+        header_ns = np.array([stamp or _NO_TIME for stamp in stamps], np.int64)
+    return replace(block.take(np.array(kept, np.intp)), rows=images, header_ns=header_ns)
+
+
+def _judge(row: PictureRow | str, picture: Picture) -> tuple[ImageCoding | None, str, str]:
+    """The picture's coding, or None with reason and detail."""
+    if isinstance(row, str):
+        return None, MISFIT, row
+    if row.start == row.stop:
+        return None, "empty picture", ""
+    if picture is Picture.VIDEO:
+        return STREAMS.get(row.label.lower()), "video coding not known", row.label[:40]
+    if picture is Picture.COMPRESSED:
+        return coding_of(row.magic, row.label), "image coding not known", row.label[:40]
+    sides = (row.width_px, row.height_px)
+    if min(sides) < 1 or max(sides) > MAX_SIDE_PX:
+        return None, "picture size not plausible", f"{row.width_px} x {row.height_px}"
+    if row.step_bytes < row.width_px or row.stop - row.start < row.step_bytes * row.height_px:
+        return None, "picture has fewer bytes than its size needs", ""
+    return "raw", "", ""

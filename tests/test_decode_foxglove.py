@@ -1,0 +1,322 @@
+"""Protobuf and JSON messages: the same columns as ROS types, damage refused message by message."""
+
+from __future__ import annotations
+
+import json
+from base64 import b64encode
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf import (  # type: ignore[import-untyped]
+    descriptor_pb2,
+    descriptor_pool,
+    message_factory,
+    timestamp_pb2,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.columns import Block, Images, Table, Topic
+from crosscue.replay.decode import Decoder, decoder_for
+from crosscue.replay.decode.ros import MISFIT
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
+from support.ros_messages import block_of
+
+F = descriptor_pb2.FieldDescriptorProto
+QUICK = settings(max_examples=60, deadline=None)
+STAMP = ("timestamp", 1, F.TYPE_MESSAGE, ".google.protobuf.Timestamp")
+IMAGE = (
+    STAMP,
+    ("frame_id", 4, F.TYPE_STRING),
+    ("data", 2, F.TYPE_BYTES),
+    ("format", 3, F.TYPE_STRING),
+)
+RAW = (
+    STAMP,
+    ("frame_id", 7, F.TYPE_STRING),
+    ("width", 2, F.TYPE_FIXED32),
+    ("height", 3, F.TYPE_FIXED32),
+    ("encoding", 4, F.TYPE_STRING),
+    ("step", 5, F.TYPE_FIXED32),
+    ("data", 6, F.TYPE_BYTES),
+)
+FIX = (
+    ("timestamp", 6, F.TYPE_MESSAGE, ".google.protobuf.Timestamp"),
+    ("latitude", 1, F.TYPE_DOUBLE),
+    ("longitude", 2, F.TYPE_DOUBLE),
+    ("altitude", 3, F.TYPE_DOUBLE),
+    ("position_covariance", 4, F.TYPE_DOUBLE, "", True),
+    ("position_covariance_type", 5, F.TYPE_INT32),
+)
+
+
+def schema_of(name: str, fields: Any) -> bytes:
+    """A FileDescriptorSet that defines ``foxglove.<name>`` and what it imports."""
+    file = descriptor_pb2.FileDescriptorProto(
+        name=f"foxglove/{name}.proto", package="foxglove", syntax="proto3",
+        dependency=["google/protobuf/timestamp.proto"],
+    )  # fmt: skip
+    message = file.message_type.add(name=name)
+    for field_name, number, kind, *rest in fields:
+        each = message.field.add(name=field_name, number=number, type=kind, label=F.LABEL_OPTIONAL)
+        if rest and rest[0]:
+            each.type_name = rest[0]
+        if len(rest) > 1:
+            each.label = F.LABEL_REPEATED
+    stamp = descriptor_pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
+    # The importing file comes first, on purpose: order in a set promises nothing.
+    return bytes(descriptor_pb2.FileDescriptorSet(file=[file, stamp]).SerializeToString())
+
+
+def message_class(schema: bytes, name: str) -> Any:
+    pool = descriptor_pool.DescriptorPool()
+    files = descriptor_pb2.FileDescriptorSet.FromString(schema).file
+    for file in reversed(files):
+        pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}"))
+
+
+def proto_topic(name: str, fields: Any) -> Topic:
+    return Topic("/t", f"foxglove.{name}", "protobuf", schema_of(name, fields), "protobuf")
+
+
+def must_decode(topic: Topic) -> Decoder:
+    decoder = decoder_for(topic)
+    assert decoder is not None
+    return decoder
+
+
+def same_stamp(cls: Any, seconds: int, nanos: int) -> Any:
+    """A message of the class with its time set."""
+    message = cls()
+    message.timestamp.seconds, message.timestamp.nanos = seconds, nanos
+    return message
+
+
+def test_compressed_images_are_ranges_of_the_log() -> None:
+    topic = proto_topic("CompressedImage", IMAGE)
+    cls = message_class(topic.schema, "CompressedImage")
+    pictures = [b"\xff\xd8" + bytes(300), b"\x89PNG\r\n\x1a\n" + bytes(9)]
+    payloads = []
+    for i, picture in enumerate(pictures):
+        message = same_stamp(cls, 5 + i, 7)
+        message.data, message.format, message.frame_id = picture, "jpeg", "front"
+        payloads.append(message.SerializeToString())
+    ledger = Ledger("made")
+
+    block = must_decode(topic)(block_of("/t", [payloads[0], payloads[1], b""]), ledger)
+
+    assert isinstance(block.rows, Images)
+    assert block.rows.coding == ("jpeg", "png")
+    assert [block.rows.bytes_.payload(i).tobytes() for i in range(2)] == pictures
+    assert block.header_ns is not None
+    assert block.header_ns.tolist() == [5_000_000_007, 6_000_000_007]
+    assert ledger.topic("/t").skipped == {"empty picture": 1}
+
+
+def test_video_packets_need_a_known_coding() -> None:
+    topic = proto_topic("CompressedVideo", IMAGE)
+    cls = message_class(topic.schema, "CompressedVideo")
+    payloads = []
+    for coding in ("h264", "h265", "vp9"):
+        message = same_stamp(cls, 1, 0)
+        message.data, message.format = b"\x00\x00\x00\x01", coding
+        payloads.append(message.SerializeToString())
+    ledger = Ledger("made")
+
+    images = must_decode(topic)(block_of("/t", payloads), ledger).rows
+
+    assert isinstance(images, Images)
+    assert images.coding == ("h264", "h265")
+    assert ledger.details[0].detail == "vp9"
+
+
+def test_raw_images_keep_size_and_pixel_format() -> None:
+    topic = proto_topic("RawImage", RAW)
+    cls = message_class(topic.schema, "RawImage")
+    message = same_stamp(cls, 1, 0)
+    message.width, message.height, message.step, message.encoding = 4, 2, 12, "rgb8"
+    message.data = bytes(24)
+    short = cls()
+    short.CopyFrom(message)
+    short.data = bytes(23)
+    ledger = Ledger("made")
+
+    images = must_decode(topic)(
+        block_of("/t", [message.SerializeToString(), short.SerializeToString()]), ledger
+    ).rows
+
+    assert isinstance(images, Images)
+    assert len(images) == 1
+    assert images.pixel_format == ("rgb8",)
+    assert images.step_bytes is not None
+    assert images.step_bytes.tolist() == [12]
+    assert ledger.topic("/t").skipped == {"picture has fewer bytes than its size needs": 1}
+
+
+def test_location_fixes_get_the_columns_of_navsatfix() -> None:
+    topic = proto_topic("LocationFix", FIX)
+    cls = message_class(topic.schema, "LocationFix")
+    message = same_stamp(cls, 3, 4)
+    message.latitude, message.longitude, message.altitude = 37.5, -122.25, 11.0
+    message.position_covariance.extend(range(9))
+    bare = same_stamp(cls, 4, 4)
+    wrong = same_stamp(cls, 5, 4)
+    wrong.position_covariance.extend([1.0, 2.0])
+    ledger = Ledger("made")
+
+    block = must_decode(topic)(
+        block_of("/t", [each.SerializeToString() for each in (message, wrong, bare)]), ledger
+    )
+
+    assert isinstance(block.rows, Table)
+    assert block.rows["latitude_deg"].tolist() == [37.5, 0.0]
+    np.testing.assert_array_equal(block.rows["covariance_m2"], [range(9), [np.nan] * 9])
+    assert block.header_ns is not None
+    assert block.header_ns.tolist() == [3_000_000_004, 4_000_000_004]
+    assert ledger.topic("/t").skipped == {MISFIT: 1}
+
+
+def test_unknown_protobuf_types_become_dotted_columns_of_their_own_types() -> None:
+    fields = (
+        STAMP,
+        ("count", 2, F.TYPE_UINT64),
+        ("gain", 3, F.TYPE_FLOAT),
+        ("on", 4, F.TYPE_BOOL),
+        ("list", 5, F.TYPE_INT32, "", True),
+        ("again", 6, F.TYPE_MESSAGE, ".foxglove.Made"),
+        ("name", 7, F.TYPE_STRING),
+    )
+    topic = proto_topic("Made", fields)
+    cls = message_class(topic.schema, "Made")
+    message = same_stamp(cls, 9, 1)
+    message.count, message.gain, message.on = 2**64 - 1, 0.5, True
+    message.list.extend([1, 2, 3])
+    message.again.count = 5
+    ledger = Ledger("made")
+
+    block = must_decode(topic)(block_of("/t", [message.SerializeToString()]), ledger)
+
+    assert isinstance(block.rows, Table)
+    assert {name: column.tolist() for name, column in block.rows.columns.items()} == {
+        "count": [2**64 - 1],
+        "gain": [0.5],
+        "on": [True],
+        "list.length": [3],
+    }
+    assert block.header_ns is not None
+    assert block.header_ns.tolist() == [9_000_000_001]
+
+
+@pytest.mark.parametrize(
+    ("schema", "complaint"),
+    [
+        (b"\xff\xff\xff", "cannot be used"),
+        (b"", None),
+        (schema_of("Other", IMAGE), "cannot be used"),
+        (schema_of("CompressedImage", (STAMP, ("data", 2, F.TYPE_STRING))), "lacks the field data"),
+        (schema_of("CompressedImage", IMAGE)[:-300], "cannot be used"),
+        (bytes(2 << 20), "over the limit"),
+    ],
+)
+def test_broken_descriptors_are_refused_in_one_line(schema: bytes, complaint: str | None) -> None:
+    topic = Topic("/cam", "foxglove.CompressedImage", "protobuf", schema, "protobuf")
+    if complaint is None:
+        assert decoder_for(topic) is None
+        return
+    with pytest.raises(SchemaError, match=complaint) as caught:
+        decoder_for(topic)
+    assert "\n" not in str(caught.value)
+    assert "/cam" in str(caught.value)
+
+
+@given(raw=st.binary(max_size=80), name=st.sampled_from(["CompressedImage", "LocationFix"]))
+@QUICK
+def test_any_bytes_are_decoded_or_skipped_and_never_more(raw: bytes, name: str) -> None:
+    topic = proto_topic(name, IMAGE if name == "CompressedImage" else FIX)
+    ledger = Ledger("made")
+    ledger.find("/t", 1)
+
+    block = must_decode(topic)(block_of("/t", [raw]), ledger)
+
+    assert len(block) == ledger.topic("/t").used
+    if isinstance(block.rows, Images):
+        for i in range(len(block)):
+            assert block.rows.bytes_.payload(i).tobytes() in raw
+
+
+def json_block(*values: Any) -> Block:
+    return block_of("/t", [v if isinstance(v, bytes) else json.dumps(v).encode() for v in values])
+
+
+def test_json_pictures_and_fixes_match_their_protobuf_twins() -> None:
+    when = {"sec": 5, "nsec": 7}
+    picture = b"\xff\xd8" + bytes(40)
+    image = {"timestamp": when, "data": b64encode(picture).decode(), "format": "jpeg"}
+    fix = {
+        "timestamp": when, "latitude": 1, "longitude": 2.5, "altitude": 3,
+        "position_covariance": list(range(9)), "position_covariance_type": 2,
+    }  # fmt: skip
+    ledger = Ledger("made")
+    images = must_decode(Topic("/t", "foxglove.CompressedImage", "json"))(
+        json_block(image, image | {"data": "not base64!"}), ledger
+    )
+    fixes = must_decode(Topic("/t", "foxglove.LocationFix", "json"))(
+        json_block(fix, fix | {"latitude": "north"}, {"timestamp": when}), ledger
+    )
+
+    assert isinstance(images.rows, Images)
+    assert images.rows.bytes_.payload(0).tobytes() == picture
+    assert images.header_ns is not None
+    assert images.header_ns.tolist() == [5_000_000_007]
+    assert isinstance(fixes.rows, Table)
+    assert fixes.rows["latitude_deg"].tolist() == [1]
+    assert fixes.rows["covariance_m2"].shape == (1, 9)
+    assert ledger.topic("/t").skipped == {MISFIT: 3}
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b'{"a": NaN}',
+        b'{"a": Infinity}',
+        b'{"a": 1, "a": 2}',
+        b"[1]",
+        b"\xff{}",
+        b'{"a": ' + b"[" * 100_000,
+        b'{"a":' * 30 + b"1" + b"}" * 30,
+        b'{"timestamp": {"sec": 1, "nsec": 1000000000}}',
+        b'{"timestamp": {"sec": 99999999999999999999, "nsec": 0}}',
+        b'{"a": ' + b"9" * 5000 + b"}",
+    ],
+)
+def test_bad_json_is_skipped_message_by_message(raw: bytes) -> None:
+    ledger = Ledger("made")
+
+    block = must_decode(Topic("/t", "made.Thing", "json"))(json_block({"a": 1}, raw), ledger)
+
+    assert len(block) == 1
+    assert ledger.topic("/t").skipped == {MISFIT: 1}
+
+
+def test_json_numbers_keep_their_kind_and_missing_ones_are_nan() -> None:
+    rows: list[Mapping[str, Any]] = [
+        {"n": 2**53 + 1, "b": True, "in": {"x": 1}},
+        {"n": 2, "b": False, "in": {"x": 0.5, "y": 2}, "s": "text", "l": [1, 2]},
+    ]
+    table = must_decode(Topic("/t", "made.Thing", "json"))(json_block(*rows), Ledger("x")).rows
+
+    assert isinstance(table, Table)
+    assert table["n"].tolist() == [2**53 + 1, 2]
+    assert table["b"].dtype == np.bool_
+    np.testing.assert_array_equal(table["in.y"], [np.nan, 2.0])
+    np.testing.assert_array_equal(table["l.length"], [np.nan, 2.0])
+
+
+def test_a_json_schema_must_be_an_object() -> None:
+    with pytest.raises(SchemaError, match="no JSON object"):
+        decoder_for(Topic("/t", "made.Thing", "json", b"[1, 2", "jsonschema"))
