@@ -162,6 +162,7 @@ def compass_settings(vehicle: Vehicle) -> compass.CompassSettings:
     """The vehicle file's compass section as the compass takes it."""
     section = vehicle.compass
     return compass.CompassSettings(
+        mounting_rotation=section.mounting_rotation,
         mounting_yaw_rad=section.mounting_yaw_rad,
         hard_iron_t=section.hard_iron_t,
         soft_iron=section.soft_iron,

@@ -24,6 +24,8 @@ DEGREE: Final = math.pi / 180.0
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Vector = tuple[Finite, Finite, Finite]
+Matrix = tuple[Vector, Vector, Vector]
 Signal = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
 """``MESSAGE.SIGNAL`` as the DBC file spells them."""
 
@@ -118,11 +120,11 @@ class Compass(Section):
     """From a magnetometer's reading to a heading; ``crosscue fit compass`` writes this section."""
 
     use: bool = True
+    mounting_rotation: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    """Turns the sensor's axes into forward, left, up."""
     mounting_yaw_rad: Finite = 0.0
-    hard_iron_t: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    soft_iron: tuple[
-        tuple[Finite, Finite, Finite], tuple[Finite, Finite, Finite], tuple[Finite, Finite, Finite]
-    ] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    hard_iron_t: Vector = (0.0, 0.0, 0.0)
+    soft_iron: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     declination_rad: Finite = 0.0
     """East positive."""
     heading_sd_rad: Positive = 15.0 * DEGREE
