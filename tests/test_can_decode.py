@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from crosscue.replay.can.database import CanDatabase
-from crosscue.replay.can.decode import BusDecoder, DecodeSettings, Engine
+from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
 from crosscue.replay.can.encode import encode
 from crosscue.replay.can.extract import PRESENT_SUFFIX
 from crosscue.replay.can.layout import Arithmetic, CanMessage, CanSignal
@@ -26,7 +26,7 @@ from crosscue.replay.columns import Block, Table
 from crosscue.replay.ledger import Ledger
 from support.can_layouts import block_of, dbc_text, frames_of, messages
 
-ENGINES: tuple[Engine, ...] = ("numpy", "numba")
+ENGINES: tuple[EngineName, ...] = ("numpy", "numba")
 LAYOUTS = st.one_of(messages(), messages(multiplexed=True))
 SEEDS = st.integers(0, 2**32 - 1)
 ROWS = 24
@@ -55,7 +55,7 @@ def read_back(message: CanMessage, folder: Path) -> tuple[CanDatabase, Message]:
 
 
 def decode_all(
-    database: CanDatabase, message: CanMessage, payload: NDArray[np.uint8], engine: Engine
+    database: CanDatabase, message: CanMessage, payload: NDArray[np.uint8], engine: EngineName
 ) -> tuple[Block | None, BusDecoder, Ledger]:
     ledger = Ledger("made up")
     ledger.find("can0", len(payload))
@@ -101,7 +101,7 @@ def assert_same_values(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
 @given(message=LAYOUTS, seed=SEEDS)
 @varied(max_examples=60)
 def test_every_value_equals_cantools(
-    message: CanMessage, seed: int, engine: Engine, tmp_path: Path
+    message: CanMessage, seed: int, engine: EngineName, tmp_path: Path
 ) -> None:
     database, theirs = read_back(message, tmp_path)
     payload = payloads(message, seed)

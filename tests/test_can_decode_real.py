@@ -15,7 +15,7 @@ from crosscue.replay.can.decode import (
     UNKNOWN_ID,
     BusDecoder,
     DecodeSettings,
-    Engine,
+    EngineName,
 )
 from crosscue.replay.can.layout import overlaps
 from crosscue.replay.columns import Block, CanFrames, Table
@@ -60,7 +60,7 @@ def test_wheel_speeds_of_a_real_drive_are_those_the_data_set_publishes() -> None
 
 @pytest.mark.parametrize("engine", ["numpy", "numba"])
 @pytest.mark.parametrize("bus", sorted(BUSES))
-def test_every_decodable_frame_of_a_real_bus_equals_cantools(bus: str, engine: Engine) -> None:
+def test_every_decodable_frame_of_a_real_bus_equals_cantools(bus: str, engine: EngineName) -> None:
     parts, read = BUSES[bus]
     path, block = shared(*parts), read()
     ledger = Ledger(bus)

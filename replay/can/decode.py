@@ -18,7 +18,8 @@ from crosscue.replay.columns import DATA, ERROR, LENGTH_UNKNOWN, REMOTE, Block, 
 from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
 
 from .database import CanDatabase, spell_id
-from .extract import PRESENT_SUFFIX, Extractor, Words
+from .engines import Engine, Grouped, NumbaEngine, NumpyEngine, Rules, has_numba
+from .extract import PRESENT_SUFFIX, Extractor
 from .layout import Arithmetic, CanMessage
 
 UNKNOWN_ID: Final = "id not in the database"
@@ -32,11 +33,14 @@ OTHERS: Final = (-1, False)
 """Stands for all further identifiers once ``COUNTS_KEPT`` have been told apart."""
 COUNTS_KEPT: Final = 20_000
 
-Engine: TypeAlias = Literal["auto", "numpy", "numba"]
+AUTO_FRAMES: Final = 4_000_000
+"""From so many frames on, compiled loops make up for the time that loading Numba takes."""
+
+EngineName: TypeAlias = Literal["auto", "numpy", "numba"]
 Wanted: TypeAlias = Collection[str] | Collection[tuple[str, str]]
 CountKey: TypeAlias = tuple[int, bool, str]
 
-_STANDARD_IDS: Final = 2048
+_FEW_KEYS: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,12 +49,13 @@ class DecodeSettings:
 
     Attributes:
         allow_longer: Decode frames with more bytes than their message has, ignoring the rest; for
-            logs that lost the true length (comma2k19 stores 8 bytes always).
-        engine: ``numpy``, ``numba``, or ``auto``.
+            logs that pad them.
+        engine: ``numpy``; ``numba``; or ``auto``, which begins with NumPy and goes on with Numba,
+            where it is installed, after ``AUTO_FRAMES`` frames. All give the same values.
     """
 
     allow_longer: bool = False
-    engine: Engine = "auto"
+    engine: EngineName = "auto"
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +102,15 @@ class BusDecoder:
         """
         self._bus = bus
         self._ledger = ledger
-        self._settings = settings
+        self._engine_name = settings.engine
+        self._frames_seen = 0
         self.counts: dict[CountKey, int] = {}
         chosen = _chosen(database, wanted)
         self._entries = tuple(_entry(message, chosen) for message in database.messages)
-        self._lookup = _Lookup(tuple(e.message for e in self._entries))
-        self._limits = _LengthLimits(self._entries, settings)
+        self._rules = [_rules(entry, settings) for entry in self._entries]
+        self._refusals = sorted({e.refusal for e in self._entries if e.refusal})
+        use_numba = settings.engine == "numba"
+        self._engine: Engine = (NumbaEngine if use_numba else NumpyEngine)(self._rules)
 
     def columns_of(self, message: str) -> dict[str, np.dtype[np.generic]]:
         """Names and types of the columns that rows of ``message`` have.
@@ -130,154 +138,113 @@ class BusDecoder:
         frames = block.rows
         if not isinstance(frames, CanFrames):
             raise ValueError(f"{block.topic}: want CanFrames, got {type(frames).__name__}")
-        slot = self._lookup(frames)
-        good = self._limits(frames, slot)
-        if not good.all():
-            self._account(frames, slot, ~good, block.log_ns)
-            slot = np.where(good, slot, np.uint16(0))
-        return self._decode(block, frames, slot)
-
-    def _decode(self, block: Block, frames: CanFrames, slot: NDArray[np.uint16]) -> list[Block]:
-        counts = np.bincount(slot, minlength=len(self._entries) + 1)
-        order = np.argsort(slot, kind="stable")  # a radix sort on 16 bits
-        stops = np.cumsum(counts)
-        words = _words(frames)[order]
-        times = _Times(block, order)
+        self._choose_engine(len(frames))
+        grouped = self._engine.group(frames)
+        if not grouped.is_good.all():
+            self._account(frames, grouped, block.log_ns)
+        times = _Times(block, grouped.order)
         decoded = []
-        for number in np.flatnonzero(counts[1:]) + 1:
-            rows = slice(int(stops[number - 1]), int(stops[number]))
+        for number in (np.flatnonzero(np.diff(grouped.stops)) + 1).tolist():
             entry = self._entries[number - 1]
-            assert entry.extractor is not None
-            columns, strange = entry.extractor(words[rows])
-            one = times.block(f"{self._bus}/{entry.message.topic_name}", rows, columns, entry.units)
+            columns, strange = self._engine.columns(number)
+            topic = f"{self._bus}/{entry.message.topic_name}"
+            one = times.block(topic, grouped.rows(number), columns, entry.units)
             if strange is not None:
-                self._skip(entry.message.key, NO_BRANCH, one.log_ns[strange])
+                at = one.log_ns[strange]
+                self._tell((*entry.message.key, NO_BRANCH), len(at), int(at[0]))
                 one = one.take(~strange)
             if len(one):
                 decoded.append(one)
         return decoded
 
-    def _account(
+    def _choose_engine(self, frames: int) -> None:
+        self._frames_seen += frames
+        if self._engine_name == "auto" and self._frames_seen > AUTO_FRAMES:
+            self._engine_name = "numba" if has_numba() else "numpy"
+            if has_numba():
+                self._engine = NumbaEngine(self._rules)
+
+    def _account(self, frames: CanFrames, grouped: Grouped, log_ns: NDArray[np.int64]) -> None:
+        """Count the frames that cannot be decoded, each under the first reason that holds."""
+        rows = np.flatnonzero(~grouped.is_good)
+        is_unknown = (grouped.number[rows] == 0) & (frames.kind[rows] == DATA)
+        self._count(frames, rows[is_unknown], [UNKNOWN_ID], None, log_ns)
+        rows = rows[~is_unknown]
+        if len(rows):
+            reasons, which = self._reasons(frames, grouped, rows)
+            self._count(frames, rows, reasons, which, log_ns)
+
+    def _count(
         self,
         frames: CanFrames,
-        slot: NDArray[np.uint16],
-        bad: NDArray[np.bool_],
+        rows: NDArray[np.intp],
+        reasons: list[str],
+        which: NDArray[np.int64] | None,
         log_ns: NDArray[np.int64],
     ) -> None:
-        rows = np.flatnonzero(bad)
-        reasons, reason_of_row = self._reasons(frames, slot, rows)
-        identifier = frames.arbitration_id[rows].astype(np.int64)
+        """Count ``rows`` by identifier and by ``which`` of the reasons; None for the first."""
         extended = frames.is_extended[rows]
-        key = identifier | (extended.astype(np.int64) << 32) | (reason_of_row << 33)
-        for value, first, count in zip(*_tally(key), strict=True):
-            reason = reasons[int(value) >> 33]
-            whose = int(value) & 0xFFFF_FFFF, bool(int(value) >> 32 & 1)
-            self._tell(whose, reason, int(count), int(log_ns[rows[first]]))
+        for is_extended, bits in ((False, 11), (True, 29)):
+            chosen = extended if is_extended else ~extended
+            if not chosen.any():
+                continue
+            mine = rows[chosen]
+            key = frames.arbitration_id[mine].astype(np.int64)
+            if which is not None:
+                key += which[chosen] << bits
+            for value, count in _tally(key):
+                whose: CountKey = (
+                    value & ((1 << bits) - 1),
+                    is_extended,
+                    reasons[value >> bits],
+                )
+                if whose in self.counts:
+                    self._add(whose, count)
+                else:
+                    first = mine[np.argmax(key == value)]
+                    self._tell(whose, count, int(log_ns[first]))
 
     def _reasons(
-        self, frames: CanFrames, slot: NDArray[np.uint16], rows: NDArray[np.intp]
+        self, frames: CanFrames, grouped: Grouped, rows: NDArray[np.intp]
     ) -> tuple[list[str], NDArray[np.int64]]:
         """All reasons, and the number of the one that holds for each of ``rows``."""
         reasons = [ERROR_FRAME, REMOTE_FRAME, UNKNOWN_ID, WRONG_FORMAT, TOO_SHORT, TOO_LONG]
-        refusals = sorted({e.refusal for e in self._entries if e.refusal})
         refused = np.zeros(len(self._entries) + 1, dtype=np.int64)
         for number, entry in enumerate(self._entries, start=1):
             if entry.refusal:
-                refused[number] = len(reasons) + refusals.index(entry.refusal)
-        numbers, kind, length = slot[rows], frames.kind[rows], frames.length[rows]
-        limits = self._limits
+                refused[number] = len(reasons) + self._refusals.index(entry.refusal)
+        longest = np.array([(-1, -1), *(rule.longest for rule in self._rules)], dtype=np.int16)
+        shortest = np.array([0, *(m.message.length for m in self._rules)])
+        number, kind = grouped.number[rows], frames.kind[rows]
+        carried = np.minimum(frames.length[rows], frames.data.shape[1])
         which = np.select(
             [
                 kind == ERROR,
                 kind == REMOTE,
-                numbers == 0,
-                refused[numbers] > 0,
-                frames.is_fd[rows] & limits.refuses_fd[numbers],
-                length < limits.shortest[numbers],
+                number == 0,
+                refused[number] > 0,
+                frames.is_fd[rows] & (longest[number, 1] < 0),
+                carried < shortest[number],
             ],
-            [np.int64(0), np.int64(1), np.int64(2), refused[numbers], np.int64(3), np.int64(4)],
+            [np.int64(0), np.int64(1), np.int64(2), refused[number], np.int64(3), np.int64(4)],
             np.int64(5),
         )
-        return reasons + refusals, which
+        return reasons + self._refusals, which
 
-    def _skip(self, whose: tuple[int, bool], reason: str, log_ns: NDArray[np.int64]) -> None:
-        self._tell(whose, reason, len(log_ns), int(log_ns[0]))
+    def _add(self, key: CountKey, count: int) -> None:
+        self.counts[key] += count
+        self._ledger.topic(self._bus).skipped[key[2]] += count
 
-    def _tell(self, whose: tuple[int, bool], reason: str, count: int, t_ns: int) -> None:
-        """Count frames; only the first of a kind leaves a detail, or a busy bus would fill all."""
-        key: CountKey = (*whose, reason)
-        is_new = key not in self.counts
-        if is_new and len(self.counts) >= COUNTS_KEPT:
-            key = (*OTHERS, reason)
+    def _tell(self, key: CountKey, count: int, t_ns: int) -> None:
+        """Count frames; only the first of a kind leave a detail, or a busy bus would fill all."""
+        if key in self.counts:
+            self._add(key, count)
+            return
+        detail = f"{spell_id(*key[:2])}, first of them"
+        if len(self.counts) >= COUNTS_KEPT:
+            key = (*OTHERS, key[2])
         self.counts[key] = self.counts.get(key, 0) + count
-        if is_new:
-            detail = f"{spell_id(*whose)}, first of them"
-            self._ledger.skip(self._bus, reason, count, detail, t_ns)
-        else:
-            self._ledger.topic(self._bus).skipped[reason] += count
-
-
-class _Lookup:
-    """From frames to the number of their message, from 1; 0 for none."""
-
-    def __init__(self, messages: tuple[CanMessage, ...]) -> None:
-        # One place more than there are identifiers: whatever is larger ends there, unknown.
-        self._standard = np.zeros(_STANDARD_IDS + 1, dtype=np.uint16)
-        extended = []
-        for number, message in enumerate(messages, start=1):
-            if message.is_extended:
-                extended.append((message.arbitration_id, number))
-            else:
-                self._standard[message.arbitration_id] = number
-        extended.sort()
-        self._ids = np.array([i for i, _ in extended], dtype=np.uint32)
-        self._numbers = np.array([n for _, n in extended], dtype=np.uint16)
-
-    def __call__(self, frames: CanFrames) -> NDArray[np.uint16]:
-        slot = self._standard.take(frames.arbitration_id, mode="clip")
-        if frames.is_extended.any():
-            rows = np.flatnonzero(frames.is_extended)
-            slot[rows] = self._of_extended(frames.arbitration_id[rows])
-        return slot
-
-    def _of_extended(self, ids: NDArray[np.uint32]) -> NDArray[np.uint16]:
-        if not len(self._ids):
-            return np.zeros(len(ids), dtype=np.uint16)
-        place = np.searchsorted(self._ids, ids)
-        place[place == len(self._ids)] = 0
-        return np.where(self._ids[place] == ids, self._numbers[place], np.uint16(0))
-
-
-class _LengthLimits:
-    """Which frames have a fitting length; nothing fits a message that is refused."""
-
-    def __init__(self, entries: tuple[_Entry, ...], settings: DecodeSettings) -> None:
-        n = len(entries) + 1
-        self.shortest = np.full(n, 256, dtype=np.int16)
-        self.refuses_fd = np.zeros(n, dtype=np.bool_)
-        self._longest = np.full((2, n), -1, dtype=np.int16)
-        for number, entry in enumerate(entries, start=1):
-            if entry.refusal:
-                continue
-            message = entry.message
-            self.shortest[number] = min(message.length, 256)
-            for is_fd in (False, True):
-                longest = 255 if settings.allow_longer else message.longest_frame(is_fd)
-                self._longest[int(is_fd), number] = min(longest, 255)
-            if message.is_fd is False:
-                self.refuses_fd[number] = True
-                self._longest[1, number] = -1
-
-    def __call__(self, frames: CanFrames, slot: NDArray[np.uint16]) -> NDArray[np.bool_]:
-        """True for the frames that can be decoded."""
-        longest = self._longest[0][slot]
-        if frames.is_fd.any():
-            longest = np.where(frames.is_fd, self._longest[1][slot], longest)
-        good: NDArray[np.bool_] = frames.length >= self.shortest[slot]
-        # Where the log keeps no lengths there is nothing to hold against the database.
-        good &= (frames.length <= longest) | ((frames.length == LENGTH_UNKNOWN) & (longest >= 0))
-        good &= frames.kind == DATA
-        return good
+        self._ledger.skip(self._bus, key[2], count, detail, t_ns)
 
 
 class _Times:
@@ -305,16 +272,16 @@ class _Times:
         )
 
 
-def _words(frames: CanFrames) -> Words:
-    words: Words = np.ascontiguousarray(frames.data).view("<u8").astype(np.uint64, copy=False)
-    return words
-
-
-def _tally(
-    key: NDArray[np.int64],
-) -> tuple[NDArray[np.int64], NDArray[np.intp], NDArray[np.intp]]:
-    """Distinct values, where each is first, and how often it occurs."""
-    return np.unique(key, return_index=True, return_counts=True)
+def _tally(key: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """Distinct values and how often each occurs."""
+    if not len(key):
+        return []
+    if key.max() < _FEW_KEYS:  # many times as fast as sorting, and buses have few identifiers
+        counts = np.bincount(key)
+        values = np.flatnonzero(counts)
+        return list(zip(values.tolist(), counts[values].tolist(), strict=True))
+    values, counts = np.unique(key, return_counts=True)
+    return list(zip(values.tolist(), counts.tolist(), strict=True))
 
 
 def _chosen(database: CanDatabase, wanted: Wanted | None) -> dict[tuple[int, bool], set[str]]:
@@ -341,6 +308,17 @@ def _entry(message: CanMessage, chosen: Mapping[tuple[int, bool], set[str]]) -> 
     extractor = Extractor(message, chosen[message.key])
     units = {s.name: s.unit for s in extractor.signals if s.unit}
     return _Entry(message, extractor, units, "")
+
+
+def _rules(entry: _Entry, settings: DecodeSettings) -> Rules:
+    message = entry.message
+    if entry.extractor is None:
+        return Rules(message, None, (-1, -1))
+    if settings.allow_longer:
+        classic = flexible = LENGTH_UNKNOWN
+    else:
+        classic, flexible = message.longest_frame(False), message.longest_frame(True)
+    return Rules(message, entry.extractor, (classic, -1 if message.is_fd is False else flexible))
 
 
 def _dtypes(extractor: Extractor) -> dict[str, np.dtype[np.generic]]:

@@ -50,7 +50,7 @@ def _place(signal: CanSignal) -> _Place:
         bit + signal.length > 64,
         signal.is_signed and not signal.is_float,
         signal.is_float,
-        signal.scale == 1 and signal.offset == 0,
+        signal.is_float and signal.scale == 1 and signal.offset == 0,
         signal.length if signal.is_float else 0,
         signal.arithmetic.name,
     )
@@ -62,6 +62,7 @@ class _Together:
     def __init__(self, place: _Place, signals: list[CanSignal]) -> None:
         self.place = place
         self.signals = signals
+        self.names = tuple(s.name for s in signals)
         bit = np.array([s.first_bit % 64 for s in signals], dtype=np.uint64)[:, None]
         length = np.array([s.length for s in signals], dtype=np.uint64)[:, None]
         self._drop = np.uint64(64) - length
@@ -70,8 +71,9 @@ class _Together:
         self._taken = np.uint64(64) - bit  # bits of a split signal in its first word
         self._short = bool((length < 64).all())
         scales, offsets = [s.scale for s in signals], [s.offset for s in signals]
-        self._scale = None if place.is_plain else _factors(scales)
-        self._offset = None if place.is_plain else _factors(offsets)
+        is_linear_float = place.is_float and not place.is_plain  # -0.0 + 0 is 0.0
+        self._scale = _factors(scales) if any(x != 1 for x in scales) else None
+        self._offset = _factors(offsets) if any(offsets) or is_linear_float else None
 
     def __call__(self, words: Words) -> Column:
         """Physical values, shape (S, N)."""
@@ -166,7 +168,7 @@ class _Flat:
         """From signal name to its values, shape (N,)."""
         columns: dict[str, Column] = {}
         for part in self._parts:
-            columns.update(zip((s.name for s in part.signals), part(words), strict=True))
+            columns.update(zip(part.names, part(words), strict=True))
         return columns
 
 
