@@ -1,0 +1,78 @@
+"""A folder of pictures and a time file: one camera.
+
+Which files are time files and how they are read: ``time_file``; how pictures get their times:
+``picture_files``. The topic is called after the folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import EVERYTHING, Selection
+
+from .picture_files import PictureFiles, list_pictures, pair
+from .time_file import find_time_file, read_time_file
+
+
+class ImageFolder:
+    """A folder of pictures as a ``Log``."""
+
+    format: Final = "images"
+
+    def __init__(self, path: Path, pictures: PictureFiles, limits: Limits) -> None:
+        """Read ``pictures`` from ``path`` within ``limits``."""
+        self.path: Final = path
+        self._pictures: Final = pictures
+        self._limits: Final = limits
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The one camera."""
+        return (self._pictures.topic,)
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """The pictures in natural order of their names; see ``Log.read``."""
+        yield from self._pictures.read(ledger, selection, self._limits)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def open_images(path: Path, limits: Limits) -> ImageFolder:
+    """Open a folder of pictures; see ``crosscue.replay.log.FORMATS``.
+
+    Raises:
+        LogFormatError: No picture, no time file, or a time file that cannot be understood.
+    """
+    paths = list_pictures(path)
+    if not paths:
+        raise LogFormatError(f"{path}: no picture in it; want .png, .jpg or .webp files")
+    time_file = find_time_file(path)
+    if time_file is None:
+        raise LogFormatError(
+            f"{path}: {len(paths)} pictures but no time file; write timestamps.txt into it with "
+            "one time a line (seconds with a decimal point), or with the one line 'rate_hz: 15' "
+            "if their times were not kept"
+        )
+    times = read_time_file(time_file, limits)
+    name = path.resolve()
+    topic = name.parent.name if name.name == "data" else name.name
+    return ImageFolder(path, pair(topic or "images", "crosscue/Images", paths, times), limits)

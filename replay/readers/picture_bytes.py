@@ -1,0 +1,57 @@
+"""Is an encoded picture whole? As far as its own bytes can tell, without decoding it."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import Final
+
+_PNG_HEAD: Final = 8
+_JPEG_END: Final = b"\xff\xd9"
+_JPEG_TAIL: Final = 4096
+"""Cameras append padding and notes after the end marker."""
+
+CUT: Final = "picture cut short"
+DAMAGED: Final = "picture damaged (checksum)"
+
+CHECKED: Final = {
+    "png": "PNG: every chunk's CRC verified",
+    "jpeg": "JPEG: no checksum, end marker seen",
+    "webp": "WebP: no checksum, length compared",
+}
+"""What ``damage_of`` checks, by coding, for the summary of a log."""
+
+
+def damage_of(picture: bytes, coding: str) -> str | None:
+    """Why a picture is known not to be whole, or None where nothing is known against it.
+
+    Args:
+        picture: Its bytes.
+        coding: ``jpeg``, ``png`` or ``webp``; others are not checked.
+    """
+    if coding == "png":
+        return _png_damage(picture)
+    if coding == "jpeg":
+        # Inside the coded pixels 0xFF is always followed by 0, so a cut picture has no such end.
+        return None if _JPEG_END in picture[-_JPEG_TAIL:] else CUT
+    if coding == "webp":
+        declared = struct.unpack_from("<I", picture, 4)[0] + 8
+        return None if len(picture) >= declared else CUT
+    return None
+
+
+def _png_damage(picture: bytes) -> str | None:
+    """Walk the chunks: length, type, content, CRC of type and content."""
+    at = _PNG_HEAD
+    while at + 12 <= len(picture):
+        (length,) = struct.unpack_from(">I", picture, at)
+        stop = at + 12 + length
+        if stop > len(picture):
+            return CUT
+        content = memoryview(picture)[at + 4 : stop - 4]
+        if zlib.crc32(content) != struct.unpack_from(">I", picture, stop - 4)[0]:
+            return DAMAGED
+        if bytes(content[:4]) == b"IEND":
+            return None
+        at = stop
+    return CUT

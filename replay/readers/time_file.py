@@ -1,0 +1,254 @@
+"""Time files: one line for each picture or video frame.
+
+Lines hold a time, or a file name and a time in either order, split by a comma, semicolon or blanks
+(``12.35``; ``frame_07.jpg,12.35``; TUM's ``1305031102.175304 rgb/1305031102.175304.png``). Empty
+lines and those that begin with ``#`` are passed over. A first line without any time names columns;
+the one whose name has ``time`` or ``stamp`` is the time, and a unit there (``time_ns``,
+``time_us``, ``time_ms``, ``time [s]``) counts. A time is
+
+* seconds with a decimal point or exponent (``12.35``, ``1.2e-1``);
+* an integer, which counts nanoseconds unless the column's name gives another unit;
+* a date-time (``2011-09-26 13:02:25.964389445``, ``...T13:02:25Z``, ``...+02:00``), UTC where it
+  names no zone.
+
+Instead of times, one line ``rate_hz: 15`` says that they were not kept and pictures came at that
+rate. Times are computed in integers and fractions, never in floats.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from decimal import Decimal, InvalidOperation
+from fractions import Fraction
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Int64s
+from crosscue.replay.errors import LogFormatError, LogTooLargeError
+from crosscue.replay.limits import Limits
+
+NAMES: Final = ("timestamps.txt", "times.txt", "rgb.txt")
+"""Tried in this order inside a folder, before any ``.csv``."""
+SECOND_NS: Final = 1_000_000_000
+_LATEST_NS: Final = 1 << 62
+_SHORTEST_PERIOD_NS: Final = 1_000_000
+_UNITS_NS: Final = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": SECOND_NS, "sec": SECOND_NS}
+_UNIT: Final = re.compile(r"(?:_|\[|\()(ns|us|ms|s|sec)[\])]?$")
+_DATE: Final = re.compile(
+    r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:[.,](\d{1,18}))?\s*(Z|[+-]\d\d:?\d\d)?"
+)
+_RATE: Final = re.compile(r"rate_hz\s*[:=]\s*(\S+)", re.IGNORECASE)
+_NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,2})?")
+_UNIX_START: Final = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimeFile:
+    """What a time file says.
+
+    Attributes:
+        path: Where it lies.
+        t_ns: Shape (N,), int64; empty where only a rate is given.
+        names: N file names without folders, or None where lines hold times only.
+        period: Nanoseconds between pictures where only a rate is given, else None.
+    """
+
+    path: Path
+    t_ns: Int64s
+    names: tuple[str, ...] | None
+    period: Fraction | None
+
+    def times_at(self, index: Int64s) -> Int64s:
+        """Times of the pictures with these numbers, counted from 0; shape (N,)."""
+        if self.period is None:
+            return self.t_ns[index]
+        return np.array([round(int(i) * self.period) for i in index], dtype=np.int64)
+
+
+def find_time_file(folder: Path) -> Path | None:
+    """The time file of a folder of pictures: inside it, or beside it under its name.
+
+    Raises:
+        LogFormatError: Several could be meant.
+    """
+    for name in NAMES:
+        if (folder / name).is_file():
+            return folder / name
+    tables = sorted(folder.glob("*.csv"))
+    if len(tables) > 1:
+        names = ", ".join(path.name for path in tables[:5])
+        raise LogFormatError(f"{folder}: several time files ({names}); name one timestamps.txt")
+    beside = [folder.parent / f"{folder.name}{suffix}" for suffix in (".csv", ".txt")]
+    if folder.name == "data":
+        beside.append(folder.parent / "timestamps.txt")
+    return next((path for path in [*tables, *beside] if path.is_file()), None)
+
+
+def time_file_of_video(video: Path) -> Path | None:
+    """``<video>.txt`` or ``<video>.csv``, with the video's suffix or in its place."""
+    names = [video.name + suffix for suffix in (".txt", ".csv")]
+    names += [video.stem + suffix for suffix in (".txt", ".csv")]
+    return next((video.with_name(name) for name in names if video.with_name(name).is_file()), None)
+
+
+def read_time_file(path: Path, limits: Limits) -> TimeFile:
+    """Read and check a time file.
+
+    Raises:
+        LogFormatError: A line cannot be understood; the message names it.
+        LogTooLargeError: The file is larger than one message may be.
+    """
+    lines = list(_lines(path, limits))
+    if len(lines) == 1 and (rate := _RATE.fullmatch(lines[0][1])):
+        return TimeFile(path, np.zeros(0, np.int64), None, _period(path, lines[0][0], rate[1]))
+    times: list[int] = []
+    names: list[str] = []
+    columns: tuple[str, ...] = ()
+    integers = True
+    for number, line in lines:
+        where = f"{path}: line {number}"
+        parts = _split(line)
+        if not times and not columns and not any(_is_time(part) for part in parts):
+            columns = tuple(parts)
+            if not any(_names_a_time(column) for column in columns):
+                raise LogFormatError(
+                    f"{where}: {line[:80]!r}: want a time (seconds with a decimal point, integer "
+                    "nanoseconds or a date-time), alone or with a file name"
+                )
+            continue
+        t_ns, name, is_integer = _one_line(parts, columns, where)
+        times.append(t_ns)
+        integers &= is_integer
+        if name is not None:
+            names.append(name)
+        if names and len(names) != len(times):
+            raise LogFormatError(f"{where}: {line[:80]!r}: names a file or not, unlike line above")
+    if not times:
+        raise LogFormatError(f"{path}: no time in it; want one line for each picture")
+    t_ns_column = np.array(times, dtype=np.int64)
+    _check_period(path, t_ns_column, integers=integers)
+    _check_twins(path, names)
+    return TimeFile(path, t_ns_column, tuple(names) or None, None)
+
+
+def _lines(path: Path, limits: Limits) -> Iterator[tuple[int, str]]:
+    """Numbers and text of the lines that say something."""
+    with path.open("rb") as file:
+        raw = file.read(limits.message_bytes + 1)
+    if len(raw) > limits.message_bytes:
+        raise LogTooLargeError(
+            f"{path}: over {limits.message_bytes} bytes; a time file has one line for each picture"
+        )
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        bad = raw[: error.start].count(b"\n") + 1
+        raise LogFormatError(f"{path}: line {bad}: not UTF-8 text; want a text file") from None
+    for number, whole in enumerate(text.split("\n"), start=1):
+        line = whole.strip()
+        if line and not line.startswith("#"):
+            yield number, line
+
+
+def _split(line: str) -> list[str]:
+    """The cells of a line; a blank between date and time does not split."""
+    if date := _DATE.search(line):
+        written = date[0].rstrip()
+        line = line.replace(written, written.replace(" ", "T", 1).replace(",", "."))
+    for mark in (",", ";", "\t"):
+        if mark in line:
+            return [cell.strip().strip('"') for cell in line.split(mark)]
+    return [cell.strip('"') for cell in line.split()]
+
+
+def _one_line(
+    parts: list[str], columns: tuple[str, ...], where: str
+) -> tuple[int, str | None, bool]:
+    """Time, name or None, and whether the time was an integer without a unit."""
+    at = [i for i, column in enumerate(columns) if _names_a_time(column)]
+    if columns:
+        if len(parts) != len(columns):
+            raise LogFormatError(f"{where}: {len(parts)} cells; want {len(columns)}")
+    else:
+        at = [i for i, part in enumerate(parts) if _is_time(part)]
+    if len(at) != 1 or (not columns and len(parts) > 2):
+        raise LogFormatError(
+            f"{where}: {' '.join(parts)[:80]!r}: want one time, alone or with a file name; "
+            "name the columns in a first line (name,time) where there are more"
+        )
+    named = _UNIT.search(columns[at[0]].lower()) if columns else None
+    unit_ns = _UNITS_NS[named[1]] if named else None
+    others = [part for i, part in enumerate(parts) if i != at[0] and not _is_time(part)]
+    name = PurePosixPath(others[0].replace("\\", "/")).name if others else None
+    text = parts[at[0]]
+    is_bare = unit_ns is None and re.fullmatch(r"[+-]?\d+", text) is not None
+    return _time_ns(text, unit_ns, where), name, is_bare
+
+
+def _is_time(text: str) -> bool:
+    return _NUMBER.fullmatch(text) is not None or _DATE.fullmatch(text) is not None
+
+
+def _names_a_time(column: str) -> bool:
+    low = column.lower()
+    return "time" in low or "stamp" in low or low in ("t", "t_ns", "t_us", "t_ms", "t_s")
+
+
+def _time_ns(text: str, unit_ns: int | None, where: str) -> int:
+    try:
+        if date := _DATE.fullmatch(text):
+            t_ns = _date_ns(date)
+        elif _NUMBER.fullmatch(text):
+            if unit_ns is None:
+                unit_ns = 1 if re.fullmatch(r"[+-]?\d+", text) else SECOND_NS
+            t_ns = int((Decimal(text) * unit_ns).to_integral_value())
+        else:
+            raise LogFormatError(f"{where}: {text[:80]!r} is no time")
+    except (ValueError, InvalidOperation) as error:
+        raise LogFormatError(f"{where}: {text[:80]!r} is no time: {error}") from None
+    if not 0 <= t_ns < _LATEST_NS:
+        raise LogFormatError(f"{where}: {text[:80]!r}: want a time from 0 on and before 2116")
+    return t_ns
+
+
+def _date_ns(date: re.Match[str]) -> int:
+    """Nanoseconds since 1970 of a matched date-time, to the last digit."""
+    zone = (date[4] or "Z").replace("Z", "+0000").replace(":", "")
+    moment = datetime.strptime(f"{date[1]} {date[2]} {zone}", "%Y-%m-%d %H:%M:%S %z")
+    whole_s = (moment - _UNIX_START) // timedelta(seconds=1)
+    return whole_s * SECOND_NS + int((date[3] or "0").ljust(9, "0")[:9])
+
+
+def _period(path: Path, line: int, text: str) -> Fraction:
+    rate = Fraction(text) if _NUMBER.fullmatch(text) else Fraction(0)
+    if not 0 < rate <= 100_000:
+        raise LogFormatError(f"{path}: line {line}: rate_hz {text[:40]!r}; want a rate like 29.97")
+    return SECOND_NS / rate
+
+
+def _check_period(path: Path, t_ns: Int64s, *, integers: bool) -> None:
+    """Refuse integers that are too close together to be nanoseconds."""
+    if not integers or len(t_ns) < 2:
+        return
+    step_ns = int(np.median(np.abs(np.diff(t_ns))))
+    if step_ns <= _SHORTEST_PERIOD_NS:
+        raise LogFormatError(
+            f"{path}: integers {step_ns} apart count nanoseconds, which is too fast for pictures; "
+            "write seconds with a decimal point, or name the column time_us or time_ms in a first "
+            "line"
+        )
+
+
+def _check_twins(path: Path, names: list[str]) -> None:
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise LogFormatError(
+                f"{path}: {name[:80]!r} stands twice; want one time for each picture"
+            )
+        seen.add(name)

@@ -1,0 +1,296 @@
+"""Folders of pictures: every picture is given, skipped or lost with a word, and paired honestly."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.columns import BLOCK_BYTES, Block, Images
+from crosscue.replay.errors import LogError, LogFormatError, UnknownFormatError
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.log import EVERYTHING, Selection, open_log
+from support.data import shared
+from support.pictures import picture, picture_folder
+
+S = 1_000_000_000
+FIVE = "0.5\n1.5\n2.5\n3.5\n4.5\n"
+
+
+def read(
+    folder: Path, selection: Selection = EVERYTHING, limits: Limits = DEFAULT
+) -> tuple[list[Block], Ledger]:
+    ledger = Ledger(str(folder))
+    with open_log(folder, limits) as log:
+        blocks = list(log.read(ledger, selection))
+    for account in ledger.accounts.values():
+        assert account.found == account.used + account.skipped.total()
+    assert sum(len(b) for b in blocks) == sum(a.used for a in ledger.accounts.values())
+    return blocks, ledger
+
+
+def shades(blocks: list[Block]) -> list[tuple[float, bytes]]:
+    """Seconds and bytes of every picture."""
+    rows = []
+    for block in blocks:
+        assert isinstance(block.rows, Images)
+        for i, t_ns in enumerate(block.log_ns.tolist()):
+            rows.append((t_ns / S, bytes(block.rows.bytes_.payload(i))))
+    return rows
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
+def test_pictures_come_in_natural_order_with_their_times(tmp_path: Path, suffix: str) -> None:
+    folder = picture_folder(tmp_path / "front", 12, "\n".join(f"{i}.5" for i in range(12)), suffix)
+
+    blocks, ledger = read(folder)
+
+    assert shades(blocks) == [(i + 0.5, picture(i, suffix)) for i in range(12)]
+    assert ledger.is_whole
+    assert ledger.notices == []
+    assert ledger.topic("front").declared == 12
+    assert ledger.integrity.startswith({".png": "PNG", ".jpg": "JPEG", ".webp": "WebP"}[suffix])
+
+
+def test_the_coding_is_what_the_bytes_say_not_the_name(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5")
+    (folder / "frame_1.png").write_bytes(picture(1, ".jpg"))
+
+    (block,), _ = read(folder)
+
+    assert isinstance(block.rows, Images)
+    assert block.rows.coding == ("png", "jpeg")
+
+
+def test_names_in_the_time_file_decide_and_the_rest_is_told(tmp_path: Path) -> None:
+    folder = picture_folder(
+        tmp_path / "front", 3, "frame_2.png,0.5\nframe_0.png,1.5\ngone.png,2.5\n"
+    )
+
+    blocks, ledger = read(folder)
+
+    assert shades(blocks) == [(1.5, picture(0)), (0.5, picture(2))]
+    account = ledger.topic("front")
+    assert account.skipped == {"a picture without its time": 1}
+    assert account.lost == {"a time without its picture": 1}
+    assert "frame_1.png" in ledger.details[0].detail
+
+
+def test_a_number_left_out_is_a_gap_not_a_shift(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 5, FIVE)
+    (folder / "frame_2.png").unlink()
+
+    blocks, ledger = read(folder)
+
+    assert [t for t, _ in shades(blocks)] == [0.5, 1.5, 3.5, 4.5]
+    assert ledger.topic("front").lost == {"a time without its picture": 1}
+    assert ledger.details[0].t_ns == 5 * S // 2
+    assert ledger.notices == ["front: 1 numbers are missing in the file names; times go by number"]
+
+
+def test_counts_that_differ_without_a_reason_are_never_zipped_in_silence(tmp_path: Path) -> None:
+    fewer = picture_folder(tmp_path / "fewer", 3, FIVE)
+    more = picture_folder(tmp_path / "more", 7, FIVE)
+
+    _, of_fewer = read(fewer)
+    _, of_more = read(more)
+
+    assert of_fewer.topic("fewer").lost == {"a time without its picture": 2}
+    assert "paired in order from the first" in of_fewer.notices[0]
+    assert of_more.topic("more").skipped == {"a picture without its time": 2}
+    assert any("7 pictures and 5 times" in notice for notice in of_more.notices)
+
+
+def test_gaps_in_numbers_with_as_many_times_are_told(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 6, FIVE)
+    (folder / "frame_2.png").unlink()
+
+    blocks, ledger = read(folder)
+
+    assert len(shades(blocks)) == 5
+    assert "leave out 1" in ledger.notices[0]
+
+
+def test_a_constant_rate_is_told_and_keeps_gaps(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 5, "rate_hz: 2\n")
+    (folder / "frame_3.png").unlink()
+
+    blocks, ledger = read(folder)
+
+    assert [t for t, _ in shades(blocks)] == [0.0, 0.5, 1.0, 2.0]
+    assert "made up from a constant rate of 2 Hz" in ledger.notices[0]
+    assert ledger.topic("front").declared is None
+
+
+def test_damaged_cut_and_foreign_files_are_never_given(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 5, FIVE)
+    whole = picture(0)
+    (folder / "frame_0.png").write_bytes(b"")
+    (folder / "frame_1.png").write_bytes(b"<html>not a picture</html>")
+    (folder / "frame_2.png").write_bytes(whole[:-20])
+    (folder / "frame_3.png").write_bytes(whole[:40] + b"\x7f" + whole[41:])
+
+    blocks, ledger = read(folder)
+
+    assert shades(blocks) == [(4.5, picture(4))]
+    account = ledger.topic("front")
+    assert account.skipped == {"empty file": 1, "not a JPEG, PNG or WebP picture": 1}
+    assert account.lost == {"picture cut short": 1, "picture damaged (checksum)": 1}
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(share=st.floats(0.0, 0.999))
+def test_a_picture_cut_anywhere_is_told(tmp_path: Path, suffix: str, share: float) -> None:
+    folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5", suffix)
+    whole = picture(0, suffix)
+    (folder / f"frame_0{suffix}").write_bytes(whole[: int(share * len(whole))])
+
+    blocks, ledger = read(folder)
+
+    assert shades(blocks) == [(1.5, picture(1, suffix))]
+    account = ledger.topic("front")
+    assert account.skipped.total() + account.lost.total() == 1
+
+
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(at=st.integers(0, 10_000), flip=st.integers(1, 255))
+def test_a_flipped_byte_in_a_png_is_told(tmp_path: Path, at: int, flip: int) -> None:
+    folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5")
+    changed = bytearray(picture(0))
+    changed[at % len(changed)] ^= flip
+    (folder / "frame_0.png").write_bytes(changed)
+
+    blocks, _ = read(folder)
+
+    assert shades(blocks) == [(1.5, picture(1))]
+
+
+def test_a_picture_over_the_limit_is_skipped_and_not_held(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 3, "0.5\n1.5\n2.5")
+    (folder / "frame_1.png").write_bytes(picture(1) + bytes(5000))
+
+    blocks, ledger = read(folder, limits=Limits(message_bytes=4000))
+
+    assert len(shades(blocks)) == 2
+    assert ledger.topic("front").skipped == {"picture over the size limit": 1}
+
+
+def test_blocks_stay_small(tmp_path: Path) -> None:
+    folder = tmp_path / "front"
+    folder.mkdir()
+    noise = np.random.default_rng(1).bytes(3 << 20)
+    for i in range(6):
+        (folder / f"{i}.jpg").write_bytes(b"\xff\xd8" + noise + b"\xff\xd9")
+    (folder / "times.txt").write_text("rate_hz: 10")
+
+    blocks, _ = read(folder)
+
+    assert [len(b) for b in blocks] == [2, 2, 2]
+    for block in blocks:
+        assert isinstance(block.rows, Images)
+        assert len(block.rows.bytes_.buffer) <= BLOCK_BYTES
+
+
+def test_only_the_part_asked_for_is_opened(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 5, FIVE)
+    for outside in (0, 4):
+        (folder / f"frame_{outside}.png").write_bytes(b"never read")
+
+    blocks, ledger = read(folder, Selection(start_ns=1 * S, end_ns=4 * S))
+    none, not_asked = read(folder, Selection(topics=frozenset({"other"})))
+
+    assert [t for t, _ in shades(blocks)] == [1.5, 2.5, 3.5]
+    assert ledger.topic("front").skipped == {NOT_ASKED_TIME: 2}
+    assert none == []
+    assert not_asked.topic("front").skipped == {NOT_ASKED_TOPIC: 5}
+    assert ledger.is_whole
+    assert not_asked.is_whole
+
+
+def test_a_folder_without_times_says_how_to_give_them(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 2)
+
+    with pytest.raises(LogFormatError, match=r"2 pictures but no time file; write timestamps.txt"):
+        open_log(folder)
+
+
+def test_an_empty_folder_and_one_without_pictures_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "a.txt").write_text("dear")
+
+    for name in ("empty", "letters"):
+        with pytest.raises(UnknownFormatError, match="without any known recording"):
+            open_log(tmp_path / name)
+
+
+def test_a_time_file_of_another_folder_is_refused(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 2, "left_0.png,0.5\n")
+
+    with pytest.raises(LogFormatError, match=r"no line names a picture .* 'frame_0.png'"):
+        open_log(folder)
+
+
+def test_a_folder_without_permission_is_refused_in_one_line(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5")
+    folder.chmod(0)
+    was = os.geteuid()
+    # Root may read everything, so it steps down for a moment.
+    if was == 0:
+        os.seteuid(65534)
+    try:
+        with pytest.raises(LogError, match=r"no permission|Permission denied"):
+            open_log(folder)
+    finally:
+        os.seteuid(was)
+        folder.chmod(0o700)
+
+
+def test_a_time_file_that_may_not_be_read_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5")
+
+    def refuse(self: Path, mode: str) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(LogError, match="no permission to read it"):
+        open_log(folder)
+
+
+def test_a_pipe_in_place_of_a_picture_does_not_hang(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5")
+    (folder / "frame_0.png").unlink()
+    os.mkfifo(folder / "frame_0.png")
+
+    blocks, ledger = read(folder)
+
+    assert len(shades(blocks)) == 1
+    assert ledger.topic("front").lost == {"picture cannot be opened": 1}
+
+
+def test_the_real_dashcam_frames_keep_their_order(tmp_path: Path) -> None:
+    source = shared("sequences", "us_signalized_intersection_dashcam")
+    folder = tmp_path / "dashcam"
+    folder.mkdir()
+    for path in source.glob("*.jpg"):
+        (folder / path.name).symlink_to(path)
+    (folder / "times.txt").write_text("rate_hz: 15\n")
+
+    blocks, ledger = read(folder)
+
+    t_ns = np.concatenate([b.log_ns for b in blocks])
+    assert len(t_ns) == 111
+    np.testing.assert_allclose(np.diff(t_ns), S / 15, atol=1.0)
+    assert ledger.is_whole

@@ -1,0 +1,175 @@
+"""Time files: every way of writing times, to the last digit, and every bad line by its number."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.errors import LogFormatError, LogTooLargeError
+from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.readers.time_file import (
+    TimeFile,
+    find_time_file,
+    read_time_file,
+    time_file_of_video,
+)
+
+quick = settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+moments = st.lists(st.integers(0, (1 << 62) - 1), min_size=1, max_size=20, unique=True)
+S = 1_000_000_000
+EUROC = [1403636579763555584, 1403636579813555456]
+
+
+def read(folder: Path, text: str) -> TimeFile:
+    path = folder / "timestamps.txt"
+    path.write_text(text, encoding="utf-8")
+    return read_time_file(path, DEFAULT)
+
+
+@quick
+@given(moments)
+def test_seconds_come_back_to_the_nanosecond(tmp_path: Path, t_ns: list[int]) -> None:
+    lines = "\n".join(f"{Decimal(t) / S:.9f}" for t in t_ns)
+
+    assert read(tmp_path, lines).t_ns.tolist() == t_ns
+
+
+@quick
+@given(st.lists(st.integers(0, 2**31 * S), min_size=1, max_size=20, unique=True))
+def test_date_times_come_back_to_the_nanosecond(tmp_path: Path, t_ns: list[int]) -> None:
+    dates = [f"{np.datetime_as_string(np.datetime64(t, 'ns')).replace('T', ' ')}" for t in t_ns]
+
+    assert read(tmp_path, "\n".join(dates)).t_ns.tolist() == t_ns
+    assert read(tmp_path, "\n".join(d.replace(" ", "T") + "Z" for d in dates)).t_ns.tolist() == t_ns
+
+
+@pytest.mark.parametrize(
+    ("text", "t_ns", "names"),
+    [
+        ("0.5\n1.25\n", [S // 2, 5 * S // 4], None),
+        ("1.5e-1\n2.5E1", [150_000_000, 25 * S], None),
+        ("1403636579763555584\n1403636579813555456", EUROC, None),
+        ("# a comment\n\n7.0\r\n8.0\r\n", [7 * S, 8 * S], None),
+        ("\ufeff7.0\n8.0", [7 * S, 8 * S], None),
+        ("2011-09-26 13:02:25.964389445", [1317042145964389445], None),
+        ("2011-09-26T15:02:25.964389445+02:00", [1317042145964389445], None),
+        ("2011-09-26 13:02:25,5", [1317042145500000000], None),
+        ("a.jpg,0.5\nb.jpg,1.5", [S // 2, 3 * S // 2], ("a.jpg", "b.jpg")),
+        ("0.5 rgb/a.png\n1.5 rgb/b.png", [S // 2, 3 * S // 2], ("a.png", "b.png")),
+        ("a.jpg;2011-09-26 13:02:25.5", [1317042145500000000], ("a.jpg",)),
+        ("2011-09-26 13:02:25.5 a.jpg", [1317042145500000000], ("a.jpg",)),
+        ("name,time\na.jpg,0.5", [S // 2], ("a.jpg",)),
+        ("#timestamp [ns],filename\n1403636579763555584,a.png", [1403636579763555584], ("a.png",)),
+        ("frame,time_ms\n0,0\n1,40\n2,80", [0, 40_000_000, 80_000_000], None),
+        ("frame,time [s],speed\n0,3,1.5\n1,4,1.6", [3 * S, 4 * S], None),
+        ("timestamp_us\n1000000\n1040000", [S, 1_040_000_000], None),
+        ('"name","time"\n"a b.jpg","0.5"', [S // 2], ("a b.jpg",)),
+    ],
+)  # fmt: skip
+def test_ways_of_writing(
+    tmp_path: Path, text: str, t_ns: list[int], names: tuple[str, ...] | None
+) -> None:
+    times = read(tmp_path, text)
+
+    assert times.t_ns.tolist() == t_ns
+    assert times.names == names
+
+
+def test_a_constant_rate_gives_times_without_drift(tmp_path: Path) -> None:
+    times = read(tmp_path, "rate_hz: 29.97\n")
+
+    at = times.times_at(np.array([0, 1, 2997]))
+    assert at.tolist() == [0, 33366700, 100 * S]
+    assert read(tmp_path, "rate_hz = 15").times_at(np.array([15])).tolist() == [S]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0.1\n0.2\nlater\n", r"timestamps.txt: line 3: 'later': want one time"),
+        ("0.1\n\n# x\n0.2 0.3", "line 4: .*want one time"),
+        ("pictures of a cat", "line 1: 'pictures of a cat': want a time"),
+        ("0.1\nnan", "line 2"),
+        ("-1.0", "line 1: '-1.0': want a time from 0 on"),
+        ("9999999999.5", "line 1: '9999999999.5': want a time from 0 on and before 2116"),
+        ("1e99", "line 1"),
+        ("2011-02-30 13:02:25.5", "line 1: .* is no time: day is out of range"),
+        ("name,time\na.jpg", "line 2: 1 cells; want 2"),
+        ("name,time\na.jpg,soon", "line 2: 'soon' is no time"),
+        ("a.jpg,0.1\n0.2", "line 2: .*names a file or not"),
+        ("a.jpg,0.1\na.jpg,0.2", "'a.jpg' stands twice"),
+        ("", "no time in it"),
+        ("# only words\n", "no time in it"),
+        ("rate_hz: fast", "rate_hz 'fast'; want a rate"),
+        ("rate_hz: 0", "rate_hz '0'; want a rate"),
+        ("0\n1\n2\n", "integers 1 apart count nanoseconds"),
+        ("1500000000000\n1500000000040", "integers 40 apart count nanoseconds"),
+        ("a,b,c\n1,2,3", "line 1: 'a,b,c': want a time"),
+    ],
+)
+def test_a_bad_line_is_named(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(LogFormatError, match=message):
+        read(tmp_path, text)
+
+
+def test_bytes_that_are_no_text_are_named_by_line(tmp_path: Path) -> None:
+    (tmp_path / "times.txt").write_bytes(b"0.1\n0.2\n\xff\xfe\n")
+
+    with pytest.raises(LogFormatError, match="line 3: not UTF-8 text"):
+        read_time_file(tmp_path / "times.txt", DEFAULT)
+
+
+def test_a_time_file_over_the_limit_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "times.txt").write_text("0.5\n" * 100)
+
+    with pytest.raises(LogTooLargeError, match="over 100 bytes"):
+        read_time_file(tmp_path / "times.txt", Limits(message_bytes=100))
+
+
+@quick
+@given(st.binary(max_size=200))
+def test_any_bytes_are_read_or_refused_in_our_words(tmp_path: Path, raw: bytes) -> None:
+    path = tmp_path / "times.txt"
+    path.write_bytes(raw)
+    refusal, count = "", 1
+    try:
+        times = read_time_file(path, DEFAULT)
+        count = 1 if times.period else len(times.t_ns)
+    except LogFormatError as error:
+        refusal = str(error)
+
+    assert count > 0
+    assert "\n" not in refusal
+
+
+def test_the_time_file_is_found_inside_or_beside(tmp_path: Path) -> None:
+    folder = tmp_path / "cam" / "data"
+    folder.mkdir(parents=True)
+    assert find_time_file(folder) is None
+    (tmp_path / "cam" / "timestamps.txt").touch()
+    assert find_time_file(folder) == tmp_path / "cam" / "timestamps.txt"
+    (tmp_path / "cam" / "data.csv").touch()
+    assert find_time_file(folder) == tmp_path / "cam" / "data.csv"
+    (folder / "one.csv").touch()
+    assert find_time_file(folder) == folder / "one.csv"
+    (folder / "two.csv").touch()
+    with pytest.raises(LogFormatError, match=r"several time files \(one.csv, two.csv\)"):
+        find_time_file(folder)
+    (folder / "times.txt").touch()
+    assert find_time_file(folder) == folder / "times.txt"
+
+
+def test_the_time_file_of_a_video_lies_next_to_it(tmp_path: Path) -> None:
+    video = tmp_path / "drive.mp4"
+    assert time_file_of_video(video) is None
+    (tmp_path / "drive.csv").touch()
+    assert time_file_of_video(video) == tmp_path / "drive.csv"
+    (tmp_path / "drive.mp4.txt").touch()
+    assert time_file_of_video(video) == tmp_path / "drive.mp4.txt"
