@@ -229,6 +229,8 @@ class Block:
         publish_ns: Shape (N,), int64: when the sender sent it, or None where the format has no such
             time.
         header_ns: Shape (N,), int64: the sensor's own stamp, known after decoding, or None.
+        sequence: Shape (N,), uint32: the sender's message counter as stored, or None where the
+            format has none.
     """
 
     topic: str
@@ -236,6 +238,7 @@ class Block:
     rows: Rows
     publish_ns: Int64s | None = None
     header_ns: Int64s | None = None
+    sequence: NDArray[np.uint32] | None = None
 
     def __post_init__(self) -> None:
         """Refuse columns that do not line up."""
@@ -246,6 +249,8 @@ class Block:
                 continue
             if column.shape != (n,) or column.dtype != np.int64:
                 raise ValueError(f"{name}: want int64 ({n},), got {column.dtype} {column.shape}")
+        if self.sequence is not None and self.sequence.shape != (n,):
+            raise ValueError(f"sequence: want ({n},), got {self.sequence.shape}")
 
     def __len__(self) -> int:
         return len(self.log_ns)
@@ -258,4 +263,5 @@ class Block:
             rows=self.rows.take(index),
             publish_ns=None if self.publish_ns is None else self.publish_ns[index],
             header_ns=None if self.header_ns is None else self.header_ns[index],
+            sequence=None if self.sequence is None else self.sequence[index],
         )
