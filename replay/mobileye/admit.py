@@ -1,0 +1,137 @@
+"""Which frames of a bus are the Mobileye's, and what each of them is."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import DATA, ERROR, LENGTH_UNKNOWN, REMOTE, CanFrames, Int64s
+from crosscue.replay.ledger import Ledger
+
+from .bits import Words, words_of
+from .layout import Message, layout
+from .settings import MobileyeSettings
+
+ERROR_FRAME: Final = "error frame"
+REMOTE_FRAME: Final = "remote frame"
+EXTENDED: Final = "extended identifier, not a Mobileye's"
+FD_FRAME: Final = "CAN FD frame, not a Mobileye's"
+FOREIGN: Final = "id not in the Mobileye table"
+WRONG_LENGTH: Final = "length that its Mobileye message does not have"
+_REASONS: Final = (ERROR_FRAME, REMOTE_FRAME, EXTENDED, FD_FRAME, FOREIGN, WRONG_LENGTH)
+
+_STANDARD_IDS: Final = 2048
+_IDS_TOLD: Final = 8
+_LENGTHS: Final = 256
+
+
+class Admitted(NamedTuple):
+    """Frames of the Mobileye, in the order of the log.
+
+    Attributes:
+        message: Shape (N,), int64: place of each one's message in ``layout().messages``.
+        instance: Shape (N,), int64: slot, side or place of it.
+        length: Shape (N,), uint8.
+        log_ns: Shape (N,).
+        words: Shape (N,).
+    """
+
+    message: Int64s
+    instance: Int64s
+    length: NDArray[np.uint8]
+    log_ns: Int64s
+    words: Words
+
+    def __len__(self) -> int:
+        return len(self.message)
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Admitted:
+        """The frames picked by ``index``."""
+        return Admitted(
+            self.message[index],
+            self.instance[index],
+            self.length[index],
+            self.log_ns[index],
+            self.words[index],
+        )
+
+
+class Admission:
+    """Takes the Mobileye's frames of a bus and tells the ledger of every other one."""
+
+    def __init__(self, bus: str, ledger: Ledger, settings: MobileyeSettings) -> None:
+        self._bus = bus
+        self._ledger = ledger
+        self._tells_foreign = not settings.is_shared_bus
+        messages = layout().messages
+        self._message = np.full(_STANDARD_IDS + 1, -1, dtype=np.int64)
+        self._instance = np.zeros(_STANDARD_IDS + 1, dtype=np.int64)
+        self._fits = np.zeros((len(messages), _LENGTHS), dtype=np.bool_)
+        for k, message in enumerate(messages):
+            ids = list(ids_of(message, settings))
+            self._message[ids] = k
+            self._instance[ids] = np.arange(len(ids))
+            self._fits[k, list(lengths_of(message, settings))] = True
+            self._fits[k, LENGTH_UNKNOWN] = True
+
+    def __call__(self, frames: CanFrames, log_ns: Int64s) -> Admitted:
+        """The frames that can be decoded."""
+        message = self._message.take(frames.arbitration_id, mode="clip")
+        is_plain = (frames.kind == DATA) & ~frames.is_extended & ~frames.is_fd
+        good = is_plain & (message >= 0) & self._fits[message, frames.length]
+        if not good.all():
+            self._tell(frames, message, ~good, log_ns)
+        return Admitted(
+            message[good],
+            self._instance.take(frames.arbitration_id[good], mode="clip"),
+            frames.length[good],
+            log_ns[good],
+            words_of(frames.data[good]),
+        )
+
+    def _tell(
+        self, frames: CanFrames, message: Int64s, bad: NDArray[np.bool_], log_ns: Int64s
+    ) -> None:
+        rows = np.flatnonzero(bad)
+        which = np.select(
+            [
+                frames.kind[rows] == ERROR,
+                frames.kind[rows] == REMOTE,
+                frames.is_extended[rows],
+                frames.is_fd[rows],
+                message[rows] < 0,
+            ],
+            list(range(5)),
+            5,
+        )
+        for number, reason in enumerate(_REASONS):
+            of_reason = rows[which == number]
+            if not len(of_reason) or (reason != WRONG_LENGTH and not self._tells_foreign):
+                continue
+            detail = _ids_text(frames.arbitration_id[of_reason])
+            first_ns = int(log_ns[of_reason[0]])
+            self._ledger.skip(self._bus, reason, len(of_reason), detail, first_ns)
+
+
+def ids_of(message: Message, settings: MobileyeSettings) -> tuple[int, ...]:
+    """The identifiers that ``message`` has on this device."""
+    return message.ids[: settings.slots] if message.table == "obstacles" else message.ids
+
+
+def lengths_of(message: Message, settings: MobileyeSettings) -> tuple[int, ...]:
+    """The lengths that ``message`` may have; a revision that is set leaves one for the status."""
+    if message.name == "status" and settings.revision != "auto":
+        return tuple(n for n, name in message.variants.items() if name == settings.revision)
+    return message.lengths
+
+
+def _ids_text(ids: NDArray[np.uint32]) -> str:
+    values, counts = np.unique(ids, return_counts=True)
+    told = ", ".join(
+        f"0x{i:03X} ({n})"
+        for i, n in zip(values[:_IDS_TOLD].tolist(), counts[:_IDS_TOLD].tolist(), strict=True)
+    )
+    more = len(values) - _IDS_TOLD
+    return f"{told} and {more} more ids" if more > 0 else told

@@ -1,0 +1,160 @@
+"""The 8-bit millisecond counter of 0x738, unwrapped against the log's clock.
+
+The counter holds the low 8 bits of the device's image-grab time in milliseconds. It says exactly
+how far apart images are, modulo 256 ms; the log says roughly when each frame arrived. Together:
+
+    log time = image time + latency,    image time = counter + 256 ms * k + (device - log offset).
+
+**What this can and cannot tell.** The device's clock has no known relation to the log's, so the
+latency is known only up to a constant: the fastest frame is given ``least_latency_ns`` (0 unless
+you know better), and the others what they took more. And it is known only modulo 256 ms: a frame
+that the host held back for 240 ms or more longer than the fastest is placed 256 ms late. Where that
+shows (the next image would come first), or a counter starts anew, a notice says so.
+
+The offset follows the fastest frames: down as quickly as keeps images in order, up by no more than
+a crystal drifts.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Int64s
+
+MS: Final = 1_000_000
+WRAP_NS: Final = 256 * MS
+
+DRIFT: Final = 200e-6
+"""A crystal is off by 100 parts in a million at worst; two of them by twice that."""
+FIRST_EARLY_NS: Final = 128 * MS
+LAST_EARLY_NS: Final = 16 * MS
+SETTLED_AFTER: Final = 15
+"""The first frame may be a slow one: until so many have come, half a wrap of them may be faster."""
+GAP_NS: Final = 60_000 * MS
+"""After this long without a frame, drift may have moved the counter: start anew."""
+WATCHED: Final = 32
+STEP_NS: Final = 12 * MS
+"""If none of ``WATCHED`` frames is this near the fastest, the counter or a clock was set."""
+
+WENT_BACK: Final = "the log's clock went back, image times start anew"
+LONG_GAP: Final = "a gap too long to follow the clocks' drift, image times start anew"
+SET_ANEW: Final = "the millisecond counter was set anew, or every frame takes longer than before"
+OUT_OF_ORDER: Final = (
+    "an image would come before the one before it: a frame 240 ms late, or a counter set anew"
+)
+
+
+class Unwrapped(NamedTuple):
+    """Image times on the log's clock, and what was noticed.
+
+    Attributes:
+        image_ns: Shape (N,), int64; never after the frame's log time, never decreasing while the
+            log times do not.
+        notices: Plain sentences.
+    """
+
+    image_ns: Int64s
+    notices: tuple[str, ...]
+
+
+def unwrap(counter_ms: NDArray[np.integer], log_ns: Int64s, least_latency_ns: int = 0) -> Unwrapped:
+    """When the image of each status frame was grabbed, on the log's clock.
+
+    Args:
+        counter_ms: Shape (N,), 0 to 255.
+        log_ns: Shape (N,).
+        least_latency_ns: What the fastest frame took.
+    """
+    clock = CounterClock(least_latency_ns)
+    image_ns = clock.feed(counter_ms, log_ns)
+    return Unwrapped(image_ns, clock.notices)
+
+
+class CounterClock:
+    """``unwrap`` for a stream: the same answers however it is cut into pieces."""
+
+    def __init__(self, least_latency_ns: int = 0) -> None:
+        self._least_ns = least_latency_ns
+        self._offset_ns = 0
+        self._frames = 0
+        self._log_ns = 0
+        self._image_ns = 0
+        self._fastest_ns = WRAP_NS
+        self._watched = 0
+        self._noticed: dict[str, tuple[int, int]] = {}
+
+    def feed(self, counter_ms: NDArray[np.integer], log_ns: Int64s) -> Int64s:
+        """Image times of the next frames, shape (N,)."""
+        pairs = zip(counter_ms.tolist(), log_ns.tolist(), strict=True)
+        return np.array([self._next(c * MS, t) for c, t in pairs], dtype=np.int64) - self._least_ns
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What was noticed so far, how often, and when first."""
+        return tuple(
+            f"{what} ({count} times, first at {first_ns} ns)"
+            for what, (first_ns, count) in self._noticed.items()
+        )
+
+    def _next(self, counter_ns: int, log_ns: int) -> int:
+        elapsed_ns = log_ns - self._log_ns
+        if not self._frames:
+            return self._start(counter_ns, log_ns)
+        if elapsed_ns < 0:
+            self._notice(WENT_BACK, log_ns)
+            return self._start(counter_ns, log_ns)
+        if elapsed_ns > GAP_NS:
+            self._notice(LONG_GAP, log_ns)
+            return self._start(counter_ns, log_ns)
+        self._log_ns = log_ns
+        early_ns = self._early()
+        over_ns = (log_ns - counter_ns - self._offset_ns + early_ns) % WRAP_NS - early_ns
+        over_ns = self._watch(self._follow(over_ns, elapsed_ns), log_ns)
+        self._frames += 1
+        return self._in_order(log_ns - max(over_ns, 0), log_ns)
+
+    def _start(self, counter_ns: int, log_ns: int) -> int:
+        self._offset_ns = (log_ns - counter_ns) % WRAP_NS
+        self._frames = 1
+        self._fastest_ns, self._watched = WRAP_NS, 0
+        self._image_ns = self._log_ns = log_ns
+        return log_ns
+
+    def _early(self) -> int:
+        share = min(1.0, self._frames / SETTLED_AFTER)
+        return int(FIRST_EARLY_NS + share * (LAST_EARLY_NS - FIRST_EARLY_NS))
+
+    def _follow(self, over_ns: int, elapsed_ns: int) -> int:
+        """Move the offset towards the fastest frames; what is left over."""
+        if over_ns < 0:
+            change_ns = max(over_ns, -(elapsed_ns // 2))
+        else:
+            change_ns = min(over_ns, int(DRIFT * elapsed_ns))
+        self._offset_ns += change_ns
+        return over_ns - change_ns
+
+    def _watch(self, over_ns: int, log_ns: int) -> int:
+        """Start the offset anew where frames no longer come near it."""
+        self._fastest_ns = min(self._fastest_ns, over_ns)
+        self._watched += 1
+        if self._watched < WATCHED:
+            return over_ns
+        fastest_ns, self._fastest_ns, self._watched = self._fastest_ns, WRAP_NS, 0
+        if fastest_ns <= STEP_NS:
+            return over_ns
+        self._notice(SET_ANEW, log_ns)
+        self._offset_ns += fastest_ns
+        return over_ns - fastest_ns
+
+    def _in_order(self, image_ns: int, log_ns: int) -> int:
+        if image_ns < self._image_ns:
+            self._notice(OUT_OF_ORDER, log_ns)
+        self._image_ns = max(image_ns, self._image_ns)
+        return self._image_ns
+
+    def _notice(self, what: str, log_ns: int) -> None:
+        first_ns, count = self._noticed.get(what, (log_ns, 0))
+        self._noticed[what] = (first_ns, count + 1)

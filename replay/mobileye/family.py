@@ -1,0 +1,62 @@
+"""Which of two families of devices sends 0x700: they read the same bits in opposite ways.
+
+A bit that only one family has, and that is set, decides; nothing else does. Both kinds of bits in
+one log decide nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from .bits import Words
+from .layout import UNKNOWN
+from .settings import Family
+from .wire import Variant, variant_number
+
+
+def _mask(*bits: int) -> np.uint64:
+    return np.uint64(sum(1 << b for b in bits))
+
+
+ONLY_EXTENDED: Final = _mask(7, 36, 37)
+"""Sound suppressed, left and right crossing."""
+ONLY_TSR: Final = _mask(13, 14, 15, *range(24, 32), *range(43, 51), 58)
+"""Zero speed, high beam, error (inverted, so usually set), reminders, TSR, repeatable headway."""
+
+
+class FamilyEvidence:
+    """Remembers what the frames so far have shown."""
+
+    def __init__(self, bus: str, family: Family) -> None:
+        self._bus = bus
+        self._set = variant_number(family)
+        self._extended = False
+        self._tsr = False
+        self._undecided = 0
+
+    def __call__(self, words: Words) -> Variant:
+        """The family of each frame, by all frames up to it."""
+        if self._set != UNKNOWN:
+            return np.full(len(words), self._set, dtype=np.int8)
+        extended = np.logical_or.accumulate(words & ONLY_EXTENDED != 0) | self._extended
+        tsr = np.logical_or.accumulate(words & ONLY_TSR != 0) | self._tsr
+        if len(words):
+            self._extended, self._tsr = bool(extended[-1]), bool(tsr[-1])
+        family = np.where(extended, variant_number("extended"), variant_number("tsr"))
+        family = np.where(extended == tsr, UNKNOWN, family)
+        self._undecided += int((extended == tsr).sum())
+        return family.astype(np.int8)
+
+    def notices(self) -> list[str]:
+        """What a person should know at the end."""
+        if not self._undecided:
+            return []
+        why = (
+            "shows bits of both" if self._extended and self._tsr else "at first shows bits of none"
+        )
+        return [
+            f"{self._bus}: 0x700 {why} families of devices; in {self._undecided} frames the bits "
+            "that they read differently are missing; set the family (extended or tsr)"
+        ]

@@ -1,0 +1,272 @@
+"""Our own table of what a Mobileye 560 says on CAN, kept as data in ``layout.toml``."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
+from types import MappingProxyType
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
+
+from crosscue.replay.errors import SchemaError
+
+Kind: TypeAlias = Literal["real", "code", "flag"]
+Beyond: TypeAlias = Literal["refuse", "clip", "drop"]
+
+VARIANTS: Final = ("classic", "2.32", "extended", "tsr", "basic")
+"""Layouts that some field is ``only`` in; a frame's is a place in this tuple, or ``UNKNOWN``."""
+UNKNOWN: Final = -1
+WORD_BITS: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One signal: where its bits lie and what they mean.
+
+    Value on the wire = (raw - zero) * scale / per. The file's head explains each key.
+    """
+
+    name: str
+    start: int
+    bits: int
+    signed: bool = False
+    order: Literal["little", "big"] = "little"
+    scale: float = 1.0
+    per: float = 1.0
+    zero: float = 0.0
+    unit: str = ""
+    missing: tuple[int, ...] = ()
+    missing_with: str = ""
+    needs: str = ""
+    low: float | None = None
+    high: float | None = None
+    beyond: Beyond = "refuse"
+    only: str = ""
+    flip: bool = False
+    fill: int = 0
+    default: int = 0
+    ros: str = ""
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse a field that cannot be."""
+        whole_bytes = self.start % 8 == 0 and self.bits % 8 == 0
+        if self.bits < 1 or self.start < 0 or self.start + self.width > WORD_BITS:
+            raise SchemaError(f"{self.name}: bits {self.start}+{self.width} are not in 8 bytes")
+        if self.order == "big" and not whole_bytes:
+            raise SchemaError(f"{self.name}: a big-endian field must fill whole bytes")
+        if self.only and self.only not in VARIANTS:
+            raise SchemaError(f"{self.name}: only {self.only!r}; there are: {', '.join(VARIANTS)}")
+
+    @property
+    def kind(self) -> Kind:
+        """How its column is kept: float64, int16 or a flag."""
+        if self.unit:
+            return "real"
+        return "flag" if self.bits == 1 else "code"
+
+    @property
+    def width(self) -> int:
+        """Bits written when encoding."""
+        return max(self.bits, self.fill)
+
+    @property
+    def may_be_missing(self) -> bool:
+        """Is there a frame in which it has no value?"""
+        return bool(self.missing or self.missing_with or self.needs or self.only)
+
+    @property
+    def raw_range(self) -> tuple[int, int]:
+        """Smallest and largest raw number that is no sign of a missing value by itself."""
+        lowest, highest = 0, (1 << self.bits) - 1
+        if self.signed:
+            lowest, highest = -(1 << (self.bits - 1)), (1 << (self.bits - 1)) - 1
+        if self.low is not None:
+            lowest = round(self.low * self.per / self.scale + self.zero)
+        if self.high is not None:
+            highest = round(self.high * self.per / self.scale + self.zero)
+        while lowest in self.missing:
+            lowest += 1
+        while highest in self.missing:
+            highest -= 1
+        return lowest, highest
+
+    @property
+    def quantum(self) -> float:
+        """Size of one step of the raw number, in ``unit``."""
+        return abs(self.scale) / self.per
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One kind of frame, in one or several instances of consecutive meaning.
+
+    Attributes:
+        name: Ours.
+        says: What it holds, in a few words.
+        table: The table its columns go to.
+        ids: Identifier of each instance (obstacle slot, lane side, sign place).
+        lengths: Payload lengths it may have.
+        fields: Its signals.
+        variant: What chooses between fields with ``only``.
+        variants: From a length to a variant, where the length chooses.
+        ros_type: Message of ``mobileye_560_660_msgs`` with the same content, or empty.
+    """
+
+    name: str
+    says: str
+    table: str
+    ids: tuple[int, ...]
+    lengths: tuple[int, ...]
+    fields: tuple[Field, ...]
+    variant: Literal["", "length", "revision", "family"] = ""
+    variants: Mapping[int, str] = field(default_factory=dict)
+    ros_type: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse fields that overlap or do not fit the shortest payload they may come in."""
+        for variant in {"", *(f.only for f in self.fields)}:
+            taken = 0
+            for f in self.fields:
+                if f.only not in ("", variant):
+                    continue
+                mask = ((1 << f.width) - 1) << f.start
+                if taken & mask:
+                    raise SchemaError(f"{self.name}.{f.name}: its bits are taken already")
+                if f.start + f.bits > 8 * self._shortest(f.only):
+                    raise SchemaError(f"{self.name}.{f.name}: does not fit the payload")
+                taken |= mask
+
+    def _shortest(self, only: str) -> int:
+        lengths = [n for n in self.lengths if self.variants.get(n, only) == only or not only]
+        return min(lengths, default=0)
+
+    def length_of(self, variant: str) -> int:
+        """Payload length when encoding ``variant``: the longest that fits."""
+        named = [n for n, name in self.variants.items() if name == variant]
+        return max(named or self.lengths)
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """All messages, and which of them makes which table."""
+
+    messages: tuple[Message, ...]
+
+    def __getitem__(self, name: str) -> Message:
+        return self._by_name[name]
+
+    @property
+    def _by_name(self) -> Mapping[str, Message]:
+        return {m.name: m for m in self.messages}
+
+    def of_table(self, table: str) -> tuple[Message, ...]:
+        """The messages whose columns make ``table``, in the order of the file."""
+        return tuple(m for m in self.messages if m.table == table)
+
+    @property
+    def tables(self) -> tuple[str, ...]:
+        """Names of all tables."""
+        return tuple(dict.fromkeys(m.table for m in self.messages))
+
+
+class LayoutRow(NamedTuple):
+    """One line of the printed table: a field in all instances of its message."""
+
+    ids: str
+    lengths: str
+    table: str
+    column: str
+    bits: str
+    value: str
+    unit: str
+    missing: str
+    only: str
+    note: str
+
+
+@cache
+def layout() -> Layout:
+    """The table, read once.
+
+    Raises:
+        SchemaError: The file that was installed is not the one that was written.
+    """
+    text = files(__package__).joinpath("layout.toml").read_text(encoding="utf-8")
+    try:
+        return parse(text)
+    except (tomllib.TOMLDecodeError, KeyError, TypeError) as error:
+        raise SchemaError(f"layout.toml: {error}; install crosscue again") from None
+
+
+def parse(text: str) -> Layout:
+    """A table from TOML text.
+
+    Raises:
+        SchemaError: Fields overlap or cannot be.
+        KeyError: A message lacks a key.
+        TypeError: A key that no message or field has.
+    """
+    entries: list[dict[str, Any]] = tomllib.loads(text)["message"]
+    messages: dict[str, Message] = {}
+    for entry in entries:
+        messages[entry["name"]] = _message(dict(entry), messages)
+    claimed = [i for m in messages.values() for i in m.ids]
+    if len(set(claimed)) != len(claimed):
+        raise SchemaError("layout.toml: two messages claim one identifier")
+    return Layout(tuple(messages.values()))
+
+
+def _message(entry: dict[str, Any], earlier: Mapping[str, Message]) -> Message:
+    ids = entry.pop("ids", None)
+    if ids is None:
+        first, stride = entry.pop("id"), entry.pop("stride", 1)
+        ids = [first + k * stride for k in range(entry.pop("count", 1))]
+    if "same_as" in entry:
+        other = earlier[entry.pop("same_as")]
+        fields, entry["ros_type"] = other.fields, other.ros_type
+    else:
+        fields = tuple(_field(f) for f in entry.pop("fields"))
+    variants = {int(k): str(v) for k, v in entry.pop("variants", {}).items()}
+    lengths = tuple(entry.pop("lengths"))
+    return Message(
+        ids=tuple(ids),
+        lengths=lengths,
+        fields=fields,
+        variants=MappingProxyType(variants),
+        **entry,
+    )
+
+
+def _field(entry: Mapping[str, Any]) -> Field:
+    missing = tuple(entry.get("missing", ()))
+    return Field(**{**entry, "missing": missing})
+
+
+def describe() -> Iterator[LayoutRow]:
+    """The table as a person reads it, a field a row."""
+    for message in layout().messages:
+        ids = ", ".join(f"0x{i:03X}" for i in message.ids[:3]) + (
+            f", ... 0x{message.ids[-1]:03X}" if len(message.ids) > 3 else ""
+        )
+        for f in message.fields:
+            yield LayoutRow(
+                ids,
+                "/".join(str(n) for n in message.lengths),
+                message.table,
+                f.name,
+                f"{f.start}+{f.bits}{' signed' if f.signed else ''}",
+                _formula(f),
+                f.unit,
+                ", ".join(str(code) for code in f.missing),
+                f.only,
+                f.note,
+            )
+
+
+def _formula(f: Field) -> str:
+    raw = "raw" if not f.zero else f"(raw - {f.zero:g})"
+    scaled = raw if f.scale == 1.0 else f"{raw} * {f.scale:g}"
+    return scaled if f.per == 1.0 else f"{scaled} / {f.per:g}"

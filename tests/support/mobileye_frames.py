@@ -1,0 +1,165 @@
+"""Made-up Mobileye frames: by hand from hex, or at random within what the layout table allows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from crosscue.replay.columns import DATA, Block, CanFrames, Int64s
+from crosscue.replay.mobileye.bits import Words, payloads_of, place
+from crosscue.replay.mobileye.layout import Field, Message, layout
+
+MS = 1_000_000
+
+
+def frames(
+    sent: Sequence[tuple[int, str]],
+    log_ns: Sequence[int] | None = None,
+    topic: str = "can1",
+    kind: int = DATA,
+    is_extended: bool = False,
+    is_fd: bool = False,
+) -> Block:
+    """Frames from (identifier, bytes in hex), a millisecond apart unless times are given."""
+    payloads = [bytes.fromhex(text) for _, text in sent]
+    n = len(sent)
+    data = np.zeros((n, 64 if is_fd else 8), dtype=np.uint8)
+    for row, payload in enumerate(payloads):
+        data[row, : len(payload)] = list(payload)
+    times = list(range(0, n * MS, MS)) if log_ns is None else list(log_ns)
+    rows = CanFrames(
+        np.array([i for i, _ in sent], dtype=np.uint32),
+        np.full(n, is_extended),
+        np.full(n, kind, dtype=np.uint8),
+        np.array([len(p) for p in payloads], dtype=np.uint8),
+        data,
+        np.full(n, is_fd),
+    )
+    return Block(topic, np.array(times, dtype=np.int64), rows)
+
+
+def join(blocks: Sequence[Block]) -> Block:
+    """Several blocks of frames as one."""
+    rows = [b.rows for b in blocks if isinstance(b.rows, CanFrames)]
+    columns = ("arbitration_id", "is_extended", "kind", "length", "data", "is_fd")
+    joined = CanFrames(*(np.concatenate([getattr(r, name) for r in rows]) for name in columns))
+    return Block(blocks[0].topic, np.concatenate([b.log_ns for b in blocks]), joined)
+
+
+def status(count: int, counter_ms: int, tail: str = "00F203", length: int = 6) -> tuple[int, str]:
+    """A status frame that announces ``count`` obstacles."""
+    text = f"{count:02X}{counter_ms & 0xFF:02X}{tail}"
+    return 0x738, text + "00" * (length - len(text) // 2)
+
+
+def triple(slot: int, mark: int) -> list[tuple[int, str]]:
+    """A, B and C of one slot; ``mark`` is the obstacle's id and makes the frames differ."""
+    first = 0x739 + 3 * slot
+    return [
+        (first, f"{mark:02X}80010000000300"),
+        (first + 1, f"1184{mark:02X}0000000000"),
+        (first + 2, f"{mark:02X}00000000103007"),
+    ]
+
+
+def random_words(message: Message, n: int, rng: np.random.Generator, variant: str = "") -> Words:
+    """Payloads whose fields are all within the ranges that the table declares.
+
+    Missing codes come up too, together with what hangs on them.
+    """
+    words = np.zeros(n, dtype=np.uint64)
+    raws: dict[str, Int64s] = {}
+    for f in message.fields:
+        if f.only not in ("", variant):
+            continue
+        raw = _random_raw(f, n, rng)
+        if f.missing_with:
+            other = next(o for o in message.fields if o.name == f.missing_with)
+            is_missing = np.isin(raws[other.name], other.missing)
+            raw = np.where(is_missing, f.missing[0], _random_present(f, n, rng))
+        raws[f.name] = raw
+    for f in message.fields:
+        if f.name not in raws or f.only not in ("", variant):
+            continue
+        raw = raws[f.name]
+        if f.needs:
+            raw = np.where(raws[f.needs] == 0, f.default, raw)
+        words |= place(raw, f.start, f.width, f.order == "big")
+    return words
+
+
+def _random_present(f: Field, n: int, rng: np.random.Generator) -> Int64s:
+    lowest, highest = f.raw_range
+    raw = rng.integers(lowest, highest + 1, n)
+    ends = rng.integers(0, 8, n)
+    raw = np.where(ends == 0, lowest, np.where(ends == 1, highest, raw))
+    return np.where(np.isin(raw, f.missing), f.default, raw)
+
+
+def _random_raw(f: Field, n: int, rng: np.random.Generator) -> Int64s:
+    raw = _random_present(f, n, rng)
+    if not f.missing:
+        return raw
+    return np.where(rng.integers(0, 4, n) == 0, f.missing[0], raw)
+
+
+def block_of(
+    words: Words, ids: Int64s, lengths: Int64s, log_ns: Int64s, topic: str = "can1"
+) -> Block:
+    """Frames from payload words."""
+    n = len(words)
+    data = payloads_of(words)
+    data = np.where(np.arange(8) < lengths[:, None], data, 0).astype(np.uint8)
+    rows = CanFrames(
+        ids.astype(np.uint32),
+        np.zeros(n, dtype=np.bool_),
+        np.zeros(n, dtype=np.uint8),
+        lengths.astype(np.uint8),
+        data,
+        np.zeros(n, dtype=np.bool_),
+    )
+    return Block(topic, log_ns, rows)
+
+
+def random_drive(
+    bursts: int, rng: np.random.Generator, revision: str = "classic", *, has_lanes: bool = True
+) -> Block:
+    """Whole bursts of obstacles, lanes and further lanes, as a device would send them."""
+    parts: list[Block] = []
+    for k in range(bursts):
+        log_ns = 10_000 * MS + k * 66 * MS
+        count = int(rng.integers(0, 11))
+        parts.append(_burst(count, k, log_ns, rng, revision, has_lanes))
+    return join(parts)
+
+
+def _burst(
+    count: int, number: int, log_ns: int, rng: np.random.Generator, revision: str, has_lanes: bool
+) -> Block:
+    step_ns = 250_000
+    words, ids, lengths = [], [], []
+
+    def add(message: Message, instance: int, payload: Words, variant: str = "") -> None:
+        words.append(int(payload[0]))
+        ids.append(message.ids[instance])
+        lengths.append(message.length_of(variant))
+
+    opening = random_words(layout()["status"], 1, rng, revision) & ~np.uint64(0xFFFF)
+    opening |= np.uint64(count | (number * 66 & 0xFF) << 8)
+    add(layout()["status"], 0, opening, revision)
+    for slot in range(count):
+        for name in ("obstacle_a", "obstacle_b", "obstacle_c"):
+            add(layout()[name], slot, random_words(layout()[name], 1, rng))
+    for prefix, lanes in (("", 2), ("next_", 8)) if has_lanes else ():
+        for lane in range(lanes):
+            for half in ("a", "b"):
+                message = layout()[f"{prefix}lane_{half}"]
+                add(message, lane, random_words(message, 1, rng))
+    n = len(words)
+    return block_of(
+        np.array(words, dtype=np.uint64),
+        np.array(ids, dtype=np.int64),
+        np.array(lengths, dtype=np.int64),
+        log_ns + np.arange(n, dtype=np.int64) * step_ns,
+    )

@@ -1,0 +1,462 @@
+"""Frames of a bus to tables: what belongs together is joined, and nothing else."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import pairwise
+from math import cos, radians, sin
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Floats, Table
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.mobileye.decode import MobileyeDecoder
+from crosscue.replay.mobileye.layout import VARIANTS
+from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting
+from support.mobileye_frames import MS, frames, join, random_drive, status, triple
+
+HERE = Mounting()
+AS_IT_COMES = MobileyeSettings(mounting=HERE)
+
+
+def decode(
+    blocks: Block | list[Block], how: MobileyeSettings = AS_IT_COMES
+) -> tuple[dict[str, Table], Ledger]:
+    """All tables of a log, and its account, which must add up."""
+    blocks = [blocks] if isinstance(blocks, Block) else blocks
+    ledger = Ledger("log")
+    decoder = MobileyeDecoder("can1", ledger, how)
+    given_blocks: list[Block] = []
+    for block in blocks:
+        ledger.find("can1", len(block))
+        given_blocks += decoder(block)
+    given_blocks += decoder.flush()
+    tables: dict[str, list[Table]] = {}
+    for block in given_blocks:
+        assert isinstance(block.rows, Table)
+        tables.setdefault(block.topic.removeprefix("can1/mobileye/"), []).append(block.rows)
+    whole = {name: stack(parts) for name, parts in tables.items()}
+    assert ledger.topic("can1").used == frames_in(whole)
+    return whole, ledger
+
+
+def stack(parts: list[Table]) -> Table:
+    names = list(parts[0].columns)
+    assert all(list(part.columns) == names for part in parts)
+    return Table({name: np.concatenate([part[name] for part in parts]) for name in names})
+
+
+def frames_in(tables: dict[str, Table]) -> int:
+    """How many frames the rows were made from."""
+    weight = {"obstacles": 3, "lanes": 2, "next_lanes": 2}
+    return sum(weight.get(name, 1) * len(table) for name, table in tables.items())
+
+
+def skipped(ledger: Ledger) -> Counter[str]:
+    return ledger.topic("can1").skipped
+
+
+def values(table: Table, name: str) -> Floats:
+    return table[name].astype(np.float64)
+
+
+def test_a_whole_burst_gives_a_row_per_obstacle() -> None:
+    sent = [status(2, 40), *triple(0, 7), *triple(1, 9)]
+    tables, ledger = decode(frames(sent))
+
+    obstacles = tables["obstacles"]
+    assert obstacles["obstacle_id"].tolist() == [7, 9]
+    assert obstacles["slot"].tolist() == [0, 1]
+    assert obstacles["x_m"].tolist() == [24.0, 24.0]
+    assert obstacles["replaced"].tolist() == [True, True]
+    assert tables["status"]["count"].tolist() == [2]
+    assert not skipped(ledger)
+    assert ledger.is_whole
+
+
+def test_order_of_frames_within_a_burst_does_not_matter() -> None:
+    whole = [*triple(0, 7), *triple(1, 9)]
+    straight, _ = decode(frames([status(2, 0), *whole]))
+    mixed, ledger = decode(frames([status(2, 0), *whole[::-1]]))
+
+    for name in straight["obstacles"].columns:
+        np.testing.assert_array_equal(straight["obstacles"][name], mixed["obstacles"][name])
+    assert not skipped(ledger)
+
+
+def test_parts_of_different_slots_are_never_one_obstacle() -> None:
+    sent = [status(2, 0), triple(0, 7)[0], triple(1, 9)[1], triple(0, 7)[2], status(0, 66)]
+    tables, ledger = decode(frames(sent, [0, MS, 2 * MS, 3 * MS, 66 * MS]))
+
+    assert "obstacles" not in tables
+    assert skipped(ledger)["obstacle cut: A, B or C is missing"] == 3
+    assert ledger.topic("can1").lost.total() == 3
+
+
+def test_a_triple_across_two_status_frames_is_not_joined() -> None:
+    a, b, c = triple(0, 7)
+    sent = [status(1, 0), a, status(1, 66), b, c, status(0, 132)]
+    tables, ledger = decode(frames(sent, [0, MS, 66 * MS, 67 * MS, 68 * MS, 132 * MS]))
+
+    assert "obstacles" not in tables
+    assert skipped(ledger)["obstacle cut: A, B or C is missing"] == 3
+    assert [d.t_ns for d in ledger.details if not d.is_loss] == [MS, 67 * MS]
+    assert ledger.topic("can1").lost.total() == 3
+
+
+def test_a_cut_burst_keeps_its_whole_obstacles_and_tells_the_rest() -> None:
+    sent = [status(3, 0), *triple(0, 7), *triple(1, 9)[:2], status(0, 66)]
+    times = [0, *range(MS, 6 * MS, MS), 66 * MS]
+    tables, ledger = decode(frames(sent, times))
+
+    assert tables["obstacles"]["obstacle_id"].tolist() == [7]
+    assert skipped(ledger)["obstacle cut: A, B or C is missing"] == 2
+    lost = list(ledger.losses())
+    assert [(d.count, d.t_ns, d.detail) for d in lost] == [(4, 0, "burst 0")]
+
+
+def test_a_log_that_ends_within_a_burst_is_not_called_damaged() -> None:
+    tables, ledger = decode(frames([status(2, 0), *triple(0, 7), triple(1, 9)[0]]))
+
+    assert tables["obstacles"]["obstacle_id"].tolist() == [7]
+    assert skipped(ledger)["obstacle cut by the end of the log"] == 1
+    assert ledger.is_whole
+    assert any("ends within an image's burst" in n for n in ledger.notices)
+
+
+def test_a_lost_status_frame_does_not_mix_two_images() -> None:
+    """Slot 0 comes again with other content: from there on it is another image."""
+    sent = [status(2, 0), *triple(0, 7), *triple(0, 8), *triple(1, 9), status(0, 99)]
+    tables, ledger = decode(frames(sent, [*range(0, 10 * MS, MS), 99 * MS]))
+
+    assert tables["obstacles"]["obstacle_id"].tolist() == [7]
+    assert skipped(ledger)["slot sent twice: the status frame between is missing"] == 6
+
+
+def test_frames_long_after_their_status_frame_belong_to_another_image() -> None:
+    """All of one slot, the next status frame and the A of the next image are lost."""
+    a, b, c = triple(0, 7)
+    sent = [status(1, 0), a, b, c]
+    tables, ledger = decode(frames(sent, [0, MS, 67 * MS, 68 * MS]))
+
+    assert "obstacles" not in tables
+    assert skipped(ledger)["too long after its status frame"] == 2
+
+
+def test_a_repeated_burst_is_used_once() -> None:
+    burst = [status(1, 10), *triple(0, 7)]
+    tables, ledger = decode(frames([*burst, *burst]))
+
+    assert tables["obstacles"]["obstacle_id"].tolist() == [7]
+    assert len(tables["status"]) == 1
+    assert skipped(ledger) == {"repeated status frame": 1, "repeated frame": 3}
+
+
+def test_the_same_counter_a_wrap_later_is_a_new_image() -> None:
+    tables, ledger = decode(frames([status(0, 10), status(0, 10)], [0, 256 * MS]))
+
+    assert len(tables["status"]) == 2
+    assert not skipped(ledger)
+
+
+def test_slots_beyond_the_count_are_told_not_used() -> None:
+    tables, ledger = decode(frames([status(1, 0), *triple(0, 7), *triple(1, 9)]))
+
+    assert tables["obstacles"]["obstacle_id"].tolist() == [7]
+    assert skipped(ledger)["slot beyond the count of its status frame"] == 3
+
+
+def test_obstacles_before_the_first_status_frame_have_no_burst() -> None:
+    tables, ledger = decode(frames([*triple(0, 7), status(1, 0), *triple(0, 8)]))
+
+    assert tables["obstacles"]["obstacle_id"].tolist() == [8]
+    assert skipped(ledger)["obstacle before the first status frame"] == 3
+
+
+def test_thirteen_slots_end_before_the_vehicle_signals() -> None:
+    sent = [status(13, 0), *(f for slot in range(13) for f in triple(slot, slot + 1))]
+    sent.append((0x760, "0100480000000000"))
+    tables, ledger = decode(frames(sent))
+
+    assert tables["obstacles"]["slot"].tolist() == list(range(13))
+    assert values(tables["vehicle"], "speed_mps") == pytest.approx([20.0])
+    assert not skipped(ledger)
+
+
+def test_with_ten_slots_the_ids_above_are_foreign() -> None:
+    how = MobileyeSettings(slots=10, mounting=HERE)
+    sent = [status(11, 0), *(f for slot in range(11) for f in triple(slot, slot + 1))]
+    tables, ledger = decode(frames([*sent, status(0, 66)], [0] * 34 + [66 * MS]), how)
+
+    assert len(tables["obstacles"]) == 10
+    assert skipped(ledger)["id not in the Mobileye table"] == 3
+    assert ledger.is_whole
+    assert any("announces 11 obstacles; there are 10 slots" in n for n in ledger.notices)
+
+
+def test_frames_that_are_no_mobileyes_are_told_by_reason() -> None:
+    good = frames([status(0, 0)])
+    odd = [
+        frames([status(0, 0)], kind=REMOTE),
+        frames([status(0, 0)], kind=ERROR),
+        frames([status(0, 0)], is_extended=True),
+        frames([status(0, 0)], is_fd=True),
+        frames([(0x123, "00")]),
+        frames([(0x739, "00" * 7)]),
+        frames([(0x766, "00" * 4)]),
+    ]
+    tables, ledger = decode([good, *odd])
+
+    assert len(tables["status"]) == 1
+    assert skipped(ledger) == {
+        "remote frame": 1,
+        "error frame": 1,
+        "extended identifier, not a Mobileye's": 1,
+        "CAN FD frame, not a Mobileye's": 1,
+        "id not in the Mobileye table": 1,
+        "length that its Mobileye message does not have": 2,
+    }
+    assert ledger.details[-1].detail == "0x766 (1)"
+
+
+def test_on_a_shared_bus_foreign_frames_are_another_decoders_business() -> None:
+    ledger = Ledger("log")
+    decoder = MobileyeDecoder("can1", ledger, MobileyeSettings(is_shared_bus=True))
+    decoder(frames([(0x123, "00"), (0x739, "00")]))
+
+    assert skipped(ledger) == {"length that its Mobileye message does not have": 1}
+
+
+def test_a_table_is_no_bus() -> None:
+    decoder = MobileyeDecoder("can1", Ledger("log"))
+    with pytest.raises(ValueError, match="can1: want CanFrames, got Table"):
+        decoder(Block("can1", np.zeros(0, dtype=np.int64), Table({})))
+
+
+def test_without_a_calibrated_mounting_a_notice_says_so() -> None:
+    ledger = Ledger("log")
+    MobileyeDecoder("can1", ledger)
+    assert any("calibrate x_m and y_m" in n for n in ledger.notices)
+
+
+def test_distances_count_from_the_rear_axle() -> None:
+    """An obstacle 24 m ahead and 28 m right of a device 3 m ahead, turned 90 degrees left."""
+    sent = [status(1, 0), (0x739, "0180014002003003"), *triple(0, 1)[1:]]
+    turned = MobileyeSettings(mounting=Mounting(3.0, 0.5, radians(90)))
+    tables, _ = decode(frames(sent), turned)
+
+    assert values(tables["obstacles"], "x_m") == pytest.approx([3.0 + 28.0])
+    assert values(tables["obstacles"], "y_m") == pytest.approx([0.5 + 24.0])
+
+
+LEFT_LANE = [(0x766, "A13EFE0A80FF7F0A"), (0x767, "0D80801E")]
+RIGHT_LANE = [(0x768, "A13801FF7FFF7F0A"), (0x769, "0D80801E")]
+
+
+def test_lanes_are_left_positive_after_decoding() -> None:
+    """On the wire both C0 are positive to the right: -1.758 m left, +1.219 m right."""
+    tables, ledger = decode(frames([status(0, 0), *LEFT_LANE, *RIGHT_LANE]))
+
+    lanes = tables["lanes"]
+    assert lanes["side"].tolist() == [1, -1]
+    assert values(lanes, "c0_m") == pytest.approx([1.7578125, -1.21875])
+    assert values(lanes, "c1")[0] == pytest.approx(-14 / 1024)
+    assert values(lanes, "c2_per_m")[0] == pytest.approx(-11 / 1024000)
+    assert lanes["quality"].tolist() == [2, 2]
+    assert not skipped(ledger)
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 0.03])
+def test_a_lane_is_the_same_curve_in_the_vehicle_frame(yaw_rad: float) -> None:
+    mounting = Mounting(1.7, -0.2, yaw_rad)
+    here, _ = decode(frames([status(0, 0), *LEFT_LANE]))
+    there, _ = decode(frames([status(0, 0), *LEFT_LANE]), MobileyeSettings(mounting=mounting))
+
+    for x_m in (0.0, 10.0, 30.0):
+        y_m = cubic(here["lanes"], x_m)
+        x_there_m = 1.7 + cos(yaw_rad) * x_m - sin(yaw_rad) * y_m
+        y_there_m = -0.2 + sin(yaw_rad) * x_m + cos(yaw_rad) * y_m
+        assert cubic(there["lanes"], x_there_m) == pytest.approx(y_there_m, abs=1e-5)
+    end_m = values(there["lanes"], "x_end_m")[0]
+    range_m = values(here["lanes"], "view_range_m")[0]
+    assert end_m == pytest.approx(1.7 + range_m, abs=0.2)
+
+
+def cubic(lanes: Table, x_m: float) -> float:
+    c = [float(values(lanes, name)[0]) for name in ("c0_m", "c1", "c2_per_m", "c3_per_m2")]
+    return c[0] + c[1] * x_m + c[2] * x_m**2 + c[3] * x_m**3
+
+
+def test_a_side_without_a_marking_has_no_curve() -> None:
+    default = [(0x766, "0220FEFF7FFF7F00"), (0x767, "FF7F0080")]
+    tables, _ = decode(frames([status(0, 0), *default]))
+
+    assert tables["lanes"]["has_marking"].tolist() == [False]
+    assert np.isnan(values(tables["lanes"], "c0_m")).all()
+    assert np.isnan(values(tables["lanes"], "x_end_m")).all()
+
+
+def test_further_lanes_alternate_left_and_right_outwards() -> None:
+    sent = [
+        frame
+        for k in range(8)
+        for frame in ((0x76C + 2 * k, LEFT_LANE[0][1]), (0x76D + 2 * k, LEFT_LANE[1][1]))
+    ]
+    tables, _ = decode(frames([status(0, 0), *sent]))
+
+    assert tables["next_lanes"]["side"].tolist() == [1, -1] * 4
+    assert tables["next_lanes"]["index"].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_halves_of_different_lanes_or_images_are_not_joined() -> None:
+    a, b = LEFT_LANE
+    sent = [status(0, 0), a, status(0, 66), b, RIGHT_LANE[0], b]
+    tables, ledger = decode(frames(sent, [0, MS, 66 * MS, 67 * MS, 68 * MS, 69 * MS]))
+
+    assert "lanes" not in tables
+    assert skipped(ledger) == {"lane A without its B": 2, "lane B without its A": 2}
+
+
+def test_the_layout_of_lane_details_follows_the_status_frame() -> None:
+    details = (0x737, "0040200C00000000")
+    classic, _ = decode(frames([status(0, 0), details]))
+    newer, _ = decode(frames([status(0, 0, length=7), details]))
+    early, ledger = decode(frames([details, status(0, 0)]))
+
+    assert values(classic["lane_details"], "c2_per_m")[0] == pytest.approx(0x4000 * 3.81e-6)
+    assert classic["lane_details"]["guard_rail_left"].tolist() == [-1]
+    assert np.isnan(values(newer["lane_details"], "c2_per_m")).all()
+    assert newer["lane_details"]["guard_rail_left"].tolist() == [1]
+    assert newer["lane_details"]["lane_count"].tolist() == [0]
+    assert np.isnan(values(early["lane_details"], "c1")).all()
+    assert any("before the first status frame" in n for n in ledger.notices)
+
+
+def test_a_revision_that_is_set_refuses_status_frames_of_the_other() -> None:
+    how = MobileyeSettings(revision="classic", mounting=HERE)
+    tables, ledger = decode(frames([status(0, 0, length=7)]), how)
+
+    assert tables == {}
+    assert skipped(ledger) == {"length that its Mobileye message does not have": 1}
+
+
+def test_both_revisions_on_one_bus_are_noticed() -> None:
+    blocks = [frames([status(0, 0)]), frames([status(0, 66, length=7)], [66 * MS])]
+    tables, ledger = decode(blocks)
+
+    assert [VARIANTS[k] for k in tables["status"]["layout"]] == ["classic", "2.32"]
+    assert any("status frames of both revisions" in n for n in ledger.notices)
+
+
+def test_an_unknown_protocol_version_is_noticed() -> None:
+    _, ledger = decode(frames([status(0, 0, tail="00F209")]))
+    assert any("protocol version 9" in n for n in ledger.notices)
+
+
+def test_a_log_without_lengths_leaves_missing_what_hangs_on_them() -> None:
+    block = frames([status(1, 0), *triple(0, 7)])
+    assert isinstance(block.rows, CanFrames)
+    block.rows.length[:] = LENGTH_UNKNOWN
+    unknown, _ = decode(block)
+    told, _ = decode(block, MobileyeSettings(revision="2.32", mounting=HERE))
+
+    assert len(unknown["obstacles"]) == 1
+    assert unknown["status"]["failsafe"].tolist() == [-1]
+    assert told["status"]["failsafe"].tolist() == [0]
+
+
+LDW_BIT = "0000000001000000"
+TSR_SHOWS = "0000000101000000"
+EXTENDED_SHOWS = "0000000011000000"
+
+
+@pytest.mark.parametrize(
+    ("sent", "want"),
+    [
+        ([LDW_BIT], [-1]),
+        ([LDW_BIT, TSR_SHOWS, LDW_BIT], [-1, 0, 0]),
+        ([EXTENDED_SHOWS, LDW_BIT], [1, 1]),
+        ([TSR_SHOWS, EXTENDED_SHOWS, LDW_BIT], [0, -1, -1]),
+    ],
+)
+def test_the_warning_family_is_decided_by_bits_of_one_family_only(
+    sent: list[str], want: list[int]
+) -> None:
+    tables, ledger = decode(frames([(0x700, text) for text in sent]))
+
+    assert tables["warnings"]["ldw_on"].tolist() == want
+    assert any("0x700" in n for n in ledger.notices) == (-1 in want)
+
+
+def test_a_family_that_is_set_is_believed() -> None:
+    how = MobileyeSettings(family="tsr", mounting=HERE)
+    tables, ledger = decode(frames([(0x700, LDW_BIT)]), how)
+
+    assert tables["warnings"]["ldw_on"].tolist() == [0]
+    assert ledger.notices == []
+
+
+def test_image_time_is_the_time_of_obstacles_and_status() -> None:
+    sent = [status(1, 0), *triple(0, 7), status(1, 66), *triple(0, 8)]
+    times = [1000 * MS, *(1000 * MS + k * MS for k in (1, 2, 3)), 1071 * MS]
+    tables, _ = decode(frames(sent, [*times, *(1071 * MS + k * MS for k in (1, 2, 3))]))
+
+    near_ns = 100_000
+    assert tables["status"]["t_ns"].tolist() == pytest.approx([1000 * MS, 1066 * MS], abs=near_ns)
+    assert tables["status"]["latency_ns"].tolist() == pytest.approx([0, 5 * MS], abs=near_ns)
+    assert tables["obstacles"]["t_ns"].tolist() == tables["status"]["t_ns"].tolist()
+    assert tables["obstacles"]["status_log_ns"].tolist() == [1000 * MS, 1071 * MS]
+
+
+@given(seed=st.integers(0, 10_000), cuts=st.lists(st.integers(0, 400), max_size=6))
+@settings(max_examples=25, deadline=None)
+def test_how_the_log_is_cut_into_blocks_changes_nothing(seed: int, cuts: list[int]) -> None:
+    """Also not on a damaged log: frames dropped, doubled and swapped."""
+    rng = np.random.default_rng(seed)
+    drive = random_drive(8, rng)
+    index = np.sort(rng.choice(len(drive), size=len(drive), replace=True))
+    drive = drive.take(index)
+    whole, ledger = decode(drive)
+    places = sorted({min(c, len(drive)) for c in cuts})
+    parts = [drive.take(np.s_[a:b]) for a, b in pairwise([0, *places, len(drive)])]
+    pieces, ledger_of_pieces = decode(parts)
+
+    assert whole.keys() == pieces.keys()
+    for name, table in whole.items():
+        for column in table.columns:
+            np.testing.assert_array_equal(table[column], pieces[name][column])
+    assert skipped(ledger) == skipped(ledger_of_pieces)
+    assert ledger.topic("can1").lost == ledger_of_pieces.topic("can1").lost
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=25, deadline=None)
+def test_losing_frames_never_makes_a_row_that_was_not_there(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    drive = random_drive(10, rng)
+    whole, _ = decode(drive)
+    left, ledger = decode(drive.take(rng.random(len(drive)) > 0.2))
+
+    known = rows_of(whole.get("obstacles"))
+    assert rows_of(left.get("obstacles")) <= known
+    assert rows_of(left.get("lanes")) <= rows_of(whole.get("lanes"))
+    if len(rows_of(left.get("obstacles"))) < len(known):
+        assert skipped(ledger) or ledger.topic("can1").lost
+
+
+def rows_of(table: Table | None) -> set[tuple[str, ...]]:
+    """Rows without what counts bursts."""
+    if table is None:
+        return set()
+    skip = ("burst", "t_ns")
+    names = [name for name in table.columns if name not in skip]
+    return set(zip(*([str(v) for v in table[name]] for name in names), strict=True))
+
+
+def test_all_blocks_may_be_empty() -> None:
+    tables, ledger = decode([frames([]), join([frames([]), frames([])])])
+    assert tables == {}
+    assert ledger.notices == []
