@@ -14,11 +14,20 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import DATA, ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Table
+from crosscue.replay.columns import (
+    DATA,
+    ERROR,
+    LENGTH_UNKNOWN,
+    REMOTE,
+    Block,
+    CanFrames,
+    Int64s,
+    Table,
+)
 from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
 
 from .database import CanDatabase, spell_id
-from .engines import Engine, Grouped, NumbaEngine, NumpyEngine, Rules, has_numba
+from .engines import STANDARD_IDS, Engine, Grouped, NumbaEngine, NumpyEngine, Rules, has_numba
 from .extract import PRESENT_SUFFIX, Extractor
 from .layout import Arithmetic, CanMessage
 
@@ -29,6 +38,14 @@ TOO_SHORT: Final = "frame shorter than its message"
 TOO_LONG: Final = "frame longer than its message"
 WRONG_FORMAT: Final = "CAN FD frame, but the database says classic"
 NO_BRANCH: Final = "multiplexer value without a branch"
+RARE_REASONS: Final = (
+    ERROR_FRAME,
+    REMOTE_FRAME,
+    UNKNOWN_ID,
+    WRONG_FORMAT,
+    TOO_SHORT,
+    TOO_LONG,
+)
 OTHERS: Final = (-1, False)
 """Stands for all further identifiers once ``COUNTS_KEPT`` have been told apart."""
 COUNTS_KEPT: Final = 20_000
@@ -39,8 +56,6 @@ AUTO_FRAMES: Final = 4_000_000
 EngineName: TypeAlias = Literal["auto", "numpy", "numba"]
 Wanted: TypeAlias = Collection[str] | Collection[tuple[str, str]]
 CountKey: TypeAlias = tuple[int, bool, str]
-
-_FEW_KEYS: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,9 +121,10 @@ class BusDecoder:
         self._frames_seen = 0
         self.counts: dict[CountKey, int] = {}
         chosen = _chosen(database, wanted)
-        self._entries = tuple(_entry(message, chosen) for message in database.messages)
+        entries = [_entry(message, chosen) for message in database.messages]
+        # The engines want the messages that are decoded first.
+        self._entries = tuple(sorted(entries, key=lambda entry: bool(entry.refusal)))
         self._rules = [_rules(entry, settings) for entry in self._entries]
-        self._refusals = sorted({e.refusal for e in self._entries if e.refusal})
         use_numba = settings.engine == "numba"
         self._engine: Engine = (NumbaEngine if use_numba else NumpyEngine)(self._rules)
 
@@ -140,7 +156,7 @@ class BusDecoder:
             raise ValueError(f"{block.topic}: want CanFrames, got {type(frames).__name__}")
         self._choose_engine(len(frames))
         grouped = self._engine.group(frames)
-        if not grouped.is_good.all():
+        if len(grouped.order) < len(frames):
             self._account(frames, grouped, block.log_ns)
         times = _Times(block, grouped.order)
         decoded = []
@@ -150,8 +166,9 @@ class BusDecoder:
             topic = f"{self._bus}/{entry.message.topic_name}"
             one = times.block(topic, grouped.rows(number), columns, entry.units)
             if strange is not None:
-                at = one.log_ns[strange]
-                self._tell((*entry.message.key, NO_BRANCH), len(at), int(at[0]))
+                key, count = (*entry.message.key, NO_BRANCH), int(strange.sum())
+                if not self._add(key, count):
+                    self._tell(key, count, one.log_ns, strange)
                 one = one.take(~strange)
             if len(one):
                 decoded.append(one)
@@ -164,87 +181,72 @@ class BusDecoder:
             if has_numba():
                 self._engine = NumbaEngine(self._rules)
 
-    def _account(self, frames: CanFrames, grouped: Grouped, log_ns: NDArray[np.int64]) -> None:
+    def _account(self, frames: CanFrames, grouped: Grouped, log_ns: Int64s) -> None:
         """Count the frames that cannot be decoded, each under the first reason that holds."""
-        rows = np.flatnonzero(~grouped.is_good)
-        is_unknown = (grouped.number[rows] == 0) & (frames.kind[rows] == DATA)
-        self._count(frames, rows[is_unknown], [UNKNOWN_ID], None, log_ns)
-        rows = rows[~is_unknown]
-        if len(rows):
-            reasons, which = self._reasons(frames, grouped, rows)
-            self._count(frames, rows, reasons, which, log_ns)
+        number, ids, is_data = grouped.number, frames.arbitration_id, frames.kind == DATA
+        left = len(frames) - len(grouped.order)
+        for identifier in np.flatnonzero(grouped.unknown).tolist():
+            count = int(grouped.unknown[identifier])
+            left -= count
+            if not self._add((identifier, False, UNKNOWN_ID), count):
+                mine = is_data & (ids == identifier) & ~frames.is_extended
+                self._tell((identifier, False, UNKNOWN_ID), count, log_ns, mine)
+        for at, entry in enumerate(self._entries, start=1):
+            count = int(grouped.seen[at])
+            if entry.refusal and count:
+                left -= count
+                key = (*entry.message.key, entry.refusal)
+                if not self._add(key, count):
+                    self._tell(key, count, log_ns, is_data & (number == at))
+        if left:
+            self._account_rare(frames, grouped, log_ns)
 
-    def _count(
-        self,
-        frames: CanFrames,
-        rows: NDArray[np.intp],
-        reasons: list[str],
-        which: NDArray[np.int64] | None,
-        log_ns: NDArray[np.int64],
-    ) -> None:
-        """Count ``rows`` by identifier and by ``which`` of the reasons; None for the first."""
-        extended = frames.is_extended[rows]
-        for is_extended, bits in ((False, 11), (True, 29)):
-            chosen = extended if is_extended else ~extended
-            if not chosen.any():
-                continue
-            mine = rows[chosen]
-            key = frames.arbitration_id[mine].astype(np.int64)
-            if which is not None:
-                key += which[chosen] << bits
-            for value, count in _tally(key):
-                whose: CountKey = (
-                    value & ((1 << bits) - 1),
-                    is_extended,
-                    reasons[value >> bits],
-                )
-                if whose in self.counts:
-                    self._add(whose, count)
-                else:
-                    first = mine[np.argmax(key == value)]
-                    self._tell(whose, count, int(log_ns[first]))
+    def _account_rare(self, frames: CanFrames, grouped: Grouped, log_ns: Int64s) -> None:
+        """Count the frames of asked-for messages that do not fit, and those that are no data."""
+        number, ids, is_data = grouped.number, frames.arbitration_id, frames.kind == DATA
+        refuses = np.array([False, *(bool(e.refusal) for e in self._entries)])
+        is_plain_unknown = (number == 0) & ~frames.is_extended & (ids < STANDARD_IDS)
+        rows = np.flatnonzero(~grouped.is_good & ~(is_data & (is_plain_unknown | refuses[number])))
+        which = self._which_reason(frames.take(rows), number[rows])
+        key = ids[rows].astype(np.int64)
+        key |= (frames.is_extended[rows].astype(np.int64) << 32) | (which << 33)
+        values, first, counts = np.unique(key, return_index=True, return_counts=True)
+        for value, at, count in zip(
+            values.tolist(), rows[first].tolist(), counts.tolist(), strict=True
+        ):
+            whose = (value & 0xFFFF_FFFF, bool(value >> 32 & 1), RARE_REASONS[value >> 33])
+            if not self._add(whose, count):
+                self._tell(whose, count, log_ns, np.arange(len(log_ns)) == at)
 
-    def _reasons(
-        self, frames: CanFrames, grouped: Grouped, rows: NDArray[np.intp]
-    ) -> tuple[list[str], NDArray[np.int64]]:
-        """All reasons, and the number of the one that holds for each of ``rows``."""
-        reasons = [ERROR_FRAME, REMOTE_FRAME, UNKNOWN_ID, WRONG_FORMAT, TOO_SHORT, TOO_LONG]
-        refused = np.zeros(len(self._entries) + 1, dtype=np.int64)
-        for number, entry in enumerate(self._entries, start=1):
-            if entry.refusal:
-                refused[number] = len(reasons) + self._refusals.index(entry.refusal)
-        longest = np.array([(-1, -1), *(rule.longest for rule in self._rules)], dtype=np.int16)
-        shortest = np.array([0, *(m.message.length for m in self._rules)])
-        number, kind = grouped.number[rows], frames.kind[rows]
-        carried = np.minimum(frames.length[rows], frames.data.shape[1])
-        which = np.select(
-            [
-                kind == ERROR,
-                kind == REMOTE,
-                number == 0,
-                refused[number] > 0,
-                frames.is_fd[rows] & (longest[number, 1] < 0),
-                carried < shortest[number],
-            ],
-            [np.int64(0), np.int64(1), np.int64(2), refused[number], np.int64(3), np.int64(4)],
-            np.int64(5),
-        )
-        return reasons + self._refusals, which
+    def _which_reason(self, frames: CanFrames, number: NDArray[np.uint16]) -> Int64s:
+        """Place in ``RARE_REASONS`` of the first reason that holds for each frame."""
+        refuses_fd = np.array([False, *(rule.longest[1] < 0 for rule in self._rules)])
+        shortest = np.array([0, *(rule.message.length for rule in self._rules)])
+        carried = np.minimum(frames.length, frames.data.shape[1])
+        holds = [
+            frames.kind == ERROR,
+            frames.kind == REMOTE,
+            number == 0,
+            frames.is_fd & refuses_fd[number],
+            carried < shortest[number],
+        ]
+        return np.select(holds, [np.int64(i) for i in range(len(holds))], np.int64(len(holds)))
 
-    def _add(self, key: CountKey, count: int) -> None:
+    def _add(self, key: CountKey, count: int) -> bool:
+        """Count more frames of a kind that was told already; False if it was not."""
+        if key not in self.counts:
+            return False
         self.counts[key] += count
         self._ledger.topic(self._bus).skipped[key[2]] += count
+        return True
 
-    def _tell(self, key: CountKey, count: int, t_ns: int) -> None:
-        """Count frames; only the first of a kind leave a detail, or a busy bus would fill all."""
-        if key in self.counts:
-            self._add(key, count)
-            return
+    def _tell(self, key: CountKey, count: int, log_ns: Int64s, rows: NDArray[np.bool_]) -> None:
+        """Count frames with a detail: only the first of a kind, or a busy bus would fill all."""
         detail = f"{spell_id(*key[:2])}, first of them"
         if len(self.counts) >= COUNTS_KEPT:
             key = (*OTHERS, key[2])
         self.counts[key] = self.counts.get(key, 0) + count
-        self._ledger.skip(self._bus, key[2], count, detail, t_ns)
+        self._ledger.skip(self._bus, key[2], count, detail, int(log_ns[np.argmax(rows)]))
 
 
 class _Times:
@@ -270,18 +272,6 @@ class _Times:
             None if self._publish is None else self._publish[rows],
             None if self._header is None else self._header[rows],
         )
-
-
-def _tally(key: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Distinct values and how often each occurs."""
-    if not len(key):
-        return []
-    if key.max() < _FEW_KEYS:  # many times as fast as sorting, and buses have few identifiers
-        counts = np.bincount(key)
-        values = np.flatnonzero(counts)
-        return list(zip(values.tolist(), counts[values].tolist(), strict=True))
-    values, counts = np.unique(key, return_counts=True)
-    return list(zip(values.tolist(), counts.tolist(), strict=True))
 
 
 def _chosen(database: CanDatabase, wanted: Wanted | None) -> dict[tuple[int, bool], set[str]]:

@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import DATA, LENGTH_UNKNOWN, CanFrames
 
-from .extract import Column, Extractor, Words
+from .extract import Column, Extractor, Words, flip_and_bias, is_short_integer
 from .layout import Arithmetic, CanMessage, CanSignal
 
 STANDARD_IDS: Final = 2048
-NOWHERE: Final = 256
-"""A length that no frame reaches."""
 
 Columns: TypeAlias = dict[str, Column]
 Strange: TypeAlias = NDArray[np.bool_] | None
@@ -51,35 +49,41 @@ class Tables:
             whatever is larger.
         extended_ids: Sorted 29-bit identifiers.
         extended_numbers: Their message numbers.
-        shortest: Shape (M + 1,): fewest bytes of a frame.
-        longest: Shape (2, M + 1): most bytes, of classic and of FD frames.
+        fits: From the width of the payload array to shape (2, M + 1, 256): whether a frame, classic
+            or FD, of this message and length can be decoded.
     """
 
     standard: NDArray[np.uint16]
     extended_ids: NDArray[np.uint32]
     extended_numbers: NDArray[np.uint16]
-    shortest: NDArray[np.int16]
-    longest: NDArray[np.int16]
+    fits: dict[int, NDArray[np.bool_]]
 
     @classmethod
     def of(cls, rules: Sequence[Rules]) -> Tables:
         """Build the tables; messages are numbered from 1."""
         standard = np.zeros(STANDARD_IDS + 1, dtype=np.uint16)
-        shortest = np.full(len(rules) + 1, NOWHERE, dtype=np.int16)
-        longest = np.full((2, len(rules) + 1), -1, dtype=np.int16)
+        fits = {width: np.zeros((2, len(rules) + 1, 256), dtype=np.bool_) for width in (8, 64)}
         extended = []
         for number, rule in enumerate(rules, start=1):
             if rule.message.is_extended:
                 extended.append((rule.message.arbitration_id, number))
             else:
                 standard[rule.message.arbitration_id] = number
-            if rule.extractor is not None:
-                shortest[number] = min(rule.message.length, NOWHERE)
-                longest[:, number] = rule.longest
+            for width, table in fits.items():
+                if rule.extractor is not None and rule.message.length <= width:
+                    table[:, number] = _fitting_lengths(rule)
         extended.sort()
         ids = np.array([i for i, _ in extended], dtype=np.uint32)
         numbers = np.array([n for _, n in extended], dtype=np.uint16)
-        return cls(standard, ids, numbers, shortest, longest)
+        return cls(standard, ids, numbers, fits)
+
+
+def _fitting_lengths(rule: Rules) -> NDArray[np.bool_]:
+    length, longest = np.arange(256), np.array(rule.longest)[:, None]
+    fits = (length >= rule.message.length) & (length <= longest)
+    # Where the log keeps no lengths there is nothing to hold against the database.
+    fits[:, LENGTH_UNKNOWN] |= longest[:, 0] >= 0
+    return fits
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +95,16 @@ class Grouped:
         is_good: Shape (N,): the frame can be decoded.
         order: Shape (G,): the G good frames: those of message 1, then of message 2, ...
         stops: Shape (M + 1,): where each message ends in ``order``; 0 for message 0.
+        seen: Shape (M + 1,): data frames of each message, good or not.
+        unknown: Shape (2048,): data frames of no message, by their 11-bit identifier.
     """
 
     number: NDArray[np.uint16]
     is_good: NDArray[np.bool_]
     order: NDArray[np.intp]
     stops: NDArray[np.intp]
+    seen: NDArray[np.intp]
+    unknown: NDArray[np.intp]
 
     def rows(self, number: int) -> slice:
         """Where a message's frames are in ``order``."""
@@ -119,7 +127,9 @@ class NumpyEngine:
     """Whole arrays at a time."""
 
     def __init__(self, rules: Sequence[Rules]) -> None:
+        """Prepare the tables; rules without an extractor come last."""
         self._rules = rules
+        self._decodable = sum(rule.extractor is not None for rule in rules)
         self._tables = Tables.of(rules)
         self._numbers = np.arange(len(rules) + 1, dtype=np.uint16)
         self._grouped: Grouped | None = None
@@ -128,34 +138,45 @@ class NumpyEngine:
     def group(self, frames: CanFrames) -> Grouped:
         """Look up, check and sort frames."""
         number = self._number(frames)
-        is_good = number > 0
+        is_data = frames.kind == DATA
+        is_good = (number > 0) & (number <= self._decodable)
         order, stops = self._sort(number)
+        seen = np.diff(stops, prepend=0)
         if not self._all_fit(frames, order, stops):
-            is_good = self._fits(frames, number)
+            is_good = self._fits(frames, number) & is_data
+            seen = np.bincount(number[is_data], minlength=len(self._rules) + 1)
             order, stops = self._sort(np.where(is_good, number, np.uint16(0)))
+        order = order[stops[0] : stops[self._decodable]]
+        stops = np.minimum(stops, stops[self._decodable]) - stops[0]
         self._words = words_of(frames).take(order, axis=0)
-        self._grouped = Grouped(number, is_good, order, stops)
+        unknown = is_data & (number == 0) & ~frames.is_extended
+        by_id = np.bincount(
+            np.minimum(frames.arbitration_id[unknown], STANDARD_IDS), minlength=STANDARD_IDS
+        )
+        self._grouped = Grouped(number, is_good, order, stops, seen, by_id[:STANDARD_IDS])
         return self._grouped
 
     def _sort(self, number: NDArray[np.uint16]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """All frames in order of ``number``, and where each number ends."""
         order = np.argsort(number, kind="stable")  # a radix sort on 16 bits
-        stops = np.searchsorted(number[order], self._numbers, side="right")
-        return order[stops[0] :], stops - stops[0]
+        return order, np.searchsorted(number[order], self._numbers, side="right")
 
     def _all_fit(self, frames: CanFrames, order: NDArray[np.intp], stops: NDArray[np.intp]) -> bool:
-        """Whether every frame that is looked up fits: the usual case, told from extremes."""
+        """Whether every frame of a decodable message fits: the usual case, told from extremes."""
         if frames.kind.any() or frames.is_fd.any():
             return False
-        if not len(order):
+        ends = stops[: self._decodable + 1]
+        groups = np.flatnonzero(np.diff(ends))
+        if not len(groups):
             return True
-        groups = np.flatnonzero(np.diff(stops))
-        lengths = frames.length[order]
-        least = np.minimum.reduceat(lengths, stops[groups])
-        most = np.maximum.reduceat(lengths, stops[groups])
-        longest = self._tables.longest[0][groups + 1]
-        carried = np.minimum(least, frames.data.shape[1])
-        fits = (most <= longest) | ((least == LENGTH_UNKNOWN) & (longest >= 0))
-        return bool((fits & (carried >= self._tables.shortest[groups + 1])).all())
+        lengths = frames.length[order[: ends[-1]]]
+        least = np.minimum.reduceat(lengths, ends[groups])
+        most = np.maximum.reduceat(lengths, ends[groups])
+        fits = self._tables.fits[frames.data.shape[1]][0, groups + 1]
+        at = np.arange(len(groups))
+        # Between two fitting lengths all fit, but for the number that stands for "unknown".
+        in_one_piece = (most < LENGTH_UNKNOWN) | (least == LENGTH_UNKNOWN)
+        return bool((fits[at, least] & fits[at, most] & in_one_piece).all())
 
     def columns(self, number: int) -> tuple[Columns, Strange]:
         """Columns of one message of the frames grouped last."""
@@ -181,15 +202,10 @@ class NumpyEngine:
         return number
 
     def _fits(self, frames: CanFrames, number: NDArray[np.uint16]) -> NDArray[np.bool_]:
-        longest = self._tables.longest[0][number]
-        if frames.is_fd.any():
-            longest = np.where(frames.is_fd, self._tables.longest[1][number], longest)
-        carried = np.minimum(frames.length, frames.data.shape[1])
-        good: NDArray[np.bool_] = carried >= self._tables.shortest[number]
-        # Where the log keeps no lengths there is nothing to hold against the database.
-        good &= (frames.length <= longest) | ((frames.length == LENGTH_UNKNOWN) & (longest >= 0))
-        good &= frames.kind == DATA
-        return good
+        fits: NDArray[np.bool_] = self._tables.fits[frames.data.shape[1]][
+            frames.is_fd.view(np.uint8), number, frames.length
+        ]
+        return fits
 
 
 class NumbaEngine:
@@ -214,31 +230,31 @@ class NumbaEngine:
         n, tables = len(frames), self._tables
         number = np.empty(n, dtype=np.uint16)
         is_good = np.empty(n, dtype=np.bool_)
-        counts = np.zeros(len(self._rules) + 1, dtype=np.intp)
+        counts, seen = np.zeros((2, len(self._rules) + 1), dtype=np.intp)
+        unknown = np.zeros(STANDARD_IDS + 1, dtype=np.intp)
         self._kernels.look_up(
             *(frames.arbitration_id, frames.is_extended, frames.kind, frames.length, frames.is_fd),
-            frames.data.shape[1],
             *(tables.standard, tables.extended_ids, tables.extended_numbers),
-            *(tables.shortest, tables.longest, number, is_good, counts),
+            tables.fits[frames.data.shape[1]],
+            *(number, is_good, counts, seen, unknown),
         )
-        counts[0] = 0
         stops = np.cumsum(counts)
         words, n = words_of(frames), int(stops[-1])
         order = np.empty(n, dtype=np.intp)
-        little, big = np.empty((2, words.shape[1], n), dtype=np.uint64)
-        self._kernels.put_in_order(number, is_good, stops - counts, words, order, little, big)
+        little = np.empty((words.shape[1], n), dtype=np.uint64)
+        self._kernels.put_in_order(number, is_good, stops - counts, words, order, little)
         sizes = counts * np.diff(self._plan.first)
         self._base = np.cumsum(sizes) - sizes
         self._values = np.empty(int(sizes.sum()), dtype=np.float64)
         plan = self._plan
         self._kernels.take_out(
-            *(little, big, stops, counts, self._base, plan.first),
+            *(little, stops, counts, self._base, plan.first),
             *(plan.is_big, plan.word, plan.bit, plan.length, plan.kind),
-            *(plan.scale, plan.offset, plan.whole_scale, plan.whole_offset),
+            *(plan.flip, plan.bias, plan.scale, plan.offset, plan.whole_scale, plan.whole_offset),
             *(self._values, self._values.view(np.uint64)),
         )
         self._words = little.T
-        self._grouped = Grouped(number, is_good, order, stops)
+        self._grouped = Grouped(number, is_good, order, stops, seen, unknown[:STANDARD_IDS])
         return self._grouped
 
     def columns(self, number: int) -> tuple[Columns, Strange]:
@@ -293,6 +309,8 @@ class _Plan:
         bit: That bit within the word, counted in the signal's direction.
         length: Bits.
         kind: One of the numbers in ``kernels``.
+        flip: Bits to flip in a short integer, as ``extract.flip_and_bias`` says.
+        bias: What to subtract then.
         scale: Units per raw step.
         offset: Value of raw zero.
         whole_scale: The scale modulo 2**64, for whole numbers.
@@ -305,6 +323,8 @@ class _Plan:
     bit: NDArray[np.uint64]
     length: NDArray[np.uint64]
     kind: NDArray[np.uint8]
+    flip: NDArray[np.uint64]
+    bias: NDArray[np.float64]
     scale: NDArray[np.float64]
     offset: NDArray[np.float64]
     whole_scale: NDArray[np.uint64]
@@ -314,6 +334,7 @@ class _Plan:
     def of(cls, messages: Sequence[Sequence[CanSignal]]) -> _Plan:
         signals = [s for message in messages for s in message]
         sizes = [len(message) for message in messages]
+        turns = [flip_and_bias(s) if is_short_integer(s) else (0, 0.0) for s in signals]
         return cls(
             first=np.cumsum([0, *sizes]).astype(np.intp),
             is_big=np.array([s.is_big_endian for s in signals], dtype=np.bool_),
@@ -321,6 +342,8 @@ class _Plan:
             bit=np.array([s.first_bit % 64 for s in signals], dtype=np.uint64),
             length=np.array([s.length for s in signals], dtype=np.uint64),
             kind=np.array([_kind(s) for s in signals], dtype=np.uint8),
+            flip=np.array([flip for flip, _ in turns], dtype=np.uint64),
+            bias=np.array([bias for _, bias in turns], dtype=np.float64),
             scale=np.array([float(s.scale) for s in signals], dtype=np.float64),
             offset=np.array([float(s.offset) for s in signals], dtype=np.float64),
             whole_scale=np.array([_modulo(s.scale) for s in signals], dtype=np.uint64),
@@ -359,6 +382,8 @@ def _kind(signal: CanSignal) -> int | None:
             (64, False): kernels.DOUBLE_SCALED,
         }
         return kinds.get((signal.length, is_plain))
+    if is_short_integer(signal):
+        return kernels.SHORT
     if signal.arithmetic is Arithmetic.BIG:
         return None
     if signal.arithmetic is not Arithmetic.FLOAT:

@@ -25,6 +25,11 @@ Column: TypeAlias = NDArray[Any]
 PRESENT_SUFFIX: Final = "_is_present"
 """Ends the name of the companion column of a signal that may be absent and cannot be NaN."""
 
+SHORT_BITS: Final = 52
+"""Integers of up to so many bits fit into the fraction of a float64."""
+EXPONENT: Final = 0x4330_0000_0000_0000
+"""Above 52 integer bits these make the float64 2**52 + integer: a conversion without a loop."""
+
 _FLOATS: Final = {16: (np.uint16, np.float16), 32: (np.uint32, np.float32)}
 
 
@@ -35,6 +40,7 @@ class _Place:
     is_big_endian: bool
     word: int
     is_split: bool
+    is_short: bool
     is_signed: bool
     is_float: bool
     is_plain: bool
@@ -44,11 +50,13 @@ class _Place:
 
 def _place(signal: CanSignal) -> _Place:
     word, bit = divmod(signal.first_bit, 64)
+    is_short = is_short_integer(signal)
     return _Place(
         signal.is_big_endian,
         word,
         bit + signal.length > 64,
-        signal.is_signed and not signal.is_float,
+        is_short,
+        signal.is_signed and not signal.is_float and not is_short,
         signal.is_float,
         signal.is_float and signal.scale == 1 and signal.offset == 0,
         signal.length if signal.is_float else 0,
@@ -69,7 +77,10 @@ class _Together:
         # Shifted left until only the wanted bits are left of it; then right, with sign or not.
         self._left = bit if place.is_big_endian else np.uint64(64) - (bit + length)
         self._taken = np.uint64(64) - bit  # bits of a split signal in its first word
-        self._short = bool((length < 64).all())
+        self._is_below_64 = bool((length < 64).all())
+        flips, biases = zip(*(flip_and_bias(s) for s in signals), strict=True)
+        self._flip = np.array(flips, dtype=np.uint64)[:, None]
+        self._bias = np.array(biases, dtype=np.float64)[:, None]
         scales, offsets = [s.scale for s in signals], [s.offset for s in signals]
         is_linear_float = place.is_float and not place.is_plain  # -0.0 + 0 is 0.0
         self._scale = _factors(scales) if any(x != 1 for x in scales) else None
@@ -78,6 +89,11 @@ class _Together:
     def __call__(self, words: Words) -> Column:
         """Physical values, shape (S, N)."""
         raw = self._split(words) if self.place.is_split else self._whole(words)
+        if self.place.is_short:
+            raw ^= self._flip
+            values = raw.view(np.float64)
+            values -= self._bias
+            return self._scaled(values)
         if self.place.is_float:
             with np.errstate(all="ignore"):  # whatever numbers the bits make
                 return self._scaled(_as_float(raw, self.place.float_bits))
@@ -91,15 +107,15 @@ class _Together:
         word = words[:, k]
         return word.byteswap() if self.place.is_big_endian else word
 
-    def _whole(self, words: Words) -> NDArray[np.int64] | NDArray[np.uint64]:
+    def _whole(self, words: Words) -> Column:
         raw = self._word(words, self.place.word) << self._left
         if self.place.is_signed:
             return np.right_shift(raw.view(np.int64), self._drop.view(np.int64))
         raw >>= self._drop
         # Conversion from int64 is the faster one; without the top bit both mean the same.
-        return raw.view(np.int64) if self._short else raw
+        return raw.view(np.int64) if self._is_below_64 and not self.place.is_short else raw
 
-    def _split(self, words: Words) -> NDArray[np.int64] | NDArray[np.uint64]:
+    def _split(self, words: Words) -> Column:
         first = self._word(words, self.place.word)
         second = self._word(words, self.place.word + 1)
         if self.place.is_big_endian:
@@ -124,6 +140,23 @@ class _Together:
         values *= _modulo([int(s.scale) for s in self.signals])
         values += _modulo([int(s.offset) for s in self.signals])
         return values.view(np.int64) if self.place.arithmetic == Arithmetic.INT64.name else values
+
+
+def is_short_integer(signal: CanSignal) -> bool:
+    """Whether the conversion by ``EXPONENT`` holds for it."""
+    is_exact = signal.arithmetic is Arithmetic.FLOAT and not signal.is_float
+    return is_exact and signal.length <= SHORT_BITS
+
+
+def flip_and_bias(signal: CanSignal) -> tuple[int, float]:
+    """What turns the raw bits of a short integer into a float64.
+
+    Returns:
+        Bits to flip in the raw number, which then is, read as a float64, too large by the second.
+        The sign bit is flipped, so that two's complement becomes a count from the lowest number.
+    """
+    lowest = signal.raw_range[0]
+    return EXPONENT | -lowest, float(2**SHORT_BITS - lowest)
 
 
 def _factors(numbers: list[float]) -> NDArray[np.float64]:

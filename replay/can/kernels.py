@@ -9,8 +9,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import DATA, LENGTH_UNKNOWN
+from crosscue.replay.columns import DATA
 
+SHORT: Final = 9
 UNSIGNED: Final = 0
 SIGNED: Final = 1
 WHOLE_UNSIGNED: Final = 2
@@ -20,6 +21,9 @@ SINGLE_SCALED: Final = 5
 DOUBLE: Final = 6
 DOUBLE_SCALED: Final = 7
 UNSIGNED_LONG: Final = 8
+
+EVEN_BYTES: Final = np.uint64(0x00FF_00FF_00FF_00FF)
+EVEN_PAIRS: Final = np.uint64(0x0000_FFFF_0000_FFFF)
 
 
 class Kernels(NamedTuple):
@@ -48,33 +52,35 @@ def look_up(  # noqa: D103
     kind: NDArray[np.uint8],
     length: NDArray[np.uint8],
     is_fd: NDArray[np.bool_],
-    width: int,
     standard: NDArray[np.uint16],
     extended_ids: NDArray[np.uint32],
     extended_numbers: NDArray[np.uint16],
-    shortest: NDArray[np.int16],
-    longest: NDArray[np.int16],
+    fits: NDArray[np.bool_],
     number: NDArray[np.uint16],
     is_good: NDArray[np.bool_],
     counts: NDArray[np.intp],
+    seen: NDArray[np.intp],
+    unknown: NDArray[np.intp],
 ) -> None:
+    # Counting without branches: one that goes either way costs more than both its sides.
+    beyond = len(standard) - 1
     for i in range(len(arbitration_id)):
         identifier = arbitration_id[i]
         if is_extended[i]:
-            found = np.uint16(0)
-            place = np.searchsorted(extended_ids, identifier)
-            if place < len(extended_ids) and extended_ids[place] == identifier:
-                found = extended_numbers[place]
+            place, found = beyond, np.uint16(0)
+            at = np.searchsorted(extended_ids, identifier)
+            if at < len(extended_ids) and extended_ids[at] == identifier:
+                found = extended_numbers[at]
         else:
-            found = standard[min(int(identifier), len(standard) - 1)]
+            place = min(int(identifier), beyond)
+            found = standard[place]
+        is_data = kind[i] == DATA
+        good = is_data & fits[int(is_fd[i]), found, length[i]]
         number[i] = found
-        stated = np.int64(length[i])
-        most = np.int64(longest[1, found] if is_fd[i] else longest[0, found])
-        # Without shortcuts: a branch that goes either way costs more than both its sides.
-        fits = (stated <= most) | ((stated == LENGTH_UNKNOWN) & (most >= 0))
-        good = (kind[i] == DATA) & (min(stated, width) >= shortest[found]) & fits
         is_good[i] = good
-        counts[found if good else 0] += 1
+        counts[found] += int(good)
+        seen[found] += int(is_data)
+        unknown[place] += int(is_data & (found == 0))
 
 
 def put_in_order(  # noqa: D103
@@ -84,7 +90,6 @@ def put_in_order(  # noqa: D103
     words: NDArray[np.uint64],
     order: NDArray[np.intp],
     little: NDArray[np.uint64],
-    big: NDArray[np.uint64],
 ) -> None:
     following = starts.copy()
     width = words.shape[1]
@@ -96,20 +101,11 @@ def put_in_order(  # noqa: D103
         following[group] = row + 1
         order[row] = i
         for k in range(width):
-            word = words[i, k]
-            little[k, row] = word
-            swapped = ((word & np.uint64(0x00FF00FF00FF00FF)) << np.uint64(8)) | (
-                (word >> np.uint64(8)) & np.uint64(0x00FF00FF00FF00FF)
-            )
-            swapped = ((swapped & np.uint64(0x0000FFFF0000FFFF)) << np.uint64(16)) | (
-                (swapped >> np.uint64(16)) & np.uint64(0x0000FFFF0000FFFF)
-            )
-            big[k, row] = (swapped << np.uint64(32)) | (swapped >> np.uint64(32))
+            little[k, row] = words[i, k]
 
 
 def take_out(  # noqa: D103
     little: NDArray[np.uint64],
-    big: NDArray[np.uint64],
     stops: NDArray[np.intp],
     counts: NDArray[np.intp],
     base: NDArray[np.intp],
@@ -119,6 +115,8 @@ def take_out(  # noqa: D103
     bit: NDArray[np.uint64],
     length: NDArray[np.uint64],
     kind: NDArray[np.uint8],
+    flip: NDArray[np.uint64],
+    bias: NDArray[np.float64],
     scale: NDArray[np.float64],
     offset: NDArray[np.float64],
     whole_scale: NDArray[np.uint64],
@@ -130,52 +128,70 @@ def take_out(  # noqa: D103
     longest = counts[1:].max() if len(counts) > 1 else 0
     raw = np.empty(longest, np.uint64)  # its bits at the top, then at the bottom
     short = np.empty(longest, np.uint32)
+    big = np.empty((little.shape[0], longest), np.uint64)
     for group in range(1, len(counts)):
         n = counts[group]
         if n == 0:
             continue
         row = stops[group] - n
+        if is_big[first[group] : first[group + 1]].any():
+            for k in range(little.shape[0]):
+                for r in range(n):
+                    x = little[k, row + r]
+                    x = ((x & EVEN_BYTES) << np.uint64(8)) | ((x >> np.uint64(8)) & EVEN_BYTES)
+                    x = ((x & EVEN_PAIRS) << np.uint64(16)) | ((x >> np.uint64(16)) & EVEN_PAIRS)
+                    big[k, r] = (x << np.uint64(32)) | (x >> np.uint64(32))
         for j in range(first[group], first[group + 1]):
             at = base[group] + (j - first[group]) * n
             k, b, drop = word[j], bit[j], full - length[j]
             a, c = scale[j], offset[j]
-            words = big if is_big[j] else little
+            # Rows of one word, so that the loops below run over contiguous memory.
+            one = big[k, :n] if is_big[j] else little[k, row : row + n]
             if b + length[j] <= full:
                 up = b if is_big[j] else drop - b
                 for r in range(n):
-                    raw[r] = words[k, row + r] << up
+                    raw[r] = one[r] << up
             elif is_big[j]:
+                two = big[k + 1, :n]
                 for r in range(n):
-                    raw[r] = (words[k, row + r] << b) | (words[k + 1, row + r] >> (full - b))
+                    raw[r] = (one[r] << b) | (two[r] >> (full - b))
             else:
+                two = little[k + 1, row : row + n]
                 for r in range(n):
-                    low, high = words[k, row + r] >> b, words[k + 1, row + r] << (full - b)
-                    raw[r] = (low | high) << drop
+                    raw[r] = ((one[r] >> b) | (two[r] << (full - b))) << drop
+            out, whole = values[at : at + n], bits[at : at + n]
             which = kind[j]
-            if which == UNSIGNED:
+            if which == SHORT:
+                turn, less = flip[j], bias[j]
                 for r in range(n):
-                    values[at + r] = np.float64(np.int64(raw[r] >> drop)) * a + c
+                    raw[r] = (raw[r] >> drop) ^ turn
+                doubles = raw.view(np.float64)
+                for r in range(n):
+                    out[r] = (doubles[r] - less) * a + c
+            elif which == UNSIGNED:
+                for r in range(n):
+                    out[r] = np.float64(np.int64(raw[r] >> drop)) * a + c
             elif which == UNSIGNED_LONG:
                 for r in range(n):
-                    values[at + r] = np.float64(raw[r]) * a + c
+                    out[r] = np.float64(raw[r]) * a + c
             elif which == SIGNED:
                 for r in range(n):
-                    values[at + r] = np.float64(np.int64(raw[r]) >> np.int64(drop)) * a + c
+                    out[r] = np.float64(np.int64(raw[r]) >> np.int64(drop)) * a + c
             elif which == WHOLE_UNSIGNED:
                 for r in range(n):
-                    bits[at + r] = (raw[r] >> drop) * whole_scale[j] + whole_offset[j]
+                    whole[r] = (raw[r] >> drop) * whole_scale[j] + whole_offset[j]
             elif which == WHOLE_SIGNED:
                 for r in range(n):
                     number = np.uint64(np.int64(raw[r]) >> np.int64(drop))
-                    bits[at + r] = number * whole_scale[j] + whole_offset[j]
+                    whole[r] = number * whole_scale[j] + whole_offset[j]
             elif which in (SINGLE, SINGLE_SCALED):
                 for r in range(n):
                     short[r] = np.uint32(raw[r] >> drop)
                 singles = short.view(np.float32)
                 for r in range(n):
                     single = np.float64(singles[r])
-                    values[at + r] = single if which == SINGLE else single * a + c
+                    out[r] = single if which == SINGLE else single * a + c
             else:
                 doubles = raw.view(np.float64)
                 for r in range(n):
-                    values[at + r] = doubles[r] if which == DOUBLE else doubles[r] * a + c
+                    out[r] = doubles[r] if which == DOUBLE else doubles[r] * a + c
