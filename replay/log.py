@@ -112,7 +112,7 @@ FORMATS: Final[dict[str, Format]] = {
         (".bag", ".active"), (), "crosscue.replay.readers.rosbag1:open_bag", "ROS 1 bag"
     ),
     "rosbag2-sqlite3": Format(
-        (".db3",), (), "crosscue.replay.readers.sqlite3:open_db3", "ROS 2 bag (sqlite3)"
+        (".db3",), (), "crosscue.replay.readers.rosbag2_db3:open_db3", "ROS 2 bag (sqlite3)"
     ),
     "rosbag2": Format(
         (),

@@ -165,18 +165,26 @@ def judge(path: Path, truth: Sequence[Row], calm: frozenset[str] = frozenset()) 
     strange = Counter(reading.rows) - Counter(truth)
     if not strange:
         return "told" if was_told else "SILENT LOSS"
-    if _only_payloads_differ(reading.rows, truth, strange):
+    if _only_payloads_differ(reading.rows, truth, strange, path.suffix == ".db3"):
         assert "cannot be seen" in ledger.integrity
         return "undetectable"
     return "wrong, told" if was_told else "SILENT WRONG"
 
 
-def _only_payloads_differ(rows: Sequence[Row], truth: Sequence[Row], strange: Counter[Row]) -> bool:
-    """Every strange row has the topic, time and length of a row that is missing."""
+def _only_payloads_differ(
+    rows: Sequence[Row], truth: Sequence[Row], strange: Counter[Row], is_sqlite: bool
+) -> bool:
+    """Every strange row stands where a row is missing.
+
+    A bag's record headers are backed by its index, so topic, time and length must be the same. In
+    SQLite only the time is: a row's topic number and payload length stand there once.
+    """
+
+    def place(row: Row) -> tuple[str, int, int]:
+        return ("", row.log_ns, 0) if is_sqlite else (row.topic, row.log_ns, len(row.payload))
+
     missing = Counter(truth) - Counter(rows)
-    places = Counter((r.topic, r.log_ns, len(r.payload)) for r in missing.elements())
-    wanted = Counter((r.topic, r.log_ns, len(r.payload)) for r in strange.elements())
-    return not wanted - places
+    return not Counter(map(place, strange.elements())) - Counter(map(place, missing.elements()))
 
 
 def _check_identity(ledger: Ledger, rows: Sequence[Row]) -> None:

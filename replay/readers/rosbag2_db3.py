@@ -1,0 +1,323 @@
+"""ROS 2 bags in SQLite (.db3): all rows that SQLite can still reach, the rest told.
+
+SQLite has no checksums. What can be known is checked instead: SQLite's own integrity check, the
+time index against the rows, the types and the order of the rows, the file's length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Block, Int64s, Messages, Topic
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.log import EVERYTHING, Selection
+
+from .mixed import MixedRows, blocks_of
+from .rosbag2_inflate import DAMAGED, inflated
+from .rosbag2_rows import FIRST_ROWID, LAST_ROWID, Row, RowScan, index_times
+from .rosbag2_sqlite import FAULTS, Database, open_database
+from .rosbag2_tables import Tables, fetched, read_tables
+
+DAMAGED_PAGE: Final = "damaged page in the database"
+DISORDER: Final = "row out of order in a damaged page"
+UNSOUND: Final = "SQLite's integrity check finds damage"
+NO_TOPIC: Final = "message without a topic"
+NOT_A_TIME: Final = "timestamp is not an integer"
+NOT_BYTES: Final = "payload is not a blob"
+OTHER_TYPE: Final = "another message type on the same topic"
+INDEX_DIFFERS: Final = "row and time index disagree"
+
+
+class Db3Log:
+    """An open ROS 2 SQLite bag; see ``crosscue.replay.log.Log``."""
+
+    def __init__(self, path: Path, limits: Limits) -> None:
+        """Open it and learn its topics.
+
+        Raises:
+            LogFormatError: No SQLite file, or none with the tables of a ROS 2 bag.
+            LogError: SQLite cannot open it.
+            OSError: It cannot be read.
+        """
+        self._path = path
+        self._limits = limits
+        self._stamp = _stamp(path)
+        self._database = open_database(path, limits)
+        try:
+            self._tables = read_tables(self._database, path, limits)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def path(self) -> Path:
+        """Where it lies."""
+        return self._path
+
+    @property
+    def format(self) -> str:
+        """``rosbag2-sqlite3``."""
+        return "rosbag2-sqlite3"
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """Topics by their number in the file, with rows counted by SQLite."""
+        return tuple(self._tables.topics.values())
+
+    @property
+    def time_range_ns(self) -> tuple[int, int] | None:
+        """First and last timestamp, or None if there is none or SQLite cannot say."""
+        try:
+            query = "SELECT MIN(timestamp), MAX(timestamp) FROM messages"
+            first, last = fetched(self._database, query)[0]
+        except FAULTS:
+            return None
+        return (first, last) if isinstance(first, int) and isinstance(last, int) else None
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """Blocks of messages in the order of their row ids; see ``Log.read``."""
+        one = _Pass(self._database, self._tables, self._limits, ledger, selection)
+        yield from one.blocks()
+        if _stamp(self._path) != self._stamp:
+            ledger.lose("", "file changed while it was read", None, "read it again")
+
+    def close(self) -> None:
+        """Release the file and any temporary copy."""
+        self._database.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class _Pass:
+    """The state of one ``read``."""
+
+    def __init__(
+        self,
+        database: Database,
+        tables: Tables,
+        limits: Limits,
+        ledger: Ledger,
+        selection: Selection,
+    ) -> None:
+        self._database = database
+        self._tables = tables
+        self._limits = limits
+        self._ledger = ledger
+        self._selection = selection
+        self._names = list(tables.topics)
+        self._place = tables.places()
+        self._scan = RowScan(database, FIRST_ROWID, LAST_ROWID)
+        self._indexed: tuple[Int64s, Int64s] | None = None
+        self._in_time_by_index: int | None = None
+        self._in_time = 0
+        self._met = 0
+
+    def blocks(self) -> Iterator[Block]:
+        """Everything asked for, and the account of it."""
+        for sentence in (*self._database.notices, *self._tables.notices):
+            self._ledger.notice(sentence)
+        for topic in self._tables.topics.values():
+            self._ledger.declare(topic.name, topic.declared)
+        self._narrow()
+        problems = self._problems() if self._in_time_by_index is None else ""
+        for rows in self._scan.batches():
+            yield from self._blocks_of(rows)
+        self._finish(problems)
+
+    def _narrow(self) -> None:
+        """Scan only the row ids between which the times asked for lie, if the index is complete."""
+        asked, index, counts = self._selection, self._tables.index, self._tables.counts
+        if index is None or counts is None or (asked.start_ns is None and asked.end_ns is None):
+            return
+        start = FIRST_ROWID if asked.start_ns is None else asked.start_ns
+        end = LAST_ROWID if asked.end_ns is None else asked.end_ns
+        try:
+            total = fetched(self._database, f"SELECT COUNT(*) FROM messages INDEXED BY {index}")  # noqa: S608
+            query = (
+                f"SELECT MIN(rowid), MAX(rowid), COUNT(*) FROM messages INDEXED BY {index} "  # noqa: S608
+                "WHERE timestamp >= ? AND timestamp < ?"
+            )
+            first, last, count = fetched(self._database, query, (start, end))[0]
+        except FAULTS:
+            return
+        if total[0][0] == sum(counts.values()):
+            self._in_time_by_index = count
+            first, last = (0, -1) if first is None else (first, last)
+            self._scan = RowScan(self._database, first, last)
+
+    def _problems(self) -> str:
+        """What SQLite's integrity check says against the file; empty if nothing."""
+        try:
+            said = [str(row[0]) for row in fetched(self._database, "PRAGMA integrity_check(5)")]
+        except FAULTS as error:
+            said = [str(error)]
+        if self._database.missing_bytes:
+            said.append(f"{self._database.missing_bytes} bytes fewer than its header says")
+        if said == ["ok"]:
+            return ""
+        if self._tables.index is not None:
+            self._indexed = index_times(self._database, self._tables.index)
+        return "; ".join(said).replace("\n", " ")
+
+    def _blocks_of(self, rows: list[Row]) -> Iterator[Block]:
+        self._met += len(rows)
+        ids, topics, times, payloads = zip(*rows, strict=True)
+        if not (
+            set(map(type, topics)) == {int}
+            and set(map(type, times)) == {int}
+            and set(map(type, payloads)) == {bytes}
+        ):
+            rows = [row for row in rows if self._is_sound(row)]
+            if not rows:
+                return
+            ids, topics, times, payloads = zip(*rows, strict=True)
+        length = np.fromiter(map(len, payloads), dtype=np.int64, count=len(rows))
+        stop = np.cumsum(length)
+        messages = Messages(np.frombuffer(b"".join(payloads), dtype=np.uint8), stop - length, stop)
+        log_ns = np.fromiter(times, dtype=np.int64, count=len(rows))
+        place = self._placed(np.fromiter(topics, dtype=np.int64, count=len(rows)))
+        if self._indexed is not None:
+            self._drop_disputed(np.fromiter(ids, dtype=np.int64, count=len(rows)), log_ns, place)
+        if self._in_time_by_index is not None:
+            self._in_time += int(_within(log_ns, self._selection).sum())
+        yield from self._grouped(messages, place, log_ns)
+
+    def _grouped(self, messages: Messages, place: Int64s, log_ns: Int64s) -> Iterator[Block]:
+        for part, plain, damaged in inflated(messages, self._limits):
+            topic, times = place[part].copy(), log_ns[part]
+            for i in damaged[topic[damaged] >= 0]:
+                name = self._names[int(topic[i])]
+                self._ledger.lose(name, DAMAGED, 1, "zstd cannot decompress it", int(times[i]))
+            topic[damaged] = -1
+            keep = topic >= 0
+            start, stop = plain.start[keep], plain.stop[keep]
+            rows = MixedRows(plain.buffer, topic[keep], times[keep], start, stop)
+            yield from blocks_of(rows, self._names, self._selection, self._limits, self._ledger)
+
+    def _is_sound(self, row: Row) -> bool:
+        """Has the row the types it must have? One that has not is skipped by reason."""
+        number, topic, time, payload = row
+        if not isinstance(topic, int):
+            reason = NO_TOPIC
+        elif not isinstance(time, int):
+            reason = NOT_A_TIME
+        elif not isinstance(payload, bytes):
+            reason = NOT_BYTES
+        else:
+            return True
+        place = self._place.get(topic, -1) if isinstance(topic, int) else -1
+        name = self._names[place] if place >= 0 else ""
+        detail = (
+            f"row {number}: topic {topic!r:.40}, timestamp {time!r:.40}, "
+            f"payload {type(payload).__name__}"
+        )
+        self._ledger.find(name, 1)
+        self._ledger.skip(name, reason, 1, detail)
+        return False
+
+    def _placed(self, numbers: Int64s) -> Int64s:
+        """Place of each row's topic among the names; -1 for rows not to be handed on."""
+        distinct, which, counts = np.unique(numbers, return_inverse=True, return_counts=True)
+        place = np.array([self._place.get(int(n), -1) for n in distinct], dtype=np.int64)
+        for i in np.flatnonzero(place < 0):
+            number, count = int(distinct[i]), int(counts[i])
+            name = next((s.name for s in self._tables.stored if s.number == number), "")
+            self._ledger.find(name, count)
+            reason = OTHER_TYPE if name else NO_TOPIC
+            self._ledger.skip(name, reason, count, f"topic number {number}")
+        return place[which]
+
+    def _drop_disputed(self, ids: Int64s, log_ns: Int64s, place: Int64s) -> None:
+        """Give no row whose time the index has otherwise: no checksum says which is right."""
+        if self._indexed is None or not len(self._indexed[0]):
+            return
+        listed, times = self._indexed
+        at = np.minimum(np.searchsorted(listed, ids), len(listed) - 1)
+        for i in np.flatnonzero((listed[at] == ids) & (times[at] != log_ns) & (place >= 0)):
+            detail = f"row {ids[i]}: row {log_ns[i]}, index {times[at[i]]}"
+            self._ledger.lose(self._names[int(place[i])], INDEX_DIFFERS, 1, detail)
+            place[i] = -1
+
+    def _finish(self, problems: str) -> None:
+        """Settle with what SQLite counted, and say what was checked."""
+        ledger, scan = self._ledger, self._scan
+        is_part = self._in_time_by_index is not None
+        ledger.integrity = (
+            "SQLite has no checksums: a changed payload byte, length or topic number cannot be seen"
+        )
+        if is_part and self._in_time_by_index != self._in_time:
+            detail = f"index {self._in_time_by_index}, rows {self._in_time}"
+            ledger.lose("", INDEX_DIFFERS, None, detail)
+        if is_part and not scan.holes:
+            self._skip_rest()
+        for name in self._names:
+            ledger.settle(name, DAMAGED_PAGE)
+        if scan.disordered and ledger.is_whole:
+            ledger.lose("", DISORDER, scan.disordered)
+        if scan.holes and ledger.is_whole:
+            ledger.lose("", DAMAGED_PAGE, self._missing(), "; ".join(scan.holes[:3]))
+        if is_part:
+            ledger.integrity += "; a part was read, the file's structure was not checked"
+        elif not problems:
+            ledger.integrity += "; SQLite's check of its structure finds no fault"
+        else:
+            ledger.integrity += "; SQLite's check finds damage"
+            if ledger.is_whole:
+                ledger.lose("", UNSOUND, None, problems)
+            else:
+                ledger.notice(f"{UNSOUND}: {problems}")
+
+    def _missing(self) -> int | None:
+        """Rows that the time index lists beyond those met, or None if it cannot say."""
+        if self._indexed is None or len(self._indexed[0]) <= self._met:
+            return None
+        return len(self._indexed[0]) - self._met
+
+    def _skip_rest(self) -> None:
+        """Count the rows outside the scan, never fetched, as skipped."""
+        for name, topic in self._tables.topics.items():
+            rest = (topic.declared or 0) - self._ledger.topic(name).in_file
+            if rest > 0:
+                reason = NOT_ASKED_TIME if self._selection.wants(name) else NOT_ASKED_TOPIC
+                self._ledger.find(name, rest)
+                self._ledger.skip(name, reason, rest)
+
+
+def _within(log_ns: Int64s, asked: Selection) -> NDArray[np.bool_]:
+    inside = np.ones(len(log_ns), dtype=np.bool_)
+    if asked.start_ns is not None:
+        inside &= log_ns >= asked.start_ns
+    if asked.end_ns is not None:
+        inside &= log_ns < asked.end_ns
+    return inside
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    at = path.stat()
+    return at.st_size, at.st_mtime_ns
+
+
+def open_db3(path: Path, limits: Limits = DEFAULT) -> Db3Log:
+    """Open a ROS 2 SQLite bag.
+
+    Raises:
+        LogError: No ROS 2 bag, damaged in its first pages, or locked.
+        OSError: It cannot be read.
+    """
+    return Db3Log(path, limits)

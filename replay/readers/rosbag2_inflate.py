@@ -1,0 +1,71 @@
+"""Messages that rosbag2 compressed one by one (zstd), told by their own first bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import BLOCK_BYTES, Bytes, Int64s, Messages
+from crosscue.replay.limits import Limits
+
+ZSTD_MAGIC: Final = 0xFD2FB528
+"""As a little-endian number; no CDR message begins so."""
+
+DAMAGED: Final = "damaged compressed message"
+_WINDOW_BYTES: Final = 1 << 27
+
+
+def is_compressed(buffer: Bytes, start: Int64s, stop: Int64s) -> NDArray[np.bool_]:
+    """Shape (N,): which messages begin as a zstd frame does."""
+    long: NDArray[np.bool_] = stop - start >= 4
+    first = np.zeros(len(start), dtype=np.uint32)
+    for shift in range(4):
+        first[long] |= buffer[start[long] + shift].astype(np.uint32) << np.uint32(8 * shift)
+    packed: NDArray[np.bool_] = long & (first == ZSTD_MAGIC)
+    return packed
+
+
+def inflated(messages: Messages, limits: Limits) -> Iterator[tuple[slice, Messages, Int64s]]:
+    """Messages with the compressed ones decompressed, a bounded stretch at a time.
+
+    Yields:
+        The stretch of the rows given, its messages, and which of them are damaged (their numbers
+        within the stretch; their range is empty).
+    """
+    packed = is_compressed(messages.buffer, messages.start, messages.stop)
+    if not packed.any():
+        yield slice(0, len(messages)), messages, np.empty(0, dtype=np.int64)
+        return
+    first, parts, bad, size = 0, list[bytes](), list[int](), 0
+    for i in range(len(messages)):
+        raw = bytes(messages.payload(i))
+        part = _one(raw, limits.message_bytes) if packed[i] else raw
+        if part is None:
+            bad.append(i - first)
+            part = b""
+        parts.append(part)
+        size += len(part)
+        if size >= BLOCK_BYTES or i + 1 == len(messages):
+            yield slice(first, i + 1), _joined(parts), np.array(bad, dtype=np.int64)
+            first, parts, bad, size = i + 1, [], [], 0
+
+
+def _joined(parts: list[bytes]) -> Messages:
+    length = np.fromiter(map(len, parts), dtype=np.int64, count=len(parts))
+    stop = np.cumsum(length)
+    return Messages(np.frombuffer(b"".join(parts), dtype=np.uint8), stop - length, stop)
+
+
+def _one(raw: bytes, largest: int) -> bytes | None:
+    import zstandard
+
+    try:
+        if zstandard.frame_content_size(raw) > largest:
+            return None
+        stream = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
+        return stream.decompress(raw, max_output_size=largest)
+    except (zstandard.ZstdError, MemoryError):
+        return None
