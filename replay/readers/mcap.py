@@ -26,7 +26,7 @@ from crosscue.replay.log import EVERYTHING, Selection
 from .mcap_bytes import ByteFile
 from .mcap_pass import read_segments
 from .mcap_segments import Segment, find_segments
-from .mcap_topics import Declarations, TopicBook
+from .mcap_topics import TopicBook
 
 
 class McapLog:
@@ -99,8 +99,7 @@ def declared_counts(segments: tuple[Segment, ...], book: TopicBook) -> dict[str,
         summary = segment.summary
         if summary is None or not summary.counts_channels or summary.statistics is None:
             return {}
-        declarations = Declarations(book, summary.schemas.values(), summary.channels.values())
-        for channel_id, topic in declarations.topics():
+        for channel_id, topic in segment.declarations(book).topics():
             counts[topic] += summary.statistics.by_channel.get(channel_id, 0)
     return dict(counts)
 

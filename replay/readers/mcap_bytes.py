@@ -82,6 +82,8 @@ class ByteFile:
         self._file.close()
 
     def _pread(self, at: int, size: int) -> bytes:
+        if at >= self.size:  # also where a damaged length leads, beyond what a file can hold
+            return b""
         try:
             return os.pread(self._file.fileno(), size, at)
         except OSError as error:

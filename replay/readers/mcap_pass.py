@@ -21,13 +21,14 @@ from .mcap_records import PREFIX, BrokenRecordError
 from .mcap_rows import NEVER_IN_A_CHUNK, Rows, contradicts, rows_by_index, rows_by_scan
 from .mcap_scan import Scanner
 from .mcap_segments import Segment, Summary
-from .mcap_topics import Declarations, TopicBook
+from .mcap_topics import TopicBook
 from .mcap_walk import Attachment, Chunk, End, Gap, How, Ignored, Item, Oversized, Run, Stray, Walk
 
 DAMAGED_CHUNK: Final = "damaged chunk"
 DAMAGED_RECORD: Final = "damaged record"
 DAMAGED_SECTION: Final = "only the data section's checksum covers it, which is wrong"
 MISSING: Final = "declared by the format, not in its bytes"
+INCOMPLETE: Final = "the file does not end as it should"
 CUT: Final = "the file is cut"
 DETAILS_JOINED: Final = 10
 
@@ -111,9 +112,7 @@ class SegmentPass:
         self._damages: list[Damage] = []
         self._section: Future[int | None] | None = None
         self._attachments: list[tuple[int, int, Future[int | None]]] = []
-        schemas, channels = self._summary.schemas.values(), self._summary.channels.values()
-        self._declarations = Declarations(book, schemas, channels)
-        self._planned = Declarations(book, schemas, channels)
+        self._declarations = segment.declarations(book)
         self._giver = Giver(ledger, selection, limits, self._declarations)
 
     def blocks(self) -> Iterator[Block]:
@@ -136,6 +135,8 @@ class SegmentPass:
                 yield from self._run(item)
             else:
                 self._note(item)
+        if segment.after:
+            self._ledger.lose("", INCOMPLETE, None, self._where + segment.after)
         self._finish_checks()
 
     def _is_wanted(self, chunk: Chunk) -> bool:
@@ -147,7 +148,7 @@ class SegmentPass:
             return True
         filled = [m for m in chunk.messages if len(m.entries)]
         ids = {m.channel_id for m in filled}
-        if ids != index.channels or not ids <= self._summary.channels.keys():
+        if ids != index.channels or not ids <= self._declarations.complete:
             return True
         if not filled or min(int(m.entries["log"].min()) for m in filled) != head.start:
             return True
@@ -199,10 +200,12 @@ class SegmentPass:
         head = chunk.head
         assert head is not None, "a chunk with rows has a head"
         log = rows.head["log"]
-        strays = len(log) and not head.start <= log.min() <= log.max() <= head.end
         doubt = chunk.differs
-        if strays and (head.start or head.end):
-            doubt = doubt or "its messages lie outside the time span it declares"
+        if not doubt and (head.start or head.end):
+            if not len(log):
+                doubt = "it declares a time span and holds no message"
+            elif not head.start <= log.min() <= log.max() <= head.end:
+                doubt = "its messages lie outside the time span it declares"
         if head.crc or (self._segment.data_crc and self._section_is_right()):
             self._checks.chunks_right += 1
             if doubt:
@@ -210,7 +213,8 @@ class SegmentPass:
             return
         if self._segment.data_crc:
             raise BrokenRecordError(DAMAGED_SECTION)
-        self._checks.chunks_bare += 1
+        self._checks.chunks_bare += 1 if head.size else 0
+        self._checks.chunks_right += 0 if head.size else 1
         if doubt or contradicts(rows, chunk.messages):
             doubt = doubt or "its message index names other messages"
             raise BrokenRecordError(f"has no checksum, and {doubt}")

@@ -49,6 +49,7 @@ from .mcap_walk import Chunk, End, How, Run, Walk
 
 SMALLEST_CHUNK: Final = PREFIX.size + CHUNK_FIXED
 HEADER_MOST: Final = 1 << 16
+DATA_END_PREFIX: Final = PREFIX.pack(DATA_END, DATA_END_SIZE - PREFIX.size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,14 +77,19 @@ class Summary:
         return counted is not None and (bool(counted.by_channel) or not counted.message_count)
 
     @property
+    def mentioned(self) -> frozenset[int]:
+        """Channels that its counts or indexes mention."""
+        found = frozenset[int]().union(*(chunk.channels for chunk in self.chunks.values()))
+        return found if self.statistics is None else found | self.statistics.by_channel.keys()
+
+    @property
     def names_all(self) -> bool:
-        """Does it name every channel that its own counts or indexes mention?"""
-        mentioned = set[int]().union(*(chunk.channels for chunk in self.chunks.values()))
-        if self.statistics is not None:
-            mentioned |= self.statistics.by_channel.keys()
-            if self.statistics.message_count and not self.channels:
-                return False
-        return bool(self.channels) and mentioned <= self.channels.keys()
+        """Does it declare, with its schema, every channel that is mentioned anywhere?"""
+        if not self.channels:
+            return self.statistics is not None and not self.statistics.message_count
+        known = self.schemas.keys() | {0}
+        is_complete = all(channel.schema_id in known for channel in self.channels.values())
+        return is_complete and self.mentioned <= self.channels.keys()
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +103,11 @@ class Segment:
         has_end: Its data section is closed.
         data_crc: CRC-32 of the bytes from ``base`` to ``end``, 0 for none.
         summary: What its summary says, or None.
+        schemas: All that became known before reading.
+        channels: The same.
         notices: What is to be said about it.
+        after: What is wrong behind its messages, so that nobody knows what the file once held;
+            empty if nothing is.
     """
 
     base: int
@@ -106,7 +116,14 @@ class Segment:
     has_end: bool
     data_crc: int = 0
     summary: Summary | None = None
+    schemas: tuple[Schema, ...] = ()
+    channels: tuple[Channel, ...] = ()
     notices: tuple[str, ...] = ()
+    after: str = ""
+
+    def declarations(self, book: TopicBook) -> Declarations:
+        """What was known before reading."""
+        return Declarations(book, self.schemas, self.channels)
 
     @property
     def rail(self) -> Mapping[int, ChunkIndex] | None:
@@ -132,8 +149,7 @@ def find_segments(
         )
     segment = _by_footer(file, limits)
     if segment is not None and segment.summary is not None and segment.summary.names_all:
-        _enter(Declarations(book, *_declared(segment.summary)))
-        return (segment,)
+        return (_enter(segment, Declarations(book, *_declared(segment.summary))),)
     segments = (
         (_survey_named(file, segment, book, limits),)
         if segment is not None
@@ -257,19 +273,20 @@ def _declared(summary: Summary) -> tuple[list[Schema], list[Channel]]:
     return list(summary.schemas.values()), list(summary.channels.values())
 
 
-def _enter(declarations: Declarations) -> None:
-    """Enter all topics declared so far, in the order of their channels' numbers."""
+def _enter(segment: Segment, declarations: Declarations) -> Segment:
+    """The segment with what is declared; all topics entered in the order of channel numbers."""
     for _ in declarations.topics():
         pass
+    return replace(segment, schemas=declarations.schemas, channels=declarations.channels)
 
 
 def _survey_named(file: ByteFile, segment: Segment, book: TopicBook, limits: Limits) -> Segment:
     """A segment whose summary does not name all channels: find them in its data section."""
     scanner = Scanner()
     walk = Walk(file, segment.begin, segment.end, segment.rail, limits, scanner)
-    summary = segment.summary or Summary()
-    _collect(file, walk, Declarations(book, *_declared(summary)), limits, scanner)
-    return segment
+    declarations = Declarations(book, *_declared(segment.summary or Summary()))
+    _collect(file, walk, declarations, limits, scanner)
+    return _enter(segment, declarations)
 
 
 def _survey(file: ByteFile, book: TopicBook, limits: Limits) -> tuple[Segment, ...]:
@@ -282,15 +299,16 @@ def _survey(file: ByteFile, book: TopicBook, limits: Limits) -> tuple[Segment, .
         declarations = Declarations(book)
         end = _collect(file, walk, declarations, limits, scanner)
         segment, after = _close(file, base, begin, end, limits)
-        if segment.summary is not None:
-            _enter(Declarations(book, *_declared(segment.summary)))
-        segments.append(segment)
+        summary = segment.summary or Summary()
+        for channel in summary.channels.values():
+            declarations.declare_missing(channel, summary.schemas.get(channel.schema_id))
+        segments.append(_enter(segment, declarations))
         if after is None:
             break
         if bytes(file.peek(after, len(MAGIC))) != MAGIC:
-            if after < file.size:
-                left = f"{file.size - after} bytes follow the end of the recording; not read"
-                segments[-1] = replace(segment, notices=(*segment.notices, left))
+            if _is_filled(file, after):
+                left = f"{file.size - after} bytes from byte {after} on are no MCAP recording"
+                segments[-1] = replace(segments[-1], after=left)
             break
         base = after
     return tuple(segments)
@@ -299,10 +317,9 @@ def _survey(file: ByteFile, book: TopicBook, limits: Limits) -> tuple[Segment, .
 def _collect(
     file: ByteFile, walk: Walk, declarations: Declarations, limits: Limits, scanner: Scanner
 ) -> End:
-    """Walk to the end, entering the topics met; chunks are read only where a channel is new."""
+    """Walk to the end, taking the definitions met; chunks are read only where one is new."""
     for item in walk:
         if isinstance(item, End):
-            _enter(declarations)
             return item
         if isinstance(item, Run):
             _take(declarations, item.rows.definitions)
@@ -313,7 +330,7 @@ def _collect(
 
 def _is_known(chunk: Chunk, declarations: Declarations) -> bool:
     ids = {index.channel_id for index in chunk.messages}
-    return bool(ids) and ids <= declarations.channel_ids
+    return bool(ids) and ids <= declarations.complete
 
 
 def _definitions_in(
@@ -337,7 +354,7 @@ def _take(declarations: Declarations, definitions: Sequence[Definition]) -> None
     for definition in definitions:
         try:
             if declarations.changed_by(definition):
-                _enter(declarations)
+                list(declarations.topics())  # enters what now gets another meaning
             declarations.declare(definition)
         except BrokenRecordError:
             continue  # told when it is met again in reading
@@ -354,8 +371,13 @@ def _close(
     segment = Segment(base, begin, end.at, True, data_crc)
     footer_at = _footer_after(file, summary_at)
     if footer_at is None:
-        notice = "the file is cut or damaged within its summary, which is not used"
-        return replace(segment, notices=(notice,)), _next_magic(file, summary_at)
+        if bytes(file.peek(file.size - len(MAGIC), len(MAGIC))) != MAGIC:
+            return replace(segment, after="the file ends within its summary"), None
+        notice = "the file is damaged within its summary, which is not used"
+        following = _find(file, summary_at, MAGIC + bytes([HEADER]))
+        hidden = None if following else _find(file, summary_at, DATA_END_PREFIX)
+        left = f"another recording, damaged at its beginning, ends at byte {hidden}"
+        return replace(segment, notices=(notice,), after=left if hidden else ""), following
     summary: Summary | None = None
     notices: list[str] = []
     if footer_at > summary_at:
@@ -365,9 +387,12 @@ def _close(
         except BrokenRecordError as error:
             notices.append(f"its summary is not used: {error}")
     after = footer_at + FOOTER_SIZE
-    if bytes(file.peek(after, len(MAGIC))) != MAGIC:
+    left = ""
+    if after + len(MAGIC) > file.size:
+        left = "the file ends within its last bytes"
+    elif bytes(file.peek(after, len(MAGIC))) != MAGIC:
         notices.append("it does not end with the magic bytes of MCAP")
-    segment = replace(segment, summary=summary, notices=tuple(notices))
+    segment = replace(segment, summary=summary, notices=tuple(notices), after=left)
     return segment, after + len(MAGIC)
 
 
@@ -389,9 +414,18 @@ def _footer_after(file: ByteFile, at: int) -> int | None:
         at += PREFIX.size + length
 
 
-def _next_magic(file: ByteFile, at: int) -> int | None:
-    """Where, after ``at``, another recording begins."""
-    wanted = MAGIC + bytes([HEADER])
+def _is_filled(file: ByteFile, at: int) -> bool:
+    """Is anything but zeros there from ``at`` to the end? Some recorders reserve space ahead."""
+    while at < file.size:
+        window = file.window(at, PIECE)
+        if not len(window) or any(window):
+            break
+        at += len(window)
+    return at < file.size
+
+
+def _find(file: ByteFile, at: int, wanted: bytes) -> int | None:
+    """Where these bytes stand next, from ``at`` on."""
     while at < file.size:
         window = bytes(file.window(at, PIECE))
         found = window.find(wanted)

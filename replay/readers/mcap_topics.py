@@ -86,9 +86,20 @@ class Declarations:
         self.redefined: set[int] = set()
 
     @property
-    def channel_ids(self) -> frozenset[int]:
-        """Numbers of the channels declared so far."""
-        return frozenset(self._channels)
+    def schemas(self) -> tuple[Schema, ...]:
+        """The schemas in force."""
+        return tuple(self._schemas.values())
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """The channels in force."""
+        return tuple(self._channels.values())
+
+    @property
+    def complete(self) -> frozenset[int]:
+        """Numbers of the channels declared together with their schema."""
+        known = self._schemas.keys() | {0}
+        return frozenset(c.id for c in self._channels.values() if c.schema_id in known)
 
     def changed_by(self, found: Definition) -> bool:
         """Would ``found`` give another meaning to a number that already has one?
@@ -129,6 +140,12 @@ class Declarations:
             if schema.id:  # the format has readers ignore number 0
                 self._schemas[schema.id] = schema
         self._seen.add(key)
+
+    def declare_missing(self, channel: Channel, schema: Schema | None) -> None:
+        """Take a channel and its schema from a summary, unless the data section had them."""
+        self._channels.setdefault(channel.id, channel)
+        if schema is not None:
+            self._schemas.setdefault(schema.id, schema)
 
     def topic(self, channel_id: int) -> str:
         """The topic of a channel, ``UNKNOWN`` if nobody declares it."""

@@ -360,6 +360,8 @@ class Walk:
             return Chunk(at, body_at, head, None, fault, is_cut=True)
         else:
             raise BrokenRecordError(f"a chunk of {length} bytes does not fit")
+        if inner_end < end and not differs:
+            differs = f"{end - inner_end} bytes follow its records"
         if inner_end > end and not fault:
             fault = f"declares {head.body_size} bytes of records, has {max(0, end - body_at)}"
         messages, index_fault = self._message_indexes(end, index)

@@ -162,7 +162,7 @@ class McapFile:
             at = len(out)
             if isinstance(part, bytes):
                 out += part
-                inner = [part]
+                inner: list[bytes] = [part]
             else:
                 out += part.coded()
                 length, offsets = len(out) - at, {}
@@ -181,7 +181,8 @@ class McapFile:
         out += record(15, struct.pack("<I", zlib.crc32(out) if self.data_crc else 0))
         summary = bytearray()
         if self.summary and self.repeats:
-            summary += b"".join(sorted(definitions, key=lambda one: one[0]))
+            again: list[bytes] = sorted(definitions, key=lambda one: one[0])
+            summary += b"".join(again)
         if self.summary and self.statistics:
             summary += _statistics(counts, logs, len(indexes))
         if self.summary and self.chunk_index:

@@ -1,0 +1,132 @@
+"""Seeded damage to MCAP files, and what a reader must make of it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+
+from crosscue.replay.errors import CrosscueError
+from support.mcap_files import ChunkOf, McapFile, Reading, channel, message, read_back, schema
+
+TOPICS = ("/imu", "/can", "/camera")
+
+
+def sound_parts(compression: str, is_chunked: bool, per_chunk: int = 25) -> list[bytes | ChunkOf]:
+    """Six hundred messages on three topics, as chunks or as bare records."""
+    rng = np.random.default_rng(7)
+    defined = [schema(1)] + [channel(i + 1, 1, name) for i, name in enumerate(TOPICS)]
+    # Payloads that say their own number cannot pass for one another.
+    messages = [
+        message(1 + i % 3, 10**9 + i * 1000, b"%06d" % i + rng.bytes(i * 13 % 60) + bytes(i % 40))
+        for i in range(600)
+    ]
+    if not is_chunked:
+        return [*defined, *messages]
+    first, *rest = [messages[i : i + per_chunk] for i in range(0, len(messages), per_chunk)]
+    return [ChunkOf([*defined, *first], compression), *(ChunkOf(m, compression) for m in rest)]
+
+
+def _without_index(part: bytes | ChunkOf) -> bytes | ChunkOf:
+    return part if isinstance(part, bytes) else replace(part, is_indexed=False)
+
+
+def sound_files() -> Iterator[tuple[str, bytes]]:
+    """Files with checksums, by name."""
+    for compression in ("", "lz4", "zstd"):
+        parts = sound_parts(compression, is_chunked=True)
+        name = compression or "none"
+        yield f"{name} indexed", McapFile(parts, data_crc=True).coded()
+        yield f"{name} without data crc", McapFile(parts).coded()
+        yield f"{name} without summary", McapFile(parts, summary=False).coded()
+        yield f"{name} without statistics", McapFile(parts, statistics=False).coded()
+        bare = [
+            ChunkOf(p.records, p.compression, is_indexed=False)
+            for p in parts
+            if not isinstance(p, bytes)
+        ]
+        yield f"{name} without any index", McapFile(bare, summary=False).coded()
+    yield "no chunks", McapFile(sound_parts("", is_chunked=False), data_crc=True).coded()
+    mixed = sound_parts("zstd", is_chunked=True)
+    outside = [message(2, 5_000 + i, b"outside %d" % i) for i in range(30)]
+    yield "mixed", McapFile([*mixed[:8], *outside, *mixed[8:]], data_crc=True).coded()
+    one = McapFile(mixed).coded()
+    yield "two in a row", one + McapFile(sound_parts("lz4", is_chunked=True)).coded()
+
+
+class Kind(Enum):
+    """What became of one damaged copy."""
+
+    REFUSED = "refused with one line"
+    SAME = "everything given, nothing to tell"
+    TOLD = "loss told"
+    NOTICED = "everything given, with a notice"
+    SILENT = "SILENT LOSS"
+    WRONG = "WRONG MESSAGE"
+    UNBALANCED = "ACCOUNT DOES NOT ADD UP, OR ERROR IS NOT ONE LINE"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of one damaged copy, and the share of messages kept."""
+
+    kind: Kind
+    kept: float = 0.0
+
+
+def judge(path: Path, truth: Reading) -> Verdict:
+    """Read a damaged copy and compare it with what the sound file gave."""
+    try:
+        reading = read_back(path)
+    except CrosscueError as error:
+        return Verdict(Kind.UNBALANCED if "\n" in str(error) else Kind.REFUSED)
+    kept = reading.count() / truth.count()
+    for topic, messages in reading.messages.items():
+        if Counter(messages) - Counter(truth.messages.get(topic, [])):
+            return Verdict(Kind.WRONG, kept)
+    if not reading.adds_up():
+        return Verdict(Kind.UNBALANCED, kept)
+    if reading.count() < truth.count():
+        return Verdict(Kind.SILENT if reading.ledger.is_whole else Kind.TOLD, kept)
+    if not reading.ledger.is_whole:
+        return Verdict(Kind.TOLD, kept)
+    said = reading.ledger.notices != truth.ledger.notices
+    return Verdict(Kind.NOTICED if said else Kind.SAME, kept)
+
+
+def cut(coded: bytes, rng: np.random.Generator) -> bytes:
+    """The file up to a random byte."""
+    return coded[: int(rng.integers(0, len(coded)))]
+
+
+def damage(coded: bytes, rng: np.random.Generator) -> bytes:
+    """1 to 64 bytes overwritten: by noise, zeros, ones, one flipped bit, or moved bytes."""
+    out = bytearray(coded)
+    size = int(rng.integers(1, 65))
+    at = int(rng.integers(0, len(coded) - size))
+    match int(rng.integers(0, 5)):
+        case 0:
+            out[at : at + size] = rng.bytes(size)
+        case 1:
+            out[at : at + size] = bytes(size)
+        case 2:
+            out[at : at + size] = b"\xff" * size
+        case 3:
+            out[at] ^= 1 << int(rng.integers(0, 8))
+        case _:
+            other = int(rng.integers(0, len(coded) - size))
+            out[at : at + size] = coded[other : other + size]
+    return bytes(out)
+
+
+def copies(coded: bytes, seed: int, cuts: int, damages: int) -> Iterator[tuple[str, bytes]]:
+    """Damaged copies of a file, each with a word on what was done; the seed fixes them all."""
+    rng = np.random.default_rng(seed)
+    for i in range(cuts):
+        yield f"cut {i}", cut(coded, rng)
+    for i in range(damages):
+        yield f"damage {i}", damage(coded, rng)
