@@ -86,7 +86,7 @@ def _log_pose(recording: rr.RecordingStream, pose: Mapping[str, Floats]) -> None
     times = [_time_column(t_ns[some])]
     rings = _rings(flat[some], _position_cov(pose, some))
     recording.send_columns(
-        "plan/ellipse", indexes=times, columns=rr.LineStrips3D.columns(strips=list(rings[:, None]))
+        "plan/ellipse", indexes=times, columns=rr.LineStrips3D.columns(strips=list(rings))
     )
     recording.log("plan/ellipse", rr.LineStrips3D.from_fields(colors=[ELLIPSE]), static=True)
     heading = pose["heading_rad"][some]

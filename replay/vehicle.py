@@ -101,7 +101,8 @@ class Odometry(Section):
     wheel_scale: Positive = 1.0
     use_front_wheels: bool = False
     wheel_step_mps: NotNegative = 0.0028
-    slip_per_sqrt_m: NotNegative = 0.02
+    slip_per_sqrt_m: NotNegative = 0.1
+    """A wheel radius that is off by one per cent shows as 1 m after 100 m: this much."""
     heading_from: Literal["auto", "yaw_rate", "steering", "wheels"] = "auto"
     """Which signal turns the pose; ``auto`` takes the first of these three that the log has."""
     yaw_rate_scale: Positive = 1.0
