@@ -103,7 +103,7 @@ def test_counts_that_differ_without_a_reason_are_never_zipped_in_silence(tmp_pat
     assert of_fewer.topic("fewer").lost == {"a time without its picture": 2}
     assert "paired in order from the first" in of_fewer.notices[0]
     assert of_more.topic("more").skipped == {"a picture without its time": 2}
-    assert any("7 pictures and 5 times" in notice for notice in of_more.notices)
+    assert any("7 files and 5 times" in notice for notice in of_more.notices)
 
 
 def test_gaps_in_numbers_with_as_many_times_are_told(tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ def test_an_empty_folder_and_one_without_pictures_are_refused(tmp_path: Path) ->
 def test_a_time_file_of_another_folder_is_refused(tmp_path: Path) -> None:
     folder = picture_folder(tmp_path / "front", 2, "left_0.png,0.5\n")
 
-    with pytest.raises(LogFormatError, match=r"no line names a picture .* 'frame_0.png'"):
+    with pytest.raises(LogFormatError, match=r"no line names a file .* 'frame_0.png'"):
         open_log(folder)
 
 

@@ -1,7 +1,7 @@
 """A folder of pictures and a time file: one camera.
 
 Which files are time files and how they are read: ``time_file``; how pictures get their times:
-``picture_files``. The topic is called after the folder.
+``timed_files``. The topic is called after the folder.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, Selection
 
-from .picture_files import PictureFiles, list_pictures, pair
+from .picture_files import SUFFIXES, PictureFiles
 from .time_file import find_time_file, read_time_file
+from .timed_files import list_files, pair
 
 
 class ImageFolder:
@@ -62,7 +63,7 @@ def open_images(path: Path, limits: Limits) -> ImageFolder:
     Raises:
         LogFormatError: No picture, no time file, or a time file that cannot be understood.
     """
-    paths = list_pictures(path)
+    paths = list_files(path, SUFFIXES)
     if not paths:
         raise LogFormatError(f"{path}: no picture in it; want .png, .jpg or .webp files")
     time_file = find_time_file(path)
@@ -74,5 +75,7 @@ def open_images(path: Path, limits: Limits) -> ImageFolder:
         )
     times = read_time_file(time_file, limits)
     name = path.resolve()
-    topic = name.parent.name if name.name == "data" else name.name
-    return ImageFolder(path, pair(topic or "images", "crosscue/Images", paths, times), limits)
+    camera = name.parent.name if name.name == "data" else name.name
+    files = pair(paths, times)
+    topic = Topic(camera or "images", "crosscue/Images", "columns", declared=files.declared)
+    return ImageFolder(path, PictureFiles(topic, files), limits)
