@@ -16,8 +16,8 @@ import numpy as np
 from crosscue.replay.columns import DATA, REMOTE, Int64s
 from crosscue.replay.ledger import Ledger
 
-from .can_lines import Lines, tokens_of
-from .can_spaced import NO_FRAMES_FAST, Spaced, spaced_frames
+from .can_lines import Lines, clean_lines, next_fields, skip_gap
+from .can_spaced import NOTHING_FAST, Spaced, is_way, payload_stop, spaced_frames
 from .can_text import Damage, Dialect, Fast, Frame, Mark, Other, Outcome
 from .digits import NANOS, Bools, decimal
 
@@ -55,35 +55,25 @@ class Busmaster(Dialect):
 
     def fast(self, lines: Lines) -> Fast:
         """Data frames in hexadecimal."""
-        tokens = tokens_of(lines)
-        line = np.flatnonzero(tokens.count >= 6)
+        line = clean_lines(lines)
         if self._base != 16 or not len(line):
-            return NO_FRAMES_FAST
-        first = tokens.first[line]
+            return NOTHING_FAST
+        limit = lines.stop[line]
+        time, way, bus, identifier, letter, code, rest = next_fields(
+            lines, lines.start[line], limit, 7
+        )
         buffer = lines.buffer
-        length = buffer[tokens.start[first + 5]].astype(np.int64) - ord("0")
-        kind = buffer[tokens.start[first + 4]]
-        ok = (length >= 0) & (length <= 8) & (tokens.count[line] == 6 + length)
-        ok &= (tokens.stop[first + 5] - tokens.start[first + 5]) == 1
-        ok &= (tokens.stop[first + 4] - tokens.start[first + 4]) == 1
-        ok &= ((kind == ord("s")) | (kind == ord("x"))) & (buffer[lines.start[line]] != ord("*"))
-        line, first, length, kind = line[ok], first[ok], length[ok], kind[ok]
-        t_ns, time_ok = _time_of_day(lines, tokens.start[first], tokens.stop[first])
-        way = buffer[tokens.start[first + 1]]
-        time_ok &= (buffer[tokens.stop[first + 1] - 1] == ord("x")) & (
-            (way == ord("R")) | (way == ord("T"))
+        length = buffer[code.start].astype(np.int64) - ord("0")
+        kind = buffer[letter.start]
+        ok = (length >= 0) & (length <= 8) & (code.size == 1) & (letter.size == 1)
+        ok &= ((kind == ord("s")) | (kind == ord("x"))) & is_way(lines, way)
+        t_ns, time_ok = _time_of_day(lines, time.start, time.stop)
+        no_fd = np.zeros(len(line), np.bool_)
+        at = Spaced(
+            line, bus, identifier, kind == ord("x"), np.clip(length, 0, 8), rest.start, no_fd
         )
-        place = Spaced(
-            line,
-            first + 2,
-            first + 3,
-            0,
-            kind == ord("x"),
-            length,
-            first + 6,
-            np.zeros(len(line), np.bool_),
-        )
-        return spaced_frames(lines, tokens, place, t_ns, time_ok)
+        ok &= skip_gap(lines, np.minimum(payload_stop(at), limit), limit) == limit
+        return spaced_frames(lines, at, t_ns, ok & time_ok)
 
     def slow(self, line: bytes) -> Outcome:
         """Header lines, remote frames, decimal logs."""

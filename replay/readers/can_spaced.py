@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
 from crosscue.replay.columns import DATA, CanFrames, Int64s
 
-from .can_lines import SPACE, Lines, Tokens
+from .can_lines import SPACE, Field, Lines
+from .can_rows import joined
 from .can_text import NO_ROWS, Fast, payloads, picked
 from .digits import LABEL_MAX, Bools, hexadecimal, labels
 
@@ -19,58 +22,49 @@ class Spaced:
 
     Attributes:
         line: Which line.
-        bus: Index of the word that names the bus; None when the format has one bus only.
-        identifier: Index of the word with the hexadecimal identifier.
-        id_tail: How many characters at the identifier's end are no digits (``x``).
+        bus: The word that names the bus; None when the format has one bus only.
+        identifier: The hexadecimal digits of the identifier.
         is_extended: 29-bit identifier.
         length: Payload bytes, 0 to 64.
-        payload: Index of the first payload word; means nothing for a length of 0.
+        payload: First character of the payload; means nothing for a length of 0.
         is_fd: CAN FD.
     """
 
     line: Int64s
-    bus: Int64s | None
-    identifier: Int64s
-    id_tail: Int64s | int
+    bus: Field | None
+    identifier: Field
     is_extended: Bools
     length: Int64s
     payload: Int64s
     is_fd: Bools
 
 
-NO_FRAMES_FAST = Fast(NO_ROWS, ())
+NOTHING_FAST: Final = Fast(NO_ROWS, ())
 
 
-def spaced_frames(lines: Lines, tokens: Tokens, at: Spaced, t_ns: Int64s, ok: Bools) -> Fast:
+def spaced_frames(lines: Lines, at: Spaced, t_ns: Int64s, ok: Bools) -> Fast:
     """The frames at these places that hold up: digits, gaps, ranges, names.
 
     Args:
         lines: The chunk.
-        tokens: Its words.
-        at: Where the fields lie; every index must be a word of its line.
+        at: Where the fields lie.
         t_ns: Shape (N,): times.
         ok: Shape (N,): what is known to be right so far.
     """
     if not len(at.line):
-        return NO_FRAMES_FAST
-    id_stop = tokens.stop[at.identifier] - at.id_tail
-    identifier, id_ok = hexadecimal(lines.words, id_stop, id_stop - tokens.start[at.identifier])
+        return NOTHING_FAST
+    identifier, id_ok = hexadecimal(lines.words, at.identifier.stop, at.identifier.size)
     ok = ok & id_ok & (identifier <= np.where(at.is_extended, 0x1FFFFFFF, 0x7FF))
-    start = np.where(at.length > 0, tokens.start[np.minimum(at.payload, len(tokens.start) - 1)], 0)
-    payload, payload_ok = payloads(lines, start, at.length, at.is_fd, SPACE)
-    # One past the last digit pair there must be a gap, or the last word is longer than a byte.
-    after = lines.buffer[np.where(at.length > 0, start + 3 * at.length - 1, lines.stop[at.line])]
-    ok &= payload_ok & (after <= SPACE)
+    payload, payload_ok = payloads(lines, at.payload, at.length, at.is_fd, SPACE)
+    stop = payload_stop(at)
+    ok &= payload_ok & (lines.buffer[stop] <= SPACE) & (stop <= lines.stop[at.line])
     spelled: tuple[bytes, ...]
     if at.bus is None:
         bus, spelled = np.zeros(len(at.line), np.int64), (b"1",)
     else:
-        name_start = tokens.start[at.bus]
-        count = tokens.stop[at.bus] - name_start
-        bus, spelled = labels(lines.words, name_start, count)
+        bus, spelled = labels(lines.words, at.bus.start, at.bus.size)
         is_name = np.array([is_bus_name(one) for one in spelled] + [False])
-        ok &= (count <= LABEL_MAX) & is_name[bus]
-    names = tuple(one.decode("ascii", "replace") for one in spelled)
+        ok &= (at.bus.size <= LABEL_MAX) & is_name[bus]
     frames = CanFrames(
         identifier.astype(np.uint32),
         at.is_extended,
@@ -79,9 +73,33 @@ def spaced_frames(lines: Lines, tokens: Tokens, at: Spaced, t_ns: Int64s, ok: Bo
         payload,
         at.is_fd,
     )
+    names = tuple(one.decode("ascii", "replace") for one in spelled)
     return Fast(picked(ok, at.line, bus, t_ns, frames), names)
+
+
+def payload_stop(at: Spaced) -> Int64s:
+    """One past the last payload digit, where a gap must be."""
+    return at.payload + np.maximum(3 * at.length - 1, 0)
 
 
 def is_bus_name(spelled: bytes) -> bool:
     """Printable ASCII, as all bus names are."""
     return bool(spelled) and all(SPACE < c < 127 for c in spelled)
+
+
+def is_way(lines: Lines, word: Field) -> Bools:
+    """``Rx`` or ``Tx``."""
+    letter = lines.buffer[word.start]
+    found: Bools = (letter == ord("R")) | (letter == ord("T"))
+    found &= (lines.buffer[word.start + 1] == ord("x")) & (word.size == 2)
+    return found
+
+
+def joined_fast(parts: Sequence[Fast]) -> Fast:
+    """All frames of one chunk by line; each part has its own bus names."""
+    rows = NO_ROWS
+    names: tuple[str, ...] = ()
+    for part in parts:
+        shifted = replace(part.rows, bus=part.rows.bus + len(names))
+        rows, names = joined(rows, shifted), (*names, *part.names)
+    return Fast(rows, names)

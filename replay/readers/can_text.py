@@ -75,11 +75,12 @@ class Damage(NamedTuple):
 class Mark(NamedTuple):
     """A header or comment line; ``clock`` gets those that change the meaning of times.
 
-    A mark with ``stops`` ends the reading, for the reason it gives.
+    A mark with ``stops`` ends the reading, for the reason it gives; ``tag`` is the dialect's own.
     """
 
     origin_ns: int | None = None
     stops: str = ""
+    tag: str = ""
 
 
 Outcome: TypeAlias = Frame | Other | Damage | Mark | None
@@ -281,8 +282,7 @@ class _Scribe:
                     odd.frames.append((i, code, outcome))
             case Other():
                 self.knows_it = True
-                self._ledger.find(outcome.bus, 1)
-                self._ledger.skip(outcome.bus, outcome.reason, 1, f"line {number}", outcome.t_ns)
+                odd.others.setdefault((outcome.bus, outcome.reason), []).append(number)
                 if outcome.t_ns is not None:
                     odd.times.append((i, outcome.t_ns))
             case Damage():
@@ -314,6 +314,10 @@ class _Scribe:
 
     def _timed(self, rows: FrameRows, odd: _Odd) -> FrameRows:
         """Fast and odd rows together, with log times."""
+        for (bus, reason), numbers in odd.others.items():
+            topic = bus and bus_name(bus)
+            self._ledger.find(topic, len(numbers))
+            self._ledger.skip(topic, reason, len(numbers), f"from line {numbers[0]} on")
         rows = joined(rows, odd.rows())
         place, t_ns = rows.place, rows.log_ns
         if odd.times:
@@ -351,6 +355,7 @@ class _Odd:
         self.frames: list[tuple[int, int, Frame]] = []
         self.times: list[tuple[int, int]] = []
         self.marks: list[tuple[int, Mark]] = []
+        self.others: dict[tuple[str, str], list[int]] = {}
         self.tainted: list[int] = []
 
     def rows(self) -> FrameRows:

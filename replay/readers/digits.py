@@ -118,7 +118,9 @@ def _packed(nibble: Words) -> Words:
     return (pair | (pair >> _u(16))) & _u(0xFFFFFFFF)
 
 
-def seconds_ns(buffer: Bytes, words: Words, start: Int64s, stop: Int64s) -> tuple[Int64s, Bools]:
+def seconds_ns(
+    buffer: Bytes, words: Words, start: Int64s, stop: Int64s, *, marked: bool = True
+) -> tuple[Int64s, Bools]:
     """Decimal numbers such as ``12.000345`` or ``12,000345``, times 10**9, exactly.
 
     One to nine digits after the mark and one to ten before it; anything else is not ok.
@@ -128,10 +130,15 @@ def seconds_ns(buffer: Bytes, words: Words, start: Int64s, stop: Int64s) -> tupl
         words: From ``words_of``.
         start: Shape (N,): first character of each number.
         stop: Shape (N,): one past its last.
+        marked: Refuse numbers without a decimal mark.
     """
     places = _places(buffer, start, stop)
     fraction, fraction_ok = decimal(words, stop, places)
-    whole, whole_ok = decimal(words, stop - 1 - places, stop - 1 - places - start)
+    whole_stop = stop - places - (places > 0)
+    whole, whole_ok = decimal(words, whole_stop, whole_stop - start)
+    if not marked:
+        fraction = np.where(places > 0, fraction, 0)
+        fraction_ok |= places == 0
     ok = fraction_ok & whole_ok & (whole <= SECONDS_MAX)
     return whole * NANOS + fraction * _POWER[9 - places], ok
 
@@ -222,6 +229,11 @@ def is_hex(characters: Bytes) -> Bools:
     """Which characters are hexadecimal digits."""
     found: Bools = _NIBBLE[characters] < 0x80
     return found
+
+
+def nibble(characters: Bytes) -> Int64s:
+    """The value of each hexadecimal digit; 128 for any other character."""
+    return _NIBBLE[characters].astype(np.int64)
 
 
 def payload64(buffer: Bytes, start: Int64s, length: Int64s, gap: int | None) -> tuple[Bytes, Bools]:

@@ -6,7 +6,10 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from itertools import chain, pairwise
 from typing import Final
+
+import numpy as np
 
 from crosscue.replay.columns import Block, Bytes
 from crosscue.replay.ledger import Ledger
@@ -30,6 +33,9 @@ DAMAGED_SECTION: Final = "only the data section's checksum covers it, which is w
 MISSING: Final = "declared by the format, not in its bytes"
 INCOMPLETE: Final = "the file does not end as it should"
 CUT: Final = "the file is cut"
+BEFORE_A_GAP: Final = "right before damaged bytes, and no checksum covers it"
+NEAR: Final = 64
+"""Bytes before a damaged place that are not trusted unless a checksum vouches for them."""
 DETAILS_JOINED: Final = 10
 
 
@@ -128,11 +134,12 @@ class SegmentPass:
         walk = Walk(
             self._file, segment.begin, segment.end, segment.rail, self._limits, self._scanner
         )
-        for item, records in self._loader.ahead(iter(walk), self._is_wanted):
+        items = self._loader.ahead(iter(walk), self._is_wanted)
+        for (item, records), (following, _) in pairwise(chain(items, [(None, None)])):
             if isinstance(item, Chunk):
                 yield from self._chunk(item, records)
             elif isinstance(item, Run):
-                yield from self._run(item)
+                yield from self._run(item, isinstance(following, Gap))
             else:
                 self._note(item)
         if segment.after:
@@ -248,10 +255,16 @@ class SegmentPass:
         if not counts or chunk.index_fault or not held <= counts.keys():
             self._damages.append(Damage(reason, detail, t_ns))
 
-    def _run(self, run: Run) -> Iterator[Block]:
+    def _run(self, run: Run, is_before_gap: bool) -> Iterator[Block]:
         """Messages, schemas and channels outside chunks."""
         rows = run.rows
         if not self._segment.data_crc:
+            if is_before_gap:
+                ends = rows.offset + rows.head["length"].astype(np.int64) + PREFIX.size
+                count = int(np.searchsorted(ends, rows.end - NEAR, side="right"))
+                detail = f"{self._where}up to byte {run.at + rows.end}, where records break off"
+                self._giver.lose(rows.between(count, len(rows)), BEFORE_A_GAP, detail)
+                rows = rows.between(0, count)
             self._checks.rows_bare += len(rows)
         elif not self._section_is_right():
             self._giver.lose(rows, DAMAGED_SECTION, f"{self._where}records from byte {run.at} on")
@@ -264,7 +277,7 @@ class SegmentPass:
             self._section = self._loader.section_crc(self._segment)
         return self._section.result() == self._segment.data_crc
 
-    def _note(self, item: Item) -> None:
+    def _note(self, item: Item | None) -> None:
         """Account for what holds no messages that could be given."""
         match item:
             case Gap(at, to, why):

@@ -9,7 +9,7 @@ other records between them cover the chunk exactly.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -79,6 +79,11 @@ class Rows:
 
     def __len__(self) -> int:
         return len(self.offset)
+
+    def between(self, begin: int, end: int) -> Rows:
+        """The messages from ``begin`` to ``end``, with all definitions."""
+        part = slice(begin, end)
+        return replace(self, offset=self.offset[part], head=self.head[part])
 
 
 def opcodes(*codes: int) -> NDArray[np.bool_]:
