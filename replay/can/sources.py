@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
 from typing import Final
 
@@ -152,7 +151,8 @@ def _refuse_ranges(source: DatabaseText) -> None:
 def doubts(source: DatabaseText, form: str, names: list[str]) -> list[str]:
     """Signs that a file that parses was cut.
 
-    Only DBC and SYM files can be cut and still parse: their message definitions have no end mark.
+    Only DBC and SYM files can be cut and still parse: nothing in them marks the end. A cut just
+    after the line end of a statement of the closing section cannot be seen.
     """
     if form not in ("dbc", "sym"):
         return []
@@ -164,8 +164,8 @@ def doubts(source: DatabaseText, form: str, names: list[str]) -> list[str]:
             f"{name}: ends with the definition of message {last} and has no closing section; "
             "if messages are missing, the file was cut"
         )
-    if not text.endswith(("\n", "\r")) and not text.endswith(";"):
-        line = list(accumulate(text.splitlines(), lambda _, b: b))[-1].strip()
+    if not text.endswith(("\n", "\r")):
+        line = text.splitlines()[-1].strip()
         notices.append(
             f"{name}:{source.line_at(len(text))}: the last line has no end ({line[-60:]!r}); "
             "it may have been cut"

@@ -1,0 +1,263 @@
+"""What a database file says is understood, and what is doubtful about it is said."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from pathlib import Path
+
+import cantools
+import pytest
+
+from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.can.layout import CanMessage, CanSignal
+from crosscue.replay.errors import CrosscueError, LogTooLargeError, SchemaError
+from crosscue.replay.limits import Limits
+from support.can_layouts import dbc_text
+from support.data import shared
+
+YAW = CanMessage(
+    "Yaw",
+    0x123,
+    False,
+    8,
+    (
+        CanSignal("rate", 7, 16, is_big_endian=True, is_signed=True, scale=0.01, unit="°/s"),
+        CanSignal("state", 16, 2, choices={0: "off", 1: "on"}),
+        CanSignal("load", 32, 32, is_float=True, minimum=-5, maximum=5),
+    ),
+)
+WHEEL = CanMessage("Wheel", 0x456, True, 4, (CanSignal("speed", 0, 16, scale=0.1, unit="km/h"),))
+
+
+def write(folder: Path, text: str | bytes, name: str = "bus.dbc") -> Path:
+    path = folder / name
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return path
+
+
+def test_a_dbc_file_says_all_there_is_to_a_signal(tmp_path: Path) -> None:
+    database = CanDatabase.load([write(tmp_path, dbc_text([YAW, WHEEL]))])
+
+    yaw = database.named("Yaw")
+    assert replace(yaw, source="", topic="") == YAW
+    assert yaw.source == "bus.dbc:6"
+    assert yaw.signal("state").choices == {0: "off", 1: "on"}
+    assert database.find(0x456, True) == database.named("Wheel")
+    assert database.find(0x456, False) is None
+    assert database.notices == ()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "utf-8-sig", "utf-16"])
+def test_units_are_read_right_in_every_encoding(encoding: str, tmp_path: Path) -> None:
+    path = write(tmp_path, dbc_text([YAW]).encode(encoding))
+
+    assert CanDatabase.load([path]).named("Yaw").signal("rate").unit == "°/s"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "where"),
+    [
+        ("SG_ rate", "SG_ rate rate rate", r"bus\.dbc:7: not a readable DBC file: .*line 7"),
+        ("BO_ 291", "BO_ dreihundert", r"bus\.dbc:6: "),
+        ("VAL_ 291", "VAL_ 292", r"bus\.dbc:10: .*unused VAL_.*; correct that line or get a whole"),
+        ("BO_ 291", "BO_ 4000", r"bus\.dbc:6: .*more than 11 bits in message Yaw"),
+    ],
+)
+def test_a_dbc_file_that_does_not_parse_is_refused_with_its_line(
+    old: str, new: str, where: str, tmp_path: Path
+) -> None:
+    text = dbc_text([replace(YAW, signals=YAW.signals[:2])])
+    path = write(tmp_path, text.replace(old, new))
+
+    with pytest.raises(SchemaError, match=where) as error:
+        CanDatabase.load([path])
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("empty.dbc", b"", r"empty\.dbc:1: empty; expected a CAN database"),
+        ("zeros.dbc", b"VERSION \n\0\0\0", r"zeros\.dbc:2: holds zero bytes"),
+        ("none.dbc", b'VERSION ""\nBU_: A\n', r"none\.dbc: defines no message"),
+        ("bus.txt", b"", r"bus\.txt: no CAN database; expected a file ending in one of \.dbc"),
+        ("bus.kcd", b"<a>\n<b></a>", r"bus\.kcd:2: not a readable KCD file"),
+        ("bus.kcd", b"<a></a>", r"bus\.kcd:1: not a readable KCD file: .*Expected root element"),
+        ("bus.arxml", b"<a>", r"bus\.arxml:1: not a readable ARXML file"),
+        ("bus.sym", b"FormatVersion=5.0", r"bus\.sym:1: not a readable SYM file: .*6\.0"),
+    ],
+)
+def test_files_that_are_no_database_are_refused(
+    name: str, content: bytes, words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SchemaError, match=words):
+        CanDatabase.load([write(tmp_path, content, name)])
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+    for path in (tmp_path / "gone.dbc", tmp_path):
+        with pytest.raises(SchemaError, match=r"no such file|no CAN database"):
+            CanDatabase.load([path])
+
+
+def test_a_file_larger_than_the_limit_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, dbc_text([YAW]))
+
+    with pytest.raises(LogTooLargeError, match="larger than 100 bytes"):
+        CanDatabase.load([path], Limits(message_bytes=100))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("7|16@", "7|99999999999@", r"bus\.dbc:7: signal length 99999999999 is larger"),
+        ("7|16@", "99999999999|16@", r"bus\.dbc:7: start bit"),
+        ("Yaw: 8", "Yaw: 99999999", r"bus\.dbc:6: message length"),
+        ("VAL_", "SG_MUL_VAL_ 291 a b 0-4000000000;\nVAL_", r"bus\.dbc:10: multiplexer ranges"),
+    ],
+)
+def test_sizes_that_would_eat_the_memory_are_refused(
+    old: str, new: str, words: str, tmp_path: Path
+) -> None:
+    text = dbc_text([replace(YAW, signals=YAW.signals[:2])])
+
+    with pytest.raises(LogTooLargeError, match=words):
+        CanDatabase.load([write(tmp_path, text.replace(old, new, 1))])
+
+
+def test_a_dbc_file_cut_anywhere_is_refused_or_told(tmp_path: Path) -> None:
+    text = dbc_text([YAW, WHEEL]).rstrip()
+    whole = CanDatabase.load([write(tmp_path, text)])
+    told = 0
+    for cut in range(len(text)):
+        try:
+            database = CanDatabase.load([write(tmp_path, text[:cut])])
+        except SchemaError:
+            continue
+        told += 1
+        # After a whole line of the closing section a cut cannot be seen.
+        is_hidden = text[:cut].endswith(";\n")
+        assert is_hidden or database.messages == whole.messages or database.notices
+    assert told > 10
+
+
+def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
+    drawn = random.Random(5)
+    text = dbc_text([YAW, WHEEL]).encode()
+    for _ in range(150):
+        damaged = bytearray(text)
+        for _ in range(drawn.randint(1, 4)):
+            damaged[drawn.randrange(len(damaged))] = drawn.randrange(256)
+        words = ""
+        try:
+            CanDatabase.load([write(tmp_path, bytes(damaged))])
+        except CrosscueError as error:
+            words = str(error)
+        assert "\n" not in words
+        assert not words or "bus.dbc" in words
+
+
+def test_two_definitions_of_one_identifier_are_refused_unless_asked(tmp_path: Path) -> None:
+    other = replace(YAW, name="Other", signals=(CanSignal("x", 0, 8),))
+    paths = [
+        write(tmp_path, dbc_text([YAW, WHEEL]), "a.dbc"),
+        write(tmp_path, dbc_text([other]), "b.dbc"),
+    ]
+
+    with pytest.raises(
+        SchemaError, match=r"0x123 is defined as Yaw \(a\.dbc:6\) and as Other \(b\.dbc:6\)"
+    ):
+        CanDatabase.load(paths)
+    database = CanDatabase.load(paths, keep_first=True)
+
+    assert [m.name for m in database.messages] == ["Yaw", "Wheel"]
+    (conflict,) = database.conflicts
+    assert not conflict.is_harmless
+    assert any("the first is used" in notice for notice in database.notices)
+
+
+def test_one_identifier_twice_in_one_file_is_found(tmp_path: Path) -> None:
+    text = dbc_text([replace(WHEEL, name="First"), replace(WHEEL, name="Second")])
+
+    with pytest.raises(SchemaError, match=r"0x00000456 \(extended\) is defined as First"):
+        CanDatabase.load([write(tmp_path, text)])
+
+
+def test_the_same_definition_twice_is_only_noticed(tmp_path: Path) -> None:
+    paths = [write(tmp_path, dbc_text([YAW]), name) for name in ("a.dbc", "b.dbc")]
+
+    database = CanDatabase.load(paths)
+
+    assert len(database.messages) == 1
+    assert database.conflicts[0].is_harmless
+    assert any("both alike" in notice for notice in database.notices)
+
+
+def test_11_and_29_bit_identifiers_do_not_conflict(tmp_path: Path) -> None:
+    text = dbc_text([YAW, replace(YAW, name="Long", is_extended=True)])
+
+    database = CanDatabase.load([write(tmp_path, text)])
+
+    assert database.conflicts == ()
+    assert database.find(0x123, True) == database.named("Long")
+
+
+def test_messages_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    text = dbc_text([YAW, replace(YAW, arbitration_id=0x124)])
+
+    database = CanDatabase.load([write(tmp_path, text)])
+
+    assert [m.topic_name for m in database.messages] == ["Yaw_0x123", "Yaw_0x124"]
+    assert database.named("Yaw_0x124").arbitration_id == 0x124
+    with pytest.raises(ValueError, match="2 messages are called 'Yaw'; say which: Yaw_0x123"):
+        database.named("Yaw")
+
+
+def test_a_message_whose_signals_do_not_fit_costs_only_itself(tmp_path: Path) -> None:
+    broken = replace(YAW, length=4)
+
+    database = CanDatabase.load([write(tmp_path, dbc_text([broken, WHEEL]))])
+
+    assert database.named("Yaw").problem == "signal load does not fit into 4 bytes"
+    assert not database.named("Wheel").problem
+    assert any("Yaw cannot be decoded" in notice for notice in database.notices)
+
+
+def test_overlapping_signals_are_noticed_unless_no_frame_has_both(tmp_path: Path) -> None:
+    page = CanSignal("page", 0, 4, is_multiplexer=True)
+    one = CanSignal("one", 8, 8, multiplexer="page", branches=frozenset({1}))
+    two = replace(one, name="two", branches=frozenset({2, 3}))
+    three = replace(one, name="three", branches=frozenset({3}))
+    message = replace(YAW, signals=(page, one, two, three))
+
+    database = CanDatabase.load([write(tmp_path, dbc_text([message]))])
+
+    assert database.notices == ("bus.dbc:6: Yaw: signals two and three share bits",)
+
+
+@pytest.mark.parametrize("form", ["kcd", "sym"])
+def test_other_formats_give_the_same_messages(form: str, tmp_path: Path) -> None:
+    dbc = write(tmp_path, dbc_text([YAW, WHEEL]))
+    other = tmp_path / f"bus.{form}"
+    parsed = cantools.database.load_file(dbc, encoding="utf-8")
+    assert isinstance(parsed, cantools.database.Database)
+    cantools.database.dump_file(parsed, other, encoding="utf-8")
+
+    ours = CanDatabase.load([other])
+
+    expected = {m.key: m for m in CanDatabase.load([dbc]).messages}
+    assert len(ours.messages) == 2
+    for message in ours.messages:
+        assert message.same_layout(expected[message.key])
+
+
+def test_real_databases_load_with_what_is_wrong_in_them_said() -> None:
+    toyota = CanDatabase.load([shared("comma2k19", "toyota_2017.dbc")])
+    gnss = CanDatabase.load([shared("can", "css_canedge", "gnss.dbc")])
+
+    assert len(toyota.messages) == 50
+    assert sum("PCS_HUD: signals" in notice for notice in toyota.notices) == 3
+    assert toyota.named("WHEEL_SPEEDS").source == "toyota_2017.dbc:67"
+    assert len({m.topic_name for m in gnss.messages}) == len(gnss.messages) == 18
+    assert any("2 messages are called gnss_pos" in notice for notice in gnss.notices)
