@@ -58,7 +58,7 @@ def save(run: RunFolder, path: Path, truth: TruthTrack | None = None) -> None:
 
     def write(partial: Path) -> None:
         recording = rr.RecordingStream("crosscue", recording_id=str(run.path.resolve().name))
-        recording.save(partial, default_blueprint=_blueprint(truth is not None))
+        recording.save(partial, default_blueprint=_blueprint(columns, truth is not None))
         recording.log("plan", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         _log_pose(recording, columns)
         if truth is not None:
@@ -79,7 +79,7 @@ def _log_pose(recording: rr.RecordingStream, pose: Mapping[str, Floats]) -> None
     thin = slice(None, None, max(1, len(t_ns) // PATH_POINTS))
     flat = np.stack([pose["x_m"], pose["y_m"], np.zeros(len(t_ns))], axis=1)
     recording.log(
-        "plan/estimate", rr.LineStrips3D([flat[thin]], colors=[ESTIMATE], labels=["estimate"]),
+        "plan/estimate", rr.LineStrips3D([flat[thin]], colors=[ESTIMATE]),
         static=True,
     )  # fmt: skip
     some = _every(t_ns, ELLIPSES_PER_S)
@@ -114,9 +114,7 @@ def _log_truth(recording: rr.RecordingStream, truth: TruthTrack) -> None:
     import rerun as rr
 
     flat = np.stack([truth.x_m, truth.y_m, np.zeros(len(truth.t_ns))], axis=1)
-    recording.log(
-        "plan/truth", rr.LineStrips3D([flat], colors=[TRUTH], labels=["truth"]), static=True
-    )
+    recording.log("plan/truth", rr.LineStrips3D([flat], colors=[TRUTH]), static=True)
     recording.send_columns(
         "plan/true_car", indexes=[_time_column(truth.t_ns)],
         columns=rr.Points3D.columns(positions=flat),
@@ -176,7 +174,7 @@ def _notes(run: RunFolder) -> rr.TextDocument:
     return rr.TextDocument(text, media_type="text/markdown")
 
 
-def _blueprint(has_truth: bool) -> rrb.Blueprint:
+def _blueprint(pose: Mapping[str, Floats], has_truth: bool) -> rrb.Blueprint:
     import rerun.blueprint as rrb
 
     plots = {"speed": "Speed (m/s)", "heading": "Heading (deg)", "heading_sd": "Heading s.d. (deg)",
@@ -184,17 +182,31 @@ def _blueprint(has_truth: bool) -> rrb.Blueprint:
     series = [rrb.TimeSeriesView(origin=f"plots/{key}", name=name) for key, name in plots.items()]
     plan = rrb.Spatial3DView(
         origin="plan", name="Plan, truth in green" if has_truth else "Plan",
-        line_grid=rrb.LineGrid3D(visible=True),
+        line_grid=rrb.LineGrid3D(visible=True), eye_controls=_from_above(pose),
     )  # fmt: skip
+    notes = rrb.TextDocumentView(origin="notes", name="Notes")
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(
-                plan, rrb.TextDocumentView(origin="notes", name="Notes"), row_shares=[4, 1]
-            ),
+            rrb.Vertical(plan, notes, row_shares=[3, 1]),
             rrb.Vertical(*series),
             column_shares=[3, 2],
         ),
-        rrb.TimePanel(timeline=TIMELINE, expanded=True),
+        rrb.TimePanel(timeline=TIMELINE, expanded=False),
         rrb.SelectionPanel(expanded=False),
         rrb.BlueprintPanel(expanded=False),
     )
+
+
+def _from_above(pose: Mapping[str, Floats]) -> rrb.EyeControls3D | None:
+    """North up, the whole track in sight."""
+    import rerun.blueprint as rrb
+
+    if not len(pose["t_ns"]):
+        return None
+    x, y = pose["x_m"], pose["y_m"]
+    middle = (float(x.min() + x.max()) / 2, float(y.min() + y.max()) / 2)
+    height_m = 1.4 * max(float(np.ptp(x)), float(np.ptp(y)), 20.0)
+    return rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital, position=(*middle, height_m), look_target=(*middle, 0.0),
+        eye_up=(0.0, 1.0, 0.0),
+    )  # fmt: skip
