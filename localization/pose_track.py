@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from typing import Final, NamedTuple, Self, TypeAlias
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,9 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import Floats, Int64s
 
 from .angles import wrap
-from .ekf import PoseBelief, arc, axis_of, coast
+from .ekf import HEADING, SPEED, PoseBelief, axis_of, coast
 from .odometry import Increments
+from .packed_state import HEADING_VARIANCE, driven, packed, unpacked, weighed
 
 ACCEPTED: Final = 0
 REJECTED: Final = 1
@@ -270,15 +271,7 @@ def advance(
     return run.result()
 
 
-_State: TypeAlias = tuple[
-    float, float, float, float,
-    float, float, float, float, float, float, float, float, float, float,
-]  # fmt: skip
-"""x, y, heading, speed; then the covariance's upper triangle, row by row."""
-
 _NEVER: Final = np.iinfo(np.int64).max
-_HEADING_ROW: Final = (2, 5, 7, 8)
-_SPEED_ROW: Final = (3, 6, 8, 9)
 
 
 class _Run:
@@ -289,7 +282,7 @@ class _Run:
     ) -> None:
         self.settings = settings
         self.t_ns = state.belief.t_ns
-        self.state = _packed(state.belief)
+        self.state = packed(state.belief)
         self.travelled_m = state.travelled_m
         self.counted_ns = state.counted_ns
         self.counted_m = state.counted_m
@@ -349,8 +342,8 @@ class _Run:
             if to_ns == stop_ns:
                 break
             self._handle_events()
-        innovation = speed_mps - self.state[3]
-        self.state = _weighed(self.state, 3, _SPEED_ROW, innovation, speed_var)
+        innovation = speed_mps - self.state[SPEED]
+        self.state = weighed(self.state, SPEED, innovation, speed_var)
         if self.event_ns == stop_ns:
             self._handle_events()
         if self.every_interval:
@@ -360,7 +353,7 @@ class _Run:
         self, to_ns: int, distance_m: float, turn_rad: float, distance_var: float, turn_var: float
     ) -> None:
         speed_var = self.settings.accel_var_m2ps3 * ((to_ns - self.t_ns) * 1e-9)
-        self.state = _driven(self.state, distance_m, turn_rad, distance_var, turn_var, speed_var)
+        self.state = driven(self.state, distance_m, turn_rad, distance_var, turn_var, speed_var)
         self.travelled_m += abs(distance_m)
         self.t_ns = to_ns
 
@@ -369,13 +362,13 @@ class _Run:
         self.tally["coast_ns"] += stop_ns - self.t_ns
         while self.t_ns < stop_ns:
             to_ns = min(self.event_ns, stop_ns)
-            before = _unpacked(self.t_ns, self.state)
+            before = unpacked(self.t_ns, self.state)
             dt_s = (to_ns - self.t_ns) * 1e-9
             after = coast(
                 before, dt_s, self.settings.accel_var_m2ps3, self.settings.coast_turn_var_rad2ps
             )
-            self.travelled_m += abs(self.state[3]) * dt_s
-            self.state, self.t_ns = _packed(after), to_ns
+            self.travelled_m += abs(self.state[SPEED]) * dt_s
+            self.state, self.t_ns = packed(after), to_ns
             if to_ns < stop_ns:
                 self._handle_events()
 
@@ -403,8 +396,8 @@ class _Run:
         if not self._is_due():
             self.tally["headings_thinned"] += 1
             return
-        innovation = wrap(heading_rad - self.state[2])
-        nis = innovation * innovation / (self.state[11] + var_rad2)
+        innovation = wrap(heading_rad - self.state[HEADING])
+        nis = innovation * innovation / (self.state[HEADING_VARIANCE] + var_rad2)
         gate = self.settings.heading_gate_nis
         outcome = ACCEPTED if gate is None or nis <= gate else REJECTED
         self.used.append((self.t_ns, innovation, nis, outcome))
@@ -413,7 +406,7 @@ class _Run:
             return
         self.tally["headings_accepted"] += 1
         self.counted_ns, self.counted_m = self.t_ns, self.travelled_m
-        self.state = _weighed(self.state, 2, _HEADING_ROW, innovation, var_rad2)
+        self.state = weighed(self.state, HEADING, innovation, var_rad2)
 
     def _is_due(self) -> bool:
         if self.counted_ns is None:
@@ -433,7 +426,7 @@ class _Run:
         poses = np.array(self.poses).reshape(-1, 12)
         used = np.array(self.used, dtype=np.float64).reshape(-1, 4)
         state = TrackState(
-            belief=_unpacked(self.t_ns, self.state),
+            belief=unpacked(self.t_ns, self.state),
             travelled_m=self.travelled_m,
             counted_ns=self.counted_ns,
             counted_m=self.counted_m,
@@ -451,83 +444,6 @@ class _Run:
             used[:, 3].astype(np.uint8),
         )
         return Advance(state, columns, headings, TrackCounts(**self.tally))
-
-
-def _driven(
-    state: _State,
-    distance_m: float,
-    turn_rad: float,
-    distance_var: float,
-    turn_var: float,
-    speed_var: float,
-) -> _State:
-    """``predict_odometry`` in plain floats."""
-    x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
-    step = arc(distance_m, turn_rad)
-    c, s = math.cos(heading), math.sin(heading)
-    mx, my = c * step.dx_m - s * step.dy_m, s * step.dx_m + c * step.dy_m
-    dx = c * step.dx_by_distance - s * step.dy_by_distance
-    dy = s * step.dx_by_distance + c * step.dy_by_distance
-    tx = c * step.dx_by_turn - s * step.dy_by_turn
-    ty = s * step.dx_by_turn + c * step.dy_by_turn
-    return (
-        x + mx,
-        y + my,
-        wrap(heading + turn_rad),
-        speed,
-        xx - 2.0 * my * xh + my * my * hh + dx * dx * distance_var + tx * tx * turn_var,
-        xy + mx * xh - my * yh - mx * my * hh + dx * dy * distance_var + tx * ty * turn_var,
-        xh - my * hh + tx * turn_var,
-        xv - my * hv,
-        yy + 2.0 * mx * yh + mx * mx * hh + dy * dy * distance_var + ty * ty * turn_var,
-        yh + mx * hh + ty * turn_var,
-        yv + mx * hv,
-        hh + turn_var,
-        hv,
-        vv + speed_var,
-    )
-
-
-def _weighed(
-    state: _State, i: int, row: tuple[int, int, int, int], innovation: float, var: float
-) -> _State:
-    """Joseph update of the directly measured state ``i`` in plain floats.
-
-    ``row`` says where the covariance's row ``i`` lies behind the mean.
-    """
-    x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
-    px, py, ph, pv = (state[4 + k] for k in row)
-    spread = (px, py, ph, pv)[i] + var
-    kx, ky, kh, kv = px / spread, py / spread, ph / spread, pv / spread
-    return (
-        x + kx * innovation,
-        y + ky * innovation,
-        wrap(heading + kh * innovation),
-        speed + kv * innovation,
-        xx - 2.0 * kx * px + kx * kx * spread,
-        xy - kx * py - ky * px + kx * ky * spread,
-        xh - kx * ph - kh * px + kx * kh * spread,
-        xv - kx * pv - kv * px + kx * kv * spread,
-        yy - 2.0 * ky * py + ky * ky * spread,
-        yh - ky * ph - kh * py + ky * kh * spread,
-        yv - ky * pv - kv * py + ky * kv * spread,
-        hh - 2.0 * kh * ph + kh * kh * spread,
-        hv - kh * pv - kv * ph + kh * kv * spread,
-        vv - 2.0 * kv * pv + kv * kv * spread,
-    )
-
-
-def _packed(belief: PoseBelief) -> _State:
-    p = belief.cov
-    numbers = (*belief.mean, *p[0], *p[1, 1:], *p[2, 2:], p[3, 3])
-    x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = map(float, numbers)
-    return x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv
-
-
-def _unpacked(t_ns: int, state: _State) -> PoseBelief:
-    x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
-    cov = np.array([[xx, xy, xh, xv], [xy, yy, yh, yv], [xh, yh, hh, hv], [xv, yv, hv, vv]])
-    return PoseBelief(t_ns, np.array([x, y, heading, speed]), cov)
 
 
 def _joined(first: Headings, second: Headings) -> Headings:
