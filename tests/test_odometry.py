@@ -219,6 +219,49 @@ def test_rounding_of_the_wheel_speed_is_in_the_variance() -> None:
     assert np.mean(np.square(misses)) == pytest.approx(np.mean(claims), rel=0.25)
 
 
+def test_speed_readings_alone_lead_to_the_distances_variance() -> None:
+    """White speed errors of the stated variance add up to the stated variance of the way."""
+    for rate_hz in (10.0, 100.0):
+        dt_s = 1.0 / rate_hz
+        t_ns = times(round(rate_hz) + 1, round(dt_s * 1e9))
+        made = integrate(WheelSpeeds(t_ns, np.full((len(t_ns), 2), 9.0)), CAR).increments
+        assert (made.speed_var_m2ps2 * dt_s**2).sum() == pytest.approx(made.distance_var_m2.sum())
+
+
+def test_a_share_of_every_turn_may_be_wrong() -> None:
+    rate = TurnSignal(times(101), np.full(101, 0.5), "yaw rate")
+    exact = replace(CAR, gyro_noise_rad_per_sqrt_s=0.0)
+    made = integrate(both_wheels(5.0), replace(exact, turn_per_turn=0.02), rate).increments
+
+    np.testing.assert_allclose(np.sqrt(made.turn_var_rad2), 0.02 * made.turn_rad)
+    assert not integrate(both_wheels(5.0), exact, rate).increments.turn_var_rad2.any()
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, -0.5])
+def test_steering_noise_is_the_slope_of_the_turn(angle: float) -> None:
+    def turned(by: float) -> float:
+        steering = TurnSignal(times(2), np.full(2, by), "steering")
+        speeds = WheelSpeeds(times(2), np.full((2, 2), 10.0))
+        return float(integrate(speeds, CAR, steering).increments.turn_rad[0])
+
+    steering = TurnSignal(times(2), np.full(2, angle), "steering")
+    speeds = WheelSpeeds(times(2), np.full((2, 2), 10.0))
+    made = integrate(speeds, CAR, steering).increments
+    slope = (turned(angle + 1e-6) - turned(angle - 1e-6)) / 2e-6
+    density = CAR.steering_noise_rad_sqrt_m / math.sqrt(made.distance_m[0])
+
+    assert math.sqrt(made.turn_var_rad2[0]) == pytest.approx(abs(slope) * density)
+
+
+def test_a_gap_in_the_wheels_makes_their_heading_unsure_but_not_the_gyros() -> None:
+    t_ns = np.array([0, 4_000], np.int64) * 1_000_000
+    speeds = WheelSpeeds(t_ns, np.full((2, 2), 10.0))
+    rate = TurnSignal(times(41, 100_000_000), np.zeros(41), "yaw rate")
+
+    assert integrate(speeds, CAR).increments.turn_var_rad2[0] > 1.5**2
+    assert integrate(speeds, CAR, rate).increments.turn_var_rad2[0] < 0.01**2
+
+
 def test_nothing_in_nothing_out() -> None:
     empty = WheelSpeeds(np.empty(0, np.int64), np.empty((0, 4)))
     one = WheelSpeeds(times(1), np.ones((1, 2)))

@@ -280,6 +280,14 @@ def test_every_heading_is_accounted_for() -> None:
     assert done.headings.outcome.tolist() == [0, 0, 1, 0]
 
 
+@pytest.mark.parametrize("var", [np.inf, np.nan, 0.0, -1.0])
+def test_a_heading_without_a_usable_variance_is_bad(var: float) -> None:
+    belief = start_belief(0, 0.0, 0.0, 0.0, heading_sd_rad=0.1)
+    done = advance(TrackState(belief), straight(), TrackSettings(), headings_at(0.5, var=var))
+
+    assert (done.counts.headings_bad, done.counts.headings) == (1, 0)
+
+
 def test_a_standing_car_does_not_count_readings_twice() -> None:
     belief = start_belief(0, 0.0, 0.0, 0.0, heading_sd_rad=0.1)
     many = headings_at(*np.arange(0.0, 1.0, 0.05))
