@@ -9,7 +9,7 @@ of eight rows gives all places at once.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -22,6 +22,7 @@ from .definition import DURATION, PRIMITIVES, TIME, Definitions, Field, Shape, w
 
 MAX_DEPTH: Final = 32
 MAX_STEPS: Final = 20_000
+HEADER: Final = "std_msgs/msg/Header"
 FILLER: Final = "structure_needs_at_least_one_member"
 """The byte that stands for an empty message on the wire; it holds no value."""
 
@@ -49,13 +50,22 @@ class Run:
 
     Attributes:
         values: K of them.
+        widths: Bytes of each value.
         place: Shape (8, K), int64: offset of each value from the run's begin, by begin modulo 8.
         size: Shape (8,), int64: bytes from the run's begin to its end, by begin modulo 8.
+        cdr_widths: Bytes of each value in CDR, where an empty message has one and a ROS 1 header
+            has no counter.
+        cdr_place: As ``place``, in CDR; differs from it in plans for ROS 1.
+        cdr_size: As ``size``, in CDR.
     """
 
     values: tuple[Value, ...]
+    widths: tuple[int, ...]
     place: Int64s
     size: Int64s
+    cdr_widths: tuple[int, ...]
+    cdr_place: Int64s
+    cdr_size: Int64s
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +87,7 @@ class Items:
         bound: Most items, 0 for no bound.
         code: NumPy code of a sequence of numbers, else empty.
         jumps: Shape (K, 8): bytes that 2**k items take, by begin modulo 8; None where items vary.
+        cdr_jumps: As ``jumps``, in CDR.
         item_bytes: Least bytes of one item.
     """
 
@@ -86,6 +97,7 @@ class Items:
     bound: int
     code: str
     jumps: Int64s | None
+    cdr_jumps: Int64s | None
     item_bytes: int
 
 
@@ -125,14 +137,24 @@ def plan_of(type_name: str, known: Definitions, *, is_cdr: bool, limits: Limits 
         type_name,
         is_cdr,
         steps,
-        {value.path: value for run in runs for value in run.values},
+        {v.path: v for run in runs for v in run.values if not v.path.endswith(FILLER)},
         frozenset(step.path for step in steps if isinstance(step, Text)),
         {step.path: step for step in steps if isinstance(step, Items)},
     )
 
 
-_Piece: TypeAlias = tuple[Value, int, int] | Text | Items
-"""A step, or a value with its alignment and size that is still to be put into a run."""
+@dataclass(frozen=True, slots=True)
+class _Fixed:
+    """A value that is still to be put into a run: alignment and bytes as stored, and in CDR."""
+
+    value: Value
+    align: int
+    width: int
+    cdr_align: int
+    cdr_width: int
+
+
+_Piece: TypeAlias = _Fixed | Text | Items
 
 
 @dataclass(slots=True)
@@ -154,12 +176,17 @@ class _Planner:
             yield self._value(Value(prefix or "stamp", code), 4, 8)
             return
         fields = self._fields(name)
-        if not fields and self.is_cdr:
-            # An empty message still takes one byte on the wire.
-            yield self._value(Value(f"{prefix}.{FILLER}".lstrip("."), "u1"), 1, 1)
+        if not fields:
+            # In CDR an empty message still takes one byte.
+            filler = Value(f"{prefix}.{FILLER}".lstrip("."), "u1")
+            yield _Fixed(filler, 1, 1 if self.is_cdr else 0, 1, 1)
         for each in fields:
             path = f"{prefix}.{each.name}" if prefix else each.name
-            yield from self._field(each, path, depth)
+            pieces = self._field(each, path, depth)
+            if not self.is_cdr and name == HEADER and each is fields[0] and each.name == "seq":
+                yield from (_without_cdr(piece) for piece in pieces)
+            else:
+                yield from pieces
 
     def _fields(self, name: str) -> tuple[Field, ...]:
         fields = self.known.get(name)
@@ -198,14 +225,14 @@ class _Planner:
         value = Value(path, code, count, each.type_name == "bool")
         return self._value(value, width, width * max(count, 1))
 
-    def _value(self, value: Value, align: int, size: int) -> tuple[Value, int, int]:
+    def _value(self, value: Value, align: int, size: int) -> _Fixed:
         self._count()
         if size > self.limits.message_bytes:
             raise SchemaError(
                 f"{self.root}: {value.path} alone takes {size} bytes, over the limit of "
                 f"{self.limits.message_bytes} for a message"
             )
-        return value, align if self.is_cdr else 1, size
+        return _Fixed(value, align if self.is_cdr else 1, size, align, size)
 
     def _items(self, each: Field, path: str, depth: int) -> Items:
         self._count()
@@ -225,7 +252,8 @@ class _Planner:
             each.size if is_array else None,
             0 if is_array else each.size,
             PRIMITIVES.get(each.type_name, ""),
-            _jumps(item) if fixed else None,
+            _jumps([step.size for step in item if isinstance(step, Run)]) if fixed else None,
+            _jumps([step.cdr_size for step in item if isinstance(step, Run)]) if fixed else None,
             least,
         )
 
@@ -243,10 +271,14 @@ def _least(step: Step) -> int:
     return 4 if step.count is None else step.count * step.item_bytes
 
 
+def _without_cdr(piece: _Piece) -> _Piece:
+    return replace(piece, cdr_align=1, cdr_width=0) if isinstance(piece, _Fixed) else piece
+
+
 def _in_runs(pieces: Iterator[_Piece]) -> Iterator[Step]:
-    waiting: list[tuple[Value, int, int]] = []
+    waiting: list[_Fixed] = []
     for piece in pieces:
-        if isinstance(piece, tuple):
+        if isinstance(piece, _Fixed):
             waiting.append(piece)
             continue
         if waiting:
@@ -257,28 +289,47 @@ def _in_runs(pieces: Iterator[_Piece]) -> Iterator[Step]:
         yield _run(waiting)
 
 
-def _run(pieces: list[tuple[Value, int, int]]) -> Run:
+def _run(pieces: list[_Fixed]) -> Run:
+    stored = [(piece.align, piece.width) for piece in pieces]
+    cdr = [(piece.cdr_align, piece.cdr_width) for piece in pieces]
+    return Run(
+        tuple(piece.value for piece in pieces),
+        tuple(piece.width for piece in pieces),
+        *_laid_out(stored),
+        tuple(piece.cdr_width for piece in pieces),
+        *_laid_out(cdr),
+    )
+
+
+def _laid_out(pieces: list[tuple[int, int]]) -> tuple[Int64s, Int64s]:
+    """Place of each piece, (8, K), and size of all, (8,), by where the run begins modulo 8."""
     place = np.zeros((8, len(pieces)), np.int64)
     size = np.zeros(8, np.int64)
     for begin in range(8):
         at = begin
-        for k, (_, align, width) in enumerate(pieces):
+        for k, (align, width) in enumerate(pieces):
             at = -(-at // align) * align
             place[begin, k] = at - begin
             at += width
         size[begin] = at - begin
-    return Run(tuple(value for value, _, _ in pieces), place, size)
+    return place, size
 
 
-def _jumps(item: tuple[Step, ...]) -> Int64s:
+def _jumps(sizes: list[Int64s]) -> Int64s:
     """Bytes that 1, 2, 4, ... 2**31 items take, by begin modulo 8: powers by squaring."""
     one = np.zeros(8, np.int64)
     begin = np.arange(8)
-    for step in item:
-        assert isinstance(step, Run)
-        one += step.size[(begin + one) & 7]
+    for size in sizes:
+        one += size[(begin + one) & 7]
     jumps = [one]
     for _ in range(31):
         last = jumps[-1]
         jumps.append(last + last[(begin + last) & 7])
     return np.stack(jumps)
+
+
+def jumped(jumps: Int64s, at: Int64s, count: Int64s) -> Int64s:
+    """Where ``count`` items that begin at ``at`` end, both of shape (N,)."""
+    for k in range(int(count.max(initial=0)).bit_length()):
+        at = at + np.where((count >> k) & 1, jumps[k][at & 7], 0)
+    return at

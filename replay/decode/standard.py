@@ -28,7 +28,7 @@ from crosscue.replay.errors import SchemaError
 
 from .coding import MAGIC_BYTES, STREAMS, coding_of
 from .fields import Fields
-from .plan import FILLER, Plan
+from .plan import Plan
 from .walk import Bools
 
 Decoded: TypeAlias = CanFrames | Table | Images
@@ -197,6 +197,25 @@ def _camera_info_doubts(fields: Fields) -> Iterator[Doubt]:
     yield fields.items(lens)[1] > LENS_COEFFICIENTS, "over 14 lens coefficients"
 
 
+_IMU: Final = {
+    "linear_acceleration": _xyz("accel_{}_mps2", "linear_acceleration"),
+    "angular_velocity": _xyz("gyro_{}_radps", "angular_velocity"),
+    "orientation": _quat("orientation"),
+}
+
+
+def _imu(fields: Fields) -> Table:
+    """NaN where the message says, by a covariance that begins with -1, that it has no estimate."""
+    columns: dict[str, NDArray[np.generic]] = {}
+    for estimate, sources in _IMU.items():
+        covariance = fields.number(f"{estimate}_covariance").astype(np.float64, copy=False)
+        absent = covariance[:, 0] == -1.0
+        for name, path in sources.items():
+            column = fields.number(path)
+            columns[name] = np.where(absent, np.nan, column) if absent.any() else column
+    return Table(columns)
+
+
 _POSE: Final = _xyz("{}_m", "pose.position") | _quat("pose.orientation")
 _POSE_COV: Final = _xyz("{}_m", "pose.pose.position") | _quat("pose.pose.orientation")
 
@@ -219,11 +238,10 @@ BY_TYPE: Final[Mapping[str, Kind]] = {
         _camera_info,
         _camera_info_doubts,
     ),
-    "sensor_msgs/msg/Imu": _table(
-        **_xyz("accel_{}_mps2", "linear_acceleration"),
-        **_xyz("gyro_{}_radps", "angular_velocity"),
-        **_quat("orientation"),
-        orientation_covariance="orientation_covariance:9",
+    "sensor_msgs/msg/Imu": Kind(
+        tuple(path for columns in _IMU.values() for path in columns.values())
+        + tuple(f"{estimate}_covariance:9" for estimate in _IMU),
+        _imu,
     ),
     "sensor_msgs/msg/MagneticField": _table(**_xyz("mag_{}_t", "magnetic_field")),
     "sensor_msgs/msg/NavSatFix": _table(
@@ -248,7 +266,7 @@ BY_TYPE: Final[Mapping[str, Kind]] = {
 def generic(fields: Fields) -> Table:
     """All numbers of a message under their dotted names, and the length of every sequence."""
     columns: dict[str, NDArray[np.generic]] = {
-        path: fields.number(path) for path in fields.plan.values if not path.endswith(FILLER)
+        path: fields.number(path) for path in fields.plan.values
     }
     for path, items in fields.plan.sequences.items():
         if items.count is None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Int64s, Messages
 
-from .plan import Items, Plan, Run, Step, Text
+from .plan import Items, Plan, Run, Step, Text, jumped
 
 Bools = NDArray[np.bool_]
 Rows = NDArray[np.intp]
@@ -77,7 +77,7 @@ def gather(buffer: Bytes, code: str, count: int, place: Int64s) -> NDArray[np.ge
 
 
 @dataclass(slots=True, eq=False)
-class _Cursor:
+class Cursor:
     """Positions of some of the messages, relative to where each one's body begins."""
 
     rows: Rows | slice
@@ -85,9 +85,17 @@ class _Cursor:
     at: Int64s
     stop: Int64s
 
-    def pick(self, which: Bools) -> _Cursor:
-        rows = np.flatnonzero(which) if isinstance(self.rows, slice) else self.rows[which]
-        return _Cursor(rows, self.origin[which], self.at[which], self.stop[which])
+    def pick(self, which: Bools) -> Cursor:
+        """A cursor of its own over some of the messages."""
+        return Cursor(self.some_rows(which), self.origin[which], self.at[which], self.stop[which])
+
+    def put_back(self, which: Bools, moved: Cursor) -> None:
+        """Take over where a cursor from ``pick`` has come to."""
+        self.at[which] = moved.at
+
+    def some_rows(self, which: Bools) -> Rows:
+        """Numbers in the block of some of the messages."""
+        return np.flatnonzero(which) if isinstance(self.rows, slice) else self.rows[which]
 
 
 def walk(plan: Plan, messages: Messages, *, little: bool = True) -> Found:
@@ -100,31 +108,42 @@ def walk(plan: Plan, messages: Messages, *, little: bool = True) -> Found:
     """
     head = 4 if plan.is_cdr else 0
     origin = messages.start + head
-    stop = messages.stop - origin
     found = Found(messages.buffer, little, np.ones(len(messages), np.bool_))
-    walker = _Walker(found, plan.is_cdr)
-    cursor = _Cursor(slice(None), origin, np.zeros_like(origin), stop)
-    walker.refuse(cursor, stop < 0, "no room for the encapsulation")
-    walker.steps(plan.steps, cursor, keep=True)
-    left = cursor.stop - cursor.at
-    most = CDR_PADDING if plan.is_cdr else 0
-    walker.refuse(cursor, left > most, "bytes left over after the last field")
+    cursor = Cursor(slice(None), origin, np.zeros_like(origin), messages.stop - origin)
+    Walker(found, plan.is_cdr).whole(plan, cursor)
     return found
 
 
 @dataclass(slots=True, eq=False)
-class _Walker:
+class Walker:
+    """Moves cursors over messages step by step, and keeps what it finds.
+
+    Attributes:
+        found: Filled as it goes.
+        is_cdr: CDR, else ROS 1.
+        damaged: Some message has been refused.
+        spent: Steps taken inside sequences of items of varying size.
+    """
+
     found: Found
     is_cdr: bool
     damaged: bool = False
     spent: int = 0
 
-    def refuse(self, cursor: _Cursor, bad: Bools, why: str) -> None:
+    def whole(self, plan: Plan, cursor: Cursor) -> None:
+        """Walk from the first field to the last and see that nothing is left over."""
+        self.refuse(cursor, cursor.stop < 0, "no room for the encapsulation")
+        self.steps(plan.steps, cursor, keep=True)
+        most = CDR_PADDING if plan.is_cdr else 0
+        left = cursor.stop - cursor.at
+        self.refuse(cursor, left > most, "bytes left over after the last field")
+
+    def refuse(self, cursor: Cursor, bad: Bools, why: str) -> None:
         """Mark the messages of ``cursor`` that are ``bad``, unless they were already."""
         if not bad.any():
             return
         ok = self.found.ok
-        rows = np.flatnonzero(bad) if isinstance(cursor.rows, slice) else cursor.rows[bad]
+        rows = cursor.some_rows(bad)
         fresh = np.unique(rows[ok[rows]])
         if len(fresh):
             ok[fresh] = False
@@ -133,16 +152,18 @@ class _Walker:
         # A refused message stays parked at its end: nothing is read behind it.
         cursor.at[bad] = cursor.stop[bad]
 
-    def steps(self, steps: Iterable[Step], cursor: _Cursor, *, keep: bool) -> None:
+    def steps(self, steps: Iterable[Step], cursor: Cursor, *, keep: bool) -> None:
+        """Take all steps; ``keep`` the places, which only fields outside sequences have."""
         for step in steps:
             if isinstance(step, Run):
-                self._run(step, cursor, keep)
+                self.run(step, cursor, keep)
             elif isinstance(step, Text):
-                self._text(step, cursor, keep)
+                self.text(step, cursor, keep)
             else:
-                self._items(step, cursor, keep)
+                self.items(step, cursor, keep)
 
-    def _run(self, run: Run, cursor: _Cursor, keep: bool) -> None:
+    def run(self, run: Run, cursor: Cursor, keep: bool) -> None:
+        """Pass fields of fixed size."""
         modulo = _same(cursor.at & 7)
         begin = cursor.origin + cursor.at
         cursor.at = cursor.at + run.size[modulo]
@@ -151,7 +172,7 @@ class _Walker:
             for k, value in enumerate(run.values):
                 self.found.places[value.path] = (begin, modulo, run.place[:, k])
 
-    def _length(self, path: str, cursor: _Cursor) -> Int64s:
+    def _length(self, path: str, cursor: Cursor) -> Int64s:
         """Read the 32-bit length at the cursor; 0 for messages refused."""
         at = (cursor.at + 3) & -4 if self.is_cdr else cursor.at
         cursor.at = at + 4
@@ -166,7 +187,8 @@ class _Walker:
         lengths[good] = gather(self.found.buffer, code, 0, place[good])
         return lengths
 
-    def _text(self, text: Text, cursor: _Cursor, keep: bool) -> None:
+    def text(self, text: Text, cursor: Cursor, keep: bool) -> tuple[Int64s, Int64s]:
+        """Pass a string; its first byte and its length without terminator come back."""
         length = self._length(text.path, cursor)
         first = cursor.origin + cursor.at
         cursor.at = cursor.at + length
@@ -178,8 +200,9 @@ class _Walker:
         self._check_utf8(text, cursor, first, length)
         if keep:
             self.found.texts[text.path] = (first, length)
+        return first, length
 
-    def _without_terminator(self, text: Text, cursor: _Cursor, length: Int64s) -> Int64s:
+    def _without_terminator(self, text: Text, cursor: Cursor, length: Int64s) -> Int64s:
         good = self.found.ok[cursor.rows]
         last = cursor.origin + cursor.at - 1
         bad = good & (length < 1)
@@ -188,12 +211,24 @@ class _Walker:
         self.refuse(cursor, bad, f"string {text.path} has no terminator")
         return np.maximum(length - 1, 0)
 
-    def _check_utf8(self, text: Text, cursor: _Cursor, first: Int64s, length: Int64s) -> None:
+    def _check_utf8(self, text: Text, cursor: Cursor, first: Int64s, length: Int64s) -> None:
         good = self.found.ok[cursor.rows]
         bad = good & ~are_utf8(self.found.buffer, first, np.where(good, length, 0))
         self.refuse(cursor, bad, f"string {text.path} is not UTF-8")
 
-    def _items(self, items: Items, cursor: _Cursor, keep: bool) -> None:
+    def items(self, items: Items, cursor: Cursor, keep: bool) -> tuple[Int64s, Int64s]:
+        """Pass a sequence; its first item's place and the number of items come back."""
+        count = self._count(items, cursor)
+        width = int(items.code[1]) if items.code and self.is_cdr else 1
+        # An empty sequence is not followed by its items' alignment.
+        cursor.at = np.where(count > 0, -(-cursor.at // width) * width, cursor.at)
+        first = cursor.origin + cursor.at
+        self.contents(items, cursor, count)
+        if keep:
+            self.found.sequences[items.path] = (first, count)
+        return first, count
+
+    def _count(self, items: Items, cursor: Cursor) -> Int64s:
         if items.count is None:
             count = self._length(items.path, cursor)
             room = cursor.stop - cursor.at
@@ -204,31 +239,17 @@ class _Walker:
                 self.refuse(cursor, over, f"sequence {items.path} is over its bound")
         else:
             count = np.full(len(cursor.at), items.count, np.int64)
-        count = np.where(self.found.ok[cursor.rows], count, 0) if self.damaged else count
-        width = int(items.code[1]) if items.code and self.is_cdr else 1
-        # An empty sequence is not followed by its items' alignment.
-        at = np.where(count > 0, -(-cursor.at // width) * width, cursor.at)
-        first = cursor.origin + at
-        cursor.at = at
-        if items.jumps is not None:
-            self._jump(items, cursor, count)
-        else:
+        return np.where(self.found.ok[cursor.rows], count, 0) if self.damaged else count
+
+    def contents(self, items: Items, cursor: Cursor, count: Int64s) -> None:
+        """Pass the items: all at once where their sizes are known, else one by one."""
+        if items.jumps is None:
             self._each(items, cursor, count)
-        if keep:
-            self.found.sequences[items.path] = (first, count)
-
-    def _jump(self, items: Items, cursor: _Cursor, count: Int64s) -> None:
-        """Pass all items at once, since their sizes are known."""
-        assert items.jumps is not None
-        at = cursor.at
-        if len(items.code) and not len(count):
             return
-        for k in range(int(count.max(initial=0)).bit_length()):
-            at = at + np.where((count >> k) & 1, items.jumps[k][at & 7], 0)
-        cursor.at = at
-        self.refuse(cursor, at > cursor.stop, f"sequence {items.path} passes the end")
+        cursor.at = jumped(items.jumps, cursor.at, count)
+        self.refuse(cursor, cursor.at > cursor.stop, f"sequence {items.path} passes the end")
 
-    def _each(self, items: Items, cursor: _Cursor, count: Int64s) -> None:
+    def _each(self, items: Items, cursor: Cursor, count: Int64s) -> None:
         """Pass items of varying size one by one, all messages that still have one at a time."""
         for i in range(int(count.max(initial=0))):
             active = count > i
@@ -242,7 +263,7 @@ class _Walker:
                 return
             inner = cursor.pick(active)
             self.steps(items.item, inner, keep=False)
-            cursor.at[active] = inner.at
+            cursor.put_back(active, inner)
 
 
 def _same(column: Int64s) -> Int64s | int:

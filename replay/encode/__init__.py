@@ -1,0 +1,82 @@
+"""Blocks of any log to ROS 2 messages: the way back from ``crosscue.replay.decode``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
+from crosscue.replay.decode import Decoder, decoder_for
+from crosscue.replay.decode.definition import definitions_of, well_known
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.roles import ros2_spelling
+
+from .can import can_messages
+from .definitions import standard_text
+from .images import image_messages
+from .outgoing import Encoder, Outgoing, Ros2Type, without_odd_times
+from .ros1 import ros1_to_cdr
+from .tables import OwnTypes, table_messages
+
+__all__ = ["Encoder", "Encoders", "Outgoing", "Ros2Type"]
+
+
+@dataclass(slots=True)
+class Encoders:
+    """Encoders of the topics of one file, which share the types made for it."""
+
+    types: OwnTypes = field(default_factory=OwnTypes)
+
+    def encoder_for(self, topic: Topic) -> Encoder | None:
+        """The encoder of ``topic``; None if its type is not known, so that ROS 2 cannot hold it.
+
+        Raises:
+            SchemaError: Its definition is damaged.
+        """
+        if topic.encoding == "cdr":
+            return _cdr(topic)
+        if topic.encoding == "ros1":
+            return ros1_to_cdr(topic)
+        decoder = decoder_for(topic)
+        return None if decoder is None else _Columns(decoder, self.types)
+
+
+def _cdr(topic: Topic) -> Encoder | None:
+    name = ros2_spelling(topic.type_name)
+    if topic.schema.strip() or topic.schema_encoding:
+        if topic.schema_encoding:
+            definitions_of(name, topic.schema, topic.schema_encoding)
+        return _AsStored(Ros2Type(name, topic.schema, topic.schema_encoding or "ros2msg"))
+    if well_known(name) is None:
+        return None
+    return _AsStored(Ros2Type(name, standard_text(name).encode()))
+
+
+@dataclass(frozen=True, slots=True)
+class _AsStored:
+    """CDR messages stay as they are, byte for byte."""
+
+    type: Ros2Type
+
+    def __call__(self, block: Block, ledger: Ledger) -> list[Outgoing]:
+        assert isinstance(block.rows, Messages)
+        return [Outgoing(self.type, block)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Columns:
+    """Decode to columns first, then write them in ROS 2's types."""
+
+    decoder: Decoder
+    types: OwnTypes
+
+    def __call__(self, block: Block, ledger: Ledger) -> list[Outgoing]:
+        columns = without_odd_times(self.decoder(block, ledger), ledger)
+        if not len(columns):
+            return []
+        rows = columns.rows
+        if isinstance(rows, CanFrames):
+            return can_messages(columns, rows, ledger)
+        if isinstance(rows, Images):
+            return image_messages(columns, rows, ledger)
+        assert isinstance(rows, Table)
+        return table_messages(columns, rows, self.types, ledger)

@@ -1,0 +1,104 @@
+"""ROS 2 definitions as complete text, and what ROS 1 types are called there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+from crosscue.replay.decode.definition import (
+    DURATION,
+    PRIMITIVES,
+    TIME,
+    Definitions,
+    Field,
+    Shape,
+    well_known,
+)
+from crosscue.replay.errors import SchemaError
+
+SEPARATOR: Final = "=" * 80 + "\n"
+HEADER: Final = "std_msgs/msg/Header"
+_TIMES: Final[Mapping[str, tuple[Field, ...]]] = {
+    TIME: (Field("sec", "int32"), Field("nanosec", "uint32")),
+    DURATION: (Field("sec", "int32"), Field("nanosec", "uint32")),
+}
+
+
+def text_of(type_name: str, known: Definitions) -> str:
+    """A complete ``ros2msg`` definition: the type and, after separators, all it is made of."""
+    parts = [_body(known[type_name])]
+    for name in _needed(type_name, known):
+        fields = known.get(name) or _TIMES.get(name)
+        if fields is None:
+            raise SchemaError(f"{type_name}: its definition lacks the type {name}")
+        parts.append(f"MSG: {_short(name)}\n{_body(fields)}")
+    return SEPARATOR.join(parts)
+
+
+def standard_text(type_name: str) -> str:
+    """``text_of`` a type that ROS 2 itself, or this toolkit, defines."""
+    known = well_known(type_name)
+    if known is None:
+        raise SchemaError(f"{type_name}: not a type that we know")
+    return text_of(type_name, known)
+
+
+def as_ros2(type_name: str, ros1: Definitions) -> Definitions:
+    """Definitions of a ROS 1 type for ROS 2: the header loses its counter.
+
+    Where ROS 2 has a type of this name whose fields are coded alike, its field names are taken.
+    """
+    known: dict[str, tuple[Field, ...]] = {}
+    for name, fields in ros1.items():
+        kept = fields
+        if name == HEADER and fields and fields[0].name == "seq":
+            kept = fields[1:]
+        known[name] = kept
+    modern = well_known(type_name)
+    if modern is not None and _alike(type_name, known, modern):
+        return modern
+    return known
+
+
+def _alike(name: str, ours: Definitions, theirs: Definitions) -> bool:
+    if name in _TIMES:
+        return True
+    mine, other = ours.get(name), theirs.get(name)
+    if mine is None or other is None or len(mine) != len(other):
+        return False
+    return all(
+        (a.type_name, a.shape, a.size if a.shape is Shape.ARRAY else 0)
+        == (b.type_name, b.shape, b.size if b.shape is Shape.ARRAY else 0)
+        and (
+            a.type_name in PRIMITIVES or "/" not in a.type_name or _alike(a.type_name, ours, theirs)
+        )
+        for a, b in zip(mine, other, strict=True)
+    )
+
+
+def _needed(type_name: str, known: Definitions) -> Iterator[str]:
+    seen = {type_name}
+    waiting = [type_name]
+    while waiting:
+        for field in known.get(waiting.pop(0)) or ():
+            if "/" in field.type_name and field.type_name not in seen:
+                seen.add(field.type_name)
+                waiting.append(field.type_name)
+                yield field.type_name
+
+
+def _short(name: str) -> str:
+    return name.replace("/msg/", "/")
+
+
+def _body(fields: tuple[Field, ...]) -> str:
+    return "".join(f"{_type(field)} {field.name}\n" for field in fields)
+
+
+def _type(field: Field) -> str:
+    name = _short(field.type_name) + (f"<={field.text_bound}" if field.text_bound else "")
+    if field.shape is Shape.ARRAY:
+        return f"{name}[{field.size}]"
+    if field.shape is Shape.SEQUENCE:
+        return f"{name}[<={field.size}]" if field.size else f"{name}[]"
+    return name

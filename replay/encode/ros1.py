@@ -1,0 +1,245 @@
+"""ROS 1 messages as CDR: the same values in the same order, aligned, strings terminated.
+
+The walk over the messages (``crosscue.replay.decode.walk``) notes what goes where; when the sizes
+of all messages are known, whole columns of values are copied at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Block, Bytes, Int64s, Messages, Topic
+from crosscue.replay.decode.definition import definitions_of
+from crosscue.replay.decode.plan import Items, Plan, Run, Text, jumped, plan_of
+from crosscue.replay.decode.ros import MISFIT
+from crosscue.replay.decode.walk import Bools, Cursor, Found, Rows, Walker
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.mcap_assembly import copy_ranges
+from crosscue.replay.roles import ros2_spelling
+
+from .definitions import as_ros2, text_of
+from .outgoing import Outgoing, Ros2Type
+from .template import ENCAPSULATION
+
+HEAD: Final = len(ENCAPSULATION)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Values:
+    """M values of equal width to be copied: message, place in the log, place in the new message."""
+
+    rows: Rows
+    source: Int64s
+    target: Int64s
+    width: int | Int64s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lengths:
+    """M lengths to be written."""
+
+    rows: Rows
+    target: Int64s
+    length: Int64s
+
+
+_Job: TypeAlias = _Values | _Lengths
+
+
+@dataclass(slots=True, eq=False)
+class _TwoCursors(Cursor):
+    """Where we are in the log, and in the new messages.
+
+    Attributes:
+        out: Position in each new message's body.
+    """
+
+    out: Int64s
+
+    def pick(self, which: Bools) -> _TwoCursors:
+        """A cursor of its own over some of the messages."""
+        return _TwoCursors(
+            self.some_rows(which),
+            self.origin[which],
+            self.at[which],
+            self.stop[which],
+            self.out[which],
+        )
+
+    def put_back(self, which: Bools, moved: Cursor) -> None:
+        """Take over where a cursor from ``pick`` has come to."""
+        assert isinstance(moved, _TwoCursors)
+        self.at[which] = moved.at
+        self.out[which] = moved.out
+
+    def numbers(self) -> Rows:
+        """Number of each message in the block."""
+        if isinstance(self.rows, slice):
+            return np.arange(len(self.at))
+        return self.rows
+
+
+@dataclass(slots=True, eq=False)
+class _Transcriber(Walker):
+    """Walks ROS 1 messages and notes the copies that make CDR messages of them."""
+
+    jobs: list[_Job] = field(default_factory=list)
+
+    def run(self, run: Run, cursor: Cursor, keep: bool) -> None:
+        """Note the values of a run."""
+        assert isinstance(cursor, _TwoCursors)
+        self._values(run, cursor.numbers(), cursor.origin + cursor.at, cursor.out)
+        cursor.out = cursor.out + run.cdr_size[cursor.out & 7]
+        Walker.run(self, run, cursor, keep)
+
+    def _values(self, run: Run, rows: Rows, source: Int64s, target: Int64s) -> None:
+        """Note copies; neighbours that stay neighbours are copied together."""
+        modulo = target & 7
+        places = run.cdr_place[modulo[0]] if len(modulo) and (modulo == modulo[0]).all() else None
+        k, last = 0, len(run.values)
+        while k < last:
+            begin, width = k, run.widths[k]
+            k += 1
+            if not run.cdr_widths[begin] or not width:
+                continue
+            while (
+                places is not None
+                and k < last
+                and run.widths[k] == run.cdr_widths[k]
+                and places[k] - places[begin] == run.place[0, k] - run.place[0, begin]
+                and places[k] == places[begin] + width
+            ):
+                width += run.widths[k]
+                k += 1
+            put = places[begin] if places is not None else run.cdr_place[modulo, begin]
+            self.jobs.append(_Values(rows, source + run.place[0, begin], target + put, width))
+
+    def text(self, text: Text, cursor: Cursor, keep: bool) -> tuple[Int64s, Int64s]:
+        """Note a string, which gets a terminator."""
+        assert isinstance(cursor, _TwoCursors)
+        first, length = Walker.text(self, text, cursor, keep)
+        at = (cursor.out + 3) & -4
+        rows = cursor.numbers()
+        self.jobs.append(_Lengths(rows, at, length + 1))
+        self.jobs.append(_Values(rows, first, at + 4, length))
+        cursor.out = at + 5 + length
+        return first, length
+
+    def contents(self, items: Items, cursor: Cursor, count: Int64s) -> None:
+        """Note a sequence's length and items."""
+        assert isinstance(cursor, _TwoCursors)
+        rows = cursor.numbers()
+        if items.count is None:
+            at = (cursor.out + 3) & -4
+            self.jobs.append(_Lengths(rows, at, count))
+            cursor.out = at + 4
+        first, out = cursor.origin + cursor.at, cursor.out
+        Walker.contents(self, items, cursor, count)
+        if items.jumps is None or items.cdr_jumps is None:
+            return
+        fits = self.found.ok[cursor.rows]
+        count = np.where(fits, count, 0)
+        if items.code:
+            width = int(items.code[1])
+            at = np.where(count > 0, -(-out // width) * width, out)
+            self.jobs.append(_Values(rows, first, at, count * width))
+        else:
+            self._all_items(items, rows, first, out, count)
+        cursor.out = jumped(items.cdr_jumps, out, count)
+
+    def _all_items(
+        self, items: Items, rows: Rows, first: Int64s, out: Int64s, count: Int64s
+    ) -> None:
+        """Note all items of all messages as if each were a message."""
+        assert items.jumps is not None
+        assert items.cdr_jumps is not None
+        owner = np.repeat(np.arange(len(count)), count)
+        number = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+        source = first[owner] + number * items.jumps[0][0]
+        target = jumped(items.cdr_jumps, out[owner], number)
+        for step in items.item:
+            assert isinstance(step, Run)
+            self._values(step, rows[owner], source, target)
+
+    def write(self, out: Int64s) -> Messages:
+        """The new messages of those that fit, in order.
+
+        Args:
+            out: Shape (N,): bytes of each new message's body.
+        """
+        ok = self.found.ok
+        size = np.where(ok, out + HEAD, 0)
+        stop = np.cumsum(size)
+        start = stop - size
+        buffer = np.zeros(int(stop[-1]) if len(stop) else 0, np.uint8)
+        for k, byte in enumerate(ENCAPSULATION):
+            buffer[start[ok] + k] = byte
+        for job in self.jobs:
+            self._do(job, buffer, start + HEAD)
+        return Messages(buffer, start[ok], stop[ok])
+
+    def _do(self, job: _Job, buffer: Bytes, body: Int64s) -> None:
+        keep: slice | NDArray[np.bool_] = slice(None)
+        if self.damaged:
+            keep = self.found.ok[job.rows]
+        target = (body[job.rows] + job.target)[keep]
+        if isinstance(job, _Lengths):
+            raw = job.length[keep].astype("<u4").view(np.uint8).reshape(-1, 4)
+            copy_ranges(buffer, target, raw.reshape(-1), np.arange(len(raw)) * 4, _of(4, target))
+            return
+        width = _of(job.width, target) if isinstance(job.width, int) else job.width[keep]
+        copy_ranges(buffer, target, self.found.buffer, job.source[keep], width)
+
+
+def _of(width: int, like: Int64s) -> Int64s:
+    return np.full(len(like), width, np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Ros1ToCdr:
+    """From blocks of ROS 1 messages of one type to CDR."""
+
+    type: Ros2Type
+    plan: Plan
+
+    def __call__(self, block: Block, ledger: Ledger) -> list[Outgoing]:
+        """Transcribe; messages that do not fit their definition are skipped."""
+        assert isinstance(block.rows, Messages)
+        messages = block.rows
+        found = Found(messages.buffer, True, np.ones(len(messages), np.bool_))
+        walker = _Transcriber(found, False)
+        zero = np.zeros(len(messages), np.int64)
+        cursor = _TwoCursors(
+            slice(None), messages.start, zero, messages.stop - messages.start, zero.copy()
+        )
+        walker.whole(self.plan, cursor)
+        for refused in found.refused:
+            first = int(block.log_ns[refused.rows[0]])
+            ledger.skip(block.topic, MISFIT, len(refused.rows), refused.why, first)
+        if not found.ok.any():
+            return []
+        kept = block if found.ok.all() else block.take(found.ok)
+        return [Outgoing(self.type, replace(kept, rows=walker.write(cursor.out)))]
+
+
+def ros1_to_cdr(topic: Topic) -> Ros1ToCdr | None:
+    """The encoder of a ROS 1 topic; None if the log does not define its type.
+
+    Raises:
+        SchemaError: The definition does not parse, or lacks a type.
+    """
+    name = ros2_spelling(topic.type_name)
+    if not topic.schema and not topic.schema_encoding:
+        return None
+    try:
+        known = definitions_of(name, topic.schema, topic.schema_encoding or "ros1msg")
+        plan = plan_of(name, known, is_cdr=False)
+        text = text_of(name, as_ros2(name, known))
+    except SchemaError as error:
+        raise SchemaError(f"{topic.name}: {error}") from None
+    return Ros1ToCdr(Ros2Type(name, text.encode()), plan)

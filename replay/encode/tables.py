@@ -1,0 +1,247 @@
+"""Tables as ROS 2 messages: a standard type where the columns are its own, else one of ours.
+
+A table that no standard type can hold becomes ``crosscue_msgs/msg/<Topic>``: a header and one field
+for each numeric column, with the column's name.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Block, Table
+from crosscue.replay.decode.plan import Plan
+from crosscue.replay.ledger import Ledger
+
+from .outgoing import Outgoing, Ros2Type, own_type, stamps, standard_type, with_rows
+from .template import filled, template_of
+
+Columns = Mapping[str, NDArray[np.generic]]
+ABSENT: Final = -1.0
+"""First element of a covariance: "there is no such estimate" (sensor_msgs/msg/Imu says so)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Standard:
+    """A standard type that can hold a table.
+
+    Attributes:
+        type_name: The type.
+        needs: Sets of columns; a table must have at least one of these sets whole.
+        together: Sets of columns, of which a table has all or none.
+        paths: From each column that the type can hold to its field.
+        rest: Further fields, from the columns there are.
+    """
+
+    type_name: str
+    needs: tuple[frozenset[str], ...]
+    paths: Mapping[str, str]
+    together: tuple[frozenset[str], ...] = ()
+    rest: Callable[[Columns, int], Columns] | None = None
+
+    def holds(self, columns: Columns) -> bool:
+        """Can it hold exactly this table, nothing left out?"""
+        names = frozenset(columns)
+        if not names <= frozenset(self.paths) or not any(need <= names for need in self.needs):
+            return False
+        if any(group & names and not group <= names for group in self.together):
+            return False
+        return all(columns[name].dtype.kind in "fiub" for name in names)
+
+
+def _axes(column: str, path: str) -> dict[str, str]:
+    return {column.format(axis): f"{path}.{axis}" for axis in "xyz"}
+
+
+_QUAT: Final = frozenset(f"quat_{axis}" for axis in "xyzw")
+_XY: Final = frozenset({"x_m", "y_m"})
+
+
+def _quat(path: str) -> dict[str, str]:
+    return {f"quat_{axis}": f"{path}.{axis}" for axis in "xyzw"}
+
+
+def _imu_rest(columns: Columns, size: int) -> Columns:
+    """Say which of the three estimates there are."""
+    rest: dict[str, NDArray[np.generic]] = {}
+    for name, field in (("quat_w", "orientation"), ("gyro_x_radps", "angular_velocity"),
+                        ("accel_x_mps2", "linear_acceleration")):  # fmt: skip
+        if name not in columns or np.isnan(columns[name].astype(np.float64)).all():
+            covariance = np.zeros((size, 9))
+            covariance[:, 0] = ABSENT
+            rest[f"{field}_covariance"] = covariance
+    return rest
+
+
+_FIX: Final = {
+    "latitude_deg": "latitude",
+    "longitude_deg": "longitude",
+    "altitude_m": "altitude",
+    "status": "status.status",
+    "covariance_m2": "position_covariance",
+    "covariance_type": "position_covariance_type",
+}
+
+
+def _fix_rest(columns: Columns, size: int) -> Columns:
+    return {} if "altitude_m" in columns else {"altitude": np.full(size, np.nan)}
+
+
+_ACCEL: Final = frozenset(f"accel_{axis}_mps2" for axis in "xyz")
+_GYRO: Final = frozenset(f"gyro_{axis}_radps" for axis in "xyz")
+
+STANDARDS: Final = (
+    Standard(
+        "sensor_msgs/msg/Imu",
+        (_ACCEL, _GYRO),
+        _axes("accel_{}_mps2", "linear_acceleration")
+        | _axes("gyro_{}_radps", "angular_velocity")
+        | _quat("orientation"),
+        (_ACCEL, _GYRO, _QUAT),
+        _imu_rest,
+    ),
+    Standard(
+        "sensor_msgs/msg/MagneticField",
+        (frozenset(f"mag_{axis}_t" for axis in "xyz"),),
+        _axes("mag_{}_t", "magnetic_field"),
+    ),
+    Standard(
+        "sensor_msgs/msg/NavSatFix",
+        (frozenset({"latitude_deg", "longitude_deg"}),),
+        _FIX,
+        rest=_fix_rest,
+    ),
+    Standard(
+        "geometry_msgs/msg/PoseStamped",
+        (_XY | _QUAT,),
+        _axes("{}_m", "pose.position") | _quat("pose.orientation"),
+    ),
+    Standard(
+        "nav_msgs/msg/Odometry",
+        (_XY | _QUAT | {"speed_x_mps"}, _XY | _QUAT | {"yaw_rate_radps"}),
+        _axes("{}_m", "pose.pose.position")
+        | _quat("pose.pose.orientation")
+        | {
+            "speed_x_mps": "twist.twist.linear.x",
+            "speed_y_mps": "twist.twist.linear.y",
+            "yaw_rate_radps": "twist.twist.angular.z",
+        },
+    ),
+)
+
+
+def table_messages(block: Block, table: Table, types: OwnTypes, ledger: Ledger) -> list[Outgoing]:
+    """Rows of a table as messages."""
+    standard = next((each for each in STANDARDS if each.holds(table.columns)), None)
+    if standard is not None and types.fields_of(block.topic) is None:
+        return [_as_standard(block, table, standard)]
+    return [types.messages(block, table, ledger)]
+
+
+def _as_standard(block: Block, table: Table, standard: Standard) -> Outgoing:
+    kind, plan = standard_type(standard.type_name)
+    size = len(block)
+    values = {standard.paths[name]: column for name, column in table.columns.items()}
+    if standard.rest is not None:
+        values = dict(standard.rest(table.columns, size)) | values
+    frame = template_of(plan, {"header.frame_id": block.topic.lstrip("/")})
+    rows = filled(plan, frame, size, {"header.stamp": stamps(block), **values})
+    return Outgoing(kind, with_rows(block, rows))
+
+
+@dataclass(frozen=True, slots=True)
+class _Own:
+    """A type made for one topic.
+
+    Attributes:
+        type: The type.
+        plan: Its CDR form.
+        fields: From column to field, shape (without rows) and NumPy code.
+    """
+
+    type: Ros2Type
+    plan: Plan
+    fields: Mapping[str, tuple[str, tuple[int, ...], str]]
+
+
+_CODES: Final = {
+    "b1": "bool", "i1": "int8", "u1": "uint8", "i2": "int16", "u2": "uint16", "i4": "int32",
+    "u4": "uint32", "i8": "int64", "u8": "uint64", "f4": "float32", "f8": "float64",
+}  # fmt: skip
+
+
+class OwnTypes:
+    """The types made so far: a topic keeps the one of its first block."""
+
+    def __init__(self) -> None:
+        """No topic has a type yet."""
+        self._made: dict[str, _Own] = {}
+        self._names: set[str] = set()
+
+    def fields_of(self, topic: str) -> Mapping[str, tuple[str, tuple[int, ...], str]] | None:
+        """The fields of the type made for ``topic``, or None."""
+        own = self._made.get(topic)
+        return None if own is None else own.fields
+
+    def messages(self, block: Block, table: Table, ledger: Ledger) -> Outgoing:
+        """Rows as messages of the topic's own type; what it cannot hold is said."""
+        own = self._made.get(block.topic)
+        if own is None:
+            own = self._made[block.topic] = self._make(block.topic, table)
+        left_out = [name for name in table.columns if name not in own.fields]
+        if left_out:
+            ledger.notice(
+                f"{block.topic}: columns that are not numbers, or came late, are not written: "
+                f"{', '.join(left_out[:8])}"
+            )
+        values: dict[str, NDArray[np.generic]] = {"header.stamp": stamps(block)}
+        for name, (field, shape, code) in own.fields.items():
+            column = table.columns.get(name)
+            if column is None or column.shape[1:] != shape:
+                filler = np.nan if code in ("f4", "f8") else 0
+                column = np.full((len(block), *shape), filler, code)
+                ledger.notice(f"{block.topic}: rows without {name} are written with {filler}")
+            values[field] = column
+        frame = template_of(own.plan, {"header.frame_id": block.topic.lstrip("/")})
+        return Outgoing(own.type, with_rows(block, filled(own.plan, frame, len(block), values)))
+
+    def _make(self, topic: str, table: Table) -> _Own:
+        fields: dict[str, tuple[str, tuple[int, ...], str]] = {}
+        lines = ["std_msgs/Header header"]
+        used = {"header"}
+        for name, column in table.columns.items():
+            code = f"{column.dtype.kind}{column.dtype.itemsize}"
+            if code not in _CODES or column.ndim > 2 or 0 in column.shape[1:]:
+                continue
+            field = _unused(_field_name(name), used)
+            array = f"[{column.shape[1]}]" if column.ndim == 2 else ""
+            lines.append(f"{_CODES[code]}{array} {field}")
+            fields[name] = (field, column.shape[1:], code)
+        type_name = _unused(_type_name(topic), self._names)
+        kind, plan = own_type(f"crosscue_msgs/msg/{type_name}", "\n".join(lines) + "\n")
+        return _Own(kind, plan, fields)
+
+
+def _field_name(column: str) -> str:
+    """A ROS 2 field name: lower case, digits and single underscores, a letter first."""
+    name = re.sub(r"_+", "_", re.sub(r"[^a-z0-9]", "_", column.lower())).strip("_")
+    return name if name and name[0].isalpha() else f"c_{name}".strip("_")
+
+
+def _type_name(topic: str) -> str:
+    words = re.findall(r"[A-Za-z0-9]+", topic)
+    name = "".join(word[0].upper() + word[1:] for word in words) or "Table"
+    return name if name[0].isalpha() else f"T{name}"
+
+
+def _unused(name: str, used: set[str]) -> str:
+    chosen, k = name, 2
+    while chosen in used:
+        chosen, k = f"{name}{k}", k + 1
+    used.add(chosen)
+    return chosen
