@@ -1,0 +1,123 @@
+"""Frames as the messages that a driver would make of them, already decoded to columns.
+
+The driver is imagined: fields one for one, values as on the wire, types as in the definitions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from crosscue.replay.columns import Block, CanFrames, Floats, Int64s, Table, Topic
+from crosscue.replay.mobileye.bits import extract, words_of
+from crosscue.replay.mobileye.layout import Field, Message, layout
+from crosscue.replay.mobileye.wire import from_raw
+from support.ros_messages import messages_of as messages_of_bytes
+
+TYPES: Final[Mapping[str, str]] = {
+    "/parsed_tx/obstacle_status": "ObstacleStatus",
+    "/parsed_tx/obstacle_data": "ObstacleData",
+    "/parsed_tx/left_lka_lane": "LkaLane",
+    "/parsed_tx/right_lka_lane": "LkaLane",
+    "/parsed_tx/next_lka_lanes": "LkaLane",
+    "/parsed_tx/lane": "Lane",
+    "/parsed_tx/aftermarket_lane": "AftermarketLane",
+    "/parsed_tx/aws_display": "AwsDisplay",
+    "/parsed_tx/tsr": "Tsr",
+    "/parsed_tx/ahbc_gradual": "AhbcGradual",
+    "/parsed_tx/fixed_foe": "FixedFoe",
+}
+TOPIC_TYPES: Final = {topic: f"mobileye_560_660_msgs/msg/{name}" for topic, name in TYPES.items()}
+
+_FLOAT32: Final = (
+    "obstacle_length", "obstacle_width", "radar_pos_x", "radar_vel_x", "obstacle_angle_rate",
+    "object_accel_x", "obstacle_angle", "marking_width", "view_range", "headway_measurement",
+    "distance_to_left_lane", "distance_to_right_lane", "sign_position_x", "sign_position_y",
+)  # fmt: skip
+
+
+def messages_of(block: Block, only: str = "") -> list[Block]:
+    """One block of messages for each topic that the frames feed."""
+    frames = block.rows
+    assert isinstance(frames, CanFrames)
+    topics = [
+        ("obstacle_status", ("status",), 0),
+        *(("obstacle_data", ("obstacle_a", "obstacle_b", "obstacle_c"), k) for k in range(13)),
+        ("left_lka_lane", ("lane_a", "lane_b"), 0),
+        ("right_lka_lane", ("lane_a", "lane_b"), 1),
+        *(("next_lka_lanes", ("next_lane_a", "next_lane_b"), k) for k in range(8)),
+        ("lane", ("lane_details",), 0),
+        ("aftermarket_lane", ("aftermarket_lane",), 0),
+        ("aws_display", ("warnings",), 0),
+        *(("tsr", ("sign",), k) for k in range(7)),
+        ("ahbc_gradual", ("high_beam_area", "high_beam_state"), 0),
+    ]
+    made: dict[str, list[Block]] = {}
+    for topic, names, instance in topics:
+        columns: dict[str, NDArray[np.generic]] = {}
+        log_ns: Int64s = np.zeros(0, dtype=np.int64)
+        for name in names:
+            message = layout()[name]
+            rows = frames.arbitration_id == message.ids[instance]
+            columns |= _fields(message, words_of(frames.data[rows]))
+            log_ns = log_ns if len(log_ns) else block.log_ns[rows]
+        if len(log_ns) and only in ("", topic):
+            made.setdefault(f"/parsed_tx/{topic}", []).append(_block(topic, log_ns, columns))
+    return [_in_time(blocks) for blocks in made.values()]
+
+
+def _fields(message: Message, words: NDArray[np.uint64]) -> dict[str, NDArray[np.generic]]:
+    columns: dict[str, NDArray[np.generic]] = {}
+    for f in message.fields:
+        if f.ros:
+            columns[f.ros] = _as_sent(f, extract(words, f.start, f.bits, f.signed, False))
+    if message.name == "warnings":
+        columns["dusk_time"] = (words >> np.uint64(3)) & np.uint64(1) > 0
+        columns["night_time"] = (words >> np.uint64(4)) & np.uint64(1) > 0
+    return columns
+
+
+def _as_sent(f: Field, raw: Int64s) -> NDArray[np.generic]:
+    value: Floats = from_raw(replace(f, missing=()), raw)
+    if f.kind == "flag":
+        return value > 0
+    if f.kind == "code":
+        return value.astype(np.uint16)
+    return value.astype(np.float32) if f.ros in _FLOAT32 else value
+
+
+def _block(topic: str, log_ns: Int64s, columns: Mapping[str, NDArray[np.generic]]) -> Block:
+    return Block(f"/parsed_tx/{topic}", log_ns + 1_000_000, Table(columns), header_ns=log_ns)
+
+
+def _in_time(blocks: list[Block]) -> Block:
+    log_ns = np.concatenate([b.log_ns for b in blocks])
+    tables = [b.rows for b in blocks if isinstance(b.rows, Table)]
+    columns = {n: np.concatenate([t[n] for t in tables]) for n in tables[0].columns}
+    block = Block(blocks[0].topic, log_ns, Table(columns), header_ns=log_ns - 1_000_000)
+    return block.take(np.argsort(log_ns, kind="stable"))
+
+
+def as_cdr(block: Block) -> tuple[Topic, Block]:
+    """The messages of a block as rosbags writes them: a topic with its definition, and bytes."""
+    rows = block.rows
+    assert isinstance(rows, Table)
+    assert block.header_ns is not None
+    name = TOPIC_TYPES[block.topic]
+    kinds = {n: "bool" if c.dtype == np.bool_ else c.dtype.name for n, c in rows.columns.items()}
+    text = "".join(["std_msgs/Header header\n", *(f"{k} {n}\n" for n, k in kinds.items())])
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(text, name))
+    stamp, header = (store.types[n] for n in ("builtin_interfaces/msg/Time", "std_msgs/msg/Header"))
+    payloads = []
+    for k, t_ns in enumerate(block.header_ns.tolist()):
+        values = [column[k].item() for column in rows.columns.values()]
+        made = header(stamp(t_ns // 10**9, t_ns % 10**9), "mobileye")
+        payloads.append(bytes(store.serialize_cdr(store.types[name](made, *values), name)))
+    topic = Topic(block.topic, name, "cdr", text.encode(), "ros2msg")
+    return topic, Block(block.topic, block.log_ns, messages_of_bytes(payloads))
