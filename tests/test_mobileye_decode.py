@@ -447,6 +447,29 @@ def test_losing_frames_never_makes_a_row_that_was_not_there(seed: int) -> None:
         assert skipped(ledger) or ledger.topic("can1").lost
 
 
+@given(seed=st.integers(0, 100_000))
+@settings(max_examples=40, deadline=None)
+def test_any_bytes_at_any_time_are_accounted_for(seed: int) -> None:
+    """Random payloads, lengths, kinds and times under ids of the table and others."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 400))
+    ids = rng.choice([0x738, *range(0x739, 0x760), *range(0x766, 0x77C), *range(0x700, 0x731)], n)
+    lengths = rng.choice([2, 3, 4, 6, 7, 8, 8, 8, 8], n)
+    data = rng.integers(0, 256, (n, 8)) * (np.arange(8) < lengths[:, None])
+    steps = rng.choice([0, MS, 70 * MS, -(10**9)], n, p=[0.3, 0.6, 0.08, 0.02])
+    rows = CanFrames(
+        np.where(rng.random(n) < 0.05, 0x123, ids).astype(np.uint32),
+        rng.random(n) < 0.02,
+        rng.choice([0, 0, 0, 0, 0, 0, 1, 2], n).astype(np.uint8),
+        lengths.astype(np.uint8),
+        data.astype(np.uint8),
+        rng.random(n) < 0.02,
+    )
+    cut = n // 2
+    block = Block("can1", 10**18 + np.cumsum(steps), rows)
+    decode([block.take(np.s_[:cut]), block.take(np.s_[cut:])])  # which checks the account
+
+
 def rows_of(table: Table | None) -> set[tuple[str, ...]]:
     """Rows without what counts bursts."""
     if table is None:

@@ -52,6 +52,11 @@ class Status:
     def __len__(self) -> int:
         return len(self.number)
 
+    def at(self, burst: Int64s) -> Int64s:
+        """Places of bursts by their numbers; numbers of none of them give places outside."""
+        places: Int64s = burst - self.number[0]
+        return places
+
     def take(self, index: NDArray[np.intp] | slice) -> Status:
         """The statuses picked by ``index``."""
         return Status(
@@ -180,9 +185,9 @@ def sift(
     parts = _leave(parts, parts.burst == NO_BURST, NO_STATUS, faults)
     if not len(parts):
         return parts, faults, is_closed and len(status) == 1
-    at = np.searchsorted(status.number, parts.burst)
+    at = status.at(parts.burst)
     parts = _leave(parts, np.abs(parts.log_ns - status.log_ns[at]) > within_ns, LATE, faults)
-    at = np.searchsorted(status.number, parts.burst)
+    at = status.at(parts.burst)
     parts = _leave(parts, parts.place >= status.count[at], BEYOND_COUNT, faults)
     first = _first_of_slot(parts)
     is_again = first != np.arange(len(parts))
@@ -215,7 +220,8 @@ def join(parts: Parts) -> tuple[Triples, list[Fault]]:
 def shortage(parts: Parts, status: Status, slots: int) -> Shortage:
     """What finished bursts lack: three frames an obstacle announced, less those that came."""
     wanted = 3 * np.minimum(status.count, slots)
-    came = np.bincount(np.searchsorted(status.number, parts.burst), minlength=len(status))
+    at = status.at(parts.burst) if len(parts) else parts.burst
+    came = np.bincount(at, minlength=len(status))
     lacking = wanted - came
     short = lacking > 0
     return Shortage(status.number[short], status.log_ns[short], lacking[short])

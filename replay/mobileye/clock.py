@@ -124,7 +124,9 @@ class CounterClock:
         return log_ns
 
     def _early(self) -> int:
-        share = min(1.0, self._frames / SETTLED_AFTER)
+        if self._frames >= SETTLED_AFTER:
+            return LAST_EARLY_NS
+        share = self._frames / SETTLED_AFTER
         return int(FIRST_EARLY_NS + share * (LAST_EARLY_NS - FIRST_EARLY_NS))
 
     def _follow(self, over_ns: int, elapsed_ns: int) -> int:

@@ -149,7 +149,7 @@ class MobileyeDecoder:
                 self._ledger.lose(self._bus, NOT_COME, count, f"burst {number}", log_ns)
         if not len(triples.a):
             return []
-        at = np.searchsorted(status.number, triples.a.burst)
+        at = status.at(triples.a.burst)
         image_ns, log_ns_of_row = status.image_ns[at], status.log_ns[at]
         columns: Columns = {
             "t_ns": image_ns,
@@ -205,7 +205,7 @@ class MobileyeDecoder:
             )
         if is_early.all():
             return _unknown(len(frames))
-        at = np.searchsorted(known.number, burst)
+        at = np.maximum(known.at(burst), 0)
         return np.where(is_early, UNKNOWN, known.variant[at]).astype(np.int8)
 
     def _tell(self, faults: Sequence[Fault]) -> None:
