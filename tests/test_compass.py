@@ -21,6 +21,7 @@ from crosscue.localization.compass import (
     course_at,
     from_bearing,
     heading,
+    level_field,
 )
 from crosscue.localization.compass_fit import (
     HARD_IRON,
@@ -99,6 +100,14 @@ def test_corrections_undo_iron_mounting_and_tilt(true: float, roll: float, pitch
 
     found = heading(field, IRON, np.array([roll]), np.array([pitch]))
     assert apart_deg(found, np.array([true])) < 1e-9
+
+
+def test_levelling_keeps_the_fields_strength_and_finds_down() -> None:
+    field = readings(around(1.0, 20), IRON, roll=0.3, pitch=-0.2)
+    level = level_field(field, IRON, np.full(20, 0.3), np.full(20, -0.2))
+
+    np.testing.assert_allclose(level[:, 2], -DOWN_T)
+    np.testing.assert_allclose(np.hypot(level[:, 0], level[:, 1]), LEVEL_T)
 
 
 def test_tilt_not_told_is_an_error_not_a_crash() -> None:

@@ -138,6 +138,13 @@ def test_all_pairs_by_metres_are_evos_even_when_the_car_stands(
     assert list(zip(first.tolist(), second.tolist(), strict=True)) == theirs
 
 
+def test_no_pose_is_paired_with_itself() -> None:
+    far_apart = np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
+    first, second = rpe_pairs(far_apart, RpeDelta(1.0, "metres", True, 100.0))
+
+    assert list(zip(first.tolist(), second.tolist(), strict=True)) == [(0, 1), (1, 2)]
+
+
 @given(seed=SEEDS)
 @settings(max_examples=25, deadline=None)
 def test_alignment_is_evos(seed: int) -> None:
