@@ -116,7 +116,7 @@ FORMATS: Final[dict[str, Format]] = {
     ),
     "rosbag2": Format(
         (),
-        ("metadata.yaml", "*.db3", "*.mcap"),
+        ("metadata.yaml", "*.db3", "*.mcap", "*.db3.zstd", "*.mcap.zstd"),
         "crosscue.replay.readers.rosbag2:open_folder",
         "ROS 2 bag folder",
     ),

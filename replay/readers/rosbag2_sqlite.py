@@ -26,6 +26,7 @@ FAULTS: Final = (sqlite3.Error, UnicodeError, ValueError, OverflowError, MemoryE
 """What the standard library raises on a damaged file; a message that is no UTF-8 is one of them."""
 
 _WAL_VERSION: Final = 2
+_WAIT_S: Final = 1.0
 _GUARD_EVERY: Final = 100_000
 _STEPS_PER_BYTE: Final = 40
 _STEPS_AT_LEAST: Final = 100_000_000
@@ -105,18 +106,15 @@ def explained(error: Exception) -> str:
 def _opened(path: Path, head: bytes, limits: Limits) -> Database:
     is_wal = _WAL_VERSION in head[18:20]
     if is_wal and _has_bytes(beside(path, "-wal")):
-        connection = _connect(path, "mode=ro&vfs=unix-none", limits)
-        connection.execute("PRAGMA locking_mode=EXCLUSIVE")
+        connection = _connect(path, "mode=ro&vfs=unix-none", limits, "locking_mode=EXCLUSIVE")
         said = "the recorder did not close it: its write-ahead log was read with it"
         return Database(connection, [said])
     missing, torn = _missing_bytes(head, path)
     if missing and torn:
         return _copy_without_torn_page(path, torn, missing, limits)
-    connection = _connect(path, "immutable=1" if is_wal else "mode=ro", limits)
     try:
-        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        connection = _connect(path, "immutable=1" if is_wal else "mode=ro", limits)
     except FAULTS:
-        connection.close()
         if _has_bytes(beside(path, "-journal")):
             return _repaired_copy(path, limits)
         raise
@@ -144,16 +142,26 @@ def _has_bytes(path: Path) -> bool:
         return False
 
 
-def _connect(path: Path, options: str, limits: Limits) -> sqlite3.Connection:
+def _connect(path: Path, options: str, limits: Limits, *first: str) -> sqlite3.Connection:
+    """Connect, with the settings ``first`` before all others, and read the schema once."""
     place = quote(os.fsencode(path.absolute()))
     connection = sqlite3.connect(
-        f"file:{place}?{options}", uri=True, isolation_level=None, check_same_thread=False
+        f"file:{place}?{options}",
+        uri=True,
+        isolation_level=None,
+        check_same_thread=False,
+        timeout=_WAIT_S,
     )
-    connection.text_factory = _text
-    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.message_bytes + MIB)
-    for setting in _SETTINGS:
-        connection.execute(f"PRAGMA {setting}")
-    _guard(connection, path)
+    try:
+        connection.text_factory = _text
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.message_bytes + MIB)
+        for setting in (*first, *_SETTINGS):
+            connection.execute(f"PRAGMA {setting}")
+        _guard(connection, path)
+        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+    except BaseException:
+        connection.close()
+        raise
     return connection
 
 
@@ -185,7 +193,6 @@ def _repaired_copy(path: Path, limits: Limits) -> Database:
         shutil.copyfile(path, copy)
         shutil.copyfile(journal, beside(copy, "-journal"))
         connection = _connect(copy, "mode=rw", limits)
-        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
@@ -204,7 +211,6 @@ def _copy_without_torn_page(path: Path, torn: int, missing: int, limits: Limits)
         shutil.copyfile(path, copy)
         os.truncate(copy, path.stat().st_size - torn)
         connection = _connect(copy, "immutable=1", limits)
-        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
