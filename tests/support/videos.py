@@ -1,0 +1,64 @@
+"""Small simulated videos whose pictures say their number by their shade."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import cast
+
+import av
+import numpy as np
+
+from crosscue.replay.columns import Block, Images
+
+STEP = 9
+"""Shades between two pictures; coding changes a shade by less than half of it."""
+SIZE_PX = (64, 48)
+
+
+def video(
+    path: Path,
+    count: int = 24,
+    codec: str = "libx264",
+    options: dict[str, str] | None = None,
+    container: dict[str, str] | None = None,
+    file_format: str | None = None,
+) -> Path:
+    """A video of ``count`` plain pictures at 20 Hz."""
+    with av.open(str(path), mode="w", options=container or {}, format=file_format) as out:
+        stream = cast("av.VideoStream", out.add_stream(codec, rate=20, options=options or {}))
+        stream.width, stream.height = SIZE_PX
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        stream.time_base = Fraction(1, 20)
+        for number in range(count):
+            grey = np.full((SIZE_PX[1], SIZE_PX[0], 3), 10 + STEP * number, dtype=np.uint8)
+            frame = av.VideoFrame.from_ndarray(grey, format="rgb24")
+            frame.pts = number
+            frame.time_base = Fraction(1, 20)
+            for packet in stream.encode(frame):
+                out.mux(packet)
+        for packet in stream.encode(None):
+            out.mux(packet)
+    return path
+
+
+def numbers_at_times(blocks: list[Block], codec: str) -> dict[int, int]:
+    """Decode blocks of packets: from time to the number that the picture shows."""
+    decoder = av.CodecContext.create(codec, "r")
+    shown: dict[int, int] = {}
+    packets: list[av.Packet | None] = []  # type: ignore[type-arg]
+    for block in blocks:
+        assert isinstance(block.rows, Images)
+        for i, t_ns in enumerate(block.log_ns.tolist()):
+            packet = av.Packet(bytes(block.rows.bytes_.payload(i)))
+            packet.pts = t_ns
+            packets.append(packet)
+    for sent in [*packets, None]:
+        for frame in decoder.decode(sent):  # type: ignore[attr-defined]
+            shown[frame.pts] = number_of(frame.to_ndarray(format="rgb24"))
+    return shown
+
+
+def number_of(rgb: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> int:
+    """The number that a plain picture shows."""
+    return round((float(rgb.mean()) - 10) / STEP)

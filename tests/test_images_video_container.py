@@ -1,0 +1,235 @@
+"""Videos: the picture at a time is the one that was filmed then, and what is cut is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from crosscue.eval.cli import run
+from crosscue.replay.columns import Block, Images
+from crosscue.replay.errors import LogError, LogFormatError
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.log import EVERYTHING, Selection, open_log
+from support.videos import number_of, numbers_at_times, video
+
+S = 1_000_000_000
+N = 24
+NO_REORDERING = {"bf": "0"}
+REORDERING = {"bf": "3", "b-adapt": "0", "g": "12"}
+ODD_S = [100.0 + 0.05 * i + (0.3 if i > 9 else 0.0) for i in range(N)]
+ODD_NS = [round(t * 1000) * 1_000_000 for t in ODD_S]
+ODD_LINES = "\n".join(f"{t:.3f}" for t in ODD_S)
+
+
+def read(path: Path, selection: Selection = EVERYTHING) -> tuple[list[Block], Ledger]:
+    ledger = Ledger(str(path))
+    with open_log(path) as log:
+        blocks = list(log.read(ledger, selection))
+    for account in ledger.accounts.values():
+        assert account.found == account.used + account.skipped.total()
+    assert sum(len(b) for b in blocks) == sum(a.used for a in ledger.accounts.values())
+    return blocks, ledger
+
+
+CASES = [
+    ("a.mp4", "libx264", NO_REORDERING, "h264", "h264"),
+    ("a.mp4", "libx264", REORDERING, "h264", "h264"),
+    ("a.mov", "libx264", REORDERING, "h264", "h264"),
+    ("a.mkv", "libx264", REORDERING, "h264", "h264"),
+    ("a.avi", "libx264", NO_REORDERING, "h264", "h264"),
+    ("a.h264", "libx264", NO_REORDERING, "h264", "h264"),
+    ("a.mp4", "libx265", {"x265-params": "log-level=none"}, "h265", "hevc"),
+    ("a.hevc", "libx265", {"x265-params": "log-level=none:bframes=0"}, "h265", "hevc"),
+    ("a.avi", "mjpeg", {}, "jpeg", "mjpeg"),
+    ("a.mkv", "mjpeg", {}, "jpeg", "mjpeg"),
+]
+
+
+@pytest.mark.parametrize(("name", "codec", "options", "coding", "decoder"), CASES)
+def test_each_time_shows_the_picture_filmed_then(
+    tmp_path: Path, name: str, codec: str, options: dict[str, str], coding: str, decoder: str
+) -> None:
+    path = video(tmp_path / name, N, codec, options)
+    path.with_suffix(".txt").write_text(ODD_LINES)
+
+    blocks, ledger = read(path)
+
+    assert numbers_at_times(blocks, decoder) == {t: i for i, t in enumerate(ODD_NS)}
+    assert ledger.is_whole
+    assert ledger.topic("a").declared == N
+    for block in blocks:
+        assert isinstance(block.rows, Images)
+        assert set(block.rows.coding) == {coding}
+        if coding in ("h264", "h265"):
+            assert bytes(block.rows.bytes_.payload(0))[:3] in (b"\0\0\0", b"\0\0\1")
+
+
+def test_another_codec_is_decoded_here(tmp_path: Path) -> None:
+    path = video(tmp_path / "a.mp4", N, "mpeg4")
+    path.with_suffix(".csv").write_text(ODD_LINES)
+
+    blocks, ledger = read(path)
+
+    assert [int(b.log_ns[0]) for b in blocks] == ODD_NS
+    for i, block in enumerate(blocks):
+        assert isinstance(block.rows, Images)
+        rows = block.rows
+        assert (rows.coding, rows.pixel_format) == (("raw",), ("rgb8",))
+        assert rows.width_px is not None
+        assert rows.width_px.tolist() == [64]
+        rgb = np.frombuffer(rows.bytes_.payload(0), dtype=np.uint8)
+        assert number_of(rgb) == i
+    assert "codec mpeg4: decoded by the reader" in ledger.notices
+    assert ledger.is_whole
+
+
+@pytest.mark.parametrize("options", [NO_REORDERING, REORDERING], ids=["plain", "reordered"])
+def test_without_a_time_file_its_own_times_are_used_and_told(
+    tmp_path: Path, options: dict[str, str]
+) -> None:
+    blocks, ledger = read(video(tmp_path / "a.mp4", N, "libx264", options))
+
+    assert numbers_at_times(blocks, "h264") == {50_000_000 * i: i for i in range(N)}
+    assert ledger.notices[0].startswith("times are the video's own, starting at 0")
+
+
+def test_a_constant_rate_is_told(tmp_path: Path) -> None:
+    path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
+    path.with_suffix(".txt").write_text("rate_hz: 10")
+
+    blocks, ledger = read(path)
+
+    assert [t for b in blocks for t in b.log_ns.tolist()] == [100_000_000 * i for i in range(N)]
+    assert "times are made up from a constant rate of 10 Hz, from 0 on" in ledger.notices
+
+
+@pytest.mark.parametrize(("lines", "lost", "skipped"), [(N + 3, 3, 0), (N - 3, 0, 3)])
+def test_more_or_fewer_times_than_pictures_are_told(
+    tmp_path: Path, lines: int, lost: int, skipped: int
+) -> None:
+    path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
+    path.with_suffix(".txt").write_text("\n".join(f"{i}.5" for i in range(lines)))
+
+    _, ledger = read(path)
+
+    account = ledger.topic("a")
+    assert sum(account.lost.values()) == lost
+    assert sum(account.skipped.values()) == skipped
+    assert f"{N} pictures and {lines} times (a.txt): paired in order from the first" in (
+        ledger.notices
+    )
+
+
+def test_only_the_part_asked_for_is_given(tmp_path: Path) -> None:
+    path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
+    path.with_suffix(".txt").write_text(ODD_LINES)
+
+    blocks, ledger = read(path, Selection(start_ns=ODD_NS[4], end_ns=ODD_NS[8]))
+    none, not_asked = read(path, Selection(topics=frozenset({"b"})))
+
+    assert [t for b in blocks for t in b.log_ns.tolist()] == ODD_NS[4:8]
+    assert ledger.topic("a").skipped == {NOT_ASKED_TIME: N - 4}
+    assert none == []
+    assert not_asked.topic("a").skipped == {NOT_ASKED_TOPIC: N}
+
+
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(share=st.floats(0.0, 0.98))
+@pytest.mark.parametrize(
+    ("name", "codec", "container", "tail"),
+    [
+        ("a.mp4", "libx264", {}, "moov at the end"),
+        ("f.mp4", "libx264", {"movflags": "faststart"}, "moov in front"),
+        ("a.avi", "mjpeg", {}, "avi"),
+        ("a.mkv", "libx264", {}, "matroska"),
+    ],
+)
+def test_a_video_cut_anywhere_is_refused_or_told(
+    tmp_path: Path, name: str, codec: str, container: dict[str, str], tail: str, share: float
+) -> None:
+    whole = tmp_path / name
+    if not whole.exists():
+        video(whole, N, codec, NO_REORDERING if codec == "libx264" else {}, container)
+    raw = whole.read_bytes()
+    cut = tmp_path / f"cut{whole.suffix}"
+    cut.write_bytes(raw[: int(share * len(raw))])
+    try:
+        blocks, ledger = read(cut)
+    except LogError as error:
+        assert "cut or damaged" in str(error) or "no video stream" in str(error)  # noqa: PT017
+        return
+
+    given = sum(len(b) for b in blocks)
+    assert not ledger.is_whole or given == N, tail
+    shown = numbers_at_times(blocks, {"libx264": "h264"}.get(codec, codec))
+    assert all(number == t_ns // 50_000_000 for t_ns, number in shown.items())
+
+
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(at=st.integers(0, 10**6), junk=st.binary(min_size=1, max_size=16))
+def test_a_damaged_video_never_ends_in_a_traceback(tmp_path: Path, at: int, junk: bytes) -> None:
+    whole = tmp_path / "a.mp4"
+    if not whole.exists():
+        video(whole, N, "libx264", NO_REORDERING)
+    raw = bytearray(whole.read_bytes())
+    start = at % len(raw)
+    raw[start : start + len(junk)] = junk
+    damaged = tmp_path / "damaged.mp4"
+    damaged.write_bytes(raw)
+
+    try:
+        blocks, _ = read(damaged)
+    except LogError as error:
+        blocks = []
+        assert "\n" not in str(error)  # noqa: PT017
+    assert sum(len(b) for b in blocks) <= 2 * N
+
+
+def test_a_raw_stream_needs_a_time_file(tmp_path: Path) -> None:
+    path = video(tmp_path / "a.h264", 3)
+
+    with pytest.raises(LogFormatError, match=r"a raw stream has no times; write a.h264.txt"):
+        open_log(path)
+
+
+def test_a_time_file_that_names_pictures_is_refused(tmp_path: Path) -> None:
+    path = video(tmp_path / "a.mp4", 3)
+    path.with_suffix(".txt").write_text("a.png,0.5")
+
+    with pytest.raises(LogFormatError, match="names files; want one time for each picture"):
+        open_log(path)
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.avi", "a.mkv", "a.mov"])
+def test_other_bytes_under_a_video_name_are_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"#EXTM3U\nhttp://127.0.0.1:9/a.ts\n" * 20)
+
+    with pytest.raises(LogFormatError, match="cut or damaged, no video can be found"):
+        open_log(tmp_path / name)
+
+
+def test_a_name_that_is_no_text_is_opened(tmp_path: Path) -> None:
+    path = video(tmp_path / "a.mp4", 3, "libx264", NO_REORDERING)
+    odd = path.rename(tmp_path / "a\udcff.mp4")
+
+    blocks, _ = read(odd)
+
+    assert sum(len(b) for b in blocks) == 3
+
+
+def test_info_on_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
+    path.with_suffix(".txt").write_text(ODD_LINES)
+
+    assert run(["info", str(path)]) == 0
+    assert "a: 1 gap over 250 ms (5 periods), the longest 350 ms at 0.45 s" in (
+        capsys.readouterr().out
+    )
