@@ -16,7 +16,7 @@ from crosscue.replay.roles import ros2_spelling
 from .definition import Definitions, definitions_of, well_known
 from .fields import Fields, Part
 from .plan import Plan, plan_of
-from .standard import BY_TYPE, Doubt, Kind, generic, header_ns
+from .standard import Doubt, Kind, header_ns, kind_of
 from .walk import Bools, Rows, gather, walk
 
 CDR_BE: Final = 0x0000
@@ -121,7 +121,7 @@ def ros_decoder(topic: Topic) -> RosDecoder | None:
         return None
     try:
         plan = plan_of(name, known, is_cdr=topic.encoding == "cdr")
-        kind = BY_TYPE.get(name, Kind((), generic))
+        kind = kind_of(name)
         kind.check(plan)
     except SchemaError as error:
         raise SchemaError(f"{topic.name}: {error}") from None

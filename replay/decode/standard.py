@@ -35,6 +35,7 @@ Decoded: TypeAlias = CanFrames | Table | Images
 Doubt: TypeAlias = tuple[Bools, str]
 """Messages that fit their definition but cannot be used, and the reason for the ledger."""
 
+FD_BYTES: Final = 64
 MAX_SIDE_PX: Final = 65_535
 LENS_COEFFICIENTS: Final = 14
 """OpenCV's largest distortion model."""
@@ -119,6 +120,32 @@ def _can_doubts(fields: Fields) -> Iterator[Doubt]:
     most = np.where(extended | error, 0x1FFF_FFFF, 0x7FF)
     yield identifier > most, "identifier has more bits than its frame kind"
     yield fields.number("dlc").astype(np.int64) > 8, "data length code over 8"
+
+
+def _can_fd_frame(fields: Fields) -> CanFrames:
+    remote = fields.number("is_rtr").astype(np.bool_)
+    error = fields.number("is_error").astype(np.bool_)
+    first, length = fields.items("data")
+    payload = np.zeros((len(fields), FD_BYTES), np.uint8)
+    for k in range(int(length.max(initial=0))):
+        has = length > k
+        payload[has, k] = fields.buffer[first[has] + k]
+    return CanFrames(
+        fields.number("id").astype(np.uint32),
+        fields.number("is_extended").astype(np.bool_),
+        np.where(error, ERROR, np.where(remote, REMOTE, DATA)).astype(np.uint8),
+        length.astype(np.uint8),
+        payload,
+        fields.number("is_fd").astype(np.bool_),
+    )
+
+
+def _can_fd_doubts(fields: Fields) -> Iterator[Doubt]:
+    identifier = fields.number("id").astype(np.int64)
+    extended = fields.number("is_extended").astype(np.bool_)
+    most = np.where(extended, 0x1FFF_FFFF, 0x7FF)
+    yield identifier > most, "identifier has more bits than its frame kind"
+    yield fields.items("data")[1] > FD_BYTES, "over 64 data bytes"
 
 
 def _picture_ranges(fields: Fields) -> Messages:
@@ -223,6 +250,11 @@ BY_TYPE: Final[Mapping[str, Kind]] = {
     "can_msgs/msg/Frame": Kind(
         ("id", "is_rtr", "is_extended", "is_error", "dlc", "data:8"), _can_frame, _can_doubts
     ),
+    "crosscue_msgs/msg/CanFdFrame": Kind(
+        ("id", "is_rtr", "is_extended", "is_error", "is_fd", "data[u1]"),
+        _can_fd_frame,
+        _can_fd_doubts,
+    ),
     "sensor_msgs/msg/CompressedImage": Kind(
         ("format$", "data[u1]"), _compressed, _compressed_doubts
     ),
@@ -274,6 +306,24 @@ def generic(fields: Fields) -> Table:
     if not columns:
         columns["present"] = np.ones(len(fields), np.bool_)
     return Table(columns)
+
+
+OWN_TYPES: Final = "crosscue_msgs/msg/"
+"""Types made by ``crosscue convert`` for tables: their fields are the columns."""
+
+
+def own_table(fields: Fields) -> Table:
+    """The table that a type of ours was made for."""
+    columns = dict(generic(fields).columns)
+    columns.pop("header.stamp", None)
+    return Table(columns or {"present": np.ones(len(fields), np.bool_)})
+
+
+def kind_of(type_name: str) -> Kind:
+    """How a type is decoded."""
+    if type_name in BY_TYPE:
+        return BY_TYPE[type_name]
+    return Kind((), own_table if type_name.startswith(OWN_TYPES) else generic)
 
 
 STAMPS: Final = ("header.stamp", "timestamp", "stamp")

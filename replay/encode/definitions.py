@@ -60,6 +60,12 @@ def as_ros2(type_name: str, ros1: Definitions) -> Definitions:
     return known
 
 
+def differs_in_ros2(type_name: str, known: Definitions) -> bool:
+    """Has ROS 2 another type of this name, coded otherwise?"""
+    modern = well_known(type_name)
+    return modern is not None and not _alike(type_name, known, modern)
+
+
 def _alike(name: str, ours: Definitions, theirs: Definitions) -> bool:
     if name in _TIMES:
         return True

@@ -22,7 +22,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.mcap_assembly import copy_ranges
 from crosscue.replay.roles import ros2_spelling
 
-from .definitions import as_ros2, text_of
+from .definitions import as_ros2, differs_in_ros2, text_of
 from .outgoing import Outgoing, Ros2Type
 from .template import ENCAPSULATION
 
@@ -202,10 +202,17 @@ def _of(width: int, like: Int64s) -> Int64s:
 
 @dataclass(frozen=True, slots=True)
 class Ros1ToCdr:
-    """From blocks of ROS 1 messages of one type to CDR."""
+    """From blocks of ROS 1 messages of one type to CDR.
+
+    Attributes:
+        type: What they become.
+        plan: How they are walked.
+        differs: ROS 2 itself has another type of this name.
+    """
 
     type: Ros2Type
     plan: Plan
+    differs: bool
 
     def __call__(self, block: Block, ledger: Ledger) -> list[Outgoing]:
         """Transcribe; messages that do not fit their definition are skipped."""
@@ -221,6 +228,11 @@ class Ros1ToCdr:
         for refused in found.refused:
             first = int(block.log_ns[refused.rows[0]])
             ledger.skip(block.topic, MISFIT, len(refused.rows), refused.why, first)
+        if self.differs:
+            ledger.notice(
+                f"{block.topic}: ROS 2 has another {self.type.name} than ROS 1; the file keeps "
+                "ROS 1's fields and defines them"
+            )
         if not found.ok.any():
             return []
         kept = block if found.ok.all() else block.take(found.ok)
@@ -239,7 +251,8 @@ def ros1_to_cdr(topic: Topic) -> Ros1ToCdr | None:
     try:
         known = definitions_of(name, topic.schema, topic.schema_encoding or "ros1msg")
         plan = plan_of(name, known, is_cdr=False)
-        text = text_of(name, as_ros2(name, known))
+        modern = as_ros2(name, known)
+        text, differs = text_of(name, modern), differs_in_ros2(name, modern)
     except SchemaError as error:
         raise SchemaError(f"{topic.name}: {error}") from None
-    return Ros1ToCdr(Ros2Type(name, text.encode()), plan)
+    return Ros1ToCdr(Ros2Type(name, text.encode()), plan, differs)

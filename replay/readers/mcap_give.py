@@ -46,6 +46,7 @@ class Giver:
         self._ledger = ledger
         self._selection = selection
         self._limits = limits
+        self._is_timeless = selection.start_ns is None and selection.end_ns is None
 
     def give(self, rows: Rows, checks: Checks, at: int) -> Iterator[Block]:
         """All messages of ``rows``, a block per topic, each under the channel in force there.
@@ -96,7 +97,8 @@ class Giver:
         """Account for a message outside chunks that is too large to be read."""
         self.met[channel_id] += 1
         topic = self.declarations.topic(channel_id)
-        if len(self._account(topic, np.array([log], dtype=np.uint64))):
+        kept = self._account(topic, np.array([log], dtype=np.uint64))
+        if kept is None or len(kept):
             self._ledger.skip(topic, TOO_LARGE, 1, self._too_large(size, at), log)
 
     def _give_part(self, rows: Rows, begin: int, end: int) -> Iterator[Block]:
@@ -113,7 +115,7 @@ class Giver:
             topic = self.declarations.topic(channel_id)
             number_of[channel_id] = numbers.setdefault(topic, len(numbers))
         stop = start + (head["length"].astype(np.int64) - MESSAGE_FIXED)
-        columns = (head["log"], head["publish"], start, stop)
+        columns = (head["log"], head["publish"], start, stop, head["sequence"])
         if len(numbers) == 1:
             yield from self._blocks(next(iter(numbers)), rows, columns, slice(None), ids)
             return
@@ -128,25 +130,27 @@ class Giver:
         self,
         topic: str,
         rows: Rows,
-        columns: tuple[Uint64s, Uint64s, Int64s, Int64s],
+        columns: tuple[Uint64s, Uint64s, Int64s, Int64s, NDArray[np.uint32]],
         index: NDArray[np.intp] | slice,
         ids: NDArray[np.intp],
     ) -> Iterator[Block]:
         log, publish = columns[0][index], columns[1][index]
-        start, stop = columns[2][index], columns[3][index]
+        start, stop, sequence = columns[2][index], columns[3][index], columns[4][index]
         if topic == UNKNOWN:
             named = ", ".join(str(i) for i in ids.tolist()[:10])
             self._ledger.lose(UNKNOWN, UNDECLARED, len(log), f"among the channels {named}")
             return
         kept = self._account(topic, log)
-        if len(kept) < len(log):
+        if kept is not None:
             log, publish, start, stop = log[kept], publish[kept], start[kept], stop[kept]
-        small = stop - start <= self._limits.message_bytes
-        if not small.all():
+            sequence = sequence[kept]
+        if len(rows.buffer) > self._limits.message_bytes:
+            small = stop - start <= self._limits.message_bytes
             for i in np.flatnonzero(~small).tolist():
                 detail = self._too_large(int(stop[i] - start[i]), None)
                 self._ledger.skip(topic, TOO_LARGE, 1, detail, int(log[i]))
             log, publish, start, stop = log[small], publish[small], start[small], stop[small]
+            sequence = sequence[small]
         if len(publish) and publish.max() > LATEST:
             self._ledger.notice(f"{topic}: {NO_PUBLISH_TIME}")
             publish = np.where(publish > LATEST, log, publish)
@@ -157,14 +161,17 @@ class Giver:
                 log[part].astype(np.int64),
                 Messages(rows.buffer, start[part], stop[part]),
                 publish[part].astype(np.int64),
+                sequence=sequence[part],
             )
 
-    def _account(self, topic: str, log: Uint64s) -> NDArray[np.intp]:
-        """Enter messages of one topic as found or skipped; which of them are to be given."""
+    def _account(self, topic: str, log: Uint64s) -> NDArray[np.intp] | None:
+        """Enter messages of one topic as found or skipped; which to give, None for all."""
         self._ledger.find(topic, len(log))
         if not self._selection.wants(topic):
             self._ledger.skip(topic, NOT_ASKED_TOPIC, len(log))
             return np.empty(0, dtype=np.intp)
+        if self._is_timeless and log.max() <= LATEST:
+            return None
         late = int((log > LATEST).sum())
         if late:
             self._ledger.skip(

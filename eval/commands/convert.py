@@ -1,0 +1,187 @@
+"""Any supported log or data set to MCAP with standard ROS 2 types, message for message.
+
+examples:
+  crosscue convert drive.bag -o drive.mcap
+  crosscue convert can0.log -o can0.mcap --from 10 --to 70
+  crosscue convert segment/ -o segment.mcap --topics wheels compass --compression lz4
+
+ROS 2 messages are copied byte for byte and ROS 1 messages transcribed. CAN frames become
+can_msgs/msg/Frame (CAN FD: crosscue_msgs/msg/CanFdFrame on TOPIC/fd), pictures
+sensor_msgs/msg/CompressedImage, Image or foxglove_msgs/msg/CompressedVideo, tables the standard
+type that holds all their columns, or else crosscue_msgs/msg/TOPIC with one field a column.
+The written file is read back and its messages counted before the command says that it is done.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from crosscue.eval.plain_text import table, terminal_width, visible, wrapped
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import LogError, OutputError, UsageError
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger, TopicAccount
+from crosscue.replay.log import Log, Selection, open_log
+from crosscue.replay.writing import LogWriter
+
+from .common import add_part_arguments, print_json, selection_of, with_progress
+
+NOT_ASKED = frozenset({NOT_ASKED_TIME, NOT_ASKED_TOPIC})
+SHOWN = 20
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("log", type=Path, metavar="LOG", help="a recording or data-set folder")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="OUT.mcap", help="file to write"
+    )
+    add_part_arguments(parser)
+    parser.add_argument(
+        "--compression", choices=("zstd", "lz4", "none"), default="zstd", help="of the chunks"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace OUT.mcap if it is there")
+    parser.add_argument("--json", action="store_true", help="print the account as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Convert, read back, print the account.
+
+    Returns:
+        0 when every row that was asked for is in the file, 3 when some are lost or skipped.
+    """
+    _check_output(args)
+    with open_log(args.log) as log:
+        selection = selection_of(args, [log])
+        ledger = Ledger(str(args.log))
+        writer = LogWriter(
+            args.output, ledger, compression=args.compression, overwrite=args.overwrite
+        )
+        with writer:
+            _copy(log, selection, ledger, writer, args)
+            _check_identity(ledger, writer)
+    _read_back(args.output, writer)
+    if args.json:
+        print_json(_as_json(args, ledger, writer))
+    elif not args.quiet:
+        _print(args, ledger, writer)
+    return 0 if _is_whole(ledger) else 3
+
+
+def _check_output(args: argparse.Namespace) -> None:
+    if args.output.suffix.lower() != ".mcap":
+        raise UsageError(f"{args.output}: want a name that ends in .mcap")
+    if args.output.exists() and args.log.exists() and args.output.samefile(args.log):
+        raise UsageError(f"{args.output}: is the log itself; give another name")
+
+
+def _copy(
+    log: Log, selection: Selection, ledger: Ledger, writer: LogWriter, args: argparse.Namespace
+) -> None:
+    known: set[Topic] = set()
+    declared = sum(topic.declared or 0 for topic in log.topics)
+    done = 0
+
+    def share() -> float:
+        return done / declared if declared else 0.0
+
+    for block in with_progress(log.read(ledger, selection), share, args, "converting"):
+        done += len(block)
+        # A topic may come to light only while a damaged log is read.
+        for topic in log.topics:
+            if topic not in known:
+                known.add(topic)
+                writer.add_topic(topic)
+        writer.write(block)
+
+
+def _check_identity(ledger: Ledger, writer: LogWriter) -> None:
+    """Found = written + skipped, for every topic."""
+    for name, account in ledger.accounts.items():
+        if account.used != writer.kept[name]:
+            raise OutputError(
+                f"{visible(name)}: {account.used} rows to write, {writer.kept[name]} written; "
+                "nothing is kept; report this as a bug"
+            )
+
+
+def _read_back(path: Path, writer: LogWriter) -> None:
+    """Count what the file holds, checksums verified.
+
+    Raises:
+        OutputError: It does not hold what was written; the file is removed.
+    """
+    held = Ledger(str(path))
+    try:
+        with open_log(path) as log:
+            for _ in log.read(held):
+                pass
+        found = {name: account.used for name, account in held.accounts.items() if account.used}
+        right = held.is_whole and found == dict(writer.written)
+    except LogError:
+        right = False
+    if not right:
+        path.unlink(missing_ok=True)
+        raise OutputError(f"{path}: reads back differently than written; check the disk, try again")
+
+
+def _is_whole(ledger: Ledger) -> bool:
+    return ledger.is_whole and not any(_refused(a) for a in ledger.accounts.values())
+
+
+def _refused(account: TopicAccount) -> Mapping[str, int]:
+    return {reason: n for reason, n in account.skipped.items() if reason not in NOT_ASKED}
+
+
+def _lost(account: TopicAccount) -> int:
+    return account.lost.total()
+
+
+def _as_json(args: argparse.Namespace, ledger: Ledger, writer: LogWriter) -> object:
+    return {
+        "log": str(args.log),
+        "output": str(args.output),
+        "bytes": args.output.stat().st_size,
+        "integrity": ledger.integrity,
+        "is_whole": _is_whole(ledger),
+        "written": {
+            visible(name): {"type": writer.types[name], "messages": count}
+            for name, count in writer.written.items()
+        },
+        "topics": {
+            visible(name): {
+                "declared": account.declared,
+                "found": account.found,
+                "written": writer.kept[name],
+                "skipped": dict(account.skipped),
+                "lost": dict(account.lost),
+                "lost_unknown": account.lost_unknown,
+            }
+            for name, account in ledger.accounts.items()
+        },
+        "notices": [visible(notice) for notice in ledger.notices],
+    }
+
+
+def _print(args: argparse.Namespace, ledger: Ledger, writer: LogWriter) -> None:
+    width = terminal_width()
+    rows = [
+        [name, writer.types.get(name, "-"), str(account.found), str(writer.kept[name]),
+         str(account.skipped.total()), str(_lost(account)) + "+" * bool(account.lost_unknown)]
+        for name, account in ledger.accounts.items()
+    ]  # fmt: skip
+    head = ["topic", "type", "found", "written", "skipped", "lost"]
+    print("\n".join(table(head, rows, width, (0, 1))))
+    size = args.output.stat().st_size / 1e6
+    print(
+        f"{visible(str(args.output))}: {writer.written.total()} messages, {size:.1f} MB, read back"
+    )
+    for notice in ledger.notices[:SHOWN]:
+        print(wrapped(visible(notice), width), file=sys.stderr)
+    for detail in ledger.details[:SHOWN]:
+        verb = "lost" if detail.is_loss else "skipped"
+        count = "?" if detail.count is None else detail.count
+        text = f"{detail.topic}: {count} {verb}: {detail.reason}; {detail.detail}".rstrip("; ")
+        print(wrapped(visible(text), width), file=sys.stderr)
