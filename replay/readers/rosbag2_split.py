@@ -94,7 +94,12 @@ def opened(path: Path, limits: Limits) -> Iterator[tuple[Log, str]]:
     try:
         plain = folder / path.name.removesuffix(PACKED)
         fault = unpack(path, plain, limits)
-        with open_log(plain, limits) as log:
+        try:
+            log = open_log(plain, limits)
+        except CrosscueError as error:
+            said = str(error).replace(str(plain), "unpacked")
+            raise LogError(f"{path}: {fault + '; ' if fault else ''}{said}") from None
+        with log:
             yield log, fault
     finally:
         shutil.rmtree(folder, ignore_errors=True)
