@@ -13,6 +13,8 @@ SECOND_NS: Final = 1_000_000_000
 DRIFT_WORTH_TELLING_PPM: Final = 50.0
 DRIFT_ERRORS_WORTH_TELLING: Final = 5.0
 DUPLICATES_WORTH_TELLING: Final = 0.01
+ROWS_FOR_OFFSET: Final = 3
+"""A message or two sent long before the recorder started are latched, not off."""
 APART_NS: Final = SECOND_NS
 """Topics whose times lie this far from each other share no clock."""
 
@@ -139,7 +141,7 @@ def _of_other(
         steps = _steps(stamps.jumps, stamps.jump_steps, start_ns)
         yield f"{clock.value} jumps against the log clock {steps}"
     line = stamps.line
-    if line is None or stamps.is_constant:
+    if line is None or stamps.is_constant or stamps.rows < ROWS_FOR_OFFSET:
         return
     if abs(line.offset_ns) > MAX_OFFSET_NS:
         yield f"{clock.value} {_offset_words(line.offset_ns, line.start_log_ns)}"

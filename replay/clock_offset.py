@@ -28,6 +28,7 @@ _JUMP_OVER_WAIT: Final = 6
 _SHARP_ROWS: Final = 4
 _ROWS_BESIDE: Final = 16
 """Rows that must lie on either side of a jump; fewer could not tell it from a ramp."""
+_SHORTEST_SIDE_NS: Final = 100_000_000
 _WINDOW_ROWS: Final = (_ROWS_BESIDE, 8192)
 _ENVELOPE_BINS: Final = 1024
 _FIRST_BIN_NS: Final = 1_000_000
@@ -130,11 +131,20 @@ class OffsetWatch:
         previous = start - self._rows_since_jump
         for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []:
             row = int(run[0] if by[run[0]] > 0 else run[-1])
-            if row - previous >= _ROWS_BESIDE:
+            if row - previous >= _ROWS_BESIDE and self._lasts(row):
                 jumps.append((row, int(by[row])))
                 previous = row
         self._rows_since_jump = min(n - previous, _ROWS_BESIDE)
         return jumps
+
+    def _lasts(self, row: int) -> bool:
+        """Do the rows on both sides span some time, or is it a queue emptied at once?"""
+        first, last = max(row - self._window, 0), min(row + self._window, len(self._log)) - 1
+        before_ns, after_ns = (
+            self._log[row - 1] - self._log[first],
+            self._log[last] - self._log[row],
+        )
+        return bool(min(before_ns, after_ns) >= _SHORTEST_SIDE_NS)
 
     def _grow_envelope(self, start: int, stop: int) -> None:
         if stop > start:

@@ -147,7 +147,7 @@ FORMATS: Final[dict[str, Format]] = {
     ),
     "images": Format(
         (),
-        ("*.png", "*.jpg", "*.jpeg", "*.webp"),
+        ("*.png", "*.jpg", "*.jpeg", "*.webp", "*.PNG", "*.JPG", "*.JPEG"),
         "crosscue.replay.readers.images:open_images",
         "folder of images with a time file",
     ),
@@ -183,6 +183,9 @@ def _format_of(path: Path) -> str:
         if not is_folder and not is_file:
             what = "not a regular file or folder" if path.exists() else "no such file or folder"
             raise LogError(f"{path}: {what}; give a recording")
+        if is_folder:
+            # A glob in a folder that may not be read finds nothing, and says nothing.
+            next(path.iterdir(), None)
     except OSError as error:
         raise LogError(f"{path}: {error.strerror or error}; check the path") from None
     suffix = path.suffix.lower()

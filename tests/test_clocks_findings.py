@@ -131,6 +131,22 @@ def test_a_single_latched_row_is_not_called_apart() -> None:
     assert said_of(latched, with_header(STREAM.header_ns())) == ()
 
 
+def test_a_latched_message_sent_long_ago_is_not_called_off() -> None:
+    log_ns = STREAM.log_ns()
+    latched = table_of("/map", log_ns[:1], log_ns[:1] - 900 * SECOND_NS)
+
+    assert said_of(latched, with_header(STREAM.header_ns())) == ()
+
+
+def test_a_queue_emptied_when_recording_starts_is_no_jump() -> None:
+    log_ns, header_ns = STREAM.log_ns(), STREAM.header_ns()
+    log_ns[:20] = log_ns[20] - np.arange(20, 0, -1) * 10_000
+
+    said = said_of(table_of("/camera", log_ns, header_ns))
+
+    assert not any("jumps" in sentence for sentence in said)
+
+
 def test_spans_that_touch_are_not_apart() -> None:
     assert apart({"a": (0, 10), "b": (10, 20)}) == ()
     assert apart({"a": (0, 10)}) == ()

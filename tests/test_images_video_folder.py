@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -241,19 +244,49 @@ def test_a_time_file_of_another_folder_is_refused(tmp_path: Path) -> None:
         open_log(folder)
 
 
-def test_a_folder_without_permission_is_refused_in_one_line(tmp_path: Path) -> None:
-    folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5")
-    folder.chmod(0)
+@pytest.fixture
+def nobody() -> Iterator[Path]:
+    """A folder open to all, while this process has no more rights than anybody."""
+    open_to_all = Path(tempfile.mkdtemp(dir=tempfile.gettempdir()))
+    open_to_all.chmod(0o755)
     was = os.geteuid()
-    # Root may read everything, so it steps down for a moment.
-    if was == 0:
+    yield open_to_all
+    os.seteuid(was)
+    for path in open_to_all.rglob("*"):
+        path.chmod(0o755)
+    shutil.rmtree(open_to_all)
+
+
+def test_a_folder_without_permission_is_refused_in_one_line(nobody: Path) -> None:
+    folder = picture_folder(nobody / "front", 2, "0.5\n1.5")
+    folder.chmod(0)
+    if os.geteuid() == 0:
         os.seteuid(65534)
-    try:
-        with pytest.raises(LogError, match=r"no permission|Permission denied"):
-            open_log(folder)
-    finally:
-        os.seteuid(was)
-        folder.chmod(0o700)
+
+    with pytest.raises(LogError, match=r"front: Permission denied; check the path"):
+        open_log(folder)
+
+
+def test_a_picture_without_permission_is_lost_and_the_rest_is_read(nobody: Path) -> None:
+    folder = picture_folder(nobody / "front", 2, "0.5\n1.5")
+    (folder / "frame_0.png").chmod(0)
+    if os.geteuid() == 0:
+        os.seteuid(65534)
+
+    blocks, ledger = read(folder)
+
+    assert len(shades(blocks)) == 1
+    assert "Permission denied" in next(ledger.losses()).detail
+
+
+def test_suffixes_may_be_in_capitals(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 1, "0.5\n1.5")
+    (folder / "frame_0.png").rename(folder / "FRAME_0.PNG")
+    (folder / "FRAME_1.JPG").write_bytes(picture(1, ".jpg"))
+
+    blocks, _ = read(folder)
+
+    assert shades(blocks) == [(0.5, picture(0)), (1.5, picture(1, ".jpg"))]
 
 
 def test_a_time_file_that_may_not_be_read_is_refused(
