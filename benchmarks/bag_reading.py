@@ -1,0 +1,198 @@
+"""Reading a drive from ROS 1 bags and ROS 2 SQLite bags: ours beside rosbags, in one run.
+
+    python benchmarks/bag_reading.py [rounds] [seconds of drive]
+
+The drive: 15 camera pictures of 150 kB, 2,258 CAN frames and 100 IMU messages a second; noise for
+pictures, which is as incompressible as JPEG. The cases run in rotation, ratios are taken round by
+round. "blocks" is our reader alone, every message accounted for; "columns" decodes CAN and IMU and
+finds the pictures' bytes. rosbags "raw" gives the bytes of each message, "objects" deserialises.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from crosscue.replay.decode import Decoder, decoder_for
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import open_log
+
+FRAME: Final = """std_msgs/Header header
+uint32 id
+bool is_rtr
+bool is_extended
+bool is_error
+uint8 dlc
+uint8[8] data
+"""
+START_NS: Final = 1_700_000_000_000_000_000
+PICTURES, FRAMES, IMUS = 15, 2258, 100
+TYPES: Final = {
+    "/camera": "sensor_msgs/msg/CompressedImage",
+    "/can": "can_msgs/msg/Frame",
+    "/imu": "sensor_msgs/msg/Imu",
+}
+
+
+def store_of(which: Stores) -> Typestore:
+    """A type store that knows CAN frames."""
+    store = get_typestore(which)
+    store.register(get_types_from_msg(FRAME, "can_msgs/msg/Frame"))
+    return store
+
+
+def moments(seconds: int) -> list[tuple[int, str]]:
+    """Log time and topic of every message, in time order."""
+    made = []
+    for topic, rate in (("/camera", PICTURES), ("/can", FRAMES), ("/imu", IMUS)):
+        steps = np.arange(seconds * rate) * (1_000_000_000 / rate)
+        made += [(START_NS + int(step), topic) for step in steps]
+    return sorted(made)
+
+
+def drive(store: Typestore, is_ros1: bool, seconds: int) -> Iterator[tuple[str, int, bytes]]:
+    """Topic, time and serialised message of the whole drive."""
+    types = store.types
+    rng = np.random.default_rng(3)
+    for i, (t_ns, topic) in enumerate(moments(seconds)):
+        stamp = types["builtin_interfaces/msg/Time"](sec=t_ns // 10**9, nanosec=t_ns % 10**9)
+        extra = {"seq": i} if is_ros1 else {}
+        header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="car", **extra)
+        kind = types[TYPES[topic]]
+        if topic == "/camera":
+            noise = rng.integers(0, 256, size=150_000, dtype=np.uint8)
+            message = kind(header=header, format="jpeg", data=noise)
+        elif topic == "/can":
+            message = kind(
+                header=header,
+                id=i % 2048,
+                is_rtr=False,
+                is_extended=False,
+                is_error=False,
+                dlc=8,
+                data=rng.integers(0, 256, size=8, dtype=np.uint8),
+            )
+        else:
+            vector = types["geometry_msgs/msg/Vector3"](x=0.1, y=0.2, z=9.8)
+            turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+            nine = np.zeros(9)
+            message = kind(header, turn, nine, vector, nine, vector, nine)
+        raw = (store.serialize_ros1 if is_ros1 else store.serialize_cdr)(message, TYPES[topic])
+        yield topic, t_ns, bytes(raw)
+
+
+def write_bag(path: Path, compression: str, seconds: int) -> Path:
+    store = store_of(Stores.ROS1_NOETIC)
+    writer = Writer1(path)
+    if compression != "none":
+        writer.set_compression(Writer1.CompressionFormat[compression.upper()])
+    with writer:
+        links: dict[str, Connection] = {
+            topic: writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in TYPES.items()
+        }
+        for topic, t_ns, raw in drive(store, True, seconds):
+            writer.write(links[topic], t_ns, raw)
+    return path
+
+
+def write_db3(path: Path, seconds: int) -> Path:
+    store = store_of(Stores.ROS2_HUMBLE)
+    with Writer2(path, version=9) as writer:
+        links = {
+            topic: writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in TYPES.items()
+        }
+        for topic, t_ns, raw in drive(store, False, seconds):
+            writer.write(links[topic], t_ns, raw)
+    return path
+
+
+def ours(path: Path, is_decoded: bool) -> int:
+    ledger = Ledger(str(path))
+    count = 0
+    with open_log(path) as log:
+        decoders: dict[str, Decoder | None] = {t.name: decoder_for(t) for t in log.topics}
+        for block in log.read(ledger):
+            decode = decoders[block.topic]
+            if is_decoded and decode is not None:
+                block = decode(block, ledger)
+            count += len(block)
+    assert ledger.is_whole, ledger.details
+    return count
+
+
+def theirs(path: Path, is_decoded: bool) -> int:
+    count = 0
+    with AnyReader([path]) as reader:
+        for link, _, raw in reader.messages():
+            if is_decoded:
+                reader.deserialize(raw, link.msgtype)
+            count += 1
+    return count
+
+
+def timed(work: Callable[[Path, bool], int], path: Path, is_decoded: bool, want: int) -> float:
+    began = time.perf_counter()
+    assert work(path, is_decoded) == want
+    return time.perf_counter() - began
+
+
+def compare(name: str, path: Path, rounds: int, want: int) -> None:
+    """Print one table line per case: median seconds, messages a second, median ratios."""
+    cases: dict[str, tuple[Callable[[Path, bool], int], bool]] = {
+        "ours, blocks": (ours, False),
+        "ours, columns": (ours, True),
+        "rosbags, raw": (theirs, False),
+        "rosbags, objects": (theirs, True),
+    }
+    for work, is_decoded in cases.values():
+        timed(work, path, is_decoded, want)
+    times: dict[str, list[float]] = {case: [] for case in cases}
+    for _ in range(rounds):
+        for case, (work, is_decoded) in cases.items():
+            times[case].append(timed(work, path, is_decoded, want))
+    for case, spent in times.items():
+        ratios = {
+            peer: statistics.median(b / a for a, b in zip(spent, times[peer], strict=True))
+            for peer in ("rosbags, raw", "rosbags, objects")
+        }
+        middle = statistics.median(spent)
+        print(
+            f"{name:10}{case:20}{middle:9.3f} s [{min(spent):.3f}-{max(spent):.3f}]"
+            f"{want / middle / 1e6:9.2f} M/s{ratios['rosbags, raw']:9.1f} x"
+            f"{ratios['rosbags, objects']:9.1f} x",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Write the drives and compare the readers on them."""
+    rounds = int(sys.argv[1]) if len(sys.argv) > 1 else 5
+    seconds = int(sys.argv[2]) if len(sys.argv) > 2 else 60
+    want = seconds * (PICTURES + FRAMES + IMUS)
+    print(f"{want} messages; x: times as fast as rosbags raw, rosbags objects; {rounds} rounds")
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        for compression in ("none", "lz4"):
+            path = write_bag(place / f"{compression}.bag", compression, seconds)
+            compare(f"bag {compression}", path, rounds, want)
+            path.unlink()
+        compare("db3", write_db3(place / "db", seconds), rounds, want)
+
+
+if __name__ == "__main__":
+    main()
