@@ -8,6 +8,7 @@ used, skipped or lost.
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -39,6 +40,7 @@ HEAD_BYTES: Final = 64 << 10
 LINE_MAX: Final = 8192
 """Longest line that ``slow`` is asked about."""
 _EXCERPT: Final = 60
+_DOS_END: Final = b"\x1a"
 
 
 class Frame(NamedTuple):
@@ -241,13 +243,14 @@ class _Scribe:
         return NO_ROWS
 
     def _tail(self, tail: Tail) -> FrameRows:
+        if tail.text == _DOS_END:
+            return NO_ROWS
         odd = _Odd()
         outcome = self.dialect.last(tail.text) if len(tail.text) <= LINE_MAX else None
-        if outcome is None:
-            if tail.text.strip():
-                outcome = Damage("last line has no line end, may be cut")
-        elif isinstance(outcome, Frame):
-            detail = f"line {tail.number} is complete but has no line end"
+        if outcome is None and tail.text.strip():
+            outcome = Damage("last line has no line end, may be cut")
+        if outcome is None or isinstance(outcome, Frame):
+            detail = f"line {tail.number} has no line end"
             self._ledger.lose("", "file may be cut after its last frame", None, detail)
         self._sort_in(odd, 0, tail.number, tail.text, outcome)
         return self._timed(NO_ROWS, odd)
@@ -377,6 +380,19 @@ class _Odd:
                 np.array([f.is_fd for f in frames], np.bool_),
             ),
         )
+
+
+_CONTROL: Final = re.compile(r"[\x00-\x08\x0e-\x1f]")
+_FRAME_LIKE: Final = re.compile(r"\d[.,]\d+\s+(?:.*\s)?(?:[RT]x|DT|F[BDE]|BI|RR)\s")
+
+
+def comment(text: str) -> Outcome:
+    """A comment line, unless damage may have joined a frame's line to it."""
+    if _CONTROL.search(text):
+        return Damage("comment with control characters")
+    if _FRAME_LIKE.search(text):
+        return Other("comment that holds a frame")
+    return None
 
 
 def head_of(path: Path) -> bytes:

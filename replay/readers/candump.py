@@ -143,7 +143,7 @@ class Candump(Dialect):
         if found := _XL_LINE.fullmatch(line):
             bus = found[3].decode("ascii")
             return Other("CAN XL frame, not supported", _time_ns(found), bus)
-        if not line.strip() or line.lstrip().startswith(b"//"):
+        if not line.strip():
             return None
         return Damage(NOT_A_FRAME, taints=not line.startswith(b"("))
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import zlib
 from pathlib import Path
-from threading import Event
+from sys import getrefcount
+from threading import Event, Lock
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,35 @@ from .mcap_records import BrokenRecordError
 
 WINDOW: Final = 64 << 10
 PIECE: Final = 1 << 20
+STEP: Final = 256 << 10
+KEPT: Final = 8
+"""Buffers kept for use again ..."""
+KEPT_BYTES: Final = 8 << 20
+"""... unless they are larger than this."""
+
+
+class Buffers:
+    """Memory that is used again once nothing refers to it any more.
+
+    Fresh memory costs as much as reading into it. An array handed out is used again when the only
+    references to it left are those here: every view of it holds one.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._owned: list[Bytes] = []
+
+    def take(self, size: int) -> Bytes:
+        """An array of shape (size,) with any content; safe from any thread."""
+        with self._lock:
+            for i in range(len(self._owned)):
+                # Two: the list's reference and the argument's.
+                if len(self._owned[i]) >= size and getrefcount(self._owned[i]) == 2:
+                    return self._owned[i][:size]
+            owner = np.empty(-(-size // STEP) * STEP, dtype=np.uint8)
+            if len(self._owned) < KEPT and size <= KEPT_BYTES:
+                self._owned.append(owner)
+            return owner[:size]
 
 
 class ByteFile:
@@ -26,6 +56,7 @@ class ByteFile:
         self.size = os.fstat(self._file.fileno()).st_size
         self._window = b""
         self._window_at = 0
+        self.buffers = Buffers()
 
     def peek(self, at: int, size: int) -> memoryview:
         """Up to ``size`` bytes at ``at``, from a window that is read ahead; shorter at the end.
@@ -44,13 +75,13 @@ class ByteFile:
         return memoryview(self._window)[begin:]
 
     def read(self, at: int, size: int) -> Bytes:
-        """Up to ``size`` bytes at ``at``, as a new array of shape (size,) or less at the end.
+        """Up to ``size`` bytes at ``at``, as an array of its own, shape (size,) or less at the end.
 
         Raises:
             BrokenRecordError: The disk reports an error.
         """
         size = max(0, min(size, self.size - at))
-        array = np.empty(size, dtype=np.uint8)
+        array = self.buffers.take(size)
         view, done = array.data, 0
         while done < size:
             try:

@@ -10,18 +10,21 @@ import numpy as np
 
 from crosscue.replay.columns import Bytes
 
+from .mcap_bytes import Buffers
 from .mcap_records import BrokenRecordError, ChunkHead
 
 UNKNOWN_SIZES: Final = (-1, 0)
 """What zstandard and lz4 say when a frame does not declare its size."""
+LZ4_STEP: Final = 64 << 10
 
 
-def inflate(body: Bytes, head: ChunkHead) -> Bytes:
+def inflate(body: Bytes, head: ChunkHead, buffers: Buffers) -> Bytes:
     """The records of a chunk, their size and checksum as the chunk declares.
 
     Args:
         body: Shape (B,), the chunk's records as stored.
         head: What the chunk says of them.
+        buffers: Where memory comes from.
 
     Returns:
         Shape (``head.size``,), uint8.
@@ -32,7 +35,7 @@ def inflate(body: Bytes, head: ChunkHead) -> Bytes:
     """
     if len(body) != head.body_size:
         raise BrokenRecordError(f"holds {len(body)} of {head.body_size} bytes")
-    records = _WHOLE[head.compression](body, head.size) if len(body) else body
+    records = _WHOLE[head.compression](body, head.size, buffers) if len(body) else body
     if len(records) != head.size:
         raise BrokenRecordError(f"decompressed to {len(records)} bytes, declared {head.size}")
     if head.crc and zlib.crc32(records.data) != head.crc:
@@ -51,23 +54,19 @@ def inflate_prefix(body: Bytes, head: ChunkHead) -> Bytes:
     return records
 
 
-def _plain(body: Bytes, size: int) -> Bytes:
+def _plain(body: Bytes, size: int, buffers: Buffers) -> Bytes:
     return body
 
 
-def _zstd(body: Bytes, size: int) -> Bytes:
+def _zstd(body: Bytes, size: int, buffers: Buffers) -> Bytes:
     import zstandard
 
     try:
         declared = zstandard.frame_content_size(body.data)
-        if declared == size and size > 0:
-            whole = zstandard.ZstdDecompressor().decompress(body.data, allow_extra_data=False)
-            return np.frombuffer(whole, dtype=np.uint8)
-        # A frame that does not say its size, or several in a row: never more than `size` bytes.
         if declared > size:
             raise BrokenRecordError(f"its zstd frame declares {declared} bytes, the chunk {size}")
-        records = np.empty(size + 1, dtype=np.uint8)
-        done = 0
+        # One byte of room more than is due, so that a frame which gives more is found out.
+        records, done = buffers.take(size + 1), 0
         with zstandard.ZstdDecompressor().stream_reader(
             body.data, read_across_frames=True
         ) as stream:
@@ -83,20 +82,31 @@ def _zstd(body: Bytes, size: int) -> Bytes:
     return records[:done]
 
 
-def _lz4(body: Bytes, size: int) -> Bytes:
+def _lz4(body: Bytes, size: int, buffers: Buffers) -> Bytes:
     import lz4.frame
 
-    stream = lz4.frame.LZ4FrameDecompressor()
+    records, done, used, is_done = buffers.take(size), 0, 0, False
+    view, context = body.data, lz4.frame.create_decompression_context()
     try:
-        declared = lz4.frame.get_frame_info(body)["content_size"]
+        declared = lz4.frame.get_frame_info(view)["content_size"]
         if declared not in (*UNKNOWN_SIZES, size):
             raise BrokenRecordError(f"its lz4 frame declares {declared} bytes, the chunk {size}")
-        whole = stream.decompress(body, max_length=max(size, 1))
+        while not is_done:
+            # In small steps: the library gives new memory each time, which is slow when large.
+            step, taken, is_done = lz4.frame.decompress_chunk(
+                context, view[used:], max_length=min(size - done, LZ4_STEP) or 1
+            )
+            if not step and not taken:
+                break
+            if len(step) > size - done:
+                raise BrokenRecordError(f"decompresses to more than the {size} bytes it declares")
+            records[done : done + len(step)] = np.frombuffer(step, dtype=np.uint8)
+            done, used = done + len(step), used + taken
     except (RuntimeError, ValueError, EOFError) as error:
         raise BrokenRecordError(f"lz4 says: {error}") from None
-    if not stream.eof:
-        raise BrokenRecordError(f"its lz4 frame does not end after the {size} bytes it declares")
-    return np.frombuffer(whole, dtype=np.uint8)
+    if not is_done:
+        raise BrokenRecordError(f"its lz4 frame does not end after {done} bytes")
+    return records[:done]
 
 
 def _zstd_prefix(body: Bytes, size: int) -> Bytes:
@@ -134,7 +144,7 @@ def _lz4_prefix(body: Bytes, size: int) -> Bytes:
     return np.frombuffer(b"".join(got), dtype=np.uint8)
 
 
-_WHOLE: Final[dict[str, Callable[[Bytes, int], Bytes]]] = {
+_WHOLE: Final[dict[str, Callable[[Bytes, int, Buffers], Bytes]]] = {
     "": _plain,
     "lz4": _lz4,
     "zstd": _zstd,

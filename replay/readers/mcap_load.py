@@ -17,7 +17,8 @@ from .mcap_records import BrokenRecordError
 from .mcap_segments import Segment
 from .mcap_walk import Chunk, Item
 
-WORKERS: Final = 2
+WORKERS: Final = 1
+"""More would help only where decompressing takes longer than what is done with the messages."""
 AHEAD: Final = 4
 """Chunks under way at once ..."""
 AHEAD_BYTES: Final = 32 << 20
@@ -86,4 +87,6 @@ class Loader:
                 f"declares {max(head.size, head.body_size)} bytes, the limit is {most}"
             )
         body = self._file.read(chunk.body_at, head.body_size)
-        return inflate_prefix(body, head) if chunk.is_cut else inflate(body, head)
+        return (
+            inflate_prefix(body, head) if chunk.is_cut else inflate(body, head, self._file.buffers)
+        )

@@ -55,6 +55,8 @@ MESSAGE_HEAD: Final = np.dtype(
 """The first 31 bytes of a message record, as they lie in the file."""
 INDEX_ENTRY: Final = np.dtype([("log", "<u8"), ("offset", "<u8")])
 MESSAGE_FIXED: Final = MESSAGE_HEAD.itemsize - PREFIX.size
+_INDEX_HEAD: Final = struct.Struct("<HI")
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")
 CHUNK_FIXED: Final = 40
 """Bytes of a chunk record's content, besides its compression's name and its records."""
 
@@ -199,23 +201,29 @@ def read_chunk_head(content: bytes | memoryview) -> ChunkHead:
     Raises:
         BrokenRecordError: Also for a compression name of more than 32 bytes.
     """
-    fields = Fields(content)
-    start, end, size, crc = (fields.number(n) for n in (8, 8, 8, 4))
-    name_length = fields.number(4)
-    if name_length > 32:
+    if len(content) < CHUNK_FIXED:
+        raise BrokenRecordError(
+            f"a chunk's fields need {CHUNK_FIXED} bytes, here are {len(content)}"
+        )
+    start, end, size, crc, name_length = _CHUNK_HEAD.unpack_from(content)
+    body_at = CHUNK_FIXED + name_length
+    if name_length > 32 or body_at > len(content):
         raise BrokenRecordError(f"a compression name of {name_length} bytes")
-    compression = bytes(fields.take(name_length)).decode("utf-8", "backslashreplace")
-    body_size = fields.number(8)
-    return ChunkHead(start, end, size, crc, compression, fields.at, body_size)
+    name = bytes(content[_CHUNK_HEAD.size : body_at - 8])
+    body_size = int.from_bytes(content[body_at - 8 : body_at], "little")
+    compression = name.decode("utf-8", "backslashreplace")
+    return ChunkHead(start, end, size, crc, compression, body_at, body_size)
 
 
 def read_message_index(content: bytes | memoryview) -> MessageIndex:
     """A MessageIndex record."""
-    fields = Fields(content)
-    channel_id, size = fields.number(2), fields.number(4)
-    if size % INDEX_ENTRY.itemsize:
-        raise BrokenRecordError(f"a message index of {size} bytes is no whole number of entries")
-    return MessageIndex(channel_id, np.frombuffer(fields.take(size), dtype=INDEX_ENTRY))
+    if len(content) < _INDEX_HEAD.size:
+        raise BrokenRecordError(f"a message index of {len(content)} bytes")
+    channel_id, size = _INDEX_HEAD.unpack_from(content)
+    if size % INDEX_ENTRY.itemsize or _INDEX_HEAD.size + size > len(content):
+        raise BrokenRecordError(f"a message index of {size} bytes does not fit")
+    count = size // INDEX_ENTRY.itemsize
+    return MessageIndex(channel_id, np.frombuffer(content, INDEX_ENTRY, count, _INDEX_HEAD.size))
 
 
 def read_chunk_index(content: bytes | memoryview, base: int = 0) -> ChunkIndex:

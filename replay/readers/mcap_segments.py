@@ -343,7 +343,7 @@ def _definitions_in(
     if max(head.size, head.body_size) > limits.chunk_bytes:
         return []
     try:
-        buffer = inflate(file.read(chunk.body_at, head.body_size), head)
+        buffer = inflate(file.read(chunk.body_at, head.body_size), head, file.buffers)
         rows = rows_by_scan(buffer, scanner, NEVER_IN_A_CHUNK, limits.records_per_chunk)
     except BrokenRecordError:
         return []

@@ -1,0 +1,264 @@
+"""Reading a ROS 2 MCAP drive: ours beside rosbags, mcap and bare decompression, in one run.
+
+    python benchmarks/mcap_reading.py [rounds]            # speed
+    python benchmarks/mcap_reading.py memory [megabytes]  # peak memory, 200 MB against 2 GB
+
+The drive: one minute of 900 camera pictures of 150 kB (noise, which is as incompressible as JPEG),
+135,468 real CAN frames (comma2k19) and 30,000 small frames, in 1 MiB chunks. Ours verifies every
+checksum; the peers by default verify none. The cases run in rotation, ratios are taken round by
+round. The recording is looked for in $CROSSCUE_DATA or ../shared/data.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.reader import NonSeekingReader
+from mcap.writer import CompressionType, Writer
+from rosbags.highlevel import AnyReader
+
+from crosscue.replay.columns import Messages
+from crosscue.replay.decode import decoder_for
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT
+from crosscue.replay.readers.mcap import open_mcap
+from crosscue.replay.readers.mcap_bytes import ByteFile
+from crosscue.replay.readers.mcap_scan import Scanner
+from crosscue.replay.readers.mcap_segments import find_segments
+from crosscue.replay.readers.mcap_topics import TopicBook
+from crosscue.replay.readers.mcap_walk import Chunk, Walk
+
+DATA = Path(os.environ.get("CROSSCUE_DATA", Path(__file__).parents[2] / "shared" / "data"))
+RAW_CAN = (
+    DATA / "comma2k19/Example_1/b0c9d2329ad1606b_2018-08-02--08-34-47/40/processed_log/CAN/raw_can"
+)
+HEADER_TEXT = """
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+FRAME_TEXT = f"""std_msgs/Header header
+uint32 id
+bool is_rtr
+bool is_extended
+bool is_error
+uint8 dlc
+uint8[8] data
+{HEADER_TEXT.strip()}
+"""
+PICTURE_TEXT = f"""std_msgs/Header header
+string format
+uint8[] data
+{HEADER_TEXT.strip()}
+"""
+PICTURES, SMALL = 900, 30_000
+START_NS = 1_533_200_000_000_000_000
+MINUTE_NS = 60_000_000_000
+
+
+def frames(address: np.ndarray, payload: np.ndarray, t_ns: np.ndarray, frame: bytes) -> list[bytes]:
+    """can_msgs/Frame in CDR, one per row."""
+    head = np.zeros(
+        len(t_ns),
+        dtype=[("cdr", "S4"), ("sec", "<i4"), ("nanosec", "<u4"), ("size", "<u4"), ("frame", "S8"),
+               ("id", "<u4"), ("flags", "u1", 3), ("dlc", "u1"), ("payload", "u1", 8)],
+    )  # fmt: skip
+    head["cdr"], head["frame"], head["size"] = b"\x00\x01\x00\x00", frame, len(frame) + 1
+    head["sec"], head["nanosec"] = t_ns // 10**9, t_ns % 10**9
+    head["id"], head["dlc"], head["payload"] = address, 8, payload
+    head["flags"][:, 1] = address > 0x7FF
+    coded, width = head.tobytes(), head.dtype.itemsize
+    return [coded[i : i + width] for i in range(0, len(coded), width)]
+
+
+def pictures(count: int) -> Iterator[bytes]:
+    """sensor_msgs/CompressedImage in CDR, of about 150 kB of noise each."""
+    rng = np.random.default_rng(3)
+    for i in range(count):
+        noise = rng.bytes(int(rng.integers(120_000, 180_000)))
+        head = b"\x00\x01\x00\x00" + np.array([i, 0, 4], dtype="<u4").tobytes() + b"cam\x00"
+        head += np.array([5], dtype="<u4").tobytes() + b"jpeg\x00\x00\x00\x00"
+        yield head + np.array([len(noise)], dtype="<u4").tobytes() + noise
+
+
+def write_log(path: Path, compression: CompressionType, minutes: int = 1) -> None:
+    """The drive described above, ``minutes`` times over."""
+    column = {n: np.load(RAW_CAN / n, allow_pickle=False) for n in ("address", "data", "t")}
+    payload = np.ascontiguousarray(column["data"]).view(np.uint8).reshape(-1, 8)
+    seconds = column["t"] - column["t"][0]
+    can_ns = START_NS + np.round(seconds / max(seconds[-1], 1.0) * 0.999 * MINUTE_NS).astype(
+        np.int64
+    )
+    small_ns = START_NS + np.linspace(0, MINUTE_NS, SMALL, endpoint=False).astype(np.int64)
+    ids = 0x700 + np.arange(SMALL) % 64
+    noise = np.random.default_rng(5).integers(0, 256, (SMALL, 8), dtype=np.uint8)
+    picture_ns = START_NS + np.linspace(0, MINUTE_NS, PICTURES, endpoint=False).astype(np.int64)
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=compression)
+        writer.start(profile="ros2")
+        picture = writer.register_schema(
+            "sensor_msgs/msg/CompressedImage", "ros2msg", PICTURE_TEXT.encode()
+        )
+        frame = writer.register_schema("can_msgs/msg/Frame", "ros2msg", FRAME_TEXT.encode())
+        channels = [
+            writer.register_channel(topic, "cdr", schema)
+            for topic, schema in (("/camera", picture), ("/can", frame), ("/mobileye", frame))
+        ]
+        for minute in range(minutes):
+            shift = minute * MINUTE_NS
+            rows = [(int(t), 0, one) for t, one in zip(picture_ns, pictures(PICTURES), strict=True)]
+            for k, t_ns, coded in (
+                (1, can_ns, frames(column["address"], payload, can_ns + shift, b"can0")),
+                (2, small_ns, frames(ids, noise, small_ns + shift, b"eye0")),
+            ):
+                rows += [(int(t), k, one) for t, one in zip(t_ns, coded, strict=True)]
+            rows.sort(key=lambda row: row[0])
+            for i, (t, k, one) in enumerate(rows):
+                writer.add_message(channels[k], t + shift, one, t + shift, i)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def ours(path: Path) -> int:
+    with open_mcap(path, DEFAULT) as log:
+        return sum(len(block) for block in log.read(Ledger(str(path))))
+
+
+def ours_decoded(path: Path) -> int:
+    count, ledger = 0, Ledger(str(path))
+    with open_mcap(path, DEFAULT) as log:
+        decoders = {topic.name: decoder_for(topic) for topic in log.topics}
+        for block in log.read(ledger):
+            decode = decoders[block.topic]
+            assert decode is not None
+            count += len(decode(block, ledger))
+    assert ledger.is_whole
+    return count
+
+
+def rosbags(path: Path) -> int:
+    count = 0
+    with AnyReader([path]) as reader:
+        for connection, _, raw in reader.messages():
+            reader.deserialize(raw, connection.msgtype)
+            count += 1
+    return count
+
+
+def rosbags_raw(path: Path) -> int:
+    with AnyReader([path]) as reader:
+        return sum(1 for _ in reader.messages())
+
+
+def mcap_package(path: Path) -> int:
+    with path.open("rb") as stream:
+        return sum(1 for _ in NonSeekingReader(stream).iter_messages(log_time_order=False))
+
+
+def bare(path: Path) -> int:
+    """Read and decompress every chunk, nothing else; on this thread."""
+    file = ByteFile(path)
+    segment = find_segments(file, path, TopicBook(DEFAULT), DEFAULT)[0]
+    inflater = zstandard.ZstdDecompressor()
+    walk = Walk(file, segment.begin, segment.end, segment.rail, DEFAULT, Scanner())
+    for item in walk:
+        if isinstance(item, Chunk) and item.head is not None:
+            body = file.read(item.body_at, item.head.body_size).data
+            if item.head.compression == "zstd":
+                inflater.decompress(body)
+            elif item.head.compression == "lz4":
+                lz4.frame.decompress(body)
+    file.close()
+    return 0
+
+
+CASES: dict[str, Callable[[Path], int]] = {
+    "rosbags, deserialised": rosbags,
+    "rosbags, raw": rosbags_raw,
+    "mcap NonSeekingReader": mcap_package,
+    "ours, blocks": ours,
+    "ours, CAN in columns": ours_decoded,
+    "bare decompression": bare,
+}
+
+
+def speed(rounds: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for compression in CompressionType:
+            path = Path(folder) / f"{compression.name.lower()}.mcap"
+            write_log(path, compression)
+            counts = {name: case(path) for name, case in CASES.items()}
+            assert len(set(counts.values()) - {0}) == 1, counts
+            seconds: dict[str, list[float]] = {name: [] for name in CASES}
+            for _ in range(rounds):
+                for name, case in CASES.items():
+                    begin = time.perf_counter()
+                    case(path)
+                    seconds[name].append(time.perf_counter() - begin)
+            size = path.stat().st_size / 1e6
+            print(f"\n{path.stem}: {size:.0f} MB, {counts['ours, blocks']} messages")
+            print(f"{'':24} {'s median [min-max]':>24} {'x rosbags':>10} {'x bare':>8}")
+            for name, took in seconds.items():
+                gain = _ratio(seconds["rosbags, deserialised"], took)
+                over = _ratio(took, seconds["bare decompression"])
+                span = f"{statistics.median(took):.3f} [{min(took):.3f}-{max(took):.3f}]"
+                print(f"{name:24} {span:>24} {gain:>10.1f} {over:>8.2f}")
+            path.unlink()
+
+
+def _ratio(above: list[float], below: list[float]) -> float:
+    return statistics.median(a / b for a, b in zip(above, below, strict=True))
+
+
+def memory(megabytes: int) -> None:
+    """Peak memory of a process that reads a log of 200 MB, and one ten times as long."""
+    with tempfile.TemporaryDirectory() as folder:
+        for compression in (CompressionType.NONE, CompressionType.ZSTD):
+            peaks = []
+            for size in (megabytes, 10 * megabytes):
+                path = Path(folder) / "log.mcap"
+                write_log(path, compression, max(1, round(size / 148)))
+                call = [sys.executable, __file__, "peak", str(path)]
+                told = subprocess.run(call, check=True, capture_output=True, text=True).stdout
+                peaks.append(float(told))
+                print(
+                    f"{compression.name.lower():6} {path.stat().st_size / 1e6:7.0f} MB log: "
+                    f"peak {peaks[-1]:.0f} MiB",
+                    flush=True,
+                )
+                path.unlink()
+            print(f"{'':6} difference {peaks[1] - peaks[0]:+.1f} MiB")
+
+
+def peak(path: Path) -> None:
+    largest = 0
+    with open_mcap(path, DEFAULT) as log:
+        for block in log.read(Ledger(str(path))):
+            assert isinstance(block.rows, Messages)
+            largest = max(largest, int(block.log_ns[-1]))
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+
+
+if __name__ == "__main__":
+    match sys.argv[1:]:
+        case ["memory", *more]:
+            memory(int(more[0]) if more else 200)
+        case ["peak", name]:
+            peak(Path(name))
+        case more:
+            speed(int(more[0]) if more else 5)
