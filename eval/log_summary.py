@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.replay.clock_findings import apart, duration_text, findings, instant_text
+from crosscue.replay.clock_findings import (
+    ROWS_FOR_OFFSET,
+    apart,
+    duration_text,
+    findings,
+    instant_text,
+)
 from crosscue.replay.clocks import ClockReport, ClockWatch
 from crosscue.replay.columns import Block, CanFrames, Messages, Topic
 from crosscue.replay.errors import SchemaError
@@ -259,7 +265,12 @@ def _summary(
         topics=topics,
         unattributed_lost=dict(nameless.lost),
         unattributed_unknown=tuple(nameless.lost_unknown),
-        findings=(*_of_account(topics, is_quick=is_quick), *findings(reports), *_choices(topics)),
+        findings=(
+            *_of_nameless(nameless),
+            *_of_account(topics, is_quick=is_quick),
+            *findings(reports),
+            *_choices(topics),
+        ),
         notices=tuple(ledger.notices),
         losses=tuple(ledger.losses()),
     )
@@ -289,6 +300,14 @@ def _topic_summary(
         can_ids=seen.top(0.0 if report is None else report.duration_ns * 1e-9),
         can_id_count=len(seen.counts),
     )
+
+
+def _of_nameless(account: TopicAccount) -> Iterator[str]:
+    """Losses that no topic can be named for."""
+    if not account.is_whole:
+        why = ", ".join(dict.fromkeys([*account.lost, *account.lost_unknown]))
+        at_least = "at least " if account.lost_unknown else ""
+        yield f"{at_least}{account.lost.total()} rows of unknown topics lost: {why}"
 
 
 def _of_account(topics: Iterable[TopicSummary], *, is_quick: bool) -> Iterator[str]:
@@ -321,15 +340,19 @@ def _choices(topics: Iterable[TopicSummary]) -> Iterator[str]:
 
 
 def rows_of_clocks(topics: Iterable[TopicSummary]) -> Iterator[tuple[str, ...]]:
-    """Cells of the table of clocks: topic, clock, period, gaps, longest, offset, drift."""
+    """Cells of the table of clocks: topic, clock, period, gaps, longest, offset, drift.
+
+    Offset and drift are those of the clock that is used; where that is the log time, those of the
+    header stamp, else of the publish time.
+    """
     for topic in topics:
         report = topic.clocks
         if report is None:
             continue
         stamps = report.of_used
-        # Where the log time is used, the clock worth showing beside it is the one passed over.
         other = next((s for s in (report.header, report.publish) if s and s.line), None)
         line = (stamps.line or (other and other.line)) or None
+        line = line if report.count >= ROWS_FOR_OFFSET else None
         drift = ""
         if line is not None and line.drift_ppm is not None:
             drift = f"{line.drift_ppm:+.1f} +-{line.drift_error_ppm:.1f}"

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from crosscue.replay.clock_findings import apart, duration_text, findings, instant_text
 from crosscue.replay.clocks import ClockWatch
@@ -166,3 +168,19 @@ def test_instants_are_dates_only_where_they_count_from_1970() -> None:
     assert instant_text(1_500_000_000) == "1.500 s"
     assert instant_text(START_NS + 5 * MS) == "2025-11-13 02:13:20.005 UTC"
     assert instant_text((1 << 62) - 1).startswith("2116-")
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(
+        st.tuples(*[st.integers(-(2**63), 2**63 - 1) | st.integers(0, 10**11)] * 3), max_size=60
+    )
+)
+def test_any_times_at_all_are_told_in_plain_lines(rows: list[tuple[int, int, int]]) -> None:
+    columns = np.array(rows, dtype=np.int64).reshape(-1, 3)
+
+    said = said_of(table_of("/a", *columns.T), table_of("/b", columns[:, 1]))
+
+    for sentence in said:
+        assert sentence.isprintable()
+        assert "nan" not in sentence

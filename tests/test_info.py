@@ -137,6 +137,7 @@ def test_losses_are_told_by_topic_reason_and_place() -> None:
     assert "- /imu: 31 of 331 rows lost: chunk CRC" in text
     assert "- 31 of /imu at 0.00 s: chunk CRC (at byte 7)" in text
     assert "- an unknown number of unknown topics: file is cut (at byte 9)" in text
+    assert "- at least 0 rows of unknown topics lost: file is cut" in text
     assert re.search(r"^\(topic not known\) .*>= 0$", text, re.M)
 
 

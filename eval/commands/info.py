@@ -4,6 +4,8 @@ examples:
   crosscue info drive.mcap
   crosscue info drive.mcap can0.log --json > drive.json
   crosscue info --quick drive.bag      only what the file declares, without reading it
+
+Offset and drift say how the header stamp (else the publish time) runs against the log time.
 """
 
 from __future__ import annotations
