@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import struct
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +15,8 @@ from crosscue.replay.columns import DATA, ERROR, REMOTE, CanFrames
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import EVERYTHING, Selection, open_log
 
-START_NS = 1_436_509_052_000_000_000
+START_NS = 1_436_529_600_000_000_000
+"""Noon of 10 July 2015, which days since 1899 spell exactly."""
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
 
@@ -61,6 +64,156 @@ def candump_line(frame: Sent) -> str:
 def candump(frames: Sequence[Sent]) -> bytes:
     """A candump log."""
     return "".join(candump_line(frame) + "\n" for frame in frames).encode()
+
+
+def _hex(payload: bytes) -> str:
+    return payload.hex(" ").upper()
+
+
+def asc(frames: Sequence[Sent], *, relative: bool = False, mark: str = ".") -> bytes:
+    """A Vector ASC log, with a statistics line every fifty frames."""
+    mode = "relative" if relative else "absolute"
+    date = "Fri Jul 10 12:00:00.000 pm 2015"
+    lines = [f"date {date}", f"base hex  timestamps {mode}", "internal events logged"]
+    lines += [
+        "// version 9.0.0",
+        f"Begin Triggerblock {date}",
+        f"   0{mark}000000 Start of measurement",
+    ]
+    before = START_NS
+    for k, frame in enumerate(frames):
+        seconds, nanos = divmod(frame.t_ns - (before if relative else START_NS), 10**9)
+        time = f"{seconds:4}{mark}{nanos // 1000:06d}"
+        before = frame.t_ns
+        lines.append(f"{time} {_asc_body(frame)}")
+        if k % 50 == 49:
+            time = f"0{mark}000000" if relative else time
+            lines.append(f"{time} 1  Statistic: D 0 R 0 XD 0 XR 0 E 0 O 0 B 0.00%")
+    return "".join(line + "\n" for line in [*lines, "End TriggerBlock"]).encode()
+
+
+def _asc_body(frame: Sent) -> str:
+    identifier = f"{frame.arbitration_id:X}{'x' if frame.is_extended else ''}"
+    if frame.kind == ERROR:
+        return f"{frame.bus}  ErrorFrame"
+    if frame.kind == REMOTE:
+        return f"{frame.bus}  {identifier:<15} Rx   r"
+    if not frame.is_fd:
+        length = len(frame.payload)
+        rest = f" Length = 0 BitCount = 0 ID = {frame.arbitration_id}"
+        return f"{frame.bus}  {identifier:<15} Rx   d {length:x} {_hex(frame.payload)} {rest}"
+    code = FD_LENGTHS.index(len(frame.payload))
+    name = "Name_of_it" if frame.arbitration_id % 2 else ""
+    return (
+        f"CANFD {frame.bus:>3} Rx {identifier:>8}  {name:>32} 1 0 {code:x} "
+        f"{len(frame.payload):>2} {_hex(frame.payload)} 102203  133   303000 e0006659 46500250"
+    )
+
+
+def trc(frames: Sequence[Sent], version: str = "2.1") -> bytes:
+    """A PEAK TRC log; versions below 2.0 have no CAN FD, below 1.2 one bus."""
+    lines = [f";$FILEVERSION={version}", ";$STARTTIME=42195.5"]
+    if version == "1.0":
+        lines = [";  no version"]
+    if version.startswith("2"):
+        lines.append(";$COLUMNS=N,O,T,B,I,d,R,L,D")
+    lines.append(";---+--   ----+----")
+    for k, frame in enumerate(frames, 1):
+        micros = (frame.t_ns - START_NS) // 1000
+        time = f"{micros // 1000}.{micros % 1000:03d}"
+        identifier = f"{frame.arbitration_id:0{8 if frame.is_extended else 4}X}"
+        length = len(frame.payload)
+        rest = "RTR" if frame.kind == REMOTE else _hex(frame.payload)
+        match version:
+            case "1.0":
+                lines.append(f"{k:>6}) {time:>12}  {identifier:>8}  {length}  {rest}")
+            case "1.1":
+                lines.append(f"{k:>6}) {time:>12}  Rx  {identifier:>8}  {length}  {rest} ")
+            case "1.2":
+                lines.append(
+                    f"{k:>6}) {time:>12} {frame.bus}  Rx  {identifier:>8}  {length}  {rest}"
+                )
+            case "1.3":
+                lines.append(
+                    f"{k:>6}) {time:>12} {frame.bus}  Rx {identifier:>8} -  {length}  {rest}"
+                )
+            case _:
+                kind = "RR" if frame.kind == REMOTE else "FB" if frame.is_fd else "DT"
+                code = FD_LENGTHS.index(length)
+                rest = "" if frame.kind == REMOTE else rest
+                start = f"{k:>7} {time:>13} {kind} {frame.bus:>2} {identifier:>8}"
+                lines.append(f"{start} Rx -  {code:<4} {rest}")
+    return "".join(line + "\r\n" for line in lines).encode()
+
+
+def blf(
+    frames: Sequence[Sent],
+    *,
+    container: int = 2000,
+    stored: bool = False,
+    is_closed: bool = True,
+    is_old: bool = False,
+) -> bytes:
+    """A Vector BLF log: objects run on from one container to the next, as Vector's do.
+
+    Args:
+        frames: What it holds.
+        container: Bytes of content in each container.
+        stored: Not compressed.
+        is_closed: Its writer came to write counts and times into the header.
+        is_old: Times in steps of ten microseconds, header version 2, CAN_MESSAGE2.
+    """
+    content = b"".join(_blf_object(frame, is_old) for frame in frames)
+    body = b""
+    for k in range(0, len(content), container):
+        part = content[k : k + container]
+        coded = part if stored else zlib.compress(part)
+        head = struct.pack(
+            "<4sHHLLH6xL4x", b"LOBJ", 16, 1, 32 + len(coded), 10, 0 if stored else 2, len(part)
+        )
+        body += head + coded + bytes(len(coded) % 4)
+    start = (2015, 7, 5, 10, 12, 0, 0, 0)
+    stop = (2038, 7, 5, 10, 12, 0, 0, 0)
+    if not is_closed:
+        start = stop = (0,) * 8
+    size, count = (144 + len(body), len(frames)) if is_closed else (144, 0)
+    header = struct.pack(
+        "<4sL8BQQLL8H8H", b"LOGG", 144, 5, 0, 0, 0, 2, 6, 8, 1, size, 144 + len(content), count, 0,
+        *start, *stop,
+    )  # fmt: skip
+    return header.ljust(144, b"\0") + body
+
+
+def _blf_object(frame: Sent, is_old: bool) -> bytes:
+    identifier = frame.arbitration_id | (0x80000000 if frame.is_extended else 0)
+    bus, length = int(frame.bus), len(frame.payload)
+    flags = 0x80 if frame.kind == REMOTE else 0
+    code = FD_LENGTHS.index(length)
+    if frame.kind == ERROR:
+        type_ = 73
+        body = struct.pack(
+            "<HHLBBBxLLH2x8s", bus, 0, 0, 0, 0, code, 0, identifier, 0, frame.payload
+        )
+    elif frame.is_fd and is_old:
+        type_ = 101
+        body = struct.pack(
+            "<BBBBLLLLLLLHBBL", bus, code, length, 0, identifier, 0, 0x1000, 0, 0, 0, 0, 0, 0, 0, 0
+        )
+        body += frame.payload
+    elif frame.is_fd:
+        type_ = 100
+        body = struct.pack(
+            "<HBBLLBBB5x64s", bus, flags, code, identifier, 0, 0, 1, length, frame.payload
+        )
+    else:
+        type_ = 86 if is_old else 1
+        body = struct.pack("<HBBL8s", bus, flags, code, identifier, frame.payload)
+        body += bytes(8) if is_old else b""
+    ticks = (frame.t_ns - START_NS) // (10_000 if is_old else 1)
+    head = struct.pack("<LHHQ", 1 if is_old else 2, 0, 0, ticks) + bytes(8 if is_old else 0)
+    size = 16 + len(head) + len(body)
+    base = struct.pack("<4sHHLL", b"LOBJ", 16 + len(head), 2 if is_old else 1, size, type_)
+    return base + head + body + bytes(size % 4)
 
 
 def frames_of(columns: CanFrames, log_ns: Sequence[int], bus: str) -> Iterator[Sent]:
