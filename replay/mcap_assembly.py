@@ -1,7 +1,7 @@
 """Message records of MCAP, whole blocks at a time: columns in, bytes out.
 
 Messages of several channels are merged by log time, without ever changing the order of two
-messages of one block, and cut into chunks.
+messages of one channel, and cut into chunks.
 """
 
 from __future__ import annotations
@@ -78,15 +78,14 @@ class ChunkRows:
 def merged(stretches: Sequence[Stretch], chunk_bytes: int) -> Iterator[ChunkRows]:
     """All messages as records, merged by log time and cut into chunks of about ``chunk_bytes``.
 
-    A stretch whose clock goes back keeps its order: each of its messages counts as no earlier than
+    A channel whose clock goes back keeps its order: each of its messages counts as no earlier than
     those before it.
     """
     counts = [len(stretch.messages) for stretch in stretches]
     if not sum(counts):
         return
     log = np.concatenate([stretch.log_ns for stretch in stretches])
-    keys = [np.maximum.accumulate(stretch.log_ns) for stretch in stretches if len(stretch.log_ns)]
-    order = np.argsort(np.concatenate(keys), kind="stable")
+    order = np.argsort(np.concatenate(_keys(stretches)), kind="stable")
     sizes = np.concatenate([s.messages.stop - s.messages.start for s in stretches])
     ends = np.cumsum(sizes[order] + HEAD.itemsize)
     begins = np.empty_like(ends)
@@ -101,6 +100,20 @@ def merged(stretches: Sequence[Stretch], chunk_bytes: int) -> Iterator[ChunkRows
                     sizes[at : at + count])  # fmt: skip
         at += count
     yield from _cut(records, channel[order], log[order], begins[order], ends, chunk_bytes)
+
+
+def _keys(stretches: Sequence[Stretch]) -> list[Int64s]:
+    """Times to sort by, which never go back within a channel."""
+    latest: dict[int, int] = {}
+    keys = []
+    for stretch in stretches:
+        key = np.maximum.accumulate(stretch.log_ns)
+        if stretch.channel in latest:
+            key = np.maximum(key, latest[stretch.channel])
+        if len(key):
+            latest[stretch.channel] = int(key[-1])
+        keys.append(key)
+    return keys
 
 
 def _heads(

@@ -215,7 +215,7 @@ def test_picking_rows_of_both_byte_orders_picks_the_same_rows() -> None:
     keep = np.array([i % 3 == 0 for i in range(10)])
 
     decoder = plain(ros2_topic("/i", name))
-    fields, _ = decoder._walked(block_of("/i", payloads), messages_of(payloads), Ledger("made"))
+    fields, _ = decoder.walked(block_of("/i", payloads), messages_of(payloads), Ledger("made"))
     assert isinstance(fields, Fields)
 
     np.testing.assert_array_equal(fields.number("data"), np.arange(10))

@@ -140,6 +140,9 @@ def _fields_of(owner: str, body: str) -> Iterator[Field]:
             shape = Shape.ARRAY if fixed else Shape.SEQUENCE
         if match["text"] and match["type"] != "string":
             raise SchemaError(f"{owner}: only strings have a bound, not {line[:80]!r}")
+        has_default = match["rest"] and not match["rest"].startswith("#")
+        if has_default and match["type"] not in PRIMITIVES and match["type"] != "string":
+            raise SchemaError(f"{owner}: cannot read the line {line[:80]!r} of its definition")
         yield Field(
             match["name"], match["type"], shape, int(match["size"] or 0), int(match["text"] or 0)
         )

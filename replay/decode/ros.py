@@ -41,7 +41,7 @@ class RosDecoder:
         """Decode; messages that do not fit are skipped in ``ledger`` with reason and time."""
         if not isinstance(block.rows, Messages):
             return block
-        fields, kept = self._walked(block, block.rows, ledger)
+        fields, kept = self.walked(block, block.rows, ledger)
         if self.kind.doubts is not None:
             good = _without_doubts(self.kind.doubts(fields), block, kept, ledger)
             fields, kept = fields.take(good), kept[good]
@@ -49,8 +49,11 @@ class RosDecoder:
         picked = block if len(kept) == len(block) else block.take(kept)
         return replace(picked, rows=rows, header_ns=header_ns(fields))
 
-    def _walked(self, block: Block, messages: Messages, ledger: Ledger) -> tuple[Fields, Rows]:
-        """Fields of the messages that fit, and which of the block they are."""
+    def walked(self, block: Block, messages: Messages, ledger: Ledger) -> tuple[Fields, Rows]:
+        """Fields of the messages that fit, and which of the block they are.
+
+        The others are skipped in ``ledger`` with reason and time.
+        """
         parts, rows = [], []
         for little, index in self._by_order(block, messages, ledger):
             whole = len(index) == len(messages)

@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 
 from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
-from crosscue.replay.decode.definition import definitions_of, well_known
+from crosscue.replay.decode.definition import definitions_of
+from crosscue.replay.decode.ros import RosDecoder
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.roles import ros2_spelling
 
 from .can import can_messages
-from .definitions import standard_text
+from .definitions import completed, standard_text
 from .images import image_messages
 from .outgoing import Encoder, Outgoing, Ros2Type, without_odd_times
 from .ros1 import ros1_to_cdr
@@ -41,25 +42,34 @@ class Encoders:
 
 
 def _cdr(topic: Topic) -> Encoder | None:
-    name = ros2_spelling(topic.type_name)
-    if topic.schema.strip() or topic.schema_encoding:
-        if topic.schema_encoding:
-            definitions_of(name, topic.schema, topic.schema_encoding)
-        return _AsStored(Ros2Type(name, topic.schema, topic.schema_encoding or "ros2msg"))
-    if well_known(name) is None:
+    decoder = decoder_for(topic)
+    if not isinstance(decoder, RosDecoder):
         return None
-    return _AsStored(Ros2Type(name, standard_text(name).encode()))
+    name, encoding = ros2_spelling(topic.type_name), topic.schema_encoding
+    if not topic.schema.strip() and not encoding:
+        kind = Ros2Type(name, standard_text(name).encode())
+    elif encoding == "ros2msg":
+        known = definitions_of(name, topic.schema, encoding)
+        kind = Ros2Type(name, completed(name, topic.schema, known))
+    else:
+        kind = Ros2Type(name, topic.schema, encoding)
+    return _AsStored(kind, decoder)
 
 
 @dataclass(frozen=True, slots=True)
 class _AsStored:
-    """CDR messages stay as they are, byte for byte."""
+    """CDR messages stay as they are, byte for byte, if they fit their definition.
+
+    Those that do not would make other readers refuse the whole file.
+    """
 
     type: Ros2Type
+    decoder: RosDecoder
 
     def __call__(self, block: Block, ledger: Ledger) -> list[Outgoing]:
         assert isinstance(block.rows, Messages)
-        return [Outgoing(self.type, block)]
+        _, kept = self.decoder.walked(block, block.rows, ledger)
+        return [Outgoing(self.type, block if len(kept) == len(block) else block.take(kept))]
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,26 @@ def text_of(type_name: str, known: Definitions) -> str:
     return SEPARATOR.join(parts)
 
 
+def completed(type_name: str, text: bytes, known: Definitions) -> bytes:
+    """A stored ``ros2msg`` text with the types added that it needs and leaves out.
+
+    Raises:
+        SchemaError: It needs a type that nobody here knows.
+    """
+    whole = dict(known)
+    missing: list[str] = []
+    for name in _needed(type_name, whole):
+        if name not in whole:
+            fields = _TIMES.get(name) or (well_known(name) or {}).get(name)
+            if fields is None:
+                raise SchemaError(f"{type_name}: its definition lacks the type {name}")
+            # What it is made of is looked at next, since the walk goes on over ``whole``.
+            whole[name] = fields
+            missing.append(f"MSG: {_short(name)}\n{_body(fields)}")
+    end = b"" if text.endswith(b"\n") or not missing else b"\n"
+    return text + end + "".join(SEPARATOR + each for each in missing).encode()
+
+
 def standard_text(type_name: str) -> str:
     """``text_of`` a type that ROS 2 itself, or this toolkit, defines."""
     known = well_known(type_name)
@@ -83,6 +103,7 @@ def _alike(name: str, ours: Definitions, theirs: Definitions) -> bool:
 
 
 def _needed(type_name: str, known: Definitions) -> Iterator[str]:
+    """Names of the types that a type is made of, asking ``known`` as late as it can."""
     seen = {type_name}
     waiting = [type_name]
     while waiting:

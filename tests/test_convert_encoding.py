@@ -1,0 +1,355 @@
+"""Columns written as ROS 2 messages come back as the same columns, and rosbags reads them too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from crosscue.replay.columns import (
+    LENGTH_UNKNOWN,
+    Block,
+    CanFrames,
+    Images,
+    Messages,
+    Rows,
+    Table,
+    Topic,
+)
+from crosscue.replay.decode import decoder_for
+from crosscue.replay.decode.ros import MISFIT
+from crosscue.replay.encode import Encoders, Outgoing
+from crosscue.replay.encode.outgoing import TIME_MISFIT
+from crosscue.replay.ledger import Ledger
+from support.ros_messages import (
+    block_of,
+    messages_of,
+    random_definition,
+    random_message,
+    ros1_store,
+    ros1_topic,
+    ros2_store,
+)
+
+QUICK = settings(max_examples=40, deadline=None)
+
+
+def encoded(topic: Topic, block: Block, ledger: Ledger | None = None) -> list[Outgoing]:
+    encoder = Encoders().encoder_for(topic)
+    assert encoder is not None
+    return encoder(block, ledger or Ledger("made"))
+
+
+def columns_block(topic: str, rows: Rows) -> Block:
+    log_ns = np.arange(len(rows), dtype=np.int64) * 1_000_003 + 5_000_000_000
+    return Block(topic, log_ns, rows, header_ns=log_ns - 7)
+
+
+def there_and_back(topic: str, rows: Rows, ledger: Ledger | None = None) -> list[Block]:
+    block = columns_block(topic, rows)
+    back: list[Block] = []
+    for outgoing in encoded(Topic(topic, "crosscue/Any", "columns"), block, ledger):
+        stored = Topic(
+            outgoing.block.topic, outgoing.type.name, "cdr", outgoing.type.schema, "ros2msg"
+        )
+        decoder = decoder_for(stored)
+        assert decoder is not None
+        told = Ledger("back")
+        back.append(decoder(outgoing.block, told))
+        assert not told.details
+        _rosbags_reads(outgoing)
+    return back
+
+
+def _rosbags_reads(outgoing: Outgoing) -> list[Any]:
+    """All messages as rosbags reads them with the definition that we store."""
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(outgoing.type.schema.decode(), outgoing.type.name))
+    rows = outgoing.block.rows
+    assert isinstance(rows, Messages)
+    return [store.deserialize_cdr(rows.payload(i), outgoing.type.name) for i in range(len(rows))]
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@QUICK
+def test_ros1_messages_of_made_up_types_become_what_rosbags_makes_of_them(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    name = "made_msgs/msg/Root"
+    text = random_definition(rng, "made_msgs/Root")
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(text, name))
+    payloads = [
+        bytes(store.serialize_ros1(random_message(rng, store, name), name)) for _ in range(5)
+    ]
+
+    out = encoded(ros1_topic("/t", name, text), block_of("/t", payloads))
+
+    rows = out[0].block.rows
+    assert isinstance(rows, Messages)
+    want = [bytes(store.ros1_to_cdr(each, name)) for each in payloads]
+    assert [bytes(rows.payload(i)) for i in range(len(rows))] == want
+    _rosbags_reads(out[0])
+
+
+def test_ros1_messages_of_standard_types_become_what_rosbags_makes_of_them() -> None:
+    rng = np.random.default_rng(8)
+    ours, theirs = ros1_store(), ros2_store()
+    compared = 0
+    # ROS 2 changed these: rosbags cannot transcribe them without a migration.
+    changed = ("shape_msgs/msg/Solid", "visualization_msgs/msg/")
+    for name in sorted(ours.fielddefs.keys() & theirs.fielddefs.keys()):
+        if "/msg/" not in name or name.startswith(changed):
+            continue
+        payloads = [
+            bytes(ours.serialize_ros1(random_message(rng, ours, name), name)) for _ in range(3)
+        ]
+        out = encoded(ros1_topic("/t", name), block_of("/t", payloads))
+        rows = out[0].block.rows
+        assert isinstance(rows, Messages)
+        want = [bytes(theirs.ros1_to_cdr(each, name)) for each in payloads]
+        assert [bytes(rows.payload(i)) for i in range(len(rows))] == want, name
+        compared += 1
+    assert compared > 60
+
+
+def test_ros1_types_that_ros2_kept_take_its_field_names() -> None:
+    topic = ros1_topic("/cam", "sensor_msgs/msg/CameraInfo")
+    store = ros1_store()
+    message = random_message(np.random.default_rng(0), store, "sensor_msgs/msg/CameraInfo")
+    raw = bytes(store.serialize_ros1(message, "sensor_msgs/msg/CameraInfo"))
+
+    (out,) = encoded(topic, block_of("/cam", [raw]))
+
+    (read,) = _rosbags_reads(out)
+    np.testing.assert_array_equal(read.k, message.K)  # type: ignore[attr-defined]
+    assert not hasattr(read.header, "seq")
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@QUICK
+def test_damaged_ros1_messages_are_skipped_and_the_rest_transcribed(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    store, name = ros1_store(), "diagnostic_msgs/msg/DiagnosticArray"
+    good = [bytes(store.serialize_ros1(random_message(rng, store, name), name)) for _ in range(8)]
+    bad = [each[: int(rng.integers(0, len(each)))] for each in good]
+    payloads = [b if rng.random() < 0.4 else g for g, b in zip(good, bad, strict=True)]
+    kept = [p for p, g in zip(payloads, good, strict=True) if p is g]
+    ledger = Ledger("made")
+
+    out = encoded(ros1_topic("/d", name), block_of("/d", payloads), ledger)
+
+    got = []
+    if out:
+        rows = out[0].block.rows
+        assert isinstance(rows, Messages)
+        got = [bytes(rows.payload(i)) for i in range(len(rows))]
+    assert got == [bytes(ros2_store().ros1_to_cdr(each, name)) for each in kept]
+    assert ledger.topic("/d").skipped.total() == len(payloads) - len(kept)
+    assert set(ledger.topic("/d").skipped) <= {MISFIT}
+
+
+def can_frames(n: int, width: int, seed: int = 0) -> CanFrames:
+    rng = np.random.default_rng(seed)
+    extended = rng.random(n) < 0.5
+    kind = rng.choice([0, 0, 0, 1, 2], n).astype(np.uint8)
+    fd = rng.random(n) < 0.5 if width == 64 else np.zeros(n, np.bool_)
+    most = np.where(fd, 64, 8)
+    length = np.where(kind == 1, 0, rng.integers(0, most + 1)).astype(np.uint8)
+    data = rng.integers(0, 256, (n, width), dtype=np.uint8)
+    data[np.arange(width) >= length[:, None]] = 0
+    identifier = np.where(extended, rng.integers(0, 1 << 29, n), rng.integers(0, 1 << 11, n))
+    return CanFrames(identifier.astype(np.uint32), extended, kind, length, data, fd)
+
+
+def test_can_frames_come_back_as_they_were() -> None:
+    frames = can_frames(500, 8)
+
+    (back,) = there_and_back("can0", frames)
+
+    assert isinstance(back.rows, CanFrames)
+    for name in ("arbitration_id", "is_extended", "kind", "length", "data", "is_fd"):
+        np.testing.assert_array_equal(getattr(back.rows, name), getattr(frames, name))
+    assert back.header_ns is not None
+    np.testing.assert_array_equal(back.header_ns, back.log_ns - 7)
+
+
+def test_can_fd_frames_go_to_a_topic_of_their_own_and_it_is_said() -> None:
+    frames, ledger = can_frames(300, 64), Ledger("made")
+
+    back = there_and_back("can0", frames, ledger)
+
+    classic, fd = back[0], [each for each in back if each.topic == "can0/fd"]
+    assert isinstance(classic.rows, CanFrames)
+    np.testing.assert_array_equal(classic.rows.arbitration_id, frames.arbitration_id[~frames.is_fd])
+    assert sum(map(len, back)) == len(frames)
+    log_ns = columns_block("can0", frames).log_ns
+    for block in fd:
+        assert isinstance(block.rows, CanFrames)
+        index = np.searchsorted(log_ns, block.log_ns)
+        np.testing.assert_array_equal(block.rows.data, frames.data[index])
+        np.testing.assert_array_equal(block.rows.length, frames.length[index])
+        assert block.rows.is_fd.all()
+    assert any("CAN FD" in notice for notice in ledger.notices)
+
+
+def test_frames_of_unknown_length_are_written_as_padded_and_it_is_said() -> None:
+    frames, ledger = can_frames(5, 8), Ledger("made")
+    unknown = CanFrames(
+        frames.arbitration_id,
+        frames.is_extended,
+        np.zeros(5, np.uint8),
+        np.full(5, LENGTH_UNKNOWN, np.uint8),
+        frames.data,
+        frames.is_fd,
+    )
+
+    (back,) = there_and_back("can0", unknown, ledger)
+
+    assert isinstance(back.rows, CanFrames)
+    assert back.rows.length.tolist() == [8] * 5
+    assert "does not keep the frames' lengths" in ledger.notices[0]
+
+
+def images(codings: tuple[str, ...], raw: bool = False) -> Images:
+    rng = np.random.default_rng(1)
+    magic = {"jpeg": b"\xff\xd8", "png": b"\x89PNG\r\n\x1a\n"}
+    payloads = [
+        magic.get(coding, b"") + rng.bytes(24 if raw else int(rng.integers(1, 900)))
+        for coding in codings
+    ]
+    n = len(codings)
+    sizes = {
+        "width_px": np.full(n, 4, np.int32),
+        "height_px": np.full(n, 2, np.int32),
+        "step_bytes": np.full(n, 12, np.int32),
+        "pixel_format": ("rgb8",) * n,
+    }
+    return Images(messages_of(payloads, 5), codings, **(sizes if raw else {}))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("pictures", "type_name"),
+    [
+        (images(("jpeg", "png", "jpeg")), "sensor_msgs/msg/CompressedImage"),
+        (images(("h264", "h264", "h265")), "foxglove_msgs/msg/CompressedVideo"),
+        (images(("raw", "raw"), raw=True), "sensor_msgs/msg/Image"),
+    ],
+    ids=["compressed", "video", "raw"],
+)
+def test_pictures_come_back_byte_for_byte(pictures: Images, type_name: str) -> None:
+    topic = Topic("/front", "crosscue/Images", "columns")
+    (out,) = encoded(topic, columns_block("/front", pictures))
+
+    (back,) = there_and_back("/front", pictures)
+
+    assert out.type.name == type_name
+    assert isinstance(back.rows, Images)
+    assert back.rows.coding == pictures.coding
+    for i in range(len(pictures)):
+        assert back.rows.bytes_.payload(i) == pictures.bytes_.payload(i)
+    if type_name == "sensor_msgs/msg/Image":
+        assert back.rows.pixel_format == pictures.pixel_format
+
+
+def column(n: int, *names: str) -> dict[str, NDArray[np.generic]]:
+    rng = np.random.default_rng(2)
+    return {name: rng.normal(size=n) for name in names}
+
+
+QUAT = ("quat_x", "quat_y", "quat_z", "quat_w")
+TABLES: Mapping[str, dict[str, NDArray[np.generic]]] = {
+    "sensor_msgs/msg/Imu": column(
+        4, *(f"accel_{a}_mps2" for a in "xyz"), *(f"gyro_{a}_radps" for a in "xyz"), *QUAT
+    ),
+    "sensor_msgs/msg/MagneticField": column(4, "mag_x_t", "mag_y_t", "mag_z_t"),
+    "sensor_msgs/msg/NavSatFix": column(4, "latitude_deg", "longitude_deg", "altitude_m")
+    | {
+        "status": np.array([0, -1, 2, 0], np.int8),
+        "covariance_m2": np.arange(36.0).reshape(4, 9),
+        "covariance_type": np.array([2, 0, 1, 3], np.uint8),
+    },
+    "nav_msgs/msg/Odometry": column(
+        4, "x_m", "y_m", "z_m", *QUAT, "speed_x_mps", "speed_y_mps", "yaw_rate_radps"
+    ),
+    "geometry_msgs/msg/PoseStamped": column(4, "x_m", "y_m", "z_m", *QUAT),
+}
+
+
+@pytest.mark.parametrize("type_name", sorted(TABLES))
+def test_standard_columns_use_the_standard_type_and_come_back(type_name: str) -> None:
+    table = Table(TABLES[type_name])
+    (out,) = encoded(Topic("/t", "crosscue/Table", "columns"), columns_block("/t", table))
+
+    (back,) = there_and_back("/t", table)
+
+    assert out.type.name == type_name
+    assert isinstance(back.rows, Table)
+    assert back.rows.columns.keys() == table.columns.keys()
+    for name, values in table.columns.items():
+        np.testing.assert_array_equal(back.rows[name], values)
+
+
+def test_an_imu_without_gyro_says_so_instead_of_standing_still() -> None:
+    table = Table(column(3, *(f"accel_{a}_mps2" for a in "xyz")))
+    (out,) = encoded(Topic("/imu", "crosscue/Table", "columns"), columns_block("/imu", table))
+
+    read = _rosbags_reads(out)
+    (back,) = there_and_back("/imu", table)
+
+    assert out.type.name == "sensor_msgs/msg/Imu"
+    assert read[0].angular_velocity_covariance[0] == -1
+    assert read[0].linear_acceleration_covariance[0] == 0
+    assert isinstance(back.rows, Table)
+    assert np.isnan(back.rows["gyro_z_radps"].astype(np.float64)).all()
+    np.testing.assert_array_equal(back.rows["accel_x_mps2"], table["accel_x_mps2"])
+
+
+def test_other_tables_get_a_type_of_their_own_and_come_back() -> None:
+    table = Table(
+        {
+            "speed_mps": np.array([1.5, np.nan]),
+            "count": np.array([1, 2**40]),
+            "Wheel FL!": np.array([1, 2], np.float32),
+            "wheel_fl": np.array([3, 4], np.uint8),
+            "matrix": np.arange(6.0).reshape(2, 3),
+            "is_on": np.array([True, False]),
+            "0x1F": np.array([-1, 1], np.int16),
+            "words": np.array(["a", "b"]),
+        }
+    )
+    ledger = Ledger("made")
+
+    (back,) = there_and_back("/car/wheel speeds", table, ledger)
+
+    assert isinstance(back.rows, Table)
+    assert list(back.rows.columns) == [
+        "speed_mps", "count", "wheel_fl", "wheel_fl2", "matrix", "is_on", "c_0x1f",
+    ]  # fmt: skip
+    for ours, theirs in zip(list(table.columns)[:-1], back.rows.columns, strict=True):
+        np.testing.assert_array_equal(back.rows[theirs], table[ours])
+    assert "words" in ledger.notices[0]
+
+
+def test_stamps_that_ros2_cannot_hold_are_skipped_not_wrapped() -> None:
+    far = np.array([0, 2**31 * 1_000_000_000, -(2**31) * 1_000_000_000 - 1], np.int64)
+    block = Block("/t", np.arange(3, dtype=np.int64), Table({"a": np.zeros(3)}), header_ns=far)
+    ledger = Ledger("made")
+
+    (out,) = encoded(Topic("/t", "crosscue/Table", "columns"), block, ledger)
+
+    assert len(out.block) == 1
+    assert ledger.topic("/t").skipped == {TIME_MISFIT: 2}
+
+
+def test_definitions_without_a_type_are_not_guessed() -> None:
+    encoders = Encoders()
+
+    assert encoders.encoder_for(Topic("/t", "unknown_msgs/msg/T", "cdr")) is None
+    assert encoders.encoder_for(Topic("/t", "unknown_msgs/T", "ros1")) is None
+    assert encoders.encoder_for(Topic("/t", "T", "flatbuffer")) is None
