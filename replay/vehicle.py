@@ -85,10 +85,13 @@ class Mobileye(Section):
     """The Mobileye's bus, protocol and mounting."""
 
     bus: str | None = None
+    """Topic of its bus; left out, no Mobileye is read from CAN."""
     revision: Literal["auto", "classic", "2.32"] = "auto"
-    slots: Literal[10, 13] = 10
-    x_m: Finite = 0.0
-    """Reference point ahead of the rear axle."""
+    family: Literal["auto", "extended", "tsr"] = "auto"
+    """Which of the two meanings message 0x700 has."""
+    slots: Literal[10, 13] = 13
+    x_m: Finite | None = None
+    """Reference point ahead of the rear axle; must be measured, so it has no default."""
     y_m: Finite = 0.0
     yaw_rad: Finite = 0.0
 
@@ -99,15 +102,17 @@ class Odometry(Section):
     track_width_m: Positive = 1.55
     wheelbase_m: Positive = 2.7
     wheel_scale: Positive = 1.0
+    right_wheel_scale: Positive = 1.0
     use_front_wheels: bool = False
     wheel_step_mps: NotNegative = 0.0028
-    slip_per_sqrt_m: NotNegative = 0.1
-    """A wheel radius that is off by one per cent shows as 1 m after 100 m: this much."""
+    slip_per_sqrt_m: NotNegative = 0.3
+    """A wheel radius off by one per cent, as an uncalibrated car's, is 10 m after 1 km: so much."""
     heading_from: Literal["auto", "yaw_rate", "steering", "wheels"] = "auto"
     """Which signal turns the pose; ``auto`` takes the first of these three that the log has."""
     yaw_rate_scale: Positive = 1.0
     gyro_bias_radps: Finite = 0.0
-    gyro_noise_rad_per_sqrt_s: NotNegative = 0.002
+    gyro_noise_rad_per_sqrt_s: NotNegative = 0.005
+    """A bias of 0.0006 rad/s, left in, is 2 degrees after a minute: so much."""
     steering_ratio: Positive = 15.0
     steering_offset_rad: Finite = 0.0
     steering_noise_rad_sqrt_m: NotNegative = 0.01

@@ -1,0 +1,54 @@
+"""Decode a drive into tables: one Parquet file for each topic, CAN message and Mobileye table.
+
+example:
+  crosscue decode drive.mcap --vehicle car.toml -o tables
+"""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack
+from pathlib import Path
+
+from crosscue.eval.decode_tables import decode_tables
+from crosscue.eval.replay_drive import account_of
+from crosscue.replay.log import open_logs
+from crosscue.replay.run_folder import create
+from crosscue.replay.vehicle import Vehicle, load
+
+from .common import add_log_arguments, print_json, selection_of
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    add_log_arguments(parser)
+    parser.add_argument("-o", "--output", required=True, type=Path, metavar="DIR", help="a folder")
+    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="DBC files, buses, mounting")
+    parser.add_argument("--overwrite", action="store_true", help="replace earlier tables")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Decode; 3 when something was lost."""
+    vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
+    with ExitStack() as stack:
+        logs = open_logs(args.logs)
+        for log in logs:
+            stack.enter_context(log)
+        folder = create(args.output, overwrite=args.overwrite)
+        rows, ledgers = decode_tables(logs, vehicle, folder, selection_of(args, logs))
+    if args.json:
+        print_json({"tables": rows, "logs": [account_of(ledger) for ledger in ledgers]})
+    elif not args.quiet:
+        width = max(map(len, rows), default=0)
+        for name, count in rows.items():
+            print(f"{name:{width}}  {count:>10,} rows")
+        for ledger in ledgers:
+            for topic, account in sorted(ledger.accounts.items()):
+                for reason, count in sorted(account.skipped.items()):
+                    print(f"skipped  {topic}: {count:,} {reason}")
+            for loss in ledger.losses():
+                print(f"lost     {loss.topic or 'the log'}: {loss.count or 'some'} {loss.reason}")
+            for sentence in ledger.notices:
+                print(f"note     {sentence}")
+    return 0 if all(ledger.is_whole for ledger in ledgers) else 3

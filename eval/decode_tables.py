@@ -1,0 +1,217 @@
+"""Every stream of a drive as columns on disk: one Parquet file for each topic or CAN message."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+
+from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
+from crosscue.replay.decode import Decoder, decoder_for
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.mobileye.decode import MobileyeDecoder
+from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting
+from crosscue.replay.run_folder import RunFolder, TableSink, clear, locked, write_manifest
+from crosscue.replay.vehicle import Vehicle
+
+from .replay_drive import account_of, versions
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+ROWS_HELD: Final = 8192
+"""Rows of one table held back until they are worth a row group."""
+
+
+class _BlockDecoder(Protocol):
+    def __call__(self, block: Block) -> list[Block]: ...
+
+
+def mobileye_settings(vehicle: Vehicle, is_shared_bus: bool) -> MobileyeSettings:
+    """The vehicle file's Mobileye section as the decoder takes it."""
+    section = vehicle.mobileye
+    mounting = None
+    if section.x_m is not None:
+        mounting = Mounting(section.x_m, section.y_m, section.yaw_rad)
+    return MobileyeSettings(
+        revision=section.revision,
+        family=section.family,
+        slots=section.slots,
+        mounting=mounting,
+        is_shared_bus=is_shared_bus,
+    )
+
+
+@dataclass(slots=True, eq=False)
+class _Table:
+    """One output file and the rows that wait for it."""
+
+    run: RunFolder
+    name: str
+    stack: ExitStack
+    rows: int = 0
+    sink: TableSink | None = None
+    held: list[Block] = field(default_factory=list)
+    held_rows: int = 0
+
+    def add(self, block: Block) -> None:
+        self.held.append(block)
+        self.held_rows += len(block)
+        if self.held_rows >= ROWS_HELD:
+            self.write()
+
+    def write(self) -> None:
+        """Write the rows that wait."""
+        if not self.held:
+            return
+        columns = _joined(self.held)
+        if self.sink is None:
+            sink = TableSink(self.run, self.name, _schema_of(columns))
+            self.sink = self.stack.enter_context(sink)
+        self.sink.write(columns)
+        self.rows += self.held_rows
+        self.held, self.held_rows = [], 0
+
+
+def decode_tables(
+    logs: Sequence[Log], vehicle: Vehicle, run: RunFolder, selection: Selection
+) -> tuple[dict[str, int], tuple[Ledger, ...]]:
+    """Write all streams of a drive as tables.
+
+    Args:
+        logs: Open logs.
+        vehicle: DBC files, buses and the Mobileye's mounting.
+        run: Folder for the tables; cleared first.
+        selection: What part.
+
+    Returns:
+        Rows for each file written, and one account for each log.
+
+    Raises:
+        SchemaError: A DBC file cannot be read.
+        OutputError: The disk is full.
+    """
+    ledgers = tuple(Ledger(str(log.path)) for log in logs)
+    tables: dict[str, _Table] = {}
+    with locked(run):
+        clear(run)
+        with ExitStack() as stack:
+            for log, ledger in zip(logs, ledgers, strict=True):
+                for block in _decoded(log, vehicle, ledger, selection):
+                    if block.topic not in tables:
+                        name = file_name(block.topic, {t.name.lower() for t in tables.values()})
+                        tables[block.topic] = _Table(run, name, stack)
+                    tables[block.topic].add(block)
+            for table in tables.values():
+                table.write()
+        rows = {f"{table.name}.parquet": table.rows for table in tables.values()}
+        content = {
+            "versions": versions(),
+            "tables": {topic: f"{table.name}.parquet" for topic, table in tables.items()},
+            "rows": rows,
+            "settings": vehicle.model_dump(mode="json"),
+            "accounts": [account_of(ledger) for ledger in ledgers],
+        }
+        write_manifest(run, content)
+    return rows, ledgers
+
+
+def _decoded(log: Log, vehicle: Vehicle, ledger: Ledger, selection: Selection) -> Iterator[Block]:
+    topics = {topic.name: topic for topic in log.topics}
+    buses: dict[str, tuple[list[_BlockDecoder], list[MobileyeDecoder]]] = {}
+    for block in log.read(ledger, selection):
+        topic = topics.get(block.topic) or _late_topic(log, block.topic)
+        if isinstance(block.rows, Messages):
+            decode = _decoder(topic, ledger)
+            if decode is None:
+                ledger.skip(block.topic, "type not understood", len(block))
+                continue
+            block = decode(block, ledger)
+        if isinstance(block.rows, Table) and len(block):
+            yield block
+        elif isinstance(block.rows, CanFrames):
+            if block.topic not in buses:
+                buses[block.topic] = _bus_decoders(block.topic, vehicle, ledger)
+            decoders, _ = buses[block.topic]
+            if not decoders:
+                ledger.skip(block.topic, "no DBC file and no Mobileye for this bus", len(block))
+            for decoder in decoders:
+                yield from decoder(block)
+        elif isinstance(block.rows, Images):
+            ledger.skip(block.topic, "pictures are not tables", len(block))
+    for _, mobileyes in buses.values():
+        for mobileye in mobileyes:
+            yield from mobileye.flush()
+
+
+def _decoder(topic: Topic, ledger: Ledger) -> Decoder | None:
+    try:
+        return decoder_for(topic)
+    except SchemaError as error:
+        ledger.notice(str(error))
+        return None
+
+
+def _late_topic(log: Log, name: str) -> Topic:
+    """A topic that came to light only while reading."""
+    return next(topic for topic in log.topics if topic.name == name)
+
+
+def _bus_decoders(
+    bus: str, vehicle: Vehicle, ledger: Ledger
+) -> tuple[list[_BlockDecoder], list[MobileyeDecoder]]:
+    decoders: list[_BlockDecoder] = []
+    mobileyes: list[MobileyeDecoder] = []
+    has_dbc = bool(vehicle.can.dbc) and vehicle.can.bus in (None, bus)
+    if has_dbc:
+        from crosscue.replay.can.database import CanDatabase
+        from crosscue.replay.can.decode import BusDecoder
+
+        database = CanDatabase.load([Path(name) for name in vehicle.can.dbc])
+        for sentence in database.notices:
+            ledger.notice(sentence)
+        decoders.append(BusDecoder(database, bus, ledger))
+    if vehicle.mobileye.bus == bus:
+        mobileyes.append(MobileyeDecoder(bus, ledger, mobileye_settings(vehicle, has_dbc)))
+        decoders += mobileyes
+    return decoders, mobileyes
+
+
+def file_name(topic: str, taken: Collection[str]) -> str:
+    """A topic's name as a file name without folders, unlike those already taken."""
+    plain = "".join(c if c.isascii() and (c.isalnum() or c in "-.") else "_" for c in topic)
+    plain = plain.strip("_.")[:100] or "topic"
+    name, number = plain, 2
+    while name.lower() in taken:
+        name, number = f"{plain}-{number}", number + 1
+    return name
+
+
+def _joined(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:
+    columns: dict[str, NDArray[np.generic]] = {"log_ns": np.concatenate([b.log_ns for b in blocks])}
+    for name in ("publish_ns", "header_ns"):
+        parts = [getattr(block, name) for block in blocks]
+        if all(part is not None for part in parts):
+            columns[name] = np.concatenate(parts)
+    tables = [block.rows for block in blocks if isinstance(block.rows, Table)]
+    for name in tables[0].columns:
+        joined = np.concatenate([table.columns[name] for table in tables])
+        if joined.ndim == 1:
+            columns[name] = joined
+            continue
+        flat = joined.reshape(len(joined), -1)
+        columns |= {f"{name}.{i}": flat[:, i] for i in range(flat.shape[1])}
+    return columns
+
+
+def _schema_of(columns: Mapping[str, NDArray[np.generic]]) -> pa.Schema:
+    import pyarrow as pa
+
+    return pa.schema([(name, pa.array(values[:0]).type) for name, values in columns.items()])
