@@ -30,6 +30,7 @@ from .blf_objects import (
     CONTAINER,
     MAGIC,
     PADDING_MAX,
+    TYPE_MAX,
     Tally,
     chain_of,
     rows_of,
@@ -148,7 +149,7 @@ class _Pass:
         self.tally = Tally()
         self._path, self._header, self._limits, self._names = path, header, limits, names
         self._tail = b""
-        self._is_resumed = False
+        self._is_resumed = self._has_loose = False
         self._deflated = self._stored = self._wasted = 0
 
     def rows(self) -> Iterator[FrameRows]:
@@ -275,7 +276,7 @@ class _Pass:
                 return
             if not head.startswith(MAGIC):
                 near = head[: PADDING_MAX + len(MAGIC) - 1].find(MAGIC)
-                found = position + near if near > 0 else _next_container(file, position + 1)
+                found = position + near if near > 0 else self._next(file, position + 1)
                 if near <= 0 and (found is not None or head.strip(b"\0")):
                     self.tally.damage("bytes that are no container", place)
                     yield None, place
@@ -293,10 +294,29 @@ class _Pass:
                 content, position = self._loose(file, position, object_bytes, size)
             yield content, place
 
+    def _next(self, file: BufferedReader, position: int) -> int | None:
+        """Where the next object to go on with begins, at or after ``position``."""
+        file.seek(position)
+        kept = b""
+        while more := file.read(_SCAN_BYTES):
+            stretch = kept + more
+            at = stretch.find(MAGIC)
+            while 0 <= at <= len(stretch) - BASE_BYTES:
+                _, header_bytes, _, object_bytes, type_ = _BASE.unpack_from(stretch, at)
+                is_container = type_ == CONTAINER and header_bytes == BASE_BYTES < object_bytes
+                is_loose = self._has_loose and header_bytes in (32, 40) and type_ <= TYPE_MAX
+                if is_container or (is_loose and object_bytes >= header_bytes):
+                    return position + at
+                at = stretch.find(MAGIC, at + 1)
+            kept = stretch[-BASE_BYTES + 1 :]
+            position += len(stretch) - len(kept)
+        return None
+
     def _loose(
         self, file: BufferedReader, position: int, object_bytes: int, size: int
     ) -> tuple[bytes | None, int]:
         """An object outside containers, with its padding, and where it ends."""
+        self._has_loose = True
         whole = object_bytes + object_bytes % 4
         is_possible = BASE_BYTES <= object_bytes <= self._limits.message_bytes
         if not is_possible or position + object_bytes > size:
@@ -380,23 +400,6 @@ class _Pass:
         self._wasted += used
         self.tally.damage("container differs from its declared size", place)
         return None, 0
-
-
-def _next_container(file: BufferedReader, position: int) -> int | None:
-    """Where the next container header stands at or after ``position``."""
-    file.seek(position)
-    kept = b""
-    while more := file.read(_SCAN_BYTES):
-        stretch = kept + more
-        at = stretch.find(MAGIC)
-        while 0 <= at <= len(stretch) - BASE_BYTES:
-            _, header_bytes, _, object_bytes, type_ = _BASE.unpack_from(stretch, at)
-            if type_ == CONTAINER and header_bytes == BASE_BYTES and object_bytes > BASE_BYTES:
-                return position + at
-            at = stretch.find(MAGIC, at + 1)
-        kept = stretch[-BASE_BYTES + 1 :]
-        position += len(stretch) - len(kept)
-    return None
 
 
 def _header_of(file: BufferedReader, path: Path) -> FileHeader:

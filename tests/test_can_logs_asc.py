@@ -1,0 +1,218 @@
+"""Vector ASC logs: headers, times, and lines off the common pattern."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import can
+import pytest
+
+from crosscue.replay.columns import DATA, ERROR, REMOTE
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.log import open_log
+from support.can_files import Sent, read_back, same_as_python_can
+from support.data import shared
+
+HEAD = "date Fri Jul 10 12:00:00.000 pm 2015\nbase hex  timestamps absolute\n"
+NOON_NS = 1_436_529_600_000_000_000
+LINE = "   0.5 1  64  Rx   d 2 64 00\n"
+
+
+def _log(folder: Path, text: str, encoding: str = "utf-8") -> Path:
+    path = folder / "x.asc"
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+def _at(seconds: float) -> int:
+    return NOON_NS + int(seconds * 1e9)
+
+
+HALF = _at(0.5)
+FD_FRAME = Sent(HALF, "can/2", 0x300, b"\1\2", False, DATA, True)
+
+
+@pytest.mark.parametrize(
+    ("line", "frame"),
+    [
+        ("1  64 Rx d 1 0A", Sent(HALF, "can/1", 0x64, b"\n")),
+        ("1  64 Tx d 0", Sent(HALF, "can/1", 0x64, b"")),
+        ("1  64x Rx d 1 0A", Sent(HALF, "can/1", 0x64, b"\n", True)),
+        ("1  64 Rx d 9 01 02 03 04 05 06 07 08", Sent(HALF, "can/1", 0x64, bytes(range(1, 9)))),
+        ("1  64 Rx d 1 0A  Length = 0 BitCount = 0 ID = 100", Sent(HALF, "can/1", 0x64, b"\n")),
+        ("1  64 Rx r", Sent(HALF, "can/1", 0x64, b"", False, REMOTE)),
+        ("1  64 Rx r 8 Length = 1704000", Sent(HALF, "can/1", 0x64, b"", False, REMOTE)),
+        ("12 ErrorFrame Flags = 0xe", Sent(HALF, "can/12", 0, b"", False, ERROR)),
+        ("Powertrain 64 Rx d 1 0A", Sent(HALF, "Powertrain", 0x64, b"\n")),
+        ("Some_really_long_name 64 Rx d 1 0A", Sent(HALF, "Some_really_long_name", 0x64, b"\n")),
+        ("CANFD 2 Tx 300 1 0 2 2 01 02 10 20 303000 0", FD_FRAME),
+        ("CANFD 2 Rx 300 Name 1 0 2 2 01 02 10 20 303000 0", FD_FRAME),
+        ("CANFD 5 Tx ErrorFrame Not Acknowledge", Sent(HALF, "can/5", 0, b"", False, ERROR, True)),
+    ],
+)
+def test_a_line_says_what_it_says(tmp_path: Path, line: str, frame: Sent) -> None:
+    for mark in ".,":
+        found, ledger = read_back(_log(tmp_path, f"{HEAD}   0{mark}5 {line}\n"))
+
+        assert found == {frame.bus: [frame]}
+        assert ledger.is_whole
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "0.5 1  64 Rx d 8 0A",
+        "0.5 1  64 Rx d 1 0A 0B",
+        "0.5 1  64 Rx d 1 A",
+        "0.5 1  64 Rx d 1 0G",
+        "0.5 1  64 Rx d 1 0AB",
+        "0.5 1  800 Rx d 1 0A",
+        "0.5 1  20000000x Rx d 1 0A",
+        "0.5 1  64 Rx q 1 0A",
+        "nan 1  64 Rx d 1 0A",
+        "-0.5 1  64 Rx d 1 0A",
+        "9223372036.9 1  64 Rx d 1 0A",
+        "0.5 CANFD 2 Tx 300 1 0 9 8 01 02 03 04 05 06 07 08",
+        "0.5 CANFD 2 Tx 300 1 0 2 2 01",
+        "0.5 1  Bogus event",
+        "gibberish",
+    ],
+)
+def test_a_line_that_can_be_no_frame_is_lost_and_told(tmp_path: Path, line: str) -> None:
+    found, ledger = read_back(_log(tmp_path, HEAD + LINE + line + "\n" + LINE))
+
+    assert len(found["can/1"]) == 2
+    assert ledger.topic("").lost.total() == 1
+    assert "line 4" in next(ledger.losses()).detail
+
+
+def test_relative_times_add_up_over_all_lines(tmp_path: Path) -> None:
+    head = HEAD.replace("absolute", "relative")
+    event = "0.1 1  Statistic: D 0 R 0 XD 0 XR 0 E 0 O 0 B 0.00%\n"
+    text = head + LINE.replace("0.5", "0.1") + event + LINE.replace("0.5", "0.1")
+
+    found, ledger = read_back(_log(tmp_path, text))
+
+    assert [f.t_ns - NOON_NS for f in found["can/1"]] == [100_000_000, 300_000_000]
+    assert ledger.topic("").skipped == {"event that is no CAN frame": 1}
+
+
+def test_relative_times_say_so_when_a_line_is_missing(tmp_path: Path) -> None:
+    head = HEAD.replace("absolute", "relative")
+
+    _, ledger = read_back(_log(tmp_path, head + LINE + "junk\n" + LINE))
+
+    assert any("shifts later ones" in notice for notice in ledger.notices)
+
+
+def test_decimal_logs_are_read_as_decimal(tmp_path: Path) -> None:
+    text = HEAD.replace("hex", "dec") + "0.5 1  100 Rx d 3 100 0 255\n0.6 1  100 Rx d 1 256\n"
+
+    found, ledger = read_back(_log(tmp_path, text))
+
+    assert found["can/1"] == [Sent(_at(0.5), "can/1", 100, b"d\0\xff")]
+    assert ledger.topic("").lost.total() == 1
+
+
+@pytest.mark.parametrize(
+    ("date", "seconds"),
+    [
+        ("Fri Jul 10 12:00:00.000 pm 2015", 0),
+        ("Fri Jul 10 12:00:00 2015", 0),
+        ("Fre Jul 10 11:00:00,250 2015", -3599.75),
+        ("Jul 10 11:00:01.5 am 2015", -3598.5),
+        ("Mit Mär 10 12:00:00 2010", -168_307_200),
+        ("Fri Okt 9 12:00:00 2015", 7_862_400),
+    ],
+)
+def test_dates_are_read_as_utc_on_every_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, date: str, seconds: float
+) -> None:
+    text = f"date {date}\nbase hex  timestamps absolute\n" + LINE.replace("0.5", "0.0")
+    path = _log(tmp_path, text, "latin-1")
+    for zone in ("UTC", "America/Los_Angeles"):
+        monkeypatch.setenv("TZ", zone)
+        time.tzset()
+
+        found, ledger = read_back(path)
+
+        assert found["can/1"][0].t_ns == _at(seconds)
+        assert any("no time zone" in notice for notice in ledger.notices)
+    monkeypatch.undo()
+    time.tzset()
+
+
+def test_without_a_header_the_first_frame_is_not_lost(tmp_path: Path) -> None:
+    found, ledger = read_back(_log(tmp_path, LINE + LINE))
+
+    assert [f.t_ns for f in found["can/1"]] == [500_000_000] * 2
+    assert any("no 'base' line" in notice for notice in ledger.notices)
+    assert any("no readable start date" in notice for notice in ledger.notices)
+
+
+def test_comments_in_any_encoding_are_no_frames(tmp_path: Path) -> None:
+    text = HEAD + "// Prüfstand größer\n" + LINE + "// nächster\n"
+
+    found, ledger = read_back(_log(tmp_path, text, "latin-1"))
+
+    assert len(found["can/1"]) == 1
+    assert ledger.is_whole
+
+
+def test_a_frame_that_became_a_comment_is_counted(tmp_path: Path) -> None:
+    _, ledger = read_back(_log(tmp_path, HEAD + LINE + "// x" + LINE))
+
+    assert ledger.topic("").skipped == {"comment that holds a frame": 1}
+
+
+def test_another_header_in_the_middle_ends_the_reading(tmp_path: Path) -> None:
+    other = HEAD.replace("hex", "dec")
+
+    found, ledger = read_back(_log(tmp_path, HEAD + LINE + other + LINE))
+
+    assert len(found["can/1"]) == 1
+    assert ledger.topic("").lost_unknown == ["another 'base' line begins inside the file"]
+
+
+def test_two_logs_in_one_file_keep_their_dates(tmp_path: Path) -> None:
+    later = HEAD.replace("Jul 10", "Jul 11")
+
+    found, ledger = read_back(_log(tmp_path, HEAD + LINE + later + LINE))
+
+    assert [f.t_ns - NOON_NS for f in found["can/1"]] == [500_000_000, 86_400_500_000_000]
+    assert ledger.is_whole
+
+
+def test_a_missing_end_of_the_trigger_block_is_told(tmp_path: Path) -> None:
+    begin = "Begin Triggerblock Fri Jul 10 12:00:00.000 pm 2015\n"
+
+    _, cut = read_back(_log(tmp_path, HEAD + begin + LINE))
+    _, whole = read_back(_log(tmp_path, HEAD + begin + LINE + "End TriggerBlock\n"))
+
+    assert not cut.is_whole
+    assert whole.is_whole
+
+
+def test_an_empty_measurement_is_a_log_without_frames(tmp_path: Path) -> None:
+    with open_log(_log(tmp_path, HEAD)) as log:
+        assert log.topics == ()
+    with pytest.raises(LogFormatError, match="no frame of a Vector ASC log"):
+        open_log(_log(tmp_path, "once upon a time\n"))
+
+
+@pytest.mark.parametrize("name", ["issue_1256.asc", "logfile.asc"])
+def test_real_logs_read_as_python_can_reads_them(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    path = shared("can", "python_can", name)
+    monkeypatch.setenv("TZ", "UTC")
+    time.tzset()
+    peer = list(can.ASCReader(path, relative_timestamp=False))
+    monkeypatch.undo()
+    time.tzset()
+    for message in peer:
+        assert isinstance(message.channel, int)
+        message.channel += 1
+
+    same_as_python_can(path, peer, "can/{}")

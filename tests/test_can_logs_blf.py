@@ -1,0 +1,199 @@
+"""Vector BLF logs: containers, objects, clocks and hostile files."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import can
+import pytest
+
+from crosscue.replay.columns import ERROR
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import open_log
+from support.can_files import Sent, blf, by_bus, made, read_back, same_as_python_can
+from support.data import shared
+
+
+def _log(folder: Path, content: bytes) -> Path:
+    path = folder / "x.blf"
+    path.write_bytes(content)
+    return path
+
+
+def _container(content: bytes, declared: int | None = None) -> bytes:
+    coded = zlib.compress(content)
+    size = len(content) if declared is None else declared
+    head = struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 32 + len(coded), 10, 2, size)
+    return head + coded + bytes(len(coded) % 4)
+
+
+def _objects(frames: list[Sent]) -> bytes:
+    return zlib.decompress(blf(frames, container=1 << 30)[144 + 32 :])
+
+
+def test_a_lost_container_costs_its_frames_and_no_more(tmp_path: Path) -> None:
+    frames = made(400)
+    content = bytearray(blf(frames, container=4000))
+    hit = content.find(b"LOBJ", 3000) + 60
+    content[hit] ^= 0xFF
+
+    found, ledger = read_back(_log(tmp_path, bytes(content)))
+
+    read = [f for rows in found.values() for f in rows]
+    assert set(read) < {f for rows in by_bus(frames).values() for f in rows}
+    assert len(read) > 250
+    assert ledger.topic("").lost.total() == len(frames) - len(read)
+    assert "checksum" in next(ledger.losses()).detail
+
+
+def test_an_unclosed_log_gives_all_it_holds_and_says_so(tmp_path: Path) -> None:
+    frames = made(200)
+
+    found, ledger = read_back(_log(tmp_path, blf(frames, is_closed=False)))
+
+    assert sum(map(len, found.values())) == 200
+    assert ledger.topic("").lost_unknown == ["file was not closed by its writer"]
+    assert any("no start time" in notice for notice in ledger.notices)
+
+
+def test_fewer_objects_than_declared_are_lost(tmp_path: Path) -> None:
+    frames = made(50)
+    content = bytearray(blf(frames))
+    content[32:36] = struct.pack("<L", 60)
+
+    _, ledger = read_back(_log(tmp_path, bytes(content)))
+
+    assert ledger.topic("").lost.total() == 10
+
+
+def test_error_frames_are_kept(tmp_path: Path) -> None:
+    (frame,) = made(1, fd=False)
+    error = Sent(frame.t_ns, "1", 0x12, b"\1\2", False, ERROR)
+
+    found, _ = read_back(_log(tmp_path, blf([error])))
+
+    assert found == by_bus([error])
+
+
+def test_other_objects_are_counted_as_no_frames(tmp_path: Path) -> None:
+    objects = bytearray(_objects(made(3, fd=False)))
+    objects[12:16] = struct.pack("<L", 96)
+    header = blf(made(3))[:144]
+
+    found, ledger = read_back(_log(tmp_path, header + _container(bytes(objects))))
+
+    assert sum(map(len, found.values())) == 2
+    assert ledger.topic("").skipped == {"object of type 96 is no CAN frame": 1}
+    assert ledger.is_whole
+
+
+def test_objects_outside_containers_are_read(tmp_path: Path) -> None:
+    frames = made(50)
+
+    found, ledger = read_back(_log(tmp_path, blf(frames)[:144] + _objects(frames)))
+
+    assert found == by_bus(frames)
+    assert ledger.topic("").lost.total() == 0
+
+
+def test_a_payload_that_looks_like_an_object_is_a_payload(tmp_path: Path) -> None:
+    frames = [Sent(f.t_ns, f.bus, 0x7, b"xLOBJabc", False) for f in made(20)]
+
+    found, ledger = read_back(_log(tmp_path, blf(frames, container=333)))
+
+    assert found == by_bus(frames)
+    assert ledger.is_whole
+
+
+@pytest.mark.parametrize("size", [0, 1, 15, 1 << 20, 0xFFFFFFFF])
+@pytest.mark.parametrize("stored", [False, True])
+def test_an_object_of_impossible_size_does_not_stop_the_reading(
+    tmp_path: Path, size: int, stored: bool
+) -> None:
+    frames = made(100, fd=False)
+    objects = bytearray(_objects(frames))
+    objects[10 * 48 + 8 : 10 * 48 + 12] = struct.pack("<L", size)
+    content = blf(frames)[:144] + (bytes(objects) if stored else _container(bytes(objects)))
+
+    found, ledger = read_back(_log(tmp_path, content))
+
+    assert sum(map(len, found.values())) == 99
+    assert ledger.topic("").lost.total() == 1
+
+
+@pytest.mark.parametrize("declared", [100, 50_000_000])
+def test_a_container_cannot_inflate_beyond_what_it_declares_or_the_limit(
+    tmp_path: Path, declared: int
+) -> None:
+    frames = made(30)
+    bomb = _container(bytes(50_000_000), declared)
+    path = _log(tmp_path, blf(frames) + bomb)
+    ledger = Ledger(str(path))
+
+    with open_log(path, Limits(chunk_bytes=1 << 20)) as log:
+        rows = sum(len(block) for block in log.read(ledger))
+
+    assert rows == 30
+    assert not ledger.is_whole
+
+
+def test_a_file_of_nothing_but_false_containers_ends_soon(tmp_path: Path) -> None:
+    false = struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 0xFFFF, 10, 2, 0xFFFF)
+    nested = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 8, 10)
+
+    for junk in (false * 20_000, nested * 20_000, b"LOBJ" * 100_000):
+        found, ledger = read_back(_log(tmp_path, blf(made(30)) + junk))
+
+        assert sum(map(len, found.values())) == 30
+        assert not ledger.is_whole
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(b"", "empty"), (b"LOGG", "no BLF header"), (bytes(500), "no BLF header")],
+)
+def test_what_is_no_blf_log_is_refused_in_one_line(
+    tmp_path: Path, content: bytes, says: str
+) -> None:
+    with pytest.raises(LogFormatError, match=says):
+        open_log(_log(tmp_path, content))
+
+
+def test_python_can_writes_what_we_read(tmp_path: Path) -> None:
+    path = tmp_path / "x.blf"
+    frames = made(3000)
+    with can.BLFWriter(path) as writer:
+        for k, f in enumerate(frames):
+            is_error = k % 100 == 7
+            writer(
+                can.Message(
+                    timestamp=f.t_ns * 1e-9,
+                    arbitration_id=f.arbitration_id,
+                    is_extended_id=f.is_extended,
+                    is_remote_frame=f.kind == 1,
+                    is_error_frame=is_error,
+                    is_fd=f.is_fd and not is_error,
+                    data=f.payload[:8] if is_error else f.payload,
+                    channel=int(f.bus) - 1,
+                )
+            )
+    peer = list(can.BLFReader(path))
+    for message in peer:
+        assert isinstance(message.channel, int)
+        message.channel += 1
+
+    same_as_python_can(path, peer, "can/{}")
+
+
+def test_the_real_log_reads_as_python_can_reads_it() -> None:
+    path = shared("can", "python_can", "issue_1905.blf")
+    peer = list(can.BLFReader(path))
+    for message in peer:
+        assert isinstance(message.channel, int)
+        message.channel += 1
+
+    same_as_python_can(path, peer, "can/{}")
