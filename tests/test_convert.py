@@ -402,7 +402,8 @@ def _rosbags_values(path: Path) -> dict[str, list[tuple[int, str]]]:
 def _values_of(value: Any) -> str:
     if hasattr(value, "__msgtype__"):
         # Constants belong to the definition; the header's counter is ROS 1's alone.
-        names = [f.name for f in fields(value) if f.name not in ("__msgtype__", "seq")]
+        hidden = ("__msgtype__", "seq")
+        names = [f.name for f in fields(value) if f.name not in hidden and not f.name.isupper()]
         return "{" + ", ".join(_values_of(getattr(value, name)) for name in names) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(map(_values_of, value)) + "]"

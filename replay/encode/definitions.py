@@ -1,4 +1,7 @@
-"""ROS 2 definitions as complete text, and what ROS 1 types are called there."""
+"""ROS 2 definitions as complete text, and what ROS 1 types are called there.
+
+A text made here says how messages are coded; constants and comments are not part of that.
+"""
 
 from __future__ import annotations
 
