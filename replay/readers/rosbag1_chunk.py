@@ -28,6 +28,7 @@ from .rosbag1_records import (
     kind_of,
     parse_fields,
     record_at,
+    tally,
     time_ns,
 )
 
@@ -130,8 +131,7 @@ class ChunkRows:
 
     def counts(self) -> dict[int, int]:
         """Messages by connection."""
-        conns, counts = np.unique(self.conn, return_counts=True)
-        return {int(c): int(n) for c, n in zip(conns, counts, strict=True)}
+        return tally(self.conn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

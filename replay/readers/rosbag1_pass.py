@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Block, Int64s, Topic
+from crosscue.replay.columns import BLOCK_ROWS, Block, Int64s, Topic
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import Selection
@@ -25,10 +25,11 @@ from .rosbag1_records import (
     Connection,
     Record,
     connection_of,
+    tally,
 )
 
-BATCH_BYTES: Final = BLOCK_BYTES // 2
-"""Inflated bytes gathered from several chunks before they become blocks."""
+BATCH_BYTES: Final = 512 << 10
+"""Small chunks are gathered up to this size before they become blocks; others are not copied."""
 
 OTHER_TYPE: Final = "another message type on the same topic"
 NO_CONNECTION: Final = "message of an unknown connection"
@@ -330,25 +331,33 @@ class Pass:
         if not batch.count:
             return
         conn = np.concatenate(batch.conn)
-        numbers, which = np.unique(conn, return_inverse=True)
         names: list[str] = []
-        place = np.full(len(numbers), -1, dtype=np.int64)
-        counts = np.bincount(which, minlength=len(numbers))
-        for i, number in enumerate(numbers):
-            name = self._roster.topic_of(int(number))
-            if not self._roster.knows(int(number)):
-                self._ledger.lose("", NO_CONNECTION, int(counts[i]), f"connection {number}")
-            elif not self._roster.fits_topic(int(number)):
-                self._ledger.find(name, int(counts[i]))
-                self._ledger.skip(name, OTHER_TYPE, int(counts[i]), f"connection {number}")
+        place: dict[int, int] = {}
+        for number, count in tally(conn).items():
+            name = self._roster.topic_of(number)
+            if not self._roster.knows(number):
+                self._ledger.lose("", NO_CONNECTION, count, f"connection {number}")
+            elif not self._roster.fits_topic(number):
+                self._ledger.find(name, count)
+                self._ledger.skip(name, OTHER_TYPE, count, f"connection {number}")
             else:
                 if name not in names:
                     names.append(name)
-                place[i] = names.index(name)
-        topic = place[which]
+                place[number] = names.index(name)
+        topic = _looked_up(conn, place)
         keep = topic >= 0
         raw = batch.raws[0] if len(batch.raws) == 1 else b"".join(batch.raws)
         columns = (np.concatenate(c) for c in (batch.log_ns, batch.start, batch.stop))
         log_ns, start, stop = (column[keep] for column in columns)
         rows = MixedRows(np.frombuffer(raw, dtype=np.uint8), topic[keep], log_ns, start, stop)
         yield from blocks_of(rows, names, self._selection, self._limits, self._ledger)
+
+
+def _looked_up(conn: Int64s, place: dict[int, int]) -> Int64s:
+    """``place`` of each connection number, -1 for those that have none."""
+    numbers = np.array(sorted(place), dtype=np.int64)
+    if not len(numbers):
+        return np.full(len(conn), -1, dtype=np.int64)
+    places = np.array([place[int(n)] for n in numbers], dtype=np.int64)
+    at = np.minimum(np.searchsorted(numbers, conn), len(numbers) - 1)
+    return np.where(numbers[at] == conn, places[at], -1)

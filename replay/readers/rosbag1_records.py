@@ -249,8 +249,19 @@ class Entries:
 
     def counts(self) -> dict[int, int]:
         """Messages by connection."""
-        conns, counts = np.unique(self.conn, return_counts=True)
-        return {int(c): int(n) for c, n in zip(conns, counts, strict=True)}
+        return tally(self.conn)
+
+
+_FEW_NUMBERS: Final = 65_536
+
+
+def tally(conn: Int64s) -> dict[int, int]:
+    """How often each connection number occurs; real ones are small, damaged ones need not be."""
+    if len(conn) and conn.max() < _FEW_NUMBERS:
+        counts = np.bincount(conn)
+        return {int(c): int(counts[c]) for c in np.flatnonzero(counts)}
+    conns, counts = np.unique(conn, return_counts=True)
+    return {int(c): int(n) for c, n in zip(conns, counts, strict=True)}
 
 
 _ENTRY: Final = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])

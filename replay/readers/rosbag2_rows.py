@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -18,6 +19,7 @@ FIRST_ROWID: Final = -(2**63)
 LAST_ROWID: Final = 2**63 - 1
 _FIRST_FETCH: Final = 8
 _LARGEST_FETCH: Final = 256
+_ROWID: Final = itemgetter(0)
 
 Row: TypeAlias = tuple[int, Any, Any, Any]
 """Row id, topic id, timestamp and payload; a file may hold any type in the last three."""
@@ -82,9 +84,9 @@ class RowScan:
                     yield rows
                 raise
             rows += part
-            sizes = [len(row[3]) for row in part if isinstance(row[3], (bytes, str))]
+            sizes = [len(row[3]) for row in part if row[3].__class__ is bytes]
             size += sum(sizes)
-            largest = max(largest, *sizes) if sizes else largest
+            largest = max(largest, max(sizes, default=0))
             if rows and (not part or size >= BLOCK_BYTES or len(rows) >= BLOCK_ROWS):
                 yield rows
                 rows, size = [], 0
@@ -95,7 +97,7 @@ class RowScan:
 
     def _ascending(self, rows: list[Row]) -> list[Row]:
         """Rows whose ids go up."""
-        number = np.fromiter((row[0] for row in rows), dtype=np.int64, count=len(rows))
+        number = np.fromiter(map(_ROWID, rows), dtype=np.int64, count=len(rows))
         if number[0] > self._highest and (np.diff(number) > 0).all():
             self._highest = int(number[-1])
             return rows
