@@ -138,7 +138,7 @@ class Sensed:
         wheels_mps: Shape (W, 4): front left, front right, rear left, rear right.
         steering_rad: Shape (W,): at the steering wheel, left positive.
         gyro_t_ns: Shape (G,), 100 Hz.
-        gyro_z_radps: Shape (G,).
+        gyro_radps: Shape (G, 3): about forward, left, up.
         mag_t_ns: Shape (M,), 10 Hz.
         mag_t: Shape (M, 3), tesla, in the sensor's axes.
     """
@@ -147,7 +147,7 @@ class Sensed:
     wheels_mps: Floats
     steering_rad: Floats
     gyro_t_ns: Int64s
-    gyro_z_radps: Floats
+    gyro_radps: Floats
     mag_t_ns: Int64s
     mag_t: Floats
 
@@ -166,8 +166,8 @@ def sense(motion: TrueMotion, settings: DriveSettings) -> Sensed:
     wheels = true_wheels * tyre * (1.0 + slip) + rng.normal(0.0, 0.02, true_wheels.shape)
     with np.errstate(invalid="ignore", divide="ignore"):
         road_wheel = np.where(v > 0.1, np.arctan(WHEELBASE_M * w / np.maximum(v, 0.1)), 0.0)
-    gyro = motion.yaw_rate_radps + settings.gyro_bias_radps
-    gyro = gyro + rng.normal(0.0, 0.004, len(gyro))
+    gyro = rng.normal(0.0, 0.004, (len(motion), 3))
+    gyro[:, 2] += motion.yaw_rate_radps + settings.gyro_bias_radps
     tenth = slice(None, None, 10)
     return Sensed(
         motion.t_ns[half],

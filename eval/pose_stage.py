@@ -23,6 +23,8 @@ from crosscue.replay.signals import Plan, Samples, Signal
 from crosscue.replay.vehicle import Vehicle
 from crosscue.replay.windows import Window
 
+REJECTED_SHARE: Final = 0.1
+"""An honest filter refuses one reading in a thousand; above this something is wrong."""
 UNKNOWN_HEADING_SD_RAD: Final = 1.8
 """About the s.d. of an angle of which nothing is known."""
 
@@ -81,6 +83,18 @@ class PoseStage:
         """Rows that waited for more odometry."""
         if self._state is not None and self._last_ns is not None:
             yield from self._advance(Window(self._last_ns, self._last_ns, {}), None)
+
+    def doubts(self) -> list[str]:
+        """What the counts say against the settings, in plain words."""
+        counts = self.track_counts
+        judged = counts.headings_accepted + counts.headings_rejected
+        if not judged or counts.headings_rejected <= REJECTED_SHARE * judged:
+            return []
+        return [
+            f"{counts.headings_rejected} of {judged} compass readings were refused by the gate: "
+            "compass or odometry err more than the vehicle file says; fit the compass, or raise "
+            "heading_sd_rad and the odometry's noise"
+        ]
 
     def counts(self) -> dict[str, dict[str, int]]:
         """What became of every odometry row and heading, for the manifest."""

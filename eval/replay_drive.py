@@ -115,7 +115,7 @@ def replay_drive(
             for ledger in ledgers:
                 sink.write(skipped_rows(ledger))
         seconds = time.monotonic() - began
-        notices = (*_missing(planned), *stage.notices, *_clock_changes(extractors))
+        notices = (*_missing(planned), *stage.notices, *stage.doubts(), *_clock_changes(extractors))
         write_manifest(run, {
             "versions": versions(),
             "logs": [
