@@ -12,7 +12,6 @@ round. The recording is looked for in $CROSSCUE_DATA or ../shared/data.
 from __future__ import annotations
 
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -28,7 +27,6 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
-from crosscue.replay.columns import Messages
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT
@@ -228,37 +226,47 @@ def _ratio(above: list[float], below: list[float]) -> float:
 def memory(megabytes: int) -> None:
     """Peak memory of a process that reads a log of 200 MB, and one ten times as long."""
     with tempfile.TemporaryDirectory() as folder:
-        for compression in (CompressionType.NONE, CompressionType.ZSTD):
-            peaks = []
+        for compression in CompressionType:
+            added = []
             for size in (megabytes, 10 * megabytes):
                 path = Path(folder) / "log.mcap"
                 write_log(path, compression, max(1, round(size / 148)))
-                call = [sys.executable, __file__, "peak", str(path)]
+                call = [sys.executable, "-c", PEAK, str(path)]
                 told = subprocess.run(call, check=True, capture_output=True, text=True).stdout
-                peaks.append(float(told))
+                before, after = (int(kib) / 1024 for kib in told.split())
+                added.append(after - before)
                 print(
-                    f"{compression.name.lower():6} {path.stat().st_size / 1e6:7.0f} MB log: "
-                    f"peak {peaks[-1]:.0f} MiB",
+                    f"{compression.name.lower():5} log of {path.stat().st_size / 1e6:5.0f} MB: "
+                    f"peak {after:.1f} MiB, of which reading {added[-1]:.1f} MiB",
                     flush=True,
                 )
                 path.unlink()
-            print(f"{'':6} difference {peaks[1] - peaks[0]:+.1f} MiB")
+            print(f"{'':5} the long one needs {added[1] - added[0]:+.1f} MiB")
 
 
-def peak(path: Path) -> None:
-    largest = 0
-    with open_mcap(path, DEFAULT) as log:
-        for block in log.read(Ledger(str(path))):
-            assert isinstance(block.rows, Messages)
-            largest = max(largest, int(block.log_ns[-1]))
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+PEAK = """
+import sys
+from pathlib import Path
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import open_log
+import crosscue.replay.readers.mcap
+
+def peak():
+    status = Path("/proc/self/status").read_text()
+    return status.split("VmHWM:")[1].split()[0]
+
+before = peak()
+with open_log(sys.argv[1]) as log:
+    last = 0
+    for block in log.read(Ledger(sys.argv[1])):
+        last = max(last, int(block.log_ns[-1]))
+print(before, peak())
+"""
 
 
 if __name__ == "__main__":
     match sys.argv[1:]:
         case ["memory", *more]:
             memory(int(more[0]) if more else 200)
-        case ["peak", name]:
-            peak(Path(name))
         case more:
             speed(int(more[0]) if more else 5)

@@ -15,7 +15,7 @@ from .mcap_records import BrokenRecordError, ChunkHead
 
 UNKNOWN_SIZES: Final = (-1, 0)
 """What zstandard and lz4 say when a frame does not declare its size."""
-LZ4_STEP: Final = 64 << 10
+LZ4_STEP: Final = 256 << 10
 
 
 def inflate(body: Bytes, head: ChunkHead, buffers: Buffers) -> Bytes:

@@ -18,7 +18,7 @@ from .mcap_segments import Segment
 from .mcap_walk import Chunk, Item
 
 WORKERS: Final = 1
-"""More would help only where decompressing takes longer than what is done with the messages."""
+"""One hides most of the work; each more costs more in handing over the interpreter."""
 AHEAD: Final = 4
 """Chunks under way at once ..."""
 AHEAD_BYTES: Final = 32 << 20
