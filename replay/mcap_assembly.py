@@ -160,7 +160,8 @@ def copy_ranges(
     if not len(length):
         return
     mean = int(length.sum()) // len(length)
-    lengths = np.unique(length) if mean < LARGE else length
+    are_equal = bool((length == length[0]).all())
+    lengths = length[:1] if are_equal or mean >= LARGE else np.unique(length)
     if mean >= LARGE or len(lengths) > FEW_LENGTHS:
         to, of = target.data, source.data
         rows = zip(target_start.tolist(), source_start.tolist(), length.tolist(), strict=True)

@@ -34,6 +34,7 @@ WINDOW_BYTES: Final = 16 << 20
 """Bytes that wait to be merged by time before they are cut into chunks."""
 CHUNKS_AHEAD: Final = 3
 """Chunks being compressed while others are written."""
+THREADS: Final = 2
 
 HEADER, FOOTER, SCHEMA, CHANNEL = 0x01, 0x02, 0x03, 0x04
 CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 0x06, 0x07, 0x08
@@ -131,7 +132,7 @@ class McapWriter:
             self._file = self._partial.open("wb")
         except OSError as error:
             raise cannot_write(path, error) from None
-        self._pool = ThreadPoolExecutor(1)
+        self._pool = ThreadPoolExecutor(THREADS)
         self._guarded(lambda: self._data(MAGIC))
         self._guarded(lambda: self._data(_record(HEADER, _text("ros2") + _text(LIBRARY))))
 
@@ -348,7 +349,8 @@ def _compressor(compression: Compression) -> Callable[[bytes | memoryview], byte
     if compression == "zstd":
         from zstandard import ZstdCompressor
 
-        return ZstdCompressor().compress
+        # A compressor must not be shared by threads.
+        return lambda records: ZstdCompressor().compress(records)
     if compression == "lz4":
         from lz4.frame import compress
 

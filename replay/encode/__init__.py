@@ -69,6 +69,8 @@ class _AsStored:
     def __call__(self, block: Block, ledger: Ledger) -> list[Outgoing]:
         assert isinstance(block.rows, Messages)
         _, kept = self.decoder.walked(block, block.rows, ledger)
+        if not len(kept):
+            return []
         return [Outgoing(self.type, block if len(kept) == len(block) else block.take(kept))]
 
 
