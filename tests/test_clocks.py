@@ -229,11 +229,37 @@ def test_a_clock_that_starts_again_at_zero_keeps_its_eras_apart() -> None:
     assert (log.gaps, log.late_rows, log.longest_step_ns) == (0, 0, 10 * MS)
 
 
+def test_a_gap_after_a_reset_is_seen() -> None:
+    after = np.arange(1, 501) * 10 * MS
+    after[300:] += SECOND_NS
+    log = log_of(np.concatenate([steady(500), after]))
+
+    assert (log.resets, log.gaps) == (1, 1)
+    assert log.longest_step_ns == SECOND_NS + 10 * MS
+
+
+def test_a_clock_whose_rate_changes_has_a_larger_error_of_its_drift() -> None:
+    stream = Stream(1200, 50 * MS, wait_ns=MS)
+    bent_ns = stream.header_ns()
+    bent_ns[600:] += np.arange(600) * 10_000
+
+    straight, bent = header_of(stream).line, watch(table_of("/s", stream.log_ns(), bent_ns)).header
+
+    assert straight is not None
+    assert straight.drift_error_ppm is not None
+    assert bent is not None
+    assert bent.line is not None
+    assert bent.line.drift_error_ppm is not None
+    assert straight.drift_error_ppm < 5.0
+    assert bent.line.drift_error_ppm == pytest.approx(200.0 / 4.0, rel=0.2)
+
+
 def test_times_that_only_go_back_end_soon() -> None:
     log = log_of(steady(200_000)[::-1], 50_000)
 
     assert log.rows == 200_000
     assert log.resets == pytest.approx(200_000 / 128, rel=0.01)
+    assert log_of(steady(20_000)[::-1], 5_000) == log_of(steady(20_000)[::-1], 777)
 
 
 @pytest.mark.parametrize(
