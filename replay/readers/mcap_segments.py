@@ -16,7 +16,7 @@ from crosscue.replay.errors import LogFormatError
 from crosscue.replay.limits import Limits
 
 from .mcap_bytes import PIECE, ByteFile
-from .mcap_inflate import inflate
+from .mcap_inflate import inflate, inflate_prefix
 from .mcap_records import (
     CHANNEL,
     CHUNK,
@@ -338,12 +338,12 @@ def _definitions_in(
 ) -> list[Definition]:
     """Schemas and channels of a chunk; none if it cannot be read."""
     head = chunk.head
-    if head is None or chunk.fault or chunk.is_cut:
-        return []
-    if max(head.size, head.body_size) > limits.chunk_bytes:
+    if head is None or chunk.fault or max(head.size, head.body_size) > limits.chunk_bytes:
         return []
     try:
-        buffer = inflate(file.read(chunk.body_at, head.body_size), head, file.buffers)
+        body = file.read(chunk.body_at, head.body_size)
+        is_cut, buffers = chunk.is_cut, file.buffers
+        buffer = inflate_prefix(body, head) if is_cut else inflate(body, head, buffers)
         rows = rows_by_scan(buffer, scanner, NEVER_IN_A_CHUNK, limits.records_per_chunk)
     except BrokenRecordError:
         return []

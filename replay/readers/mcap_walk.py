@@ -142,7 +142,7 @@ class How(Enum):
     FOOTER = "with a footer, without a data end record"
     CUT = "in the middle of a record"
     BARE = "without a data end record"
-    LOST = "where the walk lost its way"
+    TOLD = "within the chunk or gap just given"
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +187,7 @@ class Walk:
         self._limits = limits
         self._scanner = scanner
         self._run_bytes = 0
-        self._is_lost = False
+        self._is_over = False
 
     def __iter__(self) -> Iterator[Item]:
         """The items in the order of the file."""
@@ -202,7 +202,7 @@ class Walk:
             if isinstance(item, End):
                 return
             assert self._at > before, "a walk must go forward"
-        how = How.DATA_END if self._has_end else How.LOST if self._is_lost else How.BARE
+        how = How.DATA_END if self._has_end else How.TOLD if self._is_over else How.BARE
         yield End(self._end, how)
 
     def _bound(self, at: int) -> int:
@@ -239,7 +239,7 @@ class Walk:
     def _gap(self, why: str) -> Item:
         """What begins here is no record; go on where something is known to begin."""
         at, self._at = self._at, self._bound(self._at)
-        self._is_lost = self._at == self._end and not self._has_end
+        self._is_over = self._at == self._end and not self._has_end
         return Gap(at, self._at, why)
 
     def _cut(self, what: str) -> Item:
@@ -356,7 +356,7 @@ class Walk:
         elif inner_end <= bound and head.crc:
             end, differs = inner_end, f"its record says {length} bytes"
         elif not self._has_end and bound == self._file.size and outer_end == inner_end:
-            self._at = self._end
+            self._at, self._is_over = self._end, True
             return Chunk(at, body_at, head, None, fault, is_cut=True)
         else:
             raise BrokenRecordError(f"a chunk of {length} bytes does not fit")

@@ -170,6 +170,8 @@ class Pass:
         """
         for topic in self._roster.topics:
             self._ledger.declare(topic.name, topic.declared)
+        for connection in self._contents.connections.values():
+            self._say_if_renamed(connection)
         known = sorted(self._contents.infos)
         try:
             for unit in units(self._file, self._first, known, self._limits):
@@ -216,6 +218,7 @@ class Pass:
         known = self._contents.connections.get(connection.conn)
         if known is None:
             self._roster.add(connection)
+            self._say_if_renamed(connection)
         elif known != connection:
             detail = (
                 f"connection {connection.conn}: {known.topic} ({known.type_name}) and "
@@ -226,6 +229,13 @@ class Pass:
                 self._ledger.notice(f"{TWO_RECORDS}, the one with a checksum was used: {detail}")
             else:
                 self._ledger.lose(known.topic, TWO_RECORDS, None, detail)
+
+    def _say_if_renamed(self, connection: Connection) -> None:
+        if connection.topic != connection.published:
+            self._ledger.notice(
+                f"connection {connection.conn} is stored as {connection.topic}, but was published "
+                f"as {connection.published}: renamed, or damaged"
+            )
 
     def _gap(self, gap: Gap, index_at: int) -> None:
         where = f"bytes {gap.at} to {gap.stop}"

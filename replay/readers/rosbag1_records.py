@@ -178,6 +178,7 @@ class Connection:
         type_name: ROS 1 message type.
         definition: Full message definition, as stored.
         md5sum: Hash of the definition, as stored.
+        published: Topic under which they were published; another one only if renamed or damaged.
     """
 
     conn: int
@@ -185,6 +186,7 @@ class Connection:
     type_name: str
     definition: bytes
     md5sum: bytes
+    published: str
 
 
 def connection_of(record: Record, body: bytes, largest: int) -> Connection | None:
@@ -194,13 +196,19 @@ def connection_of(record: Record, body: bytes, largest: int) -> Connection | Non
         return None
     if len(fields[b"message_definition"]) > largest:
         return None
+    topic = record.fields[b"topic"]
     return Connection(
         record.u32(b"conn"),
-        record.fields[b"topic"].decode("utf-8", "backslashreplace"),
-        fields[b"type"].decode("utf-8", "backslashreplace"),
+        _text(topic),
+        _text(fields[b"type"]),
         fields[b"message_definition"],
         fields.get(b"md5sum", b""),
+        _text(fields.get(b"topic", topic)),
     )
+
+
+def _text(raw: bytes) -> str:
+    return raw.decode("utf-8", "backslashreplace")
 
 
 @dataclass(frozen=True, slots=True)
