@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import textwrap
 import unicodedata
 from collections.abc import Iterator, Sequence
 from typing import Final
@@ -66,14 +65,22 @@ def table(
 
 
 def wrapped(sentence: str, width: int, lead: str = "- ") -> str:
-    """One bullet point over as many lines as it takes."""
-    return textwrap.fill(
-        visible(sentence),
-        width,
-        initial_indent=lead,
-        subsequent_indent=" " * len(lead),
-        break_on_hyphens=False,
-    )
+    """One bullet point over as many lines as it takes; a word longer than a line is broken."""
+    room = width - cells(lead)
+    lines = [""]
+    for word in visible(sentence).split():
+        joined = f"{lines[-1]} {word}" if lines[-1] else word
+        if cells(joined) <= room:
+            lines[-1] = joined
+            continue
+        rest = word
+        while rest:
+            part = _first(rest, room)
+            lines.append(part)
+            rest = rest[len(part) :]
+    filled = [line for line in lines if line]
+    indents = [lead, *[" " * cells(lead)] * len(filled)]
+    return "\n".join(indent + line for indent, line in zip(indents, filled, strict=False))
 
 
 def _fitted(cell: str, width: int, *, left: bool) -> str:

@@ -179,7 +179,12 @@ def _blueprint(pose: Mapping[str, Floats], has_truth: bool) -> rrb.Blueprint:
 
     plots = {"speed": "Speed (m/s)", "heading": "Heading (deg)", "heading_sd": "Heading s.d. (deg)",
              "ellipse": "2-sigma ellipse, full major axis (m)"}  # fmt: skip
-    series = [rrb.TimeSeriesView(origin=f"plots/{key}", name=name) for key, name in plots.items()]
+    # Without it the viewer shows a minute around the cursor, not the drive.
+    whole = rrb.TimeRange(rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
+    series = [
+        rrb.TimeSeriesView(origin=f"plots/{key}", name=name, axis_x=rrb.TimeAxis(view_range=whole))
+        for key, name in plots.items()
+    ]
     plan = rrb.Spatial3DView(
         origin="plan", name="Plan, truth in green" if has_truth else "Plan",
         line_grid=rrb.LineGrid3D(visible=True), eye_controls=_from_above(pose),

@@ -12,6 +12,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+from crosscue.eval.plain_text import terminal_width, visible, wrapped
 from crosscue.eval.replay_drive import Outcome, account_of, replay_drive
 from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import create
@@ -77,7 +78,8 @@ def summary(outcome: Outcome) -> str:
         used = sum(a.used for a in ledger.accounts.values())
         found = sum(a.in_file for a in ledger.accounts.values())
         lines.append(f"log      {ledger.log}")
-        lines.append(f"         {used:,} rows used of {found:,}; integrity: {ledger.integrity}")
+        lines.append(f"         {used:,} rows used of {found:,}")
+        lines.append(f"         integrity: {ledger.integrity}")
         lines += [f"  lost   {_loss(d.topic, d.reason, d.count)}" for d in ledger.losses()]
         lines += [f"  note   {sentence}" for sentence in ledger.notices]
     if outcome.rows:
@@ -91,7 +93,11 @@ def summary(outcome: Outcome) -> str:
     lines += [f"  note   {sentence}" for sentence in outcome.notices]
     speed = outcome.drive_seconds / max(outcome.seconds, 1e-9)
     lines.append(f"took     {outcome.seconds:.2f} s, {speed:.0f} times real time")
-    return "\n".join(lines)
+    width = min(terminal_width(), 80)
+    return "\n".join(
+        wrapped(visible(line[9:]), width, lead=line[:9]) if len(line) > width else visible(line)
+        for line in lines
+    )
 
 
 def _loss(topic: str, reason: str, count: int | None) -> str:
