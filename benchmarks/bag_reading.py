@@ -1,6 +1,7 @@
 """Reading a drive from ROS 1 bags and ROS 2 SQLite bags: ours beside rosbags, in one run.
 
     python benchmarks/bag_reading.py [rounds] [seconds of drive]
+    python benchmarks/bag_reading.py memory [megabytes]    # peak memory, a tenth of it against it
 
 The drive: 15 camera pictures of 150 kB, 2,258 CAN frames and 100 IMU messages a second; noise for
 pictures, which is as incompressible as JPEG. The cases run in rotation, ratios are taken round by
@@ -10,7 +11,9 @@ finds the pictures' bytes. rosbags "raw" gives the bytes of each message, "objec
 
 from __future__ import annotations
 
+import shutil
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
@@ -40,6 +43,18 @@ uint8[8] data
 """
 START_NS: Final = 1_700_000_000_000_000_000
 PICTURES, FRAMES, IMUS = 15, 2258, 100
+BYTES_A_SECOND: Final = 2_500_000
+MEASURED: Final = """
+import sys
+from pathlib import Path
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import open_log
+with open_log(sys.argv[1]) as log:
+    for block in log.read(Ledger("a")):
+        pass
+status = Path("/proc/self/status").read_text().splitlines()
+print(next(line.split()[1] for line in status if line.startswith("VmHWM")))
+"""
 TYPES: Final = {
     "/camera": "sensor_msgs/msg/CompressedImage",
     "/can": "can_msgs/msg/Frame",
@@ -179,8 +194,28 @@ def compare(name: str, path: Path, rounds: int, want: int) -> None:
         )
 
 
+def show_memory(megabytes: int) -> None:
+    """Print the peak memory of reading a log and one ten times as long, in new processes."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, suffix in (("bag none", "bag"), ("bag lz4", "bag"), ("db3", "")):
+            for size in (megabytes // 10, megabytes):
+                path = Path(folder) / f"log.{suffix}" if suffix else Path(folder) / "log"
+                seconds = max(1, round(size * 1e6 / BYTES_A_SECOND))
+                if suffix:
+                    write_bag(path, name.split()[1], seconds)
+                else:
+                    write_db3(path, seconds)
+                command = [sys.executable, "-c", MEASURED, str(path)]
+                peak = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+                print(f"{name:10}{size:6} MB log: peak {int(peak) / 1024:.0f} MiB", flush=True)
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
 def main() -> None:
     """Write the drives and compare the readers on them."""
+    if sys.argv[1:2] == ["memory"]:
+        show_memory(int(sys.argv[2]) if len(sys.argv) > 2 else 2000)
+        return
     rounds = int(sys.argv[1]) if len(sys.argv) > 1 else 5
     seconds = int(sys.argv[2]) if len(sys.argv) > 2 else 60
     want = seconds * (PICTURES + FRAMES + IMUS)
