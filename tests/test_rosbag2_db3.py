@@ -18,6 +18,7 @@ from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.log import Selection, open_log
 from crosscue.replay.readers.rosbag2_db3 import open_db3
+from crosscue.replay.readers.rosbag2_wal import check_wal
 from support.data import shared
 from support.rosbag_files import (
     START_NS,
@@ -133,6 +134,53 @@ def test_a_write_ahead_log_is_read_and_nothing_touched(tmp_path: Path, has_shm: 
     assert contents(tmp_path) == before
     assert any("write-ahead log" in sentence for sentence in reading.ledger.notices)
     assert reading.ledger.is_whole
+
+
+@pytest.fixture(scope="module")
+def wal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database of a killed recorder: 40 transactions, the last 39 only in the write-ahead log."""
+    folder = tmp_path_factory.mktemp("wal")
+    db = sqlite3.connect(tmp_path_factory.mktemp("live") / "a.db3", isolation_level=None)
+    db.execute("PRAGMA journal_mode=wal")
+    db.execute("PRAGMA wal_autocheckpoint=0")
+    db.executescript(TABLES)
+    for i in range(40):
+        db.execute("INSERT INTO messages VALUES(?, 1, ?, ?)", (i + 1, i, bytes([i]) * 300))
+        if i == 0:
+            db.execute("PRAGMA wal_checkpoint")
+    live = Path(db.execute("PRAGMA database_list").fetchone()[2])
+    for suffix in ("", "-wal"):
+        source = live.with_name(live.name + suffix)
+        (folder / source.name).write_bytes(source.read_bytes())
+    db.close()
+    return folder
+
+
+def test_a_sound_write_ahead_log_is_told_sound(wal_folder: Path) -> None:
+    state = check_wal(wal_folder / "a.db3-wal")
+
+    assert state is not None
+    assert state.frames == state.sound > 40
+    assert not state.has_lost_commit
+    assert len(read_rows(wal_folder / "a.db3").rows) == 40
+
+
+def test_a_damaged_write_ahead_log_is_never_dropped_in_silence(
+    wal_folder: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.db3"
+    path.write_bytes((wal_folder / "a.db3").read_bytes())
+    truth = read_rows(wal_folder / "a.db3").rows
+    log = (wal_folder / "a.db3-wal").read_bytes()
+    silent = []
+    for how, copy in damaged_copies(log, cuts=0, flips=80, seed=22):
+        (tmp_path / "a.db3-wal").write_bytes(copy)
+        reading = read_rows(path)
+        assert not Counter(reading.rows) - Counter(truth)
+        if len(reading.rows) < len(truth) and reading.ledger.is_whole:
+            silent.append(how)
+
+    assert not silent
 
 
 def test_a_closed_wal_database_leaves_no_file_behind(tmp_path: Path) -> None:

@@ -167,8 +167,6 @@ class _Pass:
             said = [str(row[0]) for row in fetched(self._database, "PRAGMA integrity_check(5)")]
         except FAULTS as error:
             said = [str(error)]
-        if self._database.missing_bytes:
-            said.append(f"{self._database.missing_bytes} bytes fewer than its header says")
         if said == ["ok"]:
             return ""
         if self._tables.index is not None:
@@ -272,6 +270,8 @@ class _Pass:
             ledger.lose("", DISORDER, scan.disordered)
         if scan.holes and ledger.is_whole:
             ledger.lose("", DAMAGED_PAGE, self._missing(), "; ".join(scan.holes[:3]))
+        if self._database.damage and ledger.is_whole:
+            ledger.lose("", DAMAGED_PAGE, None, self._database.damage)
         if is_part:
             ledger.integrity += "; a part was read, the file's structure was not checked"
         elif not problems:

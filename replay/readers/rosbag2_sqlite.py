@@ -21,6 +21,8 @@ from urllib.parse import quote
 from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.limits import MIB, Limits
 
+from .rosbag2_wal import check_wal
+
 SQLITE_MAGIC: Final = b"SQLite format 3\x00"
 FAULTS: Final = (sqlite3.Error, UnicodeError, ValueError, OverflowError, MemoryError)
 """What the standard library raises on a damaged file; a message that is no UTF-8 is one of them."""
@@ -48,13 +50,13 @@ class Database:
         connection: Text comes as ``str``, bytes that are no UTF-8 escaped.
         notices: What had to be done to open it, for the ledger.
         copy: Folder of the temporary copy, or None.
-        missing_bytes: How much shorter the file is than its header says.
+        damage: What is known to be missing, or empty.
     """
 
     connection: sqlite3.Connection
     notices: list[str] = field(default_factory=list)
     copy: Path | None = None
-    missing_bytes: int = 0
+    damage: str = ""
 
     def close(self) -> None:
         """Close it and remove the temporary copy."""
@@ -108,7 +110,7 @@ def _opened(path: Path, head: bytes, limits: Limits) -> Database:
     if is_wal and _has_bytes(beside(path, "-wal")):
         connection = _connect(path, "mode=ro&vfs=unix-none", limits, "locking_mode=EXCLUSIVE")
         said = "the recorder did not close it: its write-ahead log was read with it"
-        return Database(connection, [said])
+        return Database(connection, [said], damage=_wal_damage(beside(path, "-wal")))
     missing, torn = _missing_bytes(head, path)
     if missing and torn:
         return _copy_without_torn_page(path, torn, missing, limits)
@@ -118,7 +120,21 @@ def _opened(path: Path, head: bytes, limits: Limits) -> Database:
         if _has_bytes(beside(path, "-journal")):
             return _repaired_copy(path, limits)
         raise
-    return Database(connection, missing_bytes=missing)
+    return Database(connection, damage=_shortfall(missing))
+
+
+def _shortfall(missing: int) -> str:
+    return f"{missing} bytes fewer than its header says" if missing else ""
+
+
+def _wal_damage(path: Path) -> str:
+    """Why committed rows in a write-ahead log are out of SQLite's reach, or empty."""
+    state = check_wal(path)
+    if state is None:
+        return "the write-ahead log's header is damaged, nothing in it can be read"
+    if state.has_lost_commit:
+        return f"the write-ahead log is damaged at frame {state.sound + 1} of {state.frames}"
+    return ""
 
 
 def _missing_bytes(head: bytes, path: Path) -> tuple[int, int]:
@@ -215,7 +231,7 @@ def _copy_without_torn_page(path: Path, torn: int, missing: int, limits: Limits)
         shutil.rmtree(folder, ignore_errors=True)
         raise
     said = "the file ends within a page: its whole pages were read in a temporary copy"
-    return Database(connection, [said], folder, missing)
+    return Database(connection, [said], folder, _shortfall(missing))
 
 
 def _room_for_copy(path: Path, size: int) -> Path:
