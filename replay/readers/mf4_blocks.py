@@ -1,0 +1,384 @@
+"""The block structure of ASAM MDF 4 files: every link and size checked before it is followed.
+
+Read here instead of through asammdf, which trusts a damaged file's sizes and offsets: it asks for
+terabytes, and reports a cut data block as a shorter one.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BufferedReader
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.limits import Limits
+
+_HEAD: Final = struct.Struct("<4s4xQQ")
+HEAD_BYTES: Final = 24
+_LINKS_MAX: Final = 100_000
+_BLOCK_MAX: Final = 1 << 20
+_TEXT_MAX: Final = 1 << 16
+_CHAIN_MAX: Final = 200_000
+"""Most blocks in one chain of links; a longer one runs in a circle."""
+_TX: Final = re.compile(rb"<TX[^>]*>(.*?)</TX>", re.DOTALL)
+PIECE_BYTES: Final = 1 << 20
+
+MASTER, VIRTUAL_MASTER = 2, 3
+FIXED, VARIABLE, MAX_LENGTH = 0, 1, 5
+TIME: Final = 1
+BUS_EVENT: Final = 2
+VLSD_GROUP: Final = 1
+REMOTE_MASTER: Final = 8
+
+
+class BrokenBlockError(Exception):
+    """A block does not lie in the file or is not what its link promises."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawBlock:
+    """One block: links and the bytes after them."""
+
+    links: tuple[int, ...]
+    body: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """How raw values become physical ones.
+
+    Attributes:
+        type: 0 none, 1 linear, 2 rational, 4 table with interpolation; others are not applied.
+        values: Its parameters.
+        unit: Of the physical value.
+    """
+
+    type: int = 0
+    values: tuple[float, ...] = ()
+    unit: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One channel of a group; offsets are within the record, after the record identifier."""
+
+    name: str
+    type: int
+    sync: int
+    data_type: int
+    bit_offset: int
+    byte_offset: int
+    bit_count: int
+    flags: int
+    invalid_bit: int
+    data: int
+    unit: str
+    conversion: Conversion
+    is_array: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """One channel group.
+
+    Attributes:
+        name: Acquisition name, or that of its source, or empty.
+        record_id: Identifier in front of its records in unsorted data.
+        records: How many the file declares.
+        flags: Bit 0 holds variable-length values, bit 1 is bus traffic, bit 3 has a remote master.
+        value_bytes: Of each record.
+        invalid_bytes: Bytes with invalidation bits after the values.
+        channels: All channels, those of structures included.
+    """
+
+    name: str
+    record_id: int
+    records: int
+    flags: int
+    value_bytes: int
+    invalid_bytes: int
+    channels: tuple[Channel, ...]
+
+    @property
+    def record_bytes(self) -> int:
+        """Bytes of each record without its identifier."""
+        return self.value_bytes + self.invalid_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class DataGroup:
+    """Groups whose records share one stretch of data."""
+
+    id_bytes: int
+    data: int
+    groups: tuple[Group, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One stored stretch of data: ``content`` None when it cannot be read."""
+
+    content: bytes | None
+    byte_count: int
+    damage: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """Identification and header block.
+
+    Attributes:
+        version: As written, ``4.11``.
+        is_finalized: The recorder came to write all counts and lengths.
+        unfinished: Its flags for what is missing.
+        start_ns: Start of the measurement.
+        is_local: The start is in local time of an unknown zone.
+        first_group: Link to the first data group.
+    """
+
+    version: str
+    is_finalized: bool
+    unfinished: int
+    start_ns: int
+    is_local: bool
+    first_group: int
+
+
+class Blocks:
+    """Blocks of an open file."""
+
+    def __init__(self, file: BufferedReader, size: int, limits: Limits) -> None:
+        self._file, self.size, self._limits = file, size, limits
+
+    def header(self, path: str) -> Header:
+        """Read identification and header.
+
+        Raises:
+            LogFormatError: It is no MDF 4 file, or its header is damaged.
+        """
+        self._file.seek(0)
+        head = self._file.read(64)
+        name, version = head[:8], head[8:16].rstrip(b"\0 ").decode("ascii", "replace")
+        if not head:
+            raise LogFormatError(f"{path}: empty file; expected MDF 4, check how it was copied")
+        if name not in (b"MDF     ", b"UnFinMF ") or len(head) < 64:
+            raise LogFormatError(f"{path}: no MDF file (begins with {name!r}); expected 'MDF'")
+        if not version.startswith("4."):
+            raise LogFormatError(f"{path}: MDF version {version!r}; expected 4.x, convert it first")
+        try:
+            block = self.block(64, b"##HD", 6, 24)
+        except BrokenBlockError as broken:
+            raise LogFormatError(f"{path}: MDF header damaged: {broken}") from None
+        start_ns, _, _, time_flags = struct.unpack_from("<QhhB", block.body)
+        if start_ns >= 1 << 62:
+            raise LogFormatError(f"{path}: MDF header damaged: start time {start_ns}")
+        unfinished = struct.unpack_from("<H", head, 60)[0] if name == b"UnFinMF " else 0
+        is_local = bool(time_flags & 1)
+        return Header(version, name == b"MDF     ", unfinished, start_ns, is_local, block.links[0])
+
+    def block(self, at: int, kind: bytes, links: int, body: int) -> RawBlock:
+        """The block at ``at``.
+
+        Args:
+            at: Byte offset.
+            kind: ``##DG`` and the like.
+            links: Fewest links it must have.
+            body: Fewest bytes after them.
+
+        Raises:
+            BrokenBlockError: It is not there, not of this kind, or not as large.
+        """
+        found, length, count = self._head(at)
+        if found != kind:
+            raise BrokenBlockError(f"expected {kind.decode()} at byte {at}, found {found!r}")
+        is_sound = links <= count <= _LINKS_MAX and HEAD_BYTES + 8 * count + body <= length
+        if not is_sound or length > _BLOCK_MAX or at + length > self.size:
+            raise BrokenBlockError(f"{kind.decode()} at byte {at} has impossible sizes")
+        raw = self._file.read(length - HEAD_BYTES)
+        return RawBlock(struct.unpack_from(f"<{count}Q", raw), raw[8 * count :])
+
+    def data_groups(self, first: int) -> Iterator[DataGroup]:
+        """All data groups.
+
+        Raises:
+            BrokenBlockError: The chain is damaged from here on.
+        """
+        for block in self._chain(first, b"##DG", 4, 1):
+            groups = tuple(
+                self._group(one, at) for at, one in self._chain_at(block.links[1], b"##CG", 6, 32)
+            )
+            yield DataGroup(block.body[0], block.links[2], groups)
+
+    def pieces(self, at: int, is_open_ended: bool) -> Iterator[Piece]:
+        """The stored stretches behind a data link, in order, each at most a container large.
+
+        Args:
+            at: Link to a data block or a list of them.
+            is_open_ended: The last block's length was never written: it reaches to the end.
+        """
+        try:
+            yield from self._pieces(at, is_open_ended)
+        except BrokenBlockError as broken:
+            yield Piece(None, 0, str(broken))
+
+    def _pieces(self, at: int, is_open_ended: bool) -> Iterator[Piece]:
+        if not at:
+            return
+        kind, _, _ = self._head(at)
+        if kind == b"##HL":
+            at = self.block(at, kind, 1, 0).links[0]
+            if not at:
+                return
+            kind, _, _ = self._head(at)
+        if kind != b"##DL":
+            yield from self._stored(at, is_open_ended)
+            return
+        for block in self._chain(at, b"##DL", 1, 0):
+            for link in block.links[1:]:
+                if link:
+                    yield from self._stored(link, is_open_ended)
+
+    def _stored(self, at: int, is_open_ended: bool) -> Iterator[Piece]:
+        kind, length, count = self._head(at)
+        if kind == b"##DZ":
+            yield self._deflated(at, length)
+            return
+        if kind not in (b"##DT", b"##SD", b"##RD") or length < HEAD_BYTES or count:
+            raise BrokenBlockError(f"no data block at byte {at}: {kind!r}")
+        end = at + length
+        if is_open_ended and (end >= self.size or length == HEAD_BYTES):
+            end = self.size
+        position = at + HEAD_BYTES
+        while position < min(end, self.size):
+            self._file.seek(position)
+            content = self._file.read(min(PIECE_BYTES, end - position))
+            if not content:
+                break
+            yield Piece(content, len(content))
+            position += len(content)
+        if position < end:
+            yield Piece(None, end - position, f"data block at byte {at} is cut by the file's end")
+
+    def _deflated(self, at: int, length: int) -> Piece:
+        head = self._file.read(24)
+        if len(head) < 24:
+            raise BrokenBlockError(f"compressed block at byte {at} is cut by the file's end")
+        method, parameter, original, stored = struct.unpack_from("<2xBxLQQ", head)
+        limit = self._limits.chunk_bytes
+        if original > limit or stored > limit or length < HEAD_BYTES + 24 + stored:
+            raise BrokenBlockError(f"compressed block at byte {at} has impossible sizes")
+        inflater = zlib.decompressobj()
+        try:
+            content = inflater.decompress(self._file.read(stored), original + 1)
+        except zlib.error:
+            return Piece(None, original, f"compressed block at byte {at} fails its checksum")
+        if not inflater.eof or len(content) != original:
+            return Piece(None, original, f"compressed block at byte {at} is cut or damaged")
+        if method not in (0, 1):
+            return Piece(None, original, f"compressed block at byte {at}: unknown method {method}")
+        if method == 1:
+            content = _transposed(content, parameter)
+        return Piece(content, original)
+
+    def _head(self, at: int) -> tuple[bytes, int, int]:
+        if at % 2 or at + HEAD_BYTES > self.size:
+            raise BrokenBlockError(f"a link leads to byte {at}, outside the file")
+        self._file.seek(at)
+        kind, length, count = _HEAD.unpack(self._file.read(HEAD_BYTES))
+        return kind, length, count
+
+    def _chain(self, at: int, kind: bytes, links: int, body: int) -> Iterator[RawBlock]:
+        for _, block in self._chain_at(at, kind, links, body):
+            yield block
+
+    def _chain_at(
+        self, at: int, kind: bytes, links: int, body: int
+    ) -> Iterator[tuple[int, RawBlock]]:
+        seen: set[int] = set()
+        while at:
+            if at in seen or len(seen) > _CHAIN_MAX:
+                raise BrokenBlockError(f"{kind.decode()} blocks run in a circle at byte {at}")
+            seen.add(at)
+            block = self.block(at, kind, links, body)
+            yield at, block
+            at = block.links[0]
+
+    def _group(self, block: RawBlock, at: int) -> Group:
+        record_id, records, flags, _, value_bytes, invalid_bytes = struct.unpack_from(
+            "<QQHH4xLL", block.body
+        )
+        if value_bytes + invalid_bytes > self._limits.message_bytes:
+            raise BrokenBlockError(f"##CG at byte {at} declares records of {value_bytes} bytes")
+        name = self._text(block.links[2]) or self._source(block.links[3])
+        channels = tuple(self._channels(block.links[1], depth=0))
+        return Group(name, record_id, records, flags, value_bytes, invalid_bytes, channels)
+
+    def _channels(self, first: int, depth: int) -> Iterator[Channel]:
+        for block in self._chain(first, b"##CN", 8, 24):
+            links = block.links
+            type_, sync, data_type, bit_offset, byte_offset, bits, flags, invalid = (
+                struct.unpack_from("<BBBBLLLL", block.body)
+            )
+            part_kind = self._head(links[1])[0] if links[1] else b""
+            conversion = self._conversion(links[4])
+            yield Channel(
+                self._text(links[2]),
+                type_,
+                sync,
+                data_type,
+                bit_offset,
+                byte_offset,
+                bits,
+                flags,
+                invalid,
+                links[5],
+                self._text(links[6]) or conversion.unit,
+                conversion,
+                part_kind == b"##CA",
+            )
+            if part_kind == b"##CN" and depth < 4:
+                yield from self._channels(links[1], depth + 1)
+
+    def _conversion(self, at: int) -> Conversion:
+        if not at:
+            return Conversion()
+        block = self.block(at, b"##CC", 4, 24)
+        type_, _, _, _, count = struct.unpack_from("<BBHHH", block.body)
+        if len(block.body) < 24 + 8 * count:
+            raise BrokenBlockError(f"##CC at byte {at} has impossible sizes")
+        values = struct.unpack_from(f"<{count}d", block.body, 24)
+        return Conversion(type_, values, self._text(block.links[1]))
+
+    def _source(self, at: int) -> str:
+        if not at:
+            return ""
+        block = self.block(at, b"##SI", 3, 0)
+        return self._text(block.links[0]) or self._text(block.links[1])
+
+    def _text(self, at: int) -> str:
+        """A text block, or the text inside an XML one; nothing in it is parsed as XML."""
+        if not at:
+            return ""
+        kind, length, count = self._head(at)
+        if kind not in (b"##TX", b"##MD") or length < HEAD_BYTES or count:
+            raise BrokenBlockError(f"no text block at byte {at}: {kind!r}")
+        raw = self._file.read(min(length - HEAD_BYTES, _TEXT_MAX)).split(b"\0", 1)[0]
+        if kind == b"##MD":
+            found = _TX.search(raw)
+            raw = found[1] if found else b""
+        return raw.decode("utf-8", "replace").strip()
+
+
+def _transposed(content: bytes, columns: int) -> bytes:
+    """Undo the column-wise order in which compressed records may be stored."""
+    if columns < 2 or columns > len(content):
+        return content
+    rows = len(content) // columns
+    whole = np.frombuffer(content, np.uint8, rows * columns).reshape(columns, rows)
+    return whole.T.tobytes() + content[rows * columns :]
