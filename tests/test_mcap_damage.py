@@ -306,3 +306,35 @@ def test_an_error_is_never_more_than_a_crosscue_error(tmp_path: Path) -> None:
             continue
         assert not reading.ledger.is_whole
         assert reading.count() == 0
+
+
+@pytest.mark.parametrize("compression", ["", "lz4", "zstd"])
+def test_without_an_index_reading_goes_on_at_the_next_chunk_that_proves_itself(
+    tmp_path: Path, compression: str
+) -> None:
+    parts = sound_parts(compression, is_chunked=True)
+    coded = bytearray(McapFile(parts, summary=False).coded())
+    fifth = parts[4]
+    assert isinstance(fifth, ChunkOf)
+    at = coded.index(fifth.coded())
+    coded[at : at + 9] = b"\xff" * 9
+    path = tmp_path / "log.mcap"
+    path.write_bytes(coded)
+
+    reading = read_back(path)
+
+    assert reading.count() == 575
+    assert any(f"bytes {at} to " in loss.detail for loss in reading.ledger.losses())
+
+
+def test_a_cut_recording_does_not_swallow_the_one_behind_it(tmp_path: Path) -> None:
+    first = McapFile(sound_parts("zstd", is_chunked=True)).coded()
+    other = [schema(1, "c/D"), channel(1, 1, "/other"), *(message(1, i, b"o") for i in range(9))]
+    path = tmp_path / "log.mcap"
+    path.write_bytes(first[: len(first) // 2] + McapFile([ChunkOf(other)]).coded())
+
+    reading = read_back(path)
+
+    assert len(reading.messages["/other"]) == 9
+    assert 200 < reading.count() < 400
+    assert not reading.ledger.is_whole

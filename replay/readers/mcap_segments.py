@@ -16,6 +16,7 @@ from crosscue.replay.errors import LogFormatError
 from crosscue.replay.limits import Limits
 
 from .mcap_bytes import PIECE, ByteFile
+from .mcap_find import find_bytes
 from .mcap_inflate import inflate, inflate_prefix
 from .mcap_records import (
     CHANNEL,
@@ -365,7 +366,8 @@ def _close(
 ) -> tuple[Segment, int | None]:
     """A segment whose data section ends at ``end``, and where the next might begin."""
     if end.how not in (How.DATA_END, How.FOOTER):
-        return Segment(base, begin, file.size, has_end=False), None
+        after = end.at if end.how is How.TOLD and end.at < file.size else None
+        return Segment(base, begin, after or file.size, has_end=False), after
     data_crc = _data_end(file, end.at) or 0
     summary_at = end.at + (DATA_END_SIZE if end.how is How.DATA_END else 0)
     segment = Segment(base, begin, end.at, True, data_crc)
@@ -374,8 +376,8 @@ def _close(
         if bytes(file.peek(file.size - len(MAGIC), len(MAGIC))) != MAGIC:
             return replace(segment, after="the file ends within its summary"), None
         notice = "the file is damaged within its summary, which is not used"
-        following = _find(file, summary_at, MAGIC + bytes([HEADER]))
-        hidden = None if following else _find(file, summary_at, DATA_END_PREFIX)
+        following = find_bytes(file, summary_at, file.size, MAGIC + bytes([HEADER]))
+        hidden = None if following else find_bytes(file, summary_at, file.size, DATA_END_PREFIX)
         left = f"another recording, damaged at its beginning, ends at byte {hidden}"
         return replace(segment, notices=(notice,), after=left if hidden else ""), following
     summary: Summary | None = None
@@ -422,14 +424,3 @@ def _is_filled(file: ByteFile, at: int) -> bool:
             break
         at += len(window)
     return at < file.size
-
-
-def _find(file: ByteFile, at: int, wanted: bytes) -> int | None:
-    """Where these bytes stand next, from ``at`` on."""
-    while at < file.size:
-        window = bytes(file.window(at, PIECE))
-        found = window.find(wanted)
-        if found >= 0:
-            return at + found
-        at += max(len(window) - len(wanted) + 1, 1)
-    return None

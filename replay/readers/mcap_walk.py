@@ -1,7 +1,8 @@
 """From record to record through one data section, without looking into chunks.
 
 The bytes lead; a chunk index from the summary serves as a rail: where a record's length cannot be
-right, the walk goes on at the next chunk that the summary knows. Without a rail it ends there.
+right, the walk goes on at the next chunk that the summary knows; without a rail, at the next chunk
+that proves itself by its checksum (``mcap_find``).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from crosscue.replay.columns import Bytes
 from crosscue.replay.limits import Limits
 
 from .mcap_bytes import ByteFile
+from .mcap_find import find_chunk
 from .mcap_records import (
     ATTACHMENT,
     CHANNEL,
@@ -173,7 +175,8 @@ class Walk:
         Args:
             file: The bytes.
             begin: First record after the header.
-            end: Where the data end record stands; the file's size if ``chunks`` is None.
+            end: Where the data end record stands; if ``chunks`` is None, where the file ends or
+                another recording begins.
             chunks: By offset, what a trusted summary says; None where no end is known.
             limits: Sizes above which nothing is read.
             scanner: Does the stepping within runs.
@@ -188,6 +191,7 @@ class Walk:
         self._scanner = scanner
         self._run_bytes = 0
         self._is_over = False
+        self._last_at = begin
 
     def __iter__(self) -> Iterator[Item]:
         """The items in the order of the file."""
@@ -197,11 +201,12 @@ class Walk:
                 item = self._next()
             except BrokenRecordError as error:
                 item = self._gap(str(error))
+            self._last_at = before
             if item is not None:
                 yield item
             if isinstance(item, End):
                 return
-            assert self._at > before, "a walk must go forward"
+            assert self._at > before or self._is_over, "a walk must go forward"
         how = How.DATA_END if self._has_end else How.TOLD if self._is_over else How.BARE
         yield End(self._end, how)
 
@@ -239,16 +244,22 @@ class Walk:
     def _gap(self, why: str) -> Item:
         """What begins here is no record; go on where something is known to begin."""
         at, self._at = self._at, self._bound(self._at)
-        self._is_over = self._at == self._end and not self._has_end
+        if self._at == self._end:
+            found = find_chunk(self._file, self._last_at + 1, at + 1, self._end, self._limits)
+            place, is_chunk = found if found is not None else (self._end, False)
+            if is_chunk:
+                self._at = place
+            elif not self._has_end:
+                self._at, self._end, self._is_over = max(place, at), place, True
         return Gap(at, self._at, why)
 
     def _cut(self, what: str) -> Item:
-        if self._has_end or self._bound(self._at) != self._file.size:
+        if self._has_end or self._bound(self._at) != self._end:
             return self._gap(f"a record ends before {what} does")
         return End(self._at, How.CUT)
 
     def _overlong(self, opcode: int, length: int, bound: int) -> Item:
-        if self._has_end or bound != self._file.size or opcode not in _KINDS:
+        if self._has_end or bound != self._end or opcode not in _KINDS:
             return self._gap(f"a record (kind {opcode:#04x}) of {length} bytes does not fit")
         return End(self._at, How.CUT)
 
@@ -355,7 +366,7 @@ class Walk:
             end, differs = outer_end, ""
         elif inner_end <= bound and head.crc:
             end, differs = inner_end, f"its record says {length} bytes"
-        elif not self._has_end and bound == self._file.size and outer_end == inner_end:
+        elif not self._has_end and bound == self._end and outer_end == inner_end:
             self._at, self._is_over = self._end, True
             return Chunk(at, body_at, head, None, fault, is_cut=True)
         else:
@@ -372,7 +383,7 @@ class Walk:
     ) -> Item:
         at = self._at
         if index is None and outer_end > bound:
-            return self._cut("its fields") if bound == self._file.size else self._gap(why)
+            return self._cut("its fields") if bound == self._end else self._gap(why)
         end = outer_end if index is None else min(at + index.length, bound)
         messages, index_fault = self._message_indexes(end, index)
         return Chunk(at, at, None, index, why, "", False, messages, index_fault)
