@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, BinaryIO, Final, Self, cast
@@ -305,8 +306,10 @@ def open_video(path: Path, limits: Limits) -> Video:
 
     Raises:
         LogFormatError: It is cut or damaged, has no video, or no times.
-        LogError: It cannot be opened.
+        LogError: It cannot be opened, or the extra ``video`` is not installed.
     """
+    if find_spec("av") is None:
+        raise LogError(f"{path}: reading video needs PyAV; install it with: pip install av")
     time_file = time_file_of_video(path)
     times = None if time_file is None else read_time_file(time_file, limits)
     if times is None and path.suffix.lower() in WITHOUT_TIMES:
