@@ -1,0 +1,62 @@
+"""Small landmark databases and the simulated pictures that go with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from crosscue.localization.landmark_database import LandmarkWriter, Place
+from crosscue.localization.landmark_features import Features
+from crosscue.replay.columns import Bytes, Floats
+
+
+def some_features(seed: int, count: int = 20) -> Features:
+    """Made-up descriptors of the size of ORB's."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0.0, 640.0, (count, 2)).astype(np.float32)
+    return Features(640, 480, points, rng.integers(0, 256, (count, 32), dtype=np.uint8))
+
+
+def place_at(x_m: float, y_m: float, name: str | None = None, sd_m: float = 2.0) -> Place:
+    """A landmark with a round covariance."""
+    return Place(name or f"at {x_m} {y_m}", np.array([x_m, y_m]), sd_m**2 * np.eye(2), 0.5, "made")
+
+
+def database_of(path: Path, xy_m: Floats, sd_m: float = 2.0, kind: str = "orb") -> Path:
+    """A database with made-up features at the positions of shape (N, 2), named ``0``, ``1``..."""
+    with LandmarkWriter(path, kind) as writer:
+        for i, (x, y) in enumerate(xy_m.tolist()):
+            writer.add(place_at(x, y, str(i), sd_m), some_features(i))
+    return path
+
+
+def wall(seed: int, width_px: int = 640, height_px: int = 480) -> Bytes:
+    """A simulated textured wall: random patches of all sizes, grey."""
+    rng = np.random.default_rng(seed)
+    picture = np.full((height_px, width_px), 128, np.uint8)
+    for _ in range(400):
+        x, y = int(rng.integers(0, width_px)), int(rng.integers(0, height_px))
+        w, h = (int(v) for v in rng.integers(4, 60, 2))
+        shade = int(rng.integers(0, 256))
+        cv2.rectangle(picture, (x, y), (x + w, y + h), shade, -1)
+    return picture
+
+
+def seen_from(picture: Bytes, turn_deg: float, scale: float, noise: float, seed: int) -> Bytes:
+    """The same wall from another place: warped, darker, noisy; simulated."""
+    height, width = picture.shape
+    turn = cv2.getRotationMatrix2D((width / 2, height / 2), turn_deg, scale)
+    warp = np.vstack([turn, [1e-5 * turn_deg, 5e-6 * turn_deg, 1.0]])
+    moved = cv2.warpPerspective(picture, warp, (width, height), borderMode=cv2.BORDER_REFLECT)
+    rng = np.random.default_rng(seed)
+    grey = 0.8 * moved.astype(np.float64) + rng.normal(10.0, noise, moved.shape)
+    return np.clip(grey, 0, 255).astype(np.uint8)
+
+
+def encoded(picture: Bytes, suffix: str = ".png") -> bytes:
+    """The picture as a file's bytes."""
+    ok, found = cv2.imencode(suffix, picture)
+    assert ok
+    return found.tobytes()
