@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final, Self, cast
 import numpy as np
 
 from crosscue.replay.columns import BLOCK_BYTES, Block, Images, Int64s, Messages, Topic
-from crosscue.replay.errors import LogFormatError
+from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, Selection
