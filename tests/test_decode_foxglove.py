@@ -234,6 +234,17 @@ def test_broken_descriptors_are_refused_in_one_line(schema: bytes, complaint: st
     assert "/cam" in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["CompressedImage", "LocationFix"])
+def test_something_else_called_a_timestamp_is_refused(name: str) -> None:
+    topic = proto_topic(name, IMAGE if name == "CompressedImage" else FIX)
+    lying = Topic(
+        topic.name, topic.type_name, "protobuf", topic.schema.replace(b"seconds", b"seconbs")
+    )
+
+    with pytest.raises(SchemaError, match="lacks the field seconds"):
+        decoder_for(lying)
+
+
 @given(raw=st.binary(max_size=80), name=st.sampled_from(["CompressedImage", "LocationFix"]))
 @QUICK
 def test_any_bytes_are_decoded_or_skipped_and_never_more(raw: bytes, name: str) -> None:

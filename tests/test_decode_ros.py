@@ -397,6 +397,11 @@ def test_columns_pass_as_they_are() -> None:
         ("uint8[0] x\n", "array x of length 0"),
         ("int32 x\n" * 30_000, "unfolds to over"),
         ("x" * (2 << 20), "over the limit"),
+        ("@a(" * 100_000 + "\n", "cannot read the line"),
+        ("string<=x y\n", "cannot read the line"),
+        ("Header h some value\n", "cannot read the line"),
+        ("int32 x\n" + "=" * 80 + "\nint32 y\n", "want 'MSG: name'"),
+        (("=" * 80 + "\n").join(["", "MSG: a/B\nint8 x\n", "MSG: a/B\nint9 x\n"]), "two different"),
     ],
 )
 def test_a_definition_that_cannot_be_is_refused_in_one_line(text: str, complaint: str) -> None:
@@ -437,6 +442,62 @@ def test_sequences_of_sequences_cannot_hold_us_up() -> None:
 
     assert len(decoded) == 0
     assert "nested items" in ledger.details[0].detail
+
+
+@pytest.mark.parametrize(
+    "idl",
+    [
+        "module a { module msg { const long X = (((1))); struct T { double x; }; }; };",
+        "module a { module msg { const long X = 1 << 99999999999; struct T { long x; }; }; };",
+        "module a { module msg { const long X = 9; const long Y = X * X; struct T { char x; }; }; "
+        "};",
+        "module a { module msg { struct T { "
+        + "sequence<" * 300
+        + "long"
+        + ">" * 300
+        + " x; }; }; };",
+        "/* never closed " * 3000,
+        "module a { module msg { struct T { double x; };",
+        "struct T { double x; };\n" * 9000,
+    ],
+)
+def test_idl_that_could_keep_us_busy_is_refused_at_once(idl: str) -> None:
+    with pytest.raises(SchemaError):
+        decoder_for(Topic("/t", "a/msg/T", "cdr", idl.encode(), "ros2idl"))
+
+
+@given(seed=SEEDS, is_cdr=st.booleans())
+@QUICK
+def test_damaged_definitions_are_refused_or_used_but_never_crash(seed: int, is_cdr: bool) -> None:
+    rng = np.random.default_rng(seed)
+    store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
+    name = str(rng.choice(["sensor_msgs/msg/Imu", "nav_msgs/msg/Path", "sensor_msgs/msg/Image"]))
+    topic = topic_of("/t", name)
+    text = bytearray(topic.schema)
+    for _ in range(int(rng.integers(1, 4))):
+        at = int(rng.integers(0, len(text)))
+        if rng.random() < 0.5:
+            text[at] = int(rng.choice(list(b"[]<=019 \n/@zZ\xff")))
+        else:
+            del text[at : at + int(rng.integers(1, 30))]
+    payloads = [serialised(store, random_message(rng, store, name), name) for _ in range(4)]
+    ledger = Ledger("made")
+    ledger.find("/t", 4)
+
+    try:
+        decoder = decoder_for(replace(topic, schema=bytes(text)))
+    except SchemaError as error:
+        assert "\n" not in str(error)  # noqa: PT017
+        return
+    assert decoder is not None
+    assert len(decoder(block_of("/t", payloads), ledger)) == ledger.topic("/t").used
+
+
+@pytest.mark.parametrize("is_cdr", [True, False])
+def test_blocks_without_messages_stay_empty(is_cdr: bool) -> None:
+    topic_of = ros2_topic if is_cdr else ros1_topic
+    for name in ("sensor_msgs/msg/Imu", "can_msgs/msg/Frame", "sensor_msgs/msg/CompressedImage"):
+        assert len(must_decode(topic_of("/t", name))(block_of("/t", []), Ledger("x"))) == 0
 
 
 def test_idl_definitions_read_the_same_as_msg() -> None:

@@ -75,7 +75,9 @@ _FIELD: Final = re.compile(
     r"(?P<array>\[(?P<most><=)?(?P<size>\d{0,10})\])?"
     r"[ \t]+(?P<name>[A-Za-z]\w*)[ \t]*(?P<rest>.*)"
 )
-_ANNOTATION: Final = re.compile(r"@\w+(?:\([^)]*\))?[ \t]*")
+_IDL_SKIP: Final = re.compile(r'/\*|//|"')
+_IDL_ANNOTATION: Final = re.compile(r"@\w{1,64}\s{0,8}\([^()]{0,4000}\)")
+_ANNOTATION: Final = re.compile(r"(?:@\w{1,64}(?:\([^)]{0,200}\))?[ \t]*){0,16}")
 
 
 def definitions_of(
@@ -126,7 +128,7 @@ def _from_msg(type_name: str, text: str) -> Definitions:
 
 def _fields_of(owner: str, body: str) -> Iterator[Field]:
     for line in body.split("\n"):
-        line = _ANNOTATION.sub("", line.strip())
+        line = _ANNOTATION.sub("", line.strip(), count=1)
         if not line or line.startswith("#"):
             continue
         match = _FIELD.fullmatch(line)
@@ -184,6 +186,7 @@ def _from_idl(type_name: str, text: str) -> Definitions:
         source = body if head.startswith("IDL:") else section
         if not source.strip():
             continue
+        _refuse_arithmetic(type_name, source)
         try:
             parsed = get_types_from_idl(source)
         except (TypesysError, RecursionError, ValueError, KeyError, AssertionError) as error:
@@ -191,6 +194,34 @@ def _from_idl(type_name: str, text: str) -> Definitions:
             raise SchemaError(f"{type_name}: IDL does not parse: {first}") from None
         found.update({name: _from_rosbags(fields) for name, (_, fields) in parsed.items()})
     return found
+
+
+def _refuse_arithmetic(type_name: str, text: str) -> None:
+    """Refuse constants that calculate.
+
+    ROS definitions have none, while brackets take the parser seconds each, and products and shifts
+    of constants can be made as large as one likes.
+    """
+    bare = _IDL_ANNOTATION.sub("", _without_comments(text))
+    for sign in ("(", "*", "<<"):
+        if sign in bare:
+            raise SchemaError(f"{type_name}: IDL calculates with {sign!r}, which is not supported")
+
+
+def _without_comments(text: str) -> str:
+    """IDL without comments and strings, in one pass."""
+    kept: list[str] = []
+    at = 0
+    for match in _IDL_SKIP.finditer(text):
+        if match.start() < at:
+            continue
+        kept.append(text[at : match.start()])
+        end = {"/*": "*/", "//": "\n", '"': '"'}[match[0]]
+        stop = text.find(end, match.end())
+        at = len(text) if stop < 0 else stop + len(end)
+        if at == len(text):
+            break
+    return "".join(kept) + text[at:]
 
 
 def _from_rosbags(fields: object) -> tuple[Field, ...]:

@@ -157,12 +157,22 @@ def _walk_type(
         if each.is_repeated:
             yield _Leaf(".".join(path) + ".length", path, "")
         elif inner is not None and inner.full_name in TIMES:
+            _check_time(inner)
             yield _Leaf(".".join(path), path, "time")
         elif inner is not None:
             if inner.full_name not in seen and len(path) < MAX_DEPTH:
                 yield from _walk_type(inner, path, (*seen, inner.full_name))
         elif each.cpp_type in _DTYPES:
             yield _Leaf(".".join(path), path, _DTYPES[each.cpp_type])
+
+
+def _check_time(descriptor: Descriptor) -> None:
+    """Refuse a descriptor that calls something else a time."""
+    wanted = (("seconds", 1, FieldDescriptor.TYPE_INT64), ("nanos", 2, FieldDescriptor.TYPE_INT32))
+    for name, number, kind in wanted:
+        each = descriptor.fields_by_name.get(name)
+        if each is None or (each.number, each.type) != (number, kind) or each.is_repeated:
+            raise SchemaError(f"{descriptor.full_name}: its descriptor lacks the field {name}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,6 +318,8 @@ def _picture_decoder(name: str, descriptor: Descriptor) -> _PictureDecoder:
                 f"{name}: its descriptor lacks the field {field_name}; "
                 "the log's definition and the type's name do not agree"
             )
+        if each.message_type is not None:
+            _check_time(each.message_type)
         numbers[each.number] = field_name
     return _PictureDecoder(PICTURES[name], numbers)
 

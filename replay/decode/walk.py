@@ -20,7 +20,7 @@ from .plan import Items, Plan, Run, Step, Text, jumped
 Bools = NDArray[np.bool_]
 Rows = NDArray[np.intp]
 
-MAX_ITEM_STEPS: Final = 200_000
+MAX_ITEM_STEPS: Final = 50_000
 """Steps that nested items of varying size may take in one block, so that no log can hang us."""
 CDR_PADDING: Final = 3
 """Bytes that may follow a CDR message to fill it up to a multiple of four."""
