@@ -216,7 +216,7 @@ def test_a_file_without_any_checksum_says_so(tmp_path: Path) -> None:
     reading = read_back(stored(tmp_path / "x.mcap", file))
 
     assert reading.count() == 1
-    assert reading.ledger.integrity == "no checksum covers 1 chunks"
+    assert reading.ledger.integrity == "no checksum covers 1 chunk"
 
 
 def selected(tmp_path: Path, is_indexed: bool) -> Path:

@@ -10,6 +10,7 @@ import pytest
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 
+from support.data import shared
 from support.mcap_files import Message, read_back
 
 PAYLOADS: Sequence[tuple[int, int, bytes]] = [
@@ -69,3 +70,14 @@ def test_every_shape_of_file_gives_the_same_messages(
         assert reading.ledger.is_whole, shape
         assert reading.adds_up(), shape
         assert reading.names == ("/t0", "/t1", "/t2"), shape
+
+
+def test_a_real_recording_gives_the_messages_that_mcap_gives() -> None:
+    recordings = sorted(shared("bags").rglob("*.mcap"))
+    assert recordings
+    for path in recordings:
+        reading = read_back(path)
+
+        assert reading.messages == by_mcap(path)
+        assert reading.ledger.is_whole
+        assert reading.adds_up()

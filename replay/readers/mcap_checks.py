@@ -71,13 +71,18 @@ class Checks:
         has_any = self.chunks_right + self.sections_right + self.summaries_right
         parts = [f"CRC-32 verified: {', '.join(right)}"] if has_any else []
         if self.chunks_bare or self.rows_bare:
-            what = [f"{self.chunks_bare} chunks"] if self.chunks_bare else []
-            what += [f"{self.rows_bare} messages outside chunks"] if self.rows_bare else []
+            what = [_many(self.chunks_bare, "chunk")] if self.chunks_bare else []
+            bare = _many(self.rows_bare, "message")
+            what += [f"{bare} outside whole chunks"] if self.rows_bare else []
             parts.append(f"no checksum covers {' and '.join(what)}")
         if self.chunks_unread:
-            parts.append(f"{self.chunks_unread} chunks not asked for and not read")
+            parts.append(f"{_many(self.chunks_unread, 'chunk')} not asked for and not read")
         if self.sections_unread:
             parts.append("the data section's checksum was not needed")
         if self.sections_wrong:
             parts.append("the data section's checksum is wrong")
         return "; ".join(parts) or "the file carries no checksums"
+
+
+def _many(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
