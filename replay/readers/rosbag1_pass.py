@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import BLOCK_ROWS, Block, Int64s, Topic
+from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Block, Bytes, Int64s, Topic
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import Selection
@@ -28,8 +28,12 @@ from .rosbag1_records import (
     tally,
 )
 
-BATCH_BYTES: Final = 512 << 10
-"""Small chunks are gathered up to this size before they become blocks; others are not copied."""
+BATCH_BYTES: Final = BLOCK_BYTES // 2
+"""Chunks are copied into buffers of this size, unless one is larger.
+
+NumPy asks the kernel for huge pages from 4 MiB on; a buffer of its own for each chunk costs more in
+page faults than the copy.
+"""
 
 OTHER_TYPE: Final = "another message type on the same topic"
 NO_CONNECTION: Final = "message of an unknown connection"
@@ -121,7 +125,7 @@ class _Checked:
 class _Batch:
     """Rows of several chunks waiting to become blocks."""
 
-    raws: list[bytes] = field(default_factory=list)
+    buffer: Bytes | None = None
     conn: list[Int64s] = field(default_factory=list)
     log_ns: list[Int64s] = field(default_factory=list)
     start: list[Int64s] = field(default_factory=list)
@@ -129,8 +133,18 @@ class _Batch:
     size: int = 0
     count: int = 0
 
+    def has_room(self, raw: bytes) -> bool:
+        """Can ``raw`` be added? An empty batch takes any size."""
+        return not self.size or (self.size + len(raw) <= BATCH_BYTES and self.count < BLOCK_ROWS)
+
     def add(self, raw: bytes, rows: ChunkRows) -> None:
-        self.raws.append(raw)
+        """Add a chunk for which there is room."""
+        content = np.frombuffer(raw, dtype=np.uint8)
+        if self.buffer is None:
+            is_large = len(raw) > BATCH_BYTES
+            self.buffer = content if is_large else np.empty(BATCH_BYTES, dtype=np.uint8)
+        if self.buffer is not content:
+            self.buffer[self.size : self.size + len(raw)] = content
         self.conn.append(rows.conn)
         self.log_ns.append(rows.log_ns)
         self.start.append(rows.start + self.size)
@@ -175,14 +189,17 @@ class Pass:
         known = sorted(self._contents.infos)
         try:
             for unit in units(self._file, self._first, known, self._limits):
+                taken = None
                 if isinstance(unit, ChunkUnit):
-                    self._chunk(unit)
+                    taken = self._chunk(unit)
                 elif isinstance(unit, Gap):
                     self._gap(unit, index_at)
                 else:
-                    self._record(unit)
-                if self._batch.size >= BATCH_BYTES or self._batch.count >= BLOCK_ROWS:
-                    yield from self._flush()
+                    taken = self._record(unit)
+                if taken is not None:
+                    if not self._batch.has_room(taken[0]):
+                        yield from self._flush()
+                    self._batch.add(*taken)
         except OSError as error:
             self._ledger.lose("", "file cannot be read on", None, str(error.strerror or error))
         yield from self._flush()
@@ -190,7 +207,8 @@ class Pass:
             self._ledger.settle(name)
         self._ledger.integrity = self._checked.words()
 
-    def _record(self, record: Record) -> None:
+    def _record(self, record: Record) -> tuple[bytes, ChunkRows] | None:
+        """Take in a record outside chunks; a message as a chunk of its own."""
         if record.op == MESSAGE:
             if record.size > self._limits.message_bytes:
                 self._ledger.lose(
@@ -199,20 +217,21 @@ class Pass:
                     1,
                     f"{record.size} bytes at byte {record.at}",
                 )
-                return
+                return None
             raw = self._file.bytes_at(record.body, record.end)
             conn, log_ns, start, stop = (
                 np.array([value], dtype=np.int64)
                 for value in (record.u32(b"conn"), record.time_ns(b"time"), 0, len(raw))
             )
-            self._batch.add(raw, ChunkRows(conn, log_ns, start, stop))
-        elif record.op == CONNECTION and record.size <= 2 * self._limits.schema_bytes:
+            return raw, ChunkRows(conn, log_ns, start, stop)
+        if record.op == CONNECTION and record.size <= 2 * self._limits.schema_bytes:
             body = self._file.bytes_at(record.body, record.end)
             connection = connection_of(record, body, self._limits.schema_bytes)
             if connection is not None:
                 self._meet(connection, is_checked=False)
         elif record.op == CHUNK_INFO and record.u64(b"chunk_pos") not in self._contents.infos:
             self._ledger.notice(f"damaged chunk info at byte {record.at}; it is only an index")
+        return None
 
     def _meet(self, connection: Connection, is_checked: bool) -> None:
         known = self._contents.connections.get(connection.conn)
@@ -258,9 +277,10 @@ class Pass:
         if not any(count > 0 for count in missing.values()):
             self._ledger.notice(f"{reason}, no message lost: {detail}")
 
-    def _chunk(self, unit: ChunkUnit) -> None:
+    def _chunk(self, unit: ChunkUnit) -> tuple[bytes, ChunkRows] | None:
+        """The records of a chunk and the messages in them, accounted for."""
         if self._is_skipped(unit):
-            return
+            return None
         size = unit.record.u32(b"size")
         where = f"chunk at byte {unit.record.at}"
         if max(size, unit.stored_stop - unit.record.body) > self._limits.chunk_bytes and (
@@ -268,7 +288,7 @@ class Pass:
         ):
             detail = f"{where}: {size} bytes, limit {self._limits.chunk_bytes}"
             self._short(unit, Counter(), TOO_LARGE, detail)
-            return
+            return None
         stop = min(unit.stored_stop, unit.record.body + self._limits.chunk_bytes)
         stored = self._file.bytes_at(unit.record.body, stop)
         inflated = inflate(unit.record.fields[b"compression"], stored, size, unit.is_framed)
@@ -278,7 +298,7 @@ class Pass:
             self._meet(connection, inflated.is_checked)
         self._count_check(unit, inflated)
         self._compare(unit, inflated, rows, where)
-        self._batch.add(inflated.raw, rows)
+        return inflated.raw, rows
 
     def _count_check(self, unit: ChunkUnit, inflated: Inflated) -> None:
         if not inflated.is_checked:
@@ -338,7 +358,7 @@ class Pass:
 
     def _flush(self) -> Iterator[Block]:
         batch, self._batch = self._batch, _Batch()
-        if not batch.count:
+        if batch.buffer is None or not batch.count:
             return
         conn = np.concatenate(batch.conn)
         names: list[str] = []
@@ -356,10 +376,9 @@ class Pass:
                 place[number] = names.index(name)
         topic = _looked_up(conn, place)
         keep = topic >= 0
-        raw = batch.raws[0] if len(batch.raws) == 1 else b"".join(batch.raws)
         columns = (np.concatenate(c) for c in (batch.log_ns, batch.start, batch.stop))
         log_ns, start, stop = (column[keep] for column in columns)
-        rows = MixedRows(np.frombuffer(raw, dtype=np.uint8), topic[keep], log_ns, start, stop)
+        rows = MixedRows(batch.buffer[: batch.size], topic[keep], log_ns, start, stop)
         yield from blocks_of(rows, names, self._selection, self._limits, self._ledger)
 
 
