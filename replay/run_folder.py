@@ -302,6 +302,8 @@ class TableSink:
             self._file.close()
             self._partial.replace(self._path)
         except OSError as error:
+            with suppress(OSError):
+                self._file.close()
             self._partial.unlink(missing_ok=True)
             raise cannot_write(self._path, error) from None
 
