@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -168,21 +169,27 @@ def mcap_package(path: Path) -> int:
         return sum(1 for _ in NonSeekingReader(stream).iter_messages(log_time_order=False))
 
 
-def bare(path: Path) -> int:
-    """Read and decompress every chunk, nothing else; on this thread."""
+def bare(path: Path, is_checked: bool = False) -> int:
+    """Read and decompress every chunk, perhaps with its checksum, nothing else; on one thread."""
     file = ByteFile(path)
     segment = find_segments(file, path, TopicBook(DEFAULT), DEFAULT)[0]
     inflater = zstandard.ZstdDecompressor()
     walk = Walk(file, segment.begin, segment.end, segment.rail, DEFAULT, Scanner())
     for item in walk:
         if isinstance(item, Chunk) and item.head is not None:
-            body = file.read(item.body_at, item.head.body_size).data
+            body: bytes | memoryview = file.read(item.body_at, item.head.body_size).data
             if item.head.compression == "zstd":
-                inflater.decompress(body)
+                body = inflater.decompress(body)
             elif item.head.compression == "lz4":
-                lz4.frame.decompress(body)
+                body = lz4.frame.decompress(body)
+            if is_checked:
+                zlib.crc32(body)
     file.close()
     return 0
+
+
+def bare_checked(path: Path) -> int:
+    return bare(path, is_checked=True)
 
 
 CASES: dict[str, Callable[[Path], int]] = {
@@ -192,6 +199,7 @@ CASES: dict[str, Callable[[Path], int]] = {
     "ours, blocks": ours,
     "ours, CAN in columns": ours_decoded,
     "bare decompression": bare,
+    "bare, with CRC-32": bare_checked,
 }
 
 

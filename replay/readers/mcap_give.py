@@ -121,7 +121,7 @@ class Giver:
             return
         number = number_of[channel]
         order = np.argsort(number, kind="stable")
-        edges = np.concatenate(([0], np.cumsum(np.bincount(number)))).tolist()
+        edges = [0, *np.cumsum(np.bincount(number)).tolist()]
         parts = [(order[edges[k] : edges[k + 1]], topic) for topic, k in numbers.items()]
         for index, topic in sorted(parts, key=lambda part: int(part[0][0])):
             yield from self._blocks(topic, rows, columns, index, ids)

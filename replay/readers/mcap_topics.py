@@ -83,6 +83,7 @@ class Declarations:
         self._schemas = {schema.id: schema for schema in schemas}
         self._channels = {channel.id: channel for channel in channels}
         self._seen: set[tuple[int, bytes]] = set()
+        self._names: dict[int, str] = {}
         self.redefined: set[int] = set()
 
     @property
@@ -124,6 +125,7 @@ class Declarations:
         key = (found.opcode, found.content)
         if key in self._seen:
             return
+        self._names.clear()
         if found.opcode == CHANNEL:
             channel = read_channel(found.content)
             if self._channels.get(channel.id, channel) != channel:
@@ -143,16 +145,20 @@ class Declarations:
 
     def declare_missing(self, channel: Channel, schema: Schema | None) -> None:
         """Take a channel and its schema from a summary, unless the data section had them."""
+        self._names.clear()
         self._channels.setdefault(channel.id, channel)
         if schema is not None:
             self._schemas.setdefault(schema.id, schema)
 
     def topic(self, channel_id: int) -> str:
         """The topic of a channel, ``UNKNOWN`` if nobody declares it."""
-        channel = self._channels.get(channel_id)
-        if channel is None:
-            return UNKNOWN
-        return self._book.name(channel, self._schemas.get(channel.schema_id))
+        if channel_id not in self._names:
+            channel = self._channels.get(channel_id)
+            if channel is None:
+                return UNKNOWN
+            schema = self._schemas.get(channel.schema_id)
+            self._names[channel_id] = self._book.name(channel, schema)
+        return self._names[channel_id]
 
     def topics(self) -> Iterator[tuple[int, str]]:
         """Every declared channel by number, with its topic."""
