@@ -15,7 +15,7 @@ from rosbags.typesys.store import Typestore
 
 from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
-from crosscue.replay.decode.fields import Fields
+from crosscue.replay.decode.fields import WalkedFields
 from crosscue.replay.decode.ros import MISFIT, WRONG_CODING, RosDecoder
 from crosscue.replay.decode.standard import Kind, generic
 from crosscue.replay.errors import SchemaError
@@ -62,6 +62,23 @@ def same_values(table: Table, messages: list[object], store: Typestore, name: st
         np.testing.assert_array_equal(table[path], want, err_msg=f"{name}: {path}")
 
 
+def same_rows(walked: Block, repeated: Block) -> None:
+    assert type(walked.rows) is type(repeated.rows)
+    if isinstance(walked.rows, Table) and isinstance(repeated.rows, Table):
+        assert walked.rows.columns.keys() == repeated.rows.columns.keys()
+        for name, column in walked.rows.columns.items():
+            assert column.dtype == repeated.rows[name].dtype
+            np.testing.assert_array_equal(column, repeated.rows[name])
+    elif isinstance(walked.rows, CanFrames) and isinstance(repeated.rows, CanFrames):
+        for name in ("arbitration_id", "is_extended", "kind", "length", "data", "is_fd"):
+            np.testing.assert_array_equal(getattr(walked.rows, name), getattr(repeated.rows, name))
+    elif isinstance(walked.rows, Images) and isinstance(repeated.rows, Images):
+        assert walked.rows.coding == repeated.rows.coding
+        assert walked.rows.pixel_format == repeated.rows.pixel_format
+        np.testing.assert_array_equal(walked.rows.bytes_.start, repeated.rows.bytes_.start)
+        np.testing.assert_array_equal(walked.rows.bytes_.stop, repeated.rows.bytes_.stop)
+
+
 @pytest.mark.parametrize(
     ("store", "topic_of"), [(ros2_store(), ros2_topic), (ros1_store(), ros1_topic)], ids=["2", "1"]
 )
@@ -80,6 +97,9 @@ def test_every_standard_type_has_the_values_that_rosbags_reads(
         assert not ledger.details, name
         assert isinstance(table, Table)
         same_values(table, messages, store, name)
+        decoder = must_decode(topic_of("/t", name))
+        twice = [decoder(block_of("/t", payloads[-1:] * 2), Ledger("made")) for _ in range(2)]
+        same_rows(*twice)
         compared += 1
     assert compared > 100
 
@@ -108,6 +128,43 @@ def test_made_up_types_have_the_values_that_rosbags_reads(seed: int, is_cdr: boo
     assert not ledger.details
     assert isinstance(decoded.rows, Table)
     same_values(decoded.rows, messages, store, name)
+
+
+@given(seed=SEEDS, is_cdr=st.booleans())
+@QUICK
+def test_a_decoder_that_knows_a_layout_says_what_one_that_walks_says(
+    seed: int, is_cdr: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    store = get_typestore(Stores.ROS2_HUMBLE if is_cdr else Stores.ROS1_NOETIC)
+    text, name = random_definition(rng, "made_msgs/Root"), "made_msgs/msg/Root"
+    store.register(get_types_from_msg(text, name))
+    topic = (ros2_topic if is_cdr else ros1_topic)("/t", name, text)
+    message = random_message(rng, store, name)
+    raw = bytes(
+        store.serialize_cdr(message, name) if is_cdr else store.serialize_ros1(message, name)
+    )
+    learned = plain(topic)
+    learned(block_of("/t", [raw]), Ledger("made"))
+    # The first bytes hold lengths more often than the rest.
+    for at in {*range(min(8, len(raw))), *rng.integers(0, max(len(raw), 1), 8).tolist()}:
+        if at >= len(raw):
+            continue
+        changed = bytearray(raw)
+        changed[at] ^= int(rng.integers(1, 256))
+        block = block_of("/t", [raw, bytes(changed), raw], gap=1)
+        ledgers = Ledger("knows"), Ledger("walks")
+
+        knows, walks = learned(block, ledgers[0]), plain(topic)(block, ledgers[1])
+
+        assert isinstance(knows.rows, Table)
+        assert isinstance(walks.rows, Table)
+        np.testing.assert_array_equal(knows.log_ns, walks.log_ns)
+        assert knows.rows.columns.keys() == walks.rows.columns.keys()
+        for column in knows.rows.columns:
+            assert knows.rows[column].dtype == walks.rows[column].dtype
+            assert knows.rows[column].tobytes() == walks.rows[column].tobytes()
+        assert ledgers[0].details == ledgers[1].details
 
 
 @given(seed=SEEDS, is_cdr=st.booleans())
@@ -216,7 +273,7 @@ def test_picking_rows_of_both_byte_orders_picks_the_same_rows() -> None:
 
     decoder = plain(ros2_topic("/i", name))
     fields, _ = decoder.walked(block_of("/i", payloads), messages_of(payloads), Ledger("made"))
-    assert isinstance(fields, Fields)
+    assert isinstance(fields, WalkedFields)
 
     np.testing.assert_array_equal(fields.number("data"), np.arange(10))
     np.testing.assert_array_equal(fields.take(keep).number("data"), [0, 3, 6, 9])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +28,48 @@ class Part:
     rows: Rows
 
 
+class Fields(Protocol):
+    """Columns of the M messages that fit their definition."""
+
+    @property
+    def plan(self) -> Plan:
+        """How their type is walked."""
+        ...
+
+    @property
+    def buffer(self) -> Bytes:
+        """All bytes, which places count in."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def number(self, path: str) -> NDArray[np.generic]:
+        """Values at ``path``, native byte order: shape (M,), or (M, k) for an array of k.
+
+        Times and durations come as int64 nanoseconds.
+        """
+        ...
+
+    def texts(self, path: str) -> tuple[str, ...]:
+        """Strings at ``path``."""
+        ...
+
+    def items(self, path: str) -> tuple[Int64s, Int64s]:
+        """First byte and number of items of the sequence at ``path``, each of shape (M,)."""
+        ...
+
+    def padded(self, path: str, width: int) -> NDArray[np.float64]:
+        """Sequences of numbers as shape (M, k), k <= ``width``, filled up with NaN."""
+        ...
+
+    def take(self, keep: Bools) -> Self:
+        """The messages picked."""
+        ...
+
+
 @dataclass(slots=True, eq=False)
-class Fields:
-    """Columns of the M messages that fit their definition.
+class WalkedFields:
+    """Columns of messages that have been walked.
 
     Attributes:
         plan: Of their type.
@@ -105,7 +145,7 @@ class Fields:
         joined = np.concatenate([of(part) for part in self.parts])
         return joined if self.order is None else joined[self.order]
 
-    def take(self, keep: Bools) -> Fields:
+    def take(self, keep: Bools) -> WalkedFields:
         """The messages picked."""
         if keep.all():
             return self
@@ -120,7 +160,7 @@ class Fields:
         order = None
         if self.order is not None:
             order = np.argsort(inverse[keep])
-        return Fields(self.plan, self.buffer, tuple(parts), order)
+        return WalkedFields(self.plan, self.buffer, tuple(parts), order)
 
 
 def _ordered(code: str, found: Found) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -14,8 +14,16 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.roles import ros2_spelling
 
 from .definition import Definitions, definitions_of, well_known
-from .fields import Fields, Part
+from .fields import Fields, Part, WalkedFields
 from .plan import Plan, plan_of
+from .repeated import (
+    LAYOUTS_KEPT,
+    MOST_BYTES,
+    Layout,
+    RepeatedFields,
+    layout_of,
+    repeats,
+)
 from .standard import Doubt, Kind, header_ns, kind_of
 from .walk import Bools, Rows, gather, walk
 
@@ -32,10 +40,12 @@ class RosDecoder:
     Attributes:
         plan: How the type is walked.
         kind: What becomes of it.
+        layouts: Layouts met, by the length of their message; None for a length that has none.
     """
 
     plan: Plan
     kind: Kind
+    layouts: dict[int, Layout | None] = field(default_factory=dict)
 
     def __call__(self, block: Block, ledger: Ledger) -> Block:
         """Decode; messages that do not fit are skipped in ``ledger`` with reason and time."""
@@ -54,6 +64,38 @@ class RosDecoder:
 
         The others are skipped in ``ledger`` with reason and time.
         """
+        repeated = self._repeated(messages)
+        if repeated is not None:
+            return repeated, np.arange(len(messages))
+        fields, kept = self._walked(block, messages, ledger)
+        if len(kept):
+            self._learn(messages, int(kept[-1]))
+        return fields, kept
+
+    def _repeated(self, messages: Messages) -> RepeatedFields | None:
+        """The messages without a walk, if they all repeat a layout met before."""
+        if not len(messages):
+            return None
+        size = messages.stop - messages.start
+        layout = self.layouts.get(int(size[0]))
+        if layout is None or not (size == size[0]).all():
+            return None
+        rows = repeats(layout, messages)
+        if rows is None:
+            return None
+        return RepeatedFields(self.plan, layout, rows, messages.buffer, messages.start)
+
+    def _learn(self, messages: Messages, i: int) -> None:
+        raw = messages.payload(i)[:MOST_BYTES].tobytes()
+        size = int(messages.stop[i] - messages.start[i])
+        is_big = self.plan.is_cdr and raw[1] == 0
+        has_room = size in self.layouts or len(self.layouts) < LAYOUTS_KEPT
+        if size == len(raw) and has_room and not is_big:
+            self.layouts[size] = layout_of(self.plan, raw)
+
+    def _walked(
+        self, block: Block, messages: Messages, ledger: Ledger
+    ) -> tuple[WalkedFields, Rows]:
         parts, rows = [], []
         for little, index in self._by_order(block, messages, ledger):
             whole = len(index) == len(messages)
@@ -68,7 +110,7 @@ class RosDecoder:
         if len(parts) > 1:
             order = np.argsort(kept, kind="stable")
             kept = kept[order]
-        return Fields(self.plan, messages.buffer, tuple(parts), order), kept
+        return WalkedFields(self.plan, messages.buffer, tuple(parts), order), kept
 
     def _by_order(
         self, block: Block, messages: Messages, ledger: Ledger

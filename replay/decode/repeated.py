@@ -1,0 +1,230 @@
+"""The short way for messages that repeat one layout, as nearly all of a topic do.
+
+When all messages of a block have the length of one that was walked before, and agree with it in
+every byte that decides where things lie (lengths of strings and sequences) and in every string,
+then every field lies where it lay there, and nothing needs to be walked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Bytes, Int64s, Messages
+
+from .plan import Items, Plan, Run, Step, Text
+from .walk import Bools
+
+MOST_BYTES: Final = 4096
+"""Longer messages are few, and copying them whole would cost more than walking them."""
+MOST_ITEMS: Final = 64
+LAYOUTS_KEPT: Final = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where everything lies in a message, counted from its first byte.
+
+    Attributes:
+        raw: The message that it was taken from.
+        places: First byte of each value.
+        texts: First byte and length of each string.
+        sequences: First byte of the items, and number of items.
+        fixed: Ranges of bytes in which another message must agree with ``raw``.
+    """
+
+    raw: bytes
+    places: Mapping[str, int]
+    texts: Mapping[str, tuple[int, int]]
+    sequences: Mapping[str, tuple[int, int]]
+    fixed: tuple[tuple[int, int], ...]
+
+
+def layout_of(plan: Plan, raw: bytes) -> Layout | None:
+    """The layout of a little-endian message that the walk has accepted.
+
+    None for a message that is empty or long, or has many items of varying size.
+    """
+    if not 0 < len(raw) <= MOST_BYTES:
+        return None
+    reading = _Reading(raw, 4 if plan.is_cdr else 0, plan.is_cdr)
+    if plan.is_cdr:
+        reading.fixed.append((0, 2))
+    reading.steps(plan.steps, keep=True)
+    if reading.items > MOST_ITEMS:
+        return None
+    return Layout(
+        raw, reading.places, reading.texts, reading.sequences, tuple(_joined(reading.fixed))
+    )
+
+
+@dataclass(slots=True)
+class _Reading:
+    """One message read field by field."""
+
+    raw: bytes
+    head: int
+    is_cdr: bool
+    at: int = 0
+    items: int = 0
+    places: dict[str, int] = field(default_factory=dict)
+    texts: dict[str, tuple[int, int]] = field(default_factory=dict)
+    sequences: dict[str, tuple[int, int]] = field(default_factory=dict)
+    fixed: list[tuple[int, int]] = field(default_factory=list)
+
+    def steps(self, steps: tuple[Step, ...], *, keep: bool) -> None:
+        for step in steps:
+            if isinstance(step, Run):
+                self._run(step, keep)
+            elif isinstance(step, Text):
+                self._text(step, keep)
+            else:
+                self._sequence(step, keep)
+
+    def _run(self, run: Run, keep: bool) -> None:
+        modulo = self.at & 7
+        if keep:
+            for k, value in enumerate(run.values):
+                self.places[value.path] = self.head + self.at + int(run.place[modulo, k])
+        self.at += int(run.size[modulo])
+
+    def _length(self) -> int:
+        if self.is_cdr:
+            self.at = (self.at + 3) & -4
+        begin = self.head + self.at
+        self.at += 4
+        self.fixed.append((begin, begin + 4))
+        return int.from_bytes(self.raw[begin : begin + 4], "little")
+
+    def _text(self, text: Text, keep: bool) -> None:
+        length = self._length()
+        begin = self.head + self.at
+        self.at += length
+        self.fixed.append((begin, begin + length))
+        if keep:
+            self.texts[text.path] = (begin, length - 1 if self.is_cdr else length)
+
+    def _sequence(self, items: Items, keep: bool) -> None:
+        count = self._length() if items.count is None else items.count
+        if count and items.code and self.is_cdr:
+            width = int(items.code[1])
+            self.at = -(-self.at // width) * width
+        if keep:
+            self.sequences[items.path] = (self.head + self.at, count)
+        if items.jumps is not None:
+            for k in range(count.bit_length()):
+                if count >> k & 1:
+                    self.at += int(items.jumps[k][self.at & 7])
+            return
+        self.items += count
+        for _ in range(count):
+            if self.items > MOST_ITEMS:
+                return
+            self.steps(items.item, keep=False)
+
+
+def _joined(ranges: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    joined: list[tuple[int, int]] = []
+    for begin, end in ranges:
+        if joined and joined[-1][1] == begin:
+            joined[-1] = (joined[-1][0], end)
+        else:
+            joined.append((begin, end))
+    return joined
+
+
+def repeats(layout: Layout, messages: Messages) -> Bytes | None:
+    """All messages as rows, shape (N, bytes of one), if all repeat ``layout``; else None.
+
+    Args:
+        layout: Of a message as long as these.
+        messages: All of that length.
+    """
+    size = len(layout.raw)
+    every: NDArray[np.void] = np.ndarray(
+        (len(messages.buffer) - size + 1,), f"V{size}", messages.buffer.data, strides=(1,)
+    )
+    rows = every[messages.start].view(np.uint8).reshape(-1, size)
+    for begin, end in layout.fixed:
+        want = np.frombuffer(layout.raw, np.uint8, end - begin, begin)
+        if not (rows[:, begin:end] == want).all():
+            return None
+    return rows
+
+
+@dataclass(slots=True, eq=False)
+class RepeatedFields:
+    """Columns of messages that repeat one layout; see ``fields.Fields``.
+
+    Attributes:
+        plan: Of their type.
+        layout: Theirs.
+        rows: Shape (M, bytes of one).
+        buffer: All bytes.
+        start: Shape (M,): first byte of each message.
+    """
+
+    plan: Plan
+    layout: Layout
+    rows: Bytes
+    buffer: Bytes
+    start: Int64s
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def number(self, path: str) -> NDArray[np.generic]:
+        """Values at ``path``: shape (M,), or (M, k) for an array of k."""
+        value = self.plan.values[path]
+        at = self.layout.places[path]
+        if value.code in ("time", "duration"):
+            return self._nanoseconds(at, value.code)
+        got = self._view(at, "<" + value.code, max(value.count, 1))
+        if value.is_bool:
+            got = got.astype(np.bool_)
+        return np.ascontiguousarray(got if value.count else got[:, 0])
+
+    def _view(self, at: int, code: str, count: int) -> NDArray[np.generic]:
+        raw = self.rows[:, at : at + int(code[2]) * count]
+        view: NDArray[np.generic] = raw.view(code)
+        return view
+
+    def _nanoseconds(self, at: int, code: str) -> Int64s:
+        signed = self.plan.is_cdr or code == "duration"
+        whole = self._view(at, "<i4" if signed else "<u4", 1)[:, 0].astype(np.int64)
+        is_signed_rest = not self.plan.is_cdr and code == "duration"
+        rest = self._view(at + 4, "<i4" if is_signed_rest else "<u4", 1)[:, 0]
+        return whole * 1_000_000_000 + rest.astype(np.int64)
+
+    def text_ranges(self, path: str) -> tuple[Int64s, Int64s]:
+        """First byte and length of the string at ``path``."""
+        begin, length = self.layout.texts[path]
+        return self.start + begin, np.full(len(self), length, np.int64)
+
+    def texts(self, path: str) -> tuple[str, ...]:
+        """Strings at ``path``, which are all the same."""
+        begin, length = self.layout.texts[path]
+        return (self.layout.raw[begin : begin + length].decode("utf-8"),) * len(self)
+
+    def items(self, path: str) -> tuple[Int64s, Int64s]:
+        """First byte and number of items of the sequence at ``path``."""
+        begin, count = self.layout.sequences[path]
+        return self.start + begin, np.full(len(self), count, np.int64)
+
+    def padded(self, path: str, width: int) -> NDArray[np.float64]:
+        """Sequences of numbers as shape (M, k), k <= ``width``."""
+        begin, count = self.layout.sequences[path]
+        code = "<" + self.plan.sequences[path].code
+        return self._view(begin, code, count)[:, :width].astype(np.float64)
+
+    def take(self, keep: Bools) -> RepeatedFields:
+        """The messages picked."""
+        if keep.all():
+            return self
+        return RepeatedFields(
+            self.plan, self.layout, self.rows[keep], self.buffer, self.start[keep]
+        )
