@@ -16,7 +16,9 @@ from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.mobileye.decode import MobileyeDecoder
+from crosscue.replay.mobileye.ros import RosMobileye
 from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting
+from crosscue.replay.roles import Role, role_of
 from crosscue.replay.run_folder import RunFolder, TableSink, clear, locked, write_manifest
 from crosscue.replay.vehicle import Vehicle
 
@@ -125,30 +127,46 @@ def decode_tables(
 
 def _decoded(log: Log, vehicle: Vehicle, ledger: Ledger, selection: Selection) -> Iterator[Block]:
     topics = {topic.name: topic for topic in log.topics}
+    mobileye = _ros_mobileye(log, vehicle, ledger)
+    decoders: dict[str, Decoder | None] = {}
     buses: dict[str, tuple[list[_BlockDecoder], list[MobileyeDecoder]]] = {}
     for block in log.read(ledger, selection):
         topic = topics.get(block.topic) or _late_topic(log, block.topic)
         if isinstance(block.rows, Messages):
-            decode = _decoder(topic, ledger)
+            if block.topic not in decoders:
+                decoders[block.topic] = _decoder(topic, ledger)
+            decode = decoders[block.topic]
             if decode is None:
                 ledger.skip(block.topic, "type not understood", len(block))
                 continue
             block = decode(block, ledger)
         if isinstance(block.rows, Table) and len(block):
             yield block
+            if mobileye is not None:
+                yield from mobileye(block)
         elif isinstance(block.rows, CanFrames):
             if block.topic not in buses:
                 buses[block.topic] = _bus_decoders(block.topic, vehicle, ledger)
-            decoders, _ = buses[block.topic]
-            if not decoders:
+            of_bus, _ = buses[block.topic]
+            if not of_bus:
                 ledger.skip(block.topic, "no DBC file and no Mobileye for this bus", len(block))
-            for decoder in decoders:
-                yield from decoder(block)
+            for on_bus in of_bus:
+                yield from on_bus(block)
         elif isinstance(block.rows, Images):
             ledger.skip(block.topic, "pictures are not tables", len(block))
     for _, mobileyes in buses.values():
-        for mobileye in mobileyes:
-            yield from mobileye.flush()
+        for on_bus in mobileyes:
+            yield from on_bus.flush()
+    if mobileye is not None:
+        yield from mobileye.flush()
+
+
+def _ros_mobileye(log: Log, vehicle: Vehicle, ledger: Ledger) -> RosMobileye | None:
+    """Tables from ``mobileye_560_660_msgs``, where the log has them."""
+    types = {t.name: t.type_name for t in log.topics if role_of(t) is Role.MOBILEYE}
+    if not types:
+        return None
+    return RosMobileye("ros", types, ledger, mobileye_settings(vehicle, is_shared_bus=False))
 
 
 def _decoder(topic: Topic, ledger: Ledger) -> Decoder | None:

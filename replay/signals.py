@@ -16,7 +16,7 @@ import numpy as np
 
 from .clocks import Clock, ClockWatch, times_of
 from .columns import Block, Floats, Int64s, Table, Topic
-from .decode import decoder_for
+from .decode import Decoder, decoder_for
 from .errors import VehicleError
 from .ledger import Ledger
 from .roles import Role, role_of
@@ -242,6 +242,7 @@ class Extractor:
     ledger: Ledger
     clocks: Mapping[str, Clock] = field(default_factory=dict)
     watch: ClockWatch = field(default_factory=ClockWatch)
+    _decoders: dict[str, Decoder | None] = field(default_factory=dict)
     _buses: dict[str, BusDecoder] = field(default_factory=dict)
     _database: CanDatabase | None = None
 
@@ -254,7 +255,9 @@ class Extractor:
         if source is None:
             return
         if source.topic.encoding != "columns":
-            decode = decoder_for(source.topic)
+            if block.topic not in self._decoders:
+                self._decoders[block.topic] = decoder_for(source.topic)
+            decode = self._decoders[block.topic]
             if decode is None:
                 self.ledger.skip(block.topic, "type not understood", len(block))
                 return
