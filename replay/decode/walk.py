@@ -246,7 +246,10 @@ class Walker:
         if items.jumps is None:
             self._each(items, cursor, count)
             return
-        cursor.at = jumped(items.jumps, cursor.at, count)
+        if items.code:
+            cursor.at = cursor.at + count * int(items.code[1])
+        else:
+            cursor.at = jumped(items.jumps, cursor.at, count)
         self.refuse(cursor, cursor.at > cursor.stop, f"sequence {items.path} passes the end")
 
     def _each(self, items: Items, cursor: Cursor, count: Int64s) -> None:
