@@ -12,6 +12,8 @@ import numpy as np
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.run_folder import write_whole
 
+from .chi_square import mean_band
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -136,17 +138,13 @@ def _heading(axes: Axes, poses: ScoredPoses) -> None:
 
 
 def _nees(axes: Axes, poses: ScoredPoses) -> None:
-    low, high = NEES_BAND_3
+    low, high = mean_band(3, 1)
     axes.axhspan(low, high, color=BAND, alpha=0.2, lw=0, label="95 % band of chi-square(3)")
     axes.plot(poses.seconds, poses.nees, color=ESTIMATE, lw=1.0, label="NEES of x, y, heading")
     axes.set_yscale("log")
     axes.set_xlim(0.0, float(poses.seconds[-1]))
     axes.set_xlabel("time (s)")
     axes.legend(frameon=False)
-
-
-NEES_BAND_3: Final = (0.2158, 9.3484)
-"""2.5 % and 97.5 % points of the chi-square distribution with three degrees of freedom."""
 
 
 def _major_axis(axes: Axes, poses: ScoredPoses, lost_above_m: float) -> None:
