@@ -15,14 +15,15 @@ passed since the last one that counted: the source's compass of variance r every
 
 Long drives go in windows: hand each call's ``TrackState`` to the next. Headings and wanted rows
 later than the odometry given so far wait in it, and the track is the same, bit for bit, as in one
-piece. A landmark found meanwhile is weighed in by ``replace(state, belief=...)``.
+piece. ``Looks`` are let in at times of their own (a camera's frames) to weigh landmarks in.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,18 +192,46 @@ class HeadingColumns:
 
     Attributes:
         t_ns: Shape (N,), int64.
+        heading_rad: Shape (N,): as measured.
+        var_rad2: Shape (N,): of the measurement.
         innovation_rad: Shape (N,): measured less expected, wrapped.
         nis: Shape (N,): normalised innovation squared, chi-square with one degree of freedom.
         outcome: Shape (N,), uint8: ``ACCEPTED`` or ``REJECTED`` by the gate.
     """
 
     t_ns: Int64s
+    heading_rad: Floats
+    var_rad2: Floats
     innovation_rad: Floats
     nis: Floats
     outcome: NDArray[np.uint8]
 
     def __len__(self) -> int:
         return len(self.t_ns)
+
+
+class Looks(Protocol):
+    """What weighs in at given times whatever it finds there."""
+
+    def times_ns(self) -> Sequence[int]:
+        """When to be asked, in order; those later than the odometry are not asked this time."""
+        ...
+
+    def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
+        """The posterior at the belief's time, or None where there is nothing to weigh in."""
+        ...
+
+
+class NoLooks:
+    """Nothing to look for."""
+
+    def times_ns(self) -> Sequence[int]:
+        """Never."""
+        return ()
+
+    def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
+        """Nothing."""
+        return None
 
 
 class Advance(NamedTuple):
@@ -212,6 +241,9 @@ class Advance(NamedTuple):
     poses: PoseColumns
     headings: HeadingColumns
     counts: TrackCounts
+
+
+NO_LOOKS: Final = NoLooks()
 
 
 def start_belief(
@@ -236,6 +268,7 @@ def advance(
     settings: TrackSettings,
     headings: Headings = NO_HEADINGS,
     rows_ns: Int64s | None = None,
+    looks: Looks = NO_LOOKS,
 ) -> Advance:
     """Drive along the increments, weighing in headings by time.
 
@@ -246,6 +279,8 @@ def advance(
         headings: The window's compass readings in any order; those later than the odometry wait.
         rows_ns: Shape (M,): times at which rows are wanted. None: after every interval. Make the
             same choice in every window.
+        looks: Asked at their times, after headings; rows made after every interval are made after
+            a look that found something, too.
 
     Returns:
         The state for the next window, the rows, what became of each heading that reached the
@@ -255,7 +290,7 @@ def advance(
     wanted = None
     if rows_ns is not None:
         wanted = np.sort(np.concatenate([state.waiting_rows_ns, rows_ns]))
-    run = _Run(state, settings, headings, wanted)
+    run = _Run(state, settings, headings, wanted, looks)
     for start, stop, *interval in zip(
         increments.start_ns.tolist(),
         increments.stop_ns.tolist(),
@@ -278,7 +313,12 @@ class _Run:
     """One call of ``advance`` under way."""
 
     def __init__(
-        self, state: TrackState, settings: TrackSettings, headings: Headings, rows: Int64s | None
+        self,
+        state: TrackState,
+        settings: TrackSettings,
+        headings: Headings,
+        rows: Int64s | None,
+        looks: Looks,
     ) -> None:
         self.settings = settings
         self.t_ns = state.belief.t_ns
@@ -301,12 +341,15 @@ class _Run:
         self.every_interval = rows is None
         self.rows = NO_TIMES if rows is None else rows[rows >= self.t_ns]
         self.row_times = self.rows.tolist()
+        self.looks = looks
+        self.look_times = [t for t in looks.times_ns() if t >= self.t_ns]
+        self.next_look = 0
         self.next_heading = 0
         self.next_row = 0
         self.event_ns = 0
         self.poses: list[tuple[float, ...]] = []
         self.pose_times: list[int] = []
-        self.used: list[tuple[int, float, float, int]] = []
+        self.used: list[tuple[int, float, float, float, float, int]] = []
         self.tally = dict.fromkeys((f.name for f in fields(TrackCounts)), 0)
         self.tally["headings_bad"] = int((~usable).sum())
         self.tally["headings_late"] = int(late.sum())
@@ -373,23 +416,38 @@ class _Run:
                 self._handle_events()
 
     def _handle_events(self) -> None:
-        """Take what falls on the present time: headings first, so that rows show them."""
+        """Take what falls on the present time: rows last, so that they show the rest."""
         rows = self.heading_rows
         while self.next_heading < len(rows) and rows[self.next_heading][0] == self.t_ns:
             self._weigh_heading(*rows[self.next_heading][1:])
             self.next_heading += 1
+        while (
+            self.next_look < len(self.look_times) and self.look_times[self.next_look] == self.t_ns
+        ):
+            self._look()
+            self.next_look += 1
         while self.next_row < len(self.row_times) and self.row_times[self.next_row] == self.t_ns:
             self._keep_row()
             self.next_row += 1
         self._find_event()
 
+    def _look(self) -> None:
+        found = self.looks.weigh(unpacked(self.t_ns, self.state), self.travelled_m)
+        if found is None:
+            return
+        self.state = packed(found)
+        if self.every_interval:
+            self._keep_row()
+
     def _find_event(self) -> None:
-        heading_ns, row_ns = _NEVER, _NEVER
+        heading_ns, row_ns, look_ns = _NEVER, _NEVER, _NEVER
         if self.next_heading < len(self.heading_rows):
             heading_ns = self.heading_rows[self.next_heading][0]
         if self.next_row < len(self.row_times):
             row_ns = self.row_times[self.next_row]
-        self.event_ns = min(heading_ns, row_ns)
+        if self.next_look < len(self.look_times):
+            look_ns = self.look_times[self.next_look]
+        self.event_ns = min(heading_ns, row_ns, look_ns)
 
     def _weigh_heading(self, heading_rad: float, var_rad2: float) -> None:
         self.tally["headings"] += 1
@@ -400,7 +458,7 @@ class _Run:
         nis = innovation * innovation / (self.state[HEADING_VARIANCE] + var_rad2)
         gate = self.settings.heading_gate_nis
         outcome = ACCEPTED if gate is None or nis <= gate else REJECTED
-        self.used.append((self.t_ns, innovation, nis, outcome))
+        self.used.append((self.t_ns, heading_rad, var_rad2, innovation, nis, outcome))
         if outcome == REJECTED:
             self.tally["headings_rejected"] += 1
             return
@@ -417,6 +475,9 @@ class _Run:
         return gone_m >= settings.heading_interval_m and passed_s >= settings.heading_interval_s
 
     def _keep_row(self) -> None:
+        if self.every_interval and self.pose_times and self.pose_times[-1] == self.t_ns:
+            self.pose_times.pop()
+            self.poses.pop()
         x, y, heading, speed, xx, xy, xh, _, yy, yh, _, hh, _, _ = self.state
         self.pose_times.append(self.t_ns)
         axis = axis_of(xx, xy, yy)
@@ -424,7 +485,7 @@ class _Run:
 
     def result(self) -> Advance:
         poses = np.array(self.poses).reshape(-1, 12)
-        used = np.array(self.used, dtype=np.float64).reshape(-1, 4)
+        used = np.array(self.used, dtype=np.float64).reshape(-1, 6)
         state = TrackState(
             belief=unpacked(self.t_ns, self.state),
             travelled_m=self.travelled_m,
@@ -441,7 +502,9 @@ class _Run:
             np.array([t for t, *_ in self.used], np.int64),
             used[:, 1],
             used[:, 2],
-            used[:, 3].astype(np.uint8),
+            used[:, 3],
+            used[:, 4],
+            used[:, 5].astype(np.uint8),
         )
         return Advance(state, columns, headings, TrackCounts(**self.tally))
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from .clocks import Clock, ClockWatch, times_of
-from .columns import Block, Floats, Int64s, Table, Topic
+from .columns import Block, Floats, Images, Int64s, Table, Topic
 from .decode import Decoder, decoder_for
 from .errors import VehicleError
 from .ledger import Ledger
@@ -223,6 +223,25 @@ def _plan_heading(planner: _Planner) -> None:
         planner.choose(place, Signal.COURSE)
 
 
+def camera_of(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> tuple[int, Topic] | None:
+    """The camera: the topic that the vehicle file names, or the only one; None where there is none.
+
+    Raises:
+        VehicleError: The named one is not there, or several could be meant.
+    """
+    return _Planner(topics, vehicle).only(Role.CAMERA, vehicle.topics.camera, "topics.camera")
+
+
+def with_pictures(planned: Plan, camera: tuple[int, Topic]) -> Plan:
+    """The same plan, with the camera's pictures read as well; see ``Extractor.on_pictures``."""
+    log, topic = camera
+    return replace(planned, sources=(*planned.sources, Source(log, topic, ())))
+
+
+def _no_pictures(block: Block) -> None:
+    """Let them pass."""
+
+
 @dataclass(slots=True)
 class Extractor:
     """Blocks of one log to samples; keeps what a bus needs from block to block.
@@ -234,6 +253,7 @@ class Extractor:
         ledger: Where skips are told.
         clocks: From a topic to the clock whose times its samples carry; the log's where none is.
         watch: Sees every block, decoded.
+        on_pictures: Given every block of ``Images``, its ``log_ns`` on the clock chosen.
     """
 
     planned: Plan
@@ -242,6 +262,7 @@ class Extractor:
     ledger: Ledger
     clocks: Mapping[str, Clock] = field(default_factory=dict)
     watch: ClockWatch = field(default_factory=ClockWatch)
+    on_pictures: Callable[[Block], None] = _no_pictures
     _decoders: dict[str, Decoder | None] = field(default_factory=dict)
     _buses: dict[str, BusDecoder] = field(default_factory=dict)
     _database: CanDatabase | None = None
@@ -270,6 +291,8 @@ class Extractor:
         if role_of(source.topic) is Role.CAN:
             yield from self._from_can(block, source)
             return
+        if isinstance(block.rows, Images):
+            self.on_pictures(block)
         for signal in source.signals:
             yield from _FROM_TABLE[signal](block, self.ledger)
 
