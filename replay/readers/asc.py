@@ -77,6 +77,8 @@ _EVENT: Final = re.compile(
 )
 _ERROR: Final = re.compile(r"(\S+)\s+ErrorFrame(?:\s.*)?", re.IGNORECASE)
 _FD_ERROR: Final = re.compile(r"CANFD\s+(\S+)\s+[RT]x\s+ErrorFrame(?:\s.*)?", re.IGNORECASE)
+_SECOND: Final = re.compile(r"\d[.,]\d{1,9}\s+(?:CANFD\s+)?\S+\s(?:.*\s)?[RT]x\s")
+_CONTROL: Final = re.compile(r"[\x00-\x08\x0e-\x1f]")
 _IDENTIFIER: Final = re.compile(r"([0-9A-Fa-f]{1,10})([xX]?)")
 _TWO_HEX: Final = re.compile(r"[0-9A-Fa-f]{2}")
 NOT_UNDERSTOOD: Final = "line not understood"
@@ -106,8 +108,8 @@ class Asc(Dialect):
         self._base, self._is_relative, self._start_ns = 16, False, 0
         self._has_date = self._has_header = False
         self._last_ns = 0
-        self._blocks: list[str] = []
-        self._other_dates = False
+        self._block = ""
+        self._other_dates = self._has_events = False
         for raw in head.splitlines():
             line = raw.decode("latin-1").strip().removeprefix("\xef\xbb\xbf")
             if found := _HEADER_BASE.fullmatch(line):
@@ -121,7 +123,7 @@ class Asc(Dialect):
         """Data frames in hexadecimal, CAN FD included."""
         if self._base != 16:
             return NOTHING_FAST
-        line = clean_lines(lines)
+        line = _single(lines, clean_lines(lines))
         if not len(line):
             return NOTHING_FAST
         head = next_fields(lines, lines.start[line], lines.stop[line], 6)
@@ -178,10 +180,13 @@ class Asc(Dialect):
             ledger.notice("a trigger block states another date than the header, which is used")
         if self._is_relative and not ledger.is_whole:
             ledger.notice("times are relative to the line before: each lost line shifts later ones")
-        if self._blocks and self._blocks[-1] == _BEGINS:
+        if self._block == _BEGINS:
             ledger.lose("", "no 'End TriggerBlock': the log may be cut", None)
+        elif not self._block and not self._has_events:
+            ledger.lose("", "a header and nothing after it: the log may be cut", None)
 
     def _stretch(self, t_ns: Int64s) -> Int64s:
+        self._has_events |= len(t_ns) > 0
         if self._is_relative and len(t_ns):
             t_ns = np.cumsum(t_ns) + self._last_ns
             self._last_ns = int(t_ns[-1])
@@ -189,7 +194,7 @@ class Asc(Dialect):
 
     def _note(self, mark: Mark) -> None:
         if mark.tag:
-            self._blocks = [mark.tag]
+            self._block = mark.tag
         if mark.origin_ns is None:
             return
         if mark.tag != _BEGINS or not self._has_date:
@@ -214,6 +219,8 @@ class Asc(Dialect):
         return Damage(NOT_UNDERSTOOD)
 
     def _timed(self, t_ns: int, rest: str) -> Outcome:
+        if _CONTROL.search(rest) or _SECOND.search(rest):
+            return Damage("control characters or two lines in one")
         if _EVENT.fullmatch(rest):
             return Other("event that is no CAN frame", t_ns)
         if found := _FD_ERROR.fullmatch(rest) or _ERROR.fullmatch(rest):
@@ -310,6 +317,18 @@ def _date_ns(text: str) -> int | None:
     except ValueError:
         return None
     return int(start.timestamp()) * NANOS + int((found[6] or "0").ljust(9, "0"))
+
+
+def _single(lines: Lines, line: Int64s) -> Int64s:
+    """Without the lines that hold ``Rx`` or ``Tx`` twice, as two lines run together do."""
+    begin, end = int(lines.start[0]), int(lines.stop[-1])
+    text = lines.buffer[begin:end]
+    # "R" and "T" differ in two bits, which are masked out.
+    is_way = (text[1:] == ord("x")) & ((text[:-1] & 0xF9) == (ord("R") & ord("T")))
+    at = np.flatnonzero(is_way) + begin
+    first = np.searchsorted(at, lines.start[line])
+    twice = np.append(at, [end, end])[np.minimum(first + 1, len(at))] < lines.stop[line]
+    return line[~twice] if bool(twice.any()) else line
 
 
 def _is_fd(lines: Lines, word: Field) -> Bools:

@@ -35,7 +35,7 @@ from .blf_objects import (
     chain_of,
     rows_of,
 )
-from .can_rows import BUSES_MAX, FrameRows, blocks_by_bus, bus_name, bus_topic
+from .can_rows import BUSES_MAX, FrameRows, blocks_by_bus, bus_name, bus_topic, keep_memory
 
 _HEADER: Final = struct.Struct("<4sL8BQQLL8H8H")
 _HEADER_MAX: Final = 4096
@@ -129,6 +129,7 @@ class BlfLog:
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """All frames, a stretch of containers at a time; see ``Log.read``."""
+        keep_memory()
         reading = _Pass(self._path, self._header, self._limits, self._names)
         try:
             for rows in reading.rows():

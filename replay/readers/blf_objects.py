@@ -28,8 +28,8 @@ BASE_BYTES: Final = 16
 CONTAINER: Final = 10
 RESTORE_POINT: Final = 115
 """Not counted by the file header."""
-TYPE_MAX: Final = 1000
-"""No type known is above 200."""
+TYPE_MAX: Final = 255
+"""No type known is above 150."""
 _PLACES_KEPT: Final = 5
 _SIGNATURE: Final = int.from_bytes(MAGIC, "little")
 _EXTENDED: Final = 0x80000000
@@ -250,7 +250,7 @@ def rows_of(stream: Bytes, start: Int64s, start_ns: int, tally: Tally, place: st
             found = _kind_rows(padded, start[is_kind], body, types, start_ns, tally, place)
             rows = joined(rows, found)
     for kind, count in zip(*np.unique(type_[~is_frame], return_counts=True), strict=True):
-        if kind > TYPE_MAX:
+        if not 0 < kind <= TYPE_MAX:
             tally.damage("object of impossible type", f"{place}, type {kind}")
             tally.counted -= int(count)
         elif kind != RESTORE_POINT:

@@ -164,24 +164,53 @@ class Field(NamedTuple):
 
 _ONES: Final = np.uint64(0x0101010101010101)
 _HIGHS: Final = _ONES * np.uint64(0x80)
-_EXCLAMATION: Final = _ONES * np.uint64(0x21)
+_ONE: Final = np.uint64(1)
 _TO_HIGH: Final = _ONES * np.uint64(0x80 - 0x21)
+_SEVEN: Final = np.uint64(7)
+_FIFTY_SIX: Final = np.uint64(56)
+_PLACES: Final = np.uint64(0x0001020304050607)
+"""Times ``1 << 8 * k``, its highest byte is ``k``."""
+_TO_BITS: Final = np.uint64(0x0102040810204080)
+"""Times eight bytes of 0 or 1, its highest byte holds those bits, the first one lowest."""
+_BITMAP_WORDS: Final = 6
+_IN_BITMAP: Final = np.uint64((1 << 8 * _BITMAP_WORDS) - 1)
 _STEPS_MAX: Final = 64
 
 
 def next_fields(lines: Lines, at: Int64s, limit: Int64s, count: int) -> list[Field]:
     """The next ``count`` words of lines, from ``at`` on and before ``limit``.
 
-    Eight characters are looked at in one step (Warren, Hacker's Delight, 6-1). Anything up to the
+    One bit for each of the next characters says whether it belongs to a word; words are then found
+    in that number with the lowest-bit tricks of Warren, Hacker's Delight, 2-1. Anything up to the
     blank counts as a gap, so lines with other control characters must be kept out, by
     ``clean_lines``.
     """
+    inside = _bitmap(lines.words, at)
     fields = []
+    past = at
     for _ in range(count):
-        start = _seek(lines.words, at, limit, _word_bits)
-        at = _seek(lines.words, start, limit, _gap_bits)
-        fields.append(Field(start, at))
+        begin = inside & (~inside + _ONE)
+        before = begin - _ONE
+        outside = ~(inside | before) & _IN_BITMAP
+        done = (outside & (~outside + _ONE)) - _ONE
+        inside &= ~done
+        start, stop = at + np.bitwise_count(before), at + np.bitwise_count(done)
+        if not bool(outside.all()):
+            open_ = np.flatnonzero(outside == 0)
+            start[open_] = _seek(lines.words, past[open_], limit[open_], _word_bits)
+            stop[open_] = _seek(lines.words, start[open_], limit[open_], _gap_bits)
+        past = np.minimum(stop, limit)
+        fields.append(Field(np.minimum(start, limit), past))
     return fields
+
+
+def _bitmap(words: Words, at: Int64s) -> Words:
+    """Bit k says whether character ``at + k`` is no gap, for the next 48 characters."""
+    bits = np.zeros(len(at), np.uint64)
+    for k in range(_BITMAP_WORDS):
+        eight = ((_word_bits(words[at + 8 * k]) >> _SEVEN) * _TO_BITS) >> _FIFTY_SIX
+        bits |= eight << np.uint64(8 * k)
+    return bits
 
 
 def skip_gap(lines: Lines, at: Int64s, limit: Int64s) -> Int64s:
@@ -189,37 +218,37 @@ def skip_gap(lines: Lines, at: Int64s, limit: Int64s) -> Int64s:
     return _seek(lines.words, at, limit, _word_bits)
 
 
-def _gap_bits(word: Words) -> Words:
-    """The lowest set bit marks the first character that is a gap."""
-    bits: Words = (word - _EXCLAMATION) & ~word & _HIGHS
-    return bits
-
-
 def _word_bits(word: Words) -> Words:
-    """The lowest set bit marks the first character that is none."""
-    bits: Words = ((word + _TO_HIGH) | word) & _HIGHS
+    """The high bit of every character that is no gap."""
+    bits: Words = (((word & ~_HIGHS) + _TO_HIGH) | word) & _HIGHS
     return bits
+
+
+def _gap_bits(word: Words) -> Words:
+    """The high bit of every character that is a gap."""
+    return _word_bits(word) ^ _HIGHS
 
 
 def _seek(words: Words, at: Int64s, limit: Int64s, bits_of: Callable[[Words], Words]) -> Int64s:
-    step = _first_byte(bits_of(words[at]))
-    found: Int64s = np.minimum(at + step, limit)
-    open_ = np.flatnonzero((step == 8) & (found < limit))
+    """The first place from ``at`` on that ``bits_of`` marks, or ``limit``."""
+    bits = bits_of(words[at])
+    found: Int64s = at + _index(bits & (~bits + _ONE))
+    open_ = np.flatnonzero(bits == 0)
     for _ in range(_STEPS_MAX):
         if not len(open_):
-            return found
-        further = found[open_]
-        step = _first_byte(bits_of(words[further]))
-        found[open_] = np.minimum(further + step, limit[open_])
-        open_ = open_[(step == 8) & (found[open_] < limit[open_])]
+            return np.minimum(found, limit)
+        further = found[open_] + 8
+        bits = bits_of(words[np.minimum(further, limit[open_])])
+        found[open_] = further + _index(bits & (~bits + _ONE))
+        open_ = open_[(bits == 0) & (further < limit[open_])]
     found[open_] = limit[open_]
-    return found
+    return np.minimum(found, limit)
 
 
-def _first_byte(bits: Words) -> Int64s:
-    below: NDArray[np.uint8] = np.bitwise_count((bits & (~bits + np.uint64(1))) - np.uint64(1))
-    first: Int64s = (below >> 3).astype(np.int64)
-    return first
+def _index(bit: Words) -> Int64s:
+    """Which character's high bit this is; 0 for none."""
+    index: Int64s = (((bit >> _SEVEN) * _PLACES) >> _FIFTY_SIX).view(np.int64)
+    return index
 
 
 def clean_lines(lines: Lines) -> Int64s:

@@ -32,6 +32,7 @@ from .can_rows import (
     bus_name,
     bus_topic,
     joined,
+    keep_memory,
     widened,
 )
 from .digits import Bools, payload8, payload64, spaced8
@@ -191,6 +192,7 @@ class TextCanLog:
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """All frames, chunk by chunk; see ``Log.read``."""
+        keep_memory()
         scribe = _Scribe(self._dialect(), self._names, ledger)
         size = self._path.stat().st_size
         try:
@@ -258,10 +260,8 @@ class _Scribe:
     def _lines(self, lines: Lines) -> FrameRows:
         fast = self.dialect.fast(lines)
         rows = self._renamed(fast)
-        is_odd = lines.stop > lines.start
-        is_odd[rows.place] = False
         odd = _Odd()
-        for i in np.flatnonzero(is_odd).tolist():
+        for i in _left_over(lines, rows):
             line = lines.text(i)
             outcome = self.dialect.slow(line) if len(line) <= LINE_MAX else Damage("line too long")
             if isinstance(outcome, Damage) and outcome.taints and i > 0:
@@ -335,6 +335,8 @@ class _Scribe:
         rows = fast.rows
         if not len(rows):
             return rows
+        if len(fast.names) == 1 and self._code(fast.names[0]) == 0:
+            return rows
         uses = np.bincount(rows.bus, minlength=len(fast.names)).tolist()
         named = zip(fast.names, uses, strict=True)
         codes = np.array([self._code(name) if used else -1 for name, used in named], np.int64)
@@ -349,6 +351,16 @@ class _Scribe:
                 return -1
             self._names[name] = len(self._names)
         return self._names[name]
+
+
+def _left_over(lines: Lines, rows: FrameRows) -> list[int]:
+    """The lines that are neither blank nor among ``rows``."""
+    if len(rows) == len(lines):
+        return []
+    is_odd = lines.stop > lines.start
+    is_odd[rows.place] = False
+    left: list[int] = np.flatnonzero(is_odd).tolist()
+    return left
 
 
 class _Odd:

@@ -51,6 +51,8 @@ from .digits import (
 
 HASH: Final = ord("#")
 BLANK: Final = ord(" ")
+_BYTE: Final = np.uint64(0xFF)
+_FIVE_BYTES: Final = np.uint64(40)
 ERROR_FLAG: Final = 0x20000000
 NOT_A_FRAME: Final = "line is not a candump frame"
 _TIME_WIDTHS: Final = 12
@@ -116,17 +118,26 @@ class Candump(Dialect):
         t_ns, ok = seconds_ns(buffer, words, lines.start[shape.line] + 1, shape.close)
         identifier, id_ok = hexadecimal(words, hash_, shape.id_digits)
         is_long = shape.id_digits == 8
-        ok &= id_ok & (identifier <= np.where(is_long, 0x3FFFFFFF, 0x7FF))
         payload, payload_ok = payloads(lines, shape.text, shape.length, shape.is_fd, None)
         name_start = shape.close + 2
         bus, spelled = labels(words, name_start, hash_ - shape.id_digits - 1 - name_start)
-        is_name = np.array([IS_INTERFACE.fullmatch(one) is not None for one in spelled] + [False])
-        ok &= payload_ok & is_name[bus]
-        is_error = (identifier & ERROR_FLAG) != 0
+        ok &= id_ok & payload_ok
+        if not all(IS_INTERFACE.fullmatch(one) for one in spelled) or int(bus.min(initial=0)) < 0:
+            is_name = [IS_INTERFACE.fullmatch(one) is not None for one in spelled]
+            ok &= np.array([*is_name, False])[bus]
+        kind = np.zeros(len(hash_), np.uint8)
+        if bool(is_long.any()):
+            ok &= identifier <= np.where(is_long, 0x3FFFFFFF, 0x7FF)
+            is_error = (identifier & ERROR_FLAG) != 0
+            kind[is_error] = ERROR
+            is_long &= ~is_error
+            identifier &= 0x1FFFFFFF
+        else:
+            ok &= identifier <= 0x7FF
         frames = CanFrames(
-            (identifier & 0x1FFFFFFF).astype(np.uint32),
-            is_long & ~is_error,
-            np.where(is_error, ERROR, DATA).astype(np.uint8),
+            identifier.astype(np.uint32),
+            is_long,
+            kind,
             shape.length.astype(np.uint8),
             payload,
             shape.is_fd,
@@ -167,20 +178,30 @@ class _Shaped:
 
 def _shaped(lines: Lines) -> _Shaped:
     line, hash_ = _first_hash(lines)
-    buffer = lines.buffer
+    buffer, words = lines.buffer, lines.words
     start, stop = lines.start[line], lines.stop[line]
     close = _closing_bracket(lines, start)
-    id_digits = np.where(buffer[hash_ - 4] == BLANK, 3, 8)
-    name_count = hash_ - id_digits - 1 - (close + 2)
-    ok = (buffer[start] == ord("(")) & (close > start) & (buffer[close + 1] == BLANK)
-    ok &= (buffer[hash_ - id_digits - 1] == BLANK) & (name_count > 0) & (name_count <= LABEL_MAX)
-    is_fd = buffer[hash_ + 1] == HASH
-    is_flag = is_hex(buffer[hash_ + 2])
-    text = hash_ + 1 + 2 * is_fd
-    digits = stop - 2 * _has_direction(lines, stop) - text
+    around = words[hash_ - 4]
+    is_short = (around & _BYTE) == BLANK
+    id_digits = np.where(is_short, 3, 8)
+    ok = is_short | (buffer[hash_ - 9] == BLANK) if not bool(is_short.all()) else is_short
+    name_count = hash_ - id_digits - (close + 3)
+    ok = ok & (buffer[start] == ord("(")) & (close > start) & (buffer[close + 1] == BLANK)
+    ok &= (name_count > 0) & (name_count <= LABEL_MAX)
+    is_fd = (around >> _FIVE_BYTES & _BYTE) == HASH
+    text = hash_ + 1
+    digits = stop - text
+    if bool((buffer[stop - 2] == BLANK).any()):
+        digits -= 2 * _has_direction(lines, stop)
+    if bool(is_fd.any()):
+        text, digits = text + 2 * is_fd, digits - 2 * is_fd
+        is_flag = is_hex(buffer[hash_ + 2])
+        fits = IS_FD_LENGTH[np.clip(digits >> 1, 0, 64)] & is_flag & (digits <= 128)
+        ok &= np.where(is_fd, fits, digits <= 16)
+    else:
+        ok &= digits <= 16
+    ok &= (digits >= 0) & ((digits & 1) == 0)
     length = digits >> 1
-    fits = np.where(is_fd, IS_FD_LENGTH[np.clip(length, 0, 64)] & is_flag, length <= 8)
-    ok &= (digits >= 0) & ((digits & 1) == 0) & (length <= 64) & fits
     if bool(ok.all()):
         return _Shaped(line, close, hash_, id_digits, text, length, is_fd)
     return _Shaped(line[ok], close[ok], hash_[ok], id_digits[ok], text[ok], length[ok], is_fd[ok])

@@ -95,6 +95,8 @@ def decimal(words: Words, stop: Int64s, count: Int64s) -> tuple[Int64s, Bools]:
         ok &= (count > 0) & (count <= 16)
     if most > 8:
         word = _filled(words[stop - 16], _KEEP_LAST, count - 8, fewest - 8, most - 8)
+        if bool((word == word[0]).all()):
+            word = word[:1]  # the leading digits of times are mostly all the same
         high, high_ok = _decimal8(word)
         value = value + high * _u(100_000_000)
         ok &= high_ok
@@ -260,12 +262,20 @@ def labels(words: Words, start: Int64s, count: Int64s) -> tuple[Int64s, tuple[by
     Returns:
         Shape (N,): which name each field holds, or -1 beyond 64 different names; and the names.
     """
-    low = words[start] & _KEEP_FIRST[np.clip(count, 0, 8)]
-    high = words[start + 8] & _KEEP_FIRST[np.clip(count - 8, 0, 8)]
     if not len(start):
         return np.zeros(0, np.int64), ()
+    fewest, most = int(count.min()), int(count.max())
+    if fewest == most:
+        low = words[start] & _KEEP_FIRST[min(max(most, 0), 8)]
+    else:
+        low = words[start] & _KEEP_FIRST[np.minimum(np.maximum(count, 0), 8)]
+    high = np.zeros(len(start), np.uint64)
+    if most > 8:
+        high = words[start + 8] & _KEEP_FIRST[np.minimum(np.maximum(count - 8, 0), 8)]
     names = [_spelled(int(low[0]), int(high[0]), int(count[0]))]
     is_first = (low == low[0]) & (high == high[0])
+    if bool(is_first.all()):
+        return np.zeros(len(start), np.int64), tuple(names)
     codes = np.where(is_first, 0, -1)
     open_ = np.flatnonzero(~is_first)
     while len(open_) and len(names) < _NAMES_MAX:

@@ -1,0 +1,115 @@
+"""Every way to write CAN frames into a file, and what a reader must make of it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.log import open_log
+from support.can_files import START_NS, Sent, asc, blf, by_bus, candump, made, read_back, trc
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One way to write frames down.
+
+    Attributes:
+        spell: From frames to a file.
+        suffix: Of the file.
+        fd: It can hold CAN FD frames.
+        buses: It names buses.
+        tells_end: It shows whether its end is missing, even after a whole line.
+        start_ns: Log time at which its clock begins.
+        step_ns: Its clock's step.
+    """
+
+    spell: Callable[[Sequence[Sent]], bytes]
+    suffix: str
+    fd: bool = True
+    buses: bool = True
+    tells_end: bool = False
+    start_ns: int = START_NS
+    step_ns: int = 1_000
+
+    def frames(self, count: int, seed: int = 1) -> list[Sent]:
+        """Frames that it can hold."""
+        frames = made(count, seed, fd=self.fd, step_ns=self.step_ns)
+        return frames if self.buses else [replace(f, bus="1") for f in frames]
+
+    def expected(self, frames: Sequence[Sent]) -> dict[str, list[Sent]]:
+        """What a reader should give."""
+        shifted = [replace(f, t_ns=f.t_ns - START_NS + self.start_ns) for f in frames]
+        return by_bus(shifted, "can{}" if self.suffix == ".log" else "can/{}")
+
+
+KINDS = {
+    "candump": Kind(candump, ".log"),
+    "asc": Kind(asc, ".asc", tells_end=True),
+    "asc-relative": Kind(lambda f: asc(f, relative=True), ".asc", tells_end=True),
+    "asc-comma": Kind(lambda f: asc(f, mark=","), ".asc", tells_end=True),
+    "trc-1.0": Kind(lambda f: trc(f, "1.0"), ".trc", fd=False, buses=False, start_ns=0),
+    "trc-1.1": Kind(lambda f: trc(f, "1.1"), ".trc", fd=False, buses=False),
+    "trc-1.2": Kind(lambda f: trc(f, "1.2"), ".trc", fd=False),
+    "trc-1.3": Kind(lambda f: trc(f, "1.3"), ".trc", fd=False),
+    "trc-2.1": Kind(trc, ".trc"),
+    "blf": Kind(blf, ".blf", tells_end=True),
+    "blf-stored": Kind(lambda f: blf(f, stored=True), ".blf", tells_end=True),
+    "blf-old": Kind(lambda f: blf(f, is_old=True), ".blf", tells_end=True, step_ns=10_000),
+    "blf-unclosed": Kind(lambda f: blf(f, is_closed=False), ".blf", tells_end=True, start_ns=0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How a damaged copy was read.
+
+    Attributes:
+        word: ``refused``, ``same``, ``told``, ``undetectable`` or, in capitals, a fault.
+        why: Numbers behind it.
+    """
+
+    word: str
+    why: str = ""
+
+    @property
+    def is_fault(self) -> bool:
+        """Something was lost or invented without a word."""
+        return self.word.isupper()
+
+
+def judge(kind: Kind, frames: Sequence[Sent], whole: bytes, copy: bytes, path: Path) -> Verdict:
+    """Read ``copy``, which is ``whole`` cut or damaged, and hold it against ``frames``."""
+    path.write_bytes(copy)
+    try:
+        open_log(path).close()
+    except CrosscueError as refused:
+        message = str(refused)
+        is_clear = "\n" not in message and path.name in message
+        return Verdict("refused" if is_clear else "UNCLEAR", message)
+    found, ledger = read_back(path)
+    sent = Counter((f.arbitration_id, f.payload) for f in frames)
+    read = Counter((f.arbitration_id, f.payload) for rows in found.values() for f in rows)
+    new, lost = (read - sent).total(), (sent - read).total()
+    numbers = f"{new} new, {lost} lost, {len(frames)} sent"
+    if new > hit(kind, whole, copy) or read.total() > len(frames):
+        return Verdict("INVENTED", numbers)
+    events = len(frames) // 50 + 1 if kind.suffix == ".asc" else 0
+    if not ledger.is_whole or ledger.topic("").skipped.total() > events:
+        return Verdict("told", numbers)
+    if read.total() < len(frames):
+        # Text that ends with a whole line is a shorter log, as good as any other.
+        is_short = not kind.tells_end and whole.startswith(copy) and copy.endswith(b"\n")
+        return Verdict("undetectable" if is_short else "SILENT", numbers)
+    return Verdict("undetectable" if new or lost else "same", numbers)
+
+
+def hit(kind: Kind, whole: bytes, copy: bytes) -> int:
+    """How many frames the damage may have changed where no checksum could show it."""
+    if kind.suffix == ".blf":
+        # A span of 64 bytes touches three objects of 48 at most.
+        return 3 if kind is KINDS["blf-stored"] else 0
+    places = [k for k, (a, b) in enumerate(zip(whole, copy, strict=False)) if a != b]
+    return whole[places[0] : places[-1] + 1].count(b"\n") + 1 if places else 0
