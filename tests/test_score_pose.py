@@ -1,6 +1,7 @@
 """A run's pose against truth: what a perfect run scores, and what is refused."""
 
 import json
+import subprocess
 import warnings
 from html.parser import HTMLParser
 from pathlib import Path
@@ -196,3 +197,21 @@ def test_the_score_command_prints_json_and_refuses_a_foreign_folder(
     assert found[str(run.path)]["coverage"]["truth_poses"] == 680
     assert cli.run(["score", str(tmp_path), "--truth", str(path)]) == 1
     assert "not a run folder" in capsys.readouterr().err
+
+
+def test_the_viewer_listens_on_this_machine_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, _, _ = _scored(tmp_path)
+    commands: list[list[str]] = []
+
+    def started(command: list[str], **_: object) -> subprocess.CompletedProcess[bytes]:
+        commands.append(command)
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(subprocess, "run", started)
+
+    assert cli.run(["view", str(run.path), "--web"]) == 0
+    ((*_, bind, address, path, web),) = commands
+    assert (bind, address, web) == ("--bind", "127.0.0.1", "--serve-web")
+    assert Path(path) == run.file("drive.rrd")
