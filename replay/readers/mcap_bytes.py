@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zlib
 from pathlib import Path
 from sys import getrefcount
 from threading import Event, Lock
@@ -11,6 +10,7 @@ from typing import Final
 
 import numpy as np
 
+from crosscue.replay.checksum import crc32
 from crosscue.replay.columns import Bytes
 
 from .mcap_records import BrokenRecordError
@@ -105,7 +105,7 @@ class ByteFile:
                 return None
             if not piece:
                 return None
-            value, at = zlib.crc32(piece, value), at + len(piece)
+            value, at = crc32(piece, value), at + len(piece)
         return value
 
     def close(self) -> None:

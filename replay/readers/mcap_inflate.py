@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 
+from crosscue.replay.checksum import crc32
 from crosscue.replay.columns import Bytes
 
 from .mcap_bytes import Buffers
@@ -38,7 +38,7 @@ def inflate(body: Bytes, head: ChunkHead, buffers: Buffers) -> Bytes:
     records = _WHOLE[head.compression](body, head.size, buffers) if len(body) else body
     if len(records) != head.size:
         raise BrokenRecordError(f"decompressed to {len(records)} bytes, declared {head.size}")
-    if head.crc and zlib.crc32(records.data) != head.crc:
+    if head.crc and crc32(records.data) != head.crc:
         raise BrokenRecordError("does not match its checksum")
     return records
 
@@ -49,7 +49,7 @@ def inflate_prefix(body: Bytes, head: ChunkHead) -> Bytes:
         return body[: head.size]
     give = _zstd_prefix if head.compression == "zstd" else _lz4_prefix
     records = give(body, head.size)
-    if len(records) == head.size and head.crc and zlib.crc32(records.data) != head.crc:
+    if len(records) == head.size and head.crc and crc32(records.data) != head.crc:
         raise BrokenRecordError("does not match its checksum")
     return records
 

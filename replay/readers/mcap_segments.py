@@ -6,12 +6,12 @@ the file leads to the summary; where it does not, the file is walked from its be
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
+from crosscue.replay.checksum import crc32
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.limits import Limits
 
@@ -224,7 +224,7 @@ def _read_summary(
         raise BrokenRecordError(f"a summary of {footer_at - begin} bytes")
     raw = file.read(begin, footer_at + FOOTER_SIZE - begin).tobytes()
     records, checked = raw[: footer_at - begin], raw[: footer_at - begin + FOOTER_SIZE - 4]
-    if crc and zlib.crc32(checked) != crc:
+    if crc and crc32(checked) != crc:
         raise BrokenRecordError("the summary does not match its checksum")
     summary = _parse_summary(records, base)
     chunks = summary.chunks if crc else _confirmed(file, summary.chunks)
