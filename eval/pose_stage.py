@@ -23,8 +23,13 @@ from crosscue.replay.signals import Plan, Samples, Signal
 from crosscue.replay.vehicle import Vehicle
 from crosscue.replay.windows import Window
 
+from .landmark_stage import LandmarkStage, NoLandmarks
+
 REJECTED_SHARE: Final = 0.1
 """An honest filter refuses one reading in a thousand; above this something is wrong."""
+FRAMES_WAIT_NS: Final = 10_000_000_000
+"""Frames without odometry are kept this long."""
+FOREVER_NS: Final = int(np.iinfo(np.int64).max)
 UNKNOWN_HEADING_SD_RAD: Final = 1.8
 """About the s.d. of an angle of which nothing is known."""
 
@@ -64,10 +69,12 @@ class PoseStage:
         notices: Plain sentences about the start, for the manifest.
         odometry_counts: What became of wheel rows.
         track_counts: What became of headings and intervals.
+        landmarks: What looks for landmarks meanwhile.
     """
 
     vehicle: Vehicle
     turn: Signal | None
+    landmarks: LandmarkStage | NoLandmarks = field(default_factory=NoLandmarks)
     notices: list[str] = field(default_factory=list)
     odometry_counts: odometry.OdometryCounts = field(default_factory=odometry.OdometryCounts)
     track_counts: TrackCounts = field(default_factory=TrackCounts)
@@ -83,6 +90,7 @@ class PoseStage:
         """Rows that waited for more odometry."""
         if self._state is not None and self._last_ns is not None:
             yield from self._advance(Window(self._last_ns, self._last_ns, {}), None)
+        self.landmarks.let_go(FOREVER_NS)
 
     def doubts(self) -> list[str]:
         """What the counts say against the settings, in plain words."""
@@ -98,7 +106,11 @@ class PoseStage:
 
     def counts(self) -> dict[str, dict[str, int]]:
         """What became of every odometry row and heading, for the manifest."""
-        return {"odometry": asdict(self.odometry_counts), "track": asdict(self.track_counts)}
+        return {
+            "odometry": asdict(self.odometry_counts),
+            "track": asdict(self.track_counts),
+            "landmarks": self.landmarks.counts(),
+        }
 
     def _advance(self, window: Window, until_ns: int | None) -> Iterator[PoseColumns]:
         wheels = window.samples.get(Signal.WHEEL_SPEEDS)
@@ -106,6 +118,7 @@ class PoseStage:
         if self._state is None:
             if wheels is None:
                 self._missed(headings)
+                self.landmarks.let_go(window.end_ns)
                 return
             headings = self._start(int(wheels.t_ns[0]), headings)
         assert self._state is not None
@@ -117,9 +130,11 @@ class PoseStage:
         self._pending = step.pending
         self.odometry_counts += step.counts
         made = pose_track.advance(
-            self._state, step.increments, track_settings(self.vehicle), headings
-        )
+            self._state, step.increments, track_settings(self.vehicle), headings,
+            looks=self.landmarks,
+        )  # fmt: skip
         self._state = made.state
+        self.landmarks.let_go(window.end_ns - FRAMES_WAIT_NS)
         self.track_counts += made.counts
         if len(made.poses):
             yield made.poses

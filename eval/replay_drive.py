@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
+from crosscue.localization.landmark_database import LandmarkDatabase
 from crosscue.localization.pose_track import PoseColumns
 from crosscue.replay.clocks import Clock
+from crosscue.replay.columns import Topic
 from crosscue.replay.ledger import Ledger, TopicAccount
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.run_folder import (
@@ -23,10 +23,11 @@ from crosscue.replay.run_folder import (
     sha256_of,
     write_manifest,
 )
-from crosscue.replay.signals import Extractor, Plan, Signal, plan
+from crosscue.replay.signals import Extractor, Plan, Signal, camera_of, plan, with_pictures
 from crosscue.replay.vehicle import Vehicle
 from crosscue.replay.windows import windows
 
+from .landmark_stage import looking
 from .pose_stage import PoseStage, turn_signal_of
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ class Outcome:
         notices: Plain sentences for the person who ran it.
         seconds: Wall time.
         drive_seconds: Log time from first to last pose row.
+        landmark_counts: What became of camera frames; empty where no landmarks were given.
     """
 
     run: RunFolder
@@ -60,6 +62,7 @@ class Outcome:
     notices: tuple[str, ...]
     seconds: float
     drive_seconds: float
+    landmark_counts: dict[str, int]
 
     @property
     def exit_status(self) -> int:
@@ -73,6 +76,7 @@ def replay_drive(
     run: RunFolder,
     selection: Selection,
     on_time: Callable[[int], None] = lambda _: None,
+    landmarks: LandmarkDatabase | None = None,
 ) -> Outcome:
     """Replay one drive into an empty or to be overwritten run folder.
 
@@ -82,13 +86,18 @@ def replay_drive(
         run: Where to; locked while this works, cleared first.
         selection: Which part of the logs.
         on_time: Told the log time that has been reached, for progress.
+        landmarks: Camera frames are compared with these, where given.
 
     Raises:
         VehicleError: The vehicle file does not fit the logs.
         OutputError: The disk is full.
     """
     began = time.monotonic()
-    planned = plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
+    planned = plan(topics, vehicle)
+    camera = None if landmarks is None else camera_of(topics, vehicle)
+    if camera is not None:
+        planned = with_pictures(planned, camera)
     ledgers = tuple(Ledger(str(log.path)) for log in logs)
     selections = [_narrowed(selection, planned.topics_of(i)) for i in range(len(logs))]
     clocks = [
@@ -99,23 +108,32 @@ def replay_drive(
         Extractor(planned, vehicle, i, ledger, clocks[i]) for i, ledger in enumerate(ledgers)
     ]
     stage = PoseStage(vehicle, turn_signal_of(planned, vehicle))
+    if camera is not None and landmarks is not None:
+        stage.landmarks = looking(landmarks, vehicle, ledgers[camera[0]])
+        extractors[camera[0]].on_pictures = stage.landmarks.see
     with locked(run):
         clear(run)
         tally = _Tally()
         with TableSink(run, "pose", pose_schema()) as sink:
             for window in windows(logs, extractors, selections, planned):
                 for poses in stage(window):
-                    sink.write(pose_rows(poses))
+                    sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
                     tally.add(poses)
                 on_time(window.end_ns)
             for poses in stage.finish():
-                sink.write(pose_rows(poses))
+                sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
                 tally.add(poses)
         with TableSink(run, "skipped", skipped_schema()) as sink:
             for ledger in ledgers:
                 sink.write(skipped_rows(ledger))
         seconds = time.monotonic() - began
-        notices = (*_missing(planned), *stage.notices, *stage.doubts(), *_clock_changes(extractors))
+        notices = (
+            *_missing(planned),
+            *_no_camera(landmarks, camera),
+            *stage.notices,
+            *stage.doubts(),
+            *_clock_changes(extractors),
+        )
         write_manifest(run, {
             "versions": versions(),
             "logs": [
@@ -128,6 +146,10 @@ def replay_drive(
             "clocks": [clock_rows(extractor) for extractor in extractors],
             "accounts": [account_of(ledger) for ledger in ledgers],
             "counts": stage.counts(),
+            "landmarks": None if landmarks is None else {
+                "database": str(landmarks.path), "landmarks": len(landmarks),
+                "sha256": sha256_of(landmarks.path),
+            },
             "notices": list(notices),
             "pose": {"rows": tally.rows, "travelled_m": tally.travelled_m,
                      "major_axis_m": tally.major_axis_m},
@@ -135,7 +157,7 @@ def replay_drive(
         })  # fmt: skip
     return Outcome(
         run, ledgers, tally.rows, tally.travelled_m, tally.major_axis_m, notices,
-        seconds, tally.seconds,
+        seconds, tally.seconds, stage.landmarks.counts(),
     )  # fmt: skip
 
 
@@ -222,6 +244,12 @@ def _missing(planned: Plan) -> list[str]:
     ]
 
 
+def _no_camera(landmarks: LandmarkDatabase | None, camera: tuple[int, Topic] | None) -> list[str]:
+    if landmarks is None or camera is not None:
+        return []
+    return ["landmarks were given, but the logs have no camera: none is looked for"]
+
+
 def _narrowed(selection: Selection, planned: frozenset[str]) -> Selection:
     topics = planned if selection.topics is None else planned & selection.topics
     return Selection(topics, selection.start_ns, selection.end_ns)
@@ -244,8 +272,8 @@ def pose_schema() -> pa.Schema:
     )
 
 
-def pose_rows(poses: PoseColumns) -> dict[str, object]:
-    """Rows of ``pose.parquet``; no landmark has been weighed in."""
+def pose_rows(poses: PoseColumns, landmarks: Sequence[str | None]) -> dict[str, object]:
+    """Rows of ``pose.parquet``, with the landmark weighed in at each."""
     rows: dict[str, object] = {
         "t_ns": poses.t_ns,
         "x_m": poses.x_m,
@@ -255,7 +283,7 @@ def pose_rows(poses: PoseColumns) -> dict[str, object]:
     }
     rows |= {f"cov_{name}": poses.cov_xyh[:, i] for i, name in enumerate(COVARIANCES)}
     rows |= {"major_axis_m": poses.major_axis_m, "travelled_m": poses.travelled_m}
-    return rows | {"landmark": np.full(len(poses), None, object)}
+    return rows | {"landmark": list(landmarks)}
 
 
 def skipped_schema() -> pa.Schema:

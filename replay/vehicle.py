@@ -165,6 +165,26 @@ class Camera(Section):
     center_px: tuple[Finite, Finite] | None = None
 
 
+class Landmarks(Section):
+    """Camera pictures against a landmark database; ``crosscue fit landmarks`` writes min_score."""
+
+    matcher: str = "orb"
+    """``orb``, ``orb-essential``, or ``module:factory`` of one's own."""
+    min_score: NotNegative = 20.0
+    """Matches with a lower score are none."""
+    sigmas: Annotated[float, Field(gt=0.0, le=4.0)] = 2.0
+    """Compare with landmarks inside the ellipse of so many."""
+    most_candidates: Annotated[int, Field(ge=1)] = 50
+    gate_nis: Positive | None = 13.8
+    """Refuse matches whose normalised innovation squared is larger (one good one in a thousand)."""
+    interval_m: NotNegative = 1.0
+    """Look again once the car has gone this far."""
+    interval_s: NotNegative = 0.1
+    """And after this long."""
+    revisit_m: NotNegative = 100.0
+    """A landmark counts again once the car has gone this far: its error stays the same."""
+
+
 class Vehicle(Section):
     """A whole vehicle file."""
 
@@ -177,6 +197,7 @@ class Vehicle(Section):
     compass: Compass = Compass()
     start: Start = Start()
     camera: Camera = Camera()
+    landmarks: Landmarks = Landmarks()
     lost_above_m: Positive = 100.0
     """The pose counts as lost while the 2-sigma ellipse's full major axis exceeds this."""
 

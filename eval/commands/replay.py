@@ -12,6 +12,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+from crosscue.eval.landmark_stage import matcher_for, open_for
 from crosscue.eval.plain_text import terminal_width, visible, wrapped
 from crosscue.eval.replay_drive import Outcome, account_of, replay_drive
 from crosscue.replay.log import open_logs
@@ -28,6 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", required=True, type=Path, metavar="RUN", help="run folder"
     )
     parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="the vehicle file")
+    parser.add_argument(
+        "--landmarks", type=Path, metavar="DB",
+        help="landmark database that camera frames are compared with",
+    )  # fmt: skip
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier run")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
@@ -40,9 +45,12 @@ def run(args: argparse.Namespace) -> int:
         for log in logs:
             stack.enter_context(log)
         selection = selection_of(args, logs)
+        landmarks = None
+        if args.landmarks:
+            landmarks = stack.enter_context(open_for(args.landmarks, matcher_for(vehicle)))
         run_folder = create(args.output, overwrite=args.overwrite)
         progress = _Progress(0 if args.quiet or not sys.stderr.isatty() else first_ns(logs))
-        outcome = replay_drive(logs, vehicle, run_folder, selection, progress)
+        outcome = replay_drive(logs, vehicle, run_folder, selection, progress, landmarks)
         progress.end()
     if args.json:
         print_json(_as_json(outcome))
@@ -90,6 +98,8 @@ def summary(outcome: Outcome) -> str:
         ]
     else:
         lines.append("pose     none")
+    if outcome.landmark_counts:
+        lines.append(f"marks    {_landmarks(outcome.landmark_counts)}")
     lines += [f"  note   {sentence}" for sentence in outcome.notices]
     speed = outcome.drive_seconds / max(outcome.seconds, 1e-9)
     lines.append(f"took     {outcome.seconds:.2f} s, {speed:.0f} times real time")
@@ -97,6 +107,14 @@ def summary(outcome: Outcome) -> str:
     return "\n".join(
         wrapped(visible(line[9:]), width, lead=line[:9]) if len(line) > width else visible(line)
         for line in lines
+    )
+
+
+def _landmarks(counts: dict[str, int]) -> str:
+    looked = counts["frames"] - counts["thinned"] - counts["late"]
+    return (
+        f"{counts['accepted']} landmarks weighed in, {counts['gated']} refused by the gate; "
+        f"{counts['matched']} of {looked} frames looked at matched one"
     )
 
 
@@ -114,6 +132,7 @@ def _as_json(outcome: Outcome) -> dict[str, object]:
             "travelled_m": outcome.travelled_m,
             "major_axis_m": outcome.major_axis_m,
         },
+        "landmarks": outcome.landmark_counts,
         "notices": list(outcome.notices),
         "seconds": outcome.seconds,
     }
