@@ -15,7 +15,7 @@ from crosscue.replay.limits import Limits
 from crosscue.replay.log import Selection
 
 from .mcap_checks import Checks
-from .mcap_records import MESSAGE_FIXED, MESSAGE_HEAD, BrokenRecordError, MessageIndex
+from .mcap_records import MESSAGE_HEAD, BrokenRecordError, MessageIndex
 from .mcap_rows import Rows
 from .mcap_topics import UNKNOWN, Declarations
 
@@ -60,17 +60,18 @@ class Giver:
         for found in rows.definitions:
             try:
                 if self.declarations.changed_by(found):
+                    rows = rows.in_stored_order()
                     end = int(np.searchsorted(rows.offset, found.at))
-                    yield from self._give_part(rows, begin, end)
+                    yield from self._give_part(rows.take(slice(begin, end)))
                     begin = end
                 self.declarations.declare(found)
             except BrokenRecordError as error:
                 checks.bad_definitions.add(f"in the chunk or record at byte {at}: {error}")
-        yield from self._give_part(rows, begin, len(rows))
+        yield from self._give_part(rows.take(slice(begin, None)) if begin else rows)
 
     def lose(self, rows: Rows, reason: str, detail: str) -> None:
         """All messages of ``rows`` are lost."""
-        channels, counts = np.unique(rows.head["channel"], return_counts=True)
+        channels, counts = np.unique(rows.channel, return_counts=True)
         for channel_id, count in zip(channels.tolist(), counts.tolist(), strict=True):
             self.lose_of_channel(channel_id, reason, count, detail, None)
 
@@ -101,43 +102,48 @@ class Giver:
         if kept is None or len(kept):
             self._ledger.skip(topic, TOO_LARGE, 1, self._too_large(size, at), log)
 
-    def _give_part(self, rows: Rows, begin: int, end: int) -> Iterator[Block]:
-        if begin == end:
+    def _give_part(self, rows: Rows) -> Iterator[Block]:
+        if not len(rows):
             return
-        head, start = rows.head[begin:end], rows.offset[begin:end] + MESSAGE_HEAD.itemsize
-        channel = head["channel"].astype(np.intp)
+        rows, parts = self._by_topic(rows)
+        start = rows.offset + MESSAGE_HEAD.itemsize
+        for topic, index in parts:
+            yield from self._blocks(topic, rows, start, index)
+
+    def _by_topic(self, rows: Rows) -> tuple[Rows, list[tuple[str, NDArray[np.intp] | slice]]]:
+        """The messages of each topic in stored order, the topics in the order of their first."""
+        if rows.groups:
+            parts = {self.declarations.topic(number): part for number, part in rows.groups}
+            if len(parts) == len(rows.groups):
+                for channel_id, part in rows.groups:
+                    self.met[channel_id] += part.stop - part.start
+                names = sorted(parts, key=lambda topic: int(rows.offset[parts[topic].start]))
+                return rows, [(topic, parts[topic]) for topic in names]
+            rows = rows.in_stored_order()
+        channel = rows.channel.astype(np.intp)
         counts = np.bincount(channel)
-        ids = np.flatnonzero(counts)
         numbers: dict[str, int] = {}
         number_of = np.empty(len(counts), dtype=np.uint16)
-        for channel_id in ids.tolist():
+        for channel_id in np.flatnonzero(counts).tolist():
             self.met[channel_id] += int(counts[channel_id])
             topic = self.declarations.topic(channel_id)
             number_of[channel_id] = numbers.setdefault(topic, len(numbers))
-        stop = start + (head["length"].astype(np.int64) - MESSAGE_FIXED)
-        columns = (head["log"], head["publish"], start, stop, head["sequence"])
         if len(numbers) == 1:
-            yield from self._blocks(next(iter(numbers)), rows, columns, slice(None), ids)
-            return
+            return rows, [(next(iter(numbers)), slice(None))]
         number = number_of[channel]
         order = np.argsort(number, kind="stable")
         edges = [0, *np.cumsum(np.bincount(number)).tolist()]
-        parts = [(order[edges[k] : edges[k + 1]], topic) for topic, k in numbers.items()]
-        for index, topic in sorted(parts, key=lambda part: int(part[0][0])):
-            yield from self._blocks(topic, rows, columns, index, ids)
+        picked = [(topic, order[edges[k] : edges[k + 1]]) for topic, k in numbers.items()]
+        picked.sort(key=lambda one: int(one[1][0]))
+        return rows, list(picked)
 
     def _blocks(
-        self,
-        topic: str,
-        rows: Rows,
-        columns: tuple[Uint64s, Uint64s, Int64s, Int64s, NDArray[np.uint32]],
-        index: NDArray[np.intp] | slice,
-        ids: NDArray[np.intp],
+        self, topic: str, rows: Rows, starts: Int64s, index: NDArray[np.intp] | slice
     ) -> Iterator[Block]:
-        log, publish = columns[0][index], columns[1][index]
-        start, stop, sequence = columns[2][index], columns[3][index], columns[4][index]
+        log, publish, sequence = rows.log[index], rows.publish[index], rows.sequence[index]
+        start, stop = starts[index], rows.stop[index]
         if topic == UNKNOWN:
-            named = ", ".join(str(i) for i in ids.tolist()[:10])
+            named = ", ".join(str(i) for i in np.unique(rows.channel)[:10].tolist())
             self._ledger.lose(UNKNOWN, UNDECLARED, len(log), f"among the channels {named}")
             return
         kept = self._account(topic, log)
@@ -151,16 +157,16 @@ class Giver:
                 self._ledger.skip(topic, TOO_LARGE, 1, detail, int(log[i]))
             log, publish, start, stop = log[small], publish[small], start[small], stop[small]
             sequence = sequence[small]
-        if len(publish) and publish.max() > LATEST:
+        if len(publish) and np.maximum.reduce(publish) > LATEST:
             self._ledger.notice(f"{topic}: {NO_PUBLISH_TIME}")
             publish = np.where(publish > LATEST, log, publish)
         for i in range(0, len(log), BLOCK_ROWS):
             part = slice(i, i + BLOCK_ROWS)
             yield Block(
                 topic,
-                log[part].astype(np.int64),
+                log[part].view(np.int64),
                 Messages(rows.buffer, start[part], stop[part]),
-                publish[part].astype(np.int64),
+                publish[part].view(np.int64),
                 sequence=sequence[part],
             )
 
@@ -170,7 +176,7 @@ class Giver:
         if not self._selection.wants(topic):
             self._ledger.skip(topic, NOT_ASKED_TOPIC, len(log))
             return np.empty(0, dtype=np.intp)
-        if self._is_timeless and log.max() <= LATEST:
+        if self._is_timeless and np.maximum.reduce(log) <= LATEST:
             return None
         late = int((log > LATEST).sum())
         if late:

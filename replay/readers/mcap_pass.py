@@ -206,12 +206,11 @@ class SegmentPass:
         """
         head = chunk.head
         assert head is not None, "a chunk with rows has a head"
-        log = rows.head["log"]
         doubt = chunk.differs
         if not doubt and (head.start or head.end):
-            if not len(log):
+            if not len(rows):
                 doubt = "it declares a time span and holds no message"
-            elif not head.start <= log.min() <= log.max() <= head.end:
+            elif np.minimum.reduce(rows.log) < head.start or np.maximum.reduce(rows.log) > head.end:
                 doubt = "its messages lie outside the time span it declares"
         if head.crc or (self._segment.data_crc and self._section_is_right()):
             self._checks.chunks_right += 1
@@ -260,11 +259,10 @@ class SegmentPass:
         rows = run.rows
         if not self._segment.data_crc:
             if is_before_gap:
-                ends = rows.offset + rows.head["length"].astype(np.int64) + PREFIX.size
-                count = int(np.searchsorted(ends, rows.end - NEAR, side="right"))
+                count = int(np.searchsorted(rows.stop, rows.end - NEAR, side="right"))
                 detail = f"{self._where}up to byte {run.at + rows.end}, where records break off"
-                self._giver.lose(rows.between(count, len(rows)), BEFORE_A_GAP, detail)
-                rows = rows.between(0, count)
+                self._giver.lose(rows.take(slice(count, None)), BEFORE_A_GAP, detail)
+                rows = rows.take(slice(count))
             self._checks.rows_bare += len(rows)
         elif not self._section_is_right():
             self._giver.lose(rows, DAMAGED_SECTION, f"{self._where}records from byte {run.at} on")

@@ -272,18 +272,63 @@ def check_metadata(content: bytes | memoryview) -> None:
         entries.text()
 
 
-def overlapping_heads(buffer: Bytes, offsets: NDArray[np.int64]) -> NDArray[np.void]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Heads:
+    """What N message records say before their messages, in columns of shape (N,).
+
+    Attributes:
+        opcode: Operation code, uint8.
+        size: Bytes of the content, int64; its two highest bytes are those in ``number``.
+        number: Channel number in the upper half, uint32; the lower half is zero in a sane record.
+        channel: Channel number, uint16.
+        sequence: The sender's counter, uint32.
+        log: Log time, uint64.
+        publish: Publish time, uint64.
+    """
+
+    opcode: NDArray[np.uint8]
+    size: NDArray[np.int64]
+    number: NDArray[np.uint32]
+    channel: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
+    log: NDArray[np.uint64]
+    publish: NDArray[np.uint64]
+
+
+_BEHIND_A_BYTE: Final = np.dtype(
+    {
+        "names": ["size", "opcode", "number", "channel", "sequence", "log", "publish"],
+        "formats": ["<i8", "u1", "<u4", "<u2", "<u4", "<u8", "<u8"],
+        "offsets": [0, 1, 8, 10, 12, 16, 24],
+        "itemsize": 32,
+    }
+)
+"""A message record's head and the byte before it, which brings every field to its alignment; a
+length's upper two bytes and the channel number are read as one."""
+
+
+def heads_at(buffer: Bytes, offsets: NDArray[np.int64]) -> Heads:
     """The message heads at ``offsets``, gathered in one step.
 
     Args:
         buffer: Shape (B,), contiguous.
         offsets: Shape (N,), each at most B - 31.
-
-    Returns:
-        Shape (N,), dtype MESSAGE_HEAD.
     """
-    size = MESSAGE_HEAD.itemsize
-    if not len(offsets):
-        return np.empty(0, dtype=MESSAGE_HEAD)
-    every = np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer, strides=(1,))
-    return every[offsets].view(MESSAGE_HEAD)
+    width = _BEHIND_A_BYTE.itemsize
+    if len(buffer) < width:
+        buffer = np.concatenate((buffer, np.zeros(width, np.uint8)))
+    every = np.ndarray((len(buffer) - width + 1,), f"V{width}", buffer, strides=(1,))
+    raw = every[np.maximum(offsets - 1, 0)]
+    at_zero = (offsets == 0).nonzero()[0]  # no byte stands before these
+    if len(at_zero):
+        raw.view(np.uint8).reshape(-1, width)[at_zero, 1:] = buffer[: width - 1]
+    fields = raw.view(_BEHIND_A_BYTE)
+    return Heads(
+        fields["opcode"],
+        fields["size"] >> 16,
+        fields["number"],
+        fields["channel"],
+        fields["sequence"],
+        fields["log"],
+        fields["publish"],
+    )

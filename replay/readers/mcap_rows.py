@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 from typing import Final
 
 import numpy as np
@@ -32,7 +33,7 @@ from .mcap_records import (
     SCHEMA,
     BrokenRecordError,
     MessageIndex,
-    overlapping_heads,
+    heads_at,
 )
 from .mcap_scan import Scan, Scanner
 
@@ -59,31 +60,54 @@ class Definition:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """N messages of one buffer, in stored order.
+    """N messages of one buffer.
 
     Attributes:
         buffer: Shape (B,).
-        offset: Shape (N,), int64, ascending: where each message record begins.
-        head: Shape (N,), MESSAGE_HEAD.
+        offset: Shape (N,), int64: where each message record begins.
+        stop: Shape (N,), int64: where it ends.
+        channel: Shape (N,), uint16.
+        sequence: Shape (N,), uint32.
+        log: Shape (N,), uint64.
+        publish: Shape (N,), uint64.
         definitions: The schemas and channels between them.
         ignored: Number of records of other kinds.
         end: Where the last whole record ends.
+        groups: If filled, messages stand channel by channel, those of each channel in stored order:
+            channel numbers and where their messages are. If empty, all are in stored order.
     """
 
     buffer: Bytes
     offset: Int64s
-    head: NDArray[np.void]
+    stop: Int64s
+    channel: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
+    log: NDArray[np.uint64]
+    publish: NDArray[np.uint64]
     definitions: Sequence[Definition]
     ignored: int
     end: int
+    groups: tuple[tuple[int, slice], ...] = ()
 
     def __len__(self) -> int:
         return len(self.offset)
 
-    def between(self, begin: int, end: int) -> Rows:
-        """The messages from ``begin`` to ``end``, with all definitions."""
-        part = slice(begin, end)
-        return replace(self, offset=self.offset[part], head=self.head[part])
+    def take(self, index: slice | NDArray[np.intp]) -> Rows:
+        """Some of the messages in the order of ``index``, with all definitions."""
+        return replace(
+            self,
+            offset=self.offset[index],
+            stop=self.stop[index],
+            channel=self.channel[index],
+            sequence=self.sequence[index],
+            log=self.log[index],
+            publish=self.publish[index],
+            groups=(),
+        )
+
+    def in_stored_order(self) -> Rows:
+        """The same messages, all channels in one order."""
+        return self.take(np.argsort(self.offset, kind="stable")) if self.groups else self
 
 
 def opcodes(*codes: int) -> NDArray[np.bool_]:
@@ -100,28 +124,74 @@ NEVER_IN_A_CHUNK: Final = opcodes(
 
 def rows_by_index(buffer: Bytes, indexes: Sequence[MessageIndex]) -> Rows | None:
     """The messages of a chunk, found through its message indexes; None if these are not true."""
-    offsets = np.concatenate([index.entries["offset"] for index in indexes])
-    if not len(offsets) or offsets.max() > max(len(buffer) - MESSAGE_HEAD.itemsize, 0):
+    filled = [index for index in indexes if len(index.entries)]
+    if not filled:
         return None
-    offset = offsets.astype(np.int64)
-    channel = np.repeat([index.channel_id for index in indexes], [len(i.entries) for i in indexes])
-    log = np.concatenate([index.entries["log"] for index in indexes])
-    order = np.argsort(offset, kind="stable")
-    offset = offset[order]
-    head = overlapping_heads(buffer, offset)
-    lengths = head["length"]
+    entries = np.concatenate([index.entries.view("<u8") for index in filled]).reshape(-1, 2)
+    log, offset = entries[:, 0].copy(), entries[:, 1].astype(np.int64)
+    if np.minimum.reduce(offset) < 0:
+        return None
+    if np.maximum.reduce(offset) > len(buffer) - MESSAGE_HEAD.itemsize:
+        return None
+    head = heads_at(buffer, offset)
+    ids = np.array([index.channel_id for index in filled], dtype=np.uint32)
+    number = np.repeat(ids << 16, [len(index.entries) for index in filled])
+    stop = offset + head.size
+    stop += PREFIX.size
     if (
-        (head["opcode"] != MESSAGE).any()
-        or (head["channel"] != channel[order]).any()
-        or (head["log"] != log[order]).any()
-        or lengths.min() < MESSAGE_FIXED
-        or lengths.max() > len(buffer)
+        np.count_nonzero(head.opcode != MESSAGE)
+        or np.count_nonzero(head.number != number)
+        or np.count_nonzero(head.log != log)
+        or np.minimum.reduce(head.size) < MESSAGE_FIXED
     ):
         return None
-    begin = np.append(offset, len(buffer))
-    end = np.concatenate(([0], offset + lengths.astype(np.int64) + PREFIX.size))
-    gaps = np.flatnonzero(end != begin)
-    if len(gaps) > GAPS_WORTH_A_LOOK or (end > begin).any():
+    others = _between_messages(buffer, offset, stop)
+    if others is None:
+        return None
+    rows = Rows(
+        buffer,
+        offset,
+        stop,
+        head.channel,
+        head.sequence.copy(),
+        log,
+        head.publish.copy(),
+        *others,
+        len(buffer),
+    )
+    groups = _groups(offset, filled)
+    return replace(rows, groups=groups) if groups else rows.take(np.argsort(offset, kind="stable"))
+
+
+def _groups(offset: Int64s, filled: Sequence[MessageIndex]) -> tuple[tuple[int, slice], ...]:
+    """The messages of each channel; empty if some channel's are not in stored order."""
+    edges = [0, *accumulate(len(index.entries) for index in filled)]
+    inner = edges[1:-1]
+    turns = sum(bool(offset[edge] < offset[edge - 1]) for edge in inner)
+    if np.count_nonzero(offset[1:] < offset[:-1]) != turns:
+        return ()
+    groups = {
+        index.channel_id: slice(begin, end)
+        for index, (begin, end) in zip(filled, pairwise(edges), strict=True)
+    }
+    return tuple(groups.items()) if len(groups) == len(filled) else ()
+
+
+def _between_messages(
+    buffer: Bytes, offset: Int64s, stop: Int64s
+) -> tuple[list[Definition], int] | None:
+    """Definitions and number of other records, if with the messages they cover the buffer.
+
+    The k-th end is at most the (k+1)-th begin, for all k, exactly if no two messages overlap; so
+    begins and ends may be sorted each for itself.
+    """
+    begin, end = np.empty(len(offset) + 1, np.int64), np.empty(len(offset) + 1, np.int64)
+    begin[:-1], begin[-1] = offset, len(buffer)
+    end[1:], end[0] = stop, 0
+    begin.sort(kind="stable")
+    end.sort(kind="stable")
+    gaps = (end != begin).nonzero()[0]
+    if len(gaps) > GAPS_WORTH_A_LOOK or np.count_nonzero(end > begin):
         return None
     definitions: list[Definition] = []
     ignored = 0
@@ -133,7 +203,7 @@ def rows_by_index(buffer: Bytes, indexes: Sequence[MessageIndex]) -> Rows | None
         ignored += others[1]
         if len(definitions) + ignored > DEFINITIONS_MOST:
             return None
-    return Rows(buffer, offset, head, definitions, ignored, len(buffer))
+    return definitions, ignored
 
 
 def rows_by_scan(buffer: Bytes, scanner: Scanner, stop_at: NDArray[np.bool_], most: int) -> Rows:
@@ -159,8 +229,19 @@ def rows_by_scan(buffer: Bytes, scanner: Scanner, stop_at: NDArray[np.bool_], mo
     if len(short):  # a message that cannot hold its own fields: nothing is trusted from there on
         end = int(offset[short[0]])
         offset = offset[: short[0]]
-    definitions, ignored = _definitions(buffer, scan, end)
-    return Rows(buffer, offset, overlapping_heads(buffer, offset), definitions, ignored, end)
+        after = after[: short[0]]
+    head = heads_at(buffer, offset)
+    return Rows(
+        buffer,
+        offset,
+        after,
+        head.channel,
+        head.sequence.copy(),
+        head.log.copy(),
+        head.publish.copy(),
+        *_definitions(buffer, scan, end),
+        end,
+    )
 
 
 def _definitions(buffer: Bytes, scan: Scan, end: int) -> tuple[list[Definition], int]:
@@ -202,6 +283,7 @@ def _others(buffer: Bytes, begin: int, end: int) -> tuple[list[Definition], int]
 
 def contradicts(rows: Rows, indexes: Sequence[MessageIndex]) -> bool:
     """Does an index name a message that is not among ``rows``?"""
+    rows = rows.in_stored_order()
     for index in indexes:
         offsets = index.entries["offset"]
         if not len(offsets):
@@ -210,11 +292,10 @@ def contradicts(rows: Rows, indexes: Sequence[MessageIndex]) -> bool:
             return True
         where = np.searchsorted(rows.offset, offsets.astype(np.int64))
         where = np.minimum(where, len(rows) - 1)
-        head = rows.head[where]
         same = (
             (rows.offset[where].astype(np.uint64) == offsets)
-            & (head["channel"] == index.channel_id)
-            & (head["log"] == index.entries["log"])
+            & (rows.channel[where] == index.channel_id)
+            & (rows.log[where] == index.entries["log"])
         )
         if not same.all():
             return True
