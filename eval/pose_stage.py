@@ -30,8 +30,8 @@ REJECTED_SHARE: Final = 0.1
 FRAMES_WAIT_NS: Final = 10_000_000_000
 """Frames without odometry are kept this long."""
 FOREVER_NS: Final = int(np.iinfo(np.int64).max)
-UNKNOWN_HEADING_SD_RAD: Final = 1.8
-"""About the s.d. of an angle of which nothing is known."""
+OWN_FRAME_SD_RAD: Final = 1e-3
+"""Where the car itself lays the map's axes, its first heading is right by definition."""
 
 
 def turn_signal_of(planned: Plan, vehicle: Vehicle) -> Signal | None:
@@ -94,6 +94,8 @@ class PoseStage:
 
     def doubts(self) -> list[str]:
         """What the counts say against the settings, in plain words."""
+        if self._state is None:
+            return ["not one wheel speed in the part that was asked for, so no pose"]
         counts = self.track_counts
         judged = counts.headings_accepted + counts.headings_rejected
         if not judged or counts.headings_rejected <= REJECTED_SHARE * judged:
@@ -152,7 +154,7 @@ class PoseStage:
             )
             headings = NO_HEADINGS
         elif heading_rad is None:
-            heading_rad, sd_rad = 0.0, UNKNOWN_HEADING_SD_RAD
+            heading_rad, sd_rad = 0.0, OWN_FRAME_SD_RAD
             self.notices.append(
                 "no start heading and no compass: the map's x axis points where the car did"
             )
