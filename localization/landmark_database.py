@@ -80,6 +80,8 @@ class Place:
         """
         if not 0 < len(self.name) <= MOST_TEXT or len(self.source) > MOST_TEXT:
             raise ValueError(f"name, source: want up to {MOST_TEXT} letters, got {self.name!r}")
+        if not _is_unicode(self.name + self.source):
+            raise ValueError(f"name, source: want Unicode, got {self.name!r}, {self.source!r}")
         if self.xy_m.shape != (2,) or self.cov_m2.shape != (2, 2):
             shapes = f"{self.xy_m.shape}, {self.cov_m2.shape}"
             raise ValueError(f"landmark {self.name}: want xy_m (2,), cov_m2 (2, 2), got {shapes}")
@@ -94,6 +96,11 @@ class Place:
                 f"landmark {self.name}: covariance: want symmetric and positive definite, "
                 f"got {self.cov_m2.tolist()}"
             )
+
+
+def _is_unicode(text: str) -> bool:
+    """Surrogates, as in file names that are not UTF-8, cannot be stored."""
+    return not any("\ud800" <= c <= "\udfff" for c in text)
 
 
 def is_positive(cov_m2: Floats) -> bool:

@@ -136,6 +136,8 @@ def test_coordinates_that_are_no_numbers_are_refused() -> None:
 def test_a_nameless_landmark_and_odd_features_are_refused() -> None:
     with pytest.raises(ValueError, match="name"):
         Place("", np.zeros(2), np.eye(2))
+    with pytest.raises(ValueError, match="want Unicode"):
+        Place("\udcff", np.zeros(2), np.eye(2))
     with pytest.raises(ValueError, match=r"points_px: want \(3, 2\)"):
         Features(1, 1, np.zeros((2, 2), np.float32), np.zeros((3, 32), np.uint8))
 
