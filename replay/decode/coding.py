@@ -9,6 +9,7 @@ from crosscue.replay.columns import ImageCoding
 MAGIC_BYTES: Final = 12
 """As many first bytes as ``coding_of`` looks at."""
 
+JPEG: Final = b"\xff\xd8"
 _LABELS: Final[tuple[tuple[str, ImageCoding], ...]] = (
     ("jpeg", "jpeg"),
     ("jpg", "jpeg"),
@@ -33,7 +34,7 @@ def coding_of(first: bytes, label: str) -> ImageCoding | None:
         first: The picture's first ``MAGIC_BYTES`` bytes, or fewer.
         label: The message's ``format`` (``jpeg``, ``rgb8; jpeg compressed bgr8``).
     """
-    if first.startswith(b"\xff\xd8"):
+    if first.startswith(JPEG):
         return "jpeg"
     if first.startswith(b"\x89PNG\r\n\x1a\n"):
         return "png"

@@ -2,12 +2,13 @@
 
 When all messages of a block have the length of one that was walked before, and agree with it in
 every byte that decides where things lie (lengths of strings and sequences) and in every string,
-then every field lies where it lay there, and nothing needs to be walked.
+then every field lies where it lay there, and nothing needs to be walked. Messages that end in a
+sequence of bytes (pictures) need not have one length: what is before those bytes repeats.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -21,6 +22,8 @@ from .walk import Bools
 
 MOST_BYTES: Final = 4096
 """Longer messages are few, and copying them whole would cost more than walking them."""
+PROBE: Final = 8
+"""Bytes compared at once."""
 MOST_ITEMS: Final = 64
 LAYOUTS_KEPT: Final = 16
 
@@ -30,35 +33,65 @@ class Layout:
     """Where everything lies in a message, counted from its first byte.
 
     Attributes:
-        raw: The message that it was taken from.
+        raw: The message that it was taken from, or the part of it before the bytes at its end.
         places: First byte of each value.
         texts: First byte and length of each string.
         sequences: First byte of the items, and number of items.
-        fixed: Ranges of bytes in which another message must agree with ``raw``.
+        probes: Where another message must agree with ``raw``: first of ``PROBE`` bytes, which bits
+            of them count, and what these must be.
+        tail: Path of the bytes at the end, whose number follows in each message's last four bytes
+            of what ``raw`` covers; empty if messages are of one length.
     """
 
     raw: bytes
     places: Mapping[str, int]
     texts: Mapping[str, tuple[int, int]]
     sequences: Mapping[str, tuple[int, int]]
-    fixed: tuple[tuple[int, int], ...]
+    probes: tuple[tuple[int, np.uint64, np.uint64], ...]
+    tail: str = ""
+
+
+def tail_of(plan: Plan) -> str:
+    """Path of the sequence of bytes that a type ends in; empty if it does not."""
+    last = plan.steps[-1] if plan.steps else None
+    if not isinstance(last, Items) or last.count is not None or last.bound:
+        return ""
+    return last.path if last.code in ("u1", "i1") else ""
 
 
 def layout_of(plan: Plan, raw: bytes) -> Layout | None:
     """The layout of a little-endian message that the walk has accepted.
 
-    None for a message that is empty or long, or has many items of varying size.
+    None for a message that is tiny or long, or has many items of varying size.
+
+    Args:
+        plan: Of its type.
+        raw: The message; of a type with a tail, its first ``MOST_BYTES`` bytes are enough.
     """
-    if not 0 < len(raw) <= MOST_BYTES:
+    tail = tail_of(plan)
+    if len(raw) < PROBE or len(raw) > MOST_BYTES:
         return None
     reading = _Reading(raw, 4 if plan.is_cdr else 0, plan.is_cdr)
     if plan.is_cdr:
         reading.fixed.append((0, 2))
-    reading.steps(plan.steps, keep=True)
+    reading.steps(plan.steps[:-1] if tail else plan.steps, keep=True)
     if reading.items > MOST_ITEMS:
         return None
+    if tail:
+        fixed = tuple(reading.fixed)
+        reading.take_length()
+        size = reading.head + reading.at
+        if not PROBE <= size <= len(raw):
+            return None
+        raw, reading.fixed = raw[:size], list(fixed)
+        reading.sequences[tail] = (size, 0)
     return Layout(
-        raw, reading.places, reading.texts, reading.sequences, tuple(_joined(reading.fixed))
+        raw,
+        reading.places,
+        reading.texts,
+        reading.sequences,
+        tuple(_probes(raw, reading.fixed)),
+        tail,
     )
 
 
@@ -77,6 +110,7 @@ class _Reading:
     fixed: list[tuple[int, int]] = field(default_factory=list)
 
     def steps(self, steps: tuple[Step, ...], *, keep: bool) -> None:
+        """Take all steps; ``keep`` the places."""
         for step in steps:
             if isinstance(step, Run):
                 self._run(step, keep)
@@ -92,7 +126,8 @@ class _Reading:
                 self.places[value.path] = self.head + self.at + int(run.place[modulo, k])
         self.at += int(run.size[modulo])
 
-    def _length(self) -> int:
+    def take_length(self) -> int:
+        """Pass a 32-bit length."""
         if self.is_cdr:
             self.at = (self.at + 3) & -4
         begin = self.head + self.at
@@ -101,7 +136,7 @@ class _Reading:
         return int.from_bytes(self.raw[begin : begin + 4], "little")
 
     def _text(self, text: Text, keep: bool) -> None:
-        length = self._length()
+        length = self.take_length()
         begin = self.head + self.at
         self.at += length
         self.fixed.append((begin, begin + length))
@@ -109,7 +144,7 @@ class _Reading:
             self.texts[text.path] = (begin, length - 1 if self.is_cdr else length)
 
     def _sequence(self, items: Items, keep: bool) -> None:
-        count = self._length() if items.count is None else items.count
+        count = self.take_length() if items.count is None else items.count
         if count and items.code and self.is_cdr:
             width = int(items.code[1])
             self.at = -(-self.at // width) * width
@@ -127,33 +162,62 @@ class _Reading:
             self.steps(items.item, keep=False)
 
 
-def _joined(ranges: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    joined: list[tuple[int, int]] = []
-    for begin, end in ranges:
-        if joined and joined[-1][1] == begin:
-            joined[-1] = (joined[-1][0], end)
-        else:
-            joined.append((begin, end))
-    return joined
+def _probes(
+    raw: bytes, ranges: list[tuple[int, int]]
+) -> Iterator[tuple[int, np.uint64, np.uint64]]:
+    """As few probes as cover all ranges, which are in order."""
+    left = [at for begin, end in ranges for at in range(begin, end)]
+    while left:
+        begin = min(left[0], len(raw) - PROBE)
+        covered = [at - begin for at in left if at < begin + PROBE]
+        left = left[len(covered) :]
+        mask = bytes(0xFF if k in covered else 0 for k in range(PROBE))
+        want = bytes(a & b for a, b in zip(raw[begin : begin + PROBE], mask, strict=True))
+        yield (
+            begin,
+            np.uint64(int.from_bytes(mask, "little")),
+            np.uint64(int.from_bytes(want, "little")),
+        )
 
 
 def repeats(layout: Layout, messages: Messages) -> Bytes | None:
-    """All messages as rows, shape (N, bytes of one), if all repeat ``layout``; else None.
+    """All messages as rows, shape (N, bytes of ``layout.raw``), if all repeat it; else None.
 
     Args:
-        layout: Of a message as long as these.
-        messages: All of that length.
+        layout: Of a message as long as these, or with a tail.
+        messages: At least one.
     """
     size = len(layout.raw)
+    sizes = messages.stop - messages.start
+    if layout.tail:
+        if np.minimum.reduce(sizes) < size:
+            return None
+    elif np.count_nonzero(sizes != size):
+        return None
     every: NDArray[np.void] = np.ndarray(
         (len(messages.buffer) - size + 1,), f"V{size}", messages.buffer.data, strides=(1,)
     )
     rows = every[messages.start].view(np.uint8).reshape(-1, size)
-    for begin, end in layout.fixed:
-        want = np.frombuffer(layout.raw, np.uint8, end - begin, begin)
-        if not (rows[:, begin:end] == want).all():
+    for begin, mask, want in layout.probes:
+        found = rows[:, begin : begin + PROBE].view("<u8")[:, 0]
+        if np.count_nonzero(found & mask != want):
             return None
     return rows
+
+
+def tail_counts(layout: Layout, rows: Bytes, messages: Messages, padding: int) -> Int64s | None:
+    """Bytes in each message's tail, shape (N,), if these fill the messages; else None.
+
+    Args:
+        layout: With a tail.
+        rows: What ``repeats`` gave.
+        messages: The same.
+        padding: Bytes that may be left over.
+    """
+    counts = rows[:, -4:].view("<u4")[:, 0].astype(np.int64)
+    left = messages.stop - messages.start - len(layout.raw) - counts
+    fits = np.minimum.reduce(left) >= 0 and np.maximum.reduce(left) <= padding
+    return counts if fits else None
 
 
 @dataclass(slots=True, eq=False)
@@ -166,6 +230,8 @@ class RepeatedFields:
         rows: Shape (M, bytes of one).
         buffer: All bytes.
         start: Shape (M,): first byte of each message.
+        counts: Shape (M,): bytes in each message's tail; None without one.
+        seen: Numbers gathered already.
     """
 
     plan: Plan
@@ -173,20 +239,27 @@ class RepeatedFields:
     rows: Bytes
     buffer: Bytes
     start: Int64s
+    counts: Int64s | None = None
+    seen: dict[str, NDArray[np.generic]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def number(self, path: str) -> NDArray[np.generic]:
         """Values at ``path``: shape (M,), or (M, k) for an array of k."""
+        if path not in self.seen:
+            self.seen[path] = self._number(path)
+        return self.seen[path]
+
+    def _number(self, path: str) -> NDArray[np.generic]:
         value = self.plan.values[path]
         at = self.layout.places[path]
         if value.code in ("time", "duration"):
             return self._nanoseconds(at, value.code)
         got = self._view(at, "<" + value.code, max(value.count, 1))
-        if value.is_bool:
-            got = got.astype(np.bool_)
-        return np.ascontiguousarray(got if value.count else got[:, 0])
+        if not value.count:
+            got = got[:, 0]
+        return got != 0 if value.is_bool else got.copy()
 
     def _view(self, at: int, code: str, count: int) -> NDArray[np.generic]:
         raw = self.rows[:, at : at + int(code[2]) * count]
@@ -213,10 +286,13 @@ class RepeatedFields:
     def items(self, path: str) -> tuple[Int64s, Int64s]:
         """First byte and number of items of the sequence at ``path``."""
         begin, count = self.layout.sequences[path]
+        if path == self.layout.tail and self.counts is not None:
+            return self.start + begin, self.counts
         return self.start + begin, np.full(len(self), count, np.int64)
 
     def padded(self, path: str, width: int) -> NDArray[np.float64]:
         """Sequences of numbers as shape (M, k), k <= ``width``."""
+        assert path != self.layout.tail, "the bytes at the end are a range, not numbers"
         begin, count = self.layout.sequences[path]
         code = "<" + self.plan.sequences[path].code
         return self._view(begin, code, count)[:, :width].astype(np.float64)
@@ -225,6 +301,7 @@ class RepeatedFields:
         """The messages picked."""
         if keep.all():
             return self
+        counts = None if self.counts is None else self.counts[keep]
         return RepeatedFields(
-            self.plan, self.layout, self.rows[keep], self.buffer, self.start[keep]
+            self.plan, self.layout, self.rows[keep], self.buffer, self.start[keep], counts
         )

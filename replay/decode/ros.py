@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -23,13 +23,17 @@ from .repeated import (
     RepeatedFields,
     layout_of,
     repeats,
+    tail_counts,
+    tail_of,
 )
 from .standard import Doubt, Kind, header_ns, kind_of
-from .walk import Bools, Rows, gather, walk
+from .walk import CDR_PADDING, Bools, Rows, gather, walk
 
 CDR_BE: Final = 0x0000
 CDR_LE: Final = 0x0001
 MISFIT: Final = "does not fit its schema"
+ANY_LENGTH: Final = -1
+"""The key of the layout of messages that end in bytes."""
 WRONG_CODING: Final = "CDR representation not supported"
 
 
@@ -40,11 +44,13 @@ class RosDecoder:
     Attributes:
         plan: How the type is walked.
         kind: What becomes of it.
+        tail: Path of the bytes that the type ends in, if it does.
         layouts: Layouts met, by the length of their message; None for a length that has none.
     """
 
     plan: Plan
     kind: Kind
+    tail: str = ""
     layouts: dict[int, Layout | None] = field(default_factory=dict)
 
     def __call__(self, block: Block, ledger: Ledger) -> Block:
@@ -54,10 +60,18 @@ class RosDecoder:
         fields, kept = self.walked(block, block.rows, ledger)
         if self.kind.doubts is not None:
             good = _without_doubts(self.kind.doubts(fields), block, kept, ledger)
-            fields, kept = fields.take(good), kept[good]
+            if np.count_nonzero(good) < len(good):
+                fields, kept = fields.take(good), kept[good]
         rows = self.kind.build(fields)
         picked = block if len(kept) == len(block) else block.take(kept)
-        return replace(picked, rows=rows, header_ns=header_ns(fields))
+        return Block(
+            picked.topic,
+            picked.log_ns,
+            rows,
+            picked.publish_ns,
+            header_ns(fields),
+            picked.sequence,
+        )
 
     def walked(self, block: Block, messages: Messages, ledger: Ledger) -> tuple[Fields, Rows]:
         """Fields of the messages that fit, and which of the block they are.
@@ -76,22 +90,28 @@ class RosDecoder:
         """The messages without a walk, if they all repeat a layout met before."""
         if not len(messages):
             return None
-        size = messages.stop - messages.start
-        layout = self.layouts.get(int(size[0]))
-        if layout is None or not (size == size[0]).all():
+        layout = self.layouts.get(self._key(messages, 0))
+        rows = None if layout is None else repeats(layout, messages)
+        if layout is None or rows is None:
             return None
-        rows = repeats(layout, messages)
-        if rows is None:
-            return None
-        return RepeatedFields(self.plan, layout, rows, messages.buffer, messages.start)
+        counts = None
+        if layout.tail:
+            padding = CDR_PADDING if self.plan.is_cdr else 0
+            counts = tail_counts(layout, rows, messages, padding)
+            if counts is None:
+                return None
+        return RepeatedFields(self.plan, layout, rows, messages.buffer, messages.start, counts)
+
+    def _key(self, messages: Messages, i: int) -> int:
+        return ANY_LENGTH if self.tail else int(messages.stop[i] - messages.start[i])
 
     def _learn(self, messages: Messages, i: int) -> None:
         raw = messages.payload(i)[:MOST_BYTES].tobytes()
-        size = int(messages.stop[i] - messages.start[i])
+        key = self._key(messages, i)
         is_big = self.plan.is_cdr and raw[1] == 0
-        has_room = size in self.layouts or len(self.layouts) < LAYOUTS_KEPT
-        if size == len(raw) and has_room and not is_big:
-            self.layouts[size] = layout_of(self.plan, raw)
+        has_room = key in self.layouts or len(self.layouts) < LAYOUTS_KEPT
+        if key in (len(raw), ANY_LENGTH) and has_room and not is_big:
+            self.layouts[key] = layout_of(self.plan, raw)
 
     def _walked(
         self, block: Block, messages: Messages, ledger: Ledger
@@ -138,6 +158,8 @@ class RosDecoder:
 def _without_doubts(doubts: Iterable[Doubt], block: Block, kept: Rows, ledger: Ledger) -> Bools:
     good = np.ones(len(kept), np.bool_)
     for bad, reason in doubts:
+        if not np.count_nonzero(bad):
+            continue
         _skip(ledger, block, kept[bad & good], reason, "")
         good &= ~bad
     return good
@@ -170,4 +192,4 @@ def ros_decoder(topic: Topic) -> RosDecoder | None:
         kind.check(plan)
     except SchemaError as error:
         raise SchemaError(f"{topic.name}: {error}") from None
-    return RosDecoder(plan, kind)
+    return RosDecoder(plan, kind, tail_of(plan))

@@ -6,7 +6,7 @@ Everything else becomes a table of all its numbers under dotted names (``pose.po
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -26,10 +26,10 @@ from crosscue.replay.columns import (
 )
 from crosscue.replay.errors import SchemaError
 
-from .coding import MAGIC_BYTES, STREAMS, coding_of
+from .coding import JPEG, MAGIC_BYTES, STREAMS, coding_of
 from .fields import Fields
 from .plan import Plan
-from .walk import Bools
+from .walk import Bools, gather
 
 Decoded: TypeAlias = CanFrames | Table | Images
 Doubt: TypeAlias = tuple[Bools, str]
@@ -98,28 +98,41 @@ _CARRIED: Final = np.where(np.arange(8) < np.arange(9)[:, None], 255, 0).astype(
 
 
 def _can_frame(fields: Fields) -> CanFrames:
-    remote = fields.number("is_rtr").astype(np.bool_)
-    error = fields.number("is_error").astype(np.bool_)
-    length = np.where(remote & ~error, 0, fields.number("dlc")).astype(np.uint8)
-    payload = fields.number("data").astype(np.uint8)
-    payload &= _CARRIED[length]
+    length = fields.number("dlc").astype(np.uint8, copy=False)
+    payload = fields.number("data").astype(np.uint8, copy=False)
+    kind = _frame_kinds(fields)
+    if np.count_nonzero(kind):
+        length = np.where(kind == REMOTE, np.uint8(0), length)
+    if np.count_nonzero(length != payload.shape[1]):
+        payload = payload & _CARRIED[length]
     return CanFrames(
-        fields.number("id").astype(np.uint32),
-        fields.number("is_extended").astype(np.bool_),
-        np.where(error, ERROR, np.where(remote, REMOTE, DATA)).astype(np.uint8),
+        fields.number("id").astype(np.uint32, copy=False),
+        fields.number("is_extended").astype(np.bool_, copy=False),
+        kind,
         length,
         payload,
         np.zeros(len(fields), np.bool_),
     )
 
 
+def _frame_kinds(fields: Fields) -> NDArray[np.uint8]:
+    remote = fields.number("is_rtr").astype(np.bool_, copy=False)
+    error = fields.number("is_error").astype(np.bool_, copy=False)
+    if not np.count_nonzero(remote) and not np.count_nonzero(error):
+        return np.full(len(fields), DATA, np.uint8)
+    return np.where(error, ERROR, np.where(remote, REMOTE, DATA)).astype(np.uint8)
+
+
 def _can_doubts(fields: Fields) -> Iterator[Doubt]:
-    identifier = fields.number("id").astype(np.int64)
-    extended = fields.number("is_extended").astype(np.bool_)
-    error = fields.number("is_error").astype(np.bool_)
-    most = np.where(extended | error, 0x1FFF_FFFF, 0x7FF)
-    yield identifier > most, "identifier has more bits than its frame kind"
-    yield fields.number("dlc").astype(np.int64) > 8, "data length code over 8"
+    # As unsigned numbers, negative ones of a lying definition are too large as well.
+    identifier = fields.number("id").astype(np.int64).view(np.uint64)
+    long = identifier > 0x7FF
+    if np.count_nonzero(long):
+        extended = fields.number("is_extended").astype(np.bool_, copy=False)
+        error = fields.number("is_error").astype(np.bool_, copy=False)
+        too_long = long & ~(extended | error) | (identifier > 0x1FFF_FFFF)
+        yield too_long, "identifier has more bits than its frame kind"
+    yield fields.number("dlc").astype(np.int64).view(np.uint64) > 8, "data length code over 8"
 
 
 def _can_fd_frame(fields: Fields) -> CanFrames:
@@ -153,8 +166,14 @@ def _picture_ranges(fields: Fields) -> Messages:
     return Messages(fields.buffer, first, first + size)
 
 
-def _codings(fields: Fields) -> list[ImageCoding | None]:
+def _codings(fields: Fields) -> Sequence[ImageCoding | None]:
     pictures = _picture_ranges(fields)
+    first, size = fields.items("data")
+    if len(fields) and np.minimum.reduce(size) >= len(JPEG):
+        begins = gather(fields.buffer, "<u2", 0, first)
+        if not np.count_nonzero(begins != int.from_bytes(JPEG, "little")):
+            jpeg: ImageCoding = "jpeg"
+            return (jpeg,) * len(fields)
     return [
         coding_of(pictures.payload(i)[:MAGIC_BYTES].tobytes(), label)
         for i, label in enumerate(fields.texts("format"))
@@ -167,7 +186,9 @@ def _compressed(fields: Fields) -> Images:
 
 def _compressed_doubts(fields: Fields) -> Iterator[Doubt]:
     yield fields.items("data")[1] == 0, "empty picture"
-    yield np.array([c is None for c in _codings(fields)], np.bool_), "image coding not known"
+    codings = _codings(fields)
+    if None in codings:
+        yield np.array([c is None for c in codings], np.bool_), "image coding not known"
 
 
 def _video(fields: Fields) -> Images:
