@@ -26,6 +26,8 @@ NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 Matrix = tuple[Vector, Vector, Vector]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Polygon = Annotated[tuple[tuple[Share, Share], ...], Field(min_length=3)]
 Signal = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
 """``MESSAGE.SIGNAL`` as the DBC file spells them."""
 
@@ -163,6 +165,72 @@ class Camera(Section):
     z_m: Finite = 1.2
     focal_px: Positive | None = None
     center_px: tuple[Finite, Finite] | None = None
+    depth_bits: Annotated[int, Field(ge=8, le=16)] = 16
+    """How many bits of a 16-bit picture are in use; 12 for many cameras."""
+
+
+class Regions(Section):
+    """Where to look for road: polygons of (x, y) in shares of the picture's width and height."""
+
+    left: Polygon = ((0.0, 0.55), (0.2, 0.55), (0.2, 0.7), (0.0, 0.7))
+    straight: Polygon = ((0.44, 0.52), (0.56, 0.52), (0.6, 0.62), (0.4, 0.62))
+    right: Polygon = ((0.8, 0.55), (1.0, 0.55), (1.0, 0.7), (0.8, 0.7))
+
+
+class Cues(Section):
+    """When a detection is a cue; the numbers are the source's for Mask R-CNN."""
+
+    stop_sign_labels: tuple[str, ...] = ("stop sign",)
+    stop_sign_score: Share = 0.9
+    traffic_light_labels: tuple[str, ...] = ("traffic light",)
+    traffic_light_score: Share = 0.9
+    road_share: Share = 0.2
+    """More road than this in a region is a cue (eq. 14)."""
+
+
+class Cars(Section):
+    """Crossing and parked cars: shape, association and motion between two frames (eq. 15, 16)."""
+
+    labels: tuple[str, ...] = ("car",)
+    score: Share = 0.95
+    length_per_height: Positive = 2.0
+    """Only cars seen from the side: longer than so many times their height."""
+    area_change: Share = 0.03
+    """The same car in two frames: mask areas differ by less."""
+    position_change: Share = 0.05
+    """And positions by less than this share of the picture's width."""
+    still_change: Share = 0.002
+    """A car that moved by less than this share of the width, both ways, stood."""
+    slope: NotNegative = 0.25
+    """Horizontal motion: less than so many pixels down or up for one to the side."""
+    most_gap_s: Positive = 0.5
+    """Frames further apart are not compared."""
+
+
+class RangeCurve(Section):
+    """From an object's height in pixels to its range; ``crosscue fit ranges`` writes it."""
+
+    family: Literal["pinhole", "pinhole-offset", "power"] = "pinhole"
+    parameters: tuple[Finite, ...]
+    residual_sd_m: Positive
+
+
+class Ranges(Section):
+    """One curve for each kind of object that measures a distance."""
+
+    stop_sign: RangeCurve | None = None
+    traffic_light: RangeCurve | None = None
+
+
+class DetectorSection(Section):
+    """A detector of one's own naming."""
+
+    kind: str = "model"
+    """A detector's name, or ``module:factory``."""
+    card: str | None = None
+    """Model card, relative to the vehicle file's folder."""
+    settings: dict[str, Any] = {}
+    """For its factory, checked by it."""
 
 
 class Landmarks(Section):
@@ -198,6 +266,11 @@ class Vehicle(Section):
     start: Start = Start()
     camera: Camera = Camera()
     landmarks: Landmarks = Landmarks()
+    regions: Regions = Regions()
+    cues: Cues = Cues()
+    cars: Cars = Cars()
+    ranges: Ranges = Ranges()
+    detectors: dict[str, DetectorSection] = {}
     lost_above_m: Positive = 100.0
     """The pose counts as lost while the 2-sigma ellipse's full major axis exceeds this."""
 
@@ -216,7 +289,14 @@ def load(path: Path) -> Vehicle:
     vehicle = parse(text, str(path))
     can = vehicle.can
     files = tuple(str((path.parent / name).resolve()) for name in can.dbc)
-    return vehicle.model_copy(update={"can": can.model_copy(update={"dbc": files})})
+    detectors = {
+        name: section
+        if section.card is None
+        else section.model_copy(update={"card": str((path.parent / section.card).resolve())})
+        for name, section in vehicle.detectors.items()
+    }
+    changed = {"can": can.model_copy(update={"dbc": files}), "detectors": detectors}
+    return vehicle.model_copy(update=changed)
 
 
 def parse(text: str, where: str) -> Vehicle:
@@ -230,31 +310,33 @@ def parse(text: str, where: str) -> Vehicle:
     except tomllib.TOMLDecodeError as error:
         raise VehicleError(f"{where}: not TOML: {error}; mend that line") from None
     try:
-        return Vehicle.model_validate(_tuples(tree))
+        return Vehicle.model_validate(tuples(tree))
     except ValidationError as error:
-        raise VehicleError(_explain(error, text, where)) from None
+        raise VehicleError(explain(error, text, where)) from None
 
 
-def _tuples(value: Any) -> Any:
+def tuples(value: Any) -> Any:
+    """TOML values with tuples for lists, which strict models want."""
     if isinstance(value, dict):
-        return {key: _tuples(item) for key, item in value.items()}
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+        return {key: tuples(item) for key, item in value.items()}
+    return tuple(tuples(item) for item in value) if isinstance(value, list) else value
 
 
-def _explain(error: ValidationError, text: str, where: str) -> str:
+def explain(error: ValidationError, text: str, where: str, root: type[BaseModel] = Vehicle) -> str:
+    """One line for a file that does not fit its model: place with line, what, what to do."""
     first, *others = error.errors(include_url=False)
     keys = [str(part) for part in first["loc"]]
     more = f" (and {len(others)} more)" if others else ""
     place = f"{where}:{_line_of(keys, text)}: {'.'.join(keys)}"
     if first["type"] == "extra_forbidden":
-        return f"{place}: no such key; {_suggestion(keys)}{more}"
+        return f"{place}: no such key; {_suggestion(keys, root)}{more}"
     if first["type"] == "missing":
         return f"{place}: missing; add it{more}"
     return f"{place}: {first['msg'].lower()}, got {first['input']!r}; mend the value{more}"
 
 
-def _suggestion(keys: list[str]) -> str:
-    section: type[BaseModel] | None = Vehicle
+def _suggestion(keys: list[str], root: type[BaseModel]) -> str:
+    section: type[BaseModel] | None = root
     for key in keys[:-1]:
         section = _section_of(section, key) if section else None
     known = sorted(section.model_fields) if section else []
