@@ -28,10 +28,12 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "score": ("score", "a run against truth: metrics, figures, report"),
     "view": ("view", "a run in Rerun"),
     "fit compass": ("fit_compass", "compass mounting, hard and soft iron from a drive"),
+    "fit landmarks": ("fit_landmarks", "the match threshold for a wanted false-match rate"),
     "landmarks add": ("landmarks_add", "pictures and where they were taken into a database"),
     "landmarks list": ("landmarks_list", "what a landmark database holds"),
     "landmarks match": ("landmarks_match", "one picture against a landmark database"),
     "truth": ("truth", "write the truth that a data set carries"),
+    "simulate": ("simulate", "drives up to intersections, with camera, CAN, Mobileye and truth"),
     "demo": ("demo", "make a small drive, replay it, score it, show it"),
 }
 

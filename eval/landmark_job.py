@@ -180,7 +180,7 @@ def add_from_log(
     last: Floats | None = None
     for frame in frames:
         counts.pictures += 1
-        place = _place_at(frame.t_ns, poses, sd_m, source)
+        place = place_at(frame.t_ns, poses, sd_m, source)
         if place is None:
             counts.without_pose += 1
             continue
@@ -202,7 +202,8 @@ def add_from_log(
     return counts
 
 
-def _place_at(t_ns: int, poses: CameraPoses, sd_m: float, source: str) -> Place | None:
+def place_at(t_ns: int, poses: CameraPoses, sd_m: float, source: str) -> Place | None:
+    """The camera's place at a time, called ``source/time``; None where no pose is near."""
     after = int(np.searchsorted(poses.t_ns, t_ns))
     if after == len(poses.t_ns) or (after == 0 and poses.t_ns[0] != t_ns):
         return None
