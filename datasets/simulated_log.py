@@ -67,7 +67,7 @@ def write_drive(folder: Path, settings: DriveSettings, *, overwrite: bool = Fals
     with LogWriter(log, ledger, overwrite=overwrite) as writer:
         for topic in (BUS, GYRO, MAGNETOMETER):
             writer.add_topic(topic)
-        for block in _blocks(sensed, settings.seed):
+        for block in sensor_blocks(sensed, settings.seed):
             writer.write(block)
     shutil.copyfile(dbc_path(), folder / "simulated_car.dbc")
     write_text(folder / "vehicle.toml", vehicle_text(settings, "simulated_car.dbc"))
@@ -80,8 +80,8 @@ def write_drive(folder: Path, settings: DriveSettings, *, overwrite: bool = Fals
     )
 
 
-def _blocks(sensed: Sensed, seed: int) -> list[Block]:
-    """All rows in batches, in order of the batches' first rows."""
+def sensor_blocks(sensed: Sensed, seed: int) -> list[Block]:
+    """What the sensors said as rows of a log, in batches, in order of the batches' first rows."""
     rng = np.random.default_rng([seed, 3])
     blocks = [
         *_batches(_can_block(sensed, rng)),

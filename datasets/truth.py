@@ -1,6 +1,7 @@
 """``truth.json``: what is known to be so about a drive, and the check that it fits a log.
 
-Version 1 carries the pose; approaches, cues and objects are sections of the same file.
+Version 1 carries pose, approaches, cues and the names of files with objects and ranges; every
+section may be missing.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import json
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Protocol, cast
+from typing import Annotated, Any, Final, Literal, Protocol, cast, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -39,6 +40,69 @@ class Origin(Section):
     altitude_m: float
 
 
+Cue = Literal[
+    "stop_sign",
+    "traffic_light",
+    "road_left",
+    "road_straight",
+    "road_right",
+    "cross_traffic_left",
+    "cross_traffic_right",
+    "parked_left",
+    "parked_right",
+    "lanes_past",
+    "vehicles_past",
+    "one_way_left",
+    "one_way_right",
+    "do_not_enter",
+]
+CUES: Final[tuple[Cue, ...]] = get_args(Cue)
+"""Cross traffic and parked cars by where their noses point; the last but three and but four are
+lane lines and vehicles past the intersection."""
+
+
+class Features(Section):
+    """Where one may drive on from an intersection."""
+
+    left: bool
+    right: bool
+    straight: bool
+
+
+class Approach(Section):
+    """One approach to one intersection."""
+
+    id: int
+    intersection: str
+    start_ns: int
+    enter_ns: int
+    """When the rear axle is at the start of the intersection."""
+    control: Literal["stop_sign", "traffic_light", "none"]
+    features: Features
+    one_way: Literal["left", "right"] | None = None
+    """Where the crossroad's traffic goes, if only one way."""
+    do_not_enter: bool = False
+    conditions: tuple[str, ...] = ()
+    """Free tags: rain, dusk, glare, occluded, ..."""
+    length_m: float | None = None
+    """From the start of the intersection to its end."""
+
+
+class CueTruth(Section):
+    """Whether what a cue stands for is there, at one time or over a half-open span."""
+
+    cue: Cue
+    present: bool
+    t_ns: int | None = None
+    start_ns: int | None = None
+    end_ns: int | None = None
+    approach: int | None = None
+    count: int | None = None
+    """How many things show it."""
+    visible: float | None = None
+    """Share of the most visible one that nothing hides."""
+
+
 class Truth(Section):
     """A whole truth file."""
 
@@ -55,6 +119,12 @@ class Truth(Section):
     origin: Origin | None = None
     source: str = ""
     """Who measured it, and how well."""
+    approaches: tuple[Approach, ...] = ()
+    cues: tuple[CueTruth, ...] = ()
+    objects: str | None = None
+    """COCO file of labelled objects beside this one, images by ``t_ns``."""
+    ranges: str | None = None
+    """CSV beside this one: t_ns, approach, start_m, end_m, of the rear axle at each picture."""
 
 
 class Writer(Protocol):
@@ -107,7 +177,44 @@ def load(path: Path) -> Truth:
         raise SchemaError(f"{path}: not readable as JSON ({error}); mend it") from None
     if truth.end_ns <= truth.start_ns:
         raise SchemaError(f"{path}: end_ns {truth.end_ns} is not after start_ns {truth.start_ns}")
+    _check_approaches(truth, path)
+    _check_cues(truth, path)
     return truth
+
+
+def _check_approaches(truth: Truth, path: Path) -> None:
+    before: Approach | None = None
+    for one in sorted(truth.approaches, key=lambda one: one.start_ns):
+        if not truth.start_ns <= one.start_ns < one.enter_ns <= truth.end_ns:
+            raise SchemaError(
+                f"{path}: approach {one.id}: start_ns {one.start_ns}, enter_ns {one.enter_ns}: want"
+                f" start before enter, both from {truth.start_ns} to {truth.end_ns}; mend it"
+            )
+        if before is not None and one.start_ns < before.enter_ns:
+            raise SchemaError(f"{path}: approaches {before.id} and {one.id} overlap; mend them")
+        before = one
+    numbers = [one.id for one in truth.approaches]
+    if len(set(numbers)) != len(numbers):
+        raise SchemaError(f"{path}: approaches: an id stands twice in {numbers}; mend it")
+
+
+def _check_cues(truth: Truth, path: Path) -> None:
+    numbers = {one.id for one in truth.approaches}
+    for place, one in enumerate(truth.cues):
+        where = f"{path}: cues.{place} ({one.cue})"
+        spans = one.start_ns is not None and one.end_ns is not None
+        if spans == (one.t_ns is not None) or (one.start_ns is None) != (one.end_ns is None):
+            raise SchemaError(f"{where}: want either t_ns, or start_ns and end_ns; mend it")
+        first = one.t_ns if one.start_ns is None else one.start_ns
+        last = first + 1 if one.end_ns is None and first is not None else one.end_ns
+        assert first is not None
+        assert last is not None
+        if not truth.start_ns <= first < last <= truth.end_ns:
+            raise SchemaError(
+                f"{where}: {first} to {last}: want times from {truth.start_ns} to {truth.end_ns}"
+            )
+        if one.approach is not None and one.approach not in numbers:
+            raise SchemaError(f"{where}: no approach {one.approach}; there are: {sorted(numbers)}")
 
 
 def _no_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""Simulated intersections with pictures: plans, actors, a renderer, sensors and truth."""

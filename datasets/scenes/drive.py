@@ -1,0 +1,354 @@
+"""A run of a simulated intersection as files: log, vehicle file, DBC file and truth.
+
+Written a second at a time: memory holds that second's pictures, however long the drive.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.datasets.simulated_drive import START_NS, DriveSettings, TrueMotion, dbc_path, sense
+from crosscue.datasets.simulated_log import sensor_blocks
+from crosscue.datasets.truth import Approach, Features, Truth, save
+from crosscue.datasets.tum import planar, write_tum
+from crosscue.replay.columns import Block, Images, Int64s, Messages, Topic
+from crosscue.replay.encode.outgoing import standard_type
+from crosscue.replay.encode.template import filled, template_of
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.run_folder import write_text
+from crosscue.replay.writing import LogWriter
+
+from .camera import Camera
+from .coco import Objects
+from .conditions import Conditions, conditions_of
+from .cues import CueRuns, present
+from .layout import Layout, layout_named
+from .mobileye import MOUNTING, Device
+from .render import DEFAULTS, Picture, PictureSettings, Renderer
+from .world import World, build
+
+CAR_BUS: Final = "/can/car"
+MOBILEYE_BUS: Final = "/can/mobileye"
+IMAGES: Final = "/camera/image/compressed"
+CALIBRATION: Final = "/camera/camera_info"
+CAMERA: Final = Camera()
+SOURCE: Final = "simulated by crosscue, exact"
+TOPICS: Final = (
+    Topic(CAR_BUS, "crosscue/CanFrames", "columns"),
+    Topic(MOBILEYE_BUS, "crosscue/CanFrames", "columns"),
+    Topic(IMAGES, "crosscue/Images", "columns"),
+    Topic(CALIBRATION, "sensor_msgs/msg/CameraInfo", "cdr"),
+    Topic("/imu", "sensor_msgs/msg/Imu", "columns"),
+    Topic("/compass", "sensor_msgs/msg/MagneticField", "columns"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class SceneSettings:
+    """One run to simulate.
+
+    Attributes:
+        layout: ``A`` to ``H``, or ``L`` and a seed.
+        run: From 1; ten are laid down, more come from the seed.
+        seed: Everything random about the run comes from it; plan and buildings do not.
+        rate_hz: Pictures a second.
+        camera: Size, lens, mounting.
+        picture: How pictures are made.
+    """
+
+    layout: str = "A"
+    run: int = 1
+    seed: int = 0
+    rate_hz: int = 10
+    camera: Camera = CAMERA
+    picture: PictureSettings = DEFAULTS
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be.
+
+        Raises:
+            ValueError: Naming what was wanted.
+        """
+        layout_named(self.layout)
+        if self.run < 1 or self.seed < 0:
+            raise ValueError(f"run {self.run}, seed {self.seed}: want 1 or more, 0 or more")
+        if self.rate_hz not in (10, 20, 25, 50):
+            raise ValueError(f"rate_hz: want 10, 20, 25 or 50, got {self.rate_hz}")
+
+    @property
+    def name(self) -> str:
+        """As its folder is called."""
+        return f"{self.layout}-{self.run:02d}"
+
+
+@dataclass(frozen=True, slots=True)
+class SceneFiles:
+    """What was written.
+
+    Attributes:
+        log: ``drive.mcap``.
+        vehicle: ``vehicle.toml``.
+        truth: ``truth.json``.
+        pictures: How many.
+        seconds: Length of the drive.
+    """
+
+    log: Path
+    vehicle: Path
+    truth: Path
+    pictures: int
+    seconds: float
+
+
+def world_of(settings: SceneSettings) -> tuple[Layout, Conditions, World]:
+    """The world that a run happens in."""
+    layout = layout_named(settings.layout)
+    conditions = conditions_of(layout, settings.run, settings.seed)
+    return layout, conditions, build(layout, conditions)
+
+
+def pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
+    """Times and pictures of a run, one after another; nothing is written."""
+    renderer = Renderer(world, settings.camera, settings.picture)
+    for number, t_ns in enumerate(picture_times(world, settings).tolist()):
+        yield t_ns, renderer.picture((t_ns - START_NS) * 1e-9, number)
+
+
+def picture_times(world: World, settings: SceneSettings) -> Int64s:
+    """When pictures are grabbed."""
+    motion = world.approach.motion
+    step = 1_000_000_000 // settings.rate_hz
+    return np.arange(int(motion.t_ns[0]), int(motion.t_ns[-1]), step, dtype=np.int64)
+
+
+def write_scene(folder: Path, settings: SceneSettings, *, overwrite: bool = False) -> SceneFiles:
+    """Simulate a run and write its files into ``folder``.
+
+    Raises:
+        OutputError: A file is there already, or cannot be written.
+    """
+    layout, conditions, world = world_of(settings)
+    log = folder / "drive.mcap"
+    record = _Record(layout, conditions, world, settings)
+    with LogWriter(log, Ledger(str(log)), overwrite=overwrite) as writer:
+        for topic in TOPICS:
+            writer.add_topic(topic)
+        for block in record.blocks():
+            writer.write(block)
+    shutil.copyfile(dbc_path(), folder / "simulated_car.dbc")
+    write_text(folder / "vehicle.toml", record.vehicle_text())
+    return SceneFiles(
+        log,
+        folder / "vehicle.toml",
+        record.write_truth(folder),
+        len(record.objects.images),
+        len(world.approach.motion) / 100.0,
+    )
+
+
+class _Record:
+    """Gathers the truth of a run while its log is made."""
+
+    def __init__(
+        self, layout: Layout, conditions: Conditions, world: World, settings: SceneSettings
+    ) -> None:
+        self.layout, self.conditions = layout, conditions
+        self.world, self.settings = world, settings
+        self.objects = Objects()
+        self._cues = CueRuns(1_000_000_000 // settings.rate_hz, approach=0)
+        self._ranges: list[str] = []
+        rng = np.random.default_rng([layout.seed, 8])
+        self._heading_rad = float(rng.uniform(-np.pi, np.pi))
+        self._car = DriveSettings(seed=conditions.seed)
+        self._motion = _in_map(world.approach.motion, self._heading_rad)
+        self._enter_ns = START_NS + round(world.approach.enter_s * 1e9)
+
+    def blocks(self) -> Iterator[Block]:
+        """All rows of the log, about in order of their times."""
+        device = Device(self.world, np.random.default_rng([self.conditions.seed, 9]))
+        others = [
+            replace(block, topic=CAR_BUS) if block.topic == "/can" else block
+            for block in sensor_blocks(sense(self._motion, self._car), self.conditions.seed)
+        ]
+        batch: list[tuple[int, Picture]] = []
+        until = START_NS
+        late = np.random.default_rng([self.conditions.seed, 10])
+        for t_ns, picture in pictures(self.world, self.settings):
+            self._note(t_ns, picture)
+            batch.append((t_ns, picture))
+            until = self._until(batch)
+            if len(batch) == self.settings.rate_hz:
+                yield from self._second(batch, others, device, late)
+                batch = []
+        yield from self._second(batch, others, device, late)
+        for block in others:
+            yield block.take(block.log_ns >= until)
+
+    def _until(self, batch: list[tuple[int, Picture]]) -> int:
+        return batch[-1][0] + 1_000_000_000 // self.settings.rate_hz
+
+    def _second(
+        self, batch: list[tuple[int, Picture]], others: list[Block], device: Device,
+        late: np.random.Generator,
+    ) -> Iterator[Block]:  # fmt: skip
+        if not batch:
+            return
+        times = np.array([t_ns for t_ns, _ in batch], np.int64)
+        begin = int(times[0]) if int(times[0]) > START_NS else -(2**62)
+        for block in others:
+            part = block.take((block.log_ns >= begin) & (block.log_ns < self._until(batch)))
+            if len(part):
+                yield part
+        log_ns = times + 9_000_000 + np.rint(late.exponential(2e6, len(times))).astype(np.int64)
+        yield _images(times, log_ns, [picture for _, picture in batch], self.settings.picture)
+        yield _calibration(times, log_ns, self.settings.camera)
+        yield device.frames(times, [picture for _, picture in batch], MOBILEYE_BUS)
+
+    def _note(self, t_ns: int, picture: Picture) -> None:
+        to_start = -picture.view.rear_axle[0]
+        self.objects.add(t_ns, picture, self.conditions.tags(self.layout), to_start)
+        if t_ns < self._enter_ns:
+            self._cues.add(t_ns, present(self.layout, picture))
+            to_end = to_start + self.layout.end_m
+            self._ranges.append(f"{t_ns},0,{to_start:.4f},{to_end:.4f}")
+
+    def vehicle_text(self) -> str:
+        """The vehicle file that fits."""
+        camera = self.settings.camera
+        return VEHICLE.format(
+            mounting_yaw_rad=self._car.mounting_yaw_rad,
+            declination_rad=self._car.declination_rad,
+            heading_rad=round(self._heading_rad, 6),
+            mobileye_x_m=MOUNTING.x_m,
+            camera_x_m=camera.x_m,
+            camera_z_m=camera.z_m,
+            focal_px=camera.focal,
+            center_px=list(camera.centre_px),
+        )
+
+    def write_truth(self, folder: Path) -> Path:
+        """Truth, objects, trajectory and ranges."""
+        motion, layout = self._motion, self.layout
+        tenth = slice(None, None, 10)
+        turned = np.angle(np.exp(1j * motion.heading_rad[tenth]))
+        track = planar(motion.t_ns[tenth], motion.x_m[tenth], motion.y_m[tenth], turned)
+        write_tum(folder / "pose.tum", track, SOURCE)
+        self.objects.save(folder / "objects.json", SOURCE)
+        write_text(
+            folder / "ranges.csv", "\n".join(["t_ns,approach,start_m,end_m", *self._ranges, ""])
+        )
+        start_ns, step = int(motion.t_ns[0]), 1_000_000_000 // self.settings.rate_hz
+        approach = Approach(
+            id=0, intersection=layout.name, start_ns=start_ns, enter_ns=self._enter_ns,
+            control=layout.control, one_way=layout.one_way, do_not_enter=layout.do_not_enter,
+            features=Features(left=layout.goes_left, right=layout.goes_right,
+                              straight=layout.goes_ahead),
+            conditions=self.conditions.tags(layout), length_m=layout.end_m,
+        )  # fmt: skip
+        return save(
+            Truth(version=1, log="drive.mcap", start_ns=start_ns,
+                  end_ns=int(motion.t_ns[-1]) + step, pose="pose.tum", source=SOURCE,
+                  approaches=(approach,), cues=self._cues.finished(), objects="objects.json",
+                  ranges="ranges.csv"),
+            folder,
+        )  # fmt: skip
+
+
+def _in_map(motion: TrueMotion, heading_rad: float) -> TrueMotion:
+    """From the intersection's frame to the map: zero where the drive begins."""
+    c, s = np.cos(heading_rad), np.sin(heading_rad)
+    x, y = motion.x_m - motion.x_m[0], motion.y_m - motion.y_m[0]
+    return replace(
+        motion, x_m=c * x - s * y, y_m=s * x + c * y, heading_rad=motion.heading_rad + heading_rad
+    )
+
+
+def jpeg(picture: Picture, quality: int) -> bytes:
+    """A picture as JPEG."""
+    import cv2
+
+    bgr = np.ascontiguousarray(picture.rgb[..., ::-1])
+    return bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+
+
+def _images(
+    times: Int64s, log_ns: Int64s, batch: list[Picture], settings: PictureSettings
+) -> Block:
+    coded = [jpeg(picture, settings.jpeg_quality) for picture in batch]
+    stop = np.cumsum([len(one) for one in coded], dtype=np.int64)
+    start = np.concatenate([[0], stop[:-1]]).astype(np.int64)
+    buffer = np.frombuffer(b"".join(coded), np.uint8)
+    images = Images(Messages(buffer, start, stop), ("jpeg",) * len(batch))
+    return Block(IMAGES, np.maximum.accumulate(log_ns), images, header_ns=times)
+
+
+def _calibration(times: Int64s, log_ns: Int64s, camera: Camera) -> Block:
+    _, plan = standard_type("sensor_msgs/msg/CameraInfo")
+    n, (cx, cy), f = len(times), camera.centre_px, camera.focal
+    layout = template_of(
+        plan, {"header.frame_id": "camera", "distortion_model": "plumb_bob"}, {"d": 5}
+    )
+    rows = filled(
+        plan, layout, n,
+        {
+            "header.stamp": times,
+            "height": np.full(n, camera.height_px), "width": np.full(n, camera.width_px),
+            "k": np.tile([f, 0, cx, 0, f, cy, 0, 0, 1.0], (n, 1)),
+            "r": np.tile(np.eye(3).ravel(), (n, 1)),
+            "p": np.tile([f, 0, cx, 0, 0, f, cy, 0, 0, 0, 1.0, 0], (n, 1)),
+        },
+    )  # fmt: skip
+    stop = np.arange(1, n + 1, dtype=np.int64) * rows.shape[1]
+    messages = Messages(np.ascontiguousarray(rows).ravel(), stop - rows.shape[1], stop)
+    return Block(CALIBRATION, np.maximum.accumulate(log_ns), messages)
+
+
+VEHICLE: Final = """\
+# A car of crosscue's simulated intersections.
+version = 1
+name = "crosscue simulated car"
+
+[topics]
+camera = "/camera/image/compressed"
+
+[can]
+bus = "/can/car"
+dbc = ["simulated_car.dbc"]
+
+[can.wheel_speeds]
+front_left = "WHEEL_SPEEDS.FRONT_LEFT"
+front_right = "WHEEL_SPEEDS.FRONT_RIGHT"
+rear_left = "WHEEL_SPEEDS.REAR_LEFT"
+rear_right = "WHEEL_SPEEDS.REAR_RIGHT"
+
+[mobileye]
+bus = "/can/mobileye"
+revision = "classic"
+x_m = {mobileye_x_m}
+
+[odometry]
+wheelbase_m = 2.7
+track_width_m = 1.55
+
+[compass]
+mounting_yaw_rad = {mounting_yaw_rad}
+declination_rad = {declination_rad}
+heading_sd_rad = 0.16
+interval_s = 8.0
+
+[start]
+heading_rad = {heading_rad}
+heading_sd_rad = 0.05
+
+[camera]
+x_m = {camera_x_m}
+z_m = {camera_z_m}
+focal_px = {focal_px}
+center_px = {center_px}
+"""

@@ -1,0 +1,146 @@
+"""Intersections as plans: the eight of Table 6, and any number of others from seeds.
+
+Local frame: x ahead along the approach road, y to the left, zero on the approach road's middle line
+where the intersection starts (stop line, and stop sign if there is one). The crossroad's near kerb
+is ``NEAR_KERB_M`` beyond; the intersection ends, and traffic lights hang, at ``end_m``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+Control = Literal["stop_sign", "traffic_light", "none"]
+Side = Literal["left", "right"]
+
+NEAR_KERB_M: Final = 4.5
+SCORED: Final = "ABCDEFGH"
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What does not change from run to run.
+
+    Attributes:
+        name: Letter of Table 6, or ``L`` and the layout's seed.
+        seed: Everything random about buildings and plants comes from it.
+        control: What the approach road's driver must heed.
+        has_left: There is road to the left; likewise ``has_right`` and ``has_ahead``.
+        one_way: Where the crossroad's traffic goes, if only one way; a sign says so.
+        do_not_enter: Signs forbid the way ahead, or that against the one-way street.
+        ahead_is_closed: The road ahead carries only traffic that comes towards us.
+        half_width_m: Half the approach road, kerb to middle.
+        cross_width_m: Crossroad, kerb to kerb.
+        cross_traffic: Cars a minute and direction on the crossroad, at usual traffic.
+        parked_cross: Cars parked on the crossroad each side of it, about.
+        parked_past: Cars parked along the road past the intersection, about.
+        vegetation: Bushes and branches hide signs and roads.
+        is_town: Shops rather than houses.
+        has_lot: A parking lot beside the approach road.
+    """
+
+    name: str
+    seed: int
+    control: Control = "stop_sign"
+    has_left: bool = True
+    has_right: bool = True
+    has_ahead: bool = True
+    one_way: Side | None = None
+    do_not_enter: bool = False
+    ahead_is_closed: bool = False
+    half_width_m: float = 5.0
+    cross_width_m: float = 10.0
+    cross_traffic: float = 4.0
+    parked_cross: int = 0
+    parked_past: int = 0
+    vegetation: bool = False
+    is_town: bool = False
+    has_lot: bool = True
+
+    @property
+    def far_kerb_m(self) -> float:
+        """Where the crossroad's far kerb lies."""
+        return NEAR_KERB_M + self.cross_width_m
+
+    @property
+    def end_m(self) -> float:
+        """Where the intersection ends."""
+        return self.far_kerb_m + 1.5
+
+    @property
+    def goes_left(self) -> bool:
+        """May one turn left?"""
+        return self.has_left and self.one_way != "right"
+
+    @property
+    def goes_right(self) -> bool:
+        """May one turn right?"""
+        return self.has_right and self.one_way != "left"
+
+    @property
+    def goes_ahead(self) -> bool:
+        """May one drive on?"""
+        return self.has_ahead and not self.ahead_is_closed
+
+
+TABLE_6: Final = {
+    layout.name: layout
+    for layout in (
+        Layout("A", 101, has_ahead=False, cross_traffic=24.0, is_town=True),
+        Layout("B", 102, has_ahead=False, parked_cross=5, cross_width_m=11.0, cross_traffic=3.0),
+        Layout("C", 103, parked_past=6, cross_traffic=5.0),
+        Layout("D", 104, cross_traffic=3.0, has_lot=False),
+        Layout("E", 105, control="traffic_light", cross_traffic=26.0, parked_cross=1, is_town=True,
+               half_width_m=5.6, cross_width_m=12.0, parked_past=1),
+        Layout("F", 106, has_ahead=False, one_way="right", do_not_enter=True, cross_traffic=20.0,
+               is_town=True, cross_width_m=9.0),
+        Layout("G", 107, vegetation=True, cross_traffic=5.0, parked_past=1),
+        Layout("H", 108, control="none", cross_traffic=1.0, cross_width_m=9.0),
+    )
+}  # fmt: skip
+
+
+def any_layout(seed: int) -> Layout:
+    """An intersection that is none of Table 6, for training and for breadth."""
+    rng = np.random.default_rng([seed, 0x1A])
+    arms = str(rng.choice(["all", "t", "no_left", "no_right"], p=[0.5, 0.26, 0.12, 0.12]))
+    control = str(rng.choice(["stop_sign", "traffic_light", "none"], p=[0.5, 0.35, 0.15]))
+    one_way = str(rng.choice(["", "left", "right"], p=[0.6, 0.2, 0.2]))
+    if arms in ("no_left", "no_right"):
+        one_way = ""
+    closed = arms != "t" and not one_way and bool(rng.random() < 0.22)
+    return Layout(
+        name=f"L{seed}",
+        seed=1000 + seed,
+        control="traffic_light" if control == "traffic_light"
+        else "stop_sign" if control == "stop_sign" else "none",
+        has_left=arms != "no_left",
+        has_right=arms != "no_right",
+        has_ahead=arms != "t",
+        one_way="left" if one_way == "left" else "right" if one_way == "right" else None,
+        do_not_enter=closed or bool(arms == "t" and one_way and rng.random() < 0.5),
+        ahead_is_closed=closed,
+        half_width_m=float(rng.uniform(4.2, 6.4)),
+        cross_width_m=float(rng.uniform(8.0, 13.0)),
+        cross_traffic=float(rng.choice([1.0, 5.0, 12.0, 26.0])),
+        parked_cross=int(rng.choice([0, 0, 2, 4, 6])),
+        parked_past=int(rng.choice([0, 0, 2, 5])),
+        vegetation=bool(rng.random() < 0.2),
+        is_town=bool(rng.random() < 0.45),
+        has_lot=bool(rng.random() < 0.6),
+    )  # fmt: skip
+
+
+def layout_named(name: str) -> Layout:
+    """``A`` to ``H``, or ``L`` and a seed.
+
+    Raises:
+        ValueError: No such layout.
+    """
+    if name in TABLE_6:
+        return TABLE_6[name]
+    if name[:1] == "L" and name[1:].isdecimal() and len(name) < 11:
+        return any_layout(int(name[1:]))
+    raise ValueError(f"{name!r} is no layout; there are: A to H, and L0, L1, ... from seeds")

@@ -1,0 +1,187 @@
+"""Triangles with texture, colour and the object they belong to, and simple solids made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32s = NDArray[np.float32]
+Floats = NDArray[np.float64]
+Rgb = tuple[float, float, float]
+
+NOBODY = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """T triangles.
+
+    Attributes:
+        corners: Shape (T, 3, 3), metres.
+        uv: Shape (T, 3, 2), in widths and heights of the texture, v downwards.
+        texture: Shape (T,), number in the atlas, -1 for none.
+        albedo: Shape (T, 3): colour 0 to 1, or factor on the texture.
+        glow: Shape (T,): 1 where the surface gives its own light.
+        instance: Shape (T,): number of the object, ``NOBODY`` for scenery.
+    """
+
+    corners: Float32s
+    uv: Float32s
+    texture: NDArray[np.int32]
+    albedo: Float32s
+    glow: Float32s
+    instance: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.texture)
+
+    def owned_by(self, instance: int) -> Mesh:
+        """The same triangles as one object's."""
+        return replace(self, instance=np.full(len(self), instance, np.int32))
+
+    def placed(self, x_m: float, y_m: float, yaw_rad: float = 0.0, z_m: float = 0.0) -> Mesh:
+        """Turned about the vertical, then moved."""
+        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        moved = self.corners @ turn.T + np.array([x_m, y_m, z_m])
+        return replace(self, corners=moved.astype(np.float32))
+
+    def normals(self) -> Floats:
+        """Unit normals, shape (T, 3), counter-clockwise corners facing the viewer."""
+        side_a = self.corners[:, 1].astype(np.float64) - self.corners[:, 0]
+        side_b = self.corners[:, 2].astype(np.float64) - self.corners[:, 0]
+        across = np.cross(side_a, side_b)
+        length = np.linalg.norm(across, axis=1, keepdims=True)
+        unit: Floats = across / np.maximum(length, 1e-12)
+        return unit
+
+
+def nothing() -> Mesh:
+    """No triangles."""
+    return Mesh(
+        np.zeros((0, 3, 3), np.float32),
+        np.zeros((0, 3, 2), np.float32),
+        np.zeros(0, np.int32),
+        np.zeros((0, 3), np.float32),
+        np.zeros(0, np.float32),
+        np.zeros(0, np.int32),
+    )
+
+
+def joined(parts: Sequence[Mesh]) -> Mesh:
+    """All triangles of all parts."""
+    if not parts:
+        return nothing()
+    return Mesh(
+        np.concatenate([p.corners for p in parts]),
+        np.concatenate([p.uv for p in parts]),
+        np.concatenate([p.texture for p in parts]),
+        np.concatenate([p.albedo for p in parts]),
+        np.concatenate([p.glow for p in parts]),
+        np.concatenate([p.instance for p in parts]),
+    )
+
+
+def triangles(
+    corners: NDArray[np.generic],
+    rgb: Rgb = (1.0, 1.0, 1.0),
+    *,
+    uv: NDArray[np.generic] | None = None,
+    texture: int = -1,
+    glow: float = 0.0,
+) -> Mesh:
+    """Triangles of one colour, corners of shape (T, 3, 3)."""
+    n = len(corners)
+    return Mesh(
+        np.asarray(corners, np.float32),
+        np.zeros((n, 3, 2), np.float32) if uv is None else np.asarray(uv, np.float32),
+        np.full(n, texture, np.int32),
+        np.tile(np.asarray(rgb, np.float32), (n, 1)),
+        np.full(n, glow, np.float32),
+        np.full(n, NOBODY, np.int32),
+    )
+
+
+def quad(
+    corners: NDArray[np.generic] | Sequence[Sequence[float]],
+    rgb: Rgb = (1.0, 1.0, 1.0),
+    *,
+    repeat: tuple[float, float] = (1.0, 1.0),
+    texture: int = -1,
+    glow: float = 0.0,
+) -> Mesh:
+    """Four corners: bottom left, bottom right, top right, top left as the texture is seen."""
+    four = np.asarray(corners, np.float64)
+    u, v = repeat[0] * 0.9999, repeat[1] * 0.9999
+    at = np.array([[0.0, v], [u, v], [u, 0.0], [0.0, 0.0]])
+    order = np.array([[0, 1, 2], [0, 2, 3]])
+    return triangles(four[order], rgb, uv=at[order], texture=texture, glow=glow)
+
+
+def box(
+    x: tuple[float, float],
+    y: tuple[float, float],
+    z: tuple[float, float],
+    rgb: Rgb,
+    *,
+    texture: int = -1,
+    wall_m: tuple[float, float] = (1.0, 1.0),
+    glow: float = 0.0,
+) -> Mesh:
+    """A box without floor; walls repeat their texture every ``wall_m``."""
+    (x0, x1), (y0, y1), (z0, z1) = x, y, z
+    high = max(1.0, round((z1 - z0) / wall_m[1])) if texture >= 0 else 1.0
+    along_x = max(1.0, round((x1 - x0) / wall_m[0])) if texture >= 0 else 1.0
+    along_y = max(1.0, round((y1 - y0) / wall_m[0])) if texture >= 0 else 1.0
+    sides = [
+        ([(x0, y0), (x1, y0)], along_x),
+        ([(x1, y0), (x1, y1)], along_y),
+        ([(x1, y1), (x0, y1)], along_x),
+        ([(x0, y1), (x0, y0)], along_y),
+    ]
+    parts = [
+        quad(
+            [(*a, z0), (*b, z0), (*b, z1), (*a, z1)],
+            rgb, repeat=(times, high), texture=texture, glow=glow,
+        )
+        for (a, b), times in sides
+    ]  # fmt: skip
+    parts.append(quad([(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)], rgb, glow=glow))
+    return joined(parts)
+
+
+def tube(a: Sequence[float], b: Sequence[float], radius_m: float, rgb: Rgb, sides: int = 6) -> Mesh:
+    """A thin pole from ``a`` to ``b``."""
+    start, stop = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    along = (stop - start) / np.linalg.norm(stop - start)
+    helper = np.array([1.0, 0.0, 0.0]) if abs(along[2]) > 0.9 else np.array([0.0, 0.0, 1.0])
+    e1 = np.cross(helper, along)
+    e1 /= np.linalg.norm(e1)
+    e2 = np.cross(along, e1)
+    angle = np.arange(sides + 1) * 2 * np.pi / sides
+    ring = radius_m * (np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2)
+    return joined(
+        [
+            quad([start + ring[k], start + ring[k + 1], stop + ring[k + 1], stop + ring[k]], rgb)
+            for k in range(sides)
+        ]
+    )
+
+
+def disc(
+    centre: Sequence[float], normal: Sequence[float], radius_m: float, rgb: Rgb, *,
+    glow: float = 0.0, sides: int = 14,
+) -> Mesh:  # fmt: skip
+    """A flat disc facing along ``normal``."""
+    middle, n = np.asarray(centre, np.float64), np.asarray(normal, np.float64)
+    helper = np.array([0.0, 0.0, 1.0]) if abs(n[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    e1 = np.cross(helper, n)
+    e1 /= np.linalg.norm(e1)
+    e2 = np.cross(n, e1)
+    angle = np.arange(sides + 1) * 2 * np.pi / sides
+    rim = middle + radius_m * (np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2)
+    fan = np.stack([np.tile(middle, (sides, 1)), rim[:-1], rim[1:]], axis=1)
+    return triangles(fan, rgb, glow=glow)

@@ -1,0 +1,197 @@
+"""What a Mobileye would say about a world: vehicles ahead and lane lines, with its faults.
+
+Reach, field of view, rates of misses and errors are plausible settings, measured nowhere, save that
+places err by a few per cent as the public comment on the protocol says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+
+from crosscue.replay.columns import Block, Int64s, Table
+from crosscue.replay.mobileye.encode import bursts_of, encode_tables
+from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting
+from crosscue.replay.mobileye.tables import table_block
+
+from .layout import Layout
+from .motion import FRONT_M, lane_y_m
+from .render import Picture, Seen
+from .world import World
+
+MOUNTING: Final = Mounting(x_m=FRONT_M)
+SETTINGS: Final = MobileyeSettings(revision="classic", mounting=MOUNTING)
+STANDING, MOVING, ONCOMING, PARKED = 1, 3, 4, 5
+TYPES: Final = {"pickup": 1}
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """How well the device sees.
+
+    Attributes:
+        half_view_rad: Half its field of view.
+        reach_m: Farthest vehicle.
+        least_visible: Share of a vehicle that must show.
+        hit: Chance that a vehicle on our road is reported; states last about a second.
+        hit_crossing: The same for one that shows its side.
+        hit_off_road: The same for one in a lot or driveway.
+        place_share: Error of distance, as a share of it.
+        side_m: Error aside.
+    """
+
+    half_view_rad: float = 0.33
+    reach_m: float = 95.0
+    least_visible: float = 0.35
+    hit: float = 0.9
+    hit_crossing: float = 0.12
+    hit_off_road: float = 0.18
+    place_share: float = 0.03
+    side_m: float = 0.15
+
+
+class Device:
+    """One Mobileye through one drive; remembers what it is tracking."""
+
+    def __init__(self, world: World, rng: Generator, faults: Faults | None = None) -> None:
+        """Switch on."""
+        self._world = world
+        self._rng = rng
+        self._faults = Faults() if faults is None else faults
+        self._reports: dict[int, bool] = {}
+        self._scale: dict[int, float] = {}
+        self._age: dict[int, int] = {}
+        self._sees_past = False
+
+    def frames(self, times_ns: Int64s, pictures: Sequence[Picture], bus: str) -> Block:
+        """CAN frames for pictures grabbed at ``times_ns``."""
+        rows = [row for t_ns, picture in zip(times_ns.tolist(), pictures, strict=True)
+                for row in self._obstacles(t_ns, picture)]  # fmt: skip
+        columns = {name: np.array([row[name] for row in rows], kind)
+                   for name, kind in _COLUMNS.items()}  # fmt: skip
+        latency = 80_000_000 + np.rint(self._rng.exponential(1.5e6, len(times_ns))).astype(np.int64)
+        tables = bursts_of(times_ns, Table(columns), SETTINGS, latency_ns=latency, bus=bus)
+        tables.append(self._lanes(times_ns, pictures, latency, bus))
+        return encode_tables(tables, SETTINGS, bus)
+
+    def _obstacles(self, t_ns: int, picture: Picture) -> list[dict[str, float]]:
+        x, y, heading = picture.view.rear_axle
+        c, s = np.cos(heading), np.sin(heading)
+        rows = []
+        for seen in picture.seen:
+            if seen.thing.category != "car":
+                continue
+            middle = np.array(seen.thing.at) + seen.thing.shift(picture.t_s)
+            dx, dy = middle[0] - x, middle[1] - y
+            ahead, left = c * dx + s * dy, -s * dx + c * dy
+            if not self._is_reported(seen, ahead, left):
+                self._age.pop(seen.thing.number, None)
+                continue
+            rows.append(self._row(t_ns, seen, picture, ahead, left))
+        return rows
+
+    def _is_reported(self, seen: Seen, ahead: float, left: float) -> bool:
+        faults, number = self._faults, seen.thing.number
+        front = ahead - FRONT_M
+        if front < 1.0 or front > faults.reach_m or seen.visible < faults.least_visible:
+            return False
+        if abs(np.arctan2(left, front)) > faults.half_view_rad:
+            return False
+        chance = faults.hit
+        if seen.thing.role in ("cross", "parked_cross"):
+            chance = faults.hit_crossing
+        elif abs(seen.thing.at[1]) > self._world.layout.half_width_m:
+            chance = faults.hit_off_road
+        chance *= 1.0 - 0.15 * self._world.conditions.rain
+        # A state is thrown anew about once a second, so hits and misses come in runs.
+        if number not in self._reports or self._rng.random() < 0.1:
+            self._reports[number] = bool(self._rng.random() < chance)
+        return self._reports[number]
+
+    def _row(
+        self, t_ns: int, seen: Seen, picture: Picture, ahead: float, left: float
+    ) -> dict[str, float]:
+        thing, faults = seen.thing, self._faults
+        number = thing.number
+        if number not in self._scale:
+            self._scale[number] = float(self._rng.normal(1.0, faults.place_share))
+        self._age[number] = min(self._age.get(number, 0) + 1, 254)
+        heading = picture.view.rear_axle[2]
+        vx = thing.velocity[0] * np.cos(heading) + thing.velocity[1] * np.sin(heading)
+        status = {"oncoming": ONCOMING, "outgoing": MOVING, "cross": MOVING}.get(
+            thing.role, PARKED if thing.role == "parked_past" else STANDING
+        )
+        near = (ahead - thing.size[0] / 2 - FRONT_M) * self._scale[number] + FRONT_M
+        return {
+            "t_ns": t_ns,
+            "obstacle_id": number % 200 + 1,
+            "x_m": max(near + self._rng.normal(0, 0.1), FRONT_M),
+            "y_m": left + self._rng.normal(0, faults.side_m),
+            "vx_mps": vx - picture.view.speed_mps + self._rng.normal(0, 0.2),
+            "type": 1 if thing.size[0] > 5.3 else 0,
+            "status": status,
+            "length_m": thing.size[0],
+            "width_m": thing.size[1] * (1 + self._rng.normal(0, 0.05)),
+            "age_frames": self._age[number],
+            "valid": 1 if self._age[number] == 1 else 2,
+        }
+
+    def _lanes(
+        self, times_ns: Int64s, pictures: Sequence[Picture], latency: Int64s, bus: str
+    ) -> Block:
+        layout, rng = self._world.layout, self._rng
+        lines = lane_lines_m(layout)
+        rows: dict[str, list[float]] = {name: [] for name in _LANE_COLUMNS}
+        for picture in pictures:
+            x, y, heading = picture.view.rear_axle
+            is_turning = abs(heading) > 0.25 or x > -1.0
+            reach, quality = self._lane_reach(x), 3 if self._world.conditions.rain < 0.4 else 2
+            for side, line_y in zip((1, -1), lines, strict=True):
+                lost = is_turning or rng.random() < 0.03
+                rows["side"].append(side)
+                rows["lane_type"].append(2 if lost else (4 if side > 0 else 1))
+                rows["quality"].append(0 if lost else quality)
+                rows["model_degree"].append(2)
+                rows["c0_m"].append(np.nan if lost else line_y - y + rng.normal(0, 0.03))
+                rows["c1"].append(np.nan if lost else -np.tan(heading) + rng.normal(0, 0.002))
+                rows["c2_per_m"].append(np.nan if lost else rng.normal(0, 2e-5))
+                rows["c3_per_m2"].append(np.nan if lost else 0.0)
+                rows["marking_width_m"].append(0.12)
+                rows["view_range_m"].append(0.0 if lost else max(reach - FRONT_M, 0.0))
+                rows["view_range_available"].append(0 if lost else 1)
+        columns = {name: np.array(rows[name], kind) for name, kind in _LANE_COLUMNS.items()}
+        sent = np.repeat(times_ns + latency + 14_000_000, 2)
+        return table_block(bus, "lanes", sent, columns)
+
+    def _lane_reach(self, x: float) -> float:
+        """How far from the rear axle the lines are followed: to the stop line, or past it."""
+        layout, conditions = self._world.layout, self._world.conditions
+        to_start, to_end = -x, layout.end_m - x
+        sight = 58.0 * (1 - 0.35 * conditions.rain) * (0.8 if conditions.light == "dusk" else 1.0)
+        chance = 0.75 if layout.has_ahead and to_end < sight - 8.0 else 0.01
+        if self._rng.random() < 0.08:
+            self._sees_past = bool(self._rng.random() < chance)
+        if self._sees_past and layout.has_ahead:
+            return float(sight + self._rng.normal(0, 1.0))
+        return float(min(to_start, sight) + self._rng.normal(0, 0.4))
+
+
+def lane_lines_m(layout: Layout) -> tuple[float, float]:
+    """Where the painted lines left and right of our lane lie."""
+    return 0.17, 2 * lane_y_m(layout)
+
+
+_COLUMNS: Final = {
+    "t_ns": np.int64, "obstacle_id": np.int16, "x_m": np.float64, "y_m": np.float64,
+    "vx_mps": np.float64, "type": np.int16, "status": np.int16, "length_m": np.float64,
+    "width_m": np.float64, "age_frames": np.int16, "valid": np.int16,
+}  # fmt: skip
+_LANE_COLUMNS: Final = {
+    "side": np.int8, "lane_type": np.int16, "quality": np.int16, "model_degree": np.int16,
+    "c0_m": np.float64, "c1": np.float64, "c2_per_m": np.float64, "c3_per_m2": np.float64,
+    "marking_width_m": np.float64, "view_range_m": np.float64, "view_range_available": np.int16,
+}  # fmt: skip

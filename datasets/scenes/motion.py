@@ -1,0 +1,137 @@
+"""How the car drives up to an intersection and through it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.random import Generator
+
+from crosscue.datasets.simulated_drive import RATE_HZ, START_NS, TrueMotion
+
+from .conditions import Conditions
+from .layout import NEAR_KERB_M, Layout
+from .mesh import Floats
+
+FRONT_M: Final = 3.75
+"""From rear axle to front bumper."""
+STEP_S: Final = 1.0 / RATE_HZ
+Turn = Literal["left", "right", "ahead"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Approach:
+    """One approach in the intersection's frame.
+
+    Attributes:
+        motion: Rear axle in the local frame, 100 Hz.
+        turn: Where it goes.
+        green_s: When the light turns green, from the start; negative if it always was.
+        enter_s: When the rear axle passes the start of the intersection.
+        inside_s: From when to when any part of the car is on the crossroad.
+    """
+
+    motion: TrueMotion
+    turn: Turn
+    green_s: float
+    enter_s: float
+    inside_s: tuple[float, float]
+
+
+def lane_y_m(layout: Layout) -> float:
+    """Middle of the lane driven, right of the middle line."""
+    parking = 2.05 if layout.half_width_m > 4.6 else 0.0
+    return -(layout.half_width_m - parking) / 2
+
+
+def approach(layout: Layout, conditions: Conditions, rng: Generator) -> Approach:
+    """Drive up from about 88 m, heed sign or light, go through."""
+    ways: list[Turn] = []
+    if layout.goes_ahead:
+        ways += ["ahead"] * 4
+    if layout.goes_left:
+        ways.append("left")
+    if layout.goes_right:
+        ways.append("right")
+    turn: Turn = ways[int(rng.integers(len(ways)))]
+    start_x = -float(rng.uniform(84.0, 90.0))
+    curvature = _curvature(layout, turn, start_x)
+    stop_at = -start_x - FRONT_M - float(rng.uniform(0.2, 0.8))
+    is_light = layout.control == "traffic_light"
+    stops = layout.control == "stop_sign" or (is_light and conditions.is_red)
+    wait_s = float(rng.uniform(1.0, 2.2)) if not is_light else float(rng.uniform(1.5, 4.0))
+    slow_from = -start_x if turn != "ahead" else None
+    along, speed = _speeds(
+        conditions.speed_mps, stop_at if stops else None, wait_s, len(curvature) - 2, slow_from
+    )
+    motion = _integrated(along, speed, curvature, start_x, lane_y_m(layout))
+    t_s = np.arange(len(motion)) * STEP_S
+    bumper = along + start_x + FRONT_M
+    inside = (bumper > NEAR_KERB_M - 1.0) & (along + start_x < layout.far_kerb_m + 4.0)
+    enter = float(t_s[np.argmax(motion.x_m >= 0.0)])
+    waited = t_s[(speed < 0.05) & (along > 1.0)]
+    green = float(waited[-1]) - 0.6 if is_light and conditions.is_red and len(waited) else -1.0
+    return Approach(motion, turn, green, enter, (float(t_s[inside][0]), float(t_s[inside][-1])))
+
+
+def _curvature(layout: Layout, turn: Turn, start_x: float) -> Floats:
+    """For each decimetre of the way."""
+    step = 0.1
+    straight_on = layout.end_m + 16.0
+    if turn == "ahead":
+        return np.zeros(round((straight_on - start_x) / step))
+    lane = 0.27 if turn == "right" else 0.73
+    if layout.one_way:
+        lane = 0.5
+    target_x = NEAR_KERB_M + lane * layout.cross_width_m
+    radius = 6.5 if turn == "right" else 9.0
+    before = round((target_x - radius - start_x) / step)
+    sign = 1.0 if turn == "left" else -1.0
+    bend = np.full(round(radius * np.pi / 2 / step), sign / radius)
+    curvature = np.concatenate([np.zeros(before), bend, np.zeros(round(14.0 / step))])
+    kernel = np.hanning(41)[1:-1]
+    smoothed: Floats = np.convolve(curvature, kernel / kernel.sum(), mode="same")
+    return smoothed
+
+
+def _speeds(
+    cruise: float, stop_at: float | None, wait_s: float, last: int, slow_from: float | None
+) -> tuple[Floats, Floats]:
+    """Way and speed at each step: brake at 1.9 m/s2, wait, pull away at 1.6 m/s2."""
+    end_m = last * 0.1
+    at, v, waited = 0.0, cruise, 0.0
+    along, speed = [], []
+    while at < end_m:
+        target = cruise
+        if slow_from is not None:
+            room = max(slow_from - 3.0 - at, 0.0)
+            target = min(target, float(np.sqrt(4.2**2 + 2 * 1.9 * room)))
+        if stop_at is not None and waited < wait_s:
+            room = stop_at - at
+            target = min(target, float(np.sqrt(max(2 * 1.9 * room, 0.0))))
+            if room < 0.03:
+                target = v = 0.0
+                waited += STEP_S
+        v += float(np.clip(target - v, -3.5 * STEP_S, 1.6 * STEP_S))
+        v = max(v, 0.0)
+        if v < 0.05 and stop_at is not None and waited < wait_s:
+            v = 0.0
+            waited += STEP_S
+        at += v * STEP_S
+        along.append(at)
+        speed.append(v)
+    return np.array(along), np.array(speed)
+
+
+def _integrated(
+    along: Floats, speed: Floats, curvature: Floats, start_x: float, lane_y: float
+) -> TrueMotion:
+    bend = np.interp(along, np.arange(len(curvature)) * 0.1, curvature)
+    yaw_rate = bend * speed
+    heading = np.concatenate(([0.0], np.cumsum(yaw_rate * STEP_S)))[:-1]
+    middle = heading + yaw_rate * STEP_S / 2
+    x = start_x + np.concatenate(([0.0], np.cumsum(speed * STEP_S * np.cos(middle))))[:-1]
+    y = lane_y + np.concatenate(([0.0], np.cumsum(speed * STEP_S * np.sin(middle))))[:-1]
+    t_ns = START_NS + np.arange(len(x), dtype=np.int64) * (1_000_000_000 // RATE_HZ)
+    return TrueMotion(t_ns, x, y, heading, speed, yaw_rate)

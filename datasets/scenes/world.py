@@ -1,0 +1,506 @@
+"""One run's world: scenery that stands, things that are labelled, cars that drive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final, Literal
+
+import numpy as np
+from numpy.random import Generator
+
+from .cars import Look, any_look, car
+from .conditions import Conditions
+from .ground import Ground, Patch, cast_shadows, paint, with_levels
+from .layout import NEAR_KERB_M, Layout
+from .lighting import Daylight, daylight
+from .mesh import Floats, Mesh, joined
+from .motion import Approach, approach, lane_y_m
+from .scenery import (
+    Shadows,
+    building,
+    bush,
+    crown,
+    light_head,
+    mast,
+    post,
+    sign_back,
+    sign_face,
+    tree,
+    utility_pole,
+    wire,
+)
+from .textures import Atlas, make_atlas
+
+Category = Literal[
+    "car", "stop_sign", "traffic_light", "one_way_left", "one_way_right", "do_not_enter"
+]
+CATEGORIES: Final[tuple[Category, ...]] = (
+    "car", "stop_sign", "traffic_light", "one_way_left", "one_way_right", "do_not_enter",
+)  # fmt: skip
+Role = Literal["cross", "parked_cross", "oncoming", "outgoing", "parked_past", "other", "furniture"]
+ALWAYS: Final = (-1e9, 1e9)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Thing:
+    """One labelled object.
+
+    Attributes:
+        number: Its instance, also its place in ``World.things``.
+        category: What it is.
+        role: What it does at the intersection.
+        mesh: Triangles where it is at time zero; a light shows red here.
+        at: x, y, z of its middle at time zero, local frame.
+        heading_rad: Where a car's nose points; where a sign's reader looks.
+        size: Length, width, height, metres.
+        velocity: x and y, metres a second.
+        span_s: From when to when it is there.
+        later: What it looks like from ``later_s`` on, or None.
+        later_s: When that begins.
+    """
+
+    number: int
+    category: Category
+    role: Role
+    mesh: Mesh
+    at: tuple[float, float, float]
+    heading_rad: float
+    size: tuple[float, float, float]
+    velocity: tuple[float, float] = (0.0, 0.0)
+    span_s: tuple[float, float] = ALWAYS
+    later: Mesh | None = None
+    later_s: float = 0.0
+
+    @property
+    def is_fixed(self) -> bool:
+        """Does it neither move nor change?"""
+        return self.velocity == (0.0, 0.0) and self.span_s == ALWAYS and self.later is None
+
+    def is_there(self, t_s: float) -> bool:
+        """Is it in the world at this time?"""
+        return self.span_s[0] <= t_s < self.span_s[1]
+
+    def shift(self, t_s: float) -> Floats:
+        """How far it has moved from where ``mesh`` is, (3,)."""
+        return np.array([self.velocity[0] * t_s, self.velocity[1] * t_s, 0.0])
+
+    def mesh_at(self, t_s: float) -> Mesh:
+        """Its look at this time."""
+        return self.later if self.later is not None and t_s >= self.later_s else self.mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class World:
+    """Everything that a camera could see in one run.
+
+    Attributes:
+        layout: The intersection.
+        conditions: The run.
+        approach: How the car drives.
+        light: Of day.
+        ground: The painted ground.
+        scenery: What is not labelled, with the fixed things.
+        things: What is labelled.
+        atlas: Textures.
+    """
+
+    layout: Layout
+    conditions: Conditions
+    approach: Approach
+    light: Daylight
+    ground: Ground
+    scenery: Mesh
+    things: tuple[Thing, ...]
+    atlas: Atlas
+
+
+@dataclass(slots=True)
+class _Site:
+    """A world under construction."""
+
+    layout: Layout
+    atlas: Atlas
+    lamps_on: bool
+    parts: list[Mesh] = field(default_factory=list)
+    things: list[Thing] = field(default_factory=list)
+    patches: list[Patch] = field(default_factory=list)
+    shadows: Shadows = field(default_factory=Shadows)
+    taken: list[tuple[float, float, float, float]] = field(default_factory=list)
+
+    def is_free(self, x: float, y: float, margin: float) -> bool:
+        """Is a spot outside all buildings and lots?"""
+        return all(
+            not (x0 - margin < x < x1 + margin and y0 - margin < y < y1 + margin)
+            for x0, x1, y0, y1 in self.taken
+        )
+
+    def add(
+        self,
+        category: Category,
+        role: Role,
+        mesh: Mesh,
+        at: tuple[float, float, float],
+        heading: float,
+        size: tuple[float, float, float],
+        velocity: tuple[float, float] = (0.0, 0.0),
+        span_s: tuple[float, float] = ALWAYS,
+        later: Mesh | None = None,
+        later_s: float = 0.0,
+    ) -> None:
+        """Take in a labelled thing, its mesh already in place."""
+        number = len(self.things)
+        owned = None if later is None else later.owned_by(number)
+        self.things.append(
+            Thing(number, category, role, mesh.owned_by(number), at, heading, size, velocity,
+                  span_s, owned, later_s)
+        )  # fmt: skip
+
+    def add_car(
+        self,
+        look: Look,
+        role: Role,
+        x: float,
+        y: float,
+        heading: float,
+        speed: float = 0.0,
+        span_s: tuple[float, float] = ALWAYS,
+    ) -> None:
+        """Put a car into the world; a moving one is at (x, y) at time zero."""
+        moving = speed != 0.0
+        mesh = car(look, lamps_on=self.lamps_on and moving, brakes_on=False)
+        shape = look.shape
+        velocity = (speed * float(np.cos(heading)), speed * float(np.sin(heading)))
+        self.add("car", role, mesh.placed(x, y, heading), (x, y, shape.height_m / 2), heading,
+                 (shape.length_m, 2 * shape.half_width_m, shape.height_m),
+                 velocity if moving else (0.0, 0.0), span_s)  # fmt: skip
+        if not moving:
+            c, s = abs(np.cos(heading)), abs(np.sin(heading))
+            a = shape.length_m / 2 * c + shape.half_width_m * s
+            b = shape.length_m / 2 * s + shape.half_width_m * c
+            foot = np.array([(x - a, y - b), (x + a, y - b), (x + a, y + b), (x - a, y + b)])
+            self.shadows.solids.append((foot, 1.0))
+
+
+def build(layout: Layout, conditions: Conditions) -> World:
+    """The world of a run; the same from the same layout and conditions."""
+    fixed = np.random.default_rng([layout.seed, 1])
+    varied = np.random.default_rng([conditions.seed, 2])
+    light = daylight(conditions, varied)
+    drive = approach(layout, conditions, varied)
+    site = _Site(layout, make_atlas(fixed), light.lamps_on)
+    _lot(site, fixed, varied)
+    _buildings(site, fixed, varied)
+    _plants(site, fixed)
+    _poles(site, fixed)
+    _control(site, drive)
+    _parked(site, varied)
+    _traffic(site, conditions, drive, varied)
+    painted, road = paint(layout, site.patches, np.random.default_rng([layout.seed, 3]))
+    cast_shadows(painted, site.shadows.outlines(light.to_sun), site.shadows.blobs(light.to_sun),
+                 light.in_shadow)  # fmt: skip
+    scenery = joined([*site.parts, *(t.mesh for t in site.things if t.is_fixed)])
+    ground = with_levels(painted, road)
+    return World(layout, conditions, drive, light, ground, scenery, tuple(site.things), site.atlas)
+
+
+def _lot(site: _Site, fixed: Generator, varied: Generator) -> None:
+    """A parking lot beside the approach road, its cars side on to us."""
+    if not site.layout.has_lot:
+        return
+    side = float(fixed.choice([-1.0, 1.0]))
+    x0 = -float(fixed.uniform(46.0, 56.0))
+    x1, w = x0 + 26.0, site.layout.half_width_m
+    y0, y1 = side * (w + 3.3), side * (w + 20.5)
+    low, high = min(y0, y1), max(y0, y1)
+    site.patches.append(Patch((x0, x1), (low, high)))
+    gate = (x0 + 11.0, x0 + 17.0)
+    site.patches.append(Patch(gate, (min(side * (w - 0.2), y0), max(side * (w - 0.2), y0))))
+    site.taken.append((x0, x1, low, high))
+    for k, x in enumerate(np.arange(x0 + 2.4, x1 - 1.5, 2.75)):
+        for row_y in (y0 + side * 3.0, y1 - side * 3.0):
+            at_gate = gate[0] - 1 < x < gate[1] + 1 and abs(row_y - y0) < 4
+            if varied.random() < 0.55 and not at_gate:
+                nose = np.pi / 2 if varied.random() < 0.5 else -np.pi / 2
+                site.add_car(any_look(varied), "other", float(x), float(row_y), nose)
+        if k == 4 and varied.random() < 0.5:
+            heading = 0.0 if varied.random() < 0.5 else np.pi
+            site.add_car(any_look(varied), "other", float(x), (y0 + y1) / 2, heading)
+
+
+def _buildings(site: _Site, fixed: Generator, varied: Generator) -> None:
+    layout = site.layout
+    w, near, far = layout.half_width_m, NEAR_KERB_M, layout.far_kerb_m
+    back = 5.0 if layout.is_town else 8.5
+    for side in (-1.0, 1.0):
+        _row_along(site, fixed, varied, -108.0, near - back, side * (w + back), side)
+        has_arm = layout.has_left if side > 0 else layout.has_right
+        if layout.has_ahead:
+            start = far + back if has_arm else near - back + 2.0
+            _row_along(site, fixed, varied, start, 108.0, side * (w + back), side)
+        if has_arm:
+            first = w + back + 16.0
+            _row_across(site, fixed, near - back, -1.0, side, first, 62.0)
+            _row_across(site, fixed, far + back, 1.0, side,
+                        first if layout.has_ahead else 7.0, 62.0)  # fmt: skip
+    if not layout.has_ahead:
+        _row_across(site, fixed, far + back, 1.0, 1.0, -7.0, 7.0)
+
+
+def _row_along(
+    site: _Site, fixed: Generator, varied: Generator, x0: float, x1: float, y: float, side: float
+) -> None:
+    """Buildings beside the road that runs along x, the last ending at ``x1``."""
+    shop = site.layout.is_town
+    at = x1
+    while at > x0 + 8.0:
+        wide = float(fixed.uniform(9.0, 13.0))
+        deep = float(fixed.uniform(9.0, 12.0))
+        gap = float(fixed.uniform(0.3, 1.5) if shop else fixed.uniform(5.0, 9.0))
+        ys = (y, y + side * deep)
+        low, high = min(ys), max(ys)
+        blocked = any(at - wide < b and at > a and low < d and high > c
+                      for a, b, c, d in site.taken)  # fmt: skip
+        if not blocked and fixed.random() < (0.97 if shop else 0.9):
+            _place(site, fixed, (at - wide, at), (low, high))
+            is_before = at < NEAR_KERB_M
+            if not shop and gap > 5.4 and is_before and fixed.random() < 0.6:
+                _driveway(site, varied, at - wide - gap / 2, side)
+        at -= wide + gap
+
+
+def _row_across(
+    site: _Site, fixed: Generator, x: float, out: float, side: float, y0: float, y1: float
+) -> None:
+    """Buildings beside the crossroad."""
+    shop = site.layout.is_town
+    at = y0
+    while at < y1 - 6.0:
+        wide = float(min(fixed.uniform(9.0, 14.0), y1 - at))
+        deep = float(fixed.uniform(9.0, 12.0))
+        gap = float(fixed.uniform(0.3, 1.2) if shop else fixed.uniform(4.0, 8.0))
+        ys = (side * at, side * (at + wide))
+        xs = (x, x + out * deep)
+        _place(site, fixed, (min(xs), max(xs)), (min(ys), max(ys)))
+        at += wide + gap
+
+
+def _place(site: _Site, fixed: Generator, x: tuple[float, float], y: tuple[float, float]) -> None:
+    mesh, high = building(x, y, site.atlas, fixed, is_shop=site.layout.is_town)
+    site.parts.append(mesh)
+    site.taken.append((*x, *y))
+    foot = np.array([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])])
+    site.shadows.solids.append((foot, high))
+
+
+def _driveway(site: _Site, varied: Generator, x: float, side: float) -> None:
+    w = site.layout.half_width_m
+    y0, y1 = side * (w - 0.2), side * (w + 15.0)
+    site.patches.append(Patch((x - 1.5, x + 1.5), (min(y0, y1), max(y0, y1)), "concrete"))
+    if varied.random() < 0.6:
+        nose = np.pi / 2 if varied.random() < 0.5 else -np.pi / 2
+        y = side * (w + float(varied.uniform(6.5, 9.0)))
+        site.add_car(any_look(varied), "other", x, y, float(nose))
+    site.taken.append((x - 1.7, x + 1.7, min(y0, y1), max(y0, y1)))
+
+
+def _plants(site: _Site, fixed: Generator) -> None:
+    layout = site.layout
+    w, near, far = layout.half_width_m, NEAR_KERB_M, layout.far_kerb_m
+    spots = []
+    for side in (-1.0, 1.0):
+        for x in np.arange(-100.0, 100.0, 13.0):
+            spots.append((x + fixed.uniform(-4, 4), side * (w + fixed.uniform(3.8, 5.5))))
+            spots.append((x + fixed.uniform(-4, 4), side * (w + fixed.uniform(20, 34))))
+        for y in np.arange(20.0, 62.0, 14.0):
+            spots.append((near - fixed.uniform(3.8, 5.0), side * (y + fixed.uniform(-4, 4))))
+            spots.append((far + fixed.uniform(3.8, 5.0), side * (y + fixed.uniform(-4, 4))))
+    for x, y in spots:
+        at_corner = near - 16 < x < far + 9 and abs(y) < w + 12
+        on_cross = near - 3.5 < x < far + 3.5 or (not layout.has_ahead and x > far and abs(y) < 12)
+        keep = fixed.random() < (0.4 if layout.is_town else 0.72)
+        if keep and not at_corner and not on_cross and site.is_free(x, y, 1.0):
+            mesh, radius, high = tree(float(x), float(y), site.atlas, fixed)
+            site.parts.append(mesh)
+            site.shadows.crowns.append((float(x), float(y), radius, high))
+    for _ in range(26):
+        x, y = fixed.uniform(-95, near - 16), fixed.choice([-1, 1]) * (w + fixed.uniform(6.5, 8.0))
+        if site.is_free(x, y, 0.4) and not layout.is_town:
+            site.parts.append(bush(float(x), float(y), 0.9, float(fixed.uniform(0.9, 1.5)),
+                                   site.atlas, fixed))  # fmt: skip
+    # Beyond the last houses the view must end in trees, not in nothing.
+    for x in (-112.0, 116.0):
+        for y in np.arange(-60.0, 60.0, 5.0):
+            if abs(y) > w + 3:
+                site.parts.append(crown(x + float(fixed.uniform(-2, 2)), float(y), 4.0, 4.0, 4.0, 5,
+                                        site.atlas, fixed))  # fmt: skip
+    if layout.vegetation:
+        _overgrowth(site, fixed)
+
+
+def _overgrowth(site: _Site, fixed: Generator) -> None:
+    """Bushes along the right side up to the corner, and branches before the stop sign."""
+    w = site.layout.half_width_m
+    for x in np.arange(-34.0, 2.5, 2.2):
+        y = -(w + float(fixed.uniform(2.0, 3.4)))
+        high = float(fixed.uniform(1.9, 3.2))
+        site.parts.append(bush(float(x), y, 1.5, high, site.atlas, fixed))
+        site.shadows.crowns.append((float(x), y, 1.4, 0.8))
+    for x in (-11.5, -9.5, -7.5):
+        mesh = crown(x, -(w + 0.55), 2.75, 0.95, 0.7, 7, site.atlas, fixed)
+        site.parts.append(mesh)
+    for x, y in ((-10.0, -(w + 2.2)), (-17.0, -(w + 2.4)), (-24.0, -(w + 2.2))):
+        mesh, radius, high = tree(x, y, site.atlas, fixed)
+        site.parts.append(mesh)
+        site.shadows.crowns.append((x, y, radius, high))
+
+
+def _poles(site: _Site, fixed: Generator) -> None:
+    layout = site.layout
+    side = float(fixed.choice([-1.0, 1.0]))
+    y = side * (layout.half_width_m + 0.9)
+    xs = np.arange(-101.0, 100.0, 34.0).tolist()
+    if not layout.has_ahead:
+        xs = [x for x in xs if x < 0]
+    xs = [x - 6.0 if NEAR_KERB_M - 7 < x < layout.far_kerb_m + 7 else x for x in xs]
+    for x in xs:
+        site.parts.append(utility_pole(float(x), y))
+    for a, b in pairwise(xs):
+        for off in (-1.0, 0.0, 1.0):
+            site.parts.append(wire((float(a), y + off, 8.9), (float(b), y + off, 8.9)))
+    face = sign_face("speed_limit", site.atlas)
+    x, y = -62.0, -(layout.half_width_m + 0.9)
+    site.parts += [face.placed(x, y, 0.0, 2.5), post(x, y, 2.9)]
+
+
+def _sign(site: _Site, category: Category, x: float, y: float, z: float, turn: float = 0.0) -> None:
+    """A sign on its own post, facing back along the approach road, or turned."""
+    face = sign_face(category, site.atlas)
+    flat = face.corners.reshape(-1, 3)
+    wide, high = (float(np.ptp(flat[:, k])) for k in (1, 2))
+    site.parts += [post(x, y, z + high / 2), sign_back(face).placed(x, y, turn, z)]
+    site.add(category, "furniture", face.placed(x, y, turn, z), (x, y, z), turn,
+             (0.02, wide, high))  # fmt: skip
+
+
+def _control(site: _Site, drive: Approach) -> None:
+    layout = site.layout
+    w, far, end = layout.half_width_m, layout.far_kerb_m, layout.end_m
+    if layout.control == "stop_sign":
+        _sign(site, "stop_sign", 0.0, -(w + 0.95), 2.5)
+    if layout.control == "traffic_light":
+        _lights(site, drive)
+    if layout.one_way:
+        kind: Category = "one_way_left" if layout.one_way == "left" else "one_way_right"
+        _sign(site, kind, end, (w + 1.2) if layout.has_ahead else 1.2, 2.45)
+        _sign(site, kind, NEAR_KERB_M - 1.0, -(w + 3.6), 2.45)
+    if layout.do_not_enter and layout.ahead_is_closed:
+        for side in (-1.0, 1.0):
+            _sign(site, "do_not_enter", end + 0.6, side * (w + 0.8), 2.3)
+    elif layout.do_not_enter:
+        # Against those who would turn into the one-way street, turned towards us.
+        side = 1.0 if layout.one_way == "right" else -1.0
+        _sign(site, "do_not_enter", far + 1.0, side * (w + 3.2), 2.3, side * 0.5)
+
+
+def _lights(site: _Site, drive: Approach) -> None:
+    """Two heads on an arm over the road and one on the pole, all beyond the intersection."""
+    layout = site.layout
+    w, end = layout.half_width_m, layout.end_m
+    site.parts.append(mast(end, -(w + 1.5), 1.2))
+    lane = lane_y_m(layout)
+    for y, z in ((lane, 5.45), (lane + 3.4, 5.5), (-(w + 1.2), 3.2)):
+        red = light_head("red").placed(end, y, 0.0, z)
+        green = light_head("green").placed(end, y, 0.0, z)
+        size = (0.24, 0.36, 1.06)
+        if drive.green_s < 0.0:
+            site.add("traffic_light", "furniture", green, (end, y, z), 0.0, size)
+        else:
+            site.add("traffic_light", "furniture", red, (end, y, z), 0.0, size,
+                     later=green, later_s=drive.green_s)  # fmt: skip
+
+
+def _parked(site: _Site, varied: Generator) -> None:
+    layout = site.layout
+    w, near, far = layout.half_width_m, NEAR_KERB_M, layout.far_kerb_m
+    for side, has_arm in ((1.0, layout.has_left), (-1.0, layout.has_right)):
+        if not has_arm or not layout.parked_cross:
+            continue
+        for x, heading in ((near + 1.15, -np.pi / 2), (far - 1.15, np.pi / 2)):
+            if layout.one_way:
+                heading = np.pi / 2 if layout.one_way == "left" else -np.pi / 2
+            y = w + float(varied.uniform(5.5, 8.0))
+            for _ in range(layout.parked_cross):
+                if varied.random() < 0.6:
+                    site.add_car(any_look(varied), "parked_cross", x, side * y, heading)
+                y += float(varied.uniform(6.0, 7.5))
+    if layout.has_ahead:
+        for side, heading in ((-1.0, 0.0), (1.0, np.pi)):
+            if layout.ahead_is_closed:
+                heading = np.pi
+            x = far + float(varied.uniform(9.0, 13.0))
+            for _ in range(layout.parked_past):
+                if varied.random() < 0.65:
+                    site.add_car(any_look(varied), "parked_past", x, side * (w - 1.05), heading)
+                x += float(varied.uniform(6.2, 9.0))
+    if w > 4.6:
+        for side, heading in ((-1.0, 0.0), (1.0, np.pi)):
+            for x in np.arange(-80.0, -16.0, 7.0):
+                if varied.random() < 0.14:
+                    site.add_car(any_look(varied), "other", float(x), side * (w - 1.05), heading)
+
+
+def _traffic(site: _Site, conditions: Conditions, drive: Approach, varied: Generator) -> None:
+    layout = site.layout
+    w, near, far = layout.half_width_m, NEAR_KERB_M, layout.far_kerb_m
+    length_s = len(drive.motion) / 100.0
+    rate = layout.cross_traffic * conditions.traffic / 60.0
+    flows = []
+    # Driving on the right, those who go right use the near half.
+    if layout.has_left or layout.has_right:
+        if layout.one_way != "left":
+            flows.append((-np.pi / 2, near + 0.27 * (far - near)))
+        if layout.one_way != "right":
+            flows.append((np.pi / 2, far - 0.27 * (far - near)))
+    for heading, x in flows:
+        _stream(site, "cross", heading, x, rate, drive, length_s, varied)
+    lane = lane_y_m(layout)
+    if layout.has_ahead:
+        along = 5.0 * conditions.traffic / 60.0
+        _stream(site, "oncoming", np.pi, -lane, along, drive, length_s, varied)
+        if not layout.ahead_is_closed:
+            _stream(site, "outgoing", 0.0, lane, along, drive, length_s, varied)
+    if layout.control == "traffic_light" and drive.green_s < 0.0:
+        for heading, x in flows:
+            y = (w + 5.5) * (1.0 if heading < 0 else -1.0)
+            if varied.random() < 0.8:
+                site.add_car(any_look(varied), "cross", x, y, heading)
+
+
+def _stream(
+    site: _Site, role: Role, heading: float, lane: float, rate_hz: float, drive: Approach,
+    length_s: float, varied: Generator,
+) -> None:  # fmt: skip
+    """Cars that follow one another at random, none where it would hit us."""
+    at = -9.0
+    speed = float(varied.uniform(8.0, 12.0))
+    enter, leave = drive.inside_s
+    while True:
+        at += 1.4 + float(varied.exponential(1.0 / max(rate_hz, 1e-3)))
+        if at > length_s + 6.0:
+            return
+        look = any_look(varied)
+        if role == "cross":
+            waits_for_red = drive.green_s >= 0.0 and at > drive.green_s - 1.0
+            always_green = site.layout.control == "traffic_light" and drive.green_s < 0.0
+            if enter - 2.2 < at < leave + 2.2 or waits_for_red or always_green:
+                continue
+            y = -speed * float(np.sin(heading)) * at
+            site.add_car(look, role, lane, y, heading, speed, (at - 9.0, at + 9.0))
+        elif role == "oncoming":
+            x = site.layout.far_kerb_m + speed * at
+            site.add_car(look, role, x, lane, heading, speed, (at - 10.0, at + 9.0))
+        else:
+            # At the far kerb at ``at``; it was never on the approach before us.
+            x = site.layout.far_kerb_m + 6.0 - speed * at
+            site.add_car(look, role, x, lane, heading, speed, (at, at + 10.0))

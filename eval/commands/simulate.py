@@ -1,0 +1,93 @@
+"""Simulate drives up to intersections: log with camera, CAN, Mobileye and compass, truth beside.
+
+Layouts A to H are those of the published study; L0, L1, ... are others, from seeds, for training.
+The same names and seeds give the same bytes.
+
+examples:
+  crosscue simulate A --run 3 -o drives
+  crosscue simulate --all -o drives
+  crosscue simulate L17 L18 --runs 2 --seed 5 -o training
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from crosscue.datasets.scenes.camera import Camera
+from crosscue.datasets.scenes.drive import SceneFiles, SceneSettings, write_scene
+from crosscue.datasets.scenes.layout import SCORED
+from crosscue.replay.errors import UsageError
+
+from .common import print_json, with_progress
+
+PUBLISHED_RUNS = 10
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("layouts", nargs="*", metavar="LAYOUT", help="A to H, or L0, L1, ...")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
+                        help="folder that gets one folder a drive")  # fmt: skip
+    parser.add_argument("--run", type=int, metavar="N", help="one run, from 1")
+    parser.add_argument("--runs", type=int, metavar="N", help="the first N runs (default: 1)")
+    parser.add_argument("--all", action="store_true", help="A to H, ten runs each")
+    parser.add_argument("--seed", type=int, default=0, help="of what differs from run to run")
+    parser.add_argument("--rate", type=int, default=10, help="pictures a second: 10, 20, 25, 50")
+    parser.add_argument("--width", type=int, default=1280, help="of the picture (9/16 high)")
+    parser.add_argument("--overwrite", action="store_true", help="replace earlier drives")
+    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate all that was asked for."""
+    wanted = _wanted(args)
+    written: list[dict[str, object]] = []
+
+    def share() -> float:
+        return len(written) / len(wanted)
+
+    for settings in with_progress(wanted, share, args, "simulating"):
+        began = time.monotonic()
+        folder = args.output / settings.name
+        files = write_scene(folder, settings, overwrite=args.overwrite)
+        written.append(_told(settings, files))
+        if not args.quiet and not args.json:
+            took = time.monotonic() - began
+            print(f"{folder}: {files.seconds:.1f} s, {files.pictures} pictures, "
+                  f"made in {took:.0f} s")  # fmt: skip
+    if args.json:
+        print_json(written)
+    return 0
+
+
+def _wanted(args: argparse.Namespace) -> list[SceneSettings]:
+    if args.all == bool(args.layouts):
+        raise UsageError("simulate: give layouts (A to H, L0, L1, ...), or --all")
+    if args.run is not None and (args.runs is not None or args.all):
+        raise UsageError("--run: not together with --runs or --all; give one of them")
+    if not 64 <= args.width <= 3840 or args.width % 16:
+        raise UsageError(f"--width {args.width}: want a multiple of 16 from 64 to 3840")
+    layouts = list(SCORED) if args.all else args.layouts
+    last = args.runs if args.runs is not None else PUBLISHED_RUNS if args.all else 1
+    if last < 1:
+        raise UsageError(f"--runs {last}: want 1 or more")
+    runs = [args.run] if args.run is not None else list(range(1, last + 1))
+    camera = Camera(width_px=args.width, height_px=args.width * 9 // 16)
+    try:
+        return [SceneSettings(layout=layout, run=run, seed=args.seed, rate_hz=args.rate,
+                              camera=camera) for layout in layouts for run in runs]  # fmt: skip
+    except ValueError as error:
+        raise UsageError(f"simulate: {error}") from None
+
+
+def _told(settings: SceneSettings, files: SceneFiles) -> dict[str, object]:
+    return {
+        "name": settings.name,
+        "log": str(files.log),
+        "vehicle": str(files.vehicle),
+        "truth": str(files.truth),
+        "pictures": files.pictures,
+        "seconds": files.seconds,
+    }
