@@ -1,0 +1,256 @@
+"""The best pose that the measurements allow: a batch smoother over the filter's own measurements.
+
+A factor graph of planar poses (F. Dellaert, M. Kaess, "Factor Graphs for Robot Perception", 2017),
+solved by GTSAM, an optional package: odometry between the poses, headings and landmarks on them,
+the start as prior. Where the filter knows only the past, the smoother knows all, and it linearises
+about its solution, not about each first guess. It is a reference, not a part of the replay.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import UsageError
+
+from .angles import wrap
+from .ekf import PoseBelief
+from .odometry import Increments
+from .packed_state import PackedState, driven
+from .pose_track import Headings
+
+if TYPE_CHECKING:
+    import gtsam
+
+STEP_NS: Final = 1_000_000_000
+"""Longest time between two poses of the graph."""
+_LEAST_VARIANCE: Final = np.diag([1e-5, 1e-5, 1e-8])
+"""Added so that exact odometry (an arc has no sideways error) can be inverted: 3 mm, 0.1 mrad."""
+_AT_REST: Final[PackedState] = (0.0,) * 14
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fixes:
+    """N positions of the camera, from landmarks.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        xy_m: Shape (N, 2).
+        cov_m2: Shape (N, 2, 2).
+    """
+
+    t_ns: Int64s
+    xy_m: Floats
+    cov_m2: Floats
+
+    def __post_init__(self) -> None:
+        """Refuse columns that do not line up.
+
+        Raises:
+            ValueError: Naming the shapes wanted and given.
+        """
+        n = len(self.t_ns)
+        if self.xy_m.shape != (n, 2) or self.cov_m2.shape != (n, 2, 2):
+            raise ValueError(
+                f"want xy_m ({n}, 2), cov_m2 ({n}, 2, 2); got {self.xy_m.shape}, "
+                f"{self.cov_m2.shape}"
+            )
+
+
+NO_FIXES: Final = Fixes(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smoothed:
+    """M poses given all measurements.
+
+    Attributes:
+        t_ns: Shape (M,), int64.
+        xyh: Shape (M, 3): x, y in metres, heading in radians in (-pi, pi].
+        cov: Shape (M, 3, 3), in the map frame.
+    """
+
+    t_ns: Int64s
+    xyh: Floats
+    cov: Floats
+
+
+def smooth(
+    start: PoseBelief,
+    increments: Increments,
+    headings: Headings,
+    fixes: Fixes = NO_FIXES,
+    at_ns: Int64s | None = None,
+    lever_m: tuple[float, float] = (0.0, 0.0),
+) -> Smoothed:
+    """Poses at the wanted times that fit all measurements best.
+
+    Args:
+        start: The first belief; its time is where the graph begins.
+        increments: Odometry without holes, from the start's time on.
+        headings: Those that count, with their variances.
+        fixes: Landmarks weighed in.
+        at_ns: Wanted times; None: the graph's own, at most ``STEP_NS`` apart. Times outside the
+            odometry are left out.
+        lever_m: The camera ahead of and to the left of the rear axle.
+
+    Raises:
+        UsageError: GTSAM is not installed.
+        ValueError: The odometry has a hole, or is empty.
+    """
+    _need_gtsam()
+    import gtsam
+
+    _check(start, increments)
+    times = _times(start, increments, headings, fixes, at_ns)
+    graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    _add_start(graph, start)
+    guess.insert(0, gtsam.Pose2(*start.mean[:3]))
+    for key, (mean, cov) in enumerate(_steps(times, increments), start=1):
+        between = gtsam.Pose2(*mean)
+        noise = gtsam.noiseModel.Gaussian.Covariance(_in_end_frame(cov, mean[2]))
+        graph.add(gtsam.BetweenFactorPose2(key - 1, key, between, noise))
+        guess.insert(key, guess.atPose2(key - 1).compose(between))
+    _add_headings(graph, times, headings)
+    _add_fixes(graph, guess, times, fixes, lever_m)
+    solved = gtsam.LevenbergMarquardtOptimizer(graph, guess).optimize()
+    return _read(graph, solved, times, times if at_ns is None else at_ns)
+
+
+def _need_gtsam() -> None:
+    try:
+        import_module("gtsam")
+    except ImportError:
+        raise UsageError(
+            "the smoother needs the package gtsam; install it with: pip install 'crosscue[gtsam]'"
+        ) from None
+
+
+def _check(start: PoseBelief, increments: Increments) -> None:
+    if not len(increments) or increments.stop_ns[-1] <= start.t_ns:
+        raise ValueError(f"increments: want odometry after {start.t_ns} ns, got none")
+    holes = np.flatnonzero(increments.start_ns[1:] != increments.stop_ns[:-1])
+    if len(holes) or increments.start_ns[0] > start.t_ns:
+        where = increments.stop_ns[holes[0]] if len(holes) else start.t_ns
+        raise ValueError(f"increments: want no holes, got one at {where} ns")
+
+
+def _times(
+    start: PoseBelief,
+    increments: Increments,
+    headings: Headings,
+    fixes: Fixes,
+    at_ns: Int64s | None,
+) -> Int64s:
+    end_ns = int(increments.stop_ns[-1])
+    wanted = [headings.t_ns, fixes.t_ns, np.arange(start.t_ns, end_ns, STEP_NS)]
+    wanted += [np.array([start.t_ns, end_ns])] + ([] if at_ns is None else [at_ns])
+    times = np.unique(np.concatenate(wanted)).astype(np.int64)
+    inside: Int64s = times[(times >= start.t_ns) & (times <= end_ns)]
+    return inside
+
+
+def _steps(times: Int64s, increments: Increments) -> list[tuple[Floats, Floats]]:
+    """Relative pose and its covariance, in the frame of its beginning, from time to time."""
+    columns = (
+        increments.distance_m,
+        increments.turn_rad,
+        increments.distance_var_m2,
+        increments.turn_var_rad2,
+    )
+    starts, stops = increments.start_ns.tolist(), increments.stop_ns.tolist()
+    rows = list(zip(*(column.tolist() for column in columns), strict=True))
+    i = int(np.searchsorted(increments.stop_ns, times[0], side="right"))
+    steps: list[tuple[Floats, Floats]] = []
+    now = int(times[0])
+    for until in times[1:].tolist():
+        state = _AT_REST
+        while now < until:
+            to = min(until, stops[i])
+            share = (to - now) / (stops[i] - starts[i])
+            distance, turn, distance_var, turn_var = (share * value for value in rows[i])
+            state = driven(state, distance, turn, distance_var, turn_var, 0.0)
+            now = to
+            i += now == stops[i]
+        x, y, heading, _, xx, xy, xh, _, yy, yh, _, hh, _, _ = state
+        cov = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
+        steps.append((np.array([x, y, heading]), cov))
+    return steps
+
+
+def _rotation(angle_rad: float) -> Floats:
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _in_end_frame(cov: Floats, turn_rad: float) -> Floats:
+    """GTSAM states a pose's error in that pose's own axes."""
+    back = _rotation(-turn_rad)
+    turned: Floats = back @ cov @ back.T + _LEAST_VARIANCE
+    return turned
+
+
+def _add_start(graph: gtsam.NonlinearFactorGraph, start: PoseBelief) -> None:
+    import gtsam
+
+    cov = _in_end_frame(start.cov[:3, :3], float(start.mean[2]))
+    noise = gtsam.noiseModel.Gaussian.Covariance(cov)
+    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*start.mean[:3]), noise))
+
+
+def _add_headings(graph: gtsam.NonlinearFactorGraph, times: Int64s, headings: Headings) -> None:
+    import gtsam
+
+    for t_ns, heading, var in zip(
+        headings.t_ns.tolist(), headings.heading_rad.tolist(), headings.var_rad2.tolist(),
+        strict=True,
+    ):  # fmt: skip
+        key = int(np.searchsorted(times, t_ns))
+        if key == len(times) or times[key] != t_ns:
+            continue
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, math.sqrt(var))
+        graph.add(gtsam.PoseRotationPrior2D(key, gtsam.Rot2(heading), noise))
+
+
+def _add_fixes(
+    graph: gtsam.NonlinearFactorGraph,
+    guess: gtsam.Values,
+    times: Int64s,
+    fixes: Fixes,
+    lever_m: tuple[float, float],
+) -> None:
+    """Each fix holds a pose of the camera, rigidly tied to the car's."""
+    import gtsam
+
+    lever = gtsam.Pose2(lever_m[0], lever_m[1], 0.0)
+    rigid = gtsam.noiseModel.Gaussian.Covariance(_LEAST_VARIANCE)
+    for i, t_ns in enumerate(fixes.t_ns.tolist()):
+        key = int(np.searchsorted(times, t_ns))
+        if key == len(times) or times[key] != t_ns:
+            continue
+        camera = len(times) + i
+        guess.insert(camera, guess.atPose2(key).compose(lever))
+        graph.add(gtsam.BetweenFactorPose2(key, camera, lever, rigid))
+        noise = gtsam.noiseModel.Gaussian.Covariance(fixes.cov_m2[i])
+        graph.add(gtsam.PoseTranslationPrior2D(camera, fixes.xy_m[i], noise))
+
+
+def _read(
+    graph: gtsam.NonlinearFactorGraph, solved: gtsam.Values, times: Int64s, at_ns: Int64s
+) -> Smoothed:
+    import gtsam
+
+    marginals = gtsam.Marginals(graph, solved)
+    found = at_ns[(at_ns >= times[0]) & (at_ns <= times[-1])]
+    xyh, covs = np.empty((len(found), 3)), np.empty((len(found), 3, 3))
+    for row, key in enumerate(np.searchsorted(times, found).tolist()):
+        pose = solved.atPose2(key)
+        xyh[row] = pose.x(), pose.y(), wrap(pose.theta())
+        out = _rotation(pose.theta())
+        covs[row] = out @ marginals.marginalCovariance(key) @ out.T
+    return Smoothed(found, xyh, covs)
