@@ -24,6 +24,7 @@ from crosscue.replay.vehicle import Vehicle
 from crosscue.replay.windows import Window
 
 from .landmark_stage import LandmarkStage, NoLandmarks
+from .measurements import heading_rows, landmark_rows, odometry_rows, start_rows
 
 REJECTED_SHARE: Final = 0.1
 """An honest filter refuses one reading in a thousand; above this something is wrong."""
@@ -81,6 +82,7 @@ class PoseStage:
     _pending: Pending = field(default_factory=Pending)
     _state: TrackState | None = None
     _last_ns: int | None = None
+    _measured: list[dict[str, object]] = field(default_factory=list)
 
     def __call__(self, window: Window) -> Iterator[PoseColumns]:
         """Rows that this window completes."""
@@ -91,6 +93,11 @@ class PoseStage:
         if self._state is not None and self._last_ns is not None:
             yield from self._advance(Window(self._last_ns, self._last_ns, {}), None)
         self.landmarks.let_go(FOREVER_NS)
+
+    def take_measured(self) -> list[dict[str, object]]:
+        """What the filter was given since the last call, as rows of ``measurements.parquet``."""
+        taken, self._measured = self._measured, []
+        return taken
 
     def doubts(self) -> list[str]:
         """What the counts say against the settings, in plain words."""
@@ -136,6 +143,11 @@ class PoseStage:
             looks=self.landmarks,
         )  # fmt: skip
         self._state = made.state
+        self._measured += [
+            odometry_rows(step.increments),
+            heading_rows(made.headings),
+            landmark_rows(self.landmarks.take_sightings()),
+        ]
         self.landmarks.let_go(window.end_ns - FRAMES_WAIT_NS)
         self.track_counts += made.counts
         if len(made.poses):
@@ -163,6 +175,7 @@ class PoseStage:
             position_sd_m=start.position_sd_m, heading_sd_rad=sd_rad,
         )  # fmt: skip
         self._state = TrackState(belief)
+        self._measured.append(start_rows(belief))
         return headings
 
     def _missed(self, headings: Headings) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Final
@@ -27,6 +27,7 @@ from crosscue.replay.signals import Extractor, Plan, Signal, camera_of, plan, wi
 from crosscue.replay.vehicle import Vehicle
 from crosscue.replay.windows import windows
 
+from . import measurements
 from .landmark_stage import looking
 from .pose_stage import PoseStage, turn_signal_of
 
@@ -114,15 +115,20 @@ def replay_drive(
     with locked(run):
         clear(run)
         tally = _Tally()
-        with TableSink(run, "pose", pose_schema()) as sink:
+        with (
+            TableSink(run, "pose", pose_schema()) as sink,
+            TableSink(run, measurements.TABLE, measurements.schema()) as measured,
+        ):
             for window in windows(logs, extractors, selections, planned):
                 for poses in stage(window):
                     sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
                     tally.add(poses)
+                _write_all(measured, stage.take_measured())
                 on_time(window.end_ns)
             for poses in stage.finish():
                 sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
                 tally.add(poses)
+            _write_all(measured, stage.take_measured())
         with TableSink(run, "skipped", skipped_schema()) as sink:
             for ledger in ledgers:
                 sink.write(skipped_rows(ledger))
@@ -159,6 +165,12 @@ def replay_drive(
         run, ledgers, tally.rows, tally.travelled_m, tally.major_axis_m, notices,
         seconds, tally.seconds, stage.landmarks.counts(),
     )  # fmt: skip
+
+
+def _write_all(sink: TableSink, parts: Sequence[Mapping[str, object]]) -> None:
+    for columns in parts:
+        if columns["kind"]:
+            sink.write(columns)
 
 
 def probe_clocks(log: Log, extractor: Extractor, selection: Selection) -> dict[str, Clock]:

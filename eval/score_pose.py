@@ -20,7 +20,7 @@ from crosscue.datasets import truth as truth_file
 from crosscue.datasets.truth import Truth
 from crosscue.datasets.tum import Trajectory, heading_rad, planar, read_tum, write_tum
 from crosscue.localization.angles import wrap_all
-from crosscue.replay.columns import Floats
+from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.run_folder import RunFolder, strict_json, write_text
 from crosscue.replay.vehicle import Vehicle
@@ -172,8 +172,25 @@ def _inside(track: Trajectory, table: pa.Table, path: Path) -> NDArray[np.bool_]
 
 def _estimate(table: pa.Table, vehicle: Vehicle, truth: Truth) -> tuple[Trajectory, Floats]:
     """The estimated track at the point the truth speaks of, with its covariance."""
-    x, y, heading = (table[name].to_numpy() for name in ("x_m", "y_m", "heading_rad"))
+    xyh = np.column_stack([table[name].to_numpy() for name in ("x_m", "y_m", "heading_rad")])
     cov = np.column_stack([table[f"cov_{name}"].to_numpy() for name in COVARIANCES])
+    return at_truths_point(table["t_ns"].to_numpy(), xyh, cov, vehicle, truth)
+
+
+def at_truths_point(
+    t_ns: Int64s, xyh: Floats, cov_xyh: Floats, vehicle: Vehicle, truth: Truth
+) -> tuple[Trajectory, Floats]:
+    """Rear-axle poses, shape (N, 3), moved to the point the truth speaks of.
+
+    Args:
+        t_ns: Shape (N,).
+        xyh: Shape (N, 3).
+        cov_xyh: Shape (N, 6): covariance of x, y, heading: xx, xy, xh, yy, yh, hh.
+        vehicle: For the camera's place.
+        truth: Names the point.
+    """
+    x, y, heading = xyh.T
+    cov = cov_xyh
     if truth.pose_point == "camera":
         ahead, left = vehicle.camera.x_m, vehicle.camera.y_m
         cos, sin = np.cos(heading), np.sin(heading)
@@ -191,7 +208,7 @@ def _estimate(table: pa.Table, vehicle: Vehicle, truth: Truth) -> tuple[Trajecto
                 hh,
             ]
         )
-    return planar(table["t_ns"].to_numpy(), x, y, heading), cov
+    return planar(t_ns, x, y, heading), cov
 
 
 def _ape(paired: Paired, how: Alignment) -> Errors:

@@ -18,6 +18,7 @@ from crosscue.datasets.simulated_log import DriveFiles, write_drive
 from crosscue.datasets.tum import read_tum
 from crosscue.eval import cli
 from crosscue.eval.landmark_stage import LandmarkStage, looking
+from crosscue.eval.measurements import read_measured
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmark_database import LandmarkDatabase
 from crosscue.localization.landmark_pictures import EncodedPicture, grey_of
@@ -350,3 +351,37 @@ def test_a_vehicle_file_with_a_landmark_section_is_checked(tmp_path: Path) -> No
     path = tmp_path / "car.toml"
     path.write_text("version = 1\n[landmarks]\nmin_score = 33\nmatcher = 'orb'\n")
     assert load(path).landmarks.min_score == 33.0
+
+
+def test_the_score_shows_filter_and_batch_smoother_side_by_side(
+    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
+    run = replay(town, tmp_path / "run", "--landmarks", str(town.database))
+    command = ["score", str(run.path), "--truth", str(town.drive.truth), "--smoother", "gtsam"]
+    capsys.readouterr()
+    assert cli.run([*command, "--json"]) == 0
+
+    (score,) = json.loads(capsys.readouterr().out).values()
+    smoother = score["smoother"]
+    assert smoother["poses"] > 20
+    assert smoother["smoother_rmse_m"] < smoother["filter_rmse_m"]
+    assert abs(smoother["smoother_end_m"] - smoother["filter_end_m"]) < 0.5
+    assert json.loads((run.path / "score" / "smoother.json").read_text()) == smoother
+    assert cli.run(command) == 0
+    assert "filter against batch smoother" in capsys.readouterr().out
+
+
+def test_the_measurements_are_those_that_the_filter_used(town: Town, tmp_path: Path) -> None:
+    run = replay(town, tmp_path / "run", "--landmarks", str(town.database))
+    counts = run.manifest()["counts"]
+    kinds = run.table("measurements")["kind"].to_pylist()
+
+    assert kinds.count("start") == 1
+    assert kinds.count("odometry") == counts["odometry"]["intervals"]
+    assert kinds.count("heading") == counts["track"]["headings_accepted"] > 0
+    assert kinds.count("landmark") == counts["landmarks"]["accepted"] > 0
+    read = read_measured(run)
+    table = run.table("pose")
+    ends = np.isin(read.increments.stop_ns, table["t_ns"].to_numpy())
+    assert ends.mean() > 0.99

@@ -14,8 +14,9 @@ from pathlib import Path
 
 from crosscue.eval.report import write_report
 from crosscue.eval.score_pose import PoseScore, load_truth, score, summary
+from crosscue.eval.smooth_pose import SmootherScore, score_smoother, told
 from crosscue.replay.errors import UsageError
-from crosscue.replay.run_folder import locked, open_run
+from crosscue.replay.run_folder import RunFolder, locked, open_run
 
 from .common import print_json
 
@@ -29,6 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rpe", nargs="+", type=_metres, default=[10.0, 100.0], metavar="M",
         help="distances of the relative error in metres (default: 10 100)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--smoother", choices=("gtsam",),
+        help="beside the filter, a batch smoother over the same measurements",
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the metrics as JSON")
 
@@ -46,16 +51,30 @@ def run(args: argparse.Namespace) -> int:
     if len({path.resolve() for path in args.runs}) != len(args.runs):
         raise UsageError("score: a run is named twice; name each once")
     results: dict[str, PoseScore] = {}
+    smoothers: dict[str, SmootherScore | None] = {}
     for path in args.runs:
         folder = open_run(path)
         with locked(folder):
             result = score(folder, args.truth, args.rpe)
             report = write_report(folder, truth, result)
+            smoothed = _smoothed(folder, args)
         results[str(path)] = result
+        smoothers[str(path)] = smoothed
         if not args.json and not args.quiet:
             print(f"run        {path}")
             print(summary(result))
+            if smoothed is not None:
+                print(told(smoothed))
             print(f"report     {report}")
     if args.json:
-        print_json({path: asdict(result) for path, result in results.items()})
+        print_json({path: _as_json(result, smoothers[path]) for path, result in results.items()})
     return 0
+
+
+def _smoothed(folder: RunFolder, args: argparse.Namespace) -> SmootherScore | None:
+    return None if args.smoother is None else score_smoother(folder, args.truth)
+
+
+def _as_json(result: PoseScore, smoothed: SmootherScore | None) -> dict[str, object]:
+    beside = {} if smoothed is None else {"smoother": asdict(smoothed)}
+    return asdict(result) | beside
