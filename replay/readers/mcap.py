@@ -71,7 +71,7 @@ class McapLog:
         )
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """Its messages in stored order: a block per topic and chunk; see ``Log.read``."""
+        """Its messages in stored order: a block per topic and a few chunks; see ``Log.read``."""
         yield from read_segments(
             self._file, self._segments, self._book, self._limits, ledger, selection
         )

@@ -38,10 +38,16 @@ class Buffers:
     def take(self, size: int) -> Bytes:
         """An array of shape (size,) with any content; safe from any thread."""
         with self._lock:
+            best: int | None = None
             for i in range(len(self._owned)):
+                has = len(self._owned[i])
                 # Two: the list's reference and the argument's.
-                if len(self._owned[i]) >= size and getrefcount(self._owned[i]) == 2:
-                    return self._owned[i][:size]
+                if has < size or getrefcount(self._owned[i]) != 2:
+                    continue
+                if best is None or has < len(self._owned[best]):
+                    best = i
+            if best is not None:
+                return self._owned[best][:size]
             owner = np.empty(-(-size // STEP) * STEP, dtype=np.uint8)
             if len(self._owned) < KEPT and size <= KEPT_BYTES:
                 self._owned.append(owner)
@@ -80,9 +86,15 @@ class ByteFile:
         Raises:
             BrokenRecordError: The disk reports an error.
         """
-        size = max(0, min(size, self.size - at))
-        array = self.buffers.take(size)
-        view, done = array.data, 0
+        return self.read_into(at, self.buffers.take(max(0, min(size, self.size - at))))
+
+    def read_into(self, at: int, array: Bytes) -> Bytes:
+        """The bytes at ``at``, written into ``array``; fewer than it has at the end.
+
+        Raises:
+            BrokenRecordError: The disk reports an error.
+        """
+        size, view, done = len(array), array.data, 0
         while done < size:
             try:
                 step = os.preadv(self._file.fileno(), [view[done:]], at + done)

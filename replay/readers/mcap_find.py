@@ -111,7 +111,7 @@ def _proves_itself(file: ByteFile, at: int) -> bool:
     head = read_chunk_head(file.peek(at, HEAD_MOST)[PREFIX.size :])
     body_at = at + PREFIX.size + head.body_at
     try:
-        inflate(file.read(body_at, head.body_size), head, file.buffers)
+        inflate(file.read(body_at, head.body_size), head, file.buffers.take(head.size + 1))
     except BrokenRecordError:
         return False
     return True

@@ -10,7 +10,6 @@ import numpy as np
 from crosscue.replay.checksum import crc32
 from crosscue.replay.columns import Bytes
 
-from .mcap_bytes import Buffers
 from .mcap_records import BrokenRecordError, ChunkHead
 
 UNKNOWN_SIZES: Final = (-1, 0)
@@ -18,16 +17,17 @@ UNKNOWN_SIZES: Final = (-1, 0)
 LZ4_STEP: Final = 256 << 10
 
 
-def inflate(body: Bytes, head: ChunkHead, buffers: Buffers) -> Bytes:
+def inflate(body: Bytes, head: ChunkHead, room: Bytes) -> Bytes:
     """The records of a chunk, their size and checksum as the chunk declares.
 
     Args:
         body: Shape (B,), the chunk's records as stored.
         head: What the chunk says of them.
-        buffers: Where memory comes from.
+        room: Where to write them, one byte more than ``head.size``; not used if they are not
+            compressed.
 
     Returns:
-        Shape (``head.size``,), uint8.
+        Shape (``head.size``,), uint8: the first bytes of ``room``, or ``body``.
 
     Raises:
         BrokenRecordError: Something is not as declared; nothing beyond the declared size was
@@ -35,7 +35,7 @@ def inflate(body: Bytes, head: ChunkHead, buffers: Buffers) -> Bytes:
     """
     if len(body) != head.body_size:
         raise BrokenRecordError(f"holds {len(body)} of {head.body_size} bytes")
-    records = _WHOLE[head.compression](body, head.size, buffers) if len(body) else body
+    records = _WHOLE[head.compression](body, head.size, room) if len(body) else body
     if len(records) != head.size:
         raise BrokenRecordError(f"decompressed to {len(records)} bytes, declared {head.size}")
     if head.crc and crc32(records.data) != head.crc:
@@ -54,11 +54,11 @@ def inflate_prefix(body: Bytes, head: ChunkHead) -> Bytes:
     return records
 
 
-def _plain(body: Bytes, size: int, buffers: Buffers) -> Bytes:
+def _plain(body: Bytes, size: int, records: Bytes) -> Bytes:
     return body
 
 
-def _zstd(body: Bytes, size: int, buffers: Buffers) -> Bytes:
+def _zstd(body: Bytes, size: int, records: Bytes) -> Bytes:
     import zstandard
 
     try:
@@ -66,12 +66,12 @@ def _zstd(body: Bytes, size: int, buffers: Buffers) -> Bytes:
         if declared > size:
             raise BrokenRecordError(f"its zstd frame declares {declared} bytes, the chunk {size}")
         # One byte of room more than is due, so that a frame which gives more is found out.
-        records, done = buffers.take(size + 1), 0
+        done = 0
         with zstandard.ZstdDecompressor().stream_reader(
             body.data, read_across_frames=True
         ) as stream:
             while done <= size:
-                step = stream.readinto(records.data[done:])
+                step = stream.readinto(records.data[done : size + 1])
                 if not step:
                     break
                 done += step
@@ -82,10 +82,10 @@ def _zstd(body: Bytes, size: int, buffers: Buffers) -> Bytes:
     return records[:done]
 
 
-def _lz4(body: Bytes, size: int, buffers: Buffers) -> Bytes:
+def _lz4(body: Bytes, size: int, records: Bytes) -> Bytes:
     import lz4.frame
 
-    records, done, used, is_done = buffers.take(size), 0, 0, False
+    done, used, is_done = 0, 0, False
     view, context = body.data, lz4.frame.create_decompression_context()
     try:
         declared = lz4.frame.get_frame_info(view)["content_size"]
@@ -144,7 +144,7 @@ def _lz4_prefix(body: Bytes, size: int) -> Bytes:
     return np.frombuffer(b"".join(got), dtype=np.uint8)
 
 
-_WHOLE: Final[dict[str, Callable[[Bytes, int, Buffers], Bytes]]] = {
+_WHOLE: Final[dict[str, Callable[[Bytes, int, Bytes], Bytes]]] = {
     "": _plain,
     "lz4": _lz4,
     "zstd": _zstd,

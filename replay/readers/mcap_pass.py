@@ -19,9 +19,9 @@ from crosscue.replay.log import EVERYTHING, Selection
 from .mcap_bytes import ByteFile
 from .mcap_checks import Checks
 from .mcap_give import Giver
-from .mcap_load import Loader
+from .mcap_load import Load, Loader, Stretch
 from .mcap_records import PREFIX, BrokenRecordError
-from .mcap_rows import NEVER_IN_A_CHUNK, Rows, contradicts, rows_by_index, rows_by_scan
+from .mcap_rows import NEVER_IN_A_CHUNK, Rows, contradicts, join, rows_by_index, rows_by_scan
 from .mcap_scan import Scanner
 from .mcap_segments import Segment, Summary
 from .mcap_topics import TopicBook
@@ -118,6 +118,7 @@ class SegmentPass:
         self._damages: list[Damage] = []
         self._section: Future[int | None] | None = None
         self._attachments: list[tuple[int, int, Future[int | None]]] = []
+        self._waiting: list[tuple[Stretch, Rows]] = []
         self._declarations = segment.declarations(book)
         self._giver = Giver(ledger, selection, limits, self._declarations)
 
@@ -135,9 +136,9 @@ class SegmentPass:
             self._file, segment.begin, segment.end, segment.rail, self._limits, self._scanner
         )
         items = self._loader.ahead(iter(walk), self._is_wanted)
-        for (item, records), (following, _) in pairwise(chain(items, [(None, None)])):
+        for (item, load), (following, _) in pairwise(chain(items, [(None, None)])):
             if isinstance(item, Chunk):
-                yield from self._chunk(item, records)
+                yield from self._chunk(item, load)
             elif isinstance(item, Run):
                 yield from self._run(item, isinstance(following, Gap))
             else:
@@ -163,21 +164,44 @@ class SegmentPass:
             return True
         return any(self._giver.wants(m) for m in filled)
 
-    def _chunk(self, chunk: Chunk, records: Future[Bytes] | None) -> Iterator[Block]:
+    def _chunk(self, chunk: Chunk, load: Load | None) -> Iterator[Block]:
         self._checks.chunks += 1
-        if records is None and not any(self._giver.wants(m) for m in chunk.messages):
+        if load is None and not any(self._giver.wants(m) for m in chunk.messages):
             self._checks.chunks_unread += 1
             for index in chunk.messages:
                 self._giver.pass_over(index)
             return
         try:
-            # Not wanted when looked at first, wanted now: a channel was given another meaning.
-            buffer = records.result() if records is not None else self._loader.load(chunk)
-            rows = self._cut_rows(chunk, buffer) if chunk.is_cut else self._rows(chunk, buffer)
+            stretch = self._stretch(chunk, load)
+            records = stretch.records
+            rows = self._cut_rows(chunk, records) if chunk.is_cut else self._rows(chunk, records)
         except BrokenRecordError as error:
+            yield from self._give_waiting()
             self._lose_chunk(chunk, str(error))
             return
+        if rows.groups and not rows.definitions and load is not None:
+            self._waiting.append((stretch, rows))
+            if load.is_last:
+                yield from self._give_waiting()
+            return
+        yield from self._give_waiting()
         yield from self._giver.give(rows, self._checks, chunk.at)
+
+    def _stretch(self, chunk: Chunk, load: Load | None) -> Stretch:
+        if load is not None:
+            return load.stretch()
+        # Not wanted when looked at first, wanted now: a channel was given another meaning.
+        records = self._loader.load(chunk)
+        return Stretch(records, 0, len(records))
+
+    def _give_waiting(self) -> Iterator[Block]:
+        """The messages of chunks of one group, which are given together."""
+        if not self._waiting:
+            return
+        whole = self._waiting[0][0].whole
+        rows = join(whole, [(rows, stretch.begin) for stretch, rows in self._waiting])
+        self._waiting.clear()
+        yield from self._giver.give(rows, self._checks, 0)
 
     def _rows(self, chunk: Chunk, buffer: Bytes) -> Rows:
         """The messages of a chunk, all that can be checked being checked.

@@ -206,6 +206,41 @@ def _between_messages(
     return definitions, ignored
 
 
+def join(whole: Bytes, parts: Sequence[tuple[Rows, int]]) -> Rows:
+    """Messages of consecutive chunks as those of one.
+
+    Args:
+        whole: Shape (B,): the buffer in which the chunks lie one after the other.
+        parts: The messages of each, in groups and without definitions, and where in ``whole`` the
+            chunk begins.
+    """
+    if len(parts) == 1:
+        rows, begin = parts[0]
+        if not begin and len(rows.buffer) == len(whole):
+            return rows
+    pieces: dict[int, list[tuple[Rows, int, slice]]] = {}
+    for rows, begin in parts:
+        for channel_id, piece in rows.groups:
+            pieces.setdefault(channel_id, []).append((rows, begin, piece))
+    every = [piece for of_channel in pieces.values() for piece in of_channel]
+    edges = [0]
+    for of_channel in pieces.values():
+        edges.append(edges[-1] + sum(piece.stop - piece.start for _, _, piece in of_channel))
+    return Rows(
+        whole,
+        np.concatenate([rows.offset[piece] + begin for rows, begin, piece in every]),
+        np.concatenate([rows.stop[piece] + begin for rows, begin, piece in every]),
+        np.concatenate([rows.channel[piece] for rows, _, piece in every]),
+        np.concatenate([rows.sequence[piece] for rows, _, piece in every]),
+        np.concatenate([rows.log[piece] for rows, _, piece in every]),
+        np.concatenate([rows.publish[piece] for rows, _, piece in every]),
+        (),
+        sum(rows.ignored for rows, _ in parts),
+        parts[-1][1] + parts[-1][0].end,
+        tuple(zip(pieces, (slice(*edge) for edge in pairwise(edges)), strict=True)),
+    )
+
+
 def rows_by_scan(buffer: Bytes, scanner: Scanner, stop_at: NDArray[np.bool_], most: int) -> Rows:
     """The messages of a stretch up to where it cannot be followed any further (``Rows.end``).
 

@@ -343,8 +343,11 @@ def _definitions_in(
         return []
     try:
         body = file.read(chunk.body_at, head.body_size)
-        is_cut, buffers = chunk.is_cut, file.buffers
-        buffer = inflate_prefix(body, head) if is_cut else inflate(body, head, buffers)
+        buffer = (
+            inflate_prefix(body, head)
+            if chunk.is_cut
+            else inflate(body, head, file.buffers.take(head.size + 1))
+        )
         rows = rows_by_scan(buffer, scanner, NEVER_IN_A_CHUNK, limits.records_per_chunk)
     except BrokenRecordError:
         return []
