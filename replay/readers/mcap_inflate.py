@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
+from threading import local
+from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from crosscue.replay.checksum import crc32
 from crosscue.replay.columns import Bytes
 
 from .mcap_records import BrokenRecordError, ChunkHead
+
+if TYPE_CHECKING:
+    import zstandard
 
 UNKNOWN_SIZES: Final = (-1, 0)
 """What zstandard and lz4 say when a frame does not declare its size."""
@@ -67,9 +71,7 @@ def _zstd(body: Bytes, size: int, records: Bytes) -> Bytes:
             raise BrokenRecordError(f"its zstd frame declares {declared} bytes, the chunk {size}")
         # One byte of room more than is due, so that a frame which gives more is found out.
         done = 0
-        with zstandard.ZstdDecompressor().stream_reader(
-            body.data, read_across_frames=True
-        ) as stream:
+        with _decompressor().stream_reader(body.data, read_across_frames=True) as stream:
             while done <= size:
                 step = stream.readinto(records.data[done : size + 1])
                 if not step:
@@ -80,6 +82,18 @@ def _zstd(body: Bytes, size: int, records: Bytes) -> Bytes:
     if done > size:
         raise BrokenRecordError(f"decompresses to more than the {size} bytes it declares")
     return records[:done]
+
+
+_of_thread: Final = local()
+
+
+def _decompressor() -> zstandard.ZstdDecompressor:
+    """This thread's own: making one takes as long as a small chunk."""
+    import zstandard
+
+    if not hasattr(_of_thread, "zstd"):
+        _of_thread.zstd = zstandard.ZstdDecompressor()
+    return cast("zstandard.ZstdDecompressor", _of_thread.zstd)
 
 
 def _lz4(body: Bytes, size: int, records: Bytes) -> Bytes:
