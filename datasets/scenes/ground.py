@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.random import Generator
@@ -22,7 +22,8 @@ WHITE: Final = (206, 206, 200)
 YELLOW: Final = (212, 170, 52)
 ASPHALT: Final = (104, 104, 106)
 CONCRETE: Final = (168, 164, 156)
-GRASS: Final = (96, 112, 58)
+KERB: Final = (190, 187, 178)
+GRASS: Final = (100, 114, 64)
 
 Map = NDArray[np.uint8]
 
@@ -124,37 +125,31 @@ def paint(
 
     canvas = _Canvas()
     high, wide = canvas.map.shape[:2]
-    patchy = _tiled(smooth_noise(rng, 512, 8), high, wide)
-    fine = _tiled(smooth_noise(rng, 512, 128), high, wide)
+    patchy = _tiled(smooth_noise(rng, 512, 8).astype(np.float32), high, wide)
+    fine = _tiled(smooth_noise(rng, 512, 128).astype(np.float32), high, wide)
     road = road_mask(layout)
-    paved = np.zeros_like(road)
-    for patch in patches:
-        canvas.rectangle(paved, patch.x, patch.y, 255)
     away = cv2.distanceTransform(255 - road, cv2.DIST_L2, 5) / TEXELS_PER_M
-    grass = np.array(GRASS) * (0.72 + 0.36 * patchy + 0.24 * fine)[..., None]
-    grass += (patchy > 0.62)[..., None] * np.array([14, 2, -4])
-    _put(canvas.map, away >= 0, grass, 120)
+    stone = 0.9 + 0.1 * patchy + 0.08 * fine
+    tar = 0.84 + 0.18 * patchy + 0.10 * fine
+    _put(canvas.map, None, GRASS, 0.72 + 0.36 * patchy + 0.24 * fine, 120)
     if layout.is_town:
-        near_houses = (away > 1.3) & (away < 9.0)
-        slabs = np.array(CONCRETE) * (0.82 + 0.12 * patchy + 0.06 * fine)[..., None]
-        _put(canvas.map, near_houses, slabs, 30)
+        _put(canvas.map, (away > 1.3) & (away < 9.0), CONCRETE, 0.9 * stone, 30)
     walk = (away > 1.3) & (away < 3.1)
-    stone = np.array(CONCRETE) * (0.9 + 0.1 * patchy + 0.08 * fine)[..., None]
-    _put(canvas.map, walk, stone, 30)
+    _put(canvas.map, walk, CONCRETE, stone, 30)
     _joints(canvas.map, walk)
-    tar = np.array(ASPHALT) * (0.82 + 0.22 * patchy + 0.14 * fine)[..., None]
+    paved = np.zeros_like(road)
     for patch in patches:
         area = np.zeros_like(road)
         canvas.rectangle(area, patch.x, patch.y, 255)
-        surface = tar * 0.92 if patch.kind == "asphalt" else stone * 1.02
-        _put(canvas.map, (area > 0) & (away > 0), surface, 60 if patch.kind == "asphalt" else 30)
-    kerb = (away > 0) & (away < 0.22) & (paved == 0)
-    _put(canvas.map, kerb, np.array((190, 187, 178)) * (0.9 + 0.15 * fine)[..., None], 20)
+        paved |= area
+        is_tar = patch.kind == "asphalt"
+        _put(canvas.map, (area > 0) & (away > 0), ASPHALT if is_tar else CONCRETE,
+             0.92 * tar if is_tar else stone, 60 if is_tar else 30)  # fmt: skip
+    _put(canvas.map, (away > 0) & (away < 0.22) & (paved == 0), KERB, stone, 20)
     is_road = road > 0
-    _put(canvas.map, is_road, tar, 80)
+    _put(canvas.map, is_road, ASPHALT, tar, 80)
     inside = cv2.distanceTransform(road, cv2.DIST_L2, 5) / TEXELS_PER_M
-    gutter = is_road & (inside < 0.3)
-    canvas.map[gutter, :3] = (canvas.map[gutter, :3] * 0.8).astype(np.uint8)
+    _dim(canvas.map, is_road & (inside < 0.3), 0.8)
     _wear(canvas, layout, rng, is_road)
     _lines(canvas, layout)
     for patch in patches:
@@ -163,12 +158,23 @@ def paint(
     return canvas.map, is_road
 
 
-def _put(canvas: Map, where: NDArray[np.bool_], rgb: Floats, grain: int) -> None:
-    canvas[where, :3] = np.clip(rgb[where], 0, 255).astype(np.uint8)
-    canvas[where, 3] = grain
+def _put(
+    canvas: Map, where: NDArray[np.bool_] | None, rgb: tuple[int, int, int],
+    light: NDArray[np.floating[Any]], grain: int,
+) -> None:  # fmt: skip
+    """Colour times light, everywhere or where it is wanted."""
+    everywhere = True if where is None else where
+    for k, value in enumerate(rgb):
+        shade = np.minimum(value * light, 255.0).astype(np.uint8)
+        np.copyto(canvas[..., k], shade, where=everywhere)
+    np.copyto(canvas[..., 3], np.uint8(grain), where=everywhere)
 
 
-def _tiled(noise: Floats, high: int, wide: int) -> Floats:
+def _dim(canvas: Map, where: NDArray[np.bool_], factor: float) -> None:
+    canvas[where, :3] = (canvas[where, :3] * factor).astype(np.uint8)
+
+
+def _tiled(noise: NDArray[np.float32], high: int, wide: int) -> NDArray[np.float32]:
     size = len(noise)
     return np.tile(noise, (high // size + 1, wide // size + 1))[:high, :wide]
 
@@ -179,7 +185,7 @@ def _joints(canvas: Map, walk: NDArray[np.bool_]) -> None:
     joint[::every] = True
     joint[:, ::every] = True
     joint &= walk
-    canvas[joint, :3] = (canvas[joint, :3] * 0.82).astype(np.uint8)
+    _dim(canvas, joint, 0.82)
 
 
 def _wear(canvas: _Canvas, layout: Layout, rng: Generator, is_road: NDArray[np.bool_]) -> None:
@@ -208,9 +214,9 @@ def _wear(canvas: _Canvas, layout: Layout, rng: Generator, is_road: NDArray[np.b
             walk.append(walk[-1] + 0.4 * np.array([np.cos(turn), np.sin(turn)]))
         texels = (np.array(walk) - np.array([X_M[0], Y_M[0]])) * TEXELS_PER_M
         cv2.polylines(dark, [np.rint(texels).astype(np.int32)], False, 90, 1)
-    factor = 1.0 - dark[..., None] / 255.0
-    worn = (canvas.map[..., :3] * factor).astype(np.uint8)
-    canvas.map[is_road, :3] = worn[is_road]
+    dark[~is_road] = 0
+    for k in range(3):
+        canvas.map[..., k] = cv2.multiply(canvas.map[..., k], 255 - dark, scale=1 / 255)
 
 
 def _lines(canvas: _Canvas, layout: Layout) -> None:

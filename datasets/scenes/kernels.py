@@ -22,7 +22,7 @@ Int64s = NDArray[np.int64]
 
 NEAR_M: Final = 0.25
 OPAQUE: Final = 110
-MOST_TAPS: Final = 10
+MOST_TAPS: Final = 7
 
 
 class Kernels(NamedTuple):
@@ -47,6 +47,7 @@ def compiled() -> Kernels:
 
 
 def draw(
+    order: Int64s,
     corners: Float32s,
     uv: Float32s,
     texture: Int32s,
@@ -66,7 +67,7 @@ def draw(
     colour: Bytes,
     owner: NDArray[np.int16],
 ) -> None:
-    """Triangles into the sample buffers.
+    """Triangles into the sample buffers, in the order given: nearest first spares work.
 
     corners (T, 3, 3) world metres, uv (T, 3, 2) texture widths, tint (T, 3) light times albedo,
     shift (3,) added to all corners; places (K, 9, 3): offset, width, height of a texture's levels.
@@ -74,7 +75,7 @@ def draw(
     high, wide = depth.shape
     polygon = np.zeros((4, 5))
     eye = np.zeros((3, 5))
-    for t in range(corners.shape[0]):
+    for t in order:
         ahead = 0
         for k in range(3):
             x = corners[t, k, 0] + shift[0] - camera_at[0]
@@ -354,12 +355,16 @@ def compose(
                 wz = world_axes[2, 0] * dx + world_axes[2, 1] * dy + world_axes[2, 2]
                 length = math.sqrt(wx * wx + wy * wy + wz * wz)
                 up = wz / length
-                turn = math.atan2(wy, wx) / (2 * math.pi) + 0.5
-                sx = min(int(turn * sky_wide), sky_wide - 1)
-                sy = min(int(abs(up) * (sky_high - 1)), sky_high - 1)
-                back0 = float(sky[sy, sx, 0])
-                back1 = float(sky[sy, sx, 1])
-                back2 = float(sky[sy, sx, 2])
+                back0 = 0.0
+                back1 = 0.0
+                back2 = 0.0
+                if up >= -0.002 or shine > 0.0:
+                    turn = math.atan2(wy, wx) / (2 * math.pi) + 0.5
+                    sx = min(int(turn * sky_wide), sky_wide - 1)
+                    sy = min(int(abs(up) * (sky_high - 1)), sky_high - 1)
+                    back0 = float(sky[sy, sx, 0])
+                    back1 = float(sky[sy, sx, 1])
+                    back2 = float(sky[sy, sx, 2])
                 if up < -0.002:
                     reach = -camera_at[2] / wz
                     gx = (camera_at[0] + reach * wx - ground_x0) * texels_per_m
@@ -367,7 +372,7 @@ def compose(
                     across = reach / focal * texels_per_m
                     flat = math.sqrt(wx * wx + wy * wy)
                     along = across / (-up)
-                    taps = min(MOST_TAPS, max(1, int(along / across + 0.5)))
+                    taps = min(MOST_TAPS, max(1, int(min(along / across, 1.5 * along) + 0.5)))
                     texel = max(across, along / taps)
                     level = 0
                     while texel > 1.5 and level < deepest:

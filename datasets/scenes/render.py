@@ -117,12 +117,12 @@ class Renderer:
         view = view_at(self.camera, self.world.approach, t_s)
         self._depth.fill(0.0)
         self._owner.fill(-1)
-        self._draw(*self._scenery, np.zeros(3), view)
         for thing, tint, later in self._movers:
             if thing.is_there(t_s):
                 mesh = thing.mesh_at(t_s)
                 lit = later if later is not None and mesh is thing.later else tint
                 self._draw(mesh, lit, thing.shift(t_s), view)
+        self._draw(*self._scenery, np.zeros(3), view)
         rgb, owner = self._composed(view, t_s)
         self._finish(rgb, view, number)
         return Picture(t_s, rgb, view, owner, self._seen(owner, view, t_s))
@@ -133,7 +133,9 @@ class Renderer:
 
     def _draw(self, mesh: Mesh, tint: NDArray[np.float32], shift: Floats, view: View) -> None:
         light = self.world.light
+        ahead = mesh.corners.mean(axis=1) @ view.eye_axes[2].astype(np.float32)
         self._kernels.draw(
+            np.argsort(ahead, kind="stable"),
             mesh.corners, mesh.uv, mesh.texture, tint, mesh.instance, shift.astype(np.float32),
             view.eye_axes, view.at_m, *self._lens(self.settings.samples), light.haze_per_m,
             light.haze, self._atlas, self._places, self._depth, self._colour, self._owner,

@@ -174,7 +174,7 @@ class _Site:
         self.add("car", role, mesh.placed(x, y, heading), (x, y, shape.height_m / 2), heading,
                  (shape.length_m, 2 * shape.half_width_m, shape.height_m),
                  velocity if moving else (0.0, 0.0), span_s)  # fmt: skip
-        if not moving:
+        if not moving and span_s == ALWAYS:
             c, s = abs(np.cos(heading)), abs(np.sin(heading))
             a = shape.length_m / 2 * c + shape.half_width_m * s
             b = shape.length_m / 2 * s + shape.half_width_m * c
@@ -464,12 +464,13 @@ def _traffic(site: _Site, conditions: Conditions, drive: Approach, varied: Gener
             flows.append((np.pi / 2, far - 0.27 * (far - near)))
     for heading, x in flows:
         _stream(site, "cross", heading, x, rate, drive, length_s, varied)
-    lane = lane_y_m(layout)
     if layout.has_ahead:
-        along = 5.0 * conditions.traffic / 60.0
-        _stream(site, "oncoming", np.pi, -lane, along, drive, length_s, varied)
+        _stream(site, "oncoming", np.pi, -lane_y_m(layout), 5.0 * conditions.traffic / 60.0, drive,
+                length_s, varied)  # fmt: skip
         if not layout.ahead_is_closed:
-            _stream(site, "outgoing", 0.0, lane, along, drive, length_s, varied)
+            _ahead_of_us(site, conditions, varied)
+        if drive.green_s >= 0.0 and varied.random() < 0.7 * conditions.traffic:
+            _waiting(site, drive, varied)
     if layout.control == "traffic_light" and drive.green_s < 0.0:
         for heading, x in flows:
             y = (w + 5.5) * (1.0 if heading < 0 else -1.0)
@@ -497,10 +498,25 @@ def _stream(
                 continue
             y = -speed * float(np.sin(heading)) * at
             site.add_car(look, role, lane, y, heading, speed, (at - 9.0, at + 9.0))
-        elif role == "oncoming":
+        elif drive.green_s < 0.0 or at > drive.green_s + 4.0:
             x = site.layout.far_kerb_m + speed * at
-            site.add_car(look, role, x, lane, heading, speed, (at - 10.0, at + 9.0))
-        else:
-            # At the far kerb at ``at``; it was never on the approach before us.
-            x = site.layout.far_kerb_m + 6.0 - speed * at
-            site.add_car(look, role, x, lane, heading, speed, (at, at + 10.0))
+            site.add_car(look, role, x, lane, heading, speed, (at - 16.0, at + 9.0))
+
+
+def _ahead_of_us(site: _Site, conditions: Conditions, varied: Generator) -> None:
+    """Cars that have left the intersection before we come, driving away."""
+    x = site.layout.far_kerb_m + float(varied.uniform(6.0, 30.0))
+    # All at one speed, or the hinder would drive through the foremost.
+    speed = float(varied.uniform(2.5, 5.0))
+    for _ in range(int(varied.poisson(0.8 * conditions.traffic))):
+        site.add_car(any_look(varied), "outgoing", x, lane_y_m(site.layout), 0.0, speed, (0.0, 1e9))
+        x += float(varied.uniform(9.0, 25.0))
+
+
+def _waiting(site: _Site, drive: Approach, varied: Generator) -> None:
+    """A car that faces us at the red light, and pulls away when it turns green."""
+    look, lane = any_look(varied), -lane_y_m(site.layout)
+    go, speed = drive.green_s + 1.2, 4.5
+    x = site.layout.end_m + 4.0 + look.shape.length_m / 2
+    site.add_car(look, "oncoming", x, lane, np.pi, 0.0, (-1e9, go))
+    site.add_car(look, "oncoming", x + speed * go, lane, np.pi, speed, (go, 1e9))
