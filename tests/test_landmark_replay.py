@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,12 @@ def view(way_m: float, noise: float, seed: int) -> Bytes:
     """What the camera sees after so much way: the next wall, the larger the nearer."""
     number, into_m = divmod(way_m, WALL_M)
     scale = 0.6 * (WALL_M + 15.0) / (WALL_M + 15.0 - into_m)
-    return seen_from(wall(int(number) + 100, 320, 240), 0.0, scale, noise, seed)
+    return seen_from(_wall(int(number) + 100), 0.0, scale, noise, seed)
+
+
+@lru_cache(maxsize=2)
+def _wall(seed: int) -> Bytes:
+    return wall(seed, 320, 240)
 
 
 def frames(folder: Path, drive: DriveFiles, every_ns: int, noise: float, seed: int) -> Path:
@@ -68,8 +74,8 @@ class Town:
 def town(tmp_path_factory: pytest.TempPathFactory) -> Town:
     folder = tmp_path_factory.mktemp("town")
     drive = write_drive(folder / "drive", DriveSettings(seed=3, blocks=3, block_m=100.0))
-    survey = frames(folder / "survey", drive, 200_000_000, 2.0, seed=1)
-    camera = frames(folder / "camera", drive, 100_000_000, 6.0, seed=50)
+    survey = frames(folder / "survey", drive, 300_000_000, 2.0, seed=1)
+    camera = frames(folder / "camera", drive, 150_000_000, 6.0, seed=50)
     database = folder / "town.sqlite"
     add = ["landmarks", "add", str(database), str(survey), "--poses", str(drive.truth)]
     assert cli.run([*add, "--every", "15", "--sd", "2"]) == 0
@@ -91,6 +97,19 @@ def replay(town: Town, run: Path, *more: str) -> RunFolder:
     return RunFolder(run)
 
 
+@pytest.fixture(scope="module")
+def found(town: Town, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """The drive replayed with the landmarks."""
+    run = tmp_path_factory.mktemp("found") / "run"
+    return replay(town, run, "--landmarks", str(town.database))
+
+
+@pytest.fixture(scope="module")
+def without(town: Town, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """The drive replayed without any."""
+    return replay(town, tmp_path_factory.mktemp("without") / "run")
+
+
 def errors_m(town: Town, run: RunFolder) -> Floats:
     track = read_tum(town.drive.truth.parent / "pose.tum")
     table = run.table("pose")
@@ -102,51 +121,52 @@ def errors_m(town: Town, run: RunFolder) -> Floats:
     return np.asarray(np.hypot(*apart), np.float64)
 
 
-def test_landmarks_correct_a_drifting_pose(town: Town, tmp_path: Path) -> None:
-    without = replay(town, tmp_path / "without")
-    with_marks = replay(town, tmp_path / "with", "--landmarks", str(town.database))
-
-    counts = with_marks.manifest()["counts"]["landmarks"]
+def test_landmarks_correct_a_drifting_pose(
+    town: Town, found: RunFolder, without: RunFolder
+) -> None:
+    counts = found.manifest()["counts"]["landmarks"]
     assert counts["accepted"] >= 10
     assert counts["gated"] <= 2
     late = slice(-500, None)
     assert np.median(errors_m(town, without)[late]) > 4.0
-    assert np.median(errors_m(town, with_marks)[late]) < 2.0
-    axis = with_marks.table("pose")["major_axis_m"].to_numpy()
+    assert np.median(errors_m(town, found)[late]) < 2.0
+    axis = found.table("pose")["major_axis_m"].to_numpy()
     assert axis[-1] < 0.7 * without.table("pose")["major_axis_m"].to_numpy()[-1]
 
 
 def test_rows_name_the_landmark_and_the_manifest_accounts_for_every_frame(
-    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    town: Town, found: RunFolder
 ) -> None:
-    run = replay(town, tmp_path / "run", "--landmarks", str(town.database))
-    manifest = run.manifest()
+    manifest = found.manifest()
     counts = manifest["counts"]["landmarks"]
-    named = [name for name in run.table("pose")["landmark"].to_pylist() if name is not None]
+    named = [name for name in found.table("pose")["landmark"].to_pylist() if name is not None]
 
     assert len(named) == counts["accepted"]
     assert all(name.startswith("survey/") for name in named)
     camera = manifest["accounts"][1]["topics"]["camera"]
     assert counts["frames"] == camera["used"] == len(list(town.camera.glob("*.png")))
-    assert manifest["landmarks"]["landmarks"] == len(LandmarkDatabase(town.database))
-    assert f"{counts['accepted']} landmarks weighed in" in capsys.readouterr().out
-    times = run.table("pose")["t_ns"].to_numpy()
+    with LandmarkDatabase(town.database) as database:
+        assert manifest["landmarks"]["landmarks"] == len(database)
+    times = found.table("pose")["t_ns"].to_numpy()
     assert (np.diff(times) > 0).all()
 
 
-def test_the_same_drive_gives_the_same_bytes(town: Town, tmp_path: Path) -> None:
-    runs = [replay(town, tmp_path / name, "--landmarks", str(town.database)) for name in "ab"]
+def test_the_same_drive_gives_the_same_bytes(town: Town, found: RunFolder, tmp_path: Path) -> None:
+    again = replay(town, tmp_path / "again", "--landmarks", str(town.database))
 
-    assert runs[0].file("pose.parquet").read_bytes() == runs[1].file("pose.parquet").read_bytes()
+    for name in ("pose.parquet", "measurements.parquet"):
+        assert again.file(name).read_bytes() == found.file(name).read_bytes()
 
 
-def test_zero_landmarks_leave_the_pose_as_it_was(town: Town, tmp_path: Path) -> None:
+def test_zero_landmarks_leave_the_pose_as_it_was(
+    town: Town, without: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     empty = database_of(tmp_path / "none.sqlite", np.empty((0, 2)))
-    without = replay(town, tmp_path / "without").table("pose")
     with_none = replay(town, tmp_path / "with", "--landmarks", str(empty)).table("pose")
 
-    np.testing.assert_allclose(with_none["x_m"], without["x_m"], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(with_none["x_m"], without.table("pose")["x_m"], rtol=0, atol=1e-6)
     assert with_none["landmark"].null_count == len(with_none)
+    assert "0 landmarks weighed in, 0 refused by the gate" in capsys.readouterr().out
 
 
 def test_a_log_without_a_camera_says_so(town: Town, tmp_path: Path) -> None:
@@ -354,11 +374,10 @@ def test_a_vehicle_file_with_a_landmark_section_is_checked(tmp_path: Path) -> No
 
 
 def test_the_score_shows_filter_and_batch_smoother_side_by_side(
-    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    town: Town, found: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
-    run = replay(town, tmp_path / "run", "--landmarks", str(town.database))
-    command = ["score", str(run.path), "--truth", str(town.drive.truth), "--smoother", "gtsam"]
+    command = ["score", str(found.path), "--truth", str(town.drive.truth), "--smoother", "gtsam"]
     capsys.readouterr()
     assert cli.run([*command, "--json"]) == 0
 
@@ -367,21 +386,20 @@ def test_the_score_shows_filter_and_batch_smoother_side_by_side(
     assert smoother["poses"] > 20
     assert smoother["smoother_rmse_m"] < smoother["filter_rmse_m"]
     assert abs(smoother["smoother_end_m"] - smoother["filter_end_m"]) < 0.5
-    assert json.loads((run.path / "score" / "smoother.json").read_text()) == smoother
+    assert json.loads((found.path / "score" / "smoother.json").read_text()) == smoother
     assert cli.run(command) == 0
     assert "filter against batch smoother" in capsys.readouterr().out
 
 
-def test_the_measurements_are_those_that_the_filter_used(town: Town, tmp_path: Path) -> None:
-    run = replay(town, tmp_path / "run", "--landmarks", str(town.database))
-    counts = run.manifest()["counts"]
-    kinds = run.table("measurements")["kind"].to_pylist()
+def test_the_measurements_are_those_that_the_filter_used(found: RunFolder) -> None:
+    counts = found.manifest()["counts"]
+    kinds = found.table("measurements")["kind"].to_pylist()
 
     assert kinds.count("start") == 1
     assert kinds.count("odometry") == counts["odometry"]["intervals"]
     assert kinds.count("heading") == counts["track"]["headings_accepted"] > 0
     assert kinds.count("landmark") == counts["landmarks"]["accepted"] > 0
-    read = read_measured(run)
-    table = run.table("pose")
+    read = read_measured(found)
+    table = found.table("pose")
     ends = np.isin(read.increments.stop_ns, table["t_ns"].to_numpy())
     assert ends.mean() > 0.99
