@@ -345,6 +345,41 @@ def test_pictures_come_as_ranges_of_the_log_itself() -> None:
     assert ledger.topic("/cam").skipped == {"image coding not known": 1, "empty picture": 1}
 
 
+@pytest.mark.parametrize("is_cdr", [True, False])
+def test_pictures_of_a_layout_met_before_are_held_to_their_lengths(is_cdr: bool) -> None:
+    store, name = (ros2_store() if is_cdr else ros1_store()), "sensor_msgs/msg/CompressedImage"
+    topic = (ros2_topic if is_cdr else ros1_topic)("/cam", name)
+    stamp = store.types["builtin_interfaces/msg/Time"](7, 8)
+    header = store.types["std_msgs/msg/Header"](*(() if is_cdr else (3,)), stamp, "cam")
+
+    def message(size: int) -> bytes:
+        picture = np.frombuffer(b"\xff\xd8" + bytes(range(size)), np.uint8)
+        made = store.types[name](header, "jpeg", picture)
+        return bytes(
+            store.serialize_cdr(made, name) if is_cdr else store.serialize_ros1(made, name)
+        )
+
+    learned = must_decode(topic)
+    learned(block_of("/cam", [message(5)]), Ledger("made"))
+    for lie in range(-3, 4):
+        for rest in range(6):
+            last = bytearray(message(40) + bytes(rest))
+            last[-42 - rest - 4] += lie
+            block = block_of("/cam", [message(9), message(0), bytes(last)], gap=1)
+            ledgers = Ledger("knows"), Ledger("walks")
+
+            knows, walks = learned(block, ledgers[0]), must_decode(topic)(block, ledgers[1])
+
+            assert ledgers[0].details == ledgers[1].details
+            assert len(knows) == (3 if 0 <= rest - lie <= (3 if is_cdr else 0) else 2)
+            assert isinstance(knows.rows, Images)
+            assert isinstance(walks.rows, Images)
+            np.testing.assert_array_equal(knows.rows.bytes_.start, walks.rows.bytes_.start)
+            np.testing.assert_array_equal(knows.rows.bytes_.stop, walks.rows.bytes_.stop)
+            assert knows.header_ns is not None
+            assert set(knows.header_ns.tolist()) == {7_000_000_008}
+
+
 def test_raw_pictures_must_have_the_bytes_that_their_size_needs() -> None:
     store, name = ros2_store(), "sensor_msgs/msg/Image"
     header = store.types["std_msgs/msg/Header"](
