@@ -7,21 +7,30 @@ timeline, the log's time; columns are sent in bulk.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.columns import Floats, Images, Int64s, Topic
+from crosscue.replay.decode import decoder_for
+from crosscue.replay.errors import LogError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Selection, open_log
+from crosscue.replay.roles import Role, role_of
 from crosscue.replay.run_folder import RunFolder, write_whole
 
 if TYPE_CHECKING:
     import rerun as rr
     import rerun.blueprint as rrb
 
-TIMELINE: Final = "log_time"
+TIMELINE: Final = "drive"
+"""Not ``log_time``: under that name the viewer keeps the wall clock of the logging itself."""
 YEAR_2000_NS: Final = 946_684_800_000_000_000
+PASSED_THROUGH: Final = ("jpeg", "png")
+"""Codings that the viewer decodes itself."""
 PATH_POINTS: Final = 20_000
 ELLIPSES_PER_S: Final = 5.0
 ESTIMATE: Final = (31, 119, 180)
@@ -56,13 +65,17 @@ def save(run: RunFolder, path: Path, truth: TruthTrack | None = None) -> None:
     table = run.table("pose")
     columns = {name: table[name].to_numpy() for name in table.column_names if name != "landmark"}
 
+    camera = _camera_of(run)
+
     def write(partial: Path) -> None:
         recording = rr.RecordingStream("crosscue", recording_id=str(run.path.resolve().name))
-        recording.save(partial, default_blueprint=_blueprint(columns, truth is not None))
+        recording.save(partial, default_blueprint=_blueprint(columns, truth, camera))
         recording.log("plan", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         _log_pose(recording, columns)
         if truth is not None:
             _log_truth(recording, truth)
+        if camera is not None:
+            _log_camera(recording, *camera)
         recording.log("notes", _notes(run), static=True)
         recording.flush()
         recording.disconnect()
@@ -124,6 +137,50 @@ def _log_truth(recording: rr.RecordingStream, truth: TruthTrack) -> None:
     )
 
 
+def _camera_of(run: RunFolder) -> tuple[Path, Topic] | None:
+    """The log and topic with the pictures, where one is still at hand and no choice is left."""
+    manifest = run.manifest()
+    named = manifest["settings"]["topics"]["camera"]
+    found: list[tuple[Path, Topic]] = []
+    for entry in manifest["logs"]:
+        path = Path(entry["path"])
+        # The log may have gone since it was replayed; the rest of the run can still be seen.
+        with suppress(LogError), open_log(path) as log:
+            found += [(path, topic) for topic in log.topics if role_of(topic) is Role.CAMERA]
+    if named is not None:
+        found = [(path, topic) for path, topic in found if topic.name == named]
+    return found[0] if len(found) == 1 else None
+
+
+def _log_camera(recording: rr.RecordingStream, path: Path, topic: Topic) -> None:
+    """Pictures as stored: their bytes pass through undecoded."""
+    import rerun as rr
+
+    ledger = Ledger(str(path))
+    decode = decoder_for(topic)
+    with open_log(path) as log:
+        for block in log.read(ledger, Selection(frozenset({topic.name}))):
+            images = (decode(block, ledger) if decode else block).rows
+            if not isinstance(images, Images):
+                continue
+            for i, coding in enumerate(images.coding):
+                if coding not in PASSED_THROUGH:
+                    continue
+                _set_time(recording, int(block.log_ns[i]))
+                picture = rr.EncodedImage(
+                    contents=bytes(images.bytes_.payload(i)), media_type=f"image/{coding}"
+                )
+                recording.log("camera", picture)
+    recording.reset_time()
+
+
+def _set_time(recording: rr.RecordingStream, t_ns: int) -> None:
+    if t_ns > YEAR_2000_NS:
+        recording.set_time(TIMELINE, timestamp=np.datetime64(t_ns, "ns"))
+    else:
+        recording.set_time(TIMELINE, duration=np.timedelta64(t_ns, "ns"))
+
+
 def _time_column(t_ns: Int64s) -> rr.TimeColumn:
     """Wall-clock logs as dates, logs on a boot clock as durations."""
     import rerun as rr
@@ -174,7 +231,9 @@ def _notes(run: RunFolder) -> rr.TextDocument:
     return rr.TextDocument(text, media_type="text/markdown")
 
 
-def _blueprint(pose: Mapping[str, Floats], has_truth: bool) -> rrb.Blueprint:
+def _blueprint(
+    pose: Mapping[str, Floats], truth: TruthTrack | None, camera: tuple[Path, Topic] | None
+) -> rrb.Blueprint:
     import rerun.blueprint as rrb
 
     plots = {"speed": "Speed (m/s)", "heading": "Heading (deg)", "heading_sd": "Heading s.d. (deg)",
@@ -186,13 +245,16 @@ def _blueprint(pose: Mapping[str, Floats], has_truth: bool) -> rrb.Blueprint:
         for key, name in plots.items()
     ]
     plan = rrb.Spatial3DView(
-        origin="plan", name="Plan, truth in green" if has_truth else "Plan",
+        origin="plan", name="Plan" if truth is None else "Plan, truth in green",
         line_grid=rrb.LineGrid3D(visible=True), eye_controls=_from_above(pose),
     )  # fmt: skip
     notes = rrb.TextDocumentView(origin="notes", name="Notes")
+    left = [plan, notes]
+    if camera is not None:
+        left.insert(0, rrb.Spatial2DView(origin="camera", name=f"Camera {camera[1].name}"))
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(plan, notes, row_shares=[3, 1]),
+            rrb.Vertical(*left, row_shares=[3] * (len(left) - 1) + [1]),
             rrb.Vertical(*series),
             column_shares=[3, 2],
         ),

@@ -6,6 +6,7 @@ import warnings
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,11 +17,13 @@ from crosscue.eval.recording import save as save_recording
 from crosscue.eval.replay_drive import replay_drive
 from crosscue.eval.report import write_report
 from crosscue.eval.score_pose import PoseScore, load_truth, score, truth_track
-from crosscue.replay.columns import Block
+from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.errors import SchemaError
-from crosscue.replay.log import EVERYTHING
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import EVERYTHING, open_log
 from crosscue.replay.run_folder import RunFolder, create
 from crosscue.replay.vehicle import Camera, Start, Vehicle
+from crosscue.replay.writing import LogWriter
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
 
 SECOND = 1_000_000_000
@@ -215,3 +218,33 @@ def test_the_viewer_listens_on_this_machine_only(
     ((*_, bind, address, path, web),) = commands
     assert (bind, address, web) == ("--bind", "127.0.0.1", "--serve-web")
     assert Path(path) == run.file("drive.rrd")
+
+
+def test_pictures_pass_into_the_recording_as_stored(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    noise = rng.integers(0, 255, (3, 240, 320, 3), np.uint8)
+    jpegs = [cv2.imencode(".jpg", picture)[1].ravel() for picture in noise]
+    edges = np.cumsum([0, *map(len, jpegs)])
+    times = np.array([1, 2, 3], np.int64) * SECOND
+    ranges = Messages(np.concatenate(jpegs), edges[:-1], edges[1:])
+    images = Images(ranges, ("jpeg",) * 3)
+    camera = Topic("/camera", "crosscue/Images", "columns")
+    log = tmp_path / "drive.mcap"
+    with LogWriter(log, Ledger(str(log))) as writer:
+        writer.add_topic(camera)
+        writer.add_topic(WHEELS)
+        writer.write(Block("/camera", times, images))
+        for block in _blocks(5):
+            if block.topic == "wheels":
+                writer.write(block)
+    with open_log(log) as opened:
+        vehicle = Vehicle(version=1)
+        folder = create(tmp_path / "run", overwrite=False)
+        run = replay_drive([opened], vehicle, folder, EVERYTHING).run
+
+    save_recording(run, tmp_path / "drive.rrd")
+    log.unlink()
+    save_recording(run, tmp_path / "without.rrd")
+
+    sizes = [(tmp_path / f"{name}.rrd").stat().st_size for name in ("drive", "without")]
+    assert edges[-1] <= sizes[0] - sizes[1] < 1.02 * edges[-1] + 4000
