@@ -165,6 +165,9 @@ def add_from_log(
 ) -> AddCounts:
     """Add a landmark each ``every_m`` of the way.
 
+    The errors of a run's poses are shared by neighbouring landmarks; a later replay takes them as
+    independent. Where the run drifted, make ``every_m`` large, or give a truth.
+
     Args:
         writer: Of the database.
         matcher: Makes the features.

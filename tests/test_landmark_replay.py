@@ -403,3 +403,40 @@ def test_the_measurements_are_those_that_the_filter_used(found: RunFolder) -> No
     table = found.table("pose")
     ends = np.isin(read.increments.stop_ns, table["t_ns"].to_numpy())
     assert ends.mean() > 0.99
+
+
+def test_a_matcher_of_ones_own_makes_and_asks_a_database(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for shade in (50, 150):
+        (folder / f"{shade}.png").write_bytes(encoded(np.full((40, 40), shade, np.uint8)))
+    (folder / "at.csv").write_text("image,x_m,y_m,sd_m\n50.png,0,0,1\n150.png,9,0,1\n")
+    own = ["--matcher", "support.landmark_files:shade"]
+    database, picture = str(tmp_path / "lm.sqlite"), tmp_path / "dark.png"
+    picture.write_bytes(encoded(np.full((60, 60), 60, np.uint8)))
+    add = ["landmarks", "add", database, "--images", str(folder)]
+    assert cli.run([*add, "--coordinates", str(folder / "at.csv"), *own, "-q"]) == 0
+    assert cli.run(["landmarks", "match", database, str(picture), *own, "--json"]) == 0
+
+    best = json.loads(capsys.readouterr().out)["best"]
+    assert [(one["name"], one["score"]) for one in best] == [
+        ("photos/50.png", 90.0), ("photos/150.png", 10.0),
+    ]  # fmt: skip
+    status, text = refused(capsys, "landmarks", "match", database, str(picture))
+    assert (status, "matcher 'shade', not 'orb'" in text) == (2, True)
+
+
+def test_a_picture_bomb_is_refused_in_one_line(
+    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    jpeg = bytearray(encoded(wall(1, 64, 64), ".jpg"))
+    frame = jpeg.index(b"\xff\xc0")
+    jpeg[frame + 5 : frame + 9] = b"\xfd\xe8\xfd\xe8"
+    (tmp_path / "bomb.jpg").write_bytes(jpeg)
+    capsys.readouterr()
+
+    match = ["landmarks", "match", str(town.database), str(tmp_path / "bomb.jpg")]
+    status, text = refused(capsys, *match)
+    assert (status, "65000 x 65000 pixels: more than" in text) == (4, True)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from crosscue.localization.landmark_database import LandmarkWriter, Place
-from crosscue.localization.landmark_features import Features
+from crosscue.localization.landmark_features import CameraGeometry, Features, Match
 from crosscue.replay.columns import Bytes, Floats
 
 
@@ -60,3 +60,25 @@ def encoded(picture: Bytes, suffix: str = ".png") -> bytes:
     ok, found = cv2.imencode(suffix, picture)
     assert ok
     return found.tobytes()
+
+
+class ShadeMatcher:
+    """A stand-in for a matcher of one's own: pictures are alike if they are as bright."""
+
+    kind = "shade"
+
+    def describe(self, grey: Bytes, /) -> Features:
+        """The mean brightness, twenty-five times."""
+        height, width = grey.shape
+        shade = np.full((25, 1), round(float(grey.mean())), np.uint8)
+        return Features(width, height, np.zeros((25, 2), np.float32), shade)
+
+    def match(self, seen: Features, known: Features, /) -> Match:
+        """The nearer in brightness, the surer."""
+        apart = abs(float(seen.descriptors[0, 0]) - float(known.descriptors[0, 0]))
+        return Match(100.0 - apart, 25, 25)
+
+
+def shade(camera: CameraGeometry) -> ShadeMatcher:
+    """For ``--matcher support.landmark_files:shade``."""
+    return ShadeMatcher()
