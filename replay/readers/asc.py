@@ -47,7 +47,16 @@ from .can_text import (
     comment,
     head_of,
 )
-from .digits import NANOS, SECONDS_MAX, Bools, decimal, nibble, seconds_ns
+from .digits import (
+    NANOS,
+    SECONDS_MAX,
+    TIME_MAX_NS,
+    Bools,
+    decimal,
+    nibble,
+    seconds_ns,
+    within_range,
+)
 
 _DATE: Final = re.compile(
     r"(?:[^\s\d]+\s+)?([^\s\d]+)\s+(\d{1,2})\s+(\d{1,2}):(\d\d):(\d\d)(?:[.,](\d{1,9}))?"
@@ -78,7 +87,8 @@ _EVENT: Final = re.compile(
 _ERROR: Final = re.compile(r"(\S+)\s+ErrorFrame(?:\s.*)?", re.IGNORECASE)
 _FD_ERROR: Final = re.compile(r"CANFD\s+(\S+)\s+[RT]x\s+ErrorFrame(?:\s.*)?", re.IGNORECASE)
 _SECOND: Final = re.compile(r"\d[.,]\d{1,9}\s+(?:CANFD\s+)?\S+\s(?:.*\s)?[RT]x\s")
-_CONTROL: Final = re.compile(r"[\x00-\x08\x0e-\x1f]")
+_STEP_MAX_NS: Final = 86_400 * NANOS
+"""Longest step from line to line; a longer one is damage."""
 _IDENTIFIER: Final = re.compile(r"([0-9A-Fa-f]{1,10})([xX]?)")
 _TWO_HEX: Final = re.compile(r"[0-9A-Fa-f]{2}")
 NOT_UNDERSTOOD: Final = "line not understood"
@@ -128,6 +138,8 @@ class Asc(Dialect):
             return NOTHING_FAST
         head = next_fields(lines, lines.start[line], lines.stop[line], 6)
         t_ns, ok = seconds_ns(lines.buffer, lines.words, head[0].start, head[0].stop)
+        if self._is_relative:
+            ok &= t_ns <= _STEP_MAX_NS
         is_fd = _is_fd(lines, head[1])
         parts = [
             _classic(lines, line, head, t_ns, ok & ~is_fd),
@@ -188,7 +200,7 @@ class Asc(Dialect):
     def _stretch(self, t_ns: Int64s) -> Int64s:
         self._has_events |= len(t_ns) > 0
         if self._is_relative and len(t_ns):
-            t_ns = np.cumsum(t_ns) + self._last_ns
+            t_ns = np.minimum(np.cumsum(t_ns) + self._last_ns, TIME_MAX_NS)
             self._last_ns = int(t_ns[-1])
         return t_ns + self._start_ns
 
@@ -219,10 +231,14 @@ class Asc(Dialect):
         return Damage(NOT_UNDERSTOOD)
 
     def _timed(self, t_ns: int, rest: str) -> Outcome:
-        if _CONTROL.search(rest) or _SECOND.search(rest):
-            return Damage("control characters or two lines in one")
+        if _SECOND.search(rest):
+            return Damage("two lines in one")
+        if self._is_relative and t_ns > _STEP_MAX_NS:
+            return Damage("time out of range")
         if _EVENT.fullmatch(rest):
             return Other("event that is no CAN frame", t_ns)
+        if not rest.isascii():
+            return Damage(NOT_UNDERSTOOD)
         if found := _FD_ERROR.fullmatch(rest) or _ERROR.fullmatch(rest):
             is_fd = rest[:5].upper() == "CANFD"
             return _checked(Frame(found[1], t_ns, 0, False, ERROR, 0, b"", is_fd))
@@ -316,7 +332,7 @@ def _date_ns(text: str) -> int | None:
         )
     except ValueError:
         return None
-    return int(start.timestamp()) * NANOS + int((found[6] or "0").ljust(9, "0"))
+    return within_range(int(start.timestamp()) * NANOS + int((found[6] or "0").ljust(9, "0")))
 
 
 def _single(lines: Lines, line: Int64s) -> Int64s:

@@ -36,6 +36,7 @@ from .blf_objects import (
     rows_of,
 )
 from .can_rows import BUSES_MAX, FrameRows, blocks_by_bus, bus_name, bus_topic, keep_memory
+from .digits import NANOS, within_range
 
 _HEADER: Final = struct.Struct("<4sL8BQQLL8H8H")
 _HEADER_MAX: Final = 4096
@@ -432,4 +433,4 @@ def _system_time_ns(fields: tuple[int, ...]) -> int | None:
         at = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     except ValueError:
         return None
-    return int(at.timestamp()) * 1_000_000_000 + millisecond * 1_000_000
+    return within_range(int(at.timestamp()) * NANOS + millisecond * 1_000_000)

@@ -35,8 +35,8 @@ _SIGNATURE: Final = int.from_bytes(MAGIC, "little")
 _EXTENDED: Final = 0x80000000
 _ID_MASK: Final = 0x1FFFFFFF
 _TEN_MICROSECONDS: Final = 1
-_TICKS_MAX: Final = 1 << 49
-"""Ticks beyond this are damage: 6 days in nanoseconds, which no other unit can overflow."""
+_NANOS_MAX: Final = 1 << 60
+"""36 years from the start; a longer recording is damage."""
 
 
 @dataclass(slots=True)
@@ -273,10 +273,10 @@ def _kind_rows(
     )
     inside = header["size"] >= header["header"].astype(np.int64) + body.itemsize
     ticks, flags = header["ticks"], header["flags"]
-    is_timed = (flags <= 2) & (ticks < _TICKS_MAX)
+    step = np.where(flags == _TEN_MICROSECONDS, 10_000, 1)
+    is_timed = (flags <= 2) & (ticks < _NANOS_MAX // step)
     ok = is_known & inside & is_timed
-    tick_ns = np.where(ok, ticks, 0).astype(np.int64)
-    tick_ns = np.where(flags == _TEN_MICROSECONDS, tick_ns * 10_000, tick_ns)
+    tick_ns = np.where(ok, ticks, 0).astype(np.int64) * step
     record = _records(stream, np.where(ok, start + header["header"], 0), body)
     frames, frame_ok = _FRAMES[types](stream, start, header, record, tally)
     ok &= frame_ok & (record["bus"] > 0)

@@ -19,7 +19,7 @@ from crosscue.replay.ledger import Ledger
 from .can_lines import Lines, clean_lines, next_fields, skip_gap
 from .can_spaced import NOTHING_FAST, Spaced, is_way, payload_stop, spaced_frames
 from .can_text import Damage, Dialect, Fast, Frame, Mark, Other, Outcome
-from .digits import NANOS, Bools, decimal
+from .digits import NANOS, TIME_MAX_NS, Bools, decimal, within_range
 
 BUSMASTER_HEAD: Final = b"***BUSMASTER"
 DAY_NS: Final = 86_400 * NANOS
@@ -117,7 +117,9 @@ class Busmaster(Dialect):
         if not len(t_ns):
             return t_ns
         if self._is_relative:
-            total = np.cumsum(t_ns) + (self._start_ns if self._last_ns is None else self._last_ns)
+            before = self._start_ns if self._last_ns is None else self._last_ns
+            steps = np.cumsum(np.minimum(t_ns, DAY_NS))
+            total: Int64s = np.minimum(steps + before, TIME_MAX_NS)
             self._last_ns = int(total[-1])
             return total
         if not self._is_clock:
@@ -167,7 +169,7 @@ def _start_of(found: re.Match[bytes]) -> int | None:
         start = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     except (ValueError, OverflowError):
         return None
-    return int(start.timestamp()) * NANOS + _fraction_ns(found[7])
+    return within_range(int(start.timestamp()) * NANOS + _fraction_ns(found[7]))
 
 
 def _fraction_ns(digits: bytes) -> int:

@@ -20,6 +20,7 @@ NEWLINE: Final = 10
 RETURN: Final = 13
 SPACE: Final = 32
 TAB: Final = 9
+_LAST_PRINTABLE: Final = 126
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -252,10 +253,10 @@ def _index(bit: Words) -> Int64s:
 
 
 def clean_lines(lines: Lines) -> Int64s:
-    """Indexes of the lines that are not empty and hold no control character but tabs."""
+    """Indexes of the lines that are not empty and hold only printable ASCII and tabs."""
     begin, end = int(lines.start[0]), int(lines.stop[-1]) + 1
     text = lines.buffer[begin:end]
-    dirty = (text < SPACE) & ((text < TAB) | (text > RETURN))
+    dirty = (text > _LAST_PRINTABLE) | ((text < SPACE) & ((text < TAB) | (text > RETURN)))
     keep = lines.stop > lines.start
     if bool(dirty.any()):
         place = np.flatnonzero(dirty) + begin

@@ -40,6 +40,7 @@ from .digits import Bools, payload8, payload64, spaced8
 HEAD_BYTES: Final = 64 << 10
 LINE_MAX: Final = 8192
 """Longest line that ``slow`` is asked about."""
+_CONTROL: Final = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 _EXCERPT: Final = 60
 _DOS_END: Final = b"\x1a"
 
@@ -263,7 +264,7 @@ class _Scribe:
         odd = _Odd()
         for i in _left_over(lines, rows):
             line = lines.text(i)
-            outcome = self.dialect.slow(line) if len(line) <= LINE_MAX else Damage("line too long")
+            outcome = self._judged(line)
             if isinstance(outcome, Damage) and outcome.taints and i > 0:
                 odd.tainted.append(i - 1)
             if i >= lines.done:
@@ -274,6 +275,15 @@ class _Scribe:
         if lines.done < len(lines):
             rows = rows.take(slice(0, int(np.searchsorted(rows.place, lines.done))))
         return self._untainted(self._timed(rows, odd), odd.tainted, lines)
+
+    def _judged(self, line: bytes) -> Outcome:
+        if len(line) > LINE_MAX:
+            return Damage("line too long")
+        outcome = self.dialect.slow(line)
+        if _CONTROL.search(line):
+            taints = isinstance(outcome, Damage) and outcome.taints
+            return Damage("control characters in a line", taints)
+        return outcome
 
     def _sort_in(self, odd: _Odd, i: int, number: int, line: bytes, outcome: Outcome) -> None:
         match outcome:
@@ -394,14 +404,13 @@ class _Odd:
         )
 
 
-_CONTROL: Final = re.compile(r"[\x00-\x08\x0e-\x1f]")
-_FRAME_LIKE: Final = re.compile(r"\d[.,]\d+\s+(?:.*\s)?(?:[RT]x|DT|F[BDE]|BI|RR)\s")
+_FRAME_LIKE: Final = re.compile(
+    r"\d[.,]\d+\s+(?:.*\s)?(?:[RT]x|DT|F[BDE]|BI|RR)\s|\d\)\s+\d+[.,]?\d*\s+[0-9A-Fa-f]{4,8}\s"
+)
 
 
 def comment(text: str) -> Outcome:
     """A comment line, unless damage may have joined a frame's line to it."""
-    if _CONTROL.search(text):
-        return Damage("comment with control characters")
     if _FRAME_LIKE.search(text):
         return Other("comment that holds a frame")
     return None

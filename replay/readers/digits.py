@@ -24,8 +24,14 @@ Bools: TypeAlias = NDArray[np.bool_]
 FRONT: Final = 32
 BACK: Final = 256
 NANOS: Final = 1_000_000_000
-SECONDS_MAX: Final = 9_223_372_035
-"""Largest whole second whose nanoseconds, and the second after it, fit in int64."""
+TIME_MAX_NS: Final = 1 << 62
+"""The year 2116. A start and an offset within it add up without overflow."""
+SECONDS_MAX: Final = TIME_MAX_NS // NANOS - 1
+
+
+def within_range(start_ns: int) -> int | None:
+    """A start time unless it is absurd, as a damaged one may be."""
+    return start_ns if abs(start_ns) <= TIME_MAX_NS else None
 
 
 def _u(value: int) -> np.uint64:

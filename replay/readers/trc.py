@@ -36,7 +36,7 @@ from .can_text import (
     comment,
     head_of,
 )
-from .digits import NANOS, SECONDS_MAX, Bools, decimal, seconds_ns
+from .digits import NANOS, SECONDS_MAX, Bools, decimal, seconds_ns, within_range
 
 _COLUMNS_OF: Final = {
     "1.0": "NOIlD",
@@ -124,6 +124,9 @@ class Trc(Dialect):
         ok &= type_ok & length_ok & ((identifier.size == 4) | (identifier.size == 8))
         if "d" in by:
             ok &= is_way(lines, by["d"])
+        if "R" in by:
+            reserved = by["R"]
+            ok &= (reserved.size == 1) & (lines.buffer[reserved.start] == ord("-"))
         if "N" in by:
             ok &= _is_number(lines, by["N"], self._is_old)
         payload = skip_gap(lines, fields[-1].stop, limit)
@@ -144,7 +147,7 @@ class Trc(Dialect):
         by = dict(zip(self._columns, values[:before], strict=False))
         found = _TIME.fullmatch(by.get("O", ""))
         number = (_OLD_NUMBER if self._is_old else _NUMBER).fullmatch(by.get("N", "1"))
-        if not found or not number:
+        if not found or not number or by.get("R", "-") != "-":
             return Damage(NOT_UNDERSTOOD)
         if int(found[1]) > SECONDS_MAX:
             return Damage("time out of range")
@@ -280,4 +283,4 @@ def _start_ns(found: re.Match[bytes]) -> int | None:
     part_ns, rest = divmod(int(decimals) * _DAY_NS, 10 ** len(decimals))
     part_ns += 2 * rest >= 10 ** len(decimals)
     days = int(found[1]) - _EPOCH_DAYS
-    return days * _DAY_NS + part_ns if abs(days) < 100_000 else None
+    return within_range(days * _DAY_NS + part_ns)
