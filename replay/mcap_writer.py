@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import struct
-import zlib
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,6 +20,7 @@ from typing import Final, Literal, Self, TypeAlias
 
 import numpy as np
 
+from .checksum import crc32
 from .columns import Int64s
 from .errors import OutputError
 from .mcap_assembly import ChunkRows, Stretch, merged
@@ -212,7 +212,7 @@ class McapWriter:
         stored = self._compress(records)
         head = struct.pack(
             "<QQQI", int(rows.log_ns.min()), int(rows.log_ns.max()), len(records),
-            zlib.crc32(records),
+            crc32(records),
         )  # fmt: skip
         head += _text(self._compression) + struct.pack("<Q", len(stored))
         whole = struct.pack("<BQ", CHUNK, len(head) + len(stored)) + head
@@ -239,7 +239,7 @@ class McapWriter:
         self._summary.last_ns = max(self._summary.last_ns, last)
 
     def _data(self, content: bytes | memoryview) -> None:
-        self._data_crc = zlib.crc32(content, self._data_crc)
+        self._data_crc = crc32(content, self._data_crc)
         self._at += len(content)
         self._file.write(content)
 
@@ -255,7 +255,7 @@ class McapWriter:
         body, offsets = self._summary_section(start)
         offset_start = start + len(body)
         tail = struct.pack("<BQQQ", FOOTER, 20, start, offset_start)
-        crc = zlib.crc32(tail, zlib.crc32(body + offsets))
+        crc = crc32(tail, crc32(body + offsets))
         self._file.write(body + offsets + tail + struct.pack("<I", crc) + MAGIC)
         self._file.flush()
         os.fsync(self._file.fileno())

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -265,7 +266,6 @@ class Extractor:
     on_pictures: Callable[[Block], None] = _no_pictures
     _decoders: dict[str, Decoder | None] = field(default_factory=dict)
     _buses: dict[str, BusDecoder] = field(default_factory=dict)
-    _database: CanDatabase | None = None
 
     def __call__(self, block: Block) -> Iterator[Samples]:
         """The samples of one block; rows that cannot be used are skipped in the ledger."""
@@ -319,16 +319,22 @@ class Extractor:
 
     def _bus_decoder(self, bus: str) -> BusDecoder:
         if bus not in self._buses:
-            from .can.database import CanDatabase
             from .can.decode import BusDecoder
 
-            if self._database is None:
-                self._database = CanDatabase.load([Path(name) for name in self.vehicle.can.dbc])
-                for sentence in self._database.notices:
-                    self.ledger.notice(sentence)
-            wanted = check_signals(self._database, self.vehicle)
-            self._buses[bus] = BusDecoder(self._database, bus, self.ledger, wanted)
+            database = _database(self.vehicle.can.dbc)
+            for sentence in database.notices:
+                self.ledger.notice(sentence)
+            wanted = check_signals(database, self.vehicle)
+            self._buses[bus] = BusDecoder(database, bus, self.ledger, wanted)
         return self._buses[bus]
+
+
+@lru_cache(maxsize=8)
+def _database(files: tuple[str, ...]) -> CanDatabase:
+    """Read once for the probe of the clocks and the run."""
+    from .can.database import CanDatabase
+
+    return CanDatabase.load([Path(name) for name in files])
 
 
 def check_signals(database: CanDatabase, vehicle: Vehicle) -> frozenset[tuple[str, str]]:
