@@ -221,13 +221,9 @@ def _wheels(shape: Shape) -> list[Mesh]:
                 disc((x, y + side * 0.012, r), out, 0.62 * r, (0.55, 0.56, 0.57)),
                 disc((x, y + side * 0.018, r), out, 0.2 * r, (0.2, 0.2, 0.2)),
             ]
-            # The tread, seen from before and behind.
-            for face in (-1.0, 1.0):
-                inner = side * (shape.half_width_m - 0.2)
-                tread = [(x + face * r * 0.8, inner, 0.0), (x + face * r * 0.8, y, 0.0),
-                         (x + face * r * 0.8, y, SKIRT_M + 0.08),
-                         (x + face * r * 0.8, inner, SKIRT_M + 0.08)]  # fmt: skip
-                parts.append(quad(tread, TYRE))
+            # The tread, seen below the bumpers.
+            inner = side * (shape.half_width_m - 0.2)
+            parts.append(quad([(x, inner, 0.0), (x, y, 0.0), (x, y, r), (x, inner, r)], TYRE))
     return parts
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from .layout import NEAR_KERB_M, Layout
+from .layout import NEAR_KERB_M, PARKING_LANE_M, Layout
 from .mesh import Floats
 from .textures import smooth_noise
 
@@ -225,8 +225,8 @@ def _lines(canvas: _Canvas, layout: Layout) -> None:
         canvas.line((X_M[0], -0.6), (y - 0.055, y + 0.055), YELLOW)
         if layout.has_ahead and not layout.ahead_is_closed:
             canvas.line((far + CORNER_M, X_M[1]), (y - 0.055, y + 0.055), YELLOW)
-    if w > 4.6:
-        for y in (-w + 2.05, w - 2.05):
+    if layout.has_parking_lane:
+        for y in (-w + PARKING_LANE_M, w - PARKING_LANE_M):
             canvas.line((X_M[0], -7.0), (y - 0.05, y + 0.05), WHITE)
             if layout.has_ahead:
                 canvas.line((far + CORNER_M + 5, X_M[1]), (y - 0.05, y + 0.05), WHITE)

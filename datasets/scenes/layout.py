@@ -16,6 +16,7 @@ Control = Literal["stop_sign", "traffic_light", "none"]
 Side = Literal["left", "right"]
 
 NEAR_KERB_M: Final = 4.5
+PARKING_LANE_M: Final = 2.05
 SCORED: Final = "ABCDEFGH"
 
 
@@ -60,6 +61,11 @@ class Layout:
     has_lot: bool = True
 
     @property
+    def has_parking_lane(self) -> bool:
+        """Is there room to park, marked by a white line?"""
+        return self.half_width_m > 4.6
+
+    @property
     def far_kerb_m(self) -> float:
         """Where the crossroad's far kerb lies."""
         return NEAR_KERB_M + self.cross_width_m
@@ -89,15 +95,17 @@ TABLE_6: Final = {
     layout.name: layout
     for layout in (
         Layout("A", 101, has_ahead=False, cross_traffic=24.0, is_town=True),
-        Layout("B", 102, has_ahead=False, parked_cross=5, cross_width_m=11.0, cross_traffic=3.0),
-        Layout("C", 103, parked_past=6, cross_traffic=5.0),
-        Layout("D", 104, cross_traffic=3.0, has_lot=False),
+        Layout("B", 102, has_ahead=False, parked_cross=5, cross_width_m=11.0, cross_traffic=3.0,
+               half_width_m=4.4),
+        Layout("C", 103, parked_past=6, cross_traffic=5.0, half_width_m=5.8),
+        Layout("D", 104, cross_traffic=3.0, has_lot=False, half_width_m=4.2, cross_width_m=9.0),
         Layout("E", 105, control="traffic_light", cross_traffic=26.0, parked_cross=1, is_town=True,
                half_width_m=5.6, cross_width_m=12.0, parked_past=1),
         Layout("F", 106, has_ahead=False, one_way="right", do_not_enter=True, cross_traffic=20.0,
                is_town=True, cross_width_m=9.0),
         Layout("G", 107, vegetation=True, cross_traffic=5.0, parked_past=1),
-        Layout("H", 108, control="none", cross_traffic=1.0, cross_width_m=9.0),
+        Layout("H", 108, control="none", cross_traffic=1.0, cross_width_m=9.0,
+               half_width_m=4.3),
     )
 }  # fmt: skip
 
@@ -110,6 +118,7 @@ def any_layout(seed: int) -> Layout:
     one_way = str(rng.choice(["", "left", "right"], p=[0.6, 0.2, 0.2]))
     if arms in ("no_left", "no_right"):
         one_way = ""
+    parked = int(rng.choice([0, 0, 2, 4, 6]))
     closed = arms != "t" and not one_way and bool(rng.random() < 0.22)
     return Layout(
         name=f"L{seed}",
@@ -123,9 +132,9 @@ def any_layout(seed: int) -> Layout:
         do_not_enter=closed or bool(arms == "t" and one_way and rng.random() < 0.5),
         ahead_is_closed=closed,
         half_width_m=float(rng.uniform(4.2, 6.4)),
-        cross_width_m=float(rng.uniform(8.0, 13.0)),
+        cross_width_m=float(rng.uniform(11.0 if parked else 8.0, 13.0)),
         cross_traffic=float(rng.choice([1.0, 5.0, 12.0, 26.0])),
-        parked_cross=int(rng.choice([0, 0, 2, 4, 6])),
+        parked_cross=parked,
         parked_past=int(rng.choice([0, 0, 2, 5])),
         vegetation=bool(rng.random() < 0.2),
         is_town=bool(rng.random() < 0.45),

@@ -25,8 +25,8 @@ from .world import World
 
 MOUNTING: Final = Mounting(x_m=FRONT_M)
 SETTINGS: Final = MobileyeSettings(revision="classic", mounting=MOUNTING)
+SOLID, ROAD_EDGE, DOUBLE = 1, 3, 4
 STANDING, MOVING, ONCOMING, PARKED = 1, 3, 4, 5
-TYPES: Final = {"pickup": 1}
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +145,8 @@ class Device:
     ) -> Block:
         layout, rng = self._world.layout, self._rng
         lines = lane_lines_m(layout)
+        # Without a parking lane there is no painted line on the right, only the kerb.
+        right_type = SOLID if layout.has_parking_lane else ROAD_EDGE
         rows: dict[str, list[float]] = {name: [] for name in _LANE_COLUMNS}
         for picture in pictures:
             x, y, heading = picture.view.rear_axle
@@ -153,7 +155,7 @@ class Device:
             for side, line_y in zip((1, -1), lines, strict=True):
                 lost = is_turning or rng.random() < 0.03
                 rows["side"].append(side)
-                rows["lane_type"].append(2 if lost else (4 if side > 0 else 1))
+                rows["lane_type"].append(2 if lost else DOUBLE if side > 0 else right_type)
                 rows["quality"].append(0 if lost else quality)
                 rows["model_degree"].append(2)
                 rows["c0_m"].append(np.nan if lost else line_y - y + rng.normal(0, 0.03))

@@ -11,7 +11,7 @@ from numpy.random import Generator
 from crosscue.datasets.simulated_drive import RATE_HZ, START_NS, TrueMotion
 
 from .conditions import Conditions
-from .layout import NEAR_KERB_M, Layout
+from .layout import NEAR_KERB_M, PARKING_LANE_M, Layout
 from .mesh import Floats
 
 FRONT_M: Final = 3.75
@@ -41,7 +41,7 @@ class Approach:
 
 def lane_y_m(layout: Layout) -> float:
     """Middle of the lane driven, right of the middle line."""
-    parking = 2.05 if layout.half_width_m > 4.6 else 0.0
+    parking = PARKING_LANE_M if layout.has_parking_lane else 0.0
     return -(layout.half_width_m - parking) / 2
 
 

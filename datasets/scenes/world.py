@@ -358,7 +358,8 @@ def _overgrowth(site: _Site, fixed: Generator) -> None:
 def _poles(site: _Site, fixed: Generator) -> None:
     layout = site.layout
     side = float(fixed.choice([-1.0, 1.0]))
-    y = side * (layout.half_width_m + 0.9)
+    # Behind the sidewalk: before it, a pole would hide the signs for most of the approach.
+    y = side * (layout.half_width_m + 3.4)
     xs = np.arange(-101.0, 100.0, 34.0).tolist()
     if not layout.has_ahead:
         xs = [x for x in xs if x < 0]
@@ -434,7 +435,7 @@ def _parked(site: _Site, varied: Generator) -> None:
                 if varied.random() < 0.6:
                     site.add_car(any_look(varied), "parked_cross", x, side * y, heading)
                 y += float(varied.uniform(6.0, 7.5))
-    if layout.has_ahead:
+    if layout.has_ahead and layout.has_parking_lane:
         for side, heading in ((-1.0, 0.0), (1.0, np.pi)):
             if layout.ahead_is_closed:
                 heading = np.pi
@@ -443,7 +444,7 @@ def _parked(site: _Site, varied: Generator) -> None:
                 if varied.random() < 0.65:
                     site.add_car(any_look(varied), "parked_past", x, side * (w - 1.05), heading)
                 x += float(varied.uniform(6.2, 9.0))
-    if w > 4.6:
+    if layout.has_parking_lane:
         for side, heading in ((-1.0, 0.0), (1.0, np.pi)):
             for x in np.arange(-80.0, -16.0, 7.0):
                 if varied.random() < 0.14:

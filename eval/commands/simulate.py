@@ -7,18 +7,24 @@ examples:
   crosscue simulate A --run 3 -o drives
   crosscue simulate --all -o drives
   crosscue simulate L17 L18 --runs 2 --seed 5 -o training
+  crosscue simulate --all --sheet sheet.jpg
 """
 
 from __future__ import annotations
 
 import argparse
-import time
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 from crosscue.datasets.scenes.camera import Camera
 from crosscue.datasets.scenes.drive import SceneFiles, SceneSettings, write_scene
 from crosscue.datasets.scenes.layout import SCORED
-from crosscue.replay.errors import UsageError
+from crosscue.datasets.scenes.sheet import contact_sheet, sheet_jpeg
+from crosscue.replay.errors import OutputError, UsageError
+from crosscue.replay.run_folder import write_whole
 
 from .common import print_json, with_progress
 
@@ -28,14 +34,17 @@ PUBLISHED_RUNS = 10
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("layouts", nargs="*", metavar="LAYOUT", help="A to H, or L0, L1, ...")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR",
+    parser.add_argument("-o", "--output", type=Path, metavar="DIR",
                         help="folder that gets one folder a drive")  # fmt: skip
+    parser.add_argument("--sheet", type=Path, metavar="JPEG",
+                        help="no drives: one picture with a frame of each")  # fmt: skip
     parser.add_argument("--run", type=int, metavar="N", help="one run, from 1")
     parser.add_argument("--runs", type=int, metavar="N", help="the first N runs (default: 1)")
     parser.add_argument("--all", action="store_true", help="A to H, ten runs each")
     parser.add_argument("--seed", type=int, default=0, help="of what differs from run to run")
     parser.add_argument("--rate", type=int, default=10, help="pictures a second: 10, 20, 25, 50")
     parser.add_argument("--width", type=int, default=1280, help="of the picture (9/16 high)")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="drives made at a time")
     parser.add_argument("--overwrite", action="store_true", help="replace earlier drives")
     parser.add_argument("--json", action="store_true", help="print what was written as JSON")
 
@@ -43,28 +52,56 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Simulate all that was asked for."""
     wanted = _wanted(args)
+    if args.sheet is not None:
+        return _sheet(wanted, args)
     written: list[dict[str, object]] = []
 
     def share() -> float:
         return len(written) / len(wanted)
 
-    for settings in with_progress(wanted, share, args, "simulating"):
-        began = time.monotonic()
-        folder = args.output / settings.name
-        files = write_scene(folder, settings, overwrite=args.overwrite)
+    for settings, files in with_progress(_made(wanted, args), share, args, "simulating"):
         written.append(_told(settings, files))
         if not args.quiet and not args.json:
-            took = time.monotonic() - began
-            print(f"{folder}: {files.seconds:.1f} s, {files.pictures} pictures, "
-                  f"made in {took:.0f} s")  # fmt: skip
+            print(f"{files.log.parent}: {files.seconds:.1f} s, {files.pictures} pictures")
     if args.json:
         print_json(written)
+    return 0
+
+
+def _made(
+    wanted: list[SceneSettings], args: argparse.Namespace
+) -> Iterator[tuple[SceneSettings, SceneFiles]]:
+    """Drives in the order asked for, several made at a time."""
+    folders = [args.output / settings.name for settings in wanted]
+    make = partial(write_scene, overwrite=args.overwrite)
+    if args.jobs == 1:
+        yield from zip(wanted, map(make, folders, wanted), strict=True)
+        return
+    fresh = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(args.jobs, len(wanted)), mp_context=fresh) as pool:
+        yield from zip(wanted, pool.map(make, folders, wanted), strict=True)
+
+
+def _sheet(wanted: list[SceneSettings], args: argparse.Namespace) -> int:
+    columns = len({(one.run, one.seed) for one in wanted})
+    if args.sheet.exists() and not args.overwrite:
+        raise OutputError(f"{args.sheet}: exists; give another name or --overwrite")
+    coded = sheet_jpeg(contact_sheet(wanted, columns))
+    write_whole(args.sheet, lambda path: path.write_bytes(coded))
+    if args.json:
+        print_json({"sheet": str(args.sheet), "drives": [one.name for one in wanted]})
+    elif not args.quiet:
+        print(args.sheet)
     return 0
 
 
 def _wanted(args: argparse.Namespace) -> list[SceneSettings]:
     if args.all == bool(args.layouts):
         raise UsageError("simulate: give layouts (A to H, L0, L1, ...), or --all")
+    if (args.output is None) == (args.sheet is None):
+        raise UsageError("simulate: give -o DIR for drives, or --sheet JPEG for pictures of them")
+    if args.jobs < 1:
+        raise UsageError(f"--jobs {args.jobs}: want 1 or more")
     if args.run is not None and (args.runs is not None or args.all):
         raise UsageError("--run: not together with --runs or --all; give one of them")
     if not 64 <= args.width <= 3840 or args.width % 16:
