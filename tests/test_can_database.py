@@ -236,6 +236,15 @@ def test_overlapping_signals_are_noticed_unless_no_frame_has_both(tmp_path: Path
     assert database.notices == ("bus.dbc:6: Yaw: signals two and three share bits",)
 
 
+def test_a_branch_without_its_multiplexer_is_not_decoded_in_every_frame(tmp_path: Path) -> None:
+    text = dbc_text([YAW, WHEEL]).replace("SG_ state ", "SG_ state m3")
+
+    database = CanDatabase.load([write(tmp_path, text)])
+
+    assert database.named("Yaw").problem == "nothing says which multiplexer brings state"
+    assert not database.named("Wheel").problem
+
+
 @pytest.mark.parametrize("form", ["kcd", "sym"])
 def test_other_formats_give_the_same_messages(form: str, tmp_path: Path) -> None:
     dbc = write(tmp_path, dbc_text([YAW, WHEEL]))
@@ -249,6 +258,7 @@ def test_other_formats_give_the_same_messages(form: str, tmp_path: Path) -> None
     expected = {m.key: m for m in CanDatabase.load([dbc]).messages}
     assert len(ours.messages) == 2
     for message in ours.messages:
+        assert message.source.startswith(f"bus.{form}:")
         assert message.same_layout(expected[message.key])
 
 

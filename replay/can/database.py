@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cantools.database.can.internal_database import InternalDatabase
 
 FORMATS: Final = ("dbc", "kcd", "arxml", "sym")
+_EXTENDED_FLAG: Final = 0x8000_0000
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,12 +178,22 @@ def _load_file(path: Path, limits: Limits) -> tuple[list[CanMessage], list[str]]
     source = read_text(path, limits)
     refuse_bombs(source, form)
     parsed = _parse(source, form)
-    messages = [_message(m, source, form, _says_fd(parsed, form)) for m in parsed.messages]
+    lines = source.lines_of_messages(form)
+    marked = source.multiplexed_signals() if form == "dbc" else {}
+    messages = []
+    for one in parsed.messages:
+        stored = str(one.frame_id | (_EXTENDED_FLAG if one.is_extended_frame else 0))
+        line = lines.get(stored if form == "dbc" else one.name)
+        where = f"{path.name}:{line}" if line else path.name
+        messages.append(_message(one, where, _says_fd(parsed, form), marked.get(stored, [])))
     if not messages:
         raise SchemaError(f"{path}: defines no message; check that the file is whole")
     notices = [*source.notices, *doubts(source, form, [m.name for m in messages])]
     for message in messages:
         notices += _doubts_of(message)
+    empty = sum(not message.signals for message in messages)
+    if empty:
+        notices.append(f"{path.name}: {empty} of {len(messages)} messages have no signals")
     return messages, notices
 
 
@@ -214,8 +225,7 @@ def _says_fd(parsed: InternalDatabase, form: str) -> bool:
     return form == "arxml"
 
 
-def _message(parsed: Message, source: DatabaseText, form: str, says_fd: bool) -> CanMessage:
-    line = source.line_of_message(parsed.name, parsed.frame_id, parsed.is_extended_frame)
+def _message(parsed: Message, where: str, says_fd: bool, marked: list[str]) -> CanMessage:
     message = CanMessage(
         name=parsed.name,
         arbitration_id=parsed.frame_id,
@@ -223,10 +233,13 @@ def _message(parsed: Message, source: DatabaseText, form: str, says_fd: bool) ->
         length=parsed.length,
         signals=tuple(_signal(s) for s in parsed.signals),
         is_fd=parsed.is_fd if says_fd else None,
-        source=f"{source.path.name}:{line}" if line else source.path.name,
+        source=where,
     )
     if parsed.is_container:
         return replace(message, problem="container message, not supported")
+    lost = [s.name for s in message.signals if s.name in marked and s.multiplexer is None]
+    if lost:
+        return replace(message, problem=f"nothing says which multiplexer brings {lost[0]}")
     return replace(message, problem=layout_problem(message))
 
 
@@ -253,6 +266,8 @@ def _signal(parsed: Signal) -> CanSignal:
 
 def _doubts_of(message: CanMessage) -> list[str]:
     where = f"{message.source}: {message.name}"
+    if not message.signals:
+        return []
     if message.problem:
         return [f"{where} cannot be decoded: {message.problem}"]
     notices = [f"{where}: signals {a} and {b} share bits" for a, b in overlaps(message)]

@@ -14,6 +14,13 @@ _MOST_BITS: Final = 8 * 2048
 """No message is longer: 1785 bytes is the longest multi-packet message there is."""
 _MOST_BRANCHES: Final = 1_000_000
 
+_MESSAGE_HEADS: Final = {
+    "dbc": r"^[ \t]*BO_\s+(\d+)",
+    "sym": r"^\["?([^\]"\n]+)"?\]",
+    "kcd": r"<Message\b[^>]*?\bname=\"([^\"]*)\"",
+    "arxml": r"<SHORT-NAME>([^<]*)</SHORT-NAME>",
+}
+
 _BYTE_ORDER_MARKS: Final = (
     (b"\xef\xbb\xbf", "utf-8"),
     (b"\xff\xfe", "utf-16-le"),
@@ -39,17 +46,27 @@ class DatabaseText:
         """Number of the line that holds the character at ``position``, from 1."""
         return self.text.count("\n", 0, position) + 1
 
-    def line_of_message(self, name: str, arbitration_id: int, is_extended: bool) -> int:
-        """Line that defines a message, or 0 if it cannot be told."""
-        stored = arbitration_id | (0x8000_0000 if is_extended else 0)
-        for pattern in (
-            rf"^[ \t]*BO_\s+{stored}\b",
-            rf"^\[{re.escape(name)}\]",
-            rf"\b(?:name=\"|<SHORT-NAME>){re.escape(name)}\b",
-        ):
-            if match := re.search(pattern, self.text, re.MULTILINE):
-                return self.line_at(match.end())
-        return 0
+    def lines_of_messages(self, form: str) -> dict[str, int]:
+        """From what a message is called in a file of this format to the line that says it.
+
+        In a DBC file that is the stored identifier, with its flag bit; elsewhere the name.
+        """
+        lines: dict[str, int] = {}
+        line, position = 1, 0
+        for match in re.finditer(_MESSAGE_HEADS[form], self.text, re.MULTILINE):
+            line += self.text.count("\n", position, match.start(1))
+            position = match.start(1)
+            lines.setdefault(match[1], line)
+        return lines
+
+    def multiplexed_signals(self) -> dict[str, list[str]]:
+        """Signals of a DBC file that are marked as multiplexed, by stored identifier."""
+        marked: dict[str, list[str]] = {}
+        for block in re.split(r"^[ \t]*BO_\s+", self.text, flags=re.MULTILINE)[1:]:
+            names = re.findall(r"^[ \t]*SG_\s+(\w+)\s+m\d+M?\s*:", block, re.MULTILINE)
+            if names:
+                marked[block.split(None, 1)[0]] = names
+        return marked
 
     def line_of_error(self, words: str) -> int:
         """Line that a parser's error speaks of; the last line if it names none."""
