@@ -104,7 +104,7 @@ def judge(kind: Kind, frames: Sequence[Sent], whole: bytes, copy: bytes, path: P
         # Text that ends with a whole line is a shorter log, as good as any other.
         is_short = not kind.tells_end and whole.startswith(copy) and copy.endswith(b"\n")
         return Verdict("undetectable" if is_short else "SILENT", numbers)
-    return Verdict("undetectable" if new or lost else "same", numbers)
+    return Verdict("same" if found == kind.expected(frames) else "undetectable", numbers)
 
 
 def hit(kind: Kind, whole: bytes, copy: bytes) -> int:
