@@ -24,6 +24,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "convert": ("convert", "any log or data set to MCAP with ROS 2 types"),
     "vehicle init": ("vehicle_init", "write a first vehicle file from what a log holds"),
     "decode": ("decode", "every stream as columns: a Parquet file for each topic or CAN message"),
+    "detect": ("detect", "run detectors over the camera: detections, road, cues"),
     "replay": ("replay", "the main job: from a log to a run folder"),
     "score": ("score", "a run against truth: metrics, figures, report"),
     "view": ("view", "a run in Rerun"),

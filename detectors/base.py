@@ -1,0 +1,150 @@
+"""What every detector takes and gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, Self, TypeAlias
+
+import numpy as np
+
+from crosscue.replay.columns import Bytes, Floats
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """The pixels a detector asks for; a frame is decoded no finer than that.
+
+    Attributes:
+        least_width_px: Any picture at least this wide will do; None for the full size.
+        is_grey: One channel instead of three.
+    """
+
+    least_width_px: int | None = None
+    is_grey: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One decoded picture.
+
+    Attributes:
+        t_ns: Log time.
+        camera: Topic.
+        pixels: Shape (H, W, 3) blue, green, red, or (H, W) grey; uint8; perhaps smaller than the
+            picture the camera took.
+        size_px: Width and height of the picture the camera took; detections are given in these.
+    """
+
+    t_ns: int
+    camera: str
+    pixels: Bytes
+    size_px: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        """Refuse pixels of another shape."""
+        shape = self.pixels.shape
+        if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] != 3):
+            raise ValueError(f"pixels: want (H, W) or (H, W, 3), got {shape}")
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """From decoded pixels to the camera's: along x and along y."""
+        height, width = self.pixels.shape[:2]
+        return self.size_px[0] / width, self.size_px[1] / height
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detections:
+    """All objects one detector found in one frame, as columns of equal length N.
+
+    Attributes:
+        t_ns: Log time of the frame.
+        size_px: Width and height of the picture.
+        boxes_px: Shape (N, 4), float64: x0, y0, x1, y1, origin at the top-left pixel's corner.
+        scores: Shape (N,), float64, in [0, 1]; comparable only within one detector.
+        labels: N class names.
+        masks: N masks as compressed runs over the picture (``crosscue.detectors.rle``), empty
+            where the detector gives only a box.
+    """
+
+    t_ns: int
+    size_px: tuple[int, int]
+    boxes_px: Floats
+    scores: Floats
+    labels: tuple[str, ...]
+    masks: tuple[bytes, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse columns that do not line up, and numbers that are none.
+
+        Raises:
+            ValueError: Naming the column, the shape wanted and the shape given.
+        """
+        n = len(self.labels)
+        if self.boxes_px.shape != (n, 4):
+            raise ValueError(f"boxes_px: want ({n}, 4), got {self.boxes_px.shape}")
+        if self.scores.shape != (n,):
+            raise ValueError(f"scores: want ({n},), got {self.scores.shape}")
+        if len(self.masks) != n:
+            raise ValueError(f"masks: want {n}, got {len(self.masks)}")
+        if not (np.isfinite(self.boxes_px).all() and np.isfinite(self.scores).all()):
+            raise ValueError("boxes_px, scores: want finite numbers")
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def above(self, score: float) -> Self:
+        """The detections with a score of at least ``score``, in the same order."""
+        keep = np.flatnonzero(self.scores >= score)
+        return type(self)(
+            self.t_ns,
+            self.size_px,
+            self.boxes_px[keep],
+            self.scores[keep],
+            tuple(self.labels[i] for i in keep),
+            tuple(self.masks[i] for i in keep),
+        )
+
+
+def nothing_found(frame: Frame) -> Detections:
+    """An empty result."""
+    return Detections(frame.t_ns, frame.size_px, np.empty((0, 4)), np.empty(0), (), ())
+
+
+@dataclass(frozen=True, slots=True)
+class RoadMask:
+    """Which pixels of one frame are road.
+
+    Attributes:
+        t_ns: Log time of the frame.
+        size_px: Width and height of the picture.
+        mask: Compressed runs (``crosscue.detectors.rle``) over the whole picture, coarser than it.
+        mask_size_px: Width and height of the mask.
+    """
+
+    t_ns: int
+    size_px: tuple[int, int]
+    mask: bytes
+    mask_size_px: tuple[int, int]
+
+
+Found: TypeAlias = Detections | RoadMask
+
+
+class Detector(Protocol):
+    """From frames to what is in each; no memory of earlier frames (that is a tracker)."""
+
+    @property
+    def view(self) -> View:
+        """The pixels it asks for."""
+        ...
+
+    @property
+    def identity(self) -> str:
+        """Text that changes whenever its output could: version, settings, hash of the weights."""
+        ...
+
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        """One result for each frame, in order; an empty one is valid."""
+        ...

@@ -1,0 +1,103 @@
+"""Detectors by name, each imported only when it is asked for.
+
+A name is one of ``BUILTIN``, one that an installed package offers under the entry point group
+``crosscue.detectors``, a ``module:factory``, or the file name of a model card (``.toml``). A
+factory takes settings by name, as the vehicle file spells them, and gives a ``Detector``.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, Final, cast
+
+from crosscue.replay.errors import UsageError, VehicleError
+
+from .base import Detector
+
+GROUP: Final = "crosscue.detectors"
+
+BUILTIN: Final[Mapping[str, str]] = {
+    "model": "crosscue.detectors.model_detector:build",
+}
+"""From name to ``module:factory``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """One detector as asked for.
+
+    Attributes:
+        name: What it is called in tables.
+        kind: As the module's text says.
+        settings: For its factory.
+    """
+
+    name: str
+    kind: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+def chosen(names: str, sections: Mapping[str, Choice]) -> tuple[Choice, ...]:
+    """The detectors that a list such as ``cars,signs,my.toml,pack.mod:make`` asks for.
+
+    Args:
+        names: Comma-separated.
+        sections: The vehicle file's own, by name; they come first.
+
+    Raises:
+        UsageError: None, or one twice.
+    """
+    asked = [name.strip() for name in names.split(",") if name.strip()]
+    if not asked:
+        raise UsageError(f"--detectors: none named; there are: {', '.join(known(sections))}")
+    found = tuple(_choice(name, sections) for name in asked)
+    if len({choice.name for choice in found}) != len(found):
+        raise UsageError(f"--detectors {names}: one is named twice; name each once")
+    return found
+
+
+def _choice(name: str, sections: Mapping[str, Choice]) -> Choice:
+    if name in sections:
+        return sections[name]
+    if name.endswith(".toml"):
+        stem = name.replace("\\", "/").rsplit("/", 1)[-1].removesuffix(".toml")
+        return Choice(stem, "model", {"card": name})
+    return Choice(name, name)
+
+
+def known(sections: Mapping[str, Choice]) -> list[str]:
+    """All names that can be asked for."""
+    return sorted({*sections, *BUILTIN, *(point.name for point in entry_points(group=GROUP))})
+
+
+def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
+    """Build one detector.
+
+    Raises:
+        UsageError: No such detector, or it cannot be imported.
+        VehicleError: Its settings do not fit.
+    """
+    place = table.get(choice.kind) or _offered(choice.kind) or choice.kind
+    module, colon, factory = place.partition(":")
+    if not colon:
+        names = known({})
+        close = difflib.get_close_matches(choice.kind, names, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names)}"
+        raise UsageError(f"detector {choice.kind!r}: no such name; {hint} Or give module:factory")
+    try:
+        build = cast("Callable[..., Detector]", getattr(import_module(module), factory))
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"detector {place}: {error}; check the module and the name") from None
+    try:
+        return build(**choice.settings)
+    except TypeError as error:
+        raise VehicleError(f"detector {choice.name}: settings do not fit: {error}") from None
+
+
+def _offered(name: str) -> str | None:
+    found = entry_points(group=GROUP, name=name)
+    return next((point.value for point in found), None)

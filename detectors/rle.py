@@ -1,0 +1,129 @@
+"""Masks as runs: COCO's compressed run-length text, a few hundred bytes for a car.
+
+Pixels are counted down the columns, from the top left; runs of background and object take turns,
+background first. The text codes the runs' lengths, from the fourth on as differences to the run two
+before, in groups of five bits (the coding that COCO annotations use, so other tools read it).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats, Int64s
+
+_BASE: Final = 48
+_MORE: Final = 0x20
+_SIGN: Final = 0x10
+_LONGEST: Final = 7
+"""Groups of five bits that a run's length may have: 35 bits."""
+
+
+def encode(mask: NDArray[np.bool_], corner_px: tuple[int, int], size_px: tuple[int, int]) -> bytes:
+    """The text for an object known only inside a box.
+
+    Args:
+        mask: Shape (h, w): object pixels inside the box.
+        corner_px: Column and row of the box's top-left pixel.
+        size_px: Width and height of the whole picture.
+
+    Raises:
+        ValueError: The box is not inside the picture.
+    """
+    (column, row), (width, height) = corner_px, size_px
+    h, w = mask.shape
+    if column < 0 or row < 0 or column + w > width or row + h > height:
+        raise ValueError(f"mask {w} x {h} at {column}, {row}: not inside {width} x {height}")
+    padded = np.zeros((w, h + 2), np.int8)
+    padded[:, 1:-1] = mask.T
+    turns = np.diff(padded, axis=1)
+    origin = (column + np.arange(w)[:, None]) * height + row + np.arange(h + 1)[None, :]
+    starts, stops = origin[turns == 1], origin[turns == -1]
+    if len(starts) > 1:
+        is_apart = np.append(stops[:-1] != starts[1:], True)
+        starts, stops = starts[np.append(True, is_apart[:-1])], stops[is_apart]
+    edges = np.empty(2 * len(starts), np.int64)
+    edges[0::2], edges[1::2] = starts, stops
+    lengths = np.diff(np.concatenate([[0], edges, [width * height]]))
+    return _to_text(lengths[:-1] if len(edges) and lengths[-1] == 0 else lengths)
+
+
+def runs(text: bytes) -> Int64s:
+    """Lengths of the runs of background and object in turn.
+
+    Raises:
+        ValueError: Not such a text.
+    """
+    codes = np.frombuffer(text, np.uint8).astype(np.int64) - _BASE
+    if len(codes) == 0 or codes.min() < 0 or codes.max() > 63 or codes[-1] & _MORE:
+        raise ValueError(f"not a compressed mask: {text[:20]!r}")
+    is_last = (codes & _MORE) == 0
+    last = np.flatnonzero(is_last)
+    first = np.concatenate([[0], last[:-1] + 1])
+    if int((last - first).max()) >= _LONGEST:
+        raise ValueError(f"not a compressed mask, a run is too long: {text[:20]!r}")
+    place = np.arange(len(codes)) - np.repeat(first, last - first + 1)
+    values = np.add.reduceat((codes & 0x1F) << (5 * place), first)
+    values -= np.where(codes[last] & _SIGN, 1 << (5 * (last - first + 1)), 0)
+    values[1::2] = np.cumsum(values[1::2])
+    values[2::2] = np.cumsum(values[2::2])
+    if values.min() < 0:
+        raise ValueError(f"not a compressed mask, a run is negative: {text[:20]!r}")
+    return np.asarray(values, np.int64)
+
+
+def area_px(text: bytes) -> int:
+    """How many pixels the object has."""
+    return int(runs(text)[1::2].sum())
+
+
+def column_heights_px(text: bytes, size_px: tuple[int, int]) -> Floats:
+    """Object pixels in each column of the picture, shape (width,).
+
+    Raises:
+        ValueError: Not such a text, or not for a picture of this size.
+    """
+    width, height = size_px
+    lengths = _checked(text, size_px)
+    edges = np.concatenate([[0], np.cumsum(lengths)])
+    is_object = np.arange(len(lengths)) % 2
+    counted = np.concatenate([[0], np.cumsum(lengths * is_object)])
+    # Between two edges the count grows evenly, so looking it up at column borders is exact.
+    return np.diff(np.interp(np.arange(width + 1) * height, edges, counted))
+
+
+def decode(text: bytes, size_px: tuple[int, int]) -> NDArray[np.bool_]:
+    """The whole picture's mask, shape (height, width).
+
+    Raises:
+        ValueError: As ``column_heights_px``.
+    """
+    width, height = size_px
+    lengths = _checked(text, size_px)
+    flat = np.zeros(width * height, np.bool_)
+    edges = np.cumsum(lengths)
+    for start, stop in zip(edges[0::2], edges[1::2], strict=False):
+        flat[start:stop] = True
+    return flat.reshape(width, height).T
+
+
+def _checked(text: bytes, size_px: tuple[int, int]) -> Int64s:
+    lengths = runs(text)
+    pixels = size_px[0] * size_px[1]
+    if int(lengths.sum()) not in (pixels, pixels - int(lengths[-1])) or lengths.sum() > pixels:
+        raise ValueError(f"mask of {int(lengths.sum())} pixels: want {size_px[0]} x {size_px[1]}")
+    return lengths
+
+
+def _to_text(lengths: Int64s) -> bytes:
+    values = lengths.copy()
+    values[3:] -= lengths[1:-2]
+    groups = (values[:, None] >> (5 * np.arange(_LONGEST))) & 0x1F
+    rests = values[:, None] >> (5 * np.arange(1, _LONGEST + 1))
+    is_done = rests == np.where(groups & _SIGN, -1, 0)
+    count = is_done.argmax(axis=1) + 1
+    place = np.arange(_LONGEST)[None, :]
+    codes = np.where(place < count[:, None] - 1, groups | _MORE, groups) + _BASE
+    return bytes(codes[place < count[:, None]].astype(np.uint8))

@@ -1,0 +1,177 @@
+"""From encoded pictures to what detectors found: decoded once, cached, in batches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Final
+
+from crosscue.replay.columns import Block, Bytes, Images
+from crosscue.replay.errors import CrosscueError, LogError, UsageError
+
+from .base import Detector, Found, Frame, View
+from .pictures import Encoded, decode, encoded, reduction, size_of
+from .result_cache import ResultCache, picture_key
+
+BATCH: Final = 8
+"""Pictures held decoded at a time, and given to a detector at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """A detector and what it is called in tables."""
+
+    name: str
+    detector: Detector
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """What all detectors found in one frame.
+
+    Attributes:
+        t_ns: Log time of the frame.
+        size_px: Width and height of the picture.
+        picture: Still encoded.
+        found: One result for each detector, in order.
+    """
+
+    t_ns: int
+    size_px: tuple[int, int]
+    picture: Encoded
+    found: tuple[Found, ...]
+
+
+@dataclass(slots=True)
+class Counts:
+    """What became of the frames, by detector name where it differs."""
+
+    frames: int = 0
+    decoded: int = 0
+    ran: dict[str, int] = field(default_factory=dict)
+    from_cache: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class _Prepared:
+    """One picture with what is known and the pixels for what is not."""
+
+    t_ns: int
+    picture: Encoded
+    key: bytes
+    size_px: tuple[int, int]
+    known: list[Found | None]
+    pixels: dict[tuple[int, bool], Bytes]
+
+
+@dataclass(slots=True)
+class Runner:
+    """Runs detectors over one camera's pictures.
+
+    Attributes:
+        detectors: In the order of results.
+        cache: Asked first.
+        camera: Topic.
+        depth_bits: Of 16-bit pictures.
+        on_skip: Told the time and reason of each picture that cannot be decoded.
+        counts: Grow as it works.
+    """
+
+    detectors: Sequence[Named]
+    cache: ResultCache
+    camera: str
+    depth_bits: int
+    on_skip: Callable[[int, str, str], None]
+    counts: Counts = field(default_factory=Counts)
+
+    def __call__(self, block: Block) -> Iterator[FrameResult]:
+        """Results of a block's pictures, in order; those that do not decode are left out.
+
+        Raises:
+            UsageError: A detector gave another number of results than it was given frames.
+            CrosscueError: A detector failed.
+        """
+        if not isinstance(block.rows, Images):
+            return
+        images, times = block.rows, block.log_ns.tolist()
+        known = [self._known(encoded(images, i), t_ns) for i, t_ns in enumerate(times)]
+        parts = [known[i : i + BATCH] for i in range(0, len(known), BATCH)]
+        with ThreadPoolExecutor(1, "decode") as pool:
+            ahead: Future[list[_Prepared]] | None = None
+            for i, part in enumerate(parts):
+                prepared = self._decoded(part) if ahead is None else ahead.result()
+                # Decoding needs no Python while it runs, so it overlaps with the networks.
+                ahead = pool.submit(self._decoded, parts[i + 1]) if i + 1 < len(parts) else None
+                yield from self._run(prepared)
+
+    def _known(self, picture: Encoded, t_ns: int) -> _Prepared:
+        key = picture_key(picture)
+        known = [self.cache.get(key, named.detector.identity, t_ns) for named in self.detectors]
+        return _Prepared(t_ns, picture, key, (0, 0), known, {})
+
+    def _decoded(self, pictures: list[_Prepared]) -> list[_Prepared]:
+        return [picture for picture in pictures if self._decode(picture)]
+
+    def _decode(self, prepared: _Prepared) -> bool:
+        try:
+            prepared.size_px = size_of(prepared.picture)
+            for named, found in zip(self.detectors, prepared.known, strict=True):
+                view = named.detector.view
+                scale = _scale(prepared, view)
+                if found is None and scale not in prepared.pixels:
+                    pixels, _ = decode(prepared.picture, view, self.depth_bits)
+                    prepared.pixels[scale] = pixels
+                    self.counts.decoded += 1
+        except LogError as error:
+            reason = "empty picture" if not len(prepared.picture.content) else "picture not decoded"
+            self.on_skip(prepared.t_ns, reason, str(error))
+            return False
+        return True
+
+    def _run(self, pictures: list[_Prepared]) -> Iterator[FrameResult]:
+        fresh: list[tuple[bytes, str, Found]] = []
+        for i, named in enumerate(self.detectors):
+            missing = [picture for picture in pictures if picture.known[i] is None]
+            self._count(named.name, len(missing), len(pictures) - len(missing))
+            if not missing:
+                continue
+            for picture, found in zip(missing, self._detect(named, missing), strict=True):
+                picture.known[i] = found
+                fresh.append((picture.key, named.detector.identity, found))
+        self.cache.put(fresh)
+        self.counts.frames += len(pictures)
+        for picture in pictures:
+            results = tuple(found for found in picture.known if found is not None)
+            yield FrameResult(picture.t_ns, picture.size_px, picture.picture, results)
+
+    def _detect(self, named: Named, pictures: list[_Prepared]) -> Sequence[Found]:
+        view = named.detector.view
+        frames = [
+            Frame(p.t_ns, self.camera, p.pixels[_scale(p, view)], p.size_px) for p in pictures
+        ]
+        try:
+            found = named.detector(frames)
+        except CrosscueError:
+            raise
+        except Exception as error:
+            why = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+            raise CrosscueError(
+                f"detector {named.name}: failed at {frames[0].t_ns} ns: {why}; leave it out of "
+                "--detectors, or mend it"
+            ) from error
+        if len(found) != len(frames):
+            raise UsageError(
+                f"detector {named.name}: gave {len(found)} results for {len(frames)} frames; "
+                "want one for each"
+            )
+        return found
+
+    def _count(self, name: str, ran: int, from_cache: int) -> None:
+        self.counts.ran[name] = self.counts.ran.get(name, 0) + ran
+        self.counts.from_cache[name] = self.counts.from_cache.get(name, 0) + from_cache
+
+
+def _scale(prepared: _Prepared, view: View) -> tuple[int, bool]:
+    by = reduction(prepared.size_px[0], view) if prepared.picture.coding == "jpeg" else 1
+    return by, view.is_grey

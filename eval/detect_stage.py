@@ -1,0 +1,305 @@
+"""From a drive's camera to detections, road shares and cues in a run folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections
+from crosscue.detectors.frame_cues import CuePass, FrameCues
+from crosscue.detectors.ranges import range_of
+from crosscue.detectors.registry import Choice, make
+from crosscue.detectors.result_cache import ResultCache
+from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
+from crosscue.replay.columns import Block
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.run_folder import (
+    RunFolder,
+    TableSink,
+    clear,
+    locked,
+    sha256_of,
+    write_manifest,
+)
+from crosscue.replay.signals import Extractor, Plan, Source, camera_of
+from crosscue.replay.vehicle import Vehicle
+
+from .detection_pictures import Drawer
+from .replay_drive import (
+    account_of,
+    clock_rows,
+    probe_clocks,
+    skipped_rows,
+    skipped_schema,
+    versions,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+@dataclass(frozen=True, slots=True)
+class DetectOutcome:
+    """What a detection run did.
+
+    Attributes:
+        run: Its folder.
+        ledger: The camera log's account.
+        counts: Frames, by detector what ran and what came from the cache.
+        objects: Detections by detector and label.
+        cues: Frames in which each cue was positive.
+        notices: Plain sentences.
+        seconds: Wall time.
+    """
+
+    run: RunFolder
+    ledger: Ledger
+    counts: Counts
+    objects: dict[str, int]
+    cues: dict[str, int]
+    notices: tuple[str, ...]
+    seconds: float
+
+    @property
+    def exit_status(self) -> int:
+        """3 when anything was lost, else 0."""
+        return 0 if self.ledger.is_whole else 3
+
+
+def choices_of(vehicle: Vehicle) -> dict[str, Choice]:
+    """The vehicle file's own detectors by name."""
+    return {
+        name: Choice(
+            name,
+            section.kind,
+            section.settings | ({} if section.card is None else {"card": section.card}),
+        )
+        for name, section in vehicle.detectors.items()
+    }
+
+
+def detect_drive(
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    run: RunFolder,
+    selection: Selection,
+    choices: Sequence[Choice],
+    cache: Path | None = None,
+    draw: int = 0,
+    on_time: Callable[[int], None] = lambda _: None,
+) -> DetectOutcome:
+    """Run detectors over the one camera of a drive.
+
+    Args:
+        logs: All logs of the drive, open.
+        vehicle: What the vehicle file says.
+        run: Where to; locked while this works, cleared first.
+        selection: Which part of the logs.
+        choices: Detectors, in order.
+        cache: File with results of earlier runs, or None for none.
+        draw: How many pictures to write with detections drawn.
+        on_time: Told the log time that has been reached.
+
+    Raises:
+        VehicleError: No camera or several; a card, weights or settings that do not fit.
+        OutputError: The disk is full.
+    """
+    began = time.monotonic()
+    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
+    camera = camera_of(topics, vehicle)
+    if camera is None:
+        raise VehicleError(f"{logs[0].path}: no camera in the logs; name its topic under [topics]")
+    named = [Named(choice.name, make(choice)) for choice in choices]
+    log, topic = logs[camera[0]], camera[1]
+    ledger = Ledger(str(log.path))
+    planned = Plan((Source(camera[0], topic, ()),), {})
+    narrowed = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
+    probe = Extractor(planned, vehicle, camera[0], Ledger(""))
+    clocks = probe_clocks(log, probe, narrowed)
+    extractor = Extractor(planned, vehicle, camera[0], ledger, clocks)
+    with locked(run), ResultCache(cache) as results:
+        clear(run)
+        runner = Runner(
+            named, results, topic.name, vehicle.camera.depth_bits,
+            lambda t_ns, reason, why: ledger.skip(topic.name, reason, 1, why, t_ns),
+        )  # fmt: skip
+        tables = _Tables(run, topic.name, vehicle, named, Drawer(run.path / "pictures", draw))
+        with tables:
+            extractor.on_pictures = lambda block: _through(runner, block, tables, on_time)
+            for block in log.read(ledger, narrowed):
+                for _ in extractor(block):
+                    pass
+        with TableSink(run, "skipped", skipped_schema()) as sink:
+            sink.write(skipped_rows(ledger))
+        seconds = time.monotonic() - began
+        notices = tuple(tables.notices)
+        write_manifest(run, {
+            "stage": "detect",
+            "versions": versions(),
+            "logs": [
+                {"path": str(log.path), "format": log.format, "sha256": sha256_of(log.path)}
+            ],
+            "selection": {"start_ns": selection.start_ns, "end_ns": selection.end_ns},
+            "settings": vehicle.model_dump(mode="json"),
+            "camera": topic.name,
+            "detectors": [
+                {"name": one.name, "identity": one.detector.identity, "kind": choice.kind,
+                 "settings": dict(choice.settings)}
+                for one, choice in zip(named, choices, strict=True)
+            ],
+            "clocks": [clock_rows(extractor)],
+            "accounts": [account_of(ledger)],
+            "counts": {
+                "frames": runner.counts.frames, "decoded": runner.counts.decoded,
+                "ran": runner.counts.ran, "from_cache": runner.counts.from_cache,
+                "objects": tables.objects, "cues": tables.cue_frames,
+            },
+            "notices": list(notices),
+            "timings": {"seconds": seconds},
+        })  # fmt: skip
+    return DetectOutcome(
+        run, ledger, runner.counts, tables.objects, tables.cue_frames, notices, seconds
+    )
+
+
+def _through(runner: Runner, block: Block, tables: _Tables, on_time: Callable[[int], None]) -> None:
+    for result in runner(block):
+        tables.add(result)
+        on_time(result.t_ns)
+
+
+@dataclass(slots=True)
+class _Tables:
+    """The three tables of a run, filled frame by frame."""
+
+    run: RunFolder
+    camera: str
+    vehicle: Vehicle
+    detectors: Sequence[Named]
+    drawer: Drawer
+    notices: list[str] = field(default_factory=list)
+    objects: dict[str, int] = field(default_factory=dict)
+    cue_frames: dict[str, int] = field(default_factory=dict)
+    _sinks: dict[str, TableSink] = field(default_factory=dict)
+    _held: dict[str, list[dict[str, object]]] = field(default_factory=dict)
+    _size: tuple[int, int] | None = None
+    _cues: CuePass = field(init=False)
+
+    def __post_init__(self) -> None:
+        names = [named.name for named in self.detectors]
+        is_sign = [name == "signs" for name in names]
+        self._cues = CuePass(self.vehicle, not all(is_sign), any(is_sign))
+
+    def __enter__(self) -> _Tables:
+        for name, schema in schemas().items():
+            self._sinks[name] = TableSink(self.run, name, schema)
+            self._held[name] = []
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        kind, error, trace = failure
+        for name, sink in self._sinks.items():
+            if kind is None:
+                self._write(name)
+            sink.__exit__(kind, error, trace)  # type: ignore[arg-type]
+
+    def add(self, result: FrameResult) -> None:
+        """Rows of one frame."""
+        if self._size not in (None, result.size_px):
+            self.notices.append(
+                f"{self.camera}: pictures of {self._size} became {result.size_px} px at "
+                f"{result.t_ns} ns"
+            )
+        self._size = result.size_px
+        cues = self._cues(result.found)
+        for named, found in zip(self.detectors, result.found, strict=True):
+            if isinstance(found, Detections):
+                self._held["detections"] += self._detection_rows(named.name, found)
+        if cues.road is not None:
+            self._held["road"].append({
+                "t_ns": result.t_ns, "camera": self.camera, "share_left": cues.road.left,
+                "share_straight": cues.road.straight, "share_right": cues.road.right,
+            })  # fmt: skip
+        self._add_cues(result.t_ns, cues)
+        self.drawer(result, cues)
+        for name, rows in self._held.items():
+            if len(rows) > 8192:
+                self._write(name)
+
+    def _add_cues(self, t_ns: int, cues: FrameCues) -> None:
+        for cue, count in cues.counts.items():
+            row: dict[str, object] = {
+                "t_ns": t_ns,
+                "approach": None,
+                "cue": cue.value,
+                "count": count,
+            }
+            self._held["cues"].append(row)
+            self.cue_frames[cue.value] = self.cue_frames.get(cue.value, 0) + (count > 0)
+
+    def _detection_rows(self, name: str, found: Detections) -> list[dict[str, object]]:
+        rows: list[dict[str, object]] = []
+        for i, label in enumerate(found.labels):
+            x0, y0, x1, y1 = found.boxes_px[i].tolist()
+            key = f"{name}: {label}"
+            self.objects[key] = self.objects.get(key, 0) + 1
+            height = _height_px(found, i)
+            rows.append({
+                "t_ns": found.t_ns, "camera": self.camera, "detector": name, "label": label,
+                "score": float(found.scores[i]), "x0": x0, "y0": y0, "x1": x1, "y1": y1,
+                "mask": found.masks[i] or None, "height_px": height,
+                "range_m": self._range_m(label, height),
+                "picture_width_px": found.size_px[0], "picture_height_px": found.size_px[1],
+            })  # fmt: skip
+        return rows
+
+    def _range_m(self, label: str, height_px: float) -> float | None:
+        cues, ranges = self.vehicle.cues, self.vehicle.ranges
+        curve = ranges.stop_sign if label in cues.stop_sign_labels else None
+        curve = ranges.traffic_light if label in cues.traffic_light_labels else curve
+        if curve is None or height_px <= 0.0:
+            return None
+        return float(range_of(np.array([height_px]), curve)[0])
+
+    def _write(self, name: str) -> None:
+        rows, self._held[name] = self._held[name], []
+        if rows:
+            self._sinks[name].write({key: [row[key] for row in rows] for key in rows[0]})
+
+
+def _height_px(found: Detections, i: int) -> float:
+    """Rows that the mask spans, or the box's height where there is no mask."""
+    if not found.masks[i]:
+        return float(found.boxes_px[i, 3] - found.boxes_px[i, 1])
+    rows = np.flatnonzero(rle.decode(found.masks[i], found.size_px).any(axis=1))
+    return float(rows[-1] - rows[0] + 1) if len(rows) else 0.0
+
+
+def schemas() -> dict[str, pa.Schema]:
+    """Columns of the tables that this stage writes."""
+    import pyarrow as pa
+
+    number, text = pa.float64(), pa.string()
+    return {
+        "detections": pa.schema([
+            ("t_ns", pa.int64()), ("camera", text), ("detector", text), ("label", text),
+            ("score", number), ("x0", number), ("y0", number), ("x1", number), ("y1", number),
+            ("mask", pa.binary()), ("height_px", number), ("range_m", number),
+            ("picture_width_px", pa.int32()), ("picture_height_px", pa.int32()),
+        ]),
+        "road": pa.schema([
+            ("t_ns", pa.int64()), ("camera", text), ("share_left", number),
+            ("share_straight", number), ("share_right", number),
+        ]),
+        "cues": pa.schema([
+            ("t_ns", pa.int64()), ("approach", pa.int64()), ("cue", text), ("count", pa.int64()),
+        ]),
+    }  # fmt: skip

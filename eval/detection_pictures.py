@@ -1,0 +1,90 @@
+"""Pictures with what was found drawn into them, for a person to look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections, RoadMask, View
+from crosscue.detectors.frame_cues import FrameCues
+from crosscue.detectors.pictures import decode
+from crosscue.detectors.runner import FrameResult
+from crosscue.replay.columns import Bytes
+from crosscue.replay.run_folder import write_whole
+
+GREEN: Final = (80, 220, 60)
+BLUE: Final = (255, 140, 0)
+
+
+@dataclass(slots=True)
+class Drawer:
+    """Writes the first ``most`` frames it is given, every ``every``-th.
+
+    Attributes:
+        folder: Made when first needed.
+        most: How many pictures at most.
+        every: Frames from one picture to the next.
+    """
+
+    folder: Path
+    most: int
+    every: int = 10
+    _seen: int = field(default=0)
+
+    def __call__(self, result: FrameResult, cues: FrameCues) -> None:
+        """Look at one frame."""
+        number, self._seen = self._seen, self._seen + 1
+        if number % self.every or number // self.every >= self.most:
+            return
+        import cv2
+
+        pixels, _ = decode(result.picture, View())
+        drawn = draw(pixels, result, cues)
+        ok, encoded = cv2.imencode(".jpg", drawn)
+        if ok:
+            path = self.folder / f"{result.t_ns}.jpg"
+            write_whole(path, lambda partial: partial.write_bytes(encoded.tobytes()))
+
+
+def draw(pixels: Bytes, result: FrameResult, cues: FrameCues) -> Bytes:
+    """A copy with road tinted, boxes and labels, and the positive cues at the bottom."""
+    import cv2
+
+    canvas = pixels.copy()
+    for found in result.found:
+        if isinstance(found, RoadMask):
+            _tint(canvas, found)
+    for found in result.found:
+        if isinstance(found, Detections):
+            _boxes(canvas, found)
+    positive = [f"{cue.value} {count}" for cue, count in cues.counts.items() if count]
+    text = "  ".join(positive) or "no cue"
+    place = (10, canvas.shape[0] - 14)
+    cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 4)
+    cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1)
+    return canvas
+
+
+def _tint(canvas: Bytes, road: RoadMask) -> None:
+    import cv2
+
+    mask = rle.decode(road.mask, road.mask_size_px).astype(np.uint8)
+    size = (canvas.shape[1], canvas.shape[0])
+    is_road = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
+    canvas[is_road] = canvas[is_road] // 2 + np.array(BLUE, np.uint8) // 2
+
+
+def _boxes(canvas: Bytes, found: Detections) -> None:
+    import cv2
+
+    for box, score, label in zip(found.boxes_px, found.scores, found.labels, strict=True):
+        x0, y0, x1, y1 = (round(float(side)) for side in box)
+        cv2.rectangle(canvas, (x0, y0), (x1, y1), GREEN, 2)
+        place = (x0, max(y0 - 4, 12))
+        text = f"{label} {score:.2f}"
+        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 3)
+        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, GREEN, 1)

@@ -1,0 +1,97 @@
+"""A small camera log, a model card and a detector to run over it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from crosscue.detectors.base import Detections, Found, Frame, View
+from crosscue.detectors.settings import Settings, identity_of, settings_of
+
+from .data import shared
+
+COCO = (
+    (
+        "person bicycle car motorbike aeroplane bus train truck boat traffic_light fire_hydrant "
+        "stop_sign parking_meter bench bird cat dog horse sheep cow elephant bear zebra giraffe "
+        "backpack umbrella handbag tie suitcase frisbee skis snowboard sports_ball kite baseball_bat "
+        "baseball_glove skateboard surfboard tennis_racket bottle wine_glass cup fork knife spoon bowl "
+        "banana apple sandwich orange broccoli carrot hot_dog pizza donut cake chair sofa pottedplant "
+        "bed diningtable toilet tvmonitor laptop mouse remote keyboard cell_phone microwave oven "
+        "toaster sink refrigerator book clock vase scissors teddy_bear hair_drier toothbrush"
+    )
+    .replace("_", "\0")
+    .split()
+)
+
+
+class BrightSettings(Settings):
+    """Settings of the detector below."""
+
+    threshold: int = 200
+
+
+@dataclass(frozen=True, slots=True)
+class BrightBlob:
+    """One box around all bright pixels: simple enough to check by eye."""
+
+    settings: BrightSettings
+
+    @property
+    def view(self) -> View:
+        """Full size, grey."""
+        return View(is_grey=True)
+
+    @property
+    def identity(self) -> str:
+        """Of the settings."""
+        return identity_of("bright", self.settings.model_dump())
+
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        """Detect."""
+        return [self._one(frame) for frame in frames]
+
+    def _one(self, frame: Frame) -> Detections:
+        rows, columns = np.nonzero(frame.pixels > self.settings.threshold)
+        if not len(rows):
+            return Detections(frame.t_ns, frame.size_px, np.empty((0, 4)), np.empty(0), (), ())
+        box = [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]]
+        boxes = np.array(box, np.float64)
+        return Detections(frame.t_ns, frame.size_px, boxes, np.ones(1), ("bright",), (b"",))
+
+
+def build(**given: object) -> BrightBlob:
+    """A factory as users write them."""
+    return BrightBlob(settings_of(BrightSettings, given, "detector bright"))
+
+
+def too_few(**given: object) -> BrightBlob:
+    """A factory of a detector that forgets frames."""
+
+    class Forgetful(BrightBlob):
+        def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+            return []
+
+    return Forgetful(BrightSettings())
+
+
+def yolox_card(folder: Path, **changes: str) -> Path:
+    """A card for the real YOLOX-nano, with values changed."""
+    weights = shared("weights", "yolox_nano", "yolox_nano.onnx")
+    values = {
+        "weights": f'"{weights}"',
+        "sha256": '"c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d"',
+        "width_px": "416",
+        "classes": "[" + ", ".join(f'"{name.replace(chr(0), " ")}"' for name in COCO) + "]",
+    } | changes
+    text = (
+        f"version = 1\nweights = {values['weights']}\nsha256 = {values['sha256']}\n"
+        f'[input]\nwidth_px = {values["width_px"]}\nheight_px = 416\nfit = "letterbox"\n'
+        f'[output]\nkind = "yolox"\nclasses = {values["classes"]}\n'
+    )
+    path = folder / "yolox.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
