@@ -16,7 +16,7 @@ _MOST_BRANCHES: Final = 1_000_000
 
 _MESSAGE_HEADS: Final = {
     "dbc": r"^[ \t]*BO_\s+(\d+)",
-    "sym": r"^\["?([^\]"\n]+)"?\]",
+    "sym": r'^\["?([^\]"\n]+)"?\]',
     "kcd": r"<Message\b[^>]*?\bname=\"([^\"]*)\"",
     "arxml": r"<SHORT-NAME>([^<]*)</SHORT-NAME>",
 }
