@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from crosscue.datasets.scenes.camera import Camera, view_at
 from crosscue.datasets.scenes.cars import SHAPES, Look, car
 from crosscue.datasets.scenes.conditions import conditions_of
+from crosscue.datasets.scenes.ground import TEXELS_PER_M, X_M, Y_M
 from crosscue.datasets.scenes.kernels import compiled
 from crosscue.datasets.scenes.layout import TABLE_6, any_layout, layout_named
 from crosscue.datasets.scenes.render import Picture, Seen
@@ -208,3 +209,26 @@ def test_layouts_from_seeds_are_none_of_the_scored_ones() -> None:
 def test_unknown_layouts_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match="there are: A to H"):
         layout_named(name)
+
+
+@pytest.mark.parametrize("layout", ["D", "F", "L12"])
+def test_cars_that_drive_stay_on_the_road(layout: str) -> None:
+    scene = world(layout)
+    moving = [one for one in scene.things if one.velocity != (0.0, 0.0)]
+    for thing in moving:
+        for t_s in np.arange(0.0, 15.0, 0.5):
+            x, y = thing.at[0] + thing.shift(t_s)[0], thing.at[1] + thing.shift(t_s)[1]
+            if thing.is_there(t_s) and abs(x) < 105.0 and abs(y) < 60.0:
+                place = int((y - Y_M[0]) * TEXELS_PER_M), int((x - X_M[0]) * TEXELS_PER_M)
+                assert scene.ground.road[place], f"{thing.role} at {x:.1f}, {y:.1f}"
+
+
+def test_our_car_stays_on_the_road_and_turns_only_where_it_may() -> None:
+    for layout in ("D", "F"):
+        scene = world(layout)
+        motion, plan = scene.approach.motion, scene.layout
+        goes = {"left": plan.goes_left, "right": plan.goes_right, "ahead": plan.goes_ahead}
+        rows = ((motion.y_m - Y_M[0]) * TEXELS_PER_M).astype(int)
+        columns = ((motion.x_m - X_M[0]) * TEXELS_PER_M).astype(int)
+        assert goes[scene.approach.turn]
+        assert scene.ground.road[rows, columns].all()

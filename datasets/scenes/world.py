@@ -458,7 +458,8 @@ def _traffic(site: _Site, conditions: Conditions, drive: Approach, varied: Gener
     rate = layout.cross_traffic * conditions.traffic / 60.0
     flows = []
     # Driving on the right, those who go right use the near half.
-    if layout.has_left or layout.has_right:
+    # Where there is but one arm, nobody drives across; those who turn are not simulated.
+    if layout.has_left and layout.has_right:
         if layout.one_way != "left":
             flows.append((-np.pi / 2, near + 0.27 * (far - near)))
         if layout.one_way != "right":
