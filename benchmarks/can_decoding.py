@@ -6,6 +6,8 @@ Every case decodes all frames of a bus that its DBC file knows. cantools gets th
 their message already looked up, and does ``message.decode(decode_choices=False)`` on each; ours
 also looks up, checks and accounts for every frame of the bus, and sorts the rows by message. The
 cases run in rotation; ratios are taken round by round. Before that, every value is compared.
+Times are CPU seconds of this one thread, since other work on the machine would drown milliseconds;
+a case of a few milliseconds is run ten times in a row and divided.
 The recordings are looked for in $CROSSCUE_DATA or ../shared/data.
 """
 
@@ -135,10 +137,11 @@ def count_equal(database: CanDatabase, theirs: Cantools, blocks: list[Block]) ->
     return compared
 
 
-def seconds(run: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start
+def seconds(run: Callable[[], object], times: int) -> float:
+    start = time.thread_time()
+    for _ in range(times):
+        run()
+    return (time.thread_time() - start) / times
 
 
 def measure(bus: Bus, rounds: int) -> list[list[float]]:
@@ -147,8 +150,8 @@ def measure(bus: Bus, rounds: int) -> list[list[float]]:
     numpy_, numba_ = ours(bus, database, "numpy"), ours(bus, database, "numba")
     for engine in (numpy_, numba_):  # also compiles, and warms caches
         compared = count_equal(database, theirs, engine())
-    cases: list[Callable[[], object]] = [theirs, numpy_, numba_]
-    times = [[seconds(case) for case in cases] for _ in range(rounds)]
+    cases: list[tuple[Callable[[], object], int]] = [(theirs, 1), (numpy_, 10), (numba_, 10)]
+    times = [[seconds(case, n) for case, n in cases] for _ in range(rounds)]
     columns = sum(len(b.rows.columns) for b in numpy_() if isinstance(b.rows, Table))
     print(
         f"{bus.name}: {len(bus.block):,} frames, {len(theirs.work):,} decodable, {columns} columns;"

@@ -232,17 +232,18 @@ class NumbaEngine:
         is_good = np.empty(n, dtype=np.bool_)
         counts, seen = np.zeros((2, len(self._rules) + 1), dtype=np.intp)
         unknown = np.zeros(STANDARD_IDS + 1, dtype=np.intp)
+        good_rows = np.empty(n, dtype=np.intp)
         self._kernels.look_up(
             *(frames.arbitration_id, frames.is_extended, frames.kind, frames.length, frames.is_fd),
             *(tables.standard, tables.extended_ids, tables.extended_numbers),
             tables.fits[frames.data.shape[1]],
-            *(number, is_good, counts, seen, unknown),
+            *(number, is_good, counts, seen, unknown, good_rows),
         )
         stops = np.cumsum(counts)
         words, n = words_of(frames), int(stops[-1])
         order = np.empty(n, dtype=np.intp)
         little = np.empty((words.shape[1], n), dtype=np.uint64)
-        self._kernels.put_in_order(number, is_good, stops - counts, words, order, little)
+        self._kernels.put_in_order(number, good_rows[:n], stops - counts, words, order, little)
         sizes = counts * np.diff(self._plan.first)
         self._base = np.cumsum(sizes) - sizes
         self._values = np.empty(int(sizes.sum()), dtype=np.float64)

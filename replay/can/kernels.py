@@ -61,9 +61,11 @@ def look_up(  # noqa: D103
     counts: NDArray[np.intp],
     seen: NDArray[np.intp],
     unknown: NDArray[np.intp],
+    good_rows: NDArray[np.intp],
 ) -> None:
     # Counting without branches: one that goes either way costs more than both its sides.
     beyond = len(standard) - 1
+    kept = 0
     for i in range(len(arbitration_id)):
         identifier = arbitration_id[i]
         if is_extended[i]:
@@ -78,6 +80,8 @@ def look_up(  # noqa: D103
         good = is_data & fits[int(is_fd[i]), found, length[i]]
         number[i] = found
         is_good[i] = good
+        good_rows[kept] = i
+        kept += int(good)
         counts[found] += int(good)
         seen[found] += int(is_data)
         unknown[place] += int(is_data & (found == 0))
@@ -85,7 +89,7 @@ def look_up(  # noqa: D103
 
 def put_in_order(  # noqa: D103
     number: NDArray[np.uint16],
-    is_good: NDArray[np.bool_],
+    good_rows: NDArray[np.intp],
     starts: NDArray[np.intp],
     words: NDArray[np.uint64],
     order: NDArray[np.intp],
@@ -93,9 +97,7 @@ def put_in_order(  # noqa: D103
 ) -> None:
     following = starts.copy()
     width = words.shape[1]
-    for i in range(len(number)):
-        if not is_good[i]:
-            continue
+    for i in good_rows:
         group = number[i]
         row = following[group]
         following[group] = row + 1
