@@ -29,6 +29,42 @@ YAW = CanMessage(
 )
 WHEEL = CanMessage("Wheel", 0x456, True, 4, (CanSignal("speed", 0, 16, scale=0.1, unit="km/h"),))
 
+ARXML = """<?xml version="1.0" encoding="UTF-8"?>
+<AUTOSAR xmlns="http://autosar.org/schema/r4.0"
+    xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance"
+    xsi:schemaLocation="http://autosar.org/schema/r4.0 AUTOSAR_4-2-1.xsd">
+<AR-PACKAGES><AR-PACKAGE><SHORT-NAME>P</SHORT-NAME><ELEMENTS>
+<CAN-CLUSTER><SHORT-NAME>Bus</SHORT-NAME><CAN-CLUSTER-VARIANTS><CAN-CLUSTER-CONDITIONAL>
+<PHYSICAL-CHANNELS><CAN-PHYSICAL-CHANNEL><SHORT-NAME>Channel</SHORT-NAME><FRAME-TRIGGERINGS>
+<CAN-FRAME-TRIGGERING><SHORT-NAME>Trigger</SHORT-NAME>
+<FRAME-REF DEST="CAN-FRAME">/P/Wheel</FRAME-REF>
+<CAN-ADDRESSING-MODE>EXTENDED</CAN-ADDRESSING-MODE>
+<CAN-FRAME-TX-BEHAVIOR>CAN-20</CAN-FRAME-TX-BEHAVIOR><IDENTIFIER>1110</IDENTIFIER>
+</CAN-FRAME-TRIGGERING>
+</FRAME-TRIGGERINGS></CAN-PHYSICAL-CHANNEL></PHYSICAL-CHANNELS>
+</CAN-CLUSTER-CONDITIONAL></CAN-CLUSTER-VARIANTS></CAN-CLUSTER>
+<CAN-FRAME>
+<SHORT-NAME>Wheel</SHORT-NAME><FRAME-LENGTH>4</FRAME-LENGTH><PDU-TO-FRAME-MAPPINGS>
+<PDU-TO-FRAME-MAPPING><SHORT-NAME>Mapping</SHORT-NAME>
+<PACKING-BYTE-ORDER>MOST-SIGNIFICANT-BYTE-LAST</PACKING-BYTE-ORDER>
+<PDU-REF DEST="I-SIGNAL-I-PDU">/P/Pdu</PDU-REF><START-POSITION>0</START-POSITION>
+</PDU-TO-FRAME-MAPPING></PDU-TO-FRAME-MAPPINGS></CAN-FRAME>
+<I-SIGNAL-I-PDU>
+<SHORT-NAME>Pdu</SHORT-NAME><LENGTH>4</LENGTH><I-SIGNAL-TO-PDU-MAPPINGS>
+<I-SIGNAL-TO-I-PDU-MAPPING><SHORT-NAME>Signal</SHORT-NAME>
+<I-SIGNAL-REF DEST="I-SIGNAL">/P/speed</I-SIGNAL-REF>
+<PACKING-BYTE-ORDER>MOST-SIGNIFICANT-BYTE-LAST</PACKING-BYTE-ORDER>
+<START-POSITION>0</START-POSITION>
+</I-SIGNAL-TO-I-PDU-MAPPING></I-SIGNAL-TO-PDU-MAPPINGS></I-SIGNAL-I-PDU>
+<I-SIGNAL>
+<SHORT-NAME>speed</SHORT-NAME>
+<LENGTH>16</LENGTH>
+<SYSTEM-SIGNAL-REF DEST="SYSTEM-SIGNAL">/P/speed_of_wheel</SYSTEM-SIGNAL-REF></I-SIGNAL>
+<SYSTEM-SIGNAL><SHORT-NAME>speed_of_wheel</SHORT-NAME></SYSTEM-SIGNAL>
+</ELEMENTS></AR-PACKAGE></AR-PACKAGES></AUTOSAR>
+"""
+"""One frame with one signal, in as few elements as AUTOSAR needs for it."""
+
 
 def write(folder: Path, text: str | bytes, name: str = "bus.dbc") -> Path:
     path = folder / name
@@ -260,6 +296,19 @@ def test_other_formats_give_the_same_messages(form: str, tmp_path: Path) -> None
     for message in ours.messages:
         assert message.source.startswith(f"bus.{form}:")
         assert message.same_layout(expected[message.key])
+
+
+def test_an_arxml_file_gives_its_frames(tmp_path: Path) -> None:
+    database = CanDatabase.load([write(tmp_path, ARXML, "bus.arxml")])
+
+    wheel = database.named("Wheel")
+    assert replace(wheel, source="", topic="") == replace(
+        WHEEL, signals=(CanSignal("speed", 0, 16),), is_fd=False
+    )
+    assert wheel.source == "bus.arxml:16"
+    huge = ARXML.replace("<LENGTH>16<", "<LENGTH>99999999999<")
+    with pytest.raises(LogTooLargeError, match=r"bus\.arxml:30: length or position"):
+        CanDatabase.load([write(tmp_path, huge, "bus.arxml")])
 
 
 def test_real_databases_load_with_what_is_wrong_in_them_said() -> None:

@@ -139,6 +139,9 @@ def refuse_bombs(source: DatabaseText, form: str) -> None:
         _refuse_ranges(source)
     elif form == "kcd":
         _refuse_over(source, r"\b(?:offset|length)\s*=\s*[\"'](\d{5,})[\"']", "offset or length")
+    elif form == "arxml":
+        sizes = r"<(?:FRAME-LENGTH|LENGTH|START-POSITION)>\s*(\d{5,})"
+        _refuse_over(source, sizes, "length or position")
     elif form == "sym":
         _refuse_over(source, r"\b(?:Var|Sig|Mux|Len|DLC)\b[^\n]*?\b(\d{5,})\b", "bit number")
 
