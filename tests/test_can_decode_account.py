@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from crosscue.replay.can import decode as decoding
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
-from crosscue.replay.can.engines import NumbaEngine, Rules
+from crosscue.replay.can.grouping import Engine, Rules
 from crosscue.replay.can.layout import CanMessage, CanSignal
 from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Table
 from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
@@ -206,6 +207,22 @@ def test_all_times_of_a_frame_go_with_it() -> None:
     assert speed.header_ns.tolist() == [25, 27]
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_frames_may_lie_in_memory_as_they_like(engine: EngineName) -> None:
+    decode, _ = decoder(engine)
+    payload = np.arange(8, dtype=np.uint8).reshape(4, 2)
+    frames = frames_of(payload, np.array([0x100, 0x101, 0x100, 0x101], np.uint32)).take(
+        slice(None, None, 2)
+    )
+    for column in (frames.arbitration_id, frames.length, frames.data):
+        column.flags.writeable = False
+
+    (block,) = decode(block_of(frames))
+
+    assert isinstance(block.rows, Table)
+    np.testing.assert_allclose(block.rows["kph"].astype(float), [2.56, 12.84])
+
+
 def test_a_log_of_nothing_but_new_ids_does_not_fill_memory(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -272,12 +289,13 @@ def test_decoded_and_counted_frames_are_all_frames_whatever_the_engine(
 def test_auto_goes_over_to_compiled_loops_in_mid_log(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(decoding, "AUTO_FRAMES", 5)
     built = []
+    build = decoding.compiled_engine
 
-    def counted(rules: list[Rules]) -> NumbaEngine:
+    def counted(rules: Sequence[Rules]) -> Engine:
         built.append(len(rules))
-        return NumbaEngine(rules)
+        return build(rules)
 
-    monkeypatch.setattr(decoding, "NumbaEngine", counted)
+    monkeypatch.setattr(decoding, "compiled_engine", counted)
     decode, _ = decoder("auto")
     block = block_of(frames_of(np.full((4, 2), 3, np.uint8), 0x100))
 

@@ -7,8 +7,9 @@ counted by identifier and reason, in the ledger and in ``BusDecoder.counts``.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
@@ -27,9 +28,10 @@ from crosscue.replay.columns import (
 from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
 
 from .database import CanDatabase, spell_id
-from .engines import STANDARD_IDS, Engine, Grouped, NumbaEngine, NumpyEngine, Rules, has_numba
 from .extract import PRESENT_SUFFIX, Extractor
+from .grouping import STANDARD_IDS, Engine, Grouped, Rules
 from .layout import Arithmetic, CanMessage
+from .numpy_engine import NumpyEngine
 
 UNKNOWN_ID: Final = "id not in the database"
 REMOTE_FRAME: Final = "remote frame"
@@ -125,8 +127,8 @@ class BusDecoder:
         # The engines want the messages that are decoded first.
         self._entries = tuple(sorted(entries, key=lambda entry: bool(entry.refusal)))
         self._rules = [_rules(entry, settings) for entry in self._entries]
-        use_numba = settings.engine == "numba"
-        self._engine: Engine = (NumbaEngine if use_numba else NumpyEngine)(self._rules)
+        is_compiled = settings.engine == "numba"
+        self._engine = compiled_engine(self._rules) if is_compiled else NumpyEngine(self._rules)
 
     def columns_of(self, message: str) -> dict[str, np.dtype[np.generic]]:
         """Names and types of the columns that rows of ``message`` have.
@@ -177,9 +179,9 @@ class BusDecoder:
     def _choose_engine(self, frames: int) -> None:
         self._frames_seen += frames
         if self._engine_name == "auto" and self._frames_seen > AUTO_FRAMES:
-            self._engine_name = "numba" if has_numba() else "numpy"
-            if has_numba():
-                self._engine = NumbaEngine(self._rules)
+            self._engine_name = "numba" if find_spec("numba") else "numpy"
+            if self._engine_name == "numba":
+                self._engine = compiled_engine(self._rules)
 
     def _account(self, frames: CanFrames, grouped: Grouped, log_ns: Int64s) -> None:
         """Count the frames that cannot be decoded, each under the first reason that holds."""
@@ -247,6 +249,13 @@ class BusDecoder:
             key = (*OTHERS, key[2])
         self.counts[key] = self.counts.get(key, 0) + count
         self._ledger.skip(self._bus, key[2], count, detail, int(log_ns[np.argmax(rows)]))
+
+
+def compiled_engine(rules: Sequence[Rules]) -> Engine:
+    """The engine of compiled loops; importing Numba takes its time, hence only when wanted."""
+    from .numba_engine import NumbaEngine
+
+    return NumbaEngine(rules)
 
 
 class _Times:

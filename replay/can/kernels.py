@@ -1,17 +1,22 @@
-"""The loops that Numba compiles. Imported only when they are wanted."""
+"""The loops that Numba compiles; it keeps the result for later processes where it may write.
+
+Importing this module imports Numba.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
-from typing import Final, NamedTuple
+from typing import Final, TypeVar, cast
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import DATA
 
-SHORT: Final = 9
+Loop = TypeVar("Loop", bound=Callable[..., None])
+
+# What becomes of raw bits.
 UNSIGNED: Final = 0
 SIGNED: Final = 1
 WHOLE_UNSIGNED: Final = 2
@@ -21,32 +26,22 @@ SINGLE_SCALED: Final = 5
 DOUBLE: Final = 6
 DOUBLE_SCALED: Final = 7
 UNSIGNED_LONG: Final = 8
+SHORT: Final = 9
 
 EVEN_BYTES: Final = np.uint64(0x00FF_00FF_00FF_00FF)
 EVEN_PAIRS: Final = np.uint64(0x0000_FFFF_0000_FFFF)
 
 
-class Kernels(NamedTuple):
-    """The compiled loops."""
-
-    look_up: Callable[..., None]
-    put_in_order: Callable[..., None]
-    take_out: Callable[..., None]
-
-
-@cache
-def compiled() -> Kernels:
-    """Compile, or load what an earlier process compiled."""
-    from numba import njit
-
-    loops = (look_up, put_in_order, take_out)
+def compiled(loop: Loop) -> Loop:
+    """Compile a loop at its first call, or load what an earlier process compiled."""
     try:
-        return Kernels(*(njit(cache=True, nogil=True)(loop) for loop in loops))
+        return cast("Loop", njit(cache=True, nogil=True)(loop))
     except RuntimeError:  # no folder to keep compiled code in
-        return Kernels(*(njit(nogil=True)(loop) for loop in loops))
+        return cast("Loop", njit(nogil=True)(loop))
 
 
-def look_up(  # noqa: D103
+@compiled
+def look_up(
     arbitration_id: NDArray[np.uint32],
     is_extended: NDArray[np.bool_],
     kind: NDArray[np.uint8],
@@ -63,6 +58,7 @@ def look_up(  # noqa: D103
     unknown: NDArray[np.intp],
     good_rows: NDArray[np.intp],
 ) -> None:
+    """Find and check each frame's message; the last six arrays take the results."""
     # Counting without branches: one that goes either way costs more than both its sides.
     beyond = len(standard) - 1
     kept = 0
@@ -87,7 +83,8 @@ def look_up(  # noqa: D103
         unknown[place] += int(is_data & (found == 0))
 
 
-def put_in_order(  # noqa: D103
+@compiled
+def put_in_order(
     number: NDArray[np.uint16],
     good_rows: NDArray[np.intp],
     starts: NDArray[np.intp],
@@ -95,6 +92,7 @@ def put_in_order(  # noqa: D103
     order: NDArray[np.intp],
     little: NDArray[np.uint64],
 ) -> None:
+    """Put the good frames and their words in order of their messages."""
     following = starts.copy()
     width = words.shape[1]
     for i in good_rows:
@@ -106,7 +104,99 @@ def put_in_order(  # noqa: D103
             little[k, row] = words[i, k]
 
 
-def take_out(  # noqa: D103
+@compiled
+def turn_round(words: NDArray[np.uint64], turned: NDArray[np.uint64]) -> None:
+    """Words of the other byte order."""
+    for r in range(len(words)):
+        x = words[r]
+        x = ((x & EVEN_BYTES) << np.uint64(8)) | ((x >> np.uint64(8)) & EVEN_BYTES)
+        x = ((x & EVEN_PAIRS) << np.uint64(16)) | ((x >> np.uint64(16)) & EVEN_PAIRS)
+        turned[r] = (x << np.uint64(32)) | (x >> np.uint64(32))
+
+
+@compiled
+def push_up(
+    words: NDArray[np.uint64],
+    following: NDArray[np.uint64],
+    is_big: bool,
+    bit: np.uint64,
+    length: np.uint64,
+    raw: NDArray[np.uint64],
+) -> None:
+    """Move a signal's bits to the top of ``raw``; what is below them is dropped later."""
+    full = np.uint64(64)
+    drop = full - length
+    if bit + length <= full:
+        up = bit if is_big else drop - bit
+        for r in range(len(words)):
+            raw[r] = words[r] << up
+    elif is_big:
+        for r in range(len(words)):
+            raw[r] = (words[r] << bit) | (following[r] >> (full - bit))
+    else:
+        for r in range(len(words)):
+            raw[r] = ((words[r] >> bit) | (following[r] << (full - bit))) << drop
+
+
+@compiled
+def to_floats(
+    kind: np.uint8,
+    raw: NDArray[np.uint64],
+    drop: np.uint64,
+    turn: np.uint64,
+    less: np.float64,
+    scale: np.float64,
+    offset: np.float64,
+    out: NDArray[np.float64],
+) -> None:
+    """Physical values of raw bits; in ``raw`` they are overwritten."""
+    n = len(out)
+    doubles = raw.view(np.float64)
+    if kind == SHORT:
+        for r in range(n):
+            raw[r] = (raw[r] >> drop) ^ turn
+        for r in range(n):
+            out[r] = (doubles[r] - less) * scale + offset
+    elif kind == UNSIGNED:
+        for r in range(n):
+            out[r] = np.float64(np.int64(raw[r] >> drop)) * scale + offset
+    elif kind == UNSIGNED_LONG:
+        for r in range(n):
+            out[r] = np.float64(raw[r]) * scale + offset
+    elif kind == SIGNED:
+        for r in range(n):
+            out[r] = np.float64(np.int64(raw[r]) >> np.int64(drop)) * scale + offset
+    elif kind in (SINGLE, SINGLE_SCALED):
+        # The bits lie in the upper half of each little-endian word.
+        singles = raw.view(np.float32)[1::2]
+        for r in range(n):
+            single = np.float64(singles[r])
+            out[r] = single if kind == SINGLE else single * scale + offset
+    else:
+        for r in range(n):
+            out[r] = doubles[r] if kind == DOUBLE else doubles[r] * scale + offset
+
+
+@compiled
+def to_whole(
+    kind: np.uint8,
+    raw: NDArray[np.uint64],
+    drop: np.uint64,
+    scale: np.uint64,
+    offset: np.uint64,
+    out: NDArray[np.uint64],
+) -> None:
+    """Whole numbers of raw bits, modulo 2**64."""
+    if kind == WHOLE_SIGNED:
+        for r in range(len(out)):
+            out[r] = np.uint64(np.int64(raw[r]) >> np.int64(drop)) * scale + offset
+    else:
+        for r in range(len(out)):
+            out[r] = (raw[r] >> drop) * scale + offset
+
+
+@compiled
+def take_out(
     little: NDArray[np.uint64],
     stops: NDArray[np.intp],
     counts: NDArray[np.intp],
@@ -126,74 +216,31 @@ def take_out(  # noqa: D103
     values: NDArray[np.float64],
     bits: NDArray[np.uint64],
 ) -> None:
-    full = np.uint64(64)
+    """All signals of all messages; ``bits`` is the same memory as ``values``."""
+    width = little.shape[0]
     longest = counts[1:].max() if len(counts) > 1 else 0
-    raw = np.empty(longest, np.uint64)  # its bits at the top, then at the bottom
-    short = np.empty(longest, np.uint32)
-    big = np.empty((little.shape[0], longest), np.uint64)
+    raw = np.empty(longest, np.uint64)
+    big = np.empty((width, longest), np.uint64)
     for group in range(1, len(counts)):
         n = counts[group]
         if n == 0:
             continue
         row = stops[group] - n
         if is_big[first[group] : first[group + 1]].any():
-            for k in range(little.shape[0]):
-                for r in range(n):
-                    x = little[k, row + r]
-                    x = ((x & EVEN_BYTES) << np.uint64(8)) | ((x >> np.uint64(8)) & EVEN_BYTES)
-                    x = ((x & EVEN_PAIRS) << np.uint64(16)) | ((x >> np.uint64(16)) & EVEN_PAIRS)
-                    big[k, r] = (x << np.uint64(32)) | (x >> np.uint64(32))
+            for k in range(width):
+                turn_round(little[k, row : row + n], big[k, :n])
         for j in range(first[group], first[group + 1]):
             at = base[group] + (j - first[group]) * n
-            k, b, drop = word[j], bit[j], full - length[j]
-            a, c = scale[j], offset[j]
-            # Rows of one word, so that the loops below run over contiguous memory.
+            k, after = word[j], min(word[j] + 1, width - 1)
+            # Rows of one word, so that the loops run over contiguous memory.
             one = big[k, :n] if is_big[j] else little[k, row : row + n]
-            if b + length[j] <= full:
-                up = b if is_big[j] else drop - b
-                for r in range(n):
-                    raw[r] = one[r] << up
-            elif is_big[j]:
-                two = big[k + 1, :n]
-                for r in range(n):
-                    raw[r] = (one[r] << b) | (two[r] >> (full - b))
+            two = big[after, :n] if is_big[j] else little[after, row : row + n]
+            push_up(one, two, is_big[j], bit[j], length[j], raw[:n])
+            drop = np.uint64(64) - length[j]
+            if kind[j] in (WHOLE_UNSIGNED, WHOLE_SIGNED):
+                out = bits[at : at + n]
+                to_whole(kind[j], raw[:n], drop, whole_scale[j], whole_offset[j], out)
             else:
-                two = little[k + 1, row : row + n]
-                for r in range(n):
-                    raw[r] = ((one[r] >> b) | (two[r] << (full - b))) << drop
-            out, whole = values[at : at + n], bits[at : at + n]
-            which = kind[j]
-            if which == SHORT:
+                real = values[at : at + n]
                 turn, less = flip[j], bias[j]
-                for r in range(n):
-                    raw[r] = (raw[r] >> drop) ^ turn
-                doubles = raw.view(np.float64)
-                for r in range(n):
-                    out[r] = (doubles[r] - less) * a + c
-            elif which == UNSIGNED:
-                for r in range(n):
-                    out[r] = np.float64(np.int64(raw[r] >> drop)) * a + c
-            elif which == UNSIGNED_LONG:
-                for r in range(n):
-                    out[r] = np.float64(raw[r]) * a + c
-            elif which == SIGNED:
-                for r in range(n):
-                    out[r] = np.float64(np.int64(raw[r]) >> np.int64(drop)) * a + c
-            elif which == WHOLE_UNSIGNED:
-                for r in range(n):
-                    whole[r] = (raw[r] >> drop) * whole_scale[j] + whole_offset[j]
-            elif which == WHOLE_SIGNED:
-                for r in range(n):
-                    number = np.uint64(np.int64(raw[r]) >> np.int64(drop))
-                    whole[r] = number * whole_scale[j] + whole_offset[j]
-            elif which in (SINGLE, SINGLE_SCALED):
-                for r in range(n):
-                    short[r] = np.uint32(raw[r] >> drop)
-                singles = short.view(np.float32)
-                for r in range(n):
-                    single = np.float64(singles[r])
-                    out[r] = single if which == SINGLE else single * a + c
-            else:
-                doubles = raw.view(np.float64)
-                for r in range(n):
-                    out[r] = doubles[r] if which == DOUBLE else doubles[r] * a + c
+                to_floats(kind[j], raw[:n], drop, turn, less, scale[j], offset[j], real)

@@ -1,0 +1,124 @@
+"""How frames are told apart and checked, as tables that both engines share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import LENGTH_UNKNOWN, CanFrames
+
+from .extract import Column, Extractor, Words
+from .layout import CanMessage
+
+STANDARD_IDS: Final = 2048
+
+Columns: TypeAlias = dict[str, Column]
+Strange: TypeAlias = NDArray[np.bool_] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What the frames of one message must look like.
+
+    Attributes:
+        message: The message.
+        extractor: Takes its signals out, or None if it is not decoded.
+        longest: Most bytes of a classic and of an FD frame; -1 where none fits.
+    """
+
+    message: CanMessage
+    extractor: Extractor | None
+    longest: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Tables:
+    """The rules of all messages as arrays; message number 0 stands for none.
+
+    Attributes:
+        standard: Shape (2049,): message number of each 11-bit identifier; the last place is for
+            whatever is larger.
+        extended_ids: Sorted 29-bit identifiers.
+        extended_numbers: Their message numbers.
+        fits: From the width of the payload array to shape (2, M + 1, 256): whether a frame, classic
+            or FD, of this message and length can be decoded.
+    """
+
+    standard: NDArray[np.uint16]
+    extended_ids: NDArray[np.uint32]
+    extended_numbers: NDArray[np.uint16]
+    fits: dict[int, NDArray[np.bool_]]
+
+    @classmethod
+    def of(cls, rules: Sequence[Rules]) -> Tables:
+        """Build the tables; messages are numbered from 1."""
+        standard = np.zeros(STANDARD_IDS + 1, dtype=np.uint16)
+        fits = {width: np.zeros((2, len(rules) + 1, 256), dtype=np.bool_) for width in (8, 64)}
+        extended = []
+        for number, rule in enumerate(rules, start=1):
+            if rule.message.is_extended:
+                extended.append((rule.message.arbitration_id, number))
+            else:
+                standard[rule.message.arbitration_id] = number
+            for width, table in fits.items():
+                if rule.extractor is not None and rule.message.length <= width:
+                    table[:, number] = _fitting_lengths(rule)
+        extended.sort()
+        ids = np.array([i for i, _ in extended], dtype=np.uint32)
+        numbers = np.array([n for _, n in extended], dtype=np.uint16)
+        return cls(standard, ids, numbers, fits)
+
+
+def _fitting_lengths(rule: Rules) -> NDArray[np.bool_]:
+    length, longest = np.arange(256), np.array(rule.longest)[:, None]
+    fits = (length >= rule.message.length) & (length <= longest)
+    # Where the log keeps no lengths there is nothing to hold against the database.
+    fits[:, LENGTH_UNKNOWN] |= longest[:, 0] >= 0
+    return fits
+
+
+@dataclass(frozen=True, slots=True)
+class Grouped:
+    """The frames of a block, put in order of their messages.
+
+    Attributes:
+        number: Shape (N,): number of each frame's message, 0 for none.
+        is_good: Shape (N,): the frame can be decoded.
+        order: Shape (G,): the G good frames: those of message 1, then of message 2, ...
+        stops: Shape (M + 1,): where each message ends in ``order``; 0 for message 0.
+        seen: Shape (M + 1,): data frames of each message, good or not.
+        unknown: Shape (2048,): data frames of no message, by their 11-bit identifier.
+    """
+
+    number: NDArray[np.uint16]
+    is_good: NDArray[np.bool_]
+    order: NDArray[np.intp]
+    stops: NDArray[np.intp]
+    seen: NDArray[np.intp]
+    unknown: NDArray[np.intp]
+
+    def rows(self, number: int) -> slice:
+        """Where a message's frames are in ``order``."""
+        return slice(int(self.stops[number - 1]), int(self.stops[number]))
+
+
+class Engine(Protocol):
+    """Groups frames and gives the columns of each group."""
+
+    def group(self, frames: CanFrames) -> Grouped:
+        """Look up, check and sort frames."""
+        ...
+
+    def columns(self, number: int) -> tuple[Columns, Strange]:
+        """Columns of one message of the frames grouped last, as ``Extractor`` gives them."""
+        ...
+
+
+def words_of(frames: CanFrames) -> Words:
+    """Payloads as little-endian words, shape (N, W / 8)."""
+    words: Words = np.ascontiguousarray(frames.data).view("<u8").astype(np.uint64, copy=False)
+    return words
