@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.closing import Closing
 from crosscue.replay.columns import (
     DATA,
     LENGTH_UNKNOWN,
@@ -130,7 +130,7 @@ class _Source:
         self.reach_ns = np.maximum.accumulate(self.t_ns) if len(self.t_ns) else self.t_ns
 
 
-class Segment:
+class Segment(Closing):
     """One segment folder as a ``Log``."""
 
     format: Final = "comma2k19"
@@ -185,17 +185,6 @@ class Segment:
     def close(self) -> None:
         """Let the mapped files go."""
         self._sources = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _column(self, relative: str) -> Column | None:
         path = self.path / "processed_log" / relative

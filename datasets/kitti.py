@@ -17,12 +17,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.closing import Closing
 from crosscue.replay.columns import Block, Int64s, Table, Topic
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
@@ -90,7 +90,7 @@ class Oxts:
                 number += 1
 
 
-class Drive:
+class Drive(Closing):
     """One drive as a ``Log``."""
 
     format: Final = "kitti-raw"
@@ -150,17 +150,6 @@ class Drive:
 
     def close(self) -> None:
         """Nothing is held open."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def open_drive(path: Path, limits: Limits) -> Drive:

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from io import BufferedReader
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
+from crosscue.replay.closing import Closing
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.ledger import Ledger
@@ -82,7 +82,7 @@ def open_blf(path: Path, limits: Limits) -> Log:
     return BlfLog(path, limits)
 
 
-class BlfLog:
+class BlfLog(Closing):
     """An open BLF log (``Log``)."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
@@ -116,17 +116,6 @@ class BlfLog:
 
     def close(self) -> None:
         """Nothing stays open between passes."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """All frames, a stretch of containers at a time; see ``Log.read``."""

@@ -13,11 +13,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import ClassVar, Final, NamedTuple, Self, TypeAlias
+from typing import ClassVar, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
+from crosscue.replay.closing import Closing
 from crosscue.replay.columns import Block, Bytes, CanFrames, Int64s, Topic
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.ledger import Ledger
@@ -145,7 +145,7 @@ _NO_INTS: Final = np.zeros(0, np.int64)
 NO_ROWS: Final = FrameRows(_NO_INTS, _NO_INTS, _NO_INTS, NO_FRAMES)
 
 
-class TextCanLog:
+class TextCanLog(Closing):
     """An open CAN log in text form (``Log``)."""
 
     def __init__(self, path: Path, limits: Limits, dialect: Callable[[], Dialect]) -> None:
@@ -179,17 +179,6 @@ class TextCanLog:
 
     def close(self) -> None:
         """Nothing stays open between passes."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """All frames, chunk by chunk; see ``Log.read``."""

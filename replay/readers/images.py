@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
+from crosscue.replay.closing import Closing
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.ledger import Ledger
@@ -22,7 +22,7 @@ from .time_file import find_time_file, read_time_file
 from .timed_files import list_files, pair
 
 
-class ImageFolder:
+class ImageFolder(Closing):
     """A folder of pictures as a ``Log``."""
 
     format: Final = "images"
@@ -44,17 +44,6 @@ class ImageFolder:
 
     def close(self) -> None:
         """Nothing is held open."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def open_images(path: Path, limits: Limits) -> ImageFolder:

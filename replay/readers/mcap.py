@@ -15,9 +15,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from crosscue.replay.closing import Closing
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
@@ -29,7 +28,7 @@ from .mcap_segments import Segment, find_segments
 from .mcap_topics import TopicBook
 
 
-class McapLog:
+class McapLog(Closing):
     """An open MCAP file; see ``crosscue.replay.log.Log``."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
@@ -79,17 +78,6 @@ class McapLog:
     def close(self) -> None:
         """Release the file."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def declared_counts(segments: tuple[Segment, ...], book: TopicBook) -> dict[str, int]:

@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.closing import Closing
 from crosscue.replay.columns import (
     Block,
     Bytes,
@@ -72,7 +72,7 @@ def open_mf4(path: Path, limits: Limits) -> Log:
     return Mf4Log(path, limits)
 
 
-class Mf4Log:
+class Mf4Log(Closing):
     """An open MDF 4 log (``Log``)."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
@@ -119,17 +119,6 @@ class Mf4Log:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """All rows, group by group; see ``Log.read``."""

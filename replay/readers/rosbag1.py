@@ -10,9 +10,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from crosscue.replay.closing import Closing
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.ledger import Ledger
@@ -24,7 +23,7 @@ from .rosbag1_pass import Pass, Roster
 from .rosbag1_records import BAG_HEADER, MAGIC, BagFile, Record
 
 
-class BagLog:
+class BagLog(Closing):
     """An open ROS 1 bag; see ``crosscue.replay.log.Log``."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
@@ -79,17 +78,6 @@ class BagLog:
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _bag_header(self) -> tuple[int, Record | None]:
         """Where the records begin behind the bag header, and the header if it can be read."""

@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self, cast
+from typing import Final, cast
 
 import numpy as np
 
+from crosscue.replay.closing import Closing
 from crosscue.replay.columns import Block, Messages, Topic
 from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import DETAILS_KEPT, Ledger
@@ -32,7 +32,7 @@ BY_METADATA: Final = "metadata.yaml counts more"
 OTHER_TYPE: Final = "another message type on the same topic"
 
 
-class FolderLog:
+class FolderLog(Closing):
     """An open ROS 2 bag folder; see ``crosscue.replay.log.Log``."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
@@ -103,17 +103,6 @@ class FolderLog:
 
     def close(self) -> None:
         """Nothing stays open between reads."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _stream(
         self, split: Split, ledger: Ledger, selection: Selection, stack: ExitStack

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.closing import Closing
 from crosscue.replay.columns import Block, Int64s, Messages, Topic
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import DEFAULT, Limits
@@ -35,7 +35,7 @@ OTHER_TYPE: Final = "another message type on the same topic"
 INDEX_DIFFERS: Final = "row and time index disagree"
 
 
-class Db3Log:
+class Db3Log(Closing):
     """An open ROS 2 SQLite bag; see ``crosscue.replay.log.Log``."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
@@ -91,17 +91,6 @@ class Db3Log:
     def close(self) -> None:
         """Release the file and any temporary copy."""
         self._database.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 class _Pass:

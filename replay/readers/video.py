@@ -17,11 +17,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, BinaryIO, Final, Self, cast
+from typing import TYPE_CHECKING, BinaryIO, Final, cast
 
 import numpy as np
 
+from crosscue.replay.closing import Closing
 from crosscue.replay.columns import BLOCK_BYTES, Block, Images, Int64s, Messages, Topic
 from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
@@ -71,7 +71,7 @@ class _Index:
     missing: int
 
 
-class Video:
+class Video(Closing):
     """A video file as a ``Log``."""
 
     format: Final = "video"
@@ -129,17 +129,6 @@ class Video:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _container(self) -> InputContainer:
         import av
