@@ -124,7 +124,7 @@ def nose_of(heights_px: Floats) -> int:
     heights = heights_px[columns[0] : columns[-1] + 1]
     quarter = max(len(heights) // 4, 1)
     difference = float(heights[-quarter:].sum() - heights[:quarter].sum())
-    return int(np.sign(difference))
+    return -int(np.sign(difference))
 
 
 def pair_cars(before: CarShapes, now: CarShapes, settings: Cars) -> Pairs:

@@ -17,6 +17,7 @@ from crosscue.replay.errors import UsageError
 from crosscue.replay.vehicle import RangeCurve
 
 Family = Literal["pinhole", "pinhole-offset", "power"]
+FAMILIES: Final[tuple[Family, ...]] = ("pinhole", "pinhole-offset", "power")
 
 
 @dataclass(frozen=True, slots=True)

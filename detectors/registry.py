@@ -22,6 +22,7 @@ GROUP: Final = "crosscue.detectors"
 
 BUILTIN: Final[Mapping[str, str]] = {
     "model": "crosscue.detectors.model_detector:build",
+    "signs": "crosscue.detectors.sign_detector:build",
 }
 """From name to ``module:factory``."""
 

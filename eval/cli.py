@@ -29,6 +29,8 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "score": ("score", "a run against truth: metrics, figures, report"),
     "view": ("view", "a run in Rerun"),
     "fit compass": ("fit_compass", "compass mounting, hard and soft iron from a drive"),
+    "fit signs": ("fit_signs", "the sign threshold for a wanted precision"),
+    "fit ranges": ("fit_ranges", "from heights in pixels to ranges, with residuals"),
     "fit landmarks": ("fit_landmarks", "the match threshold for a wanted false-match rate"),
     "landmarks add": ("landmarks_add", "pictures and where they were taken into a database"),
     "landmarks list": ("landmarks_list", "what a landmark database holds"),

@@ -1,0 +1,191 @@
+"""Signs against our own drawings: found, told apart, nothing seen twice; thresholds by labels."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.model_detector import overlaps
+from crosscue.detectors.sign_detector import build
+from crosscue.detectors.sign_drawings import AMERICAN, Kind
+from crosscue.detectors.sign_threshold import (
+    Judged,
+    judge,
+    rates_at,
+    threshold_for,
+    wilson,
+)
+from crosscue.detectors.sign_votes import nearest, window_counts
+from crosscue.eval.cli import run
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import VehicleError
+from support.data import shared
+from support.sign_scenes import clutter, scene
+
+
+def _signs(grey: Bytes, **changes: object) -> Detections:
+    size = (grey.shape[1], grey.shape[0])
+    found = build(**changes)([Frame(7, "cam", grey, size)])[0]
+    assert isinstance(found, Detections)
+    return found
+
+
+@pytest.mark.parametrize("kind", AMERICAN)
+def test_each_american_sign_is_found_where_it_is_and_called_what_it_is(kind: Kind) -> None:
+    hits = 0
+    for seed in range(8):
+        grey, box = scene(kind, seed)
+        found = _signs(grey)
+        over = overlaps(box, found.boxes_px) if len(found) else np.empty(0)
+        hits += any(
+            label == kind and share > 0.4 for label, share in zip(found.labels, over, strict=True)
+        )
+
+    assert hits >= 7
+
+
+@pytest.mark.parametrize(
+    ("kind", "other"), [("one way left", "one way right"), ("one way right", "one way left")]
+)
+def test_a_left_arrow_is_never_a_right_one(kind: Kind, other: Kind) -> None:
+    for seed in range(8):
+        grey, box = scene(kind, seed)
+        found = _signs(grey)
+        for label, candidate in zip(found.labels, found.boxes_px, strict=True):
+            assert not (label == other and overlaps(box, candidate[None])[0] > 0.4)
+
+
+def test_clutter_without_signs_has_no_arrows() -> None:
+    labels = [label for seed in range(10) for label in _signs(clutter(9000 + seed)).labels]
+
+    assert not [label for label in labels if label.startswith("one way")]
+
+
+def test_nothing_is_found_in_the_cropped_part() -> None:
+    grey, box = scene("do not enter", 3, height_px=80)
+    bottom = 1.0 - (box[1] + 5) / grey.shape[0]
+
+    assert len(_signs(grey, crop_bottom=0.0))
+    found = _signs(grey, crop_bottom=float(bottom))
+    assert all(overlaps(box, b[None])[0] < 0.4 for b in found.boxes_px)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (20, 20), (40, 300)])
+def test_pictures_too_small_or_flat_give_nothing(shape: tuple[int, int]) -> None:
+    assert len(_signs(np.full(shape, 90, np.uint8))) == 0
+
+
+def test_a_setting_that_is_none_is_refused() -> None:
+    with pytest.raises(VehicleError, match="detector signs: ratoi: no such setting; did you mean"):
+        build(ratoi=0.8)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 10_000))
+def test_the_ratio_test_agrees_with_opencv(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.integers(0, 256, (7, 32), np.uint8)
+    drawn = rng.integers(0, 256, (9, 32), np.uint8)
+    drawn[2] = points[4] ^ np.uint8(1)
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(points, drawn, k=2)
+    want = [a.trainIdx if a.distance < 0.8 * b.distance else -1 for a, b in pairs]
+
+    got = nearest(points.view(np.uint64), drawn.view(np.uint64), np.array([0, 9]), 0.8, 256)
+
+    assert got[:, 0].tolist() == want
+    assert got[4, 0] == 2
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 10_000), reach=st.integers(0, 3))
+def test_a_window_counts_each_drawn_point_once(seed: int, reach: int) -> None:
+    rng = np.random.default_rng(seed)
+    cells, drawn = rng.integers(-2, 9, (40, 2)), np.sort(rng.integers(0, 6, 40))
+
+    counts = window_counts(cells, drawn, 7, 6, reach)
+
+    for row in range(7):
+        for column in range(6):
+            near = (np.abs(cells - [column, row]) <= reach).all(axis=1)
+            assert counts[row, column] == len(set(drawn[near].tolist()))
+
+
+def test_a_true_sign_counts_once_and_the_best_takes_it() -> None:
+    boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10], [50, 50, 60, 60]], np.float64)
+
+    judged = judge(boxes, np.array([0.5, 0.9, 0.7]), boxes[:1], 0.4)
+
+    assert judged.is_right.tolist() == [False, True, False]
+    assert judged.signs == 1
+
+
+def test_the_threshold_is_the_lowest_that_keeps_the_precision() -> None:
+    judged = Judged(np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, True, False, True]), 4)
+
+    assert threshold_for(judged, 0.95) == 0.8
+    assert threshold_for(judged, 0.6) == 0.6
+    assert rates_at(judged, 0.8).precision == 1.0
+    assert rates_at(judged, 0.8).recall == 0.5
+    assert threshold_for(Judged(np.array([0.9]), np.array([False]), 1), 0.95) is None
+
+
+def test_wilsons_interval_is_the_books() -> None:
+    # Brown, Cai, DasGupta (2001): 0 of 10 gives 0 to 0.2775.
+    assert wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
+    assert wilson(10, 10) == pytest.approx((0.7225, 1.0), abs=1e-4)
+    assert wilson(0, 0) == (0.0, 1.0)
+
+
+def test_fit_signs_chooses_on_some_frames_and_measures_on_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = ["picture,label,x0,y0,x1,y1"]
+    for seed in range(8):
+        grey, box = scene("one way left", seed)
+        ok, encoded = cv2.imencode(".png", grey)
+        assert ok
+        (tmp_path / f"{seed}.png").write_bytes(encoded.tobytes())
+        rows.append(f"{seed}.png,one way left," + ",".join(map(str, box.tolist())))
+    labels = tmp_path / "labels.csv"
+    labels.write_text("\n".join(rows) + "\n")
+
+    assert run(["fit", "signs", str(labels), "--label", "one way left"]) == 0
+
+    told = capsys.readouterr().out
+    assert "least_score = " in told
+    assert "precision 1.00 (4 of 4; 95 % interval 0.51 to 1.00)" in told
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("a.png,stop,1,2,x,4", "labels.csv:2: want four numbers"),
+        ("a.png,stop,9,2,3,4", "want x0 < x1"),
+        ("a.png,stop,1,2,3,4", "check the picture column"),
+        ("labels.csv,stop,1,2,3,4", "not a JPEG, PNG or WebP picture"),
+    ],
+)
+def test_labels_that_do_not_fit_are_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], row: str, said: str
+) -> None:
+    labels = tmp_path / "labels.csv"
+    labels.write_text(f"picture,label,x0,y0,x1,y1\n{row}\n")
+
+    assert run(["fit", "signs", str(labels), "--label", "stop"]) == 2
+
+    assert said in capsys.readouterr().err
+
+
+def test_a_real_no_entry_sign_is_found_in_a_photo() -> None:
+    path = shared("signs", "no_entry", "images", "NoEntry10.png")
+    grey = np.asarray(cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), 0), np.uint8)
+
+    found = _signs(grey, kinds=("no entry",), crop_bottom=0.0)
+
+    true_sign = np.array([504, 155, 593, 243], np.float64)
+    assert "do not enter" in found.labels
+    assert overlaps(true_sign, found.boxes_px).max() > 0.4
