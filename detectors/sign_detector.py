@@ -59,7 +59,7 @@ class SignSettings(Settings):
     """Different points that must agree."""
     least_share: Share = 0.25
     """And the share of the drawing's points that they must be."""
-    least_score: Share = 0.4
+    least_score: Share = 0.3
     overlap: Share = 0.2
     """Of two signs that overlap more, the better stays."""
 
