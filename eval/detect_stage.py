@@ -131,7 +131,10 @@ def detect_drive(
             named, results, topic.name, vehicle.camera.depth_bits,
             lambda t_ns, reason, why: ledger.skip(topic.name, reason, 1, why, t_ns),
         )  # fmt: skip
-        tables = _Tables(run, topic.name, vehicle, named, Drawer(run.path / "pictures", draw))
+        is_sign = [choice.kind == "signs" for choice in choices]
+        cues = CuePass(vehicle, has_boxes=not all(is_sign), has_signs=any(is_sign))
+        drawer = Drawer(run.path / "pictures", draw)
+        tables = _Tables(run, topic.name, vehicle, named, drawer, cues)
         with tables:
             extractor.on_pictures = lambda block: _through(runner, block, tables, on_time)
             for block in log.read(ledger, narrowed):
@@ -185,18 +188,13 @@ class _Tables:
     vehicle: Vehicle
     detectors: Sequence[Named]
     drawer: Drawer
+    cues: CuePass
     notices: list[str] = field(default_factory=list)
     objects: dict[str, int] = field(default_factory=dict)
     cue_frames: dict[str, int] = field(default_factory=dict)
     _sinks: dict[str, TableSink] = field(default_factory=dict)
     _held: dict[str, list[dict[str, object]]] = field(default_factory=dict)
     _size: tuple[int, int] | None = None
-    _cues: CuePass = field(init=False)
-
-    def __post_init__(self) -> None:
-        names = [named.name for named in self.detectors]
-        is_sign = [name == "signs" for name in names]
-        self._cues = CuePass(self.vehicle, not all(is_sign), any(is_sign))
 
     def __enter__(self) -> _Tables:
         for name, schema in schemas().items():
@@ -219,7 +217,7 @@ class _Tables:
                 f"{result.t_ns} ns"
             )
         self._size = result.size_px
-        cues = self._cues(result.found)
+        cues = self.cues(result.found)
         for named, found in zip(self.detectors, result.found, strict=True):
             if isinstance(found, Detections):
                 self._held["detections"] += self._detection_rows(named.name, found)

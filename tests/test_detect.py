@@ -14,6 +14,59 @@ from support.detecting import yolox_card
 from support.pictures import picture_folder
 
 BRIGHT = "support.detecting:build"
+CITY = (
+    "road,sidewalk,building,wall,fence,pole,traffic light,traffic sign,vegetation,terrain,sky,"
+    "person,rider,car,truck,bus,train,motorcycle,bicycle"
+)
+ROAD_CARDS = {
+    "twinlitenet": (
+        "twinlitenet",
+        "cv2",
+        """weights = "FOLDER/twinlitenet_best.onnx"
+sha256 = "f505b56bd7c9e4e38b2928373aa4daa191a9a398e07e1fb340024b9ce84d4285"
+[input]
+width_px = 640
+height_px = 360
+colour = "rgb"
+scale = [0.00392156862745098, 0.00392156862745098, 0.00392156862745098]
+[output]
+kind = "segmentation"
+name = "da"
+classes = ["other", "road"]
+""",
+    ),
+    "road-segmentation-adas-0001": (
+        "road-segmentation-adas-0001",
+        "openvino",
+        """weights = "FOLDER/road-segmentation-adas-0001.xml"
+sha256 = "51d457ec677cb921c1003f6447671fdfba5acec5df6ecc0a236b613062ea852f"
+sha256_bin = "2a1d09b6aab18e145f14d92f5f425af92ad5338a04b0670205759d8c5b075111"
+[input]
+width_px = 896
+height_px = 512
+[output]
+kind = "segmentation"
+classes = ["background", "road", "curb", "mark"]
+road = ["road", "mark"]
+""",
+    ),
+    "deeplab": (
+        "deeplab_cityscapes_slim",
+        "ai_edge_litert",
+        f"""weights = "FOLDER/deeplab_mobilenet_edgetpu_slim_cityscapes_quant.tflite"
+sha256 = "322fe29945cb1693f426952f2a330ab67ea5678545ddee6f2548e0cfd0ca03e5"
+[input]
+width_px = 513
+height_px = 513
+colour = "rgb"
+layout = "nhwc"
+dtype = "uint8"
+[output]
+kind = "segmentation"
+classes = {json.dumps(CITY.split(","))}
+""",
+    ),
+}
 
 
 def _folder(tmp_path: Path, count: int = 5) -> Path:
@@ -171,3 +224,35 @@ def test_yolox_finds_the_cars_and_lights_of_a_real_approach(tmp_path: Path) -> N
     assert labels.count("car") >= 8
     assert labels.count("traffic light") >= 4
     assert len(list((tmp_path / "run" / "pictures").glob("*.jpg"))) == 1
+
+
+@pytest.mark.parametrize("name", sorted(ROAD_CARDS))
+def test_each_real_segmentation_sees_the_road_ahead_and_none_in_the_sky(
+    name: str, tmp_path: Path
+) -> None:
+    folder, package, text = ROAD_CARDS[name]
+    pytest.importorskip(package, reason=f"{package} is an optional back end")
+    picture = shared("sequences", "us_signalized_intersection_dashcam", "frame_5050.jpg")
+    card = tmp_path / "road.toml"
+    card.write_text("version = 1\n" + text.replace("FOLDER", str(shared("weights", folder))))
+    vehicle = tmp_path / "v.toml"
+    vehicle.write_text(
+        "version = 1\n[regions]\nstraight = [[0.5, 0.7], [0.65, 0.7], [0.75, 0.85], [0.5, 0.85]]\n"
+        "left = [[0.0, 0.0], [0.3, 0.0], [0.3, 0.3], [0.0, 0.3]]\n"
+    )
+    log = tmp_path / "us"
+    log.mkdir()
+    (log / picture.name).symlink_to(picture)
+    (log / "timestamps.txt").write_text("rate_hz: 15\n")
+    args = ["--detectors", str(card), "--vehicle", str(vehicle), "--no-cache", "-q"]
+
+    assert run(["detect", str(log), "-o", str(tmp_path / "run"), *args]) == 0
+
+    shares = open_run(tmp_path / "run").table("road").to_pylist()[0]
+    assert shares["share_straight"] > 0.8
+    assert shares["share_left"] < 0.02
+    cues = {
+        row["cue"]: row["count"] for row in open_run(tmp_path / "run").table("cues").to_pylist()
+    }
+    assert cues["road_straight"] == 1
+    assert cues["road_left"] == 0
