@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from crosscue.replay.vehicle import NotNegative, Positive, Section
+from crosscue.replay.settings_section import NotNegative, Positive, Section
 
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 

@@ -14,28 +14,22 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from .errors import VehicleError
+from .fusion_settings import Fusion, RangeFilter
+from .past_settings import Past
+from .settings_section import Finite, NotNegative, Positive, Section
 
 VERSION: Final = 1
 DEGREE: Final = math.pi / 180.0
 
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 Matrix = tuple[Vector, Vector, Vector]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Polygon = Annotated[tuple[tuple[Share, Share], ...], Field(min_length=3)]
 Signal = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
 """``MESSAGE.SIGNAL`` as the DBC file spells them."""
-
-
-class Section(BaseModel):
-    """What all sections share: unknown keys are refused, nothing changes after reading."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 class Topics(Section):
@@ -229,7 +223,7 @@ class DetectorSection(Section):
     """A detector's name, or ``module:factory``."""
     card: str | None = None
     """Model card, relative to the vehicle file's folder."""
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = Field(default_factory=dict)
     """For its factory, checked by it."""
 
 
@@ -270,7 +264,10 @@ class Vehicle(Section):
     cues: Cues = Cues()
     cars: Cars = Cars()
     ranges: Ranges = Ranges()
-    detectors: dict[str, DetectorSection] = {}
+    range_filter: RangeFilter = RangeFilter()
+    past: Past = Past()
+    fusion: Fusion = Fusion()
+    detectors: dict[str, DetectorSection] = Field(default_factory=dict)
     lost_above_m: Positive = 100.0
     """The pose counts as lost while the 2-sigma ellipse's full major axis exceeds this."""
 
