@@ -26,6 +26,7 @@ from .vehicle import AngleSignal, Vehicle
 if TYPE_CHECKING:
     from .can.database import CanDatabase
     from .can.decode import BusDecoder
+    from .mobileye.samples import MobileyeStream
 
 SPEED_UNITS: Final[Mapping[str, float]] = {
     "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6, "kph": 1 / 3.6, "kmh": 1 / 3.6, "kmph": 1 / 3.6,
@@ -47,6 +48,11 @@ class Signal(Enum):
     MAGNETIC_FIELD = "(N, 3) tesla, forward, left, up"
     HEADING = "(N,) rad from east, counter-clockwise"
     COURSE = "(N, 2) rad from east, counter-clockwise, and speed in m/s, of the ground track"
+    MOBILEYE_OBSTACLES = "(N, 8) vehicles and when each picture was told; mobileye/samples.py"
+    MOBILEYE_LANES = "(N, 8) lane lines left and right, as cubics; mobileye/samples.py"
+
+
+MOBILEYE_SIGNALS: Final = (Signal.MOBILEYE_OBSTACLES, Signal.MOBILEYE_LANES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,6 +152,7 @@ def plan(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> Plan:
     _plan_odometry(planner)
     _plan_imu(planner)
     _plan_heading(planner)
+    _plan_mobileye(planner)
     given = {signal for _, signals in planner.chosen.values() for signal in signals}
     sources = tuple(
         Source(log, topic, tuple(signals)) for (log, _), (topic, signals) in planner.chosen.items()
@@ -224,6 +231,42 @@ def _plan_heading(planner: _Planner) -> None:
         planner.choose(place, Signal.COURSE)
 
 
+def _plan_mobileye(planner: _Planner) -> None:
+    """From the bus that the vehicle file names, else from messages; a log without is no error."""
+    bus = planner.vehicle.mobileye.bus
+    on_bus = [(log, topic) for log, topic in planner.topics if topic.name == bus]
+    if on_bus and role_of(on_bus[0][1]) is Role.CAN:
+        for signal in MOBILEYE_SIGNALS:
+            planner.choose(on_bus[0], signal)
+        return
+    places = {
+        name: [
+            (log, topic)
+            for log, topic in planner.topics
+            if role_of(topic) is Role.MOBILEYE
+            and topic.type_name.rpartition("/")[2] == name
+            and topic.name.startswith(bus or "")
+            and "next" not in topic.name.rpartition("/")[2].lower()
+        ]
+        for name in ("ObstacleStatus", "ObstacleData", "LkaLane")
+    }
+    if not any(places.values()):
+        lacks = "mobileye.bus is not given" if bus is None else f"no topic {bus} (mobileye.bus)"
+        reason = f"{lacks}, and there are no messages of mobileye_560_660_msgs"
+        planner.missing.update(dict.fromkeys(MOBILEYE_SIGNALS, reason))
+        return
+    if len(places["ObstacleData"]) > 1:
+        names = ", ".join(topic.name for _, topic in places["ObstacleData"])
+        raise VehicleError(
+            f"several topics could be the Mobileye's obstacles: {names}; give the beginning of one "
+            "device's topics as mobileye.bus in the vehicle file"
+        )
+    for name, found in places.items():
+        for place in found:
+            lanes = name == "LkaLane"
+            planner.choose(place, Signal.MOBILEYE_LANES if lanes else Signal.MOBILEYE_OBSTACLES)
+
+
 def camera_of(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> tuple[int, Topic] | None:
     """The camera: the topic that the vehicle file names, or the only one; None where there is none.
 
@@ -266,6 +309,7 @@ class Extractor:
     on_pictures: Callable[[Block], None] = _no_pictures
     _decoders: dict[str, Decoder | None] = field(default_factory=dict)
     _buses: dict[str, BusDecoder] = field(default_factory=dict)
+    _mobileye: MobileyeStream | None = None
 
     def __call__(self, block: Block) -> Iterator[Samples]:
         """The samples of one block; rows that cannot be used are skipped in the ledger."""
@@ -288,13 +332,46 @@ class Extractor:
         self.watch.see(block)
         clock = self.clocks.get(block.topic, Clock.LOG)
         block = replace(block, log_ns=times_of(block, clock))
+        if not {*source.signals}.isdisjoint(MOBILEYE_SIGNALS):
+            yield from self._mobileye_stream(source)(block)
         if role_of(source.topic) is Role.CAN:
-            yield from self._from_can(block, source)
+            if not {*source.signals} <= {*MOBILEYE_SIGNALS}:
+                yield from self._from_can(block, source)
             return
         if isinstance(block.rows, Images):
             self.on_pictures(block)
         for signal in source.signals:
-            yield from _FROM_TABLE[signal](block, self.ledger)
+            if signal not in MOBILEYE_SIGNALS:
+                yield from _FROM_TABLE[signal](block, self.ledger)
+
+    def finish(self) -> Iterator[tuple[str, Samples]]:
+        """What was held back until it was known to be whole, with its topic; at the log's end."""
+        if self._mobileye is not None:
+            source = self._mobileye_sources()[0]
+            for samples in self._mobileye.flush():
+                yield source.topic.name, samples
+
+    def _mobileye_sources(self) -> list[Source]:
+        return [
+            source
+            for source in self.planned.sources
+            if source.log == self.log and not {*source.signals}.isdisjoint(MOBILEYE_SIGNALS)
+        ]
+
+    def _mobileye_stream(self, source: Source) -> MobileyeStream:
+        if self._mobileye is None:
+            from .mobileye.samples import MobileyeStream
+
+            types = {
+                one.topic.name: one.topic.type_name
+                for one in self._mobileye_sources()
+                if role_of(one.topic) is Role.MOBILEYE
+            }
+            self._mobileye = MobileyeStream(
+                source.topic.name, self.ledger, self.vehicle.mobileye, types,
+                is_shared_bus=not {*source.signals} <= {*MOBILEYE_SIGNALS},
+            )  # fmt: skip
+        return self._mobileye
 
     def _from_can(self, block: Block, source: Source) -> Iterator[Samples]:
         decoder = self._bus_decoder(block.topic)

@@ -89,6 +89,8 @@ def windows(
         block = next(streams[behind], None)
         if block is None:
             progress[behind].ended = True
+            for topic, samples in extractors[behind].finish():
+                pending.add(behind, topic, samples)
         elif len(block):
             progress[behind].saw(block)
             for samples in extractors[behind](block):

@@ -1,0 +1,91 @@
+"""A Mobileye's lanes and obstacles as the samples that estimators take, from CAN or from ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Block, CanFrames, Floats, Table
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.signals import Samples, Signal
+from crosscue.replay.vehicle import Mobileye
+
+from .decode import MobileyeDecoder
+from .ros import RosMobileye
+from .settings import MobileyeSettings, Mounting
+
+OBSTACLE_COLUMNS: Final = (
+    "burst", "x_m", "y_m", "vx_mps", "type", "status", "valid", "age_frames",
+)  # fmt: skip
+"""A row with nothing but ``burst`` opens the burst of one image, which may hold no obstacle."""
+LANE_COLUMNS: Final = (
+    "side", "lane_type", "quality", "c0_m", "c1", "c2_per_m", "c3_per_m2", "x_end_m",
+)  # fmt: skip
+"""``c0_m`` and ``x_end_m`` are NaN on a side without a marking."""
+
+
+class MobileyeStream:
+    """Reads one device, from frames of its bus or from messages, a block at a time."""
+
+    def __init__(
+        self, bus: str, ledger: Ledger, section: Mobileye, types: Mapping[str, str], *,
+        is_shared_bus: bool,
+    ) -> None:  # fmt: skip
+        """Prepare.
+
+        Args:
+            bus: Topic of the bus; for messages any name.
+            ledger: Told of what could not be used.
+            section: The vehicle file's.
+            types: Of the topics with messages, from their names.
+            is_shared_bus: The car's own signals are read from the same bus.
+        """
+        settings = settings_of(section, is_shared_bus=is_shared_bus)
+        self._of_frames = MobileyeDecoder(bus, ledger, settings) if not types else None
+        self._of_messages = RosMobileye(bus, types, ledger, settings) if types else None
+
+    def __call__(self, block: Block) -> Iterator[Samples]:
+        """The samples of a block of frames, or of decoded messages."""
+        if self._of_frames is not None and isinstance(block.rows, CanFrames):
+            yield from samples_of(self._of_frames(block))
+        elif self._of_messages is not None:
+            yield from samples_of(self._of_messages(block))
+
+    def flush(self) -> Iterator[Samples]:
+        """What was held back until it was known to be whole; call it once, at the log's end."""
+        reader = self._of_frames or self._of_messages
+        if reader is not None:
+            yield from samples_of(reader.flush())
+
+
+def settings_of(section: Mobileye, *, is_shared_bus: bool) -> MobileyeSettings:
+    """The decoder's settings from the vehicle file's; without ``x_m`` the mounting is unknown."""
+    mounting = None if section.x_m is None else Mounting(section.x_m, section.y_m, section.yaw_rad)
+    return MobileyeSettings(
+        section.revision, section.family, section.slots, mounting, is_shared_bus=is_shared_bus
+    )
+
+
+def samples_of(blocks: Iterable[Block]) -> Iterator[Samples]:
+    """Tables of the decoder as samples, at their log times."""
+    for block in blocks:
+        name = block.topic.rpartition("/")[2]
+        if isinstance(block.rows, Table) and name in _TABLES:
+            signal, names = _TABLES[name]
+            yield Samples(signal, block.log_ns, _stacked(block.rows, names))
+
+
+def _stacked(rows: Table, names: tuple[str, ...]) -> Floats:
+    absent = np.full(len(rows), np.nan)
+    return np.stack(
+        [np.asarray(rows.columns.get(name, absent), np.float64) for name in names], axis=1
+    )
+
+
+_TABLES: Final = {
+    "status": (Signal.MOBILEYE_OBSTACLES, OBSTACLE_COLUMNS),
+    "obstacles": (Signal.MOBILEYE_OBSTACLES, OBSTACLE_COLUMNS),
+    "lanes": (Signal.MOBILEYE_LANES, LANE_COLUMNS),
+}
