@@ -1,0 +1,335 @@
+"""A drive's approaches to intersections: when one opens and closes, its ranges and its belief.
+
+The source scores one approach for each run; a drive has many. An approach
+
+* opens at the first evidence: a sign with a range, or a cue that speaks first (so a neutral belief
+  is never old when an intersection comes);
+* closes once its end is behind the rear axle (the end as ranged, or the start and a usual length),
+  once the car has turned at it, or when evidence has gone stale. Where no sign tells a range it
+  goes stale sooner, since nothing else could end it;
+* that closes before presence was established was noise: counted as neutral, no detection.
+
+Only signs with a range and cues that speak first keep evidence fresh: road straight ahead is seen
+everywhere. Staleness is a matter of way, not of time, so a car that waits at the line keeps its
+approach. Where odometry is missing the way is reckoned at ``RangeFilter.unseen_mps``, which also
+widens the ranges; a range that has become too wide is dropped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from crosscue.replay.fusion_settings import Fusion, RangeFilter
+
+from .belief import Belief, Situation, Speaker, begin, establish, multiply, probabilities
+from .factor_graph import FactorGraph
+from .intersection_range import RangeBelief, Reference
+from .range_track import NOTHING, RangeTrack, Verdict, advance, measure
+from .speakers import speakers_of
+
+TURN_FADES_M: Final = 25.0
+"""A turn counts less and less over this way, so that bends of a road do not add up to one."""
+
+
+@dataclass(frozen=True, slots=True)
+class SignRange:
+    """The range that one detected sign or light tells.
+
+    Attributes:
+        reference: What it stands at.
+        range_m: From the rear axle to there.
+        var_m2: How sure that is.
+    """
+
+    reference: Reference
+    range_m: float
+    var_m2: float
+
+
+@dataclass(frozen=True, slots=True)
+class FrameEvidence:
+    """What one frame brings.
+
+    Attributes:
+        t_ns: Log time.
+        travelled_m: Way since the evidence before, negative in reverse; None where odometry is
+            missing.
+        travelled_var_m2: Its variance.
+        signs: Each detection that tells a range.
+        counts: From cue to how many; 0 is looked for and not found, absent is not looked for.
+        objects: From cue to identities of the counted things, where a tracker gives them.
+        is_new_picture: Not the same picture as the frame before.
+        turned_rad: Change of heading since the evidence before, counter-clockwise, where known.
+    """
+
+    t_ns: int
+    travelled_m: float | None
+    travelled_var_m2: float
+    signs: tuple[SignRange, ...]
+    counts: Mapping[str, int]
+    objects: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    is_new_picture: bool = True
+    turned_rad: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RangeRow:
+    """A row of ``range.parquet``; ``measured_m`` is None where nothing was measured or taken."""
+
+    reference: Reference
+    range_m: float
+    var_m2: float
+    measured_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What is believed after one frame.
+
+    Attributes:
+        t_ns: Of the evidence.
+        approach: Number of the open approach; None outside any.
+        counts: The evidence's counts and those of the cues past the intersection.
+        ranges: One row for each reference that has a belief.
+        probabilities: By feature; empty outside approaches.
+        established: Presence of the intersection is established.
+    """
+
+    t_ns: int
+    approach: int | None
+    counts: Mapping[str, int]
+    ranges: tuple[RangeRow, ...] = ()
+    probabilities: Mapping[str, float] = field(default_factory=dict)
+    established: bool = False
+
+
+PastCues = Callable[[RangeBelief | None, Reference | None], Mapping[str, int]]
+"""Cues that need to know where the intersection is: from the best range to counts."""
+
+
+def no_past_cues(best: RangeBelief | None, reference: Reference | None) -> Mapping[str, int]:
+    """A car without a Mobileye."""
+    return {}
+
+
+@dataclass(slots=True)
+class _Open:
+    """The approach at hand."""
+
+    number: int
+    belief: Belief
+    speaker: Speaker
+    start: RangeTrack = NOTHING
+    end: RangeTrack = NOTHING
+    since_evidence_m: float = 0.0
+    since_dissent_m: float = math.inf
+    turned_rad: float = 0.0
+
+
+class Approaches:
+    """Takes evidence in time order and holds the approach at hand; the only thing with memory.
+
+    Attributes:
+        counts: Approaches opened, established and closed by reason; ranges and evidence refused.
+    """
+
+    def __init__(self, graph: FactorGraph, fusion: Fusion, range_filter: RangeFilter) -> None:
+        self.counts: Counter[str] = Counter()
+        self._graph = graph
+        self._fusion = fusion
+        self._filter = range_filter
+        self._new_speaker = speakers_of(graph, fusion)
+        self._first = tuple(cue.name for cue in graph.cues if cue.speaks_first)
+        self._open: _Open | None = None
+        self._last_ns: int | None = None
+        self._rest_m = 0.0
+
+    def __call__(self, evidence: FrameEvidence, past: PastCues = no_past_cues) -> Step:
+        """Take the next evidence; one that is not later than the last changes nothing."""
+        moved_m = self._moved(evidence)
+        if moved_m is None:
+            return Step(evidence.t_ns, None, {})
+        if self._open is not None:
+            self._go_on(self._open, evidence, moved_m)
+        self._rest_m = max(0.0, self._rest_m - moved_m)
+        signs = self._sane(evidence.signs)
+        speaks = any(evidence.counts.get(cue, 0) > 0 for cue in self._first)
+        if self._open is None and (signs or (speaks and self._rest_m <= 0.0)):
+            self._begin()
+        if self._open is None:
+            return Step(evidence.t_ns, None, evidence.counts)
+        if signs or speaks:
+            self._open.since_evidence_m = 0.0
+        return self._step(self._open, evidence, signs, past, moved_m)
+
+    def finish(self) -> None:
+        """Say that the drive is over; an approach still open is counted as such."""
+        if self._open is not None:
+            self._close("the drive ended")
+
+    def _moved(self, evidence: FrameEvidence) -> float | None:
+        """Way gone without sign, reckoned where unknown; None for evidence that is refused."""
+        last_ns = self._last_ns
+        if last_ns is not None and evidence.t_ns <= last_ns:
+            why = "repeated" if evidence.t_ns == last_ns else "out of order"
+            self.counts[f"evidence refused: {why}"] += 1
+            return None
+        self._last_ns = evidence.t_ns
+        if _has_way(evidence):
+            return abs(evidence.travelled_m or 0.0)
+        if last_ns is None:
+            return 0.0
+        self.counts["odometry missing"] += 1
+        return self._filter.unseen_mps * (evidence.t_ns - last_ns) * 1e-9
+
+    def _go_on(self, at_hand: _Open, evidence: FrameEvidence, moved_m: float) -> None:
+        """Carry the approach over the way since the evidence before, and close it if it is over."""
+        travelled_m, var_m2 = 0.0, moved_m * moved_m
+        if _has_way(evidence):
+            travelled_m, var_m2 = evidence.travelled_m or 0.0, evidence.travelled_var_m2
+        had = (at_hand.start.belief is not None) + (at_hand.end.belief is not None)
+        at_hand.start = advance(at_hand.start, travelled_m, var_m2, self._filter.most_sd_m)
+        at_hand.end = advance(at_hand.end, travelled_m, var_m2, self._filter.most_sd_m)
+        has = (at_hand.start.belief is not None) + (at_hand.end.belief is not None)
+        if has < had:
+            self.counts["ranges dropped: too unsure"] += had - has
+        at_hand.since_evidence_m += moved_m
+        at_hand.since_dissent_m += moved_m
+        if evidence.turned_rad is not None and math.isfinite(evidence.turned_rad):
+            kept = at_hand.turned_rad * math.exp(-moved_m / TURN_FADES_M)
+            at_hand.turned_rad = kept + evidence.turned_rad
+        why = self._over(at_hand)
+        if why is not None:
+            self._close(why)
+
+    def _over(self, at_hand: _Open) -> str | None:
+        """Why the approach is over, or None."""
+        fusion, end_m = self._fusion, _end_m(at_hand, self._fusion.length_m)
+        if end_m is not None and end_m < -fusion.closes_behind_m:
+            return "passed"
+        if end_m is not None and end_m > self._filter.most_m + fusion.length_m:
+            return "out of reach"
+        is_at_it = end_m is None or end_m <= fusion.length_m
+        if is_at_it and abs(at_hand.turned_rad) >= fusion.turned_rad:
+            return "turned"
+        limit_m = fusion.stale_unranged_m if end_m is None else fusion.stale_after_m
+        return "stale" if at_hand.since_evidence_m > limit_m else None
+
+    def _begin(self) -> None:
+        self.counts["approaches opened"] += 1
+        number = self.counts["approaches opened"]
+        self._open = _Open(number, begin(self._graph), self._new_speaker())
+
+    def _close(self, why: str) -> None:
+        is_real = self._open is not None and self._open.belief.is_established
+        self.counts[f"approaches closed: {why if is_real else 'neutral'}"] += 1
+        self._rest_m = self._fusion.rest_m if why in ("passed", "turned") else 0.0
+        self._open = None
+
+    def _sane(self, signs: Sequence[SignRange]) -> dict[Reference, tuple[float, float]]:
+        """Mean range and variance of each reference's signs; those beyond reason are refused.
+
+        The variance of the mean is that of one sign: all share the curve's error.
+        """
+        found: dict[Reference, list[SignRange]] = {}
+        for sign in signs:
+            is_sane = 0.0 < sign.range_m <= self._filter.most_m and 0.0 < sign.var_m2 < math.inf
+            if is_sane:
+                found.setdefault(sign.reference, []).append(sign)
+            else:
+                self.counts["ranges refused: beyond reason"] += 1
+        return {
+            reference: (
+                sum(one.range_m for one in some) / len(some),
+                sum(one.var_m2 for one in some) / len(some),
+            )
+            for reference, some in found.items()
+        }
+
+    def _step(
+        self,
+        at_hand: _Open,
+        evidence: FrameEvidence,
+        signs: Mapping[Reference, tuple[float, float]],
+        past: PastCues,
+        moved_m: float,
+    ) -> Step:
+        ranges = self._measured(at_hand, signs)
+        best, reference = _best(at_hand, Reference(self._fusion.reference))
+        more = past(best, reference)
+        counts = {**evidence.counts, **more} if more else evidence.counts
+        is_near = best is not None and best.mean_m <= self._fusion.dissent_within_m
+        may_dissent = is_near and at_hand.since_dissent_m >= self._fusion.dissent_every_m
+        if may_dissent:
+            at_hand.since_dissent_m = 0.0
+        messages = at_hand.speaker(
+            Situation(
+                counts, at_hand.belief.is_established, may_dissent, evidence.objects,
+                evidence.is_new_picture, moved_m,
+            )
+        )  # fmt: skip
+        was_established = at_hand.belief.is_established
+        belief = multiply(at_hand.belief, messages)
+        at_hand.belief = belief = establish(belief, self._graph, self._fusion.established)
+        if belief.is_established and not was_established:
+            self.counts["approaches established"] += 1
+        now = probabilities(belief, self._graph)
+        return Step(evidence.t_ns, at_hand.number, counts, ranges, now, belief.is_established)
+
+    def _measured(
+        self, at_hand: _Open, signs: Mapping[Reference, tuple[float, float]]
+    ) -> tuple[RangeRow, ...]:
+        """Weigh in the signs; the rows to write."""
+        start_m = end_m = None
+        if Reference.START in signs:
+            at_hand.start, start_m = self._weigh(at_hand.start, *signs[Reference.START])
+        if Reference.END in signs:
+            at_hand.end, end_m = self._weigh(at_hand.end, *signs[Reference.END])
+        rows = (
+            (Reference.START, at_hand.start.belief, start_m),
+            (Reference.END, at_hand.end.belief, end_m),
+        )
+        return tuple(
+            RangeRow(reference, belief.mean_m, belief.var_m2, measured_m)
+            for reference, belief, measured_m in rows
+            if belief is not None
+        )
+
+    def _weigh(
+        self, track: RangeTrack, range_m: float, var_m2: float
+    ) -> tuple[RangeTrack, float | None]:
+        near_m = self._fusion.dissent_within_m
+        track, verdict = measure(track, range_m, var_m2, self._filter, near_m)
+        if verdict is Verdict.REFUSED:
+            self.counts["ranges refused: outside the gate"] += 1
+            return track, None
+        if verdict is Verdict.RESTARTED:
+            self.counts["ranges restarted"] += 1
+        return track, range_m
+
+
+def _has_way(evidence: FrameEvidence) -> bool:
+    way_m, var_m2 = evidence.travelled_m, evidence.travelled_var_m2
+    return way_m is not None and math.isfinite(way_m) and 0.0 <= var_m2 < math.inf
+
+
+def _end_m(at_hand: _Open, length_m: float) -> float | None:
+    """Where the intersection ends, as far as known."""
+    if at_hand.end.belief is not None:
+        return at_hand.end.belief.mean_m
+    start = at_hand.start.belief
+    return None if start is None else start.mean_m + length_m
+
+
+def _best(at_hand: _Open, wanted: Reference) -> tuple[RangeBelief | None, Reference | None]:
+    """The wanted reference's range, or else the other's as it is."""
+    known = {Reference.START: at_hand.start.belief, Reference.END: at_hand.end.belief}
+    other = Reference.END if wanted is Reference.START else Reference.START
+    for reference in (wanted, other):
+        if known[reference] is not None:
+            return known[reference], reference
+    return None, None

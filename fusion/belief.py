@@ -1,0 +1,131 @@
+"""Belief over the features of one intersection, in log odds, and what cues say to it (eq. 18)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from .factor_graph import FactorGraph, log_odds, probability
+
+
+class Belief(NamedTuple):
+    """What is believed of each feature, in the graph's order.
+
+    Attributes:
+        log_odds: Sum of the prior's and of all messages so far; not limited.
+        is_established: Presence was established; stays so for the approach.
+    """
+
+    log_odds: tuple[float, ...]
+    is_established: bool = False
+
+
+def begin(graph: FactorGraph) -> Belief:
+    """The belief before any cue."""
+    return Belief(tuple(log_odds(feature.prior) for feature in graph.features))
+
+
+def multiply(belief: Belief, messages: Sequence[float]) -> Belief:
+    """Multiply in one message (in log odds) to each feature and normalise (eq. 18)."""
+    sums = tuple(old + new for old, new in zip(belief.log_odds, messages, strict=True))
+    return Belief(sums, belief.is_established)
+
+
+def establish(belief: Belief, graph: FactorGraph, threshold: float) -> Belief:
+    """The belief, established if a feature that establishes presence exceeds ``threshold``."""
+    if belief.is_established:
+        return belief
+    limit = log_odds(threshold)
+    is_now = any(
+        feature.establishes and odds > limit
+        for feature, odds in zip(graph.features, belief.log_odds, strict=True)
+    )
+    return Belief(belief.log_odds, is_now)
+
+
+def probabilities(belief: Belief, graph: FactorGraph) -> dict[str, float]:
+    """Each feature's probability, strictly between 0 and 1."""
+    return {
+        name: probability(odds)
+        for name, odds in zip(graph.feature_names, belief.log_odds, strict=True)
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """All that decides what the cues of one frame say.
+
+    Attributes:
+        counts: From cue to how many; 0 is looked for and not found, absent is not looked for.
+        is_established: Presence was established by earlier frames.
+        may_dissent: Near the intersection, and moved since dissent was last sent.
+        objects: From cue to identities of the counted things, where a tracker gives them.
+        is_new_picture: Not the same picture as before.
+        moved_m: Way gone since the frame before, forwards or back; None where unknown.
+    """
+
+    counts: Mapping[str, int]
+    is_established: bool
+    may_dissent: bool
+    objects: Mapping[str, tuple[int, ...]]
+    is_new_picture: bool = True
+    moved_m: float | None = 0.0
+
+
+Speaker = Callable[[Situation], Sequence[float]]
+"""From a frame's situation to the sum of messages into each feature, in log odds. May remember
+what it said earlier in the same approach; each approach gets a new one."""
+
+
+class _Line(NamedTuple):
+    """One cue, made ready: what it adds to which feature when detected, and when absent."""
+
+    cue: str
+    speaks_first: bool
+    is_counted: bool
+    detected: tuple[tuple[int, float], ...]
+    absent: tuple[tuple[int, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SourceSpeaker:
+    """The published messages: precision along direct edges, its reverse along exclusive ones.
+
+    Until presence is established only cues that speak first do. The frame that establishes it does
+    not open the gate for itself: earlier frames decide.
+    """
+
+    size: int
+    lines: tuple[_Line, ...]
+
+    def __call__(self, situation: Situation) -> list[float]:
+        """Sum the messages of one frame."""
+        out = [0.0] * self.size
+        counts = situation.counts
+        for cue, speaks_first, is_counted, detected, absent in self.lines:
+            count = counts.get(cue)
+            if count is None or not (speaks_first or situation.is_established):
+                continue
+            if count > 0:
+                times = count if is_counted else 1
+                for feature, odds in detected:
+                    out[feature] += times * odds
+            elif situation.may_dissent:
+                for feature, odds in absent:
+                    out[feature] += odds
+        return out
+
+
+def source_speaker(graph: FactorGraph, dissent: float) -> SourceSpeaker:
+    """Make the graph's table ready; ``dissent`` is what an absent cue sends near by."""
+    place = {name: i for i, name in enumerate(graph.feature_names)}
+    against = log_odds(dissent)
+    lines = []
+    for cue in graph.cues:
+        edges = [edge for edge in graph.edges if edge.cue == cue.name]
+        says = log_odds(cue.precision)
+        detected = tuple((place[e.feature], says if e.is_direct else -says) for e in edges)
+        absent = tuple((place[e.feature], against) for e in edges if cue.dissents and e.is_direct)
+        lines.append(_Line(cue.name, cue.speaks_first, cue.counted, detected, absent))
+    return SourceSpeaker(len(place), tuple(lines))

@@ -1,0 +1,72 @@
+"""Distance to an intersection as a scalar Kalman filter, as pure functions.
+
+The state is one number: metres along the path from the rear axle to the start of the intersection
+(a stop sign tells it) or to its end (a traffic light does). The two are never mixed. Equation
+numbers are those of Chipka (2018), chapter 3.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import NamedTuple
+
+
+class Reference(StrEnum):
+    """What a range is to."""
+
+    START = "start"
+    END = "end"
+
+
+class RangeBelief(NamedTuple):
+    """A Gaussian over the distance to one reference.
+
+    Attributes:
+        mean_m: Expected distance; negative once the rear axle is past.
+        var_m2: Its variance, positive.
+    """
+
+    mean_m: float
+    var_m2: float
+
+
+def initialise(measured_m: float, sensor_var_m2: float) -> RangeBelief:
+    """What the first measurement alone says.
+
+    Raises:
+        ValueError: ``sensor_var_m2`` is not positive.
+    """
+    if not sensor_var_m2 > 0.0:
+        raise ValueError(f"sensor_var_m2: want > 0, got {sensor_var_m2}")
+    return RangeBelief(measured_m, sensor_var_m2)
+
+
+def predict(belief: RangeBelief, travelled_m: float, odometry_var_m2: float) -> RangeBelief:
+    """Go on by ``travelled_m`` (negative in reverse), losing certainty (eq. 8 and 9).
+
+    Raises:
+        ValueError: ``odometry_var_m2`` is negative.
+    """
+    if not odometry_var_m2 >= 0.0:
+        raise ValueError(f"odometry_var_m2: want >= 0, got {odometry_var_m2}")
+    return RangeBelief(belief.mean_m - travelled_m, belief.var_m2 + odometry_var_m2)
+
+
+def nis(belief: RangeBelief, measured_m: float, sensor_var_m2: float) -> float:
+    """Innovation squared over the variance it should have; chi-squared with one degree."""
+    return (measured_m - belief.mean_m) ** 2 / (belief.var_m2 + sensor_var_m2)
+
+
+def update(belief: RangeBelief, measured_m: float, sensor_var_m2: float) -> RangeBelief:
+    """Weigh in one measured distance (eq. 10 to 12).
+
+    Raises:
+        ValueError: ``sensor_var_m2`` is not positive.
+    """
+    if not sensor_var_m2 > 0.0:
+        raise ValueError(f"sensor_var_m2: want > 0, got {sensor_var_m2}")
+    gain = belief.var_m2 / (belief.var_m2 + sensor_var_m2)
+    return RangeBelief(
+        mean_m=belief.mean_m + gain * (measured_m - belief.mean_m),
+        var_m2=belief.var_m2 - gain * belief.var_m2,
+    )
