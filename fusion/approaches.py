@@ -28,7 +28,7 @@ from crosscue.replay.fusion_settings import Fusion, RangeFilter
 from .belief import Belief, Situation, Speaker, begin, establish, multiply, probabilities
 from .factor_graph import FactorGraph
 from .intersection_range import RangeBelief, Reference
-from .range_track import NOTHING, RangeTrack, Verdict, advance, measure
+from .range_track import NOTHING, RangeTrack, Verdict, advance, go_blind, measure
 from .speakers import speakers_of
 
 TURN_FADES_M: Final = 25.0
@@ -188,12 +188,9 @@ class Approaches:
 
     def _go_on(self, at_hand: _Open, evidence: FrameEvidence, moved_m: float) -> None:
         """Carry the approach over the way since the evidence before, and close it if it is over."""
-        travelled_m, var_m2 = 0.0, moved_m * moved_m
-        if _has_way(evidence):
-            travelled_m, var_m2 = evidence.travelled_m or 0.0, evidence.travelled_var_m2
         had = (at_hand.start.belief is not None) + (at_hand.end.belief is not None)
-        at_hand.start = advance(at_hand.start, travelled_m, var_m2, self._filter.most_sd_m)
-        at_hand.end = advance(at_hand.end, travelled_m, var_m2, self._filter.most_sd_m)
+        at_hand.start = self._carried(at_hand.start, evidence, moved_m)
+        at_hand.end = self._carried(at_hand.end, evidence, moved_m)
         has = (at_hand.start.belief is not None) + (at_hand.end.belief is not None)
         if has < had:
             self.counts["ranges dropped: too unsure"] += had - has
@@ -205,6 +202,12 @@ class Approaches:
         why = self._over(at_hand)
         if why is not None:
             self._close(why)
+
+    def _carried(self, track: RangeTrack, evidence: FrameEvidence, moved_m: float) -> RangeTrack:
+        most_sd_m = self._filter.most_sd_m
+        if evidence.travelled_m is None or not _has_way(evidence):
+            return go_blind(track, moved_m, most_sd_m)
+        return advance(track, evidence.travelled_m, evidence.travelled_var_m2, most_sd_m)
 
     def _over(self, at_hand: _Open) -> str | None:
         """Why the approach is over, or None."""

@@ -7,6 +7,7 @@ would shut out all good ones.
 
 from __future__ import annotations
 
+import math
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -50,6 +51,17 @@ def advance(track: RangeTrack, travelled_m: float, var_m2: float, most_sd_m: flo
         return NOTHING
     rival = None if track.rival is None else predict(track.rival, travelled_m, var_m2)
     return RangeTrack(belief, rival, track.rival_seen)
+
+
+def go_blind(track: RangeTrack, widens_m: float, most_sd_m: float) -> RangeTrack:
+    """The track after a way that nobody measured: the mean stays, the s.d. grows by ``widens_m``.
+
+    Standard deviations add, not variances: the unknown speed of one moment is that of the next.
+    """
+    if track.belief is None:
+        return track
+    sd_m = math.sqrt(track.belief.var_m2)
+    return advance(track, 0.0, widens_m * (widens_m + 2.0 * sd_m), most_sd_m)
 
 
 def measure(
