@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
-from crosscue.detectors.frame_cues import CuePass
+from crosscue.detectors.frame_cues import CuePass, Seen
 from crosscue.detectors.registry import chosen
 from crosscue.eval.detect_stage import detect_drive
 from crosscue.replay.log import Selection, open_log
@@ -51,7 +51,7 @@ def cue_seconds(found: list[Detections]) -> float:
     cues = CuePass(VEHICLE)
     began = time.perf_counter()
     for one in found:
-        cues([one])
+        cues(Seen(one.t_ns, (one,)))
     return time.perf_counter() - began
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Final
-
-import numpy as np
 
 from crosscue.replay.vehicle import Vehicle
 
@@ -21,6 +20,56 @@ SIGN_CUES: Final[Mapping[str, Cue]] = {
     "do not enter": Cue.DO_NOT_ENTER,
 }
 """From the labels that the sign detector gives."""
+
+
+class Role(StrEnum):
+    """What a detector looks for; where none of a role ran, its cues are not looked for."""
+
+    OBJECTS = "objects"
+    SIGNS = "signs"
+    ROAD = "road"
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What detectors found in one frame, by what they look for.
+
+    Attributes:
+        t_ns: Log time of the frame.
+        objects: Of detectors of objects; empty where none ran.
+        signs: Of detectors of one-way and do-not-enter signs; empty where none ran.
+        road: Road pixels, or their shares where these are known already.
+    """
+
+    t_ns: int
+    objects: tuple[Detections, ...] = ()
+    signs: tuple[Detections, ...] = ()
+    road: RoadMask | RoadShares | None = None
+
+
+def role_of(found: Found, is_for_signs: bool) -> Role:
+    """The role that a result plays."""
+    if isinstance(found, RoadMask):
+        return Role.ROAD
+    return Role.SIGNS if is_for_signs else Role.OBJECTS
+
+
+def seen(t_ns: int, found: Sequence[Found], is_for_signs: Sequence[bool]) -> Seen:
+    """One frame's results, sorted by role.
+
+    Args:
+        t_ns: Log time of the frame.
+        found: One result for each detector.
+        is_for_signs: Whether that detector looks for one-way and do-not-enter signs.
+    """
+    boxes: dict[bool, list[Detections]] = {True: [], False: []}
+    road: RoadMask | None = None
+    for one, for_signs in zip(found, is_for_signs, strict=True):
+        if isinstance(one, Detections):
+            boxes[for_signs].append(one)
+        elif road is None:
+            road = one
+    return Seen(t_ns, tuple(boxes[False]), tuple(boxes[True]), road)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,27 +91,23 @@ class CuePass:
 
     Attributes:
         vehicle: Regions and thresholds.
-        has_boxes: A detector gives objects, so their absence counts.
-        has_signs: A detector looks for signs.
         tracker: Pairs cars of two frames.
     """
 
     vehicle: Vehicle
-    has_boxes: bool = True
-    has_signs: bool = False
     tracker: Tracker = pair_cars
     _before: CarShapes | None = None
 
-    def __call__(self, found: Sequence[Found]) -> FrameCues:
-        """The cues of the next frame, of its detectors' results in any order."""
-        boxes = [one for one in found if isinstance(one, Detections)]
-        masks = [one for one in found if isinstance(one, RoadMask)]
+    def __call__(self, frame: Seen) -> FrameCues:
+        """The cues of the next frame."""
         counts: dict[Cue, int] = {}
-        if self.has_boxes and boxes:
-            counts |= self._objects(boxes) | self._cars(boxes)
-        if self.has_signs:
-            counts |= {cue: _count(boxes, (label,), 0.0) for label, cue in SIGN_CUES.items()}
-        road = road_shares(masks[0], self.vehicle.regions) if masks else None
+        if frame.objects:
+            counts |= self._objects(frame.objects) | self._cars(frame.objects)
+        if frame.signs:
+            counts |= {cue: _count(frame.signs, (label,), 0.0) for label, cue in SIGN_CUES.items()}
+        road = frame.road
+        if isinstance(road, RoadMask):
+            road = road_shares(road, self.vehicle.regions)
         if road is not None:
             sides = (Cue.ROAD_LEFT, Cue.ROAD_STRAIGHT, Cue.ROAD_RIGHT)
             positive = road.positive(self.vehicle.cues.road_share)
@@ -94,10 +139,7 @@ class CuePass:
 
 def _count(boxes: Sequence[Detections], labels: tuple[str, ...], score: float) -> int:
     return sum(
-        int(
-            np.sum(
-                [label in labels and s > score for label, s in zip(d.labels, d.scores, strict=True)]
-            )
-        )
-        for d in boxes
+        label in labels and bool(s > score)
+        for found in boxes
+        for label, s in zip(found.labels, found.scores.tolist(), strict=True)
     )

@@ -25,6 +25,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "vehicle init": ("vehicle_init", "write a first vehicle file from what a log holds"),
     "decode": ("decode", "every stream as columns: a Parquet file for each topic or CAN message"),
     "detect": ("detect", "run detectors over the camera: detections, road, cues"),
+    "estimate": ("estimate", "estimate a run again, from what detectors found before"),
     "replay": ("replay", "the main job: from a log to a run folder"),
     "score": ("score", "a run against truth: metrics, figures, report"),
     "view": ("view", "a run in Rerun"),
@@ -37,6 +38,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "landmarks match": ("landmarks_match", "one picture against a landmark database"),
     "truth": ("truth", "write the truth that a data set carries"),
     "simulate": ("simulate", "drives up to intersections, with camera, CAN, Mobileye and truth"),
+    "train road": ("train_road", "the road network, on simulated or own pictures"),
     "demo": ("demo", "make a small drive, replay it, score it, show it"),
 }
 

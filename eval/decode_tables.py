@@ -22,7 +22,7 @@ from crosscue.replay.roles import Role, role_of
 from crosscue.replay.run_folder import RunFolder, TableSink, clear, locked, write_manifest
 from crosscue.replay.vehicle import Vehicle
 
-from .replay_drive import account_of, versions
+from .accounts import account_of, versions
 
 if TYPE_CHECKING:
     import pyarrow as pa

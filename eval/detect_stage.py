@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crosscue.detectors import rle
-from crosscue.detectors.base import Detections
-from crosscue.detectors.frame_cues import CuePass, FrameCues
+from crosscue.detectors.base import Detections, RoadMask
+from crosscue.detectors.frame_cues import CuePass, FrameCues, Role, role_of, seen
 from crosscue.detectors.ranges import range_of
 from crosscue.detectors.registry import Choice, make
 from crosscue.detectors.result_cache import ResultCache
@@ -26,24 +26,32 @@ from crosscue.replay.run_folder import (
     TableSink,
     clear,
     locked,
-    sha256_of,
     write_manifest,
 )
 from crosscue.replay.signals import Extractor, Plan, Source, camera_of
 from crosscue.replay.vehicle import Vehicle
 
-from .detection_pictures import Drawer
-from .replay_drive import (
+from .accounts import (
     account_of,
     clock_rows,
+    log_rows,
     probe_clocks,
-    skipped_rows,
-    skipped_schema,
+    selection_told,
     versions,
+    write_skipped,
 )
+from .detection_pictures import Drawer
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+
+OnFrames = Callable[[int, int | None], None]
+"""Told how many frames are done, and of how many where that is known."""
+
+
+def unwatched(_done: int, _of: int | None) -> None:
+    """Nobody looks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,19 +102,38 @@ def detect_drive(
     choices: Sequence[Choice],
     cache: Path | None = None,
     draw: int = 0,
-    on_time: Callable[[int], None] = lambda _: None,
+    on_frames: OnFrames = unwatched,
 ) -> DetectOutcome:
-    """Run detectors over the one camera of a drive.
+    """Run detectors over the one camera of a drive, into an empty run folder.
+
+    The folder is locked while this works, and cleared first; otherwise as ``detect_into``.
+    """
+    with locked(run):
+        clear(run)
+        return detect_into(logs, vehicle, run, selection, choices, cache, draw, on_frames)
+
+
+def detect_into(
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    run: RunFolder,
+    selection: Selection,
+    choices: Sequence[Choice],
+    cache: Path | None = None,
+    draw: int = 0,
+    on_frames: OnFrames = unwatched,
+) -> DetectOutcome:
+    """Run detectors over the one camera of a drive, into a run folder that is locked.
 
     Args:
         logs: All logs of the drive, open.
         vehicle: What the vehicle file says.
-        run: Where to; locked while this works, cleared first.
+        run: Where to.
         selection: Which part of the logs.
         choices: Detectors, in order.
         cache: File with results of earlier runs, or None for none.
         draw: How many pictures to write with detections drawn.
-        on_time: Told the log time that has been reached.
+        on_frames: Told how many frames are done, and of how many where the log declares it.
 
     Raises:
         VehicleError: No camera or several; a card, weights or settings that do not fit.
@@ -125,37 +152,39 @@ def detect_drive(
     probe = Extractor(planned, vehicle, camera[0], Ledger(""))
     clocks = probe_clocks(log, probe, narrowed)
     extractor = Extractor(planned, vehicle, camera[0], ledger, clocks)
-    with locked(run), ResultCache(cache) as results:
-        clear(run)
+    is_sign = [choice.kind == "signs" for choice in choices]
+    with ResultCache(cache) as results:
         runner = Runner(
             named, results, topic.name, vehicle.camera.depth_bits,
             lambda t_ns, reason, why: ledger.skip(topic.name, reason, 1, why, t_ns),
         )  # fmt: skip
-        is_sign = [choice.kind == "signs" for choice in choices]
-        cues = CuePass(vehicle, has_boxes=not all(is_sign), has_signs=any(is_sign))
         drawer = Drawer(run.path / "pictures", draw)
-        tables = _Tables(run, topic.name, vehicle, named, drawer, cues)
+        tables = _Tables(run, topic.name, vehicle, named, drawer, CuePass(vehicle), is_sign)
+
+        def declared() -> int | None:
+            is_whole = selection.start_ns is None and selection.end_ns is None
+            return ledger.topic(topic.name).declared if is_whole else None
+
         with tables:
-            extractor.on_pictures = lambda block: _through(runner, block, tables, on_time)
+            extractor.on_pictures = lambda block: _through(
+                runner, block, tables, lambda: on_frames(runner.counts.frames, declared())
+            )
             for block in log.read(ledger, narrowed):
                 for _ in extractor(block):
                     pass
-        with TableSink(run, "skipped", skipped_schema()) as sink:
-            sink.write(skipped_rows(ledger))
+        write_skipped(run, [ledger])
         seconds = time.monotonic() - began
         notices = tuple(tables.notices)
         write_manifest(run, {
             "stage": "detect",
             "versions": versions(),
-            "logs": [
-                {"path": str(log.path), "format": log.format, "sha256": sha256_of(log.path)}
-            ],
-            "selection": {"start_ns": selection.start_ns, "end_ns": selection.end_ns},
+            "logs": log_rows(logs),
+            "selection": selection_told(selection),
             "settings": vehicle.model_dump(mode="json"),
             "camera": topic.name,
             "detectors": [
                 {"name": one.name, "identity": one.detector.identity, "kind": choice.kind,
-                 "settings": dict(choice.settings)}
+                 "role": tables.roles.get(one.name), "settings": dict(choice.settings)}
                 for one, choice in zip(named, choices, strict=True)
             ],
             "clocks": [clock_rows(extractor)],
@@ -173,10 +202,10 @@ def detect_drive(
     )
 
 
-def _through(runner: Runner, block: Block, tables: _Tables, on_time: Callable[[int], None]) -> None:
+def _through(runner: Runner, block: Block, tables: _Tables, on_frame: Callable[[], None]) -> None:
     for result in runner(block):
         tables.add(result)
-        on_time(result.t_ns)
+        on_frame()
 
 
 @dataclass(slots=True)
@@ -189,12 +218,15 @@ class _Tables:
     detectors: Sequence[Named]
     drawer: Drawer
     cues: CuePass
+    is_for_signs: Sequence[bool]
     notices: list[str] = field(default_factory=list)
     objects: dict[str, int] = field(default_factory=dict)
     cue_frames: dict[str, int] = field(default_factory=dict)
     _sinks: dict[str, TableSink] = field(default_factory=dict)
+    roles: dict[str, Role] = field(default_factory=dict)
     _held: dict[str, list[dict[str, object]]] = field(default_factory=dict)
     _size: tuple[int, int] | None = None
+    _frame: int = -1
 
     def __enter__(self) -> _Tables:
         for name, schema in schemas().items():
@@ -217,14 +249,26 @@ class _Tables:
                 f"{result.t_ns} ns"
             )
         self._size = result.size_px
-        cues = self.cues(result.found)
-        for named, found in zip(self.detectors, result.found, strict=True):
+        self._frame += 1
+        sorted_by_role = seen(result.t_ns, result.found, self.is_for_signs)
+        cues = self.cues(sorted_by_role)
+        self._held["frames"].append({
+            "frame": self._frame, "t_ns": result.t_ns, "camera": self.camera,
+            "width_px": result.size_px[0], "height_px": result.size_px[1],
+        })  # fmt: skip
+        for named, found, for_signs in zip(
+            self.detectors, result.found, self.is_for_signs, strict=True
+        ):
+            self.roles[named.name] = role_of(found, for_signs)
             if isinstance(found, Detections):
                 self._held["detections"] += self._detection_rows(named.name, found)
-        if cues.road is not None:
+        road = sorted_by_role.road
+        if cues.road is not None and isinstance(road, RoadMask):
             self._held["road"].append({
-                "t_ns": result.t_ns, "camera": self.camera, "share_left": cues.road.left,
-                "share_straight": cues.road.straight, "share_right": cues.road.right,
+                "frame": self._frame, "t_ns": result.t_ns, "camera": self.camera,
+                "share_left": cues.road.left, "share_straight": cues.road.straight,
+                "share_right": cues.road.right, "mask": road.mask,
+                "mask_width_px": road.mask_size_px[0], "mask_height_px": road.mask_size_px[1],
             })  # fmt: skip
         self._add_cues(result.t_ns, cues)
         self.drawer(result, cues)
@@ -251,7 +295,8 @@ class _Tables:
             self.objects[key] = self.objects.get(key, 0) + 1
             height = _height_px(found, i)
             rows.append({
-                "t_ns": found.t_ns, "camera": self.camera, "detector": name, "label": label,
+                "frame": self._frame, "t_ns": found.t_ns, "camera": self.camera,
+                "detector": name, "label": label,
                 "score": float(found.scores[i]), "x0": x0, "y0": y0, "x1": x1, "y1": y1,
                 "mask": found.masks[i] or None, "height_px": height,
                 "range_m": self._range_m(label, height),
@@ -287,15 +332,21 @@ def schemas() -> dict[str, pa.Schema]:
 
     number, text = pa.float64(), pa.string()
     return {
+        "frames": pa.schema([
+            ("frame", pa.int64()), ("t_ns", pa.int64()), ("camera", text),
+            ("width_px", pa.int32()), ("height_px", pa.int32()),
+        ]),
         "detections": pa.schema([
-            ("t_ns", pa.int64()), ("camera", text), ("detector", text), ("label", text),
+            ("frame", pa.int64()), ("t_ns", pa.int64()), ("camera", text),
+            ("detector", text), ("label", text),
             ("score", number), ("x0", number), ("y0", number), ("x1", number), ("y1", number),
             ("mask", pa.binary()), ("height_px", number), ("range_m", number),
             ("picture_width_px", pa.int32()), ("picture_height_px", pa.int32()),
         ]),
         "road": pa.schema([
-            ("t_ns", pa.int64()), ("camera", text), ("share_left", number),
-            ("share_straight", number), ("share_right", number),
+            ("frame", pa.int64()), ("t_ns", pa.int64()), ("camera", text),
+            ("share_left", number), ("share_straight", number), ("share_right", number),
+            ("mask", pa.binary()), ("mask_width_px", pa.int32()), ("mask_height_px", pa.int32()),
         ]),
         "cues": pa.schema([
             ("t_ns", pa.int64()), ("approach", pa.int64()), ("cue", text), ("count", pa.int64()),

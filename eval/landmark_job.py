@@ -25,11 +25,11 @@ from crosscue.replay.columns import Block, Floats, Images, Int64s
 from crosscue.replay.errors import LogError, SchemaError, UsageError, VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.run_folder import open_run, strict_json
+from crosscue.replay.run_folder import open_run
 from crosscue.replay.signals import Extractor, Plan, camera_of, with_pictures
-from crosscue.replay.vehicle import Vehicle
+from crosscue.replay.vehicle import Vehicle, of_manifest
 
-from .replay_drive import probe_clocks
+from .accounts import probe_clocks
 from .score_pose import load_truth
 
 LEAST_POINTS: Final = 20
@@ -108,7 +108,7 @@ def read_poses(path: Path, vehicle: Vehicle) -> CameraPoses:
 
 def _run_poses(path: Path) -> CameraPoses:
     run = open_run(path)
-    vehicle = Vehicle.model_validate_json(strict_json(run.manifest()["settings"]))
+    vehicle = of_manifest(run.manifest()["settings"])
     names = ["t_ns", "x_m", "y_m", "heading_rad", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2"]
     table = run.table("pose", names)
     x, y, heading, xx, xy, yy = (table[name].to_numpy() for name in names[1:])

@@ -23,7 +23,7 @@ from crosscue.localization.angles import wrap_all
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.run_folder import RunFolder, strict_json, write_text
-from crosscue.replay.vehicle import Vehicle
+from crosscue.replay.vehicle import Vehicle, of_manifest
 
 from .pose_figures import ScoredPoses, draw_all
 from .pose_metrics import (
@@ -124,7 +124,7 @@ def score(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.
     """
     truth, track = load_truth(truth_path)
     table = run.table("pose")
-    vehicle = Vehicle.model_validate_json(strict_json(run.manifest()["settings"]))
+    vehicle = of_manifest(run.manifest()["settings"])
     inside = _inside(track, table, truth_path)
     estimate, cov = _estimate(table, vehicle, truth)
     flat = planar(track.t_ns, track.xyz_m[:, 0], track.xyz_m[:, 1], heading_rad(track))

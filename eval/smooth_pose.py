@@ -15,7 +15,7 @@ from crosscue.localization.smoother import smooth
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.run_folder import RunFolder, strict_json, write_text
-from crosscue.replay.vehicle import Vehicle
+from crosscue.replay.vehicle import of_manifest
 
 from .measurements import read_measured
 from .pose_metrics import NeesSummary, nees, pair, summarise_nees
@@ -62,7 +62,7 @@ def score_smoother(run: RunFolder, truth_path: Path) -> SmootherScore:
     """
     truth, track = load_truth(truth_path)
     measured = read_measured(run)
-    vehicle = Vehicle.model_validate_json(strict_json(run.manifest()["settings"]))
+    vehicle = of_manifest(run.manifest()["settings"])
     first_ns, last_ns = measured.start.t_ns, int(measured.increments.stop_ns[-1])
     wanted = _thinned(track.t_ns[(track.t_ns > first_ns) & (track.t_ns <= last_ns)])
     if not len(wanted):

@@ -83,6 +83,29 @@ class RunFolder:
         except (OSError, pa.ArrowException) as error:
             raise RunError(f"{path}: damaged ({error}); run crosscue replay again") from None
 
+    def batches(
+        self, name: str, columns: list[str] | None = None, rows: int = 16_384
+    ) -> Iterator[pa.RecordBatch]:
+        """Rows of ``NAME.parquet`` a batch at a time, its page checksums verified.
+
+        Raises:
+            RunError: Not there or damaged.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        path = self.file(f"{name}.parquet")
+        try:
+            with (
+                path.open("rb") as handle,
+                pq.ParquetFile(handle, page_checksum_verification=True) as file,
+            ):
+                yield from file.iter_batches(rows, columns=columns)
+        except FileNotFoundError:
+            raise RunError(f"{path}: not there; run crosscue replay again") from None
+        except (OSError, pa.ArrowException) as error:
+            raise RunError(f"{path}: damaged ({error}); run crosscue replay again") from None
+
 
 def create(path: Path, *, overwrite: bool) -> RunFolder:
     """An empty run folder.

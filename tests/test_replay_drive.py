@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from crosscue.eval import cli
-from crosscue.eval.replay_drive import Outcome, replay_drive
+from crosscue.eval.estimate_stage import Outcome
+from crosscue.eval.replay_drive import replay_drive
 from crosscue.replay.columns import Block
 from crosscue.replay.errors import RunError, VehicleError
 from crosscue.replay.log import EVERYTHING

@@ -10,8 +10,8 @@ import argparse
 from contextlib import ExitStack
 from pathlib import Path
 
+from crosscue.eval.accounts import account_of
 from crosscue.eval.decode_tables import decode_tables
-from crosscue.eval.replay_drive import account_of
 from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import create
 from crosscue.replay.vehicle import Vehicle, load

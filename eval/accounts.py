@@ -1,0 +1,165 @@
+"""What a run's manifest and ``skipped.parquet`` tell of logs, clocks and versions."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Final
+
+from crosscue.replay.clocks import Clock
+from crosscue.replay.ledger import Ledger, TopicAccount
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.run_folder import RunFolder, TableSink, sha256_of
+from crosscue.replay.signals import Extractor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+PROBE_NS: Final = 10_000_000_000
+"""Log time looked at before a clock is chosen for each topic."""
+
+
+def probe_clocks(log: Log, extractor: Extractor, selection: Selection) -> dict[str, Clock]:
+    """Which clock to use for each planned topic, judged by the log's first seconds."""
+    first_ns: int | None = None
+    for block in log.read(extractor.ledger, selection):
+        if not len(block):
+            continue
+        first_ns = int(block.log_ns[0]) if first_ns is None else first_ns
+        for _ in extractor(block):
+            pass
+        if int(block.log_ns[0]) - first_ns > PROBE_NS:
+            break
+    return {name: report.used for name, report in extractor.watch.reports().items()}
+
+
+def clock_rows(extractor: Extractor) -> dict[str, object]:
+    """Clock used and the whole pass's report for each topic, as plain values."""
+    return {
+        name: {
+            "used": extractor.clocks.get(name, Clock.LOG).value,
+            "why": report.why,
+            "rows": report.of_used.rows,
+            "rate_hz": report.rate_hz,
+        }
+        for name, report in extractor.watch.reports().items()
+    }
+
+
+def clock_changes(extractors: Sequence[Extractor]) -> list[str]:
+    """Topics whose clock would have been chosen otherwise in hindsight."""
+    return [
+        f"{name}: used the {extractor.clocks[name].value}, but over the whole log: {report.why}"
+        for extractor in extractors
+        for name, report in extractor.watch.reports().items()
+        if name in extractor.clocks and extractor.clocks[name] is not report.used
+    ]
+
+
+def skipped_schema() -> pa.Schema:
+    """Columns of ``skipped.parquet``."""
+    import pyarrow as pa
+
+    return pa.schema(
+        [
+            ("t_ns", pa.int64()),
+            ("topic", pa.string()),
+            ("reason", pa.string()),
+            ("detail", pa.string()),
+            ("count", pa.int64()),
+            ("is_loss", pa.bool_()),
+            ("log", pa.string()),
+        ]
+    )
+
+
+def skipped_rows(ledger: Ledger) -> dict[str, object]:
+    """Rows of ``skipped.parquet``: single skips and losses of one log."""
+    details = ledger.details
+    return {
+        "t_ns": [d.t_ns for d in details],
+        "topic": [d.topic for d in details],
+        "reason": [d.reason for d in details],
+        "detail": [d.detail for d in details],
+        "count": [d.count for d in details],
+        "is_loss": [d.is_loss for d in details],
+        "log": [ledger.log] * len(details),
+    }
+
+
+def account_of(ledger: Ledger) -> dict[str, object]:
+    """One log's account as plain values, for manifest and JSON output."""
+    return {
+        "log": ledger.log,
+        "integrity": ledger.integrity,
+        "is_whole": ledger.is_whole,
+        "notices": list(ledger.notices),
+        "topics": {name: _account(a) for name, a in sorted(ledger.accounts.items())},
+    }
+
+
+def _account(account: TopicAccount) -> dict[str, object]:
+    return {
+        "declared": account.declared,
+        "in_file": account.in_file,
+        "found": account.found,
+        "used": account.used,
+        "skipped": dict(sorted(account.skipped.items())),
+        "lost": dict(sorted(account.lost.items())),
+        "lost_unknown": sorted(set(account.lost_unknown)),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of crosscue, Python and the libraries that results depend on."""
+    libraries = ("crosscue", "numpy", "numba", "cantools", "rosbags", "mcap", "pyarrow")
+    return {"python": platform.python_version(), **{name: version(name) for name in libraries}}
+
+
+def log_rows(logs: Sequence[Log]) -> list[dict[str, object]]:
+    """Path, format and hash of every log, for the manifest."""
+    return [
+        {"path": str(log.path), "format": log.format, "sha256": sha256_of(log.path)} for log in logs
+    ]
+
+
+def write_skipped(run: RunFolder, ledgers: Sequence[Ledger], kept: pa.Table | None = None) -> None:
+    """Write ``skipped.parquet``.
+
+    Args:
+        run: The run.
+        ledgers: Of all logs.
+        kept: Rows of an earlier stage that stay.
+    """
+    with TableSink(run, "skipped", skipped_schema()) as sink:
+        if kept is not None:
+            sink.write({name: kept[name] for name in kept.column_names})
+        for ledger in ledgers:
+            sink.write(skipped_rows(ledger))
+
+
+def joined_accounts(
+    ours: Sequence[Mapping[str, Any]], earlier: Sequence[Mapping[str, Any]], topic: str
+) -> list[dict[str, Any]]:
+    """Accounts of one stage with that of ``topic`` taken from an earlier one, which read it."""
+    logs = {account["log"]: account for account in earlier}
+    joined = []
+    for account in ours:
+        one = dict(account)
+        before = logs.get(account["log"])
+        if before is not None and topic in before["topics"]:
+            one["topics"] = {**account["topics"], topic: before["topics"][topic]}
+            one["is_whole"] = account["is_whole"] and before["is_whole"]
+            one["notices"] = list(dict.fromkeys([*before["notices"], *account["notices"]]))
+        joined.append(one)
+    return joined
+
+
+def selection_told(selection: Selection) -> dict[str, object]:
+    """Which part of the logs was asked for, for the manifest."""
+    return {
+        "start_ns": selection.start_ns,
+        "end_ns": selection.end_ns,
+        "topics": None if selection.topics is None else sorted(selection.topics),
+    }

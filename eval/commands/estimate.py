@@ -1,0 +1,43 @@
+"""Estimate again from what detectors found before: pose, cues, ranges and beliefs of a run.
+
+No picture is opened, so other settings can be tried in seconds. The run's tables are replaced.
+
+example:
+  crosscue estimate runs/drive --vehicle other.toml
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from crosscue.eval.estimate_run import estimate_run
+from crosscue.replay.run_folder import open_run
+from crosscue.replay.vehicle import load
+
+from .common import print_json
+from .replay import Progress, as_json, summary
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("run", type=Path, metavar="RUN", help="a run folder")
+    parser.add_argument(
+        "--vehicle", type=Path, metavar="V.toml", help="other settings; the run's, if left out"
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Estimate; 3 when something was lost."""
+    folder = open_run(args.run)
+    vehicle = load(args.vehicle) if args.vehicle else None
+    progress = Progress("estimating", not args.quiet and sys.stderr.isatty())
+    outcome = estimate_run(folder, vehicle, progress.at_time)
+    progress.end()
+    if args.json:
+        print_json(as_json(outcome))
+    elif not args.quiet:
+        print(summary(outcome))
+    return outcome.exit_status

@@ -1,0 +1,68 @@
+"""The second stage once more, over a run whose detections are there already."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from crosscue.replay.errors import RunError
+from crosscue.replay.log import Log, Selection, open_log
+from crosscue.replay.run_folder import RunFolder, locked
+from crosscue.replay.vehicle import Vehicle, of_manifest
+
+from .accounts import log_rows
+from .estimate_stage import Outcome, detected_part, estimate_into
+
+
+def selection_used(manifest: Mapping[str, Any]) -> Selection:
+    """The part of the logs that a run was made of."""
+    said = manifest["selection"]
+    topics = said.get("topics")
+    return Selection(
+        None if topics is None else frozenset(topics), said["start_ns"], said["end_ns"]
+    )
+
+
+def estimate_run(
+    run: RunFolder,
+    vehicle: Vehicle | None = None,
+    on_time: Callable[[int], None] = lambda _: None,
+) -> Outcome:
+    """Estimate again into the same run folder; no picture is opened.
+
+    Args:
+        run: A finished run, or one whose detect stage has finished.
+        vehicle: Other settings; those of the run, if left out.
+        on_time: Told the log time that has been reached.
+
+    Raises:
+        RunError: Its logs are gone or have changed, or it was made with landmarks.
+        VehicleError: The settings do not fit the logs.
+    """
+    manifest = run.manifest()
+    if manifest.get("landmarks"):
+        raise RunError(
+            f"{run.path}: landmarks are looked for in pictures, which estimate does not open; run "
+            "crosscue replay --landmarks again"
+        )
+    with ExitStack() as stack:
+        logs = [stack.enter_context(_reopened(run, said)) for said in manifest["logs"]]
+        stack.enter_context(locked(run))
+        settings = vehicle or of_manifest(manifest["settings"])
+        return estimate_into(
+            logs, settings, run, selection_used(manifest), on_time,
+            earlier=detected_part(manifest),
+        )  # fmt: skip
+
+
+def _reopened(run: RunFolder, said: Mapping[str, Any]) -> Log:
+    path = Path(said["path"])
+    if not path.exists():
+        raise RunError(f"{run.path}: its log {path} is gone; put it back, or replay again")
+    log = open_log(path)
+    if log_rows([log])[0]["sha256"] != said["sha256"]:
+        log.close()
+        raise RunError(f"{run.path}: its log {path} has changed since; replay again")
+    return log

@@ -1,0 +1,301 @@
+"""The second stage: pose from the logs' signals, and the scene from what detectors found before.
+
+No picture is opened here, unless landmarks are to be looked for: a detector's results come from
+the run's own tables.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from crosscue.localization.landmark_database import LandmarkDatabase
+from crosscue.replay.columns import Topic
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.roles import Role, role_of
+from crosscue.replay.run_folder import RunFolder, TableSink, sha256_of, write_manifest
+from crosscue.replay.signals import Extractor, Plan, Signal, camera_of, plan, with_pictures
+from crosscue.replay.vehicle import Vehicle
+from crosscue.replay.windows import windows
+
+from . import measurements
+from .accounts import (
+    account_of,
+    clock_changes,
+    clock_rows,
+    joined_accounts,
+    log_rows,
+    probe_clocks,
+    selection_told,
+    versions,
+    write_skipped,
+)
+from .detect_stage import DetectOutcome
+from .landmark_stage import looking
+from .pose_stage import PoseStage, turn_signal_of
+from .pose_tables import PoseTally, pose_rows, pose_schema
+from .scene_stage import SceneOutcome, estimate_scene, schemas
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+DETECT: Final = "detect"
+"""Stage name and key of the manifest's part on detection."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a replay, or its second stage alone, did.
+
+    Attributes:
+        run: Its folder.
+        ledgers: One account for each log.
+        rows: Pose rows written.
+        travelled_m: Along the estimated track.
+        major_axis_m: At the end; NaN without any pose.
+        notices: Plain sentences for the person who ran it.
+        seconds: Wall time, detection included where it ran.
+        drive_seconds: Log time from first to last pose row.
+        landmark_counts: What became of camera frames; empty where no landmarks were given.
+        detected: What the detect stage did, where it ran just now.
+        scene: Cues, ranges and beliefs, where detectors have run.
+    """
+
+    run: RunFolder
+    ledgers: tuple[Ledger, ...]
+    rows: int
+    travelled_m: float
+    major_axis_m: float
+    notices: tuple[str, ...]
+    seconds: float
+    drive_seconds: float
+    landmark_counts: dict[str, int]
+    detected: DetectOutcome | None = None
+    scene: SceneOutcome | None = None
+
+    @property
+    def exit_status(self) -> int:
+        """3 when anything was lost, else 0."""
+        whole = all(ledger.is_whole for ledger in self.ledgers)
+        return 0 if whole and (self.detected is None or self.detected.ledger.is_whole) else 3
+
+
+def detected_part(manifest: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """What a manifest says of the detect stage; None where none ran."""
+    if manifest.get("stage") == DETECT:
+        return manifest
+    found: Mapping[str, Any] | None = manifest.get(DETECT)
+    return found
+
+
+def estimate_into(
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    run: RunFolder,
+    selection: Selection,
+    on_time: Callable[[int], None] = lambda _: None,
+    landmarks: LandmarkDatabase | None = None,
+    detected: DetectOutcome | None = None,
+    earlier: Mapping[str, Any] | None = None,
+) -> Outcome:
+    """Write pose, cues, ranges, beliefs and the manifest into a run folder that is locked.
+
+    Args:
+        logs: All logs of the drive, open.
+        vehicle: What the vehicle file says.
+        run: With the detect stage's tables, or without any.
+        selection: Which part of the logs.
+        on_time: Told the log time that has been reached.
+        landmarks: Camera frames are compared with these, where given.
+        detected: The detect stage, if it ran just now.
+        earlier: The manifest's part on the detect stage, if it ran earlier.
+
+    Raises:
+        VehicleError: The vehicle file does not fit the logs.
+        OutputError: The disk is full.
+    """
+    began = time.monotonic()
+    found = earlier if detected is None else detected_part(run.manifest())
+    kept = None if found is None else _camera_skips(run, found["camera"])
+    reading = _Reading(logs, vehicle, selection, landmarks)
+    stage = PoseStage(vehicle, turn_signal_of(reading.planned, vehicle))
+    if reading.camera is not None and landmarks is not None:
+        at = reading.camera[0]
+        stage.landmarks = looking(landmarks, vehicle, reading.ledgers[at])
+        reading.extractors[at].on_pictures = stage.landmarks.see
+    tally = _pose(reading, stage, run, on_time)
+    scene = None if found is None else _scene(run, vehicle, found)
+    write_skipped(run, reading.ledgers, kept)
+    before = 0.0 if detected is None else detected.seconds
+    seconds = time.monotonic() - began
+    notices = (
+        *_missing(reading.planned),
+        *_no_camera(landmarks, reading.camera),
+        *_no_scene(found, reading),
+        *([] if found is None else found["notices"]),
+        *stage.notices,
+        *stage.doubts(),
+        *clock_changes(reading.extractors),
+    )
+    accounts: list[dict[str, Any]] = [account_of(ledger) for ledger in reading.ledgers]
+    if found is not None:
+        accounts = joined_accounts(accounts, found["accounts"], found["camera"])
+    write_manifest(run, {
+        "stage": "estimate",
+        "versions": versions(),
+        "logs": log_rows(logs),
+        "selection": selection_told(selection),
+        "settings": vehicle.model_dump(mode="json"),
+        "sources": _sources(reading.planned, logs),
+        "clocks": [clock_rows(extractor) for extractor in reading.extractors],
+        "accounts": accounts,
+        "counts": stage.counts(),
+        "landmarks": None if landmarks is None else {
+            "database": str(landmarks.path), "landmarks": len(landmarks),
+            "sha256": sha256_of(landmarks.path),
+        },
+        "notices": list(notices),
+        "pose": {"rows": tally.rows, "travelled_m": tally.travelled_m,
+                 "major_axis_m": tally.major_axis_m},
+        "scene": None if scene is None else _scene_told(scene),
+        DETECT: None if found is None else {
+            key: value for key, value in found.items() if key != "format_version"
+        },
+        "timings": {"seconds": seconds + before, "detect_seconds": before},
+    })  # fmt: skip
+    return Outcome(
+        run, reading.ledgers, tally.rows, tally.travelled_m, tally.major_axis_m, notices,
+        seconds + before, tally.seconds, stage.landmarks.counts(), detected, scene,
+    )  # fmt: skip
+
+
+class _Reading:
+    """A drive's logs, planned and with their clocks chosen."""
+
+    def __init__(
+        self, logs: Sequence[Log], vehicle: Vehicle, selection: Selection,
+        landmarks: LandmarkDatabase | None,
+    ) -> None:  # fmt: skip
+        topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
+        self.logs = logs
+        self.has_camera = any(role_of(topic) is Role.CAMERA for _, topic in topics)
+        self.planned = plan(topics, vehicle)
+        self.camera = None if landmarks is None else camera_of(topics, vehicle)
+        if self.camera is not None:
+            self.planned = with_pictures(self.planned, self.camera)
+        self.ledgers = tuple(Ledger(str(log.path)) for log in logs)
+        self.selections = [
+            _narrowed(selection, self.planned.topics_of(i)) for i in range(len(logs))
+        ]
+        clocks = [
+            probe_clocks(log, Extractor(self.planned, vehicle, i, Ledger("")), self.selections[i])
+            for i, log in enumerate(logs)
+        ]
+        self.extractors = [
+            Extractor(self.planned, vehicle, i, ledger, clocks[i])
+            for i, ledger in enumerate(self.ledgers)
+        ]
+
+
+def _pose(
+    reading: _Reading, stage: PoseStage, run: RunFolder, on_time: Callable[[int], None]
+) -> PoseTally:
+    tally = PoseTally()
+    with (
+        TableSink(run, "pose", pose_schema()) as sink,
+        TableSink(run, measurements.TABLE, measurements.schema()) as measured,
+    ):
+        for window in windows(
+            reading.logs, reading.extractors, reading.selections, reading.planned
+        ):
+            for poses in stage(window):
+                sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
+                tally.add(poses)
+            _write_all(measured, stage.take_measured())
+            on_time(window.end_ns)
+        for poses in stage.finish():
+            sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
+            tally.add(poses)
+        _write_all(measured, stage.take_measured())
+    return tally
+
+
+def _write_all(sink: TableSink, parts: Sequence[Mapping[str, object]]) -> None:
+    for columns in parts:
+        if columns["kind"]:
+            sink.write(columns)
+
+
+def _scene(run: RunFolder, vehicle: Vehicle, found: Mapping[str, Any]) -> SceneOutcome:
+    with ExitStack() as stack:
+        sinks = {
+            name: stack.enter_context(TableSink(run, name, schema))
+            for name, schema in schemas().items()
+        }
+        return estimate_scene(run, vehicle, found, lambda name, rows: sinks[name].write(rows))
+
+
+def _scene_told(scene: SceneOutcome) -> dict[str, object]:
+    return {
+        "frames": scene.frames,
+        "positive": dict(scene.positive),
+        "counts": dict(scene.counts),
+        "without_odometry": scene.without_odometry,
+        "approaches": [asdict(one) for one in scene.approaches],
+    }
+
+
+def _camera_skips(run: RunFolder, camera: str) -> pa.Table:
+    """What the detect stage told of the camera; the other topics are read again."""
+    import pyarrow.compute as pc
+
+    table = run.table("skipped")
+    return table.filter(pc.equal(table["topic"], camera))
+
+
+def _sources(planned: Plan, logs: Sequence[Log]) -> dict[str, str | None]:
+    """From a signal to the log and topic that gave it."""
+    found = {signal: planned.source_of(signal) for signal in Signal}
+    return {
+        signal.name.lower(): None
+        if source is None
+        else f"{logs[source.log].path}: {source.topic.name}"
+        for signal, source in found.items()
+    }
+
+
+def _missing(planned: Plan) -> list[str]:
+    """What the run had to do without, in plain words."""
+    names = {
+        Signal.WHEEL_SPEEDS: "no wheel speeds, so no pose",
+        Signal.MAGNETIC_FIELD: "no compass, so the heading drifts",
+    }
+    has_heading = planned.source_of(Signal.HEADING) is not None
+    return [
+        f"{what}: {planned.missing[signal]}"
+        for signal, what in names.items()
+        if signal in planned.missing and not (signal is Signal.MAGNETIC_FIELD and has_heading)
+    ]
+
+
+def _no_camera(landmarks: LandmarkDatabase | None, camera: tuple[int, Topic] | None) -> list[str]:
+    if landmarks is None or camera is not None:
+        return []
+    return ["landmarks were given, but the logs have no camera: none is looked for"]
+
+
+def _narrowed(selection: Selection, planned: frozenset[str]) -> Selection:
+    topics = planned if selection.topics is None else planned & selection.topics
+    return Selection(topics, selection.start_ns, selection.end_ns)
+
+
+def _no_scene(found: Mapping[str, Any] | None, reading: _Reading) -> list[str]:
+    if found is not None:
+        return []
+    if not reading.has_camera:
+        return ["no camera in the logs, so no cue and no belief"]
+    return ["no detector has looked at the camera, so no cue and no belief; name some"]

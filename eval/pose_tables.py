@@ -1,0 +1,70 @@
+"""Columns of ``pose.parquet``, and what a run sums up of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from crosscue.localization.pose_track import PoseColumns
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+COVARIANCES: Final = ("xx_m2", "xy_m2", "xh_mrad", "yy_m2", "yh_mrad", "hh_rad2")
+
+
+@dataclass(slots=True)
+class PoseTally:
+    """Grows with every batch of poses."""
+
+    rows: int = 0
+    travelled_m: float = 0.0
+    major_axis_m: float = float("nan")
+    first_ns: int | None = None
+    last_ns: int = 0
+
+    @property
+    def seconds(self) -> float:
+        """From the first row to the last."""
+        return 0.0 if self.first_ns is None else (self.last_ns - self.first_ns) * 1e-9
+
+    def add(self, poses: PoseColumns) -> None:
+        """Take in a batch, not empty."""
+        self.rows += len(poses)
+        self.travelled_m = float(poses.travelled_m[-1])
+        self.major_axis_m = float(poses.major_axis_m[-1])
+        self.last_ns = int(poses.t_ns[-1])
+        if self.first_ns is None:
+            self.first_ns = int(poses.t_ns[0])
+
+
+def pose_schema() -> pa.Schema:
+    """Columns of ``pose.parquet``."""
+    import pyarrow as pa
+
+    numbers = [
+        "x_m", "y_m", "heading_rad", "speed_mps",
+        *(f"cov_{name}" for name in COVARIANCES), "major_axis_m", "travelled_m",
+    ]  # fmt: skip
+    return pa.schema(
+        [
+            ("t_ns", pa.int64()),
+            *((name, pa.float64()) for name in numbers),
+            ("landmark", pa.string()),
+        ]
+    )
+
+
+def pose_rows(poses: PoseColumns, landmarks: Sequence[str | None]) -> dict[str, object]:
+    """Rows of ``pose.parquet``, with the landmark weighed in at each."""
+    rows: dict[str, object] = {
+        "t_ns": poses.t_ns,
+        "x_m": poses.x_m,
+        "y_m": poses.y_m,
+        "heading_rad": poses.heading_rad,
+        "speed_mps": poses.speed_mps,
+    }
+    rows |= {f"cov_{name}": poses.cov_xyh[:, i] for i, name in enumerate(COVARIANCES)}
+    rows |= {"major_axis_m": poses.major_axis_m, "travelled_m": poses.travelled_m}
+    return rows | {"landmark": list(landmarks)}
