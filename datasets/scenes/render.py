@@ -12,6 +12,7 @@ from .camera import Camera, View, view_at
 from .ground import TEXELS_PER_M, X_M, Y_M
 from .kernels import compiled
 from .mesh import Floats, Mesh
+from .road_truth import road_seen
 from .textures import smooth_noise
 from .world import Thing, World
 
@@ -70,6 +71,7 @@ class Picture:
         view: The camera.
         owner: Shape (H, W), int16: number of the thing, -1 for none.
         seen: Every labelled object with at least one pixel.
+        road: Shape (H, W), bool: road, by the rule of ``road_truth``; None where not asked for.
     """
 
     t_s: float
@@ -77,6 +79,7 @@ class Picture:
     view: View
     owner: NDArray[np.int16]
     seen: tuple[Seen, ...]
+    road: NDArray[np.bool_] | None = None
 
 
 class Renderer:
@@ -112,7 +115,7 @@ class Renderer:
         )
         self._noise = np.clip(rng.normal(0.0, 32.0, (512, 512)), -127, 127).astype(np.int8)
 
-    def picture(self, t_s: float, number: int = 0) -> Picture:
+    def picture(self, t_s: float, number: int = 0, *, with_road: bool = False) -> Picture:
         """The camera's picture at a time; ``number`` seeds its noise."""
         view = view_at(self.camera, self.world.approach, t_s)
         self._depth.fill(0.0)
@@ -125,7 +128,11 @@ class Renderer:
         self._draw(*self._scenery, np.zeros(3), view)
         rgb, owner = self._composed(view, t_s)
         self._finish(rgb, view, number)
-        return Picture(t_s, rgb, view, owner, self._seen(owner, view, t_s))
+        road = None
+        if with_road:
+            on_map = self.world.ground.road.view(np.uint8)
+            road = road_seen(on_map, self._depth, self.settings.samples, view)
+        return Picture(t_s, rgb, view, owner, self._seen(owner, view, t_s), road)
 
     def _lens(self, scale: float) -> tuple[float, float, float]:
         cx, cy = self.camera.centre_px
