@@ -1,0 +1,191 @@
+"""A small made-up drive to score, checked by hand: one approach, ten frames a second."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from crosscue.datasets.truth import Approach, CueTruth, Features, Truth, save
+from crosscue.eval.score_tables import RunTables, run_tables
+from crosscue.eval.score_truth import DriveTruth, TrueRanges
+from crosscue.replay.run_folder import RunFolder, create, write_manifest, write_text
+
+STEP_NS: Final = 100_000_000
+ENTER: Final = 40
+"""Frame at which the car enters; it starts 40 m away and drives 10 m/s: 1 m a frame."""
+
+
+def at(frame: int) -> int:
+    """Time of a frame."""
+    return 1_000_000_000 + frame * STEP_NS
+
+
+def approach(**changes: Any) -> Approach:
+    """A T junction with a stop sign: left and right, not straight."""
+    content: dict[str, Any] = {
+        "id": 0, "intersection": "A", "start_ns": at(0), "enter_ns": at(ENTER),
+        "control": "stop_sign", "features": Features(left=True, right=True, straight=False),
+        "conditions": ("rain",), "length_m": 10.0,
+    }  # fmt: skip
+    return Approach.model_validate(content | changes)
+
+
+def span(cue: str, first: int, end: int, present: bool = True, **more: Any) -> CueTruth:
+    """Truth of a cue from one frame to before another."""
+    content = {"cue": cue, "present": present, "start_ns": at(first), "end_ns": at(end)}
+    return CueTruth.model_validate(content | more)
+
+
+def truth(
+    cues: Sequence[CueTruth] = (),
+    approaches: Sequence[Approach] | None = None,
+    drive: str = "made up",
+    end: int = 60,
+) -> DriveTruth:
+    """The made-up drive's truth; ranges go on beyond none of its approaches."""
+    approaches = [approach()] if approaches is None else approaches
+    told = Truth(version=1, start_ns=at(0), end_ns=at(end), cues=tuple(cues),
+                 approaches=tuple(approaches), source="made up")  # fmt: skip
+    return DriveTruth(drive, told, true_ranges(approaches))
+
+
+def true_ranges(approaches: Sequence[Approach]) -> TrueRanges:
+    """One metre a frame until entering."""
+    rows = [
+        (t, one.id, (one.enter_ns - t) / STEP_NS)
+        for one in approaches
+        for t in range(one.start_ns, one.enter_ns, STEP_NS)
+    ]
+    start = np.array([row[2] for row in rows], np.float64)
+    return TrueRanges(
+        np.array([row[0] for row in rows], np.int64), np.array([row[1] for row in rows], np.int64),
+        start, start + 10.0,
+    )  # fmt: skip
+
+
+def cue_table(found: Mapping[str, Mapping[int, int]]) -> pa.Table:
+    """From cue to frame to count."""
+    rows = [(at(frame), cue, count) for cue, frames in found.items()
+            for frame, count in frames.items()]  # fmt: skip
+    return pa.table({
+        "t_ns": pa.array([row[0] for row in rows], pa.int64()),
+        "approach": pa.nulls(len(rows), pa.int64()),
+        "cue": pa.array([row[1] for row in rows], pa.string()),
+        "count": pa.array([row[2] for row in rows], pa.int64()),
+    })  # fmt: skip
+
+
+def frame_table(frames: int) -> pa.Table:
+    return pa.table({"t_ns": pa.array([at(frame) for frame in range(frames)], pa.int64())})
+
+
+def belief_table(
+    features: Mapping[str, Mapping[int, float]], number: int = 7, frames: Sequence[int] = range(50)
+) -> pa.Table:
+    """Each feature holds 0.5 until the first frame named, then that frame's value, and so on."""
+    columns: dict[str, Any] = {
+        "t_ns": pa.array([at(frame) for frame in frames], pa.int64()),
+        "approach": pa.array([number] * len(frames), pa.int64()),
+    }
+    for name, changes in features.items():
+        values, now = [], 0.5
+        for frame in frames:
+            now = changes.get(frame, now)
+            values.append(now)
+        columns[name] = pa.array(values, pa.float64())
+    columns["established"] = pa.array([True] * len(frames), pa.bool_())
+    return pa.table(columns)
+
+
+def range_table(
+    first: int, last: int, error_m: float = 0.0, var_m2: float = 1.0, number: int = 7,
+    reference: str = "start",
+) -> pa.Table:  # fmt: skip
+    """Ranges that are wrong by ``error_m``, frame by frame."""
+    frames = range(first, last)
+    offset = 0.0 if reference == "start" else 10.0
+    return pa.table({
+        "t_ns": pa.array([at(frame) for frame in frames], pa.int64()),
+        "approach": pa.array([number] * len(frames), pa.int64()),
+        "reference": pa.array([reference] * len(frames), pa.string()),
+        "range_m": pa.array([ENTER - frame + offset + error_m for frame in frames], pa.float64()),
+        "var_m2": pa.array([var_m2] * len(frames), pa.float64()),
+        "measured_m": pa.nulls(len(frames), pa.float64()),
+    })  # fmt: skip
+
+
+def tables(
+    cues: Mapping[str, Mapping[int, int]] | None = None,
+    belief: pa.Table | None = None,
+    ranges: pa.Table | None = None,
+    frames: int | None = None,
+) -> RunTables:
+    return run_tables(
+        "made up",
+        frames_table=None if frames is None else frame_table(frames),
+        cues_table=None if cues is None else cue_table(cues),
+        belief_table=belief,
+        range_table=ranges,
+    )
+
+
+BELIEF: Final[Mapping[str, Mapping[int, float]]] = {
+    "intersection": {10: 0.95}, "left": {20: 0.97}, "right": {25: 0.92}, "straight": {30: 0.2},
+}  # fmt: skip
+CUES: Final[Mapping[str, Mapping[int, int]]] = {
+    "stop_sign": {frame: int(frame >= 10) for frame in range(40)},
+    "road_left": {frame: int(frame == 35) for frame in range(50)},
+}
+
+
+def good_tables() -> RunTables:
+    """What a fine run has."""
+    return tables(CUES, belief_table(BELIEF), range_table(8, 45, 0.5), frames=50)
+
+
+def good_truth(drive: str = "made up") -> DriveTruth:
+    """Its truth: the sign can be seen from frame 5 on, road to the left always."""
+    return truth(
+        [span("stop_sign", 0, 5, present=False), span("stop_sign", 5, 40, count=1, visible=1.0),
+         span("road_left", 0, 40)],
+        drive=drive,
+    )  # fmt: skip
+
+
+def run_folder(
+    path: Path, found: Mapping[str, pa.Table] | None = None, **manifest: Any
+) -> RunFolder:
+    """A finished run folder with tables of the made-up drive."""
+    run = create(path, overwrite=False)
+    if found is None:
+        found = {"frames": frame_table(50), "cues": cue_table(CUES), "belief": belief_table(BELIEF),
+                 "range": range_table(8, 45, 0.5)}  # fmt: skip
+    for name, table in found.items():
+        pq.write_table(table, run.file(f"{name}.parquet"), write_page_checksum=True)
+    content: dict[str, Any] = {
+        "stage": "replay", "versions": {"crosscue": "0"}, "settings": {}, "notices": [],
+        "logs": [{"path": str(path.parent / "drive.mcap"), "format": "mcap",
+                  "sha256": {"drive.mcap": "00"}}],
+        "accounts": [], "clocks": [], "counts": {}, "timings": {"seconds": 1.0},
+    }  # fmt: skip
+    write_manifest(run, content | manifest)
+    return run
+
+
+def truth_folder(path: Path, drive_truth: DriveTruth | None = None) -> Path:
+    """The made-up truth as files; the path of ``truth.json`` comes back."""
+    path.mkdir(parents=True, exist_ok=True)
+    one = good_truth() if drive_truth is None else drive_truth
+    told = one.truth
+    if one.ranges is not None:
+        rows = zip(one.ranges.t_ns, one.ranges.approach, one.ranges.start_m, one.ranges.end_m,
+                   strict=True)  # fmt: skip
+        lines = ["t_ns,approach,start_m,end_m", *(f"{t},{a},{s},{e}" for t, a, s, e in rows), ""]
+        write_text(path / "ranges.csv", "\n".join(lines))
+        told = told.model_copy(update={"ranges": "ranges.csv"})
+    return save(told, path)
