@@ -158,13 +158,19 @@ FORMATS: Final[dict[str, Format]] = {
 def open_log(path: Path | str, limits: Limits = DEFAULT) -> Log:
     """Open any recording by its suffix or, for a folder, by what lies in it.
 
+    A text with ``://`` is a URL: it is fetched first, see ``remote``.
+
     Raises:
         UnknownFormatError: No format fits; the message lists those there are.
         LogError: It cannot be opened: missing, no permission, not a file or folder, or not one
             readable record in it.
     """
+    if isinstance(path, str) and "://" in path:
+        from .remote import open_remote
+
+        return open_remote(path, lambda fetched: open_log(fetched, limits))
     path = Path(path)
-    name = _format_of(path)
+    name = format_of(path)
     module, _, function = FORMATS[name].opener.partition(":")
     opener = cast("Callable[[Path, Limits], Log]", getattr(import_module(module), function))
     try:
@@ -177,7 +183,13 @@ def open_log(path: Path | str, limits: Limits = DEFAULT) -> Log:
         raise LogError(f"{path}: {error.strerror or error}; check the path and the disk") from None
 
 
-def _format_of(path: Path) -> str:
+def format_of(path: Path) -> str:
+    """Which of ``FORMATS`` a file or folder is.
+
+    Raises:
+        UnknownFormatError: No format fits; the message lists those there are.
+        LogError: It is not there, or is no file or folder.
+    """
     try:
         is_folder, is_file = path.is_dir(), path.is_file()
         if not is_folder and not is_file:

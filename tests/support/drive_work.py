@@ -1,0 +1,84 @@
+"""Work on made-up drives, importable by workers: a log's word says what shall happen."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+
+from crosscue.eval.many_drives import Job
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.run_folder import TableSink, clear, create, locked, write_manifest
+
+SCHEMA = pa.schema([("t_ns", pa.int64()), ("letter", pa.string())])
+
+
+@dataclass(frozen=True, slots=True)
+class Letters:
+    """What the work on a made-up drive gave."""
+
+    rows: int
+    exit_status: int
+    pid: int
+    threads: str
+
+
+def made_jobs(folder: Path, says: Sequence[str], runs: str = "runs") -> list[Job]:
+    """One drive for each word."""
+    folder.mkdir(parents=True, exist_ok=True)
+    jobs = []
+    for i, word in enumerate(says):
+        log = folder / f"drive{i}.txt"
+        if not log.exists():
+            log.write_text(word)
+        jobs.append(Job(f"drive{i}", (str(log),), folder / runs / f"drive{i}", "settings 1"))
+    return jobs
+
+
+def letters(job: Job) -> Letters:
+    """Write the log's letters as rows, or fail as its first word asks."""
+    log = Path(job.logs[0])
+    word = log.read_text()
+    run = create(job.run, overwrite=True)
+    with locked(run):
+        clear(run)
+        with TableSink(run, "letters", SCHEMA) as sink:
+            sink.write({"t_ns": range(len(word)), "letter": list(word)})
+            _obey(word, log)
+        write_manifest(run, {
+            "accounts": [{"log": str(log), "is_whole": word != "loss", "topics": {
+                "letters": {"found": len(word), "in_file": len(word), "used": len(word) - 1,
+                            "declared": None, "skipped": {"dull": 1}, "lost": {},
+                            "lost_unknown": []},
+            }}],
+            "timings": {"seconds": time.monotonic()},
+        })  # fmt: skip
+    status = 3 if word == "loss" else 0
+    return Letters(len(word), status, os.getpid(), os.environ.get("OMP_NUM_THREADS", ""))
+
+
+def _obey(word: str, log: Path) -> None:
+    match word:
+        case "damaged":
+            raise LogFormatError(f"{log}: cut; copy it again")
+        case "bug":
+            raise ZeroDivisionError("a\nbug")
+        case "memory":
+            raise MemoryError
+        case "dies":
+            os.kill(os.getpid(), signal.SIGKILL)
+        case "dies once" if not log.with_suffix(".died").exists():
+            log.with_suffix(".died").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        case "leaves":
+            os._exit(7)
+        case "slow":
+            log.with_suffix(".begun").write_text(str(os.getpid()))
+            time.sleep(60.0)
+        case _:
+            return

@@ -1,0 +1,25 @@
+"""Folders as plain values, to hold two against each other."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+
+def tree(folder: Path) -> dict[str, str]:
+    """From relative name to a hash of the bytes; of a manifest without its timings."""
+    return {
+        path.relative_to(folder).as_posix(): _hash(path)
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and ".drives" not in path.relative_to(folder).parts
+    }
+
+
+def _hash(path: Path) -> str:
+    content = path.read_bytes()
+    if path.name == "manifest.json":
+        manifest = json.loads(content)
+        manifest.pop("timings", None)
+        content = json.dumps(manifest, sort_keys=True).encode()
+    return hashlib.sha256(content).hexdigest()
