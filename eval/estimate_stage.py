@@ -36,6 +36,7 @@ from .accounts import (
 )
 from .detect_stage import DetectOutcome
 from .landmark_stage import looking
+from .mobileye_tables import MobileyeSink, StoredMobileye
 from .pose_stage import PoseStage, turn_signal_of
 from .pose_tables import PoseTally, pose_rows, pose_schema
 from .scene_stage import SceneOutcome, estimate_scene, schemas
@@ -135,6 +136,7 @@ def estimate_into(
     notices = (
         *_missing(reading.planned),
         *_no_camera(landmarks, reading.camera),
+        *_no_mobileye(found, reading.planned),
         *_no_scene(found, reading),
         *([] if found is None else found["notices"]),
         *stage.notices,
@@ -208,6 +210,7 @@ def _pose(
     with (
         TableSink(run, "pose", pose_schema()) as sink,
         TableSink(run, measurements.TABLE, measurements.schema()) as measured,
+        MobileyeSink(run) as mobileye,
     ):
         for window in windows(
             reading.logs, reading.extractors, reading.selections, reading.planned
@@ -216,6 +219,7 @@ def _pose(
                 sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
                 tally.add(poses)
             _write_all(measured, stage.take_measured())
+            mobileye.write(window.samples)
             on_time(window.end_ns)
         for poses in stage.finish():
             sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
@@ -236,7 +240,8 @@ def _scene(run: RunFolder, vehicle: Vehicle, found: Mapping[str, Any]) -> SceneO
             name: stack.enter_context(TableSink(run, name, schema))
             for name, schema in schemas().items()
         }
-        return estimate_scene(run, vehicle, found, lambda name, rows: sinks[name].write(rows))
+        past = StoredMobileye(run, vehicle.past).cues
+        return estimate_scene(run, vehicle, found, lambda name, rows: sinks[name].write(rows), past)
 
 
 def _scene_told(scene: SceneOutcome) -> dict[str, object]:
@@ -291,6 +296,13 @@ def _no_camera(landmarks: LandmarkDatabase | None, camera: tuple[int, Topic] | N
 def _narrowed(selection: Selection, planned: frozenset[str]) -> Selection:
     topics = planned if selection.topics is None else planned & selection.topics
     return Selection(topics, selection.start_ns, selection.end_ns)
+
+
+def _no_mobileye(found: Mapping[str, Any] | None, planned: Plan) -> list[str]:
+    reason = planned.missing.get(Signal.MOBILEYE_OBSTACLES)
+    if found is None or reason is None:
+        return []
+    return [f"no Mobileye, so no lane lines or vehicles past the intersection: {reason}"]
 
 
 def _no_scene(found: Mapping[str, Any] | None, reading: _Reading) -> list[str]:
