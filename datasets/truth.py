@@ -109,6 +109,8 @@ class Truth(Section):
     version: Literal[1]
     log: str = ""
     """Name of the log it belongs to, for people."""
+    log_sha256: dict[str, str] = {}
+    """By file name: a run of a log with none of these hashes is refused. Empty: not checked."""
     start_ns: int
     end_ns: int
     """Log times between which the truth speaks; half open."""

@@ -111,7 +111,7 @@ def truth_track(path: Path, run: RunFolder) -> TruthTrack:
 
 
 def score(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.0)) -> PoseScore:
-    """Score a run and write metrics, tracks and figures into its ``score`` folder.
+    """Score a run's pose alone; metrics, tracks and figures go into its ``score`` folder.
 
     Args:
         run: A finished run.
@@ -122,6 +122,15 @@ def score(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.
         RunError: The run's tables are missing or damaged.
         SchemaError: The truth does not fit the run.
     """
+    truth, _ = load_truth(truth_path)
+    result = measure(run, truth_path, rpe_m)
+    content = {"truth": truth.model_dump(mode="json"), "pose": asdict(result)}
+    write_text(run.file("score") / "metrics.json", strict_json(content) + "\n")
+    return result
+
+
+def measure(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.0)) -> PoseScore:
+    """As ``score``, with tracks and figures written but no metrics."""
     truth, track = load_truth(truth_path)
     table = run.table("pose")
     vehicle = of_manifest(run.manifest()["settings"])
@@ -141,11 +150,8 @@ def score(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.
         lost_at_m=_lost_at(table, vehicle.lost_above_m),
     )
     folder = run.file("score")
-    folder.mkdir(exist_ok=True)
     write_tum(folder / "estimate.tum", paired.estimate, "crosscue estimate, planar")
     write_tum(folder / "truth.tum", paired.truth, "truth, planar")
-    content = {"truth": truth.model_dump(mode="json"), "pose": asdict(result)}
-    write_text(folder / "metrics.json", strict_json(content) + "\n")
     if inside.any():
         title = f"{run.path.name} against {truth.source or truth_path.name}"
         draw_all(_scored(paired, values, table), folder, title, vehicle.lost_above_m)

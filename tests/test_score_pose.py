@@ -197,7 +197,8 @@ def test_the_score_command_prints_json_and_refuses_a_foreign_folder(
 
     assert cli.run(["score", str(run.path), "--truth", str(path), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found[str(run.path)]["coverage"]["truth_poses"] == 680
+    assert found["metrics"]["pose"]["coverage"]["truth_poses"] == 680
+    assert found["runs"] == {str(run.path): found["metrics"]}
     assert cli.run(["score", str(tmp_path), "--truth", str(path)]) == 1
     assert "not a run folder" in capsys.readouterr().err
 
