@@ -90,6 +90,23 @@ def fit_range(height_px: Floats, range_m: Floats, family: Family, bin_m: float =
     return RangeFit(curve, len(range_m), _bins(range_m, residual, bin_m))
 
 
+def residuals(
+    height_px: Floats, range_m: Floats, curve: RangeCurve, bin_m: float = 10.0
+) -> RangeFit:
+    """A curve on pairs it was not fitted to; its ``residual_sd_m`` becomes theirs.
+
+    Args:
+        height_px: Shape (N,).
+        range_m: Shape (N,), true ranges.
+        curve: Fitted elsewhere.
+        bin_m: Width of the bins of distance.
+    """
+    error = range_of(height_px, curve) - range_m
+    sd = max(float(np.sqrt(np.mean(error**2))), 1e-6)
+    theirs = curve.model_copy(update={"residual_sd_m": sd})
+    return RangeFit(theirs, len(range_m), _bins(range_m, error, bin_m))
+
+
 def _bins(range_m: Floats, residual: Floats, bin_m: float) -> tuple[Bin, ...]:
     number = np.floor(range_m / bin_m).astype(int)
     bins = []
