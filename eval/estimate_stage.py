@@ -39,7 +39,7 @@ from .landmark_stage import looking
 from .mobileye_tables import MobileyeSink, StoredMobileye
 from .pose_stage import PoseStage, turn_signal_of
 from .pose_tables import PoseTally, pose_rows, pose_schema
-from .scene_stage import SceneOutcome, estimate_scene, schemas
+from .scene_stage import SceneOutcome, estimate_scene, features_of, schemas
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -238,7 +238,7 @@ def _scene(run: RunFolder, vehicle: Vehicle, found: Mapping[str, Any]) -> SceneO
     with ExitStack() as stack:
         sinks = {
             name: stack.enter_context(TableSink(run, name, schema))
-            for name, schema in schemas().items()
+            for name, schema in schemas(features_of(vehicle)).items()
         }
         past = StoredMobileye(run, vehicle.past).cues
         return estimate_scene(run, vehicle, found, lambda name, rows: sinks[name].write(rows), past)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 ROWS_HELD: Final = 8192
 FEATURES: Final = ("intersection", "left", "right", "straight")
-"""Columns of ``belief.parquet`` that are always there; a user's own features follow."""
+"""Columns of ``belief.parquet``, unless the vehicle file's graph has others."""
 
 Sink = Callable[[str, dict[str, list[Any]]], None]
 """Takes a batch of a table: its name and columns."""
@@ -111,7 +111,7 @@ def estimate_scene(
         vehicle,
         Approaches(graph, vehicle.fusion, vehicle.range_filter),
         odometer_of(run),
-        _Rows(sink, tuple(feature.name for feature in graph.features)),
+        _Rows(sink, features_of(vehicle)),
     )
     fresh_regions = detected["settings"]["regions"] != vehicle.model_dump(mode="json")["regions"]
     for frame in stored_frames(run, detected["detectors"], with_road_masks=fresh_regions):
@@ -187,7 +187,7 @@ class _Scene:
         )
         one.end_ns = step.t_ns
         one.probabilities = step.probabilities
-        is_sure = step.probabilities[FEATURES[0]] > self.vehicle.fusion.established
+        is_sure = step.probabilities.get(FEATURES[0], 0.0) > self.vehicle.fusion.established
         if is_sure and step.ranges and one.detected_ns is None:
             one.detected_ns = step.t_ns
             one.detected_m = step.ranges[0].range_m
@@ -242,6 +242,11 @@ class _Rows:
 
 CUE_COLUMNS: Final = ("t_ns", "approach", "cue", "count")
 RANGE_COLUMNS: Final = ("t_ns", "approach", "reference", "range_m", "var_m2", "measured_m")
+
+
+def features_of(vehicle: Vehicle) -> tuple[str, ...]:
+    """Names of the features that are believed in, a user's own among them."""
+    return tuple(feature.name for feature in graph_of(vehicle.fusion).features)
 
 
 def schemas(features: Sequence[str] = FEATURES) -> dict[str, pa.Schema]:

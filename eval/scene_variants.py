@@ -1,0 +1,63 @@
+"""A run's scene once more with other settings or without a cue, in memory: what was it worth?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from crosscue.replay.errors import RunError
+from crosscue.replay.run_folder import RunFolder
+from crosscue.replay.vehicle import Vehicle, of_manifest
+
+from .estimate_stage import detected_part
+from .mobileye_tables import StoredMobileye
+from .scene_stage import estimate_scene, features_of, schemas
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
+    "stop_sign": ("stop_sign",),
+    "traffic_light": ("traffic_light",),
+    "road": ("road_left", "road_straight", "road_right"),
+    "cross_traffic": ("cross_traffic_left", "cross_traffic_right"),
+    "parked": ("parked_left", "parked_right"),
+    "lanes_past": ("lanes_past",),
+    "vehicles_past": ("vehicles_past",),
+    "one_way": ("one_way_left", "one_way_right"),
+    "do_not_enter": ("do_not_enter",),
+}
+"""The nine cues of Table 5 and the columns that each has; left out together."""
+
+
+def scene_tables(
+    run: RunFolder, vehicle: Vehicle | None = None, without: frozenset[str] = frozenset()
+) -> dict[str, pa.Table]:
+    """Tables ``cues``, ``range`` and ``belief`` as the run would have them.
+
+    Args:
+        run: With a finished detect stage and a pose.
+        vehicle: Other settings; the run's, if left out.
+        without: Cues to leave out as if nothing had looked for them.
+
+    Raises:
+        RunError: No detector has looked at the run's camera.
+    """
+    import pyarrow as pa
+
+    manifest = run.manifest()
+    detected = detected_part(manifest)
+    if detected is None:
+        raise RunError(f"{run.path}: no detector has looked at its camera; replay with detectors")
+    settings = of_manifest(manifest["settings"]) if vehicle is None else vehicle
+    wanted = schemas(features_of(settings))
+    parts: dict[str, list[pa.Table]] = {
+        name: [schema.empty_table()] for name, schema in wanted.items()
+    }
+
+    def keep(name: str, rows: dict[str, list[Any]]) -> None:
+        parts[name].append(pa.table(rows, schema=wanted[name]))
+
+    past = StoredMobileye(run, settings.past).cues
+    estimate_scene(run, settings, detected, keep, past, without)
+    return {name: pa.concat_tables(some) for name, some in parts.items()}
