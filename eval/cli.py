@@ -27,11 +27,13 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "detect": ("detect", "run detectors over the camera: detections, road, cues"),
     "estimate": ("estimate", "estimate a run again, from what detectors found before"),
     "replay": ("replay", "the main job: from a log to a run folder"),
-    "score": ("score", "a run against truth: metrics, figures, report"),
+    "score": ("score", "runs against truth: metrics, figures, report, gates"),
+    "compare": ("compare", "what changed between two runs, with tolerances"),
     "view": ("view", "a run in Rerun"),
     "fit compass": ("fit_compass", "compass mounting, hard and soft iron from a drive"),
     "fit signs": ("fit_signs", "the sign threshold for a wanted precision"),
     "fit ranges": ("fit_ranges", "from heights in pixels to ranges, with residuals"),
+    "fit messages": ("fit_messages", "how far each cue is to be believed, from annotated drives"),
     "fit landmarks": ("fit_landmarks", "the match threshold for a wanted false-match rate"),
     "landmarks add": ("landmarks_add", "pictures and where they were taken into a database"),
     "landmarks list": ("landmarks_list", "what a landmark database holds"),
@@ -39,6 +41,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "truth": ("truth", "write the truth that a data set carries"),
     "simulate": ("simulate", "drives up to intersections, with camera, CAN, Mobileye and truth"),
     "train road": ("train_road", "the road network, on simulated or own pictures"),
+    "study intersections": (
+        "study_intersections",
+        "the published experiment on simulated drives, table beside table",
+    ),
     "demo": ("demo", "make a small drive, replay it, score it, show it"),
 }
 

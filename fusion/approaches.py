@@ -21,7 +21,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 from crosscue.replay.fusion_settings import Fusion, RangeFilter
 
@@ -116,6 +116,13 @@ def no_past_cues(best: RangeBelief | None, reference: Reference | None) -> Mappi
     return {}
 
 
+class _Moved(NamedTuple):
+    """Since the evidence before: way gone, forwards or back, and time."""
+
+    way_m: float
+    time_s: float
+
+
 @dataclass(slots=True)
 class _Open:
     """The approach at hand."""
@@ -150,12 +157,12 @@ class Approaches:
 
     def __call__(self, evidence: FrameEvidence, past: PastCues = no_past_cues) -> Step:
         """Take the next evidence; one that is not later than the last changes nothing."""
-        moved_m = self._moved(evidence)
-        if moved_m is None:
+        moved = self._moved(evidence)
+        if moved is None:
             return Step(evidence.t_ns, None, {})
         if self._open is not None:
-            self._go_on(self._open, evidence, moved_m)
-        self._rest_m = max(0.0, self._rest_m - moved_m)
+            self._go_on(self._open, evidence, moved.way_m)
+        self._rest_m = max(0.0, self._rest_m - moved.way_m)
         signs = self._sane(evidence.signs)
         speaks = any(evidence.counts.get(cue, 0) > 0 for cue in self._first)
         if self._open is None and (signs or (speaks and self._rest_m <= 0.0)):
@@ -164,27 +171,27 @@ class Approaches:
             return Step(evidence.t_ns, None, evidence.counts)
         if signs or speaks:
             self._open.since_evidence_m = 0.0
-        return self._step(self._open, evidence, signs, past, moved_m)
+        return self._step(self._open, evidence, signs, past, moved)
 
     def finish(self) -> None:
         """Say that the drive is over; an approach still open is counted as such."""
         if self._open is not None:
             self._close("the drive ended")
 
-    def _moved(self, evidence: FrameEvidence) -> float | None:
-        """Way gone without sign, reckoned where unknown; None for evidence that is refused."""
+    def _moved(self, evidence: FrameEvidence) -> _Moved | None:
+        """Way without sign, reckoned where unknown, and time; None for evidence refused."""
         last_ns = self._last_ns
         if last_ns is not None and evidence.t_ns <= last_ns:
             why = "repeated" if evidence.t_ns == last_ns else "out of order"
             self.counts[f"evidence refused: {why}"] += 1
             return None
         self._last_ns = evidence.t_ns
-        if _has_way(evidence):
-            return abs(evidence.travelled_m or 0.0)
-        if last_ns is None:
-            return 0.0
-        self.counts["odometry missing"] += 1
-        return self._filter.unseen_mps * (evidence.t_ns - last_ns) * 1e-9
+        passed_s = 0.0 if last_ns is None else (evidence.t_ns - last_ns) * 1e-9
+        if evidence.travelled_m is not None and _has_way(evidence):
+            return _Moved(abs(evidence.travelled_m), passed_s)
+        if last_ns is not None:
+            self.counts["odometry missing"] += 1
+        return _Moved(self._filter.unseen_mps * passed_s, passed_s)
 
     def _go_on(self, at_hand: _Open, evidence: FrameEvidence, moved_m: float) -> None:
         """Carry the approach over the way since the evidence before, and close it if it is over."""
@@ -259,7 +266,7 @@ class Approaches:
         evidence: FrameEvidence,
         signs: Mapping[Reference, tuple[float, float]],
         past: PastCues,
-        moved_m: float,
+        moved: _Moved,
     ) -> Step:
         ranges = self._measured(at_hand, signs)
         best, reference = _best(at_hand, Reference(self._fusion.reference))
@@ -271,8 +278,8 @@ class Approaches:
             at_hand.since_dissent_m = 0.0
         messages = at_hand.speaker(
             Situation(
-                counts, at_hand.belief.is_established, may_dissent, evidence.objects,
-                evidence.is_new_picture, moved_m,
+                counts, at_hand.belief.is_established, is_near, may_dissent, evidence.objects,
+                evidence.is_new_picture, moved.way_m, moved.time_s,
             )
         )  # fmt: skip
         was_established = at_hand.belief.is_established

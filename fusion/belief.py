@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from .factor_graph import FactorGraph, log_odds, probability
@@ -59,18 +59,22 @@ class Situation:
     Attributes:
         counts: From cue to how many; 0 is looked for and not found, absent is not looked for.
         is_established: Presence was established by earlier frames.
-        may_dissent: Near the intersection, and moved since dissent was last sent.
+        is_near: The intersection is known to be near, or passed.
+        may_dissent: It is, and the car has moved since dissent was last sent.
         objects: From cue to identities of the counted things, where a tracker gives them.
         is_new_picture: Not the same picture as before.
-        moved_m: Way gone since the frame before, forwards or back; None where unknown.
+        moved_m: Way gone since the frame before, forwards or back.
+        passed_s: Time since then.
     """
 
     counts: Mapping[str, int]
     is_established: bool
-    may_dissent: bool
-    objects: Mapping[str, tuple[int, ...]]
+    is_near: bool = False
+    may_dissent: bool = False
+    objects: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     is_new_picture: bool = True
-    moved_m: float | None = 0.0
+    moved_m: float = 0.0
+    passed_s: float = 0.0
 
 
 Speaker = Callable[[Situation], Sequence[float]]

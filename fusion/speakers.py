@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from crosscue.replay.errors import VehicleError
 from crosscue.replay.fusion_settings import Fusion
 
 from .belief import Speaker, source_speaker
+from .calibrated import CalibratedSpeaker, voices_of
 from .factor_graph import FactorGraph
 
 
@@ -15,12 +15,12 @@ def speakers_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], Speaker]:
     """What gives each approach its speaker.
 
     Raises:
-        VehicleError: ``calibrated`` without what was learned.
+        ValueError: ``calibrated`` without what was learned; no vehicle file can say that.
     """
-    if fusion.kind == "calibrated":
-        raise VehicleError(
-            'fusion.kind = "calibrated" needs [fusion.calibrated]; make it with: '
-            "crosscue fit messages"
-        )
-    speaker = source_speaker(graph, fusion.dissent)
-    return lambda: speaker
+    if fusion.kind == "source":
+        speaker = source_speaker(graph, fusion.dissent)
+        return lambda: speaker
+    if fusion.calibrated is None:
+        raise ValueError("fusion.calibrated: want what crosscue fit messages wrote, got None")
+    voices, size = voices_of(graph, fusion.calibrated), len(graph.features)
+    return lambda: CalibratedSpeaker(size, voices)

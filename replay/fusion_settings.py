@@ -104,6 +104,40 @@ CUES: Final[Mapping[str, CueEntry]] = {
 """Table 5 and our reading of Fig. 27; signs by the precision to which they are tuned."""
 
 
+class Fade(Section):
+    """Over what a cue's looks become independent: a way, or a time for what moves by itself."""
+
+    way_m: Positive | None = None
+    time_s: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.way_m is None) == (self.time_s is None):
+            raise _refused("want either way_m or time_s")
+        return self
+
+
+class Rates(Section):
+    """How often a cue is positive where a feature is there, and where it is not."""
+
+    cue: Name
+    feature: Name
+    near: bool
+    """Within ``dissent_within_m`` of the intersection, or not known to be."""
+    if_there: Probability
+    if_not: Probability
+
+
+class Calibrated(Section):
+    """What ``crosscue fit messages`` has learned; see ``crosscue.fusion.calibrated``."""
+
+    fades: dict[Name, Fade] = Field(default_factory=dict)
+    """By cue."""
+    exponents: dict[Name, NotNegative] = Field(default_factory=dict)
+    """By feature: all messages' log odds times this, since cues repeat one another."""
+    rates: tuple[Rates, ...] = ()
+
+
 class Fusion(Section):
     """Belief over the features of an intersection (eq. 18)."""
 
@@ -136,6 +170,8 @@ class Fusion(Section):
     cues: Annotated[dict[Name, CueEntry], Field(validate_default=True)] = Field(
         default_factory=dict
     )
+
+    calibrated: Calibrated | None = None
 
     @field_validator("features", mode="before")
     @classmethod
@@ -182,6 +218,37 @@ class Fusion(Section):
                         f"there are: {', '.join(features)}"
                     )
         return cues
+
+    @field_validator("calibrated")
+    @classmethod
+    def _known_edges(cls, learned: Calibrated | None, info: ValidationInfo) -> Calibrated | None:
+        if learned is None or "cues" not in info.data:
+            return learned
+        cues, features = info.data["cues"], info.data["features"]
+        for known, names in ((cues, learned.fades), (features, learned.exponents)):
+            for name in names:
+                if name not in known:
+                    raise _refused(
+                        f"no {name!r}{_near(name, known)}; there are: {', '.join(known)}"
+                    )
+        seen: set[tuple[str, str, bool]] = set()
+        for one in learned.rates:
+            edges = cues[one.cue].supports + cues[one.cue].excludes if one.cue in cues else ()
+            if one.feature not in edges:
+                raise _refused(f"rates: {one.cue} and {one.feature} are not joined; add the edge")
+            key = (one.cue, one.feature, one.near)
+            if key in seen:
+                raise _refused(f"rates: {one.cue} and {one.feature} stand twice; keep one")
+            seen.add(key)
+        return learned
+
+    @model_validator(mode="after")
+    def _has_learned(self) -> Self:
+        if self.kind == "calibrated" and self.calibrated is None:
+            raise _refused(
+                "kind calibrated needs [fusion.calibrated]; make it with: crosscue fit messages"
+            )
+        return self
 
     @model_validator(mode="after")
     def _can_begin(self) -> Self:

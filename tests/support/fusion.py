@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 
+import numpy as np
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from crosscue.detectors.cue_names import Cue
 from crosscue.fusion.approaches import FrameEvidence, SignRange
 from crosscue.fusion.belief import Situation
 from crosscue.fusion.factor_graph import CueNode, Edge, FactorGraph, Feature
 from crosscue.fusion.intersection_range import Reference
+from crosscue.fusion.message_fit import AnnotatedApproach
+from crosscue.replay.columns import Floats
 
 SECOND_NS = 1_000_000_000
 NONE_SEEN: Mapping[str, int] = {cue.value: 0 for cue in Cue if cue not in (Cue.LANES, Cue.VEHICLES)}
@@ -54,10 +59,11 @@ def situation(
     near: bool = False,
     objects: Mapping[str, tuple[int, ...]] | None = None,
     new_picture: bool = True,
-    moved_m: float | None = 1.0,
+    moved_m: float = 1.0,
+    passed_s: float = 0.1,
 ) -> Situation:
     """One frame, by default of an established approach that is far away."""
-    return Situation(counts, established, near, objects or {}, new_picture, moved_m)
+    return Situation(counts, established, near, near, objects or {}, new_picture, moved_m, passed_s)
 
 
 def sign(range_m: float, sd_m: float = 1.7) -> SignRange:
@@ -96,3 +102,40 @@ def drive(
             counts[cue] = many if 0.5 < ahead_m <= within_m else 0
         signs = (sign(ahead_m),) if counts[Cue.STOP_SIGN] else ()
         yield FrameEvidence(begin_ns + i * SECOND_NS // 10, step_m, 1e-4, signs, counts)
+
+
+def chain(rng: np.random.Generator, way_m: Floats, rate: float, fade_m: float) -> NDArray[np.int64]:
+    """Looks of a cue along a way: positive at a rate, alike over a fading length."""
+    out = [int(rng.random() < rate)]
+    for step_m in np.diff(way_m).tolist():
+        rho = math.exp(-step_m / fade_m)
+        again = rate + (1.0 - rate) * rho if out[-1] else rate * (1.0 - rho)
+        out.append(int(rng.random() < again))
+    return np.array(out, np.int64)
+
+
+RATES: Mapping[str, tuple[float, float]] = {
+    "road_left": (0.6, 0.15),
+    "parked_left": (0.3, 0.05),
+    "road_straight": (0.7, 0.2),
+}
+FADE_M = 4.0
+
+
+def annotated(seed: int, many: int, frames: int = 60) -> list[AnnotatedApproach]:
+    """Simulated approaches whose cues follow ``RATES`` and resemble themselves over ``FADE_M``."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for _ in range(many):
+        way_m = np.arange(frames, dtype=np.float64)
+        has_left, has_straight = bool(rng.random() < 0.6), bool(rng.random() < 0.6)
+        is_there = {"road_left": has_left, "parked_left": has_left, "road_straight": has_straight}
+        counts = {
+            cue: chain(rng, way_m, RATES[cue][0 if there else 1], FADE_M)
+            for cue, there in is_there.items()
+        }
+        features = {"intersection": True, "left": has_left, "straight": has_straight}
+        always = np.ones(frames, np.bool_)
+        near = np.arange(frames) >= frames - 20
+        out.append(AnnotatedApproach(way_m, way_m * 0.1, near, always, counts, features))
+    return out

@@ -1,0 +1,144 @@
+"""Learn how far each cue is to be believed, from annotated drives, for fusion.kind = "calibrated".
+
+Give finished runs and the truth of each, in the same order. What is learned goes into the vehicle
+file's section [fusion.calibrated]; each line carries its counts. Frames of one approach resemble
+each other, so looks are counted by what they are worth as independent ones, and intervals with
+them.
+
+example:
+  crosscue fit messages runs/* --truth drives/*/truth.json -o calibrated.toml
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import Counter
+from pathlib import Path
+
+from crosscue.datasets.truth import load
+from crosscue.eval.message_fit_job import (
+    Annotated,
+    annotate,
+    graph_of_runs,
+    section_of,
+    share_of,
+)
+from crosscue.fusion.message_fit import FadeFit, MessageFit, RateFit, Side, fit_messages
+from crosscue.replay.errors import UsageError
+from crosscue.replay.run_folder import open_run, write_text
+
+from .common import print_json, with_progress
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folders")
+    parser.add_argument(
+        "--truth", nargs="+", required=True, type=Path, metavar="T.json",
+        help="the truth of each run, in the same order",
+    )  # fmt: skip
+    parser.add_argument("-o", "--output", type=Path, metavar="TOML", help="write the section here")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Learn and tell."""
+    if len(args.runs) != len(args.truth):
+        raise UsageError(
+            f"fit messages: {len(args.runs)} runs and {len(args.truth)} truths; give one for each, "
+            "in the same order"
+        )
+    runs = [open_run(path) for path in args.runs]
+    graph, vehicle = graph_of_runs(runs)
+    found = Annotated([], Counter())
+    done = 0
+
+    def share() -> float:
+        return done / len(runs)
+
+    pairs = zip(runs, args.truth, strict=True)
+    for folder, path in with_progress(pairs, share, args, "reading"):
+        annotate(folder, load(path), vehicle, found)
+        done += 1
+    if not found.approaches:
+        raise UsageError("fit messages: no approach of any run lies in an annotated one; give more")
+    fitted = fit_messages(found.approaches, graph)
+    if args.output is not None:
+        write_text(args.output, section_of(fitted))
+    if args.json:
+        print_json(_as_json(fitted, found.used))
+    elif not args.quiet:
+        print(_told(fitted, found.used, len(runs)))
+        print(section_of(fitted) if args.output is None else f"written to {args.output}")
+    return 0
+
+
+def _told(fitted: MessageFit, used: Counter[str], runs: int) -> str:
+    lines = [f"{runs} runs, {fitted.approaches} approaches to learn from"]
+    lines += [f"  {count:5} {what}" for what, count in sorted(used.items())]
+    lines += ["", "rates of positive looks, feature there / not there (95 % intervals)"]
+    lines += [_rate_told(one) for one in fitted.rates]
+    lines += ["", "looks become independent over"]
+    lines += [_fade_told(one) for one in fitted.fades]
+    scales = ", ".join(f"{name} {value:.2f}" for name, value in fitted.calibrated.exponents.items())
+    lines += ["", f"exponents: {scales or 'none: no feature was both there and not there'}", ""]
+    return "\n".join(lines)
+
+
+def _rate_told(one: RateFit) -> str:
+    name = f"{one.cue} -> {one.feature}, {'near' if one.near else 'far'}"
+    if one.rates is None:
+        return f"  {name}\n    not learned: {_too_few(one)}; the published message stands"
+    says = math.log(one.rates.if_there / one.rates.if_not)
+    silence = math.log((1.0 - one.rates.if_there) / (1.0 - one.rates.if_not))
+    return (
+        f"  {name}\n    {_side_told(one.there)} / {_side_told(one.missing)}\n"
+        f"    log odds of a detection {says:+.2f}, of none {silence:+.2f}"
+    )
+
+
+def _too_few(one: RateFit) -> str:
+    there, missing = one.there.approaches, one.missing.approaches
+    return f"{there} approaches with it, {missing} without"
+
+
+def _side_told(side: Side) -> str:
+    value, ends = share_of(side)
+    return f"{value:.2f} ({ends.low:.2f} to {ends.high:.2f}; {side.looks:.0f} of {side.frames})"
+
+
+def _fade_told(one: FadeFit) -> str:
+    fade = one.fade
+    scale = f"{fade.way_m:.1f} m" if fade.way_m is not None else f"{fade.time_s:.2f} s"
+    why = "" if one.is_learned else ", not learned: too few positive"
+    return f"  {one.cue:20} {scale:>8}  {one.positives} positive of {one.looks} frames{why}"
+
+
+def _as_json(fitted: MessageFit, used: Counter[str]) -> dict[str, object]:
+    return {
+        "approaches": fitted.approaches,
+        "used": dict(used),
+        "calibrated": fitted.calibrated.model_dump(mode="json"),
+        "rates": [
+            {
+                "cue": one.cue,
+                "feature": one.feature,
+                "near": one.near,
+                "learned": one.rates is not None,
+                "there": _side_json(one.there),
+                "missing": _side_json(one.missing),
+            }
+            for one in fitted.rates
+        ],
+        "fades": [
+            {"cue": one.cue, "positives": one.positives, "frames": one.looks,
+             "learned": one.is_learned, **one.fade.model_dump()}
+            for one in fitted.fades
+        ],
+    }  # fmt: skip
+
+
+def _side_json(side: Side) -> dict[str, object]:
+    value, ends = share_of(side)
+    return {**side._asdict(), "rate": value, "interval": list(ends)}

@@ -1,0 +1,103 @@
+"""Run folders of made-up drives, as far as the fit of messages reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from crosscue.datasets.truth import Approach, Features, Truth, save
+from crosscue.eval import measurements
+from crosscue.eval.scene_stage import schemas
+from crosscue.fusion.approaches import Approaches, FrameEvidence, Step
+from crosscue.fusion.factor_graph import graph_of
+from crosscue.replay.run_folder import RunFolder, TableSink, create, write_manifest
+from crosscue.replay.vehicle import Vehicle
+
+from .fusion import NONE_SEEN, SECOND_NS, sign
+
+FRAME_NS = SECOND_NS // 10
+
+
+def made_up_drive(rng: np.random.Generator, *, left: bool, signed: bool) -> list[FrameEvidence]:
+    """Sixty metres up to an intersection; the road to the left is mostly seen where there is one.
+
+    Without a sign, a road seen to the right keeps the approach open.
+    """
+    out = []
+    for i in range(60):
+        ahead_m = 60.0 - i
+        counts = {
+            **NONE_SEEN,
+            "stop_sign": int(signed),
+            "road_left": int(rng.random() < (0.6 if left else 0.1)),
+            "road_right": int(not signed),
+        }
+        signs = (sign(ahead_m + float(rng.normal(0.0, 1.0))),) if signed else ()
+        out.append(FrameEvidence(i * FRAME_NS, 1.0, 1e-4, signs, counts))
+    return out
+
+
+def write_run(
+    folder: Path, evidence: Iterable[FrameEvidence], vehicle: Vehicle | None = None
+) -> RunFolder:
+    """A finished run over the evidence."""
+    vehicle = vehicle or Vehicle(version=1)
+    run = create(folder, overwrite=False)
+    loop = Approaches(graph_of(vehicle.fusion), vehicle.fusion, vehicle.range_filter)
+    taken = list(evidence)
+    steps = [loop(one) for one in taken]
+    _write_steps(run, steps)
+    with TableSink(run, measurements.TABLE, measurements.schema()) as sink:
+        empty: dict[str, list[object]] = {
+            field.name: [None] * len(taken) for field in measurements.schema()
+        }
+        sink.write(
+            empty
+            | {
+                "kind": ["odometry"] * len(taken),
+                "start_ns": [one.t_ns - FRAME_NS for one in taken],
+                "t_ns": [one.t_ns for one in taken],
+                "distance_m": [one.travelled_m for one in taken],
+                "turn_rad": [0.0] * len(taken),
+                "distance_var_m2": [one.travelled_var_m2 for one in taken],
+            }
+        )
+    write_manifest(run, {"settings": vehicle.model_dump(mode="json")})
+    return run
+
+
+def _write_steps(run: RunFolder, steps: list[Step]) -> None:
+    cues = [(s.t_ns, s.approach, cue, n) for s in steps for cue, n in s.counts.items()]
+    ranges = [
+        (s.t_ns, s.approach, str(row.reference), row.range_m, row.var_m2, row.measured_m)
+        for s in steps
+        for row in s.ranges
+    ]
+    beliefs = [
+        (s.t_ns, s.approach, *s.probabilities.values(), s.established)
+        for s in steps
+        if s.approach is not None
+    ]
+    for name, rows in (("cues", cues), ("range", ranges), ("belief", beliefs)):
+        schema = schemas()[name]
+        with TableSink(run, name, schema) as sink:
+            if rows:
+                sink.write(dict(zip(schema.names, zip(*rows, strict=True), strict=True)))
+
+
+def write_truth(folder: Path, *, left: bool, enter_ns: int = 59 * FRAME_NS) -> Path:
+    """The truth of one drive: one approach over all of it."""
+    folder.mkdir()
+    one = Approach(
+        id=0, intersection="made up", start_ns=0, enter_ns=enter_ns, control="none",
+        features=Features(left=left, right=True, straight=True),
+    )  # fmt: skip
+    return save(Truth(version=1, start_ns=0, end_ns=10**12, approaches=(one,)), folder)
+
+
+def write_empty_truth(folder: Path, end_ns: int = 10**12) -> Path:
+    """The truth of a drive that meets no intersection."""
+    folder.mkdir()
+    return save(Truth(version=1, start_ns=0, end_ns=end_ns), folder)
