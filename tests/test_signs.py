@@ -1,5 +1,6 @@
 """Signs against our own drawings: found, told apart, nothing seen twice; thresholds by labels."""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -158,6 +159,48 @@ def test_fit_signs_chooses_on_some_frames_and_measures_on_others(
     told = capsys.readouterr().out
     assert "least_score = " in told
     assert "precision 1.00 (4 of 4; 95 % interval 0.51 to 1.00)" in told
+
+
+def coco(folder: Path, seeds: range) -> Path:
+    """Left and right one-way signs in turn, as a COCO file with its folder of pictures."""
+    kinds: tuple[Kind, Kind] = ("one way left", "one way right")
+    (folder / "images").mkdir(parents=True)
+    images, annotations = [], []
+    for seed in seeds:
+        grey, (x0, y0, x1, y1) = scene(kinds[seed % 2], seed)
+        ok, encoded = cv2.imencode(".png", grey)
+        assert ok
+        (folder / "images" / f"{seed}.png").write_bytes(encoded.tobytes())
+        images.append({"id": seed, "file_name": f"{seed}.png"})
+        annotations.append({"id": seed, "image_id": seed, "category_id": seed % 2,
+                            "bbox": [x0, y0, x1 - x0, y1 - y0]})  # fmt: skip
+    names = [{"id": i, "name": name} for i, name in enumerate(kinds)]
+    tree = {"images": images, "annotations": annotations, "categories": names}
+    (folder / "coco.json").write_text(json.dumps(tree))
+    return folder / "coco.json"
+
+
+def test_several_labels_share_a_threshold_and_coco_files_serve_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fitted, other = coco(tmp_path / "a", range(4)), coco(tmp_path / "b", range(4, 8))
+    both = ["--label", "one way left", "one way right"]
+
+    assert run(["fit", "signs", str(fitted), "--test", str(other), *both, "--json"]) == 0
+
+    told = json.loads(capsys.readouterr().out)
+    assert (told["chosen_on"]["signs"], told["other_frames"]["signs"]) == (4, 4)
+    assert told["other_frames"]["precision"] == 1.0
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"images": [], "annotations": [], "categories": []}'])
+def test_a_file_that_is_no_coco_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
+) -> None:
+    (tmp_path / "coco.json").write_text(text)
+
+    assert run(["fit", "signs", str(tmp_path / "coco.json"), "--label", "stop"]) == 2
+    assert "coco.json: no " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

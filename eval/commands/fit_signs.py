@@ -1,11 +1,12 @@
 """Choose the sign detector's threshold for a wanted precision, and tell how good it is elsewhere.
 
 LABELS is a CSV file: picture,label,x0,y0,x1,y1 with one row for each sign (or an empty label for a
-picture without any). Every second picture chooses the threshold, the others measure it, unless
---test names another file.
+picture without any), or a COCO file as crosscue train frames writes it. Every second picture
+chooses the threshold, the others measure it, unless --test names another file.
 
-example:
+examples:
   crosscue fit signs labels.csv --label "do not enter" --kinds "no entry" --precision 0.95
+  crosscue fit signs fit/coco.json --test other/coco.json --label "one way left" "one way right"
 """
 
 from __future__ import annotations
@@ -26,9 +27,10 @@ LOWEST = 0.05
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("labels", type=Path, metavar="LABELS", help="CSV file of boxes")
+    parser.add_argument("labels", type=Path, metavar="LABELS", help="CSV or COCO file of boxes")
     parser.add_argument("--test", type=Path, metavar="LABELS", help="other frames to measure on")
-    parser.add_argument("--label", required=True, help="the label to choose a threshold for")
+    parser.add_argument("--label", required=True, nargs="+",
+                        help="the labels to choose one threshold for")  # fmt: skip
     parser.add_argument(
         "--kinds", nargs="+", default=list(AMERICAN), choices=KINDS, help="drawings to look for"
     )
@@ -55,7 +57,9 @@ def run(args: argparse.Namespace) -> int:
     )  # fmt: skip
     fitted = judged_pictures(chosen_on, detector, args.label, args.overlap)
     if not fitted.signs:
-        raise UsageError(f"{args.labels}: no {args.label!r} in the pictures that choose; add some")
+        raise UsageError(
+            f"{args.labels}: no {' or '.join(args.label)} in the pictures that choose; add some"
+        )
     tested = judged_pictures(rest, detector, args.label, args.overlap)
     score = threshold_for(fitted, args.precision)
     if args.json:
