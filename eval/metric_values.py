@@ -24,21 +24,27 @@ class MetricValue:
     of: int | None = None
 
 
-def metric_values(tree: Mapping[str, object]) -> dict[str, MetricValue]:
+def metric_values(tree: Mapping[str, object], *, parts: bool = True) -> dict[str, MetricValue]:
     """All numbers of a tree by path; texts, flags and lists are passed over.
 
-    A branch with a ``value`` is one metric with an interval; its parts have paths, too.
+    Args:
+        tree: As in ``metrics.json``. A branch with a ``value`` is one metric with an interval.
+        parts: Give the parts of such branches paths of their own, too.
     """
-    return dict(_walk(tree, ""))
+    return dict(_walk(tree, "", parts))
 
 
-def _walk(tree: Mapping[str, object], prefix: str) -> Iterator[tuple[str, MetricValue]]:
+def _walk(
+    tree: Mapping[str, object], prefix: str, parts: bool
+) -> Iterator[tuple[str, MetricValue]]:
     for name, branch in tree.items():
         path = f"{prefix}{name}"
         if isinstance(branch, Mapping):
-            if "value" in branch:
+            is_whole = "value" in branch
+            if is_whole:
                 yield path, _with_interval(branch)
-            yield from _walk(branch, path + ".")
+            if parts or not is_whole:
+                yield from _walk(branch, path + ".", parts)
         elif branch is None or (isinstance(branch, int | float) and not isinstance(branch, bool)):
             yield path, MetricValue(_number(branch))
 

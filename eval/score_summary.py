@@ -153,6 +153,8 @@ def _distance(found: Share, distance: Mean) -> str:
 
 
 def _belief(belief: Mapping[str, BeliefScore]) -> list[str]:
+    if not any(one.scored for one in belief.values()):
+        return [_line("belief", "no step that the truth could judge")]
     lines = ["belief         scored of steps   there   Brier  of base rate  log score"]
     for name, one in belief.items():
         lines.append(
