@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from crosscue.replay.errors import VehicleError
 
 from .model_card import Weights
+from .onnx_input import input_shape
 
 Array = NDArray[np.generic]
 _EXTERNAL: Final = b"\x0a\x08location"
@@ -117,13 +118,22 @@ def _in_opencv(weights: Weights, threads: int) -> Network:
 
     net = cv2.dnn.readNetFromONNX(np.frombuffer(weights.content, np.uint8))
     names = list(net.getUnconnectedOutLayersNames())
+    wanted = input_shape(weights.content)
 
     def call(batch: Array) -> Mapping[str, Array]:
+        if wanted is not None and not _fits(batch.shape, wanted):
+            raise ValueError(f"got {batch.shape}, the network's own input is {wanted}")
         net.setInput(np.asarray(batch))
         outputs = net.forward(names)
         return {name: np.asarray(out) for name, out in zip(names, outputs, strict=True)}
 
     return _Function(f"opencv {cv2.__version__}", call)
+
+
+def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(wanted) and all(
+        want is None or size == want for size, want in zip(shape, wanted, strict=True)
+    )
 
 
 def _in_openvino(weights: Weights, threads: int) -> Network:
