@@ -45,6 +45,8 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "study_intersections",
         "the published experiment on simulated drives, table beside table",
     ),
+    "train frames": ("train_frames", "pictures of simulated intersections to train on, with COCO"),
+    "train mask-rcnn": ("train_mask_rcnn", "a Mask R-CNN on COCO annotations"),
     "demo": ("demo", "make a small drive, replay it, score it, show it"),
 }
 

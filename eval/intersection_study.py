@@ -1,0 +1,208 @@
+"""The published experiment on simulated drives: eight intersections, ten conditions each.
+
+Every drive is simulated, replayed from its pixels, and scored, all from seeds. Drives are done in
+the order of runs (A-01 to H-01, then A-02 ...), so that a study that is cut short has each
+intersection about as often; a second start goes on with what is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from crosscue.datasets.scenes.camera import Camera
+from crosscue.datasets.scenes.drive import SceneSettings, write_scene
+from crosscue.datasets.scenes.layout import SCORED
+from crosscue.datasets.truth import FILE
+from crosscue.replay.errors import RunError, UsageError, VehicleError
+from crosscue.replay.log import EVERYTHING, open_log
+from crosscue.replay.run_folder import RunFolder, create, open_run
+from crosscue.replay.vehicle import Vehicle, load, of_manifest
+
+from .accounts import versions
+from .detect_stage import choices_of
+from .estimate_stage import Outcome
+from .many_drives import Done, Engine, Job, Progress, fingerprint_of, run_many
+from .replay_drive import Detecting, replay_drive
+from .scene_variants import GROUPS, scene_tables
+from .score_belief import BeliefDifference, compare_belief
+from .score_drives import DriveJudged, Scores, judge, score
+from .score_run import RunScored, judge_run
+from .score_tables import run_tables
+
+LOG: Final = "drive.mcap"
+VEHICLE: Final = "vehicle.toml"
+
+
+@dataclass(frozen=True, slots=True)
+class StudySettings:
+    """What to simulate and how to replay it.
+
+    Attributes:
+        layouts: Intersections.
+        runs: Of each, from 1.
+        seed: Of everything that differs from run to run.
+        width_px: Of the pictures, 9/16 high.
+        vehicle: A vehicle file to replay with; each drive's own, if left out.
+    """
+
+    layouts: tuple[str, ...] = tuple(SCORED)
+    runs: int = 10
+    seed: int = 0
+    width_px: int = 1280
+    vehicle: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be.
+
+        Raises:
+            UsageError: Naming what was wanted.
+        """
+        if self.runs < 1 or self.seed < 0:
+            raise UsageError(f"runs {self.runs}, seed {self.seed}: want 1 or more, 0 or more")
+        if not 64 <= self.width_px <= 3840 or self.width_px % 16:
+            raise UsageError(f"width {self.width_px}: want a multiple of 16 from 64 to 3840")
+        unknown = [name for name in self.layouts if name not in SCORED]
+        if unknown or len(set(self.layouts)) != len(self.layouts) or not self.layouts:
+            raise UsageError(f"layouts {', '.join(self.layouts)}: want some of A to H, each once")
+
+    def scenes(self) -> tuple[SceneSettings, ...]:
+        """Every drive, in the order in which they are done."""
+        camera = Camera(width_px=self.width_px, height_px=self.width_px * 9 // 16)
+        return tuple(
+            SceneSettings(layout=layout, run=run, seed=self.seed, camera=camera)
+            for run in range(1, self.runs + 1)
+            for layout in self.layouts
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """What is done for one drive, here or in another process.
+
+    Attributes:
+        drives: Folder of the simulated drives.
+        scenes: By name.
+        vehicle: A vehicle file to replay with, or None.
+        cache: Where detectors' results are kept.
+    """
+
+    drives: Path
+    scenes: Mapping[str, SceneSettings]
+    vehicle: Path | None
+    cache: Path
+
+    def __call__(self, job: Job) -> Outcome:
+        """Simulate the drive unless it is there, then replay it."""
+        folder = self.drives / job.name
+        if not (folder / FILE).exists():
+            write_scene(folder, self.scenes[job.name], overwrite=True)
+        vehicle = load(self.vehicle or folder / VEHICLE)
+        choices = tuple(choices_of(vehicle).values())
+        if not choices:
+            raise VehicleError(f"{self.vehicle}: no [detectors]; the study needs some")
+        # One cache a drive: workers never wait for one another.
+        detecting = Detecting(choices, self.cache / f"{job.name}.sqlite")
+        run = create(job.run, overwrite=True)
+        with open_log(folder / LOG) as log:
+            outcome = replay_drive([log], vehicle, run, EVERYTHING, detecting=detecting)
+        return replace(outcome, ledgers=(), detected=None)
+
+
+def run_drives(
+    out: Path,
+    settings: StudySettings,
+    engine: Engine,
+    on_progress: Callable[[Progress], None] = lambda _: None,
+) -> tuple[Done[Outcome], ...]:
+    """Simulate and replay all drives that are not there yet, below ``out``.
+
+    Raises:
+        VehicleError: The vehicle file cannot be read.
+    """
+    scenes = {scene.name: scene for scene in settings.scenes()}
+    vehicle = None if settings.vehicle is None else load(settings.vehicle).model_dump(mode="json")
+    jobs = [
+        Job(
+            name=name,
+            logs=(),
+            run=out / "runs" / name,
+            fingerprint=fingerprint_of(asdict(scene), vehicle, versions()),
+        )
+        for name, scene in scenes.items()
+    ]
+    work = Work(out / "drives", scenes, settings.vehicle, out / "cache")
+    return run_many(jobs, work, engine, overwrite=True, on_progress=on_progress)
+
+
+@dataclass(frozen=True, slots=True)
+class StudyScores:
+    """The scored study.
+
+    Attributes:
+        scored: Every drive beside its truth.
+        scores: All together.
+        without: All again with each of the nine cues left out.
+        calibrated: All again with learned messages; None where none are given.
+        difference: Calibrated less source, by feature.
+    """
+
+    scored: tuple[RunScored, ...]
+    scores: Scores
+    without: dict[str, Scores]
+    calibrated: Scores | None
+    difference: dict[str, BeliefDifference]
+
+
+def score_study(out: Path, names: Sequence[str], *, attribution: bool = True) -> StudyScores:
+    """Score the drives of a study that are done.
+
+    Raises:
+        RunError: None is done, or one is damaged.
+    """
+    scored = tuple(
+        judge_run(open_run(out / "runs" / name), out / "drives" / name / FILE) for name in names
+    )
+    if not scored:
+        raise RunError(f"{out}: not one drive is done, so there is nothing to score")
+    without = {}
+    if attribution:
+        without = {
+            group: score([_variant(one, None, frozenset(cues)) for one in scored])
+            for group, cues in GROUPS.items()
+        }
+    first = [one.judged for one in scored]
+    learned = [_calibrated(one.run) for one in scored]
+    if any(vehicle is None for vehicle in learned):
+        return StudyScores(scored, score(first), without, None, {})
+    second = [
+        _variant(one, vehicle, frozenset()) for one, vehicle in zip(scored, learned, strict=True)
+    ]
+    return StudyScores(
+        scored,
+        score(first),
+        without,
+        score(second),
+        compare_belief(
+            [part for one in first for part in one.belief],
+            [part for one in second for part in one.belief],
+        ),
+    )
+
+
+def _calibrated(run: RunFolder) -> Vehicle | None:
+    """The run's settings with the other fusion, where messages have been learned."""
+    vehicle = of_manifest(run.manifest()["settings"])
+    if vehicle.fusion.calibrated is None:
+        return None
+    fusion = vehicle.fusion.model_copy(update={"kind": "calibrated"})
+    return vehicle.model_copy(update={"fusion": fusion})
+
+
+def _variant(one: RunScored, vehicle: Vehicle | None, without: frozenset[str]) -> DriveJudged:
+    tables: dict[str, Any] = scene_tables(one.run, vehicle, without)
+    columns = {f"{name}_table": table for name, table in tables.items()}
+    frames = one.run.table("frames", ["t_ns"])
+    return judge(run_tables(str(one.run.path), frames_table=frames, **columns), one.truth)
