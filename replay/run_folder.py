@@ -8,6 +8,7 @@ checksums, verified when read.
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import json
 import math
@@ -30,6 +31,8 @@ MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
 FORMAT_VERSION: Final = 1
 PARTIAL: Final = ".partial"
+WITHOUT_LOCKS: Final = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL})
+"""What file systems answer that cannot lock; the lock file's text must do there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,14 +133,25 @@ def create(path: Path, *, overwrite: bool) -> RunFolder:
 
 
 def clear(run: RunFolder) -> None:
-    """Delete an earlier run's files; the lock stays. Call it while holding the lock."""
-    for entry in run.path.iterdir():
-        if entry.name == LOCK:
-            continue
-        if entry.is_dir() and not entry.is_symlink():
-            shutil.rmtree(entry)
-        else:
-            entry.unlink()
+    """Delete an earlier run's files; the lock stays. Call it while holding the lock.
+
+    The manifest goes first: a folder that has one is a whole run, even if this is cut short.
+
+    Raises:
+        OutputError: One cannot be deleted.
+    """
+    try:
+        run.file(MANIFEST).unlink(missing_ok=True)
+        for entry in run.path.iterdir():
+            if entry.name == LOCK:
+                continue
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+            else:
+                entry.unlink()
+    except OSError as error:
+        place = Path(error.filename) if error.filename else run.path
+        raise cannot_write(place, error) from None
 
 
 def open_run(path: Path) -> RunFolder:
@@ -152,7 +166,7 @@ def open_run(path: Path) -> RunFolder:
 
 
 def _looks_like_run(entries: list[Path]) -> bool:
-    ours = {MANIFEST, "score", "view"}
+    ours = {MANIFEST, "score", "view", "pictures"}
     return all(
         e.name in ours or e.suffix in (".parquet", ".rrd", ".json", PARTIAL) for e in entries
     )
@@ -162,40 +176,80 @@ def _looks_like_run(entries: list[Path]) -> bool:
 def locked(run: RunFolder) -> Iterator[None]:
     """Hold the folder for this process.
 
+    The kernel keeps the lock and drops it when its holder dies, however that happens; the file's
+    text says who holds it, which is all there is where a network file system has no such locks.
+
     Raises:
         RunError: Another living process holds it; it is named.
+        OutputError: The folder cannot be written.
     """
     path = run.file(LOCK)
-    me = f"{os.getpid()} {socket.gethostname()} {_boot_id()}"
-    for _ in range(2):
-        try:
-            handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-            break
-        except FileExistsError:
-            _refuse_if_alive(path)
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise OutputError(f"{run.path}: {error.strerror}; cannot lock the run folder") from None
-    else:
-        raise RunError(f"{run.path}: another process took the folder; run again")
-    with os.fdopen(handle, "w") as file:
-        file.write(me)
+    try:
+        handle = _lock_file(path)
+    except OSError as error:
+        raise cannot_write(path, error) from None
     try:
         yield
     finally:
+        # Gone from the folder before it is free, so that nobody waits for a file without a name.
         path.unlink(missing_ok=True)
+        os.close(handle)
 
 
-def _refuse_if_alive(path: Path) -> None:
+def _lock_file(path: Path) -> int:
+    """The folder's lock file, open, locked, and with our name in it."""
+    while True:
+        handle = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                is_ours = True
+            except BlockingIOError:
+                is_ours = False
+            except OSError as error:
+                if error.errno not in WITHOUT_LOCKS:
+                    raise
+                is_ours = True
+            _refuse_if_held(path, os.read(handle, 4096), is_ours=is_ours)
+            if is_ours and _is_still(handle, path):
+                me = f"{os.getpid()} {socket.gethostname()} {_boot_id()}"
+                os.ftruncate(handle, 0)
+                os.pwrite(handle, me.encode(), 0)
+                return handle
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)
+
+
+def _is_still(handle: int, path: Path) -> bool:
+    """Is the open file the one that has this name now?"""
     try:
-        pid, host, boot = path.read_text().split(" ", 2)
-    except (OSError, ValueError):
-        return
-    if host != socket.gethostname():
+        return os.path.samestat(os.fstat(handle), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def _refuse_if_held(path: Path, text: bytes, *, is_ours: bool) -> None:
+    """Refuse when the lock's text names a living holder, or the kernel knows of one.
+
+    Args:
+        path: The lock.
+        text: What it says.
+        is_ours: Did the kernel give it to us?
+    """
+    try:
+        pid, host, boot = text.decode().split(" ", 2)
+    except ValueError:
+        # Nobody is named: taken this moment, or its holder died before writing.
+        pid = host = boot = ""
+    if host not in ("", socket.gethostname()):
         raise RunError(f"{path}: held by process {pid} on {host}; delete the file if that is over")
-    alive = boot == _boot_id() and Path(f"/proc/{pid}").exists() and int(pid) != os.getpid()
-    if alive:
-        raise RunError(f"{path.parent}: process {pid} on {host} is writing it; wait or stop that")
+    is_other = pid.isdigit() and int(pid) != os.getpid()
+    alive = is_other and boot == _boot_id() and Path(f"/proc/{pid}").exists()
+    if not is_ours or alive:
+        who = f"process {pid} on {host}" if pid else "another process"
+        raise RunError(f"{path.parent}: {who} is writing it; wait or stop that")
 
 
 def _boot_id() -> str:
@@ -219,11 +273,17 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
         partial.replace(path)
         _sync(path.parent)
     except OSError as error:
-        partial.unlink(missing_ok=True)
+        _drop(partial)
         raise cannot_write(path, error) from None
     except BaseException:
-        partial.unlink(missing_ok=True)
+        _drop(partial)
         raise
+
+
+def _drop(partial: Path) -> None:
+    """Take a half-written file away; the error that led here matters more than one of this."""
+    with suppress(OSError):
+        partial.unlink(missing_ok=True)
 
 
 def cannot_write(path: Path, error: OSError) -> OutputError:
@@ -285,9 +345,13 @@ class TableSink:
             self._file: Final = self._partial.open("wb")
         except OSError as error:
             raise cannot_write(self._path, error) from None
-        self._writer: Final = pq.ParquetWriter(
-            self._file, schema, compression="zstd", write_page_checksum=True
-        )
+        try:
+            self._writer: Final = pq.ParquetWriter(
+                self._file, schema, compression="zstd", write_page_checksum=True
+            )
+        except OSError as error:
+            self._give_up()
+            raise cannot_write(self._path, error) from None
 
     def write(self, columns: Mapping[str, object]) -> None:
         """Append rows given as columns.
@@ -315,8 +379,7 @@ class TableSink:
             # The disk may be full: what matters is that nothing half stays and the cause is kept.
             with suppress(OSError, ValueError):
                 self._writer.close()
-            self._file.close()
-            self._partial.unlink(missing_ok=True)
+            self._give_up()
             return
         try:
             self._writer.close()
@@ -325,10 +388,14 @@ class TableSink:
             self._file.close()
             self._partial.replace(self._path)
         except OSError as error:
-            with suppress(OSError):
-                self._file.close()
-            self._partial.unlink(missing_ok=True)
+            self._give_up()
             raise cannot_write(self._path, error) from None
+
+    def _give_up(self) -> None:
+        """Leave nothing half."""
+        with suppress(OSError):
+            self._file.close()
+        _drop(self._partial)
 
 
 def sha256_of(path: Path) -> dict[str, str]:
