@@ -252,13 +252,12 @@ class Approaches:
                 found.setdefault(sign.reference, []).append(sign)
             else:
                 self.counts["ranges refused: beyond reason"] += 1
-        return {
-            reference: (
-                sum(one.range_m for one in some) / len(some),
-                sum(one.var_m2 for one in some) / len(some),
-            )
-            for reference, some in found.items()
-        }
+        return {reference: self._mean(some) for reference, some in found.items()}
+
+    def _mean(self, signs: Sequence[SignRange]) -> tuple[float, float]:
+        range_m = sum(one.range_m for one in signs) / len(signs)
+        var_m2 = sum(one.var_m2 for one in signs) / len(signs)
+        return range_m, var_m2 + (self._filter.sd_share * range_m) ** 2
 
     def _step(
         self,

@@ -32,6 +32,7 @@ from crosscue.replay.fusion_settings import Calibrated, Fade, Rates
 
 from .belief import Situation
 from .factor_graph import CueNode, FactorGraph, log_odds
+from .independence import independent_share
 
 USUAL_FADE: Final = Fade(way_m=10.0)
 """For a cue of which no fade was learned."""
@@ -151,15 +152,6 @@ class CalibratedSpeaker:
             heard.sent_at = at
         heard.looked_at = at
         heard.was_positive = is_positive
-
-
-def independent_share(fades: float) -> float:
-    """What one more look is worth, ``fades`` fading lengths after the last one.
-
-    Looks that resemble each other by rho are worth (1 - rho) / (1 + rho) independent ones each
-    (first-order autoregression); with rho = exp(-fades) that is tanh(fades / 2).
-    """
-    return math.tanh(0.5 * fades)
 
 
 def _is_fresh(heard: _Heard, count: int, objects: tuple[int, ...] | None) -> bool:

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from crosscue.replay.fusion_settings import RangeFilter
 
+from .independence import independent_share
 from .intersection_range import RangeBelief, initialise, nis, predict, update
 
 
@@ -32,14 +33,18 @@ class RangeTrack(NamedTuple):
         belief: None before the first measurement and after it was dropped.
         rival: What refused measurements say that agree among themselves.
         rival_seen: How many of them in a row.
+        unseen_m: Way gone since the last measurement that was taken.
     """
 
     belief: RangeBelief | None = None
     rival: RangeBelief | None = None
     rival_seen: int = 0
+    unseen_m: float = 0.0
 
 
-NOTHING = RangeTrack()
+NOTHING: Final = RangeTrack()
+LEAST_WORTH: Final = 1e-9
+"""Of a look from where the car stood at the last one: next to nothing, yet no division by zero."""
 
 
 def advance(track: RangeTrack, travelled_m: float, var_m2: float, most_sd_m: float) -> RangeTrack:
@@ -50,7 +55,7 @@ def advance(track: RangeTrack, travelled_m: float, var_m2: float, most_sd_m: flo
     if belief.var_m2 > most_sd_m * most_sd_m:
         return NOTHING
     rival = None if track.rival is None else predict(track.rival, travelled_m, var_m2)
-    return RangeTrack(belief, rival, track.rival_seen)
+    return RangeTrack(belief, rival, track.rival_seen, track.unseen_m + abs(travelled_m))
 
 
 def go_blind(track: RangeTrack, widens_m: float, most_sd_m: float) -> RangeTrack:
@@ -61,7 +66,8 @@ def go_blind(track: RangeTrack, widens_m: float, most_sd_m: float) -> RangeTrack
     if track.belief is None:
         return track
     sd_m = math.sqrt(track.belief.var_m2)
-    return advance(track, 0.0, widens_m * (widens_m + 2.0 * sd_m), most_sd_m)
+    blind = advance(track, 0.0, widens_m * (widens_m + 2.0 * sd_m), most_sd_m)
+    return blind._replace(unseen_m=track.unseen_m + widens_m)
 
 
 def measure(
@@ -77,7 +83,7 @@ def measure(
         track: Before the measurement, advanced to its time.
         measured_m: Distance to the track's reference.
         sensor_var_m2: Of the measurement.
-        settings: Gate, and when a rival takes over.
+        settings: Gate, fade, and when a rival takes over.
         restarts_beyond_m: No rival takes over from a belief nearer than this: signs further away
             are then the next intersection's.
     """
@@ -85,7 +91,8 @@ def measure(
     if belief is None:
         return RangeTrack(initialise(measured_m, sensor_var_m2)), Verdict.BEGAN
     if _inside(belief, measured_m, sensor_var_m2, settings.gate_nis):
-        return RangeTrack(update(belief, measured_m, sensor_var_m2)), Verdict.TAKEN
+        worth = _worth(track.unseen_m, settings.fade_m)
+        return RangeTrack(update(belief, measured_m, sensor_var_m2 / worth)), Verdict.TAKEN
     rival, seen = track.rival, track.rival_seen + 1
     if rival is not None and _inside(rival, measured_m, sensor_var_m2, settings.gate_nis):
         rival = update(rival, measured_m, sensor_var_m2)
@@ -93,10 +100,17 @@ def measure(
         rival, seen = initialise(measured_m, sensor_var_m2), 1
     if seen >= settings.restart_after and belief.mean_m > restarts_beyond_m:
         return RangeTrack(rival), Verdict.RESTARTED
-    return RangeTrack(belief, rival, seen), Verdict.REFUSED
+    return RangeTrack(belief, rival, seen, track.unseen_m), Verdict.REFUSED
 
 
 def _inside(
     belief: RangeBelief, measured_m: float, sensor_var_m2: float, gate: float | None
 ) -> bool:
     return gate is None or nis(belief, measured_m, sensor_var_m2) <= gate
+
+
+def _worth(since_m: float, fade_m: float) -> float:
+    """How many independent looks one is, so soon after another; as in ``calibrated``."""
+    if fade_m == 0.0:
+        return 1.0
+    return max(independent_share(since_m / fade_m), LEAST_WORTH)

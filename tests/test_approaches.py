@@ -263,6 +263,14 @@ def test_several_signs_of_one_kind_count_as_their_mean() -> None:
     assert (row.range_m, row.var_m2, row.measured_m) == (32.0, 4.0, 32.0)
 
 
+def test_a_signs_sd_may_grow_with_its_range() -> None:
+    loop = approaches(range_filter=RangeFilter(sd_share=0.1))
+
+    (step,) = steps([replace(frame(0), signs=(sign(30.0, 4.0),))], loop)
+
+    assert step.ranges[0].var_m2 == pytest.approx(4.0**2 + 3.0**2)
+
+
 @pytest.mark.parametrize("range_m", [0.0, -3.0, 151.0, math.nan, math.inf])
 def test_a_range_beyond_reason_is_refused_and_counted(range_m: float) -> None:
     loop = approaches()

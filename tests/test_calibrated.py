@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from crosscue.fusion.approaches import Approaches
 from crosscue.fusion.belief import Situation, source_speaker
-from crosscue.fusion.calibrated import CalibratedSpeaker, independent_share, voices_of
+from crosscue.fusion.calibrated import CalibratedSpeaker, voices_of
 from crosscue.fusion.factor_graph import graph_of
+from crosscue.fusion.independence import independent_share
 from crosscue.fusion.message_fit import fit_messages, log_odds_of
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.fusion_settings import Calibrated, Fade, Fusion, RangeFilter, Rates

@@ -169,3 +169,38 @@ def test_the_next_intersections_sign_does_not_pull_away_one_that_is_near() -> No
 
 def test_a_range_that_has_become_too_unsure_is_dropped() -> None:
     assert advance(RangeTrack(RangeBelief(50.0, 399.0)), 0.0, 2.0, 20.0) == NOTHING
+
+
+def test_a_look_from_the_same_place_says_nothing_new_where_errors_fade() -> None:
+    fading = RangeFilter(fade_m=2.0)
+    track, _ = measure(NOTHING, 40.0, 2.9, fading, 20.0)
+
+    again, verdict = measure(track, 42.0, 2.9, fading, 20.0)
+    far, _ = measure(advance(track, 30.0, 0.0, 20.0), 12.0, 2.9, fading, 20.0)
+
+    assert verdict is Verdict.TAKEN
+    assert again.belief == pytest.approx(RangeBelief(40.0, 2.9))
+    assert far.belief == pytest.approx(RangeBelief(11.0, 1.45))
+
+
+def test_errors_that_fade_along_the_way_are_as_large_as_the_filter_says() -> None:
+    rng = np.random.default_rng(3)
+    fade_m, sd_m, runs = 3.0, 1.7, 1500
+    rho = math.exp(-1.0 / fade_m)
+    nees: dict[float, list[float]] = {fade_m: [], 0.0: []}
+    for _ in range(runs):
+        tracks = dict.fromkeys(nees, NOTHING)
+        truth_m, error_m = 70.0, float(rng.normal(0.0, sd_m))
+        for _ in range(40):
+            truth_m -= 1.0
+            error_m = rho * error_m + math.sqrt(1.0 - rho**2) * float(rng.normal(0.0, sd_m))
+            for fade in tracks:
+                gone = advance(tracks[fade], 1.0, 0.0, 20.0)
+                filters = RangeFilter(gate_nis=None, fade_m=fade)
+                tracks[fade], _ = measure(gone, truth_m + error_m, sd_m**2, filters, 20.0)
+        for fade, track in tracks.items():
+            assert track.belief is not None
+            nees[fade].append((track.belief.mean_m - truth_m) ** 2 / track.belief.var_m2)
+
+    assert np.mean(nees[fade_m]) == pytest.approx(1.0, abs=0.15)
+    assert np.mean(nees[0.0]) > 3.0
