@@ -1,0 +1,244 @@
+"""COCO annotations, checked at the door: what cannot be used is counted, with the reason.
+
+Masks are compressed run lengths, plain run lengths or polygons. An annotation is left out when its
+class is none of those wanted, its picture is not listed, its box has no area within the picture, or
+its mask is not one of that picture's size; a box that sticks out is cut off at the picture's edge.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.detectors import rle
+from crosscue.replay.columns import Int64s
+from crosscue.replay.errors import SchemaError
+
+MOST_BYTES: Final = 2 << 30
+"""Largest file read."""
+MOST_SIDE_PX: Final = 32768
+
+
+@dataclass(frozen=True, slots=True)
+class Labelled:
+    """One object.
+
+    Attributes:
+        label: Index into the classes.
+        box_px: x0, y0, x1, y1 within the picture.
+        mask: Compressed runs, or polygons as (x, y) pairs one after another.
+        is_crowd: Neither to be found nor wrong when found.
+    """
+
+    label: int
+    box_px: tuple[float, float, float, float]
+    mask: bytes | tuple[tuple[float, ...], ...]
+    is_crowd: bool
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledPicture:
+    """One picture.
+
+    Attributes:
+        path: Its file.
+        size_px: Width and height as annotated.
+        objects: All of the classes wanted.
+    """
+
+    path: Path
+    size_px: tuple[int, int]
+    objects: tuple[Labelled, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledSet:
+    """A set to train or to measure on.
+
+    Attributes:
+        source: The file.
+        classes: In the order of ``Labelled.label``.
+        pictures: In the order of the file.
+        left_out: What was left out or mended, by reason.
+    """
+
+    source: Path
+    classes: tuple[str, ...]
+    pictures: tuple[LabelledPicture, ...]
+    left_out: Mapping[str, int]
+
+
+def read_coco(path: Path, folder: Path, classes: Sequence[str]) -> LabelledSet:
+    """Read a COCO file.
+
+    Args:
+        path: The file.
+        folder: Where its pictures lie.
+        classes: Names wanted, in the order that labels number them.
+
+    Raises:
+        SchemaError: No COCO file, none of its pictures is there, or nothing is of the classes.
+    """
+    tree = _tree(path)
+    left_out: Counter[str] = Counter()
+    names = {row["id"]: row["name"] for row in _rows(tree, "categories", path) if "id" in row}
+    if not set(classes) & set(names.values()):
+        has = ", ".join(sorted(str(name) for name in names.values())[:20])
+        raise SchemaError(f"{path}: no class of {', '.join(classes)}; it has: {has or 'none'}")
+    pictures = _pictures(_rows(tree, "images", path), folder, left_out)
+    if not pictures:
+        raise SchemaError(f"{path}: none of its pictures is in {folder}; give the folder of images")
+    numbers = {name: i for i, name in enumerate(classes)}
+    objects: dict[Any, list[Labelled]] = {key: [] for key in pictures}
+    for row in _rows(tree, "annotations", path):
+        found = _labelled(row, pictures, names, numbers, left_out)
+        if found is not None:
+            objects[row["image_id"]].append(found)
+    if not any(objects.values()):
+        raise SchemaError(f"{path}: no usable annotation of {', '.join(classes)}{_why(left_out)}")
+    whole = tuple(
+        LabelledPicture(picture, size, tuple(objects[key]))
+        for key, (picture, size) in pictures.items()
+    )
+    return LabelledSet(path, tuple(classes), whole, dict(left_out))
+
+
+def _why(left_out: Counter[str]) -> str:
+    told = ", ".join(f"{count} {reason}" for reason, count in left_out.most_common(3))
+    return f"; left out: {told}" if told else ""
+
+
+def _tree(path: Path) -> Mapping[str, Any]:
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise SchemaError(f"{path}: more than {MOST_BYTES:,} bytes of annotations; split it")
+        tree = json.loads(path.read_bytes())
+    except OSError as error:
+        raise SchemaError(f"{path}: {error.strerror}; want a COCO file") from None
+    except (ValueError, RecursionError) as error:
+        raise SchemaError(f"{path}: no JSON ({error}); want a COCO file") from None
+    if not isinstance(tree, dict):
+        raise SchemaError(f"{path}: want a COCO file: images, annotations and categories")
+    return tree
+
+
+def _rows(tree: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
+    rows = tree.get(key)
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise SchemaError(f"{path}: {key}: want a list of objects, as COCO files have")
+    return rows
+
+
+def _pictures(
+    rows: list[dict[str, Any]], folder: Path, left_out: Counter[str]
+) -> dict[Any, tuple[Path, tuple[int, int]]]:
+    found: dict[Any, tuple[Path, tuple[int, int]]] = {}
+    for row in rows:
+        name, width, height = row.get("file_name"), row.get("width"), row.get("height")
+        sides = [side for side in (width, height) if type(side) is int and 0 < side <= MOST_SIDE_PX]
+        if not isinstance(name, str) or len(sides) != 2 or not isinstance(row.get("id"), int | str):
+            left_out["pictures without a name or size"] += 1
+        elif Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
+            left_out["pictures outside the folder"] += 1
+        elif not (folder / name).is_file():
+            left_out["pictures not there"] += 1
+        else:
+            found[row["id"]] = (folder / name, (sides[0], sides[1]))
+    return found
+
+
+def _labelled(
+    row: Mapping[str, Any],
+    pictures: Mapping[Any, tuple[Path, tuple[int, int]]],
+    names: Mapping[Any, Any],
+    numbers: Mapping[str, int],
+    left_out: Counter[str],
+) -> Labelled | None:
+    picture, category = row.get("image_id"), row.get("category_id")
+    if not isinstance(picture, int | str) or picture not in pictures:
+        left_out["annotations of other pictures"] += 1
+        return None
+    if not isinstance(category, int | str) or category not in names:
+        left_out["annotations of unknown classes"] += 1
+        return None
+    if names[category] not in numbers:
+        left_out["annotations of other classes"] += 1
+        return None
+    size = pictures[picture][1]
+    box = _box(row.get("bbox"), size, left_out)
+    if box is None:
+        return None
+    mask = _mask(row.get("segmentation"), size)
+    if mask is None:
+        left_out["annotations without a mask of the picture's size"] += 1
+        return None
+    return Labelled(numbers[names[category]], box, mask, bool(row.get("iscrowd", 0)))
+
+
+def _box(
+    given: object, size: tuple[int, int], left_out: Counter[str]
+) -> tuple[float, float, float, float] | None:
+    if not _is_numbers(given) or len(given) != 4:
+        left_out["annotations without a box"] += 1
+        return None
+    x, y, width, height = given
+    x0, y0 = max(x, 0.0), max(y, 0.0)
+    x1, y1 = min(x + width, float(size[0])), min(y + height, float(size[1]))
+    if x1 - x0 < 1.0 or y1 - y0 < 1.0:
+        left_out["boxes outside the picture, or empty"] += 1
+        return None
+    if (x0, y0, x1, y1) != (x, y, x + width, y + height):
+        left_out["boxes cut off at the picture's edge"] += 1
+    return x0, y0, x1, y1
+
+
+def _is_numbers(given: object) -> TypeGuard[list[float]]:
+    return isinstance(given, list) and all(
+        isinstance(one, int | float) and math.isfinite(one) for one in given
+    )
+
+
+def _mask(given: Any, size: tuple[int, int]) -> bytes | tuple[tuple[float, ...], ...] | None:
+    if isinstance(given, list) and given:
+        is_polygons = all(_is_numbers(one) and len(one) >= 6 and len(one) % 2 == 0 for one in given)
+        return tuple(tuple(float(v) for v in one) for one in given) if is_polygons else None
+    if not isinstance(given, dict) or given.get("size") != [size[1], size[0]]:
+        return None
+    counts = given.get("counts")
+    try:
+        if isinstance(counts, list):
+            return _from_lengths(np.array(counts, np.int64), size)
+        text = str(counts).encode("ascii")
+        rle.column_heights_px(text, size)
+    except (ValueError, TypeError, OverflowError):
+        return None
+    return text
+
+
+def _from_lengths(lengths: Int64s, size: tuple[int, int]) -> bytes:
+    if lengths.min(initial=0) < 0 or int(lengths.sum()) != size[0] * size[1]:
+        raise ValueError("run lengths do not fill the picture")
+    flat = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
+    return rle.encode(flat.reshape(size).T, (0, 0), size)
+
+
+def mask_of(labelled: Labelled, size_px: tuple[int, int]) -> NDArray[np.bool_]:
+    """An object's pixels over the whole picture, shape (height, width)."""
+    import cv2
+
+    if isinstance(labelled.mask, bytes):
+        return rle.decode(labelled.mask, size_px)
+    canvas = np.zeros((size_px[1], size_px[0]), np.uint8)
+    for polygon in labelled.mask:
+        # Corners are at pixel edges in COCO, at pixel middles in OpenCV; 4 bits of fraction.
+        corners = np.clip(np.array(polygon).reshape(-1, 2) - 0.5, -(2.0**20), 2.0**20)
+        cv2.fillPoly(canvas, [np.rint(corners * 16).astype(np.int32)], (1,), shift=4)
+    return canvas.astype(np.bool_)

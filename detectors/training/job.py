@@ -1,0 +1,236 @@
+"""One training from annotations to a checkpoint: validated on the way, going on after a kill."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from crosscue.detectors.base import Detections
+from crosscue.detectors.mask_rcnn import (
+    MaskRcnnSettings,
+    calibrated,
+    checkpoint_named,
+    chosen_device,
+    detector_of,
+)
+from crosscue.detectors.mask_rcnn_checkpoint import (
+    Calibration,
+    Checkpoint,
+    Facts,
+    save_checkpoint,
+)
+from crosscue.detectors.mask_rcnn_coco import COCO_NETWORKS
+from crosscue.detectors.mask_rcnn_network import Plan, build_network
+from crosscue.detectors.sign_threshold import Judged, rates_at
+from crosscue.replay.errors import OutputError
+from crosscue.replay.run_folder import strict_json, write_text
+
+from .annotations import LabelledSet
+from .calibration import fitted, judged
+from .loop import Schedule, Training
+from .samples import Sampler, Window
+from .scores import average_precisions, detections_on
+
+COMPACT: Final = "compact"
+LEAST_SCORE: Final = 0.02
+"""Detections below it are left out of the average precision."""
+AIMS: Final = (0.5, 0.9, 0.95)
+"""Scores at which precision and recall are told; the last two are the cues' own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What to train and where it goes.
+
+    Attributes:
+        start: ``compact``, ``resnet50``, ``resnet50-v2`` (with COCO weights), or a checkpoint.
+        plan: Of the network.
+        schedule: How long and how fast.
+        window: Of samples.
+        output: The checkpoint; its curve and state lie beside it.
+        check_every: Steps between validations.
+        check_pictures: At most so many pictures in those; the last one takes all.
+        device: As the detector's setting.
+        threads: On a CPU.
+        recipe: Words for the checkpoint.
+    """
+
+    start: str
+    plan: Plan
+    schedule: Schedule
+    window: Window
+    output: Path
+    check_every: int
+    check_pictures: int
+    device: str = "auto"
+    threads: int = 1
+    recipe: dict[str, str | int | float] = field(default_factory=dict)
+
+    @property
+    def state_path(self) -> Path:
+        """What a killed training goes on from."""
+        return self.output.with_suffix(".state.safetensors")
+
+    @property
+    def curve_path(self) -> Path:
+        """Losses and average precisions on the way."""
+        return self.output.with_suffix(".curve.json")
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One place of the curve.
+
+    Attributes:
+        step: After so many.
+        loss: Mean since the last point.
+        seconds: Of training so far, validations left out.
+        ap: By name; empty where nothing was validated.
+    """
+
+    step: int
+    loss: float
+    seconds: float
+    ap: dict[str, float | None] = field(default_factory=dict)
+
+
+def run_job(
+    job: Job, train: LabelledSet, held_out: LabelledSet, *, resume: bool, overwrite: bool,
+    tell: Callable[[Point], None],
+) -> Facts:  # fmt: skip
+    """Train, validate, calibrate, write; gives what the checkpoint says of itself.
+
+    Raises:
+        OutputError: Something lies where the results go, or they cannot be written.
+        SchemaError: A picture cannot be read, or the state to go on from does not fit.
+        VehicleError: The network to start from does not fit.
+        CrosscueError: The losses are no numbers any more.
+    """
+    if not resume:
+        _check_place(job, overwrite)
+    device = chosen_device(job.device)
+    torch.set_num_threads(job.threads)
+    training = Training(lambda: starting_network(job), job.schedule, device)
+    points: list[Point] = []
+    if resume and job.state_path.exists():
+        points = [Point(**row) for row in training.resume(job.state_path)["points"]]
+    sampler = Sampler(train, job.plan, job.window, job.schedule.seed)
+    for point in _learned(job, training, sampler, held_out, points):
+        tell(point)
+    facts = finished_facts(job, training.averaged, held_out, device)
+    save_checkpoint(job.output, training.averaged, facts)
+    job.state_path.unlink(missing_ok=True)
+    return facts
+
+
+def _check_place(job: Job, overwrite: bool) -> None:
+    for path in (job.state_path, job.output):
+        if path.exists() and not overwrite:
+            raise OutputError(f"{path}: exists; --resume goes on with it, --overwrite begins anew")
+    job.state_path.unlink(missing_ok=True)
+
+
+def starting_network(job: Job) -> Any:
+    """A network of the plan, with the weights it starts from; heads of other classes start anew."""
+    network = build_network(job.plan)
+    if job.start == COMPACT:
+        return network
+    begun: Checkpoint = checkpoint_named(job.start)
+    wanted = network.state_dict()
+    fitting = {
+        name: value.to(wanted[name].dtype)
+        for name, value in begun.network.state_dict().items()
+        if name in wanted and wanted[name].shape == value.shape
+    }
+    if begun.facts.plan.classes != job.plan.classes:
+        fitting = {name: value for name, value in fitting.items() if "predictor" not in name}
+    network.load_state_dict(fitting, strict=False)
+    return network
+
+
+def architecture_of(start: str) -> str:
+    """Which network a name or file is."""
+    if start == COMPACT or start in COCO_NETWORKS:
+        return start
+    return checkpoint_named(start).facts.plan.architecture
+
+
+def _learned(
+    job: Job, training: Training, sampler: Sampler, held_out: LabelledSet, points: list[Point]
+) -> Iterator[Point]:
+    some = replace(held_out, pictures=_spread(held_out.pictures, job.check_pictures))
+    before_s = points[-1].seconds if points else 0.0
+    began, checking_s, losses = time.monotonic(), 0.0, list[float]()
+    for step, loss in training.steps(sampler):
+        if math.isfinite(loss):
+            losses.append(loss)
+        if step % job.check_every and step != job.schedule.steps:
+            continue
+        seconds = before_s + time.monotonic() - began - checking_s
+        checked = time.monotonic()
+        found = _found(job, training.averaged, some, training.device)
+        point = Point(step, float(np.mean(losses or [math.nan])), round(seconds, 1),
+                      average_precisions(some, found))  # fmt: skip
+        points.append(point)
+        training.save(job.state_path, {"points": [asdict(one) for one in points]})
+        write_text(job.curve_path, strict_json([asdict(one) for one in points]) + "\n")
+        checking_s += time.monotonic() - checked
+        losses = []
+        yield point
+
+
+def _spread(pictures: tuple[Any, ...], most: int) -> tuple[Any, ...]:
+    if len(pictures) <= most:
+        return pictures
+    return tuple(pictures[i] for i in np.linspace(0, len(pictures) - 1, most).astype(int))
+
+
+def _found(job: Job, network: Any, labelled: LabelledSet, device: torch.device) -> list[Detections]:
+    bare = Checkpoint(Facts(plan=job.plan), network, "")
+    settings = MaskRcnnSettings(score=LEAST_SCORE, threads=job.threads)
+    return list(detections_on(labelled, detector_of(bare, settings, device)))
+
+
+def finished_facts(job: Job, network: Any, held_out: LabelledSet, device: torch.device) -> Facts:
+    """What the checkpoint says: its measured average precision, and calibrated scores.
+
+    The first half of the held-out pictures calibrates, the second half tells how well.
+    """
+    found = _found(job, network, held_out, device)
+    half = len(found) // 2
+    first = replace(held_out, pictures=held_out.pictures[:half])
+    second = replace(held_out, pictures=held_out.pictures[half:])
+    by = {name: fitted(rows) for name, rows in judged(first, found[:half]).items()}
+    measured = average_precisions(held_out, found)
+    for name, rows in judged(second, found[half:]).items():
+        measured |= told_rates(name, rows, by[name])
+    recipe = {**job.recipe, "start": Path(job.start).name,
+              **{f"schedule.{k}": v for k, v in asdict(job.schedule).items()},
+              "held_out_pictures": len(held_out.pictures)}  # fmt: skip
+    return Facts(plan=job.plan, calibration=by, recipe=recipe, measured=measured)
+
+
+def told_rates(name: str, rows: Judged, by: Calibration) -> dict[str, float | None]:
+    """Precision and recall of a class at calibrated scores, in percent; None where undefined."""
+    scores = np.array([calibrated(score, by) for score in rows.scores.tolist()])
+    told: dict[str, float | None] = {}
+    for aim in AIMS:
+        at = rates_at(Judged(scores, rows.is_right, rows.signs), aim)
+        for what, share in (("precision", at.precision), ("recall", at.recall)):
+            told[f"{what} {name} at {aim}"] = (
+                round(100.0 * share, 2) if math.isfinite(share) else None
+            )
+    return told
+
+
+def read_curve(path: Path) -> list[Point]:
+    """The points of a curve file."""
+    return [Point(**row) for row in json.loads(path.read_text(encoding="utf-8"))]

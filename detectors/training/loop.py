@@ -1,0 +1,239 @@
+"""The training loop: samples in, an averaged network out, going on after a kill as if none came.
+
+AdamW with a warm-up and a cosine, and a running average of the weights, which is what is measured
+and kept (Loshchilov and Hutter 2019; Polyak and Juditsky 1992).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from crosscue.detectors.mask_rcnn_network import forward_training
+from crosscue.replay.errors import CrosscueError, SchemaError
+from crosscue.replay.run_folder import write_whole
+
+from .samples import Sample, Sampler
+
+STATE_KEY: Final = "crosscue_training"
+GRADIENT_LIMIT: Final = 5.0
+BAD_STEPS: Final = 20
+"""So many losses in a row that are no numbers end the training."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """How long and how fast to learn.
+
+    Attributes:
+        steps: Batches altogether.
+        batch: Samples in one.
+        rate: Highest learning rate.
+        warm_up: Steps until that is reached.
+        decay: Of weights, as AdamW means it.
+        average: Share of the running average that a step leaves as it was, once it has settled.
+        seed: Everything random comes from it.
+    """
+
+    steps: int
+    batch: int = 8
+    rate: float = 1e-3
+    warm_up: int = 100
+    decay: float = 0.05
+    average: float = 0.998
+    seed: int = 0
+
+    def rate_at(self, step: int) -> float:
+        """The learning rate of a step."""
+        if step < self.warm_up:
+            return self.rate * (step + 1) / self.warm_up
+        share = (step - self.warm_up) / max(self.steps - self.warm_up, 1)
+        return self.rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0))))
+
+
+class Training:
+    """A network in training; ``steps`` goes on, ``save`` and ``resume`` keep and restore it all.
+
+    Attributes:
+        network: Learns.
+        averaged: Its running average, in evaluation mode.
+        done: Steps taken.
+    """
+
+    def __init__(self, make: Callable[[], Any], schedule: Schedule, device: torch.device) -> None:
+        """Build twice: what learns and its average.
+
+        Args:
+            make: Builds the network, with the weights to start from.
+            schedule: How long and how fast.
+            device: Where.
+        """
+        torch.manual_seed(schedule.seed)
+        self.schedule, self.device = schedule, device
+        self.network = make().to(device).to(memory_format=torch.channels_last).train()
+        self.averaged = make().to(device).to(memory_format=torch.channels_last).eval()
+        self.averaged.load_state_dict(self.network.state_dict())
+        self.averaged.requires_grad_(False)
+        self.done = 0
+        self._bad = 0
+        self._optimizer = torch.optim.AdamW(
+            _groups(self.network, schedule.decay), schedule.rate, foreach=True
+        )
+
+    def steps(self, sampler: Sampler) -> Iterator[tuple[int, float]]:
+        """Number and loss of each step, until all are done.
+
+        Raises:
+            SchemaError: A picture cannot be read.
+            CrosscueError: The losses are no numbers any more.
+        """
+        schedule = self.schedule
+        first, last = self.done * schedule.batch, schedule.steps * schedule.batch
+        with ThreadPoolExecutor(1, "samples") as pool:
+            # One batch is always in the making while the last one is learnt from.
+            waiting = [
+                pool.submit(sampler, k) for k in range(first, min(first + schedule.batch, last))
+            ]
+            while self.done < schedule.steps:
+                batch = [future.result() for future in waiting]
+                first += schedule.batch
+                waiting = [
+                    pool.submit(sampler, k) for k in range(first, min(first + schedule.batch, last))
+                ]
+                loss = self._learn(batch)
+                yield self.done, loss
+
+    def _learn(self, batch: list[Sample]) -> float:
+        schedule = self.schedule
+        # Which places the losses look at is random too, and must not depend on where we resumed.
+        torch.manual_seed(schedule.seed * 1_000_003 + self.done)
+        for group in self._optimizer.param_groups:
+            group["lr"] = schedule.rate_at(self.done)
+        pictures = torch.from_numpy(np.stack([sample.pixels for sample in batch]))
+        pictures = pictures.to(self.device, memory_format=torch.channels_last)
+        targets = [_target(sample, self.device) for sample in batch]
+        with torch.autocast(self.device.type, enabled=self.device.type == "cuda",
+                            dtype=torch.bfloat16):  # fmt: skip
+            loss = forward_training(self.network, pictures, targets)
+        value = float(loss.detach())
+        self.done += 1
+        if not math.isfinite(value):
+            self._note_bad()
+            self._optimizer.zero_grad(set_to_none=True)
+            return value
+        self._bad = 0
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), GRADIENT_LIMIT)
+        self._optimizer.step()
+        self._optimizer.zero_grad(set_to_none=True)
+        self._average()
+        return value
+
+    def _note_bad(self) -> None:
+        self._bad += 1
+        if self._bad >= BAD_STEPS:
+            raise CrosscueError(
+                f"step {self.done}: {BAD_STEPS} losses in a row are no numbers; lower --rate and "
+                "begin anew"
+            )
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        keep = min(self.schedule.average, (1.0 + self.done) / (10.0 + self.done))
+        for kept, now in zip(
+            self.averaged.state_dict().values(), self.network.state_dict().values(), strict=True
+        ):
+            if kept.is_floating_point():
+                kept.lerp_(now, 1.0 - keep)
+            else:
+                kept.copy_(now)
+
+    def save(self, path: Path, said: Mapping[str, Any]) -> None:
+        """Keep everything needed to go on, with words of the caller's.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        from safetensors.torch import save
+
+        tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
+        tensors |= {f"averaged.{k}": v for k, v in self.averaged.state_dict().items()}
+        for i, state in self._optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer.{i}.{k}": v for k, v in state.items()}
+        header = {
+            STATE_KEY: json.dumps(
+                {"done": self.done, "schedule": asdict(self.schedule), "said": said}
+            )
+        }
+        plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
+        content = save(plain, header)
+        write_whole(path, lambda place: place.write_bytes(content))
+
+    def resume(self, path: Path) -> Mapping[str, Any]:
+        """Go on where ``save`` was called; gives the words kept then.
+
+        Raises:
+            SchemaError: Damaged, or of a training with other settings.
+        """
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(path, "pt", device=str(self.device)) as file:
+                kept = json.loads((file.metadata() or {}).get(STATE_KEY, "{}"))
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        except (SafetensorError, OSError, ValueError) as error:
+            raise SchemaError(
+                f"{path}: damaged ({error}); delete it and begin the training anew"
+            ) from None
+        if kept.get("schedule") != asdict(self.schedule):
+            raise SchemaError(
+                f"{path}: holds a training with other settings; give the same ones, or another -o"
+            )
+        self._restore(tensors, path)
+        self.done = int(kept["done"])
+        said: Mapping[str, Any] = kept["said"]
+        return said
+
+    def _restore(self, tensors: Mapping[str, Tensor], path: Path) -> None:
+        groups: dict[str, dict[str, Tensor]] = {"network": {}, "averaged": {}, "optimizer": {}}
+        for name, value in tensors.items():
+            group, _, rest = name.partition(".")
+            groups.setdefault(group, {})[rest] = value
+        state: dict[int, dict[str, Tensor]] = {}
+        try:
+            for name, value in groups["optimizer"].items():
+                number, _, what = name.partition(".")
+                state.setdefault(int(number), {})[what] = value
+            self.network.load_state_dict(groups["network"])
+            self.averaged.load_state_dict(groups["averaged"])
+            whole = self._optimizer.state_dict()
+            self._optimizer.load_state_dict({**whole, "state": state})
+        except (RuntimeError, ValueError, KeyError) as error:
+            why = " ".join(str(error).split())[:120]
+            raise SchemaError(f"{path}: does not fit this network ({why}); begin anew") from None
+
+
+def _groups(network: Any, decay: float) -> list[dict[str, Any]]:
+    """Weights decay, biases and normalisations do not."""
+    learns = [p for p in network.parameters() if p.requires_grad]
+    return [
+        {"params": [p for p in learns if p.ndim > 1], "weight_decay": decay},
+        {"params": [p for p in learns if p.ndim <= 1], "weight_decay": 0.0},
+    ]
+
+
+def _target(sample: Sample, device: torch.device) -> dict[str, Tensor]:
+    return {
+        "boxes": torch.from_numpy(sample.boxes_px).to(device),
+        "labels": torch.from_numpy(sample.labels).to(device),
+        "masks": torch.from_numpy(sample.masks).to(device),
+    }

@@ -1,0 +1,247 @@
+"""Training samples: windows of pictures, zoomed, mirrored and recoloured, from seeds.
+
+Signs and lights are small and rare. A window therefore lies about an object as a rule, and classes
+that are rare among the annotations are picked more often.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from crosscue.detectors.mask_rcnn_network import MEAN, SPREAD, Plan
+from crosscue.replay.columns import Bytes, Floats
+from crosscue.replay.errors import SchemaError
+
+from .annotations import Labelled, LabelledPicture, LabelledSet, mask_of
+
+NEAR_OBJECT: Final = 0.85
+"""Share of windows that are laid about an object."""
+LEAST_SIDE_PX: Final = 3.0
+"""Of an object in the window: nobody could tell a smaller one."""
+LEAST_SHARE: Final = 0.3
+"""Of an object's pixels within the window; a thinner slice is not asked for."""
+MOST_OBJECTS: Final = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Size and variety of samples.
+
+    Attributes:
+        width_px: Of a sample.
+        height_px: Of a sample.
+        zoom: Least and most, of the scale that the network will see.
+        mirror: Chance.
+    """
+
+    width_px: int = 544
+    height_px: int = 288
+    zoom: tuple[float, float] = (0.5, 1.25)
+    mirror: float = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """One window.
+
+    Attributes:
+        pixels: Shape (3, H, W), float32, normalised.
+        boxes_px: Shape (N, 4), float32.
+        labels: Shape (N,), int64, from 1.
+        masks: Shape (N, H, W), uint8.
+    """
+
+    pixels: NDArray[np.float32]
+    boxes_px: NDArray[np.float32]
+    labels: NDArray[np.int64]
+    masks: Bytes
+
+
+def read_picture(picture: LabelledPicture) -> Bytes:
+    """Pixels, blue green red, (H, W, 3).
+
+    Raises:
+        SchemaError: Not a picture, or of another size than annotated.
+    """
+    import cv2
+
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    content = np.fromfile(picture.path, np.uint8)
+    pixels = cv2.imdecode(content, flags) if len(content) else None
+    if pixels is None or pixels.shape[:2] != picture.size_px[::-1]:
+        width, height = picture.size_px
+        raise SchemaError(
+            f"{picture.path}: want a picture of {width} x {height}, as its annotations say; "
+            "mend the file or leave it out of the annotations"
+        )
+    return np.asarray(pixels, np.uint8)
+
+
+def normalised(pixels: Bytes) -> NDArray[np.float32]:
+    """From (H, W, 3) blue, green, red to (3, H, W) as the networks want it."""
+    scaled = pixels[:, :, ::-1].astype(np.float32)
+    mean, spread = np.array(MEAN, np.float32), np.array(SPREAD, np.float32)
+    scaled = (scaled - 255.0 * mean) * (1.0 / (255.0 * spread))
+    return np.ascontiguousarray(scaled.transpose(2, 0, 1), np.float32)
+
+
+class Sampler:
+    """Draws samples; the same seed and number give the same sample."""
+
+    def __init__(self, labelled: LabelledSet, plan: Plan, window: Window, seed: int) -> None:
+        """Count classes."""
+        self._set, self._plan, self._window, self._seed = labelled, plan, window, seed
+        places = [
+            (i, j)
+            for i, picture in enumerate(labelled.pictures)
+            for j, one in enumerate(picture.objects)
+            if not one.is_crowd and _is_big_enough(one, picture, plan)
+        ]
+        labels = np.array([labelled.pictures[i].objects[j].label for i, j in places], np.int64)
+        counts = np.maximum(np.bincount(labels, minlength=len(labelled.classes)), 1)
+        weight = (1.0 / np.sqrt(counts))[labels]
+        self._places, self._chance = places, weight / max(weight.sum(), 1e-12)
+
+    def __call__(self, number: int) -> Sample:
+        """One sample.
+
+        Raises:
+            SchemaError: As ``read_picture``.
+        """
+        rng = np.random.default_rng([self._seed, number])
+        about: Labelled | None = None
+        if self._places and rng.random() < NEAR_OBJECT:
+            i, j = self._places[int(rng.choice(len(self._places), p=self._chance))]
+            about = self._set.pictures[i].objects[j]
+        else:
+            i = int(rng.integers(len(self._set.pictures)))
+        picture = self._set.pictures[i]
+        low, high = self._window.zoom
+        zoom = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        scale = self._plan.width_px / picture.size_px[0] * zoom
+        corner = _corner(picture.size_px, about, scale, self._window, self._plan, rng)
+        warp = np.array([[scale, 0.0, -corner[0] * scale], [0.0, scale, -corner[1] * scale]])
+        if rng.random() < self._window.mirror:
+            warp[0] = -warp[0]
+            warp[0, 2] += self._window.width_px
+        pixels = recoloured(_warped(read_picture(picture), warp, self._window), rng)
+        return _sample(pixels, picture, warp, self._window)
+
+
+def _is_big_enough(one: Labelled, picture: LabelledPicture, plan: Plan) -> bool:
+    scale = plan.width_px / picture.size_px[0]
+    x0, y0, x1, y1 = one.box_px
+    return min(x1 - x0, y1 - y0) * scale >= LEAST_SIDE_PX
+
+
+def _corner(
+    size_px: tuple[int, int], about: Labelled | None, scale: float, window: Window, plan: Plan,
+    rng: Generator,
+) -> Floats:  # fmt: skip
+    """Top left of the window in the picture; it may stick out where the picture is smaller."""
+    span = np.array([window.width_px, window.height_px]) / scale
+    low = np.array([0.0, plan.top * size_px[1]])
+    high = np.array([size_px[0], (1.0 - plan.bottom) * size_px[1]]) - span
+    low, high = np.minimum(low, high), np.maximum(low, high)
+    if about is None:
+        return np.asarray(rng.uniform(low, high))
+    x0, y0, x1, y1 = about.box_px
+    middle = np.array([x0 + x1, y0 + y1]) / 2.0
+    room = np.maximum(span - [x1 - x0, y1 - y0], 0.2 * span)
+    corner = middle - span / 2.0 + rng.uniform(-0.5, 0.5, 2) * room
+    return np.asarray(np.clip(corner, low, high))
+
+
+def _warped(pixels: Bytes, warp: Floats, window: Window) -> Bytes:
+    import cv2
+
+    return np.asarray(
+        cv2.warpAffine(pixels, _to_middles(warp), (window.width_px, window.height_px),
+                       flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
+                       borderValue=(114, 114, 114)), np.uint8)  # fmt: skip
+
+
+def _to_middles(warp: Floats) -> Floats:
+    """From coordinates at pixel corners, as boxes have, to those at pixel middles, as OpenCV."""
+    moved = warp.copy()
+    moved[:, 2] += 0.5 * (warp[:, 0] + warp[:, 1]) - 0.5
+    return moved
+
+
+def recoloured(pixels: Bytes, rng: Generator) -> Bytes:
+    """Other light, contrast, colour and noise."""
+    import cv2
+
+    gain = rng.uniform(0.7, 1.35) * rng.uniform(0.9, 1.1, 3)
+    levels = np.arange(256.0) / 255.0
+    gamma, lift = np.exp(rng.uniform(-0.3, 0.3)), rng.uniform(-0.06, 0.06)
+    table = np.clip((levels[:, None] ** gamma * gain + lift) * 255.0, 0, 255).astype(np.uint8)
+    changed = np.asarray(cv2.LUT(pixels, table.reshape(1, 256, 3)), np.uint8)
+    if rng.random() < 0.3:
+        grey = cv2.cvtColor(changed, cv2.COLOR_BGR2GRAY)[:, :, None].repeat(3, axis=2)
+        share = rng.uniform(0.0, 1.0)
+        changed = np.asarray(cv2.addWeighted(changed, 1.0 - share, grey, share, 0.0), np.uint8)
+    if rng.random() < 0.25:
+        changed = np.asarray(cv2.GaussianBlur(changed, (3, 3), rng.uniform(0.3, 1.0)), np.uint8)
+    if rng.random() < 0.25:
+        noise = rng.integers(-12, 13, changed.shape, np.int16)
+        changed = np.clip(changed + noise, 0, 255).astype(np.uint8)
+    return changed
+
+
+def _sample(pixels: Bytes, picture: LabelledPicture, warp: Floats, window: Window) -> Sample:
+    boxes, labels, masks = [], [], []
+    for one in picture.objects:
+        if one.is_crowd or not _may_be_inside(one, warp, window):
+            continue
+        whole = mask_of(one, picture.size_px)
+        mask = _warped_mask(whole, warp, window)
+        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        if not len(rows):
+            continue
+        box = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
+        scale = np.hypot(*warp[0, :2])
+        share = mask.sum() / max(float(whole.sum()) * scale * scale, 1.0)
+        if min(box[2] - box[0], box[3] - box[1]) >= LEAST_SIDE_PX and share >= LEAST_SHARE:
+            boxes.append(box)
+            labels.append(one.label + 1)
+            masks.append(mask)
+    if len(boxes) > MOST_OBJECTS:
+        order = np.argsort([-int(mask.sum()) for mask in masks], kind="stable")[:MOST_OBJECTS]
+        boxes, labels, masks = ([part[i] for i in order] for part in (boxes, labels, masks))
+    size = (window.height_px, window.width_px)
+    return Sample(
+        normalised(pixels),
+        np.array(boxes, np.float32).reshape(-1, 4),
+        np.array(labels, np.int64),
+        np.stack(masks) if masks else np.zeros((0, *size), np.uint8),
+    )
+
+
+def _may_be_inside(one: Labelled, warp: Floats, window: Window) -> bool:
+    x0, y0, x1, y1 = one.box_px
+    across = np.sort(warp[0, 0] * np.array([x0, x1]) + warp[0, 2])
+    down = warp[1, 1] * np.array([y0, y1]) + warp[1, 2]
+    return bool(across[1] > 0 and across[0] < window.width_px
+                and down[1] > 0 and down[0] < window.height_px)  # fmt: skip
+
+
+def _warped_mask(mask: NDArray[np.bool_], warp: Floats, window: Window) -> Bytes:
+    import cv2
+
+    grey = cv2.warpAffine(
+        mask.astype(np.uint8) * 255, _to_middles(warp), (window.width_px, window.height_px),
+        flags=cv2.INTER_LINEAR,
+    )  # fmt: skip
+    return np.asarray(np.asarray(grey) >= 128, np.uint8)
+
+
+def batch_numbers(step: int, batch: int) -> Sequence[int]:
+    """The samples that a step is made of."""
+    return range(step * batch, (step + 1) * batch)

@@ -1,0 +1,135 @@
+"""Average precision on labelled pictures, by COCO's rules (pycocotools)."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.rle import area_px, encode
+from crosscue.replay.errors import UsageError
+
+from .annotations import LabelledPicture, LabelledSet, mask_of
+from .samples import read_picture
+
+LEAST_AREA_PX: Final = 24
+"""Smaller truth is neither asked for nor wrong when found."""
+SIZES: Final = ("all", "small", "medium", "large")
+"""COCO's: small below 32 x 32 pixels, large above 96 x 96."""
+
+
+def detections_on(
+    labelled: LabelledSet, detect: Callable[[Sequence[Frame]], Sequence[Any]]
+) -> Iterator[Detections]:
+    """A detector's results picture by picture.
+
+    Raises:
+        SchemaError: A picture cannot be read.
+    """
+    for number, picture in enumerate(labelled.pictures):
+        frame = Frame(number, "", read_picture(picture), picture.size_px)
+        (found,) = detect([frame])
+        yield found
+
+
+def average_precisions(
+    labelled: LabelledSet, found: Sequence[Detections]
+) -> dict[str, float | None]:
+    """AP by COCO's rules, of boxes and masks: overall, by class and by size; in percent.
+
+    Names are ``box``, ``box50`` (overlap of one half), ``box car``, ``box small``, ``box50 car``,
+    ``box car small``, and likewise ``mask``. None where the truth has no such object.
+
+    Raises:
+        UsageError: pycocotools is not installed.
+    """
+    try:
+        from pycocotools.coco import COCO
+        from pycocotools.cocoeval import COCOeval
+    except ImportError:
+        raise UsageError(
+            "average precision needs pycocotools, which is not installed: pip install pycocotools"
+        ) from None
+    truth = COCO()
+    truth.dataset = _truth(labelled)
+    scores: dict[str, float | None] = {}
+    with contextlib.redirect_stdout(io.StringIO()):
+        truth.createIndex()
+        answers = _answers(labelled, found)
+        for kind, name in (("bbox", "box"), ("segm", "mask")):
+            if not answers:
+                scores |= dict.fromkeys((name, f"{name}50"), 0.0)
+                continue
+            judge = COCOeval(truth, truth.loadRes(answers), kind)
+            judge.evaluate()
+            judge.accumulate()
+            scores |= _named(name, judge.eval["precision"], labelled.classes)
+    return scores
+
+
+def _named(kind: str, precision: Any, classes: Sequence[str]) -> dict[str, float | None]:
+    """From COCO's table (overlap, recall, class, size, most detections), its last column."""
+    table = np.asarray(precision)[..., -1]
+    scores = {kind: _mean(table[:, :, :, 0]), f"{kind}50": _mean(table[0, :, :, 0])}
+    for i, size in enumerate(SIZES[1:], 1):
+        scores[f"{kind} {size}"] = _mean(table[:, :, :, i])
+    for k, name in enumerate(classes):
+        scores[f"{kind} {name}"] = _mean(table[:, :, k, 0])
+        scores[f"{kind}50 {name}"] = _mean(table[0, :, k, 0])
+        for i, size in enumerate(SIZES[1:], 1):
+            scores[f"{kind} {name} {size}"] = _mean(table[:, :, k, i])
+    return scores
+
+
+def _mean(values: Any) -> float | None:
+    known = values[values > -1]
+    return round(100.0 * float(known.mean()), 2) if known.size else None
+
+
+def _truth(labelled: LabelledSet) -> dict[str, Any]:
+    annotations: list[dict[str, Any]] = []
+    for number, picture in enumerate(labelled.pictures):
+        for one in picture.objects:
+            text = _runs(one.mask, picture, one)
+            area = area_px(text)
+            x0, y0, x1, y1 = one.box_px
+            annotations.append({
+                "id": len(annotations) + 1, "image_id": number, "category_id": one.label,
+                "bbox": [x0, y0, x1 - x0, y1 - y0], "area": area,
+                "iscrowd": int(one.is_crowd or area < LEAST_AREA_PX),
+                "segmentation": {"size": list(picture.size_px[::-1]), "counts": text},
+            })  # fmt: skip
+    return {
+        "images": [
+            {"id": i, "width": p.size_px[0], "height": p.size_px[1]}
+            for i, p in enumerate(labelled.pictures)
+        ],
+        "annotations": annotations,
+        "categories": [{"id": i, "name": name} for i, name in enumerate(labelled.classes)],
+    }
+
+
+def _runs(mask: Any, picture: LabelledPicture, one: Any) -> bytes:
+    if isinstance(mask, bytes):
+        return mask
+    return encode(mask_of(one, picture.size_px), (0, 0), picture.size_px)
+
+
+def _answers(labelled: LabelledSet, found: Sequence[Detections]) -> list[dict[str, Any]]:
+    numbers = {name: i for i, name in enumerate(labelled.classes)}
+    return [
+        {
+            "image_id": i, "category_id": numbers[label], "score": float(score),
+            "bbox": [float(box[0]), float(box[1]), float(box[2] - box[0]), float(box[3] - box[1])],
+            "segmentation": {"size": [one.size_px[1], one.size_px[0]], "counts": mask},
+        }
+        for i, one in enumerate(found)
+        for box, score, label, mask in zip(
+            one.boxes_px, one.scores, one.labels, one.masks, strict=True
+        )
+        if label in numbers
+    ]  # fmt: skip

@@ -1,0 +1,78 @@
+"""Small Mask R-CNN checkpoints with random weights, and tiny labelled pictures."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import torch
+
+from crosscue.detectors.base import Frame
+from crosscue.detectors.mask_rcnn_checkpoint import Checkpoint, Facts
+from crosscue.detectors.mask_rcnn_network import Plan, build_network
+from crosscue.replay.columns import Bytes
+
+CLASSES: Final = ("car", "stop sign", "traffic light")
+CPU: Final = torch.device("cpu")
+
+
+def plan_of(width_px: int = 128, **changes: Any) -> Plan:
+    asked = {"architecture": "compact", "classes": CLASSES, "width_px": width_px}
+    return Plan.model_validate({**asked, **changes})
+
+
+@cache
+def random_checkpoint(seed: int = 0) -> Checkpoint:
+    """A network that has learnt nothing, but whose scores differ from place to place."""
+    torch.manual_seed(seed)
+    network = build_network(plan_of())
+    with torch.no_grad():
+        network.roi_heads.box_predictor.cls_score.weight.mul_(30.0)
+        network.roi_heads.mask_predictor.mask_fcn_logits.weight.mul_(30.0)
+    return Checkpoint(Facts(plan=plan_of()), network.eval(), f"random {seed}")
+
+
+def noise_frame(seed: int = 0, width: int = 128, height: int = 96, t_ns: int = 5) -> Frame:
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(0, 256, (height // 8, width // 8, 3), np.uint8)
+    pixels = np.asarray(cv2.resize(coarse, (width, height)), np.uint8)
+    return Frame(t_ns, "cam", pixels, (width, height))
+
+
+def bars(seed: int) -> tuple[Bytes, list[tuple[int, int, int, int]]]:
+    """Grey with two bright bars, 128 x 96, and their boxes as x, y, width, height."""
+    rng = np.random.default_rng(seed)
+    pixels = rng.integers(60, 90, (96, 128, 3), np.uint8)
+    boxes = []
+    for left in (4, 68):
+        x, y = left + int(rng.integers(10)), int(rng.integers(10, 60))
+        width, height = int(rng.integers(24, 44)), int(rng.integers(12, 22))
+        pixels[y : y + height, x : x + width] = (40, 220, 250)
+        boxes.append((x, y, width, height))
+    return pixels, boxes
+
+
+def write_bars(folder: Path, count: int) -> Path:
+    """A COCO file of such pictures, in ``folder/images``; the bars are called cars."""
+    (folder / "images").mkdir(parents=True)
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    for i in range(count):
+        pixels, boxes = bars(i)
+        cv2.imwrite(str(folder / "images" / f"{i}.png"), pixels)
+        images.append({"id": i, "file_name": f"{i}.png", "width": 128, "height": 96})
+        for x, y, width, height in boxes:
+            corners = [x, y, x + width, y, x + width, y + height, x, y + height]
+            annotations.append({
+                "id": len(annotations), "image_id": i, "category_id": 3, "iscrowd": 0,
+                "bbox": [x, y, width, height], "segmentation": [corners],
+            })  # fmt: skip
+    tree = {"images": images, "annotations": annotations,
+            "categories": [{"id": 3, "name": "car"}, {"id": 9, "name": "boat"}]}  # fmt: skip
+    path = folder / "coco.json"
+    path.write_text(json.dumps(tree), encoding="utf-8")
+    return path
