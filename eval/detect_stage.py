@@ -172,6 +172,8 @@ def detect_into(
             for block in log.read(ledger, narrowed):
                 for _ in extractor(block):
                     pass
+            for _ in extractor.finish():
+                pass
         write_skipped(run, [ledger])
         seconds = time.monotonic() - began
         notices = tuple(tables.notices)

@@ -26,6 +26,7 @@ from .vehicle import AngleSignal, Vehicle
 if TYPE_CHECKING:
     from .can.database import CanDatabase
     from .can.decode import BusDecoder
+    from .decode.packets import PacketDecoder
     from .mobileye.samples import MobileyeStream
 
 SPEED_UNITS: Final[Mapping[str, float]] = {
@@ -310,6 +311,7 @@ class Extractor:
     _decoders: dict[str, Decoder | None] = field(default_factory=dict)
     _buses: dict[str, BusDecoder] = field(default_factory=dict)
     _mobileye: MobileyeStream | None = None
+    _packets: dict[str, PacketDecoder] = field(default_factory=dict)
 
     def __call__(self, block: Block) -> Iterator[Samples]:
         """The samples of one block; rows that cannot be used are skipped in the ledger."""
@@ -339,17 +341,37 @@ class Extractor:
                 yield from self._from_can(block, source)
             return
         if isinstance(block.rows, Images):
-            self.on_pictures(block)
+            self._show(block, block.rows)
         for signal in source.signals:
             if signal not in MOBILEYE_SIGNALS:
                 yield from _FROM_TABLE[signal](block, self.ledger)
 
     def finish(self) -> Iterator[tuple[str, Samples]]:
-        """What was held back until it was known to be whole, with its topic; at the log's end."""
+        """What was held back until it was known to be whole, with its topic; at the log's end.
+
+        The last pictures of a video stream go to ``on_pictures``.
+        """
+        for packets in self._packets.values():
+            for block in packets.flush():
+                self.on_pictures(block)
         if self._mobileye is not None:
             source = self._mobileye_sources()[0]
             for samples in self._mobileye.flush():
                 yield source.topic.name, samples
+
+    def _show(self, block: Block, images: Images) -> None:
+        """Pictures to whoever looks at them, packets of a video decoded first."""
+        from .decode.packets import PacketDecoder, is_stream
+
+        if self.on_pictures is _no_pictures:
+            return
+        if not is_stream(images):
+            self.on_pictures(block)
+            return
+        if block.topic not in self._packets:
+            self._packets[block.topic] = PacketDecoder(block.topic, self.ledger)
+        for shown in self._packets[block.topic](block):
+            self.on_pictures(shown)
 
     def _mobileye_sources(self) -> list[Source]:
         return [

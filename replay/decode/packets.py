@@ -1,0 +1,128 @@
+"""Packets of a video stream to pictures: H.264, H.265 and AV1, through FFmpeg (PyAV).
+
+A packet's row carries the time of the picture that it becomes, so pictures come out with their own
+times, in the order in which they are shown, however the stream was coded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from crosscue.replay.columns import Block, Images, Messages
+from crosscue.replay.errors import LogError
+from crosscue.replay.ledger import Ledger
+
+if TYPE_CHECKING:
+    from av import VideoFrame
+
+CODECS: Final = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
+"""From a coding of ``Images`` to FFmpeg's decoder."""
+MOST_PIXELS: Final = 64_000_000
+AT_ONCE: Final = 8
+"""Pictures in a block: at 1280 by 720 these are 22 MB."""
+NOT_DECODED: Final = "video packet not decoded"
+NO_PICTURE: Final = "video packet that became no picture"
+
+
+def is_stream(images: Images) -> bool:
+    """Are these packets, of which none is a picture by itself?"""
+    return any(coding in CODECS for coding in images.coding)
+
+
+class PacketDecoder:
+    """One topic's packets to raw pictures (``bgr8``); call ``flush`` once at the end."""
+
+    def __init__(self, topic: str, ledger: Ledger) -> None:
+        """Prepare.
+
+        Args:
+            topic: Of the packets.
+            ledger: Told of packets that become no picture.
+        """
+        self._topic = topic
+        self._ledger = ledger
+        self._context: Any = None
+        self._waiting: list[VideoFrame] = []
+        self._taken = self._shown = 0
+
+    def __call__(self, block: Block) -> Iterator[Block]:
+        """Pictures that these packets complete; those of later ones may still be awaited.
+
+        Raises:
+            LogError: PyAV is not installed.
+        """
+        assert isinstance(block.rows, Images)
+        import_av(self._topic)
+        import av
+
+        for i, t_ns in enumerate(block.log_ns.tolist()):
+            if self._context is None:
+                self._context = _context(block.rows.coding[i])
+            packet = av.Packet(bytes(block.rows.bytes_.payload(i)))
+            packet.pts = t_ns
+            try:
+                self._waiting += self._context.decode(packet)
+                self._taken += 1
+            except av.FFmpegError as error:
+                why = " ".join(str(error).split())[:100]
+                self._ledger.skip(self._topic, NOT_DECODED, 1, why, t_ns)
+            yield from self._full()
+
+    def flush(self) -> Iterator[Block]:
+        """The last pictures; packets that never became one are told."""
+        if self._context is None:
+            return
+        import av
+
+        try:
+            self._waiting += self._context.decode(None)
+        except av.FFmpegError as error:
+            self._ledger.notice(f"{self._topic}: the video's end does not decode: {error}")
+        while self._waiting:
+            yield self._block()
+        lacking = self._taken - self._shown
+        if lacking > 0:
+            # A stream that does not begin at a key frame loses those before the first.
+            self._ledger.skip(self._topic, NO_PICTURE, lacking)
+        self._context = None
+
+    def _full(self) -> Iterator[Block]:
+        while len(self._waiting) >= AT_ONCE:
+            yield self._block()
+
+    def _block(self) -> Block:
+        frames, self._waiting = self._waiting[:AT_ONCE], self._waiting[AT_ONCE:]
+        self._shown += len(frames)
+        pixels = [frame.to_ndarray(format="bgr24") for frame in frames]
+        stop = np.cumsum([picture.size for picture in pixels], dtype=np.int64)
+        start = np.concatenate([[0], stop[:-1]]).astype(np.int64)
+        buffer = np.concatenate([np.asarray(picture, np.uint8).ravel() for picture in pixels])
+        sizes = np.array([picture.shape[:2] for picture in pixels], np.int32)
+        images = Images(
+            Messages(buffer, start, stop), ("raw",) * len(frames), sizes[:, 1], sizes[:, 0],
+            3 * sizes[:, 1], ("bgr8",) * len(frames),
+        )  # fmt: skip
+        return Block(self._topic, np.array([frame.pts for frame in frames], np.int64), images)
+
+
+def import_av(where: str) -> None:
+    """Refuse with a remedy where PyAV is not installed.
+
+    Raises:
+        LogError: It is not.
+    """
+    if find_spec("av") is None:
+        raise LogError(f"{where}: decoding video needs PyAV; install it with: pip install av")
+
+
+def _context(coding: str) -> Any:
+    import av
+
+    context: Any = av.CodecContext.create(CODECS[coding], "r")
+    context.options = {"max_pixels": str(MOST_PIXELS)}
+    context.thread_count = 1
+    return context
