@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Final, NamedTuple, TypeVar, cast
+from dataclasses import dataclass
+from typing import Final, NamedTuple, TypeVar, cast, get_type_hints
 
 import numpy as np
 from numba import njit
@@ -44,12 +45,17 @@ from .navigation import Strategy
 from .random_stream import Stream, key_of, ziggurat
 
 Function = TypeVar("Function", bound=Callable[..., object])
+Number = TypeVar("Number", np.int64, np.float64)
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 Keys = NDArray[np.uint64]
 
 FIELDS: Final = len(Result._fields)
 REACHED, LOST, GIVEN_UP = (int(o) for o in (Outcome.REACHED, Outcome.LOST, Outcome.GIVEN_UP))
+TRACED: Final = 16
+EVENT: Final = 6
+GOAL_SET, LANDMARK_SET, LANDMARK_MISSED, LANDMARK_TAKEN, LANDMARK_REFUSED = range(5)
+"""Kinds of events: a new goal, a new landmark, one passed unnoticed, weighed in, refused."""
 NO_CITY: Final = -1
 """In place of an outcome: the settings gave a city without intersections."""
 
@@ -71,7 +77,11 @@ COSINES: Final = tuple(math.cos(heading) for heading in HEADINGS_RAD)
 SINES: Final = tuple(math.sin(heading) for heading in HEADINGS_RAD)
 QUARTER_TURNS: Final = HEADINGS_RAD
 SERIES_RAD: Final = 0.15
-"""Below this angle the series of ``_arc`` are exact to the last bit."""
+"""Below this angle the series of ``_arc`` are exact to rounding."""
+A1, A2, A3, A4 = -1 / 6, 1 / 120, -1 / 5040, 1 / 362880
+B1, B2, B3, B4 = -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800
+C0, C1, C2, C3, C4 = -1 / 3, 1 / 30, -1 / 840, 1 / 45360, -1 / 3991680
+D1, D2, D3, D4 = -1 / 8, 1 / 144, -1 / 5760, 1 / 403200
 PI: Final = math.pi
 STRATEGIES: Final = tuple(Strategy)
 LANDMARKS: Final = STRATEGIES.index(Strategy.LANDMARKS)
@@ -176,6 +186,47 @@ def drive_many(settings: settings_of.Drive, seeds: Keys) -> Floats:
     return rows
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Traced:
+    """One drive step by step; simulated throughout.
+
+    Attributes:
+        result: As ``drive_simulator.drive`` gives it.
+        steps: Shape (S, 16), as ``drive_row`` tells.
+        events: Shape (E, 6), likewise.
+    """
+
+    result: Result
+    steps: Floats
+    events: Floats
+
+    def of_kind(self, *kinds: int) -> Floats:
+        """Shape (K, 6): events of these kinds."""
+        chosen: Floats = self.events[np.isin(self.events[:, 1], kinds)]
+        return chosen
+
+
+def drive_traced(settings: settings_of.Drive, seed: int) -> Traced:
+    """Drive once and keep every step.
+
+    Raises:
+        ValueError: As ``drive_many``.
+    """
+    key = np.uint64(seed)
+    first = as_result(drive_many(settings, np.array([key], np.uint64))[0])
+    most = 2 * (first.goals + 1) + first.landmarks + first.passed
+    steps, events = np.empty((first.steps, TRACED)), np.full((most, EVENT), np.nan)
+    drive_row(numbers_of(settings), *ziggurat(), key, np.empty(FIELDS), steps, events)
+    return Traced(first, steps, events[~np.isnan(events[:, 0])])
+
+
+def as_result(row: Floats) -> Result:
+    """One row as a record, its counts whole numbers again."""
+    kinds = get_type_hints(Result)
+    pairs = zip(Result._fields, row.tolist(), strict=True)
+    return Result(**{name: kinds[name](value) for name, value in pairs})
+
+
 def compiled(function: Function) -> Function:
     """Compile at the first call, or load what an earlier process compiled."""
     try:
@@ -237,7 +288,7 @@ def _normal(
 
 @compiled
 def _rare_normal(
-    state: np.uint64, step: np.uint64, edge: Floats, inner: Floats, layer: int, share: float
+    state: np.uint64, step: np.uint64, edge: Floats, inner: Floats, layer: np.int64, share: float
 ) -> tuple[float, np.uint64]:
     while True:
         if abs(share) < inner[layer]:
@@ -343,7 +394,7 @@ def _largest_part(ways: Bytes, columns: int, queue: Ints) -> NDArray[np.bool_]:
 
 @compiled
 def _open_traps(ways: Bytes, columns: int, inside: NDArray[np.bool_], queue: Ints) -> None:
-    root = np.argmax(inside)
+    root = int(np.argmax(inside))
     onward, homeward = np.empty(len(ways), np.bool_), np.empty(len(ways), np.bool_)
     while True:
         _reach(ways, columns, root, False, onward, queue)
@@ -460,10 +511,10 @@ def _arc(t: float) -> tuple[float, float, float, float]:
     """Per metre of an arc that turns by ``t``: along, across, and their derivatives by ``t``."""
     if abs(t) < SERIES_RAD:
         u = t * t
-        along = 1.0 - u / 6.0 * (1.0 - u / 20.0 * (1.0 - u / 42.0 * (1.0 - u / 72.0)))
-        across = t * (0.5 - u / 24.0 * (1.0 - u / 30.0 * (1.0 - u / 56.0 * (1.0 - u / 90.0))))
-        along_by = -t / 3.0 * (1.0 - u / 10.0 * (1.0 - u / 28.0 * (1.0 - u / 54.0)))
-        across_by = 0.5 - u / 8.0 * (1.0 - u / 18.0 * (1.0 - u / 40.0 * (1.0 - u / 70.0)))
+        along = 1.0 + u * (A1 + u * (A2 + u * (A3 + u * A4)))
+        across = t * (0.5 + u * (B1 + u * (B2 + u * (B3 + u * B4))))
+        along_by = t * (C0 + u * (C1 + u * (C2 + u * (C3 + u * C4))))
+        across_by = 0.5 + u * (D1 + u * (D2 + u * (D3 + u * D4)))
         return along, across, along_by, across_by
     sine = math.sin(t)
     along, across = sine / t, 2.0 * math.sin(t / 2.0) ** 2 / t
@@ -538,10 +589,25 @@ def _landmark_ahead(
 
 
 @compiled
-def _doubled(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+def _doubled(numbers: NDArray[Number]) -> NDArray[Number]:
     larger = np.empty(2 * len(numbers), numbers.dtype)
     larger[: len(numbers)] = numbers
     return larger
+
+
+@compiled
+def _note(
+    events: Floats, noted: int, step: int, kind: int, xs: Floats, ys: Floats, node: int,
+    seen_x: float, seen_y: float,
+) -> int:  # fmt: skip
+    """Keep an event while there is room; how many there are comes back."""
+    if noted == len(events):
+        return noted
+    row = events[noted]
+    row[0], row[1] = step, kind
+    row[2], row[3] = xs[node % len(xs)], ys[node // len(xs)]
+    row[4], row[5] = seen_x, seen_y
+    return noted + 1
 
 
 # -- The drive ------------------------------------------------------------------------------------
@@ -550,12 +616,29 @@ def _doubled(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 @compiled
 def drive_rows(n: Numbers, edge: Floats, inner: Floats, seeds: Keys, rows: Floats) -> None:
     """Fill ``rows`` with the result of each seed's drive."""
+    none = np.empty((0, TRACED)), np.empty((0, EVENT))
     for i in range(len(seeds)):
-        _drive(n, edge, inner, seeds[i], rows[i])
+        drive_row(n, edge, inner, seeds[i], rows[i], none[0], none[1])
 
 
 @compiled
-def _drive(n: Numbers, edge: Floats, inner: Floats, seed: np.uint64, row: Floats) -> None:
+def drive_row(
+    n: Numbers, edge: Floats, inner: Floats, seed: np.uint64, row: Floats, trace: Floats,
+    events: Floats,
+) -> None:  # fmt: skip
+    """Drive once; ``trace`` and ``events`` are filled as far as they go, none where they are empty.
+
+    Args:
+        n: Settings.
+        edge: Of ``ziggurat``.
+        inner: Likewise.
+        seed: Of this drive.
+        row: Shape (22,): its ``Result``.
+        trace: Shape (S, 16): true x, y, heading, speed; left and right wheel's path as read;
+            compass, NaN where none was read; then the filter's x, y, heading and their covariance
+            xx, xy, xh, yy, yh, hh.
+        events: Shape (E, 6): step, kind, x, y of goal or landmark, x, y that a landmark gave.
+    """
     xs, ys, ways, inside, area_km2 = _make_city(_key_of(seed, CITY_KEY), n)
     columns = len(xs)
     row[:] = np.nan
@@ -589,6 +672,9 @@ def _drive(n: Numbers, edge: Floats, inner: Floats, seed: np.uint64, row: Floats
                 there, places = _draw_place(places, places_step, inside)
             landmark_at[there], landmarks[i] = i, there
     is_visited = np.zeros(max(landmark_count, 1), np.bool_)
+    noted = _note(events, 0, 0, GOAL_SET, xs, ys, goal, np.nan, np.nan)
+    for i in range(landmark_count):
+        noted = _note(events, noted, 0, LANDMARK_SET, xs, ys, landmarks[i], np.nan, np.nan)
     start_x, start_y = xs[start % columns], ys[start // columns]
     goal_x, goal_y = xs[goal % columns], ys[goal // columns]
     row[4] = math.hypot(goal_x - start_x, goal_y - start_y)
@@ -629,7 +715,8 @@ def _drive(n: Numbers, edge: Floats, inner: Floats, seed: np.uint64, row: Floats
     steps = passed = detected = refused = decisions = turns = goals = 0
     # What stays the same at every step.
     step_s, half_track = n.step_s, 0.5 * n.track_width_m
-    per_count = 1.0 / n.encoder_step_m
+    per_count, per_track = 1.0 / n.encoder_step_m, 1.0 / n.track_width_m
+    per_wheelbase, per_step = 1.0 / n.wheelbase_m, 1.0 / n.step_s
     slip_var = n.slip_per_sqrt_m**2
     turn_var_per_m = 2.0 * slip_var / n.track_width_m**2
     compass_var = n.compass_sd_rad**2
@@ -652,21 +739,19 @@ def _drive(n: Numbers, edge: Floats, inner: Floats, seed: np.uint64, row: Floats
                 room = street_c * (node_x - x) + street_s * (node_y - y) - entry_m
                 wanted = n.turn_mps
                 if room > 0.0:
-                    wanted = min(
-                        n.cruise_mps, math.sqrt(n.turn_mps**2 + 2.0 * n.accel_mps2 * room)
-                    )
+                    wanted = min(n.cruise_mps, math.sqrt(n.turn_mps**2 + 2.0 * n.accel_mps2 * room))
         # Controllers.
         slow = wanted - speed
         slow_sum = min(max(slow_sum + slow * step_s, -WINDUP), WINDUP)
         push = n.speed_p * slow + n.speed_i * slow_sum - n.speed_d * accel
         push = min(max(push, -BRAKE_SHARE * n.accel_mps2), n.accel_mps2)
-        accel = max(push, (SLOWEST_MPS - speed) / step_s)
+        accel = max(push, (SLOWEST_MPS - speed) * per_step)
         steering = n.wheelbase_m * curvature - n.steering_p * beside
         steering -= n.steering_i * beside_sum + n.steering_d * growth
         steering = min(max(steering, -STEERING_LIMIT_RAD), STEERING_LIMIT_RAD)
         # Bicycle model (eq. 5 and 6).
         distance = speed * step_s + 0.5 * accel * step_s**2
-        turned = distance * steering / n.wheelbase_m
+        turned = distance * steering * per_wheelbase
         along, across, _, _ = _arc(turned)
         x += distance * (c * along - s * across)
         y += distance * (s * along + c * across)
@@ -683,15 +768,15 @@ def _drive(n: Numbers, edge: Floats, inner: Floats, seed: np.uint64, row: Floats
         path = distance - half
         off, noise = _normal(noise, noise_step, edge, inner)
         unread_left += path + n.slip_per_sqrt_m * math.sqrt(abs(path)) * off
-        left = math.floor(unread_left * per_count + 0.5) * n.encoder_step_m
+        left = np.floor(unread_left * per_count + 0.5) * n.encoder_step_m
         unread_left -= left
         path = distance + half
         off, noise = _normal(noise, noise_step, edge, inner)
         unread_right += path + n.slip_per_sqrt_m * math.sqrt(abs(path)) * off
-        right = math.floor(unread_right * per_count + 0.5) * n.encoder_step_m
+        right = np.floor(unread_right * per_count + 0.5) * n.encoder_step_m
         unread_right -= right
         # Estimate: along the arc that odometry tells.
-        gone, bend = 0.5 * (left + right), (right - left) / n.track_width_m
+        gone, bend = 0.5 * (left + right), (right - left) * per_track
         gone_var, bend_var = 0.5 * slip_var * abs(gone), turn_var_per_m * abs(gone)
         along, across, along_by, across_by = _arc(bend)
         fx, fy = bc * along - bs * across, bs * along + bc * across
@@ -708,12 +793,14 @@ def _drive(n: Numbers, edge: Floats, inner: Floats, seed: np.uint64, row: Floats
         yh += ty * bend_var + mx * hh
         hh += bend_var
         steps += 1
+        compass = np.nan
         if has_compass:
             since_compass += abs(gone)
             if since_compass >= n.compass_interval_m:
                 since_compass -= n.compass_interval_m
                 off, noise = _normal(noise, noise_step, edge, inner)
-                innovation = _wrap(_wrap(heading + n.compass_sd_rad * off) - bh)
+                compass = _wrap(heading + n.compass_sd_rad * off)
+                innovation = _wrap(compass - bh)
                 per = 1.0 / (hh + compass_var)
                 kx, ky, kh = xh * per, yh * per, hh * per
                 shift = kh * innovation
@@ -725,6 +812,12 @@ def _drive(n: Numbers, edge: Floats, inner: Floats, seed: np.uint64, row: Floats
                 yy -= ky * yh
                 keep = compass_var * per
                 xh, yh, hh = xh * keep, yh * keep, hh * keep
+        if steps <= len(trace):
+            kept = trace[steps - 1]
+            kept[0], kept[1], kept[2], kept[3] = x, y, heading, speed
+            kept[4], kept[5], kept[6] = left, right, compass
+            kept[7], kept[8], kept[9] = bx, by, bh
+            kept[10], kept[11], kept[12], kept[13], kept[14], kept[15] = xx, xy, xh, yy, yh, hh
         # How does it end? Ellipse's full major axis = 4 sqrt(half sum + radius).
         half_sum, half_gap = 0.5 * (xx + yy), 0.5 * (xx - yy)
         room = lost_16 - half_sum
@@ -747,6 +840,7 @@ def _drive(n: Numbers, edge: Floats, inner: Floats, seed: np.uint64, row: Floats
                     places, places_step, xs, ys, inside, node, n.goal_at_least_m
                 )
                 goal_x, goal_y = xs[goal % columns], ys[goal // columns]
+                noted = _note(events, noted, steps, GOAL_SET, xs, ys, goal, np.nan, np.nan)
                 if n.landmark_per_goal:
                     if landmark_count:
                         landmark_at[landmarks[0]] = -1
@@ -756,6 +850,9 @@ def _drive(n: Numbers, edge: Floats, inner: Floats, seed: np.uint64, row: Floats
                         landmarks[0], places = _draw_place(places, places_step, inside)
                         landmark_at[landmarks[0]] = 0
                         is_visited[0] = False
+                        noted = _note(
+                            events, noted, steps, LANDMARK_SET, xs, ys, landmarks[0], np.nan, np.nan
+                        )
         if travelled_m > n.longest_m or steps * step_s > n.longest_s:
             outcome = GIVEN_UP
             break
@@ -852,19 +949,30 @@ def _drive(n: Numbers, edge: Floats, inner: Floats, seed: np.uint64, row: Floats
             if landmark_at[node] >= 0:
                 passed += 1
                 share, noise = _uniform(noise, noise_step)
-                if share < n.detection_rate:
+                if share >= n.detection_rate:
+                    noted = _note(
+                        events, noted, steps, LANDMARK_MISSED, xs, ys, node, np.nan, np.nan
+                    )
+                else:
                     off, noise = _normal(noise, noise_step, edge, inner)
-                    ix = x + n.landmark_sd_m * off - bx
+                    seen_x = x + n.landmark_sd_m * off
                     off, noise = _normal(noise, noise_step, edge, inner)
-                    iy = y + n.landmark_sd_m * off - by
+                    seen_y = y + n.landmark_sd_m * off
+                    ix, iy = seen_x - bx, seen_y - by
                     is_visited[landmark_at[node]] = True
                     sxx, syy = xx + n.landmark_sd_m**2, yy + n.landmark_sd_m**2
                     per = 1.0 / (sxx * syy - xy * xy)
                     wx, wy = (syy * ix - xy * iy) * per, (sxx * iy - xy * ix) * per
                     if ix * wx + iy * wy > n.landmark_gate_nis:
                         refused += 1
+                        noted = _note(
+                            events, noted, steps, LANDMARK_REFUSED, xs, ys, node, seen_x, seen_y
+                        )
                     else:
                         detected += 1
+                        noted = _note(
+                            events, noted, steps, LANDMARK_TAKEN, xs, ys, node, seen_x, seen_y
+                        )
                         longest_gap_m = max(longest_gap_m, travelled_m - last_fix_m)
                         last_fix_m = travelled_m
                         bx, by = bx + xx * wx + xy * wy, by + xy * wx + yy * wy
