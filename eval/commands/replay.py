@@ -4,8 +4,13 @@ The run folder then holds every table, and a manifest that accounts for every me
 found in a picture is kept by content, so a second run is quick; --resume keeps what an interrupted
 run had finished.
 
-example:
+Many drives (a folder of drives, a quoted pattern, @list.txt, or --each) get a run folder each below
+the one given, side by side with --workers or on a Ray cluster with --ray. One that fails does not
+stop the rest, and a second start does only what is missing.
+
+examples:
   crosscue replay drive.mcap --vehicle car.toml -o runs/drive
+  crosscue replay 'drives/*/drive.mcap' --vehicle car.toml -o runs --workers 8
 """
 
 from __future__ import annotations
@@ -14,33 +19,60 @@ import argparse
 import os
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from crosscue.detectors.registry import Choice, chosen
-from crosscue.eval.accounts import account_of
+from crosscue.eval.accounts import account_of, versions
 from crosscue.eval.detect_stage import choices_of
+from crosscue.eval.drive_list import DriveInput, DriveList, drives_of
 from crosscue.eval.estimate_stage import Outcome
 from crosscue.eval.landmark_stage import matcher_for, open_for
+from crosscue.eval.many_drives import (
+    Done,
+    Engine,
+    Job,
+    exit_status_of,
+    fingerprint_of,
+    in_turn,
+    run_many,
+)
+from crosscue.eval.many_drives import Progress as DrivesDone
 from crosscue.eval.plain_text import terminal_width, visible, wrapped
 from crosscue.eval.replay_drive import Detecting, replay_drive
 from crosscue.eval.scene_stage import ApproachSummary, SceneOutcome
+from crosscue.eval.worker_pool import Processes
+from crosscue.replay.errors import UsageError
 from crosscue.replay.ledger import NOT_ASKED_TOPIC
 from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import create
 from crosscue.replay.vehicle import Vehicle, load
 
-from .common import add_log_arguments, first_ns, print_json, selection_of
+from .common import add_part_arguments, first_ns, print_json, selection_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    add_log_arguments(parser)
     parser.add_argument(
-        "-o", "--output", required=True, type=Path, metavar="RUN", help="run folder"
+        "logs", nargs="+", metavar="LOG",
+        help="recordings of one drive, or drives; paths or URLs",
+    )  # fmt: skip
+    add_part_arguments(parser)
+    parser.add_argument(
+        "-o", "--output", required=True, type=Path, metavar="RUN",
+        help="run folder; for many drives, the folder that gets one for each",
+    )  # fmt: skip
+    parser.add_argument(
+        "--vehicle", type=Path, metavar="V.toml",
+        help="the vehicle file (default: vehicle.toml beside a drive's logs)",
+    )  # fmt: skip
+    parser.add_argument("--each", action="store_true", help="every LOG is a drive of its own")
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="drives at a time (default: 1)"
     )
-    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="the vehicle file")
+    parser.add_argument("--ray", metavar="ADDRESS", help="on a Ray cluster; local starts one here")
     add_detector_arguments(parser)
     parser.add_argument(
         "--landmarks", type=Path, metavar="DB",
@@ -87,31 +119,153 @@ def cache_of(args: argparse.Namespace) -> Path | None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay; 3 when something was lost."""
-    vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
+    if args.draw < 0:
+        raise UsageError(f"--draw {args.draw}: want 0 or more")
+    drives = drives_of(args.logs, each=args.each)
+    if drives.is_many:
+        return _run_many(args, drives)
+    if args.workers != 1 or args.ray is not None:
+        raise UsageError("--workers, --ray: for many drives; this is one (--each makes it many)")
     progress = Progress("replaying", not args.quiet and sys.stderr.isatty())
+    outcome = _replay(drives.drives[0], args.output, args, progress)
+    progress.end()
+    if args.json:
+        print_json(as_json(outcome))
+    elif not args.quiet:
+        print(summary(outcome))
+    return outcome.exit_status
+
+
+def _vehicle(path: Path | None, own: Path | None) -> Vehicle:
+    found = path or own
+    return Vehicle(version=1) if found is None else load(found)
+
+
+def _replay(
+    drive: DriveInput | Job, output: Path, args: argparse.Namespace, progress: Progress
+) -> Outcome:
+    vehicle = _vehicle(args.vehicle, drive.vehicle)
     detecting = Detecting(
         detectors_of(args, vehicle), cache_of(args), args.draw, args.resume, progress.at_frame
     )
     with ExitStack() as stack:
-        logs = open_logs(args.logs)
+        logs = open_logs(drive.logs)
         for log in logs:
             stack.enter_context(log)
         selection = selection_of(args, logs)
         landmarks = None
         if args.landmarks:
             landmarks = stack.enter_context(open_for(args.landmarks, matcher_for(vehicle)))
-        run_folder = create(args.output, overwrite=args.overwrite or args.resume)
+        run_folder = create(output, overwrite=args.overwrite or args.resume)
         if progress.is_shown:
             progress.start_ns = first_ns(logs)
-        outcome = replay_drive(
+        return replay_drive(
             logs, vehicle, run_folder, selection, progress.at_time, landmarks, detecting
         )
-        progress.end()
+
+
+@dataclass(frozen=True, slots=True)
+class _Work:
+    """One of many drives, here or in another process."""
+
+    args: argparse.Namespace
+
+    def __call__(self, job: Job) -> Outcome:
+        # Whether a folder may be replaced was decided before the drive was handed out.
+        args = argparse.Namespace(**{**vars(self.args), "overwrite": True})
+        return _replay(job, job.run, args, Progress("", False))
+
+
+def _run_many(args: argparse.Namespace, drives: DriveList) -> int:
+    engine = engine_of(args.workers, args.ray)
+    flags = {
+        name: str(getattr(args, name))
+        for name in ("detectors", "draw", "start", "end", "topics", "landmarks")
+    }
+    jobs = [
+        Job(
+            drive.name, drive.logs, args.output / drive.name,
+            fingerprint_of(
+                _vehicle(args.vehicle, drive.vehicle).model_dump(mode="json"), flags, versions()
+            ),
+            drive.vehicle, drive.truth,
+        )
+        for drive in drives.drives
+    ]  # fmt: skip
+    line = DriveProgress(not args.quiet and sys.stderr.isatty())
+    done = run_many(jobs, _Work(args), engine, overwrite=args.overwrite, on_progress=line)
+    line.end()
     if args.json:
-        print_json(as_json(outcome))
+        print_json({"drives": [_drive_as_json(one) for one in done]})
     elif not args.quiet:
-        print(summary(outcome))
-    return outcome.exit_status
+        print("\n".join(_drive_lines(done)))
+    return exit_status_of(done)
+
+
+def engine_of(workers: int, ray: str | None) -> Engine:
+    """Where many drives are worked on.
+
+    Raises:
+        UsageError: Too few workers.
+    """
+    if workers < 1:
+        raise UsageError(f"--workers {workers}: want 1 or more")
+    if ray is not None:
+        from crosscue.eval.ray_drives import OnRay
+
+        return OnRay(ray)
+    return in_turn if workers == 1 else Processes(workers)
+
+
+class DriveProgress:
+    """One line on a terminal: drives done, failed, and the time left."""
+
+    def __init__(self, is_shown: bool) -> None:
+        """Say nothing unless ``is_shown``."""
+        self._is_shown = is_shown
+
+    def __call__(self, at: DrivesDone) -> None:
+        """Told how far it has come."""
+        if not self._is_shown:
+            return
+        left = "" if at.seconds_left is None else f", {at.seconds_left:.0f} s left"
+        failed = f", {at.failed} failed" if at.failed else ""
+        sys.stderr.write(f"\r{at.earlier + at.done} of {at.total} drives{failed}{left} \x1b[K")
+        sys.stderr.flush()
+
+    def end(self) -> None:
+        """Take the line away."""
+        if self._is_shown:
+            sys.stderr.write("\r\x1b[K")
+            sys.stderr.flush()
+
+
+def _drive_lines(done: Sequence[Done[Outcome]]) -> list[str]:
+    lines = []
+    for one in done:
+        if one.error is not None:
+            lines.append(f"failed   {one.job.name}: {one.error}")
+        elif one.is_earlier:
+            lines.append(f"earlier  {one.job.name}: done before, kept")
+        else:
+            lost = "" if not one.exit_status else ", with losses"
+            lines.append(f"done     {one.job.name}: {one.seconds:.1f} s{lost}")
+    failed = sum(one.error is not None for one in done)
+    lines.append(f"drives   {len(done) - failed} of {len(done)}, {failed} failed")
+    return [visible(line) for line in lines]
+
+
+def _drive_as_json(one: Done[Outcome]) -> dict[str, object]:
+    return {
+        "name": one.job.name,
+        "run": str(one.job.run),
+        "exit_status": one.exit_status,
+        "error": one.error,
+        "earlier": one.is_earlier,
+        "attempts": one.attempts,
+        "seconds": one.seconds,
+        "result": None if one.result is None else as_json(one.result),
+    }
 
 
 class Progress:

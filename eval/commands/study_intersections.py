@@ -16,10 +16,11 @@ from pathlib import Path
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.eval.intersection_report import TABLES, summary, write_study
 from crosscue.eval.intersection_study import StudySettings, run_drives, score_study
-from crosscue.eval.many_drives import Engine, Progress, exit_status_of, in_turn
+from crosscue.eval.many_drives import exit_status_of
 from crosscue.eval.plain_text import visible
-from crosscue.eval.worker_pool import Processes
-from crosscue.replay.errors import RunError, UsageError
+from crosscue.replay.errors import RunError
+
+from .replay import DriveProgress, engine_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,6 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vehicle", type=Path, metavar="V.toml",
                         help="replay with it instead of each drive's own")  # fmt: skip
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="drives at a time")
+    parser.add_argument("--ray", metavar="ADDRESS",
+                        help="on a Ray cluster that shares DIR; local starts one here")  # fmt: skip
     parser.add_argument("--no-attribution", action="store_true",
                         help="leave out what each cue is worth")  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the tables as JSON")
@@ -41,14 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, replay, score; 3 when a drive failed."""
-    if args.workers < 1:
-        raise UsageError(f"--workers {args.workers}: want 1 or more")
+    engine = engine_of(args.workers, args.ray)
     settings = StudySettings(
         layouts=tuple(name.strip() for name in args.layouts.split(",") if name.strip()),
         runs=args.runs, seed=args.seed, width_px=args.width, vehicle=args.vehicle,
     )  # fmt: skip
-    engine: Engine = in_turn if args.workers == 1 else Processes(args.workers)
-    line = _Line(not args.quiet and sys.stderr.isatty())
+    line = DriveProgress(not args.quiet and sys.stderr.isatty())
     done = run_drives(args.output, settings, engine, line)
     line.end()
     names = [one.job.name for one in done if one.error is None]
@@ -61,23 +62,3 @@ def run(args: argparse.Namespace) -> int:
     elif not args.quiet:
         print("\n".join(visible(text) for text in summary(done, scored, written).split("\n")))
     return exit_status_of(done)
-
-
-class _Line:
-    """One line on a terminal with drives done and time left."""
-
-    def __init__(self, is_shown: bool) -> None:
-        self._is_shown = is_shown
-
-    def __call__(self, at: Progress) -> None:
-        if self._is_shown:
-            left = "" if at.seconds_left is None else f", {at.seconds_left:.0f} s left"
-            done = at.earlier + at.done
-            sys.stderr.write(f"\r{done} of {at.total} drives{left} \x1b[K")
-            sys.stderr.flush()
-
-    def end(self) -> None:
-        """Take the line away."""
-        if self._is_shown:
-            sys.stderr.write("\r\x1b[K")
-            sys.stderr.flush()
