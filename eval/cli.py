@@ -39,6 +39,9 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "landmarks list": ("landmarks_list", "what a landmark database holds"),
     "landmarks match": ("landmarks_match", "one picture against a landmark database"),
     "truth": ("truth", "write the truth that a data set carries"),
+    "truth import": ("truth_import", "annotations from COCO or CVAT as truth"),
+    "truth check": ("truth_check", "does a truth file fit its log?"),
+    "truth schema": ("truth_schema", "the JSON Schema of truth.json"),
     "simulate": ("simulate", "drives up to intersections, with camera, CAN, Mobileye and truth"),
     "train road": ("train_road", "the road network, on simulated or own pictures"),
     "study intersections": (

@@ -1,0 +1,340 @@
+"""Annotated pictures from other tools, laid onto a log's frames and turned into truth.
+
+A label that is a cue's name (``stop sign``, ``parked_left``) says that the cue is there. A picture
+that was annotated without it says that the cue is not there. Labels of other things stay labelled
+objects.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from crosscue.replay.columns import Int64s
+from crosscue.replay.errors import SchemaError, UsageError
+
+from .truth import CUES, CueTruth
+
+OTHER_THINGS: Final = frozenset(
+    {"person", "pedestrian", "bicycle", "car", "motorcycle", "bus", "train", "truck", "van",
+     "vehicle", "rider", "trailer"}
+)  # fmt: skip
+"""Labels of things on a road that are no cue by themselves."""
+SLACK_PX: Final = 1.0
+"""Boxes may lie so far outside: tools round differently."""
+FAR: Final = 0.4
+"""Share of the time between frames that a picture may be off the frame it belongs to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Thing:
+    """One annotated thing.
+
+    Attributes:
+        label: As annotated.
+        box_px: x0, y0, x1, y1; None for a label of the whole picture.
+        is_crowd: It stands for a number of things that nobody counted.
+        visible: Share that nothing hides, or None.
+        track: The same number in several pictures is the same thing; None unknown.
+        segmentation: COCO's polygons or runs, or None.
+        place: Where it stands in its file, for errors.
+    """
+
+    label: str
+    box_px: tuple[float, float, float, float] | None
+    is_crowd: bool = False
+    visible: float | None = None
+    track: int | None = None
+    segmentation: Any = None
+    place: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One annotated picture.
+
+    Attributes:
+        name: File name.
+        size_px: Width and height as the tool saw it.
+        t_ns: Log time where the file tells it.
+        frame: Number of the frame in its video where the file tells it.
+        things: What was annotated; none is an answer, too.
+    """
+
+    name: str
+    size_px: tuple[int, int]
+    t_ns: int | None = None
+    frame: int | None = None
+    things: tuple[Thing, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Annotations:
+    """One file of annotations.
+
+    Attributes:
+        where: The file.
+        labels: All that annotators could choose from.
+        pictures: All that were annotated.
+        ignored: What the file holds besides, by kind.
+    """
+
+    where: str
+    labels: tuple[str, ...]
+    pictures: tuple[Picture, ...]
+    ignored: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogPictures:
+    """The pictures of a log's camera.
+
+    Attributes:
+        where: The log.
+        t_ns: Shape (N,), growing.
+        size_px: Width and height of the first one.
+        names: From file name to time where they are files of their own; else empty.
+    """
+
+    where: str
+    t_ns: Int64s
+    size_px: tuple[int, int]
+    names: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """Pictures with their log times.
+
+    Attributes:
+        t_ns: One for each picture.
+        rule: How they were found, for people.
+    """
+
+    t_ns: tuple[int, ...]
+    rule: str
+
+
+def place(annotations: Annotations, log: LogPictures) -> Placed:
+    """Find the frame of each picture: by its time, its file name, or its number.
+
+    Raises:
+        SchemaError: Pictures belong to no frame, two to the same, or are of another size.
+    """
+    if not annotations.pictures:
+        raise SchemaError(f"{annotations.where}: no picture in it; nothing to import")
+    _check_sizes(annotations, log)
+    placed = (
+        _by_name(annotations, log) or _by_time(annotations, log) or _by_number(annotations, log)
+    )
+    for t_ns, times in Counter(placed.t_ns).items():
+        if times > 1:
+            names = [p.name for p, t in zip(annotations.pictures, placed.t_ns, strict=True)
+                     if t == t_ns]  # fmt: skip
+            raise SchemaError(
+                f"{annotations.where}: {' and '.join(names[:2])} belong to one frame, {t_ns} ns "
+                f"({placed.rule}); give each its own time or number"
+            )
+    return placed
+
+
+def _check_sizes(annotations: Annotations, log: LogPictures) -> None:
+    for picture in annotations.pictures:
+        if picture.size_px != log.size_px:
+            raise SchemaError(
+                f"{annotations.where}: {picture.name}: {_size(picture.size_px)} pixels, those of "
+                f"{log.where} have {_size(log.size_px)}; annotate pictures as recorded"
+            )
+
+
+def _size(size_px: tuple[int, int]) -> str:
+    return f"{size_px[0]} x {size_px[1]}"
+
+
+def _by_name(annotations: Annotations, log: LogPictures) -> Placed | None:
+    names = [re.split(r"[/\\]", picture.name)[-1] for picture in annotations.pictures]
+    if not all(name in log.names for name in names):
+        return None
+    return Placed(tuple(log.names[name] for name in names), "by file name")
+
+
+def _by_time(annotations: Annotations, log: LogPictures) -> Placed | None:
+    """By ``t_ns``, or by a file name that is a time; each goes to the nearest frame."""
+    asked = [_time_of(picture) for picture in annotations.pictures]
+    if any(t is None for t in asked):
+        return None
+    wanted = np.array(asked, np.int64)
+    after = np.clip(np.searchsorted(log.t_ns, wanted), 0, len(log.t_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    is_before = np.abs(wanted - log.t_ns[before]) < np.abs(wanted - log.t_ns[after])
+    found = log.t_ns[np.where(is_before, before, after)]
+    off = np.abs(found - wanted)
+    period = float(np.median(np.diff(log.t_ns))) if len(log.t_ns) > 1 else math.inf
+    if off.max() > FAR * period:
+        worst = int(off.argmax())
+        raise SchemaError(
+            f"{annotations.where}: {annotations.pictures[worst].name}: no frame of {log.where} "
+            f"near {wanted[worst]} ns; the nearest is {found[worst]} ns: it is of another log"
+        )
+    return Placed(tuple(found.tolist()), f"by time, at most {off.max() * 1e-6:.1f} ms off")
+
+
+def _time_of(picture: Picture) -> int | None:
+    if picture.t_ns is not None:
+        return picture.t_ns
+    stem = re.split(r"[/\\]", picture.name)[-1].rpartition(".")[0]
+    # Nanoseconds since 1970 have nineteen digits, and no frame's number has.
+    return int(stem) if re.fullmatch(r"[0-9]{16,19}", stem) else None
+
+
+def _by_number(annotations: Annotations, log: LogPictures) -> Placed:
+    times: list[int] = []
+    for picture in annotations.pictures:
+        number = picture.frame
+        if number is None:
+            digits = re.search(r"([0-9]{1,9})\.[A-Za-z]+$", picture.name)
+            if digits is None:
+                raise SchemaError(
+                    f"{annotations.where}: {picture.name}: tells neither a time nor a frame; give "
+                    "pictures a t_ns, or names that end in the frame's number, from 0"
+                )
+            number = int(digits[1])
+        if not 0 <= number < len(log.t_ns):
+            raise SchemaError(
+                f"{annotations.where}: {picture.name}: frame {number} of {len(log.t_ns)} in "
+                f"{log.where} (the first is 0); it is of another log"
+            )
+        times.append(int(log.t_ns[number]))
+    return Placed(tuple(times), "by frame number, the first being 0")
+
+
+def meanings(annotations: Annotations, own: Mapping[str, str]) -> dict[str, str | None]:
+    """From label to cue; None for things that are no cue.
+
+    Args:
+        annotations: With labels.
+        own: From label to cue as the user says; an empty cue for a thing that is none.
+
+    Raises:
+        UsageError: ``own`` names a label or cue that there is not.
+        SchemaError: A label is neither a cue nor a known thing.
+    """
+    for label, cue in own.items():
+        if label not in annotations.labels:
+            raise UsageError(
+                f"--map {label}={cue}: no such label; {_there_are(annotations.labels)}"
+            )
+        if cue and cue not in CUES:
+            raise UsageError(f"--map {label}={cue}: no such cue; {_there_are(CUES)}")
+    found: dict[str, str | None] = {}
+    for label in annotations.labels:
+        plain = re.sub(r"[^a-z0-9]+", "_", label.lower()).strip("_")
+        if label in own:
+            found[label] = own[label] or None
+        elif plain in CUES:
+            found[label] = plain
+        elif plain in OTHER_THINGS:
+            found[label] = None
+        else:
+            close = difflib.get_close_matches(plain, CUES, n=1, cutoff=0.6)
+            hint = close[0] if close else ""
+            raise SchemaError(
+                f"{annotations.where}: class {label!r} is neither a cue nor a known thing; say "
+                f"what it is: --map '{label}={hint}' (nothing after = for no cue)"
+            )
+    return found
+
+
+def _there_are(names: Sequence[str]) -> str:
+    return f"there are: {', '.join(names)}"
+
+
+def check_boxes(annotations: Annotations) -> None:
+    """Refuse boxes without area, or that lie outside their picture.
+
+    Raises:
+        SchemaError: With the first one's place.
+    """
+    for picture in annotations.pictures:
+        width, height = picture.size_px
+        for thing in picture.things:
+            if thing.box_px is None:
+                continue
+            x0, y0, x1, y1 = thing.box_px
+            where = f"{annotations.where}: {thing.place or picture.name} ({thing.label})"
+            if not (x0 < x1 and y0 < y1):
+                raise SchemaError(f"{where}: box {_box(thing.box_px)} has no area; mend it")
+            if x0 < -SLACK_PX or y0 < -SLACK_PX or x1 > width + SLACK_PX or y1 > height + SLACK_PX:
+                raise SchemaError(
+                    f"{where}: box {_box(thing.box_px)} lies outside the picture of "
+                    f"{_size(picture.size_px)} pixels; mend it"
+                )
+
+
+def _box(box: tuple[float, float, float, float]) -> str:
+    return " ".join(f"{value:g}" for value in box)
+
+
+def cue_truths(
+    annotations: Annotations, placed: Placed, cues: Mapping[str, str | None]
+) -> tuple[CueTruth, ...]:
+    """One statement for each annotated picture and each cue that could have been labelled."""
+    known = [cue for cue in CUES if cue in cues.values()]
+    told: list[CueTruth] = []
+    for t_ns, picture in sorted(
+        zip(placed.t_ns, annotations.pictures, strict=True), key=lambda pair: pair[0]
+    ):
+        for cue in known:
+            mine = [thing for thing in picture.things if cues[thing.label] == cue]
+            seen = [thing.visible for thing in mine if thing.visible is not None]
+            counted = not any(thing.is_crowd for thing in mine)
+            told.append(
+                CueTruth(cue=cue, present=bool(mine), t_ns=t_ns,
+                         count=len(mine) if counted else None,
+                         visible=max(seen) if mine and len(seen) == len(mine) else None)
+            )  # fmt: skip
+    return tuple(told)
+
+
+def coco_tree(annotations: Annotations, placed: Placed) -> dict[str, Any]:
+    """The labelled objects as a COCO tree, pictures with their log times."""
+    numbers = {label: number for number, label in enumerate(annotations.labels, start=1)}
+    images: list[dict[str, Any]] = []
+    things: list[dict[str, Any]] = []
+    for number, (picture, t_ns) in enumerate(
+        zip(annotations.pictures, placed.t_ns, strict=True), start=1
+    ):
+        width, height = picture.size_px
+        images.append({"id": number, "t_ns": t_ns, "file_name": picture.name, "width": width,
+                       "height": height})  # fmt: skip
+        for thing in picture.things:
+            if thing.box_px is not None:
+                things.append(_coco_thing(len(things) + 1, number, numbers[thing.label], thing))
+    return {
+        "info": {"description": f"imported from {annotations.where}"},
+        "images": images,
+        "annotations": things,
+        "categories": [{"id": number, "name": label} for label, number in numbers.items()],
+    }
+
+
+def _coco_thing(number: int, image: int, category: int, thing: Thing) -> dict[str, Any]:
+    assert thing.box_px is not None
+    x0, y0, x1, y1 = thing.box_px
+    found: dict[str, Any] = {
+        "id": number, "image_id": image, "category_id": category,
+        "bbox": [x0, y0, x1 - x0, y1 - y0], "area": (x1 - x0) * (y1 - y0),
+        "iscrowd": int(thing.is_crowd),
+    }  # fmt: skip
+    for name, value in (("segmentation", thing.segmentation), ("visible", thing.visible),
+                        ("track_id", thing.track)):  # fmt: skip
+        if value is not None:
+            found[name] = value
+    return found

@@ -1,0 +1,235 @@
+"""CVAT's own annotation files, XML 1.1: "CVAT for images" and "CVAT for video".
+
+Read by expat's events. A document type declaration is refused, and with it every entity: nothing is
+fetched and nothing grows.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+from xml.parsers import expat
+
+import numpy as np
+
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.limits import MIB
+
+from .annotations import Annotations, Picture, Thing
+
+MOST_BYTES: Final = 512 * MIB
+MOST_DEPTH: Final = 64
+MOST_FRAMES: Final = 10_000_000
+MOST_SIDE: Final = 100_000
+SHAPES: Final = ("box", "polygon", "mask", "tag")
+IGNORED: Final = ("polyline", "points", "cuboid", "ellipse", "skeleton")
+
+
+def read_cvat(path: Path) -> Annotations:
+    """Read an ``annotations.xml``.
+
+    Boxes, polygons, masks and tags are taken; other shapes are counted under ``ignored``.
+
+    Raises:
+        SchemaError: Not there, not such a file, or with a document type declaration.
+    """
+    reader = _Reader(str(path))
+    parser = expat.ParserCreate()
+    parser.StartDoctypeDeclHandler = reader.refuse_doctype
+    parser.StartElementHandler = reader.start
+    parser.EndElementHandler = reader.end
+    parser.CharacterDataHandler = reader.text
+    parser.buffer_text = True
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split it")
+        with path.open("rb") as file:
+            parser.ParseFile(file)
+    except (OSError, expat.ExpatError) as error:
+        raise SchemaError(f"{path}: not readable as XML ({error}); give CVAT's XML 1.1") from None
+    return reader.annotations()
+
+
+@dataclass(slots=True)
+class _Reader:
+    """What has been read so far."""
+
+    where: str
+    _path: list[str] = field(default_factory=list)
+    _words: list[str] = field(default_factory=list)
+    _meta: dict[str, str] = field(default_factory=dict)
+    _labels: list[str] = field(default_factory=list)
+    _pictures: list[Picture] = field(default_factory=list)
+    _things: list[Thing] = field(default_factory=list)
+    _by_frame: dict[int, list[Thing]] = field(default_factory=dict)
+    _track: tuple[int, str] | None = None
+    _ignored: dict[str, int] = field(default_factory=dict)
+
+    def refuse_doctype(self, *_: object) -> None:
+        raise SchemaError(
+            f"{self.where}: has a document type declaration, which may hide entities; CVAT writes "
+            "none: take it out"
+        )
+
+    def start(self, tag: str, found: Mapping[str, str]) -> None:
+        if not self._path and tag != "annotations":
+            raise SchemaError(f"{self.where}: <{tag}>: want <annotations>; give CVAT's XML 1.1")
+        if len(self._path) >= MOST_DEPTH:
+            raise SchemaError(f"{self.where}: elements over {MOST_DEPTH} deep; this is not CVAT's")
+        self._path.append(tag)
+        self._words = []
+        if tag == "image":
+            self._things = []
+            self._pictures.append(self._picture(found))
+        elif tag == "track":
+            self._track = (self._whole(found, "id"), self._text(found, "label"))
+        elif tag in SHAPES and self._path[-2] in ("image", "track"):
+            self._shape(tag, found)
+        elif tag in IGNORED and self._path[-2] in ("image", "track"):
+            self._ignored[tag] = self._ignored.get(tag, 0) + 1
+
+    def end(self, tag: str) -> None:
+        text = "".join(self._words).strip()
+        if self._path[-3:] == ["labels", "label", "name"]:
+            self._labels.append(text)
+        elif "meta" in self._path:
+            # The first wins: below <segments> other numbers go by the same names.
+            self._meta.setdefault("/".join(self._path[-2:]), text)
+        elif tag == "image":
+            last = self._pictures.pop()
+            self._pictures.append(Picture(last.name, last.size_px, None, last.frame,
+                                          tuple(self._things)))  # fmt: skip
+        elif tag == "track":
+            self._track = None
+        self._path.pop()
+        self._words = []
+
+    def text(self, words: str) -> None:
+        self._words.append(words)
+
+    def _picture(self, found: Mapping[str, str]) -> Picture:
+        name = self._text(found, "name")
+        size = (self._whole(found, "width"), self._whole(found, "height"))
+        self._check_size(size)
+        # A name that ends in a number tells the frame; else the number of the picture does.
+        has_number = re.search(r"[0-9]\.[A-Za-z]+$", name) is not None
+        return Picture(name, size, None, None if has_number else self._whole(found, "id"))
+
+    def _check_size(self, size: tuple[int, int]) -> None:
+        if not (0 < size[0] <= MOST_SIDE and 0 < size[1] <= MOST_SIDE):
+            raise SchemaError(f"{self.where}: pictures of {size[0]} x {size[1]}: want pixels")
+
+    def _shape(self, tag: str, found: Mapping[str, str]) -> None:
+        if self._path[-2] == "track":
+            assert self._track is not None
+            frame = self._whole(found, "frame")
+            things = self._by_frame.setdefault(frame, [])
+            # An ``outside`` box only says where the thing was last; it is not in this frame.
+            if found.get("outside") != "1":
+                number, label = self._track
+                things.append(self._thing(tag, found, label, number, f"track {number}"))
+            return
+        label = self._text(found, "label")
+        name = self._pictures[-1].name
+        self._things.append(self._thing(tag, found, label, None, name))
+
+    def _thing(
+        self, tag: str, found: Mapping[str, str], label: str, track: int | None, place: str
+    ) -> Thing:
+        if tag == "tag":
+            return Thing(label, None, track=track, place=place)
+        if tag == "box":
+            x0, y0, x1, y1 = (self._number(found, name) for name in ("xtl", "ytl", "xbr", "ybr"))
+            return Thing(label, (x0, y0, x1, y1), track=track, place=place)
+        if tag == "mask":
+            left, top, wide, high = (
+                self._whole(found, name) for name in ("left", "top", "width", "height")
+            )
+            return Thing(label, (left, top, left + wide, top + high), track=track, place=place)
+        points = self._points(found)
+        corners = (*points.min(axis=0).tolist(), *points.max(axis=0).tolist())
+        box = (corners[0], corners[1], corners[2], corners[3])
+        return Thing(label, box, track=track, place=place, segmentation=[points.ravel().tolist()])
+
+    def _points(self, found: Mapping[str, str]) -> np.typing.NDArray[np.float64]:
+        text = self._text(found, "points")
+        try:
+            pairs = [[float(value) for value in pair.split(",")] for pair in text.split(";")]
+            points = np.array(pairs, np.float64)
+        except ValueError:
+            points = np.empty((0, 0))
+        if points.ndim != 2 or points.shape[1:] != (2,) or not np.isfinite(points).all():
+            raise SchemaError(f"{self.where}: points {text[:40]!r}: want x,y;x,y;...; mend it")
+        return points
+
+    def _text(self, found: Mapping[str, str], name: str) -> str:
+        if name not in found:
+            raise SchemaError(
+                f"{self.where}: <{self._path[-1]}> has no {name}; give CVAT's XML 1.1"
+            )
+        return found[name]
+
+    def _whole(self, found: Mapping[str, str], name: str) -> int:
+        text = self._text(found, name)
+        if not re.fullmatch(r"[0-9]{1,9}", text):
+            raise SchemaError(
+                f"{self.where}: <{self._path[-1]}> {name} {text[:40]!r}: want a whole number"
+            )
+        return int(text)
+
+    def _number(self, found: Mapping[str, str], name: str) -> float:
+        text = self._text(found, name)
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise SchemaError(
+                f"{self.where}: <{self._path[-1]}> {name} {text[:40]!r}: want a number"
+            )
+        return value
+
+    def annotations(self) -> Annotations:
+        """Everything, once the file has been read."""
+        pictures = tuple(self._pictures) or self._video()
+        used = {thing.label for picture in pictures for thing in picture.things}
+        labels = tuple(dict.fromkeys([*self._labels, *sorted(used)]))
+        return Annotations(self.where, labels, pictures, dict(self._ignored))
+
+    def _video(self) -> tuple[Picture, ...]:
+        """Every frame of the task counts as annotated, also those that no track touches."""
+        size = (self._known("original_size/width"), self._known("original_size/height"))
+        self._check_size(size)
+        first = self._known("start_frame", 0)
+        last = self._known("stop_frame", first + self._known("size", 0) - 1)
+        filtered = re.search(r"step=([0-9]{1,6})", self._found("frame_filter") or "")
+        step = max(int(filtered[1]), 1) if filtered else 1
+        if last - first > MOST_FRAMES:
+            raise SchemaError(f"{self.where}: frames {first} to {last}: over {MOST_FRAMES}")
+        frames = range(first, last + 1, step)
+        # A thing drawn in a single frame is closed one frame later, maybe behind the last one.
+        strange = [n for n, things in self._by_frame.items() if things and n not in frames]
+        if strange:
+            raise SchemaError(
+                f"{self.where}: frame {strange[0]}: the task has {first} to {last} by {step}"
+            )
+        return tuple(
+            Picture(f"frame {n}", size, None, n, tuple(self._by_frame.get(n, ()))) for n in frames
+        )
+
+    def _found(self, name: str) -> str | None:
+        """Of the task or job, or from below it."""
+        ends = (f"task/{name}", f"job/{name}", name)
+        return next((self._meta[end] for end in ends if end in self._meta), None)
+
+    def _known(self, name: str, otherwise: int | None = None) -> int:
+        text = self._found(name) or ""
+        if re.fullmatch(r"[0-9]{1,9}", text):
+            return int(text)
+        if otherwise is None or text:
+            raise SchemaError(f"{self.where}: meta: {name} {text[:40]!r}: want a whole number")
+        return otherwise
