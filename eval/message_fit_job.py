@@ -7,22 +7,24 @@ straight ahead nothing is known: the road goes on). Other frames are left out.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from crosscue.datasets.truth import Truth
+from crosscue.fusion.annotated_approach import NOT_LOOKED, AnnotatedApproach
 from crosscue.fusion.factor_graph import FactorGraph, graph_of
-from crosscue.fusion.message_fit import NOT_LOOKED, AnnotatedApproach, MessageFit, RateFit, Side
+from crosscue.fusion.message_fit import MessageFit, RateFit, Side
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.run_folder import RunFolder
 from crosscue.replay.vehicle import Vehicle, of_manifest
 
-from .intervals import Interval, wilson
+from .intervals import Interval, resampled, wilson
 from .score_truth import CROSSING_NS
 from .travelled import odometer_of
 
@@ -81,7 +83,7 @@ def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) ->
     counts = _counts(run, t_ns)
     for one in np.unique(number).tolist():
         rows = np.flatnonzero(number == one)
-        kept, features, what = _meant(t_ns[rows], truth)
+        kept, features, place, what = _meant(t_ns[rows], truth)
         into.used[what] += 1
         if features is None or not kept.any():
             continue
@@ -95,26 +97,28 @@ def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) ->
                 before.astype(np.bool_),
                 {cue: column[rows] for cue, column in counts.items()},
                 features,
+                place or f"{run.path}, approach {one}",
             )
         )
 
 
 def _meant(
     t_ns: Int64s, truth: Truth
-) -> tuple[np.typing.NDArray[np.bool_], dict[str, bool] | None, str]:
-    """Which frames count, what is true of the intersection, and what the approach was."""
+) -> tuple[np.typing.NDArray[np.bool_], dict[str, bool] | None, str, str]:
+    """Which frames count, what is true, which intersection, and what the approach was."""
     shared = [((t_ns >= a.start_ns) & (t_ns < a.enter_ns)).sum() for a in truth.approaches]
     if shared and max(shared) > 0:
         one = truth.approaches[int(np.argmax(shared))]
         features = {"intersection": True, **one.features.model_dump()}
-        return (t_ns >= one.start_ns) & (t_ns < one.enter_ns), features, "to an intersection"
+        before = (t_ns >= one.start_ns) & (t_ns < one.enter_ns)
+        return before, features, one.intersection, "to an intersection"
     inside = (t_ns >= truth.start_ns) & (t_ns < truth.end_ns)
     for a in truth.approaches:
         if ((t_ns >= a.enter_ns) & (t_ns < a.enter_ns + CROSSING_NS)).any():
-            return inside, None, "in an intersection, left out"
+            return inside, None, "", "in an intersection, left out"
     if not inside.all():
-        return inside, None, "outside the truth's time, left out"
-    return inside, dict(NOTHING_THERE), "to nothing"
+        return inside, None, "", "outside the truth's time, left out"
+    return inside, dict(NOTHING_THERE), "", "to nothing"
 
 
 def _whole(column: object) -> Int64s:
@@ -172,14 +176,30 @@ def _places(
     return where[found], found
 
 
-def share_of(side: Side) -> tuple[float, Interval]:
-    """Share of positive looks and Wilson's interval, both by independent looks.
+class SideTold(NamedTuple):
+    """A rate and how sure it is.
 
-    Rounding to whole looks costs less than pretending that every frame is one.
+    Attributes:
+        rate: Mean over places; NaN without any.
+        wilson: Interval by independent looks; rounding them to whole ones costs less than
+            pretending that every frame is one.
+        places: Interval by resampling places; NaN for fewer than two.
     """
+
+    rate: float
+    wilson: Interval
+    places: Interval
+
+
+def told_of(side: Side) -> SideTold:
+    """A side's rate with both intervals."""
     looks = round(side.looks)
-    hits = min(round(side.hits), looks)
-    return side.hits / side.looks if side.looks else float("nan"), wilson(hits, looks)
+    rates = np.array(side.rates)
+    return SideTold(
+        float(rates.mean()) if len(rates) else math.nan,
+        wilson(min(round(side.hits), looks), looks),
+        resampled(rates, np.arange(len(rates))),
+    )
 
 
 def section_of(fit: MessageFit) -> str:
@@ -205,6 +225,5 @@ def _rate_line(one: RateFit) -> str:
     return (
         f'  {{ cue = "{one.cue}", feature = "{one.feature}", near = {str(one.near).lower()}, '
         f"if_there = {one.rates.if_there:.4g}, if_not = {one.rates.if_not:.4g} }},  "
-        f"# {one.there.hits:.1f} of {one.there.looks:.1f} looks, "
-        f"{one.missing.hits:.1f} of {one.missing.looks:.1f}"
+        f"# {one.there.places} and {one.missing.places} places"
     )

@@ -179,7 +179,7 @@ def test_the_fit_finds_the_rates_that_the_looks_were_drawn_with() -> None:
 
 
 def test_the_fit_finds_the_fade_that_the_looks_were_drawn_with() -> None:
-    fit = fit_messages(annotated(2, 150), GRAPH)
+    fit = fit_messages(annotated(2, 400), GRAPH)
 
     for one in fit.fades:
         if one.is_learned:

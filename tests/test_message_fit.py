@@ -149,8 +149,9 @@ def test_the_section_is_printed_where_no_file_is_named(
         one for one in printed["rates"]
         if (one["cue"], one["feature"], one["near"]) == ("road_left", "left", True)
     ]  # fmt: skip
-    low, high = rate["there"]["interval"]
-    assert low < rate["there"]["rate"] < high
+    for interval in ("wilson", "by_places"):
+        low, high = rate["there"][interval]
+        assert low < rate["there"]["rate"] < high
 
 
 def test_each_run_needs_its_truth(
@@ -159,4 +160,4 @@ def test_each_run_needs_its_truth(
     runs, truths = drives
 
     assert crosscue(["fit", "messages", *map(str, runs), "--truth", str(truths[0])]) == 2
-    assert "16 runs and 1 truths; give one for each" in capsys.readouterr().err
+    assert "16 runs, 1 truth files; give one" in capsys.readouterr().err

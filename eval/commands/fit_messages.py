@@ -22,9 +22,10 @@ from crosscue.eval.message_fit_job import (
     annotate,
     graph_of_runs,
     section_of,
-    share_of,
+    told_of,
 )
-from crosscue.fusion.message_fit import FadeFit, MessageFit, RateFit, Side, fit_messages
+from crosscue.fusion.fade_fit import FadeFit
+from crosscue.fusion.message_fit import MessageFit, RateFit, Side, fit_messages
 from crosscue.replay.errors import UsageError
 from crosscue.replay.run_folder import open_run, write_text
 
@@ -46,8 +47,8 @@ def run(args: argparse.Namespace) -> int:
     """Learn and tell."""
     if len(args.runs) != len(args.truth):
         raise UsageError(
-            f"fit messages: {len(args.runs)} runs and {len(args.truth)} truths; give one for each, "
-            "in the same order"
+            f"fit messages: {len(args.runs)} runs, {len(args.truth)} truth files; give one "
+            "for each, in the same order"
         )
     runs = [open_run(path) for path in args.runs]
     graph, vehicle = graph_of_runs(runs)
@@ -77,7 +78,10 @@ def run(args: argparse.Namespace) -> int:
 def _told(fitted: MessageFit, used: Counter[str], runs: int) -> str:
     lines = [f"{runs} runs, {fitted.approaches} approaches to learn from"]
     lines += [f"  {count:5} {what}" for what, count in sorted(used.items())]
-    lines += ["", "rates of positive looks, feature there / not there (95 % intervals)"]
+    lines += [
+        "",
+        "shares of positive looks where the feature is there and where not (95 % intervals)",
+    ]
     lines += [_rate_told(one) for one in fitted.rates]
     lines += ["", "looks become independent over"]
     lines += [_fade_told(one) for one in fitted.fades]
@@ -93,19 +97,23 @@ def _rate_told(one: RateFit) -> str:
     says = math.log(one.rates.if_there / one.rates.if_not)
     silence = math.log((1.0 - one.rates.if_there) / (1.0 - one.rates.if_not))
     return (
-        f"  {name}\n    {_side_told(one.there)} / {_side_told(one.missing)}\n"
+        f"  {name}\n    there     {_side_told(one.there)}\n"
+        f"    not there {_side_told(one.missing)}\n"
         f"    log odds of a detection {says:+.2f}, of none {silence:+.2f}"
     )
 
 
 def _too_few(one: RateFit) -> str:
-    there, missing = one.there.approaches, one.missing.approaches
-    return f"{there} approaches with it, {missing} without"
+    return f"{one.there.places} places with it, {one.missing.places} without"
 
 
 def _side_told(side: Side) -> str:
-    value, ends = share_of(side)
-    return f"{value:.2f} ({ends.low:.2f} to {ends.high:.2f}; {side.looks:.0f} of {side.frames})"
+    told = told_of(side)
+    return (
+        f"{told.rate:.2f} ({told.wilson.low:.2f} to {told.wilson.high:.2f} by "
+        f"{side.looks:.0f} looks in {side.frames} frames; {told.places.low:.2f} to "
+        f"{told.places.high:.2f} by {side.places} places)"
+    )
 
 
 def _fade_told(one: FadeFit) -> str:
@@ -140,5 +148,10 @@ def _as_json(fitted: MessageFit, used: Counter[str]) -> dict[str, object]:
 
 
 def _side_json(side: Side) -> dict[str, object]:
-    value, ends = share_of(side)
-    return {**side._asdict(), "rate": value, "interval": list(ends)}
+    told = told_of(side)
+    return {
+        **side._asdict(),
+        "rate": told.rate,
+        "wilson": list(told.wilson),
+        "by_places": list(told.places),
+    }

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from crosscue.detectors.cue_names import Cue
+from crosscue.fusion.annotated_approach import AnnotatedApproach
 from crosscue.fusion.approaches import FrameEvidence, SignRange
 from crosscue.fusion.belief import Situation
 from crosscue.fusion.factor_graph import CueNode, Edge, FactorGraph, Feature
 from crosscue.fusion.intersection_range import Reference
-from crosscue.fusion.message_fit import AnnotatedApproach
 from crosscue.replay.columns import Floats
 
 SECOND_NS = 1_000_000_000
@@ -126,7 +126,7 @@ def annotated(seed: int, many: int, frames: int = 60) -> list[AnnotatedApproach]
     """Simulated approaches whose cues follow ``RATES`` and resemble themselves over ``FADE_M``."""
     rng = np.random.default_rng(seed)
     out = []
-    for _ in range(many):
+    for i in range(many):
         way_m = np.arange(frames, dtype=np.float64)
         has_left, has_straight = bool(rng.random() < 0.6), bool(rng.random() < 0.6)
         is_there = {"road_left": has_left, "parked_left": has_left, "road_straight": has_straight}
@@ -137,5 +137,5 @@ def annotated(seed: int, many: int, frames: int = 60) -> list[AnnotatedApproach]
         features = {"intersection": True, "left": has_left, "straight": has_straight}
         always = np.ones(frames, np.bool_)
         near = np.arange(frames) >= frames - 20
-        out.append(AnnotatedApproach(way_m, way_m * 0.1, near, always, counts, features))
+        out.append(AnnotatedApproach(way_m, way_m * 0.1, near, always, counts, features, f"L{i}"))
     return out

@@ -1,0 +1,149 @@
+"""How many independent looks an approach holds: a cue's fade.
+
+A cue's residual (positive or not, less the rate to be expected) resembles itself at a distance by
+``always + fading * exp(-distance / scale)``, the rest being noise of single looks; ``always`` is
+what a place keeps saying wrongly all the way. Least squares on products of residuals at many lags;
+distance is way or time, whichever leaves less. The fade is the integral of that over an approach's
+length: the scale of the one exponential that is worth as many looks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.fusion_settings import Fade
+
+from .annotated_approach import AnnotatedApproach, Bools
+from .calibrated import USUAL_FADE
+from .factor_graph import CueNode, FactorGraph
+
+LEAST_POSITIVES: Final = 20
+"""Fewer positive looks do not tell a fade."""
+LAGS: Final = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
+WAYS_M: Final = np.geomspace(0.3, 100.0, 36)
+TIMES_S: Final = np.geomspace(0.05, 20.0, 36)
+BINS: Final = 60
+
+
+class FadeFit(NamedTuple):
+    """A cue's fade; ``is_learned`` is false where the usual one stands in."""
+
+    cue: str
+    fade: Fade
+    positives: int
+    looks: int
+    is_learned: bool
+
+
+class Binned(NamedTuple):
+    """Products of residuals over their variance, in bins of distance, columns of equal length.
+
+    Attributes:
+        pairs: How many.
+        distance: Mean, in metres or seconds.
+        correlation: Mean.
+    """
+
+    pairs: Floats
+    distance: Floats
+    correlation: Floats
+
+
+def fit_fade(approaches: Sequence[AnnotatedApproach], graph: FactorGraph, cue: CueNode) -> FadeFit:
+    """A cue's fade, or the usual one where too few positive looks tell it."""
+    residuals = _residuals(approaches, graph, cue)
+    looks, positives, squares = 0, 0, 0.0
+    ways, times, products = [np.empty(0)], [np.empty(0)], [np.empty(0)]
+    spans: list[tuple[float, float]] = []
+    for approach, (rows, residual) in zip(approaches, residuals, strict=True):
+        if not len(rows):
+            continue
+        way_m, time_s = approach.way_m[rows], approach.time_s[rows]
+        looks += len(rows)
+        positives += int((approach.counts[cue.name][rows] > 0).sum())
+        squares += float((residual**2).sum())
+        spans.append((float(way_m[-1] - way_m[0]), float(time_s[-1] - time_s[0])))
+        for lag in LAGS[: int(np.searchsorted(LAGS, len(rows)))]:
+            ways.append(way_m[lag:] - way_m[:-lag])
+            times.append(time_s[lag:] - time_s[:-lag])
+            products.append(residual[lag:] * residual[:-lag])
+    correlation = np.concatenate(products)
+    if positives < LEAST_POSITIVES or squares == 0.0 or not len(correlation):
+        return FadeFit(cue.name, USUAL_FADE, positives, looks, False)
+    correlation *= looks / squares
+    length_m, length_s = np.mean(spans, axis=0).tolist()
+    way, way_misfit = _integral(_binned(np.concatenate(ways), correlation), WAYS_M, length_m)
+    time, time_misfit = _integral(_binned(np.concatenate(times), correlation), TIMES_S, length_s)
+    fade = Fade(way_m=way) if way_misfit <= time_misfit else Fade(time_s=time)
+    return FadeFit(cue.name, fade, positives, looks, True)
+
+
+def _residuals(
+    approaches: Sequence[AnnotatedApproach], graph: FactorGraph, cue: CueNode
+) -> list[tuple[Int64s, Floats]]:
+    """Looks of each approach, and positive (1) or not (0) less the rate among looks alike."""
+    ends = [edge.feature for edge in graph.edges if edge.cue == cue.name]
+    rows = [approach.looks(cue) for approach in approaches]
+    groups: dict[tuple[object, ...], list[tuple[int, Bools]]] = {}
+    positive = [
+        (approach.counts[cue.name][at] > 0).astype(np.float64) if len(at) else np.empty(0)
+        for approach, at in zip(approaches, rows, strict=True)
+    ]
+    for i, (approach, at) in enumerate(zip(approaches, rows, strict=True)):
+        for near in (False, True):
+            alike = approach.is_near[at] == near
+            key = (near, *(approach.features.get(feature) for feature in ends))
+            groups.setdefault(key, []).append((i, alike))
+    residuals = [values.copy() for values in positive]
+    for members in groups.values():
+        total = sum(int(alike.sum()) for _, alike in members)
+        rate = sum(float(positive[i][alike].sum()) for i, alike in members) / max(total, 1)
+        for i, alike in members:
+            residuals[i][alike] -= rate
+    return list(zip(rows, residuals, strict=True))
+
+
+def _binned(distance: Floats, correlation: Floats) -> Binned:
+    """Equally many pairs in each bin, but equal distances never parted."""
+    edges = np.unique(np.quantile(distance, np.linspace(0.0, 1.0, BINS + 1)))
+    which = np.searchsorted(edges, distance, side="right")
+    pairs = np.bincount(which).astype(np.float64)
+    some = pairs > 0.0
+    return Binned(
+        pairs[some],
+        np.bincount(which, distance)[some] / pairs[some],
+        np.bincount(which, correlation)[some] / pairs[some],
+    )
+
+
+def _integral(binned: Binned, scales: Floats, length: float) -> tuple[float, float]:
+    """Integral of the best curve over ``length``, and its misfit less what no curve can mend."""
+    best, least = float(scales[0]), float("inf")
+    for scale in scales.tolist():
+        shape = np.exp(-binned.distance / scale)
+        always, fading = _line(shape, binned)
+        curve = always + fading * shape
+        misfit = float((binned.pairs * curve * (curve - 2.0 * binned.correlation)).sum())
+        if misfit < least:
+            least = misfit
+            best = always * length + fading * scale * -float(np.expm1(-length / scale))
+    return max(best, float(scales[0])), least
+
+
+def _line(shape: Floats, binned: Binned) -> tuple[float, float]:
+    """Least squares of ``always + fading * shape``, both from 0 to 1."""
+    weight = binned.pairs / binned.pairs.sum()
+    middle, level = float(weight @ shape), float(weight @ binned.correlation)
+    spread = float(weight @ (shape - middle) ** 2)
+    fading = 0.0
+    if spread > 0.0:
+        fading = float(weight @ ((shape - middle) * (binned.correlation - level))) / spread
+    always = level - fading * middle
+    if always < 0.0:
+        always = 0.0
+        fading = float(weight @ (shape * binned.correlation)) / float(weight @ shape**2)
+    return min(always, 1.0), min(max(fading, 0.0), 1.0)
