@@ -6,7 +6,8 @@ The source scores one approach for each run; a drive has many. An approach
   is never old when an intersection comes);
 * closes once its end is behind the rear axle (the end as ranged, or the start and a usual length),
   once the car has turned at it, or when evidence has gone stale. Where no sign tells a range it
-  goes stale sooner, since nothing else could end it;
+  goes stale sooner, and ends after ``longest_m`` in any case, since nothing else could end it;
+* begins anew when its first range shows that it began too far away to be about that intersection;
 * that closes before presence was established was noise: counted as neutral, no detection.
 
 Only signs with a range and cues that speak first keep evidence fresh: road straight ahead is seen
@@ -132,6 +133,7 @@ class _Open:
     speaker: Speaker
     start: RangeTrack = NOTHING
     end: RangeTrack = NOTHING
+    way_m: float = 0.0
     since_evidence_m: float = 0.0
     since_dissent_m: float = math.inf
     turned_rad: float = 0.0
@@ -165,6 +167,8 @@ class Approaches:
         self._rest_m = max(0.0, self._rest_m - moved.way_m)
         signs = self._sane(evidence.signs)
         speaks = any(evidence.counts.get(cue, 0) > 0 for cue in self._first)
+        if self._open is not None and _is_about_another(self._open, signs, self._fusion.longest_m):
+            self._close("another ahead")
         if self._open is None and (signs or (speaks and self._rest_m <= 0.0)):
             self._begin()
         if self._open is None:
@@ -201,6 +205,7 @@ class Approaches:
         has = (at_hand.start.belief is not None) + (at_hand.end.belief is not None)
         if has < had:
             self.counts["ranges dropped: too unsure"] += had - has
+        at_hand.way_m += moved_m
         at_hand.since_evidence_m += moved_m
         at_hand.since_dissent_m += moved_m
         if evidence.turned_rad is not None and math.isfinite(evidence.turned_rad):
@@ -226,6 +231,8 @@ class Approaches:
         is_at_it = end_m is None or end_m <= fusion.length_m
         if is_at_it and abs(at_hand.turned_rad) >= fusion.turned_rad:
             return "turned"
+        if end_m is None and at_hand.way_m > fusion.longest_m:
+            return "too long"
         limit_m = fusion.stale_unranged_m if end_m is None else fusion.stale_after_m
         return "stale" if at_hand.since_evidence_m > limit_m else None
 
@@ -332,6 +339,17 @@ def _end_m(at_hand: _Open, length_m: float) -> float | None:
         return at_hand.end.belief.mean_m
     start = at_hand.start.belief
     return None if start is None else start.mean_m + length_m
+
+
+def _is_about_another(
+    at_hand: _Open, signs: Mapping[Reference, tuple[float, float]], longest_m: float
+) -> bool:
+    """Does the first range show that the approach began too far away?"""
+    is_ranged = at_hand.start.belief is not None or at_hand.end.belief is not None
+    if is_ranged or not signs or at_hand.way_m == 0.0:
+        return False
+    nearest_m = min(range_m for range_m, _ in signs.values())
+    return at_hand.way_m + nearest_m > longest_m
 
 
 def _best(at_hand: _Open, wanted: Reference) -> tuple[RangeBelief | None, Reference | None]:

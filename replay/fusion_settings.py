@@ -165,6 +165,9 @@ class Fusion(Section):
     """Or once the car has gone this far without any evidence."""
     stale_unranged_m: Positive = 30.0
     """So far where no sign has told a range."""
+    longest_m: Positive = 100.0
+    """Evidence from further before an intersection is not about it; the source's runs are as long.
+    Without a range an approach ends after so far."""
     turned_rad: Positive = 0.8
     """Without a range ahead, an approach ends once the car has turned so much in some 25 m."""
     rest_m: NotNegative = 10.0

@@ -153,6 +153,35 @@ def test_without_any_range_an_approach_still_closes() -> None:
     assert loop.counts["approaches closed: stale"] == 1
 
 
+def test_road_seen_everywhere_is_not_one_endless_approach() -> None:
+    loop = approaches()
+
+    steps([frame(i, 1.0, road_left=1) for i in range(1000)], loop)
+
+    assert loop.counts["approaches closed: too long"] == 9
+
+
+def test_a_sign_far_ahead_begins_an_approach_that_knows_nothing_of_the_way_before() -> None:
+    loop = approaches()
+    steps([frame(i, 1.0, road_left=1) for i in range(60)], loop)
+
+    step = loop(replace(frame(60, 1.0, stop_sign=1), signs=(sign(60.0),)))
+
+    assert step.approach == 2
+    assert step.probabilities["left"] == 0.5
+    assert loop.counts["approaches closed: another ahead"] == 1
+
+
+def test_a_sign_near_by_takes_over_what_the_road_said() -> None:
+    loop = approaches()
+    steps([frame(i, 1.0, road_left=1) for i in range(10)], loop)
+
+    step = loop(replace(frame(10, 1.0, stop_sign=1), signs=(sign(40.0),)))
+
+    assert step.approach == 1
+    assert step.probabilities["left"] > 0.9
+
+
 def test_noise_that_never_established_anything_is_no_detection() -> None:
     loop = approaches()
     noise = [frame(i, 1.0, road_left=int(i % 50 == 0)) for i in range(500)]
