@@ -56,11 +56,13 @@ class Pairs:
 
     Attributes:
         step_px: Shape (M, 2), float64: how their middles moved.
+        center_px: Shape (M, 2), float64: where these are in the later frame.
         nose: Shape (M,), int64: as in ``CarShapes``, of the later frame.
         width_px: Of the picture.
     """
 
     step_px: Floats
+    center_px: Floats
     nose: Int64s
     width_px: int
 
@@ -138,13 +140,13 @@ def pair_cars(before: CarShapes, now: CarShapes, settings: Cars) -> Pairs:
     width = now.size_px[0]
     is_apart = not 0.0 < gap_s <= settings.most_gap_s or before.size_px != now.size_px
     if is_apart or not len(before) or not len(now):
-        return Pairs(np.empty((0, 2)), np.empty(0, np.int64), width)
+        return Pairs(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), width)
     steps = now.center_px[None, :, :] - before.center_px[:, None, :]
     distance = np.hypot(steps[:, :, 0], steps[:, :, 1])
     change = np.abs(now.area_px[None, :] - before.area_px[:, None]) / before.area_px[:, None]
     fits = (change < settings.area_change) & (distance < settings.position_change * width)
     first, second = _nearest(np.where(fits, distance, np.inf))
-    return Pairs(steps[first, second], now.nose[second], width)
+    return Pairs(steps[first, second], now.center_px[second], now.nose[second], width)
 
 
 def _nearest(cost: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -1,0 +1,30 @@
+"""Colours that mean the same in every view of a recording, on light and on dark ground."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from .columns import Colour
+
+ESTIMATE: Final[Colour] = (50, 130, 230)
+TRUTH: Final[Colour] = (40, 160, 70)
+ELLIPSE: Final[Colour] = (255, 150, 60)
+START: Final[Colour] = (225, 60, 60)
+END: Final[Colour] = (220, 150, 0)
+QUIET: Final[Colour] = (125, 125, 125)
+FAINT: Final[Colour] = (165, 165, 165)
+VEHICLE: Final[Colour] = (50, 130, 230)
+LANE: Final[Colour] = (140, 100, 220)
+FEATURES: Final[Mapping[str, Colour]] = {
+    "intersection": (160, 90, 220),
+    "left": (50, 130, 230),
+    "right": (230, 110, 30),
+    "straight": (50, 165, 80),
+}
+OTHERS: Final[tuple[Colour, ...]] = ((200, 120, 255), (250, 220, 90), (90, 220, 220))
+
+
+def of_feature(name: str, number: int) -> Colour:
+    """A user's own features take the other colours in turn."""
+    return FEATURES.get(name, OTHERS[number % len(OTHERS)])

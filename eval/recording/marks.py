@@ -1,0 +1,209 @@
+"""What detectors found, drawn over the pictures: boxes, outlines, road, regions, moving cars.
+
+Outlines are strips of a few points, and road is hatched every few rows: a small part of the bytes
+of a mask, and one still sees the picture below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Final
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections, RoadMask
+from crosscue.detectors.cars import (
+    CarShapes,
+    Pairs,
+    car_shapes,
+    cross_traffic,
+    pair_cars,
+    parked_cars,
+)
+from crosscue.detectors.road import RoadShares, road_shares
+from crosscue.eval.stored_frames import StoredFrame
+from crosscue.replay.columns import Floats
+from crosscue.replay.vehicle import Vehicle
+
+from .columns import Colour, Shapes, arrows, boxes, labelled_strips, strips
+from .drive_time import DriveTime
+
+FRAMES_HELD: Final = 256
+CAR: Final = (80, 170, 255)
+STOP_SIGN: Final = (255, 70, 70)
+TRAFFIC_LIGHT: Final = (255, 200, 40)
+SIGN: Final = (240, 90, 230)
+UNSURE: Final = (150, 150, 150)
+ROAD: Final = (40, 210, 190)
+REGION: Final = (220, 220, 220)
+REGION_WITH_ROAD: Final = (90, 230, 90)
+CROSSING: Final = (255, 130, 30)
+PARKED: Final = (190, 130, 255)
+HATCH_ROWS: Final = 4
+ARROW_STEPS: Final = 4.0
+"""An arrow's length in steps from one frame to the next."""
+LABELLED: Final = 0.03
+"""Narrower things, in shares of the picture's width, show their label only when pointed at."""
+SIDES: Final = ("left", "straight", "right")
+
+
+@dataclass(slots=True)
+class Marks:
+    """Draws frame by frame; keeps the cars of the frame before.
+
+    Attributes:
+        vehicle: For labels, thresholds and regions.
+    """
+
+    vehicle: Vehicle
+    objects: Shapes = field(default_factory=lambda: Shapes("camera/objects", boxes))
+    far: Shapes = field(default_factory=lambda: Shapes("camera/far_objects", boxes))
+    outlines: Shapes = field(default_factory=lambda: Shapes("camera/outlines", strips))
+    signs: Shapes = field(default_factory=lambda: Shapes("camera/sign_windows", boxes))
+    road: Shapes = field(default_factory=lambda: Shapes("camera/road", strips))
+    regions: Shapes = field(default_factory=lambda: Shapes("camera/regions", labelled_strips))
+    cars: Shapes = field(default_factory=lambda: Shapes("camera/cars", arrows))
+    _before: CarShapes | None = None
+
+    def add(self, frame: StoredFrame) -> None:
+        """Draw one frame."""
+        seen = frame.seen
+        for shapes in self.all():
+            shapes.begin(seen.t_ns)
+        for found in seen.objects:
+            self._objects(found)
+        for found in seen.signs:
+            for box, text, _ in _told(found):
+                self.signs.add(box, SIGN, text)
+        if isinstance(seen.road, RoadMask):
+            for line in road_lines(seen.road):
+                self.road.add(line, ROAD)
+        self._regions(seen.road, frame.size_px)
+        if seen.objects:
+            self._cars(seen.objects)
+
+    def all(self) -> Iterator[Shapes]:
+        """Everything that is drawn."""
+        yield from (self.objects, self.far, self.outlines, self.signs)
+        yield from (self.road, self.regions, self.cars)
+
+    def send(self, recording: rr.RecordingStream, time: DriveTime) -> None:
+        """Send the frames gathered so far."""
+        for shapes in self.all():
+            shapes.send(recording, time)
+
+    def _objects(self, found: Detections) -> None:
+        for box, text, row in _told(found):
+            colour = self._colour(found.labels[row], float(found.scores[row]))
+            is_far = box[2] - box[0] < LABELLED * found.size_px[0]
+            (self.far if is_far else self.objects).add(box, colour, text)
+            for line in outline(found.masks[row], found.size_px, box):
+                self.outlines.add(line, colour)
+
+    def _colour(self, label: str, score: float) -> Colour:
+        """Grey for what is too unsure to be a cue."""
+        cues, cars = self.vehicle.cues, self.vehicle.cars
+        for labels, least, colour in (
+            (cars.labels, cars.score, CAR),
+            (cues.stop_sign_labels, cues.stop_sign_score, STOP_SIGN),
+            (cues.traffic_light_labels, cues.traffic_light_score, TRAFFIC_LIGHT),
+        ):
+            if label in labels and score > least:
+                return colour
+        return UNSURE
+
+    def _regions(self, road: RoadMask | RoadShares | None, size_px: tuple[int, int]) -> None:
+        """Polygons, green where there is road; none where no detector looks for road."""
+        if road is None:
+            return
+        shares = road_shares(road, self.vehicle.regions) if isinstance(road, RoadMask) else road
+        positive = shares.positive(self.vehicle.cues.road_share)
+        for side, is_road in zip(SIDES, positive, strict=True):
+            corners = np.array(getattr(self.vehicle.regions, side)) * size_px
+            colour = REGION_WITH_ROAD if is_road else REGION
+            share = 100.0 * getattr(shares, side)
+            self.regions.add(np.vstack([corners, corners[:1]]), colour, f"{side} {share:.0f} %")
+
+    def _cars(self, found: tuple[Detections, ...]) -> None:
+        now = car_shapes(found, self.vehicle.cars)
+        before, self._before = self._before, now
+        if before is None:
+            return
+        pairs = pair_cars(before, now, self.vehicle.cars)
+        for i in range(len(pairs.nose)):
+            one = Pairs(
+                pairs.step_px[i : i + 1], pairs.center_px[i : i + 1], pairs.nose[i : i + 1],
+                pairs.width_px,
+            )  # fmt: skip
+            if any(cross_traffic(one, self.vehicle.cars)):
+                self._arrow(one.center_px[0], ARROW_STEPS * one.step_px[0], CROSSING, "crossing")
+            elif any(parked_cars(one, self.vehicle.cars)):
+                ahead = np.array([0.04 * pairs.width_px * float(one.nose[0]), 0.0])
+                self._arrow(one.center_px[0], ahead, PARKED, "parked")
+
+    def _arrow(self, tail: Floats, way: Floats, colour: Colour, label: str) -> None:
+        self.cars.add(np.concatenate([tail, way]), colour, label)
+
+
+def _told(found: Detections) -> Iterator[tuple[Floats, str, int]]:
+    """Box, text and row of each detection."""
+    for row, (label, score) in enumerate(zip(found.labels, found.scores.tolist(), strict=True)):
+        yield found.boxes_px[row], f"{label} {score:.2f}", row
+
+
+def outline(mask: bytes, size_px: tuple[int, int], box_px: Floats) -> list[Floats]:
+    """Closed strips of shape (N, 2) around a mask, to a pixel; none for an empty mask."""
+    import cv2
+
+    if not mask:
+        return []
+    x0, y0 = (int(v) for v in np.maximum(np.floor(box_px[:2]) - 1, 0))
+    x1, y1 = (int(v) for v in np.ceil(box_px[2:]) + 1)
+    inside = np.ascontiguousarray(rle.decode(mask, size_px)[y0:y1, x0:x1]).view(np.uint8)
+    found, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    rounded = [cv2.approxPolyDP(line, 1.0, closed=True)[:, 0, :] for line in found]
+    corner = np.array([x0 + 0.5, y0 + 0.5])
+    return [corner + np.vstack([line, line[:1]]) for line in rounded if len(line) > 2]
+
+
+def road_lines(road: RoadMask) -> list[Floats]:
+    """Outline of the road and a line along every few rows of it, in the picture's pixels."""
+    width, height = road.mask_size_px
+    scale = np.array(road.size_px, np.float64) / (width, height)
+    whole = np.array([0.0, 0.0, width, height])
+    lines = outline(road.mask, road.mask_size_px, whole)
+    is_road = rle.decode(road.mask, road.mask_size_px)
+    hatch = chain.from_iterable(
+        [np.array([[a, row + 0.5], [b, row + 0.5]]) for a, b in _spans(is_road[row])]
+        for row in range(0, height, HATCH_ROWS)
+    )
+    return [line * scale for line in chain(lines, hatch)]
+
+
+def _spans(row: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Begin and end of each run of true, shape (N, 2)."""
+    turns = np.flatnonzero(np.diff(row, prepend=False, append=False))
+    return turns.reshape(-1, 2)
+
+
+def log_styles(recording: rr.RecordingStream) -> None:
+    """Widths in points of the screen; labels where there is room for them."""
+    boxes_style = rr.Boxes2D.from_fields(radii=[_points(1.0)], show_labels=True)
+    recording.log("camera/objects", boxes_style, static=True)
+    recording.log("camera/sign_windows", boxes_style, static=True)
+    far_style = rr.Boxes2D.from_fields(radii=[_points(1.0)], show_labels=False)
+    recording.log("camera/far_objects", far_style, static=True)
+    for entity, width in (("outlines", 1.5), ("road", 0.6), ("regions", 1.2)):
+        style = rr.LineStrips2D.from_fields(radii=[_points(width)])
+        recording.log(f"camera/{entity}", style, static=True)
+    recording.log("camera/cars", rr.Arrows2D.from_fields(radii=[_points(2.5)]), static=True)
+
+
+def _points(width: float) -> float:
+    """Rerun takes negative radii for points of the screen."""
+    return -width

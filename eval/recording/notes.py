@@ -1,0 +1,42 @@
+"""A page of text beside the pictures: which logs, what was lost, what the colours say."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Final
+
+import rerun as rr
+
+from crosscue.eval.plain_text import visible
+from crosscue.replay.run_folder import RunFolder
+
+COLOURS: Final = (
+    "- camera: cars blue, stop signs red, traffic lights yellow, sign windows magenta, what is "
+    "too unsure to be a cue grey; road hatched in teal, regions of interest green while they hold "
+    "road; arrows: orange cars cross, violet ones are parked and point where their nose does",
+    "- ahead of the car: red bar the start, yellow bar the end of the intersection with its "
+    "2-sigma band, green the truth; blue dots and white lines are the Mobileye's",
+    "- map: blue the estimated path, orange its 2-sigma ellipse, green the truth",
+)
+
+
+def notes(run: RunFolder, more: Sequence[str]) -> rr.TextDocument:
+    """What a person should know before looking."""
+    manifest = run.manifest()
+    logs = [f"- {inert(log['path'])}" for log in manifest["logs"]]
+    notices = [f"- {inert(sentence)}" for sentence in (*manifest["notices"], *more)]
+    lost = sum(not account["is_whole"] for account in manifest["accounts"])
+    whole = (
+        "nothing is known to be lost" if not lost else f"{lost} log(s) with losses: see manifest"
+    )
+    lines = [
+        f"# {inert(run.path.name)}", "", f"Logs ({whole}):", *logs, "", "Notes:",
+        *(notices or ["- none"]), "", "Colours:", *COLOURS,
+    ]  # fmt: skip
+    return rr.TextDocument("\n".join(lines), media_type="text/markdown")
+
+
+def inert(text: str) -> str:
+    """Text that Markdown shows as it is: no link, no picture to fetch, no mark-up."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", visible(text))

@@ -1,0 +1,109 @@
+"""The map seen from above: x east, y north, metres."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+import rerun as rr
+
+from crosscue.replay.columns import Floats, Int64s
+
+from .colours import ELLIPSE, END, ESTIMATE, START, TRUTH
+from .columns import Shapes, strips_above
+from .drive_time import DriveTime
+from .scene_rows import SceneRows
+from .truth import TruthTrack
+
+PATH_POINTS: Final = 20_000
+ELLIPSES_PER_S: Final = 5.0
+HALF_ROAD_M: Final = 8.0
+
+
+def log_pose(recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, Floats]) -> None:
+    """Path, car and ellipse."""
+    recording.log("plan", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    t_ns = pose["t_ns"].astype(np.int64)
+    thin = slice(None, None, max(1, len(t_ns) // PATH_POINTS))
+    flat = np.stack([pose["x_m"], pose["y_m"], np.zeros(len(t_ns))], axis=1)
+    recording.log(
+        "plan/estimate", rr.LineStrips3D([flat[thin]], colors=[ESTIMATE]),
+        static=True,
+    )  # fmt: skip
+    some = _every(t_ns, ELLIPSES_PER_S)
+    times = time.column(t_ns[some])
+    rings = _rings(flat[some], _position_cov(pose, some))
+    recording.send_columns(
+        "plan/ellipse", indexes=times, columns=rr.LineStrips3D.columns(strips=list(rings))
+    )
+    recording.log("plan/ellipse", rr.LineStrips3D.from_fields(colors=[ELLIPSE]), static=True)
+    heading = pose["heading_rad"][some]
+    ahead = np.stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))], axis=1)
+    recording.send_columns(
+        "plan/car", indexes=times,
+        columns=rr.Arrows3D.columns(origins=flat[some], vectors=ahead * 8.0),
+    )  # fmt: skip
+    recording.log("plan/car", rr.Arrows3D.from_fields(colors=[ESTIMATE], radii=[0.8]), static=True)
+
+
+def log_truth(recording: rr.RecordingStream, time: DriveTime, truth: TruthTrack) -> None:
+    """The true path, and where the car truly was."""
+    flat = np.stack([truth.x_m, truth.y_m, np.zeros(len(truth.t_ns))], axis=1)
+    recording.log("plan/truth", rr.LineStrips3D([flat], colors=[TRUTH]), static=True)
+    recording.send_columns(
+        "plan/true_car", indexes=time.column(truth.t_ns),
+        columns=rr.Points3D.columns(positions=flat),
+    )  # fmt: skip
+    recording.log(
+        "plan/true_car", rr.Points3D.from_fields(colors=[TRUTH], radii=[1.2]), static=True
+    )
+
+
+def log_intersection(
+    recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, Floats], scene: SceneRows
+) -> None:
+    """A bar across the road where the intersection starts and ends: ahead of the estimated car."""
+    if scene.ranges is None:
+        return
+    t_ns = scene.ranges["t_ns"].to_numpy()
+    x, y = (np.interp(t_ns, pose["t_ns"], pose[name]) for name in ("x_m", "y_m"))
+    heading = np.interp(t_ns, pose["t_ns"], np.unwrap(pose["heading_rad"]))
+    ahead = np.stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))], axis=1)
+    aside = np.stack([-ahead[:, 1], ahead[:, 0], ahead[:, 2]], axis=1)
+    middle = np.stack([x, y, np.zeros(len(x))], axis=1)
+    middle += scene.ranges["range_m"].to_numpy()[:, None] * ahead
+    bars = np.stack([middle - HALF_ROAD_M * aside, middle + HALF_ROAD_M * aside], axis=1)
+    references = scene.ranges["reference"].to_pylist()
+    first = np.searchsorted(t_ns, scene.frames_ns, side="left")
+    last = np.searchsorted(t_ns, scene.frames_ns, side="right")
+    shapes = Shapes("plan/intersection", strips_above)
+    for frame_ns, a, b in zip(scene.frames_ns.tolist(), first, last, strict=True):
+        shapes.begin(frame_ns)
+        for row in range(a, b):
+            shapes.add(bars[row], START if references[row] == "start" else END)
+    shapes.send(recording, time)
+    recording.log("plan/intersection", rr.LineStrips3D.from_fields(radii=[0.5]), static=True)
+
+
+def _every(t_ns: Int64s, rate_hz: float) -> Int64s:
+    """Indices of about ``rate_hz`` rows a second, the last one included."""
+    slots = (t_ns - t_ns[0]) // round(1e9 / rate_hz)
+    first = np.flatnonzero(np.diff(slots, prepend=-1))
+    return np.union1d(first, [len(t_ns) - 1]).astype(np.int64)
+
+
+def _position_cov(pose: Mapping[str, Floats], rows: Int64s) -> Floats:
+    xx, xy, yy = (pose[f"cov_{name}"][rows] for name in ("xx_m2", "xy_m2", "yy_m2"))
+    return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
+
+
+def _rings(centre: Floats, cov: Floats, points: int = 33) -> Floats:
+    """2-sigma ellipses, shape (N, points, 3)."""
+    angle = np.linspace(0.0, 2.0 * np.pi, points)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    values, vectors = np.linalg.eigh(cov)
+    axes = vectors * (2.0 * np.sqrt(np.maximum(values, 0.0)))[:, None, :]
+    rings = np.zeros((len(cov), points, 3))
+    rings[:, :, :2] = np.swapaxes(axes @ circle, 1, 2)
+    return rings + centre[:, None, :]

@@ -1,0 +1,49 @@
+"""A run's cues, ranges and beliefs as a recording needs them; whatever the run lacks is empty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crosscue.replay.columns import Int64s
+from crosscue.replay.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneRows:
+    """The run's tables, sorted by time; None where the run has none.
+
+    Attributes:
+        frames_ns: Times of frames, each once; empty for a run without camera.
+        cues: As in ``cues.parquet``.
+        ranges: As in ``range.parquet``.
+        belief: As in ``belief.parquet``.
+    """
+
+    frames_ns: Int64s
+    cues: pa.Table | None
+    ranges: pa.Table | None
+    belief: pa.Table | None
+
+
+def scene_rows(run: RunFolder) -> SceneRows:
+    """Read them.
+
+    Raises:
+        RunError: A table is damaged.
+    """
+    frames = _table(run, "frames")
+    times = np.empty(0, np.int64) if frames is None else np.unique(frames["t_ns"].to_numpy())
+    return SceneRows(times, _table(run, "cues"), _table(run, "range"), _table(run, "belief"))
+
+
+def _table(run: RunFolder, name: str) -> pa.Table | None:
+    if not run.file(f"{name}.parquet").exists():
+        return None
+    table = run.table(name).sort_by("t_ns")
+    return table if table.num_rows else None

@@ -1,0 +1,166 @@
+"""What is plotted over time: beliefs, ranges, cues, pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import rerun as rr
+from numpy.typing import NDArray
+
+from crosscue.eval.score_truth import TrueRanges
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.vehicle import Vehicle
+
+from .colours import END, QUIET, START, TRUTH, of_feature
+from .columns import Colour
+from .drive_time import DriveTime
+from .scene_rows import SceneRows
+
+BELIEF: Final = ("plots", "belief")
+RANGE: Final = ("plots", "range")
+CUES: Final = ("cues",)
+FOUND: Final = "found"
+POSE: Final[Mapping[str, str]] = {
+    "speed": "Speed (m/s)",
+    "heading": "Heading (deg)",
+    "heading_sd": "Heading s.d. (deg)",
+    "ellipse": "2-sigma ellipse, full major axis (m)",
+}
+"""Plots of the pose and their titles."""
+NOT_IN_BELIEF: Final = ("t_ns", "approach", "established")
+
+
+def log_pose_series(
+    recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, Floats]
+) -> None:
+    """One plot for each of ``POSE``."""
+    series = {
+        "speed/speed_mps": pose["speed_mps"],
+        "heading/heading_deg": np.rad2deg(np.unwrap(pose["heading_rad"])),
+        "heading_sd/heading_sd_deg": np.rad2deg(np.sqrt(pose["cov_hh_rad2"])),
+        "ellipse/major_axis_m": pose["major_axis_m"],
+    }
+    times = time.column(pose["t_ns"].astype(np.int64))
+    for name, values in series.items():
+        recording.send_columns(
+            f"plots/{name}", indexes=times, columns=rr.Scalars.columns(scalars=values)
+        )
+
+
+def log_belief(
+    recording: rr.RecordingStream, time: DriveTime, scene: SceneRows, vehicle: Vehicle
+) -> None:
+    """The probability of every feature, and the line above which it counts as established."""
+    if scene.belief is None:
+        return
+    t_ns, approach = scene.belief["t_ns"].to_numpy(), scene.belief["approach"].to_numpy()
+    features = [name for name in scene.belief.column_names if name not in NOT_IN_BELIEF]
+    for number, name in enumerate(features):
+        _line([*BELIEF, name], name, of_feature(name, number), recording, width=2.0)
+        _send(recording, time, [*BELIEF, name], t_ns, scene.belief[name].to_numpy(), approach)
+    ends = np.array([min(scene.frames_ns[0], t_ns[0]), max(scene.frames_ns[-1], t_ns[-1])])
+    entity = [*BELIEF, "established above"]
+    _line(entity, f"{vehicle.fusion.established:g}", QUIET, recording)
+    _send(recording, time, entity, ends, np.full(2, vehicle.fusion.established))
+
+
+def log_ranges(
+    recording: rr.RecordingStream, time: DriveTime, scene: SceneRows, truth: TrueRanges | None
+) -> None:
+    """Range to start and end with the 2-sigma band, what signs measured, and the truth."""
+    for reference, colour in (("start", START), ("end", END)):
+        if scene.ranges is None:
+            break
+        rows = scene.ranges.filter(pc.equal(scene.ranges["reference"], reference))
+        if not rows.num_rows:
+            continue
+        t_ns, approach = rows["t_ns"].to_numpy(), rows["approach"].to_numpy()
+        mean_m = rows["range_m"].to_numpy()
+        two_sd_m = 2.0 * np.sqrt(rows["var_m2"].to_numpy())
+        for name, values, width in (
+            (reference, mean_m, 2.0),
+            (f"{reference} + 2 sd", mean_m + two_sd_m, 0.7),
+            (f"{reference} - 2 sd", mean_m - two_sd_m, 0.7),
+        ):
+            _line([*RANGE, name], name, colour, recording, width)
+            _send(recording, time, [*RANGE, name], t_ns, values, approach)
+        _log_measured(recording, time, rows, reference, colour)
+    if truth is not None:
+        for reference, values in (("start", truth.start_m), ("end", truth.end_m)):
+            if np.isfinite(values).any():
+                name = f"true {reference}"
+                _line([*RANGE, name], name, TRUTH, recording, width=1.5)
+                _send(recording, time, [*RANGE, name], truth.t_ns, values, truth.approach)
+
+
+def _log_measured(
+    recording: rr.RecordingStream, time: DriveTime, rows: pa.Table, reference: str, colour: Colour
+) -> None:
+    measured = rows.filter(pc.is_valid(rows["measured_m"]))
+    if measured.num_rows:
+        entity = [*RANGE, f"{reference} measured"]
+        style = rr.SeriesPoints(colors=[colour], names=[entity[-1]], marker_sizes=[2.0])
+        recording.log(rr.new_entity_path([*entity]), style, static=True)
+        _send(recording, time, entity, measured["t_ns"].to_numpy(),
+              measured["measured_m"].to_numpy())  # fmt: skip
+
+
+def log_cues(recording: rr.RecordingStream, time: DriveTime, scene: SceneRows) -> None:
+    """A lane for every cue that was ever found, filled while it is."""
+    if scene.cues is None:
+        return
+    found = scene.cues.filter(pc.greater(scene.cues["count"], 0))
+    for cue in pc.unique(found["cue"]).sort().to_pylist():
+        rows = scene.cues.filter(pc.equal(scene.cues["cue"], cue))
+        t_ns, first = np.unique(rows["t_ns"].to_numpy(), return_index=True)
+        counts = rows["count"].to_numpy()[first]
+        at, is_found = _changes(t_ns, counts > 0, scene.frames_ns)
+        entity = [*CUES, cue]
+        style = rr.StateConfiguration(values=[FOUND], labels=[FOUND], colors=[of_cue(cue)])
+        recording.log(rr.new_entity_path([*entity]), style, static=True)
+        recording.send_columns(
+            rr.new_entity_path([*entity]),
+            indexes=time.column(at),
+            columns=rr.StateChange.columns(state=[FOUND] * int(is_found.sum())).partition(is_found),
+        )
+
+
+def of_cue(cue: str) -> Colour:
+    """By the side that the cue speaks of."""
+    for number, side in enumerate(("left", "right", "straight")):
+        if cue.endswith(side):
+            return of_feature(side, number)
+    return of_feature("straight" if cue.endswith("past") else "intersection", 0)
+
+
+def _changes(t_ns: Int64s, is_found: NDArray[np.bool_], frames_ns: Int64s) -> tuple[Int64s, Int64s]:
+    """Times at which a cue comes or goes, and 1 or 0 from then on; not looked at counts as 0."""
+    everywhere = np.isin(frames_ns, t_ns[is_found]).astype(np.int64)
+    turns = np.flatnonzero(np.diff(everywhere, prepend=-1))
+    return frames_ns[turns], everywhere[turns]
+
+
+def _line(
+    entity: list[str], name: str, colour: Colour, recording: rr.RecordingStream, width: float = 1.0
+) -> None:
+    style = rr.SeriesLines(colors=[colour], names=[name], widths=[width])
+    recording.log(rr.new_entity_path([*entity]), style, static=True)
+
+
+def _send(
+    recording: rr.RecordingStream, time: DriveTime, entity: list[str], t_ns: Int64s,
+    values: Floats, approach: Int64s | None = None,
+) -> None:  # fmt: skip
+    """Send a series, broken between approaches."""
+    if approach is not None:
+        breaks = np.flatnonzero(np.diff(approach)) + 1
+        t_ns = np.insert(t_ns, breaks, t_ns[breaks - 1] + 1)
+        values = np.insert(values, breaks, np.nan)
+    path = rr.new_entity_path([*entity])
+    recording.send_columns(
+        path, indexes=time.column(t_ns), columns=rr.Scalars.columns(scalars=values)
+    )
