@@ -19,6 +19,8 @@ from crosscue.replay.columns import Floats, Int64s
 CONFIDENCE: Final = 0.95
 ROUNDS: Final = 2000
 SEED: Final = 0
+LEAST_CLUSTERS: Final = 5
+"""Of fewer, resampling can only give back the smallest and the largest: no interval is given."""
 
 
 class Interval(NamedTuple):
@@ -40,7 +42,7 @@ class Share:
         low: Lower end of Wilson's interval, as if counts were independent.
         high: Its upper end.
         clusters: How many drives or approaches the counts come from.
-        clusters_low: Lower end when whole clusters are resampled; NaN for fewer than two.
+        clusters_low: Lower end when whole clusters are resampled; NaN for fewer than five.
         clusters_high: Its upper end.
     """
 
@@ -60,7 +62,7 @@ class Mean:
 
     Attributes:
         value: NaN for no rows.
-        low: NaN for fewer than two clusters: one drive says nothing about another.
+        low: NaN for fewer than five clusters: few drives say little about the next.
         high: The same.
         of: Rows.
         clusters: Drives or approaches.
@@ -142,7 +144,7 @@ def resampled(
     """
     names, which = np.unique(clusters, return_inverse=True)
     n = len(names)
-    if n < 2:
+    if n < LEAST_CLUSTERS:
         return UNKNOWN
     total = np.bincount(which, values, n)
     rows = np.bincount(which, minlength=n).astype(np.float64)

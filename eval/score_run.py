@@ -28,6 +28,8 @@ FOLDER: Final = "score"
 METRICS: Final = "metrics.json"
 CURVES: Final = "curves"
 CUE_FRAMES: Final = "cue_frames"
+SLACK_NS: Final = 1_000_000_000
+"""An approach may lie so far outside the run: clocks and last pictures differ a little."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +89,7 @@ def judge_run(
     truth = score_truth.load(truth_path, str(run.path))
     _check_log(run, truth.truth, truth_path)
     tables = tables_of(run)
+    _check_times(run, truth.truth, tables, truth_path)
     judged = judge(tables, truth, settings)
     why = _why_no_pose(run, truth.truth)
     pose = None if why else score_pose.measure(run, truth_path, rpe_m)
@@ -107,6 +110,24 @@ def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
             f"{path}: belongs to {truth.log or 'another log'} by its hash, not to {names}; "
             "give the truth of that log"
         )
+
+
+def _check_times(run: RunFolder, truth: Truth, tables: RunTables, path: Path) -> None:
+    """Refuse truth of approaches that lie wholly outside a run over its whole log.
+
+    A truth that shares no moment with the run at all is refused by ``judge``.
+    """
+    selection = run.manifest().get("selection") or {}
+    span = tables.span_ns()
+    is_whole = selection.get("start_ns") is None and selection.get("end_ns") is None
+    if span is None or not is_whole or truth.start_ns > span[1] or truth.end_ns <= span[0]:
+        return
+    for one in truth.approaches:
+        if one.start_ns > span[1] + SLACK_NS or one.enter_ns < span[0] - SLACK_NS:
+            raise SchemaError(
+                f"{path}: approach {one.id} from {one.start_ns} to {one.enter_ns} ns lies outside "
+                f"the log, of which {run.path} has {span[0]} to {span[1]} ns; mend the truth"
+            )
 
 
 def _why_no_pose(run: RunFolder, truth: Truth) -> str:

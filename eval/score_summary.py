@@ -80,15 +80,15 @@ def _cues(cues: Mapping[str, CueScore]) -> list[str]:
     lines = ["cue                  scored  found  precision (95 %)      recall (95 %)"]
     for name, one in shown.items():
         star = " " if one.is_sources_reading else "*"
-        recall = "      -" if one.recall is None else _share(one.recall)
+        recall = "-" if one.recall is None else _share(one.recall)
         lines.append(
             f"{visible(name):19}{star} {one.scored:6} {one.positives:6}  "
             f"{_share(one.precision):20}  {recall}".rstrip()
         )
     if any(not one.is_sources_reading for one in shown.values()):
         lines.append("* judged by the feature or thing that the source does not judge it by")
-    if any(one.precision.clusters < 2 for one in shown.values()):
-        lines.append("intervals count frames as independent, which they are not: merge more drives")
+    if any(math.isnan(one.precision.clusters_low) for one in shown.values() if one.positives):
+        lines.append("few approaches: intervals count frames as independent, which they are not")
     return [*lines, *_left_out(cues)]
 
 
@@ -109,9 +109,9 @@ def _left_out(cues: Mapping[str, CueScore]) -> list[str]:
 
 def _share(one: Share) -> str:
     if not one.of:
-        return "      -"
+        return "-"
     low, high = _ends(one)
-    return f"{one.value:7.3f} ({low:.2f} to {high:.2f})"
+    return f"{one.value:.3f} ({low:.2f} to {high:.2f})"
 
 
 def _ends(one: Share) -> tuple[float, float]:

@@ -224,6 +224,18 @@ def test_truth_of_another_log_is_refused_by_time_and_by_hash(
     assert cli.run(["score", str(run), "--truth", str(hashed), "-q"]) == 0
 
 
+def test_an_approach_outside_the_log_is_refused_unless_only_a_part_was_replayed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    late = approach(id=1, start_ns=at(1000), enter_ns=at(1040))
+    truth_folder(tmp_path, truth([], [approach(), late], end=2000))
+    whole = run_folder(tmp_path / "whole", selection={"start_ns": None, "end_ns": None})
+    part = run_folder(tmp_path / "part", selection={"start_ns": None, "end_ns": at(50)})
+
+    assert "approach 1 from" in _fails(capsys, "score", whole.path)
+    assert cli.run(["score", str(part.path), "-q"]) == 0
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -25,6 +25,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from crosscue.eval.attribution import (
+    Attribution,
+    Drive,
+    attribute,
+    attribution_lines,
+    attribution_tree,
+    estimate_of,
+)
 from crosscue.eval.gates import GateResult, check_gates, load_gates
 from crosscue.eval.junit import write_junit
 from crosscue.eval.metric_values import metric_values
@@ -68,6 +76,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rpe", nargs="+", type=_metres, default=[10.0, 100.0], metavar="M",
         help="distances of the relative pose error in metres (default: 10 100)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--attribution", action="store_true",
+        help="estimate again with each cue left out, and score what it was worth",
     )  # fmt: skip
     parser.add_argument(
         "--smoother", choices=("gtsam",),
@@ -126,6 +138,8 @@ def _score_run(
         smoothed = None if args.smoother is None else score_smoother(folder, truth_path)
         if smoothed is not None:
             tree["smoother"] = asdict(smoothed)
+        # Of several runs it is asked once, of all together.
+        worth = {} if len(args.runs) > 1 else _attribution([one], tree, settings, args)
         write_scores(folder.file(FOLDER), [one], tree)
         report = None if one.pose is None else write_report(folder, one.truth.truth, one.pose)
     if args.json or args.quiet:
@@ -139,8 +153,23 @@ def _score_run(
         print("\n" + pose_summary(one.pose))
     if smoothed is not None:
         print(told(smoothed))
+    if worth:
+        print("\n" + "\n".join(attribution_lines(worth)))
     print(f"written to {visible(str(report or folder.file(FOLDER)))}")
     return one, tree
+
+
+def _attribution(
+    scored: Sequence[RunScored], tree: dict[str, Any], settings: ScoreSettings,
+    args: argparse.Namespace,
+) -> dict[str, Attribution]:  # fmt: skip
+    """What each cue was worth, also put into the metrics; nothing unless asked for."""
+    if not args.attribution:
+        return {}
+    drives = [Drive(one.judged, one.truth, estimate_of(one.run)) for one in scored]
+    found = attribute(drives, settings=settings)
+    tree["attribution"] = attribution_tree(found)
+    return found
 
 
 def _pool(
@@ -149,11 +178,14 @@ def _pool(
     """Score all runs together, as pooled in the folder asked for."""
     scores = scores_of(scored, settings)
     tree = metrics_of(scored, scores)
+    worth = _attribution(scored, tree, settings, args)
     if args.output is not None:
         write_scores(args.output, scored, tree)
     if not (args.json or args.quiet):
         why = scored[0].why_no_pose if all(one.pose is None for one in scored) else ""
         print("\n" + summary(scores, why))
+        if worth:
+            print("\n" + "\n".join(attribution_lines(worth)))
         if args.output is not None:
             print(f"written to {visible(str(args.output))}")
     return tree
