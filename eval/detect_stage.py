@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -225,23 +226,27 @@ class _Tables:
     objects: dict[str, int] = field(default_factory=dict)
     cue_frames: dict[str, int] = field(default_factory=dict)
     _sinks: dict[str, TableSink] = field(default_factory=dict)
+    _open: ExitStack = field(default_factory=ExitStack)
     roles: dict[str, Role] = field(default_factory=dict)
     _held: dict[str, list[dict[str, object]]] = field(default_factory=dict)
     _size: tuple[int, int] | None = None
     _frame: int = -1
 
     def __enter__(self) -> _Tables:
-        for name, schema in schemas().items():
-            self._sinks[name] = TableSink(self.run, name, schema)
-            self._held[name] = []
+        with ExitStack() as stack:
+            for name, schema in schemas().items():
+                self._sinks[name] = stack.enter_context(TableSink(self.run, name, schema))
+                self._held[name] = []
+            self._open = stack.pop_all()
         return self
 
     def __exit__(self, *failure: object) -> None:
-        kind, error, trace = failure
-        for name, sink in self._sinks.items():
-            if kind is None:
+        if failure[0] is not None:
+            self._open.__exit__(*failure)  # type: ignore[arg-type]
+            return
+        with self._open:
+            for name in self._sinks:
                 self._write(name)
-            sink.__exit__(kind, error, trace)  # type: ignore[arg-type]
 
     def add(self, result: FrameResult) -> None:
         """Rows of one frame."""
@@ -283,11 +288,11 @@ class _Tables:
             row: dict[str, object] = {
                 "t_ns": t_ns,
                 "approach": None,
-                "cue": cue.value,
+                "cue": cue,
                 "count": count,
             }
             self._held["cues"].append(row)
-            self.cue_frames[cue.value] = self.cue_frames.get(cue.value, 0) + (count > 0)
+            self.cue_frames[cue] = self.cue_frames.get(cue, 0) + (count > 0)
 
     def _detection_rows(self, name: str, found: Detections) -> list[dict[str, object]]:
         rows: list[dict[str, object]] = []

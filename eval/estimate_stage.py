@@ -17,7 +17,13 @@ from crosscue.replay.columns import Topic
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.roles import Role, role_of
-from crosscue.replay.run_folder import RunFolder, TableSink, sha256_of, write_manifest
+from crosscue.replay.run_folder import (
+    MANIFEST,
+    RunFolder,
+    TableSink,
+    sha256_of,
+    write_manifest,
+)
 from crosscue.replay.signals import Extractor, Plan, Signal, camera_of, plan, with_pictures
 from crosscue.replay.vehicle import Vehicle
 from crosscue.replay.windows import windows
@@ -128,6 +134,8 @@ def estimate_into(
         at = reading.camera[0]
         stage.landmarks = looking(landmarks, vehicle, reading.ledgers[at])
         reading.extractors[at].on_pictures = stage.landmarks.see
+    if detected is None:
+        _begin_again(run, found)
     tally = _pose(reading, stage, run, on_time)
     scene = None if found is None else _scene(run, vehicle, found)
     write_skipped(run, reading.ledgers, kept)
@@ -173,6 +181,14 @@ def estimate_into(
         run, reading.ledgers, tally.rows, tally.travelled_m, tally.major_axis_m, notices,
         seconds + before, tally.seconds, stage.landmarks.counts(), detected, scene,
     )  # fmt: skip
+
+
+def _begin_again(run: RunFolder, found: Mapping[str, Any] | None) -> None:
+    """Make the run what the detect stage left: cut short, it must not pass for a whole one."""
+    if found is None:
+        run.file(MANIFEST).unlink(missing_ok=True)
+    else:
+        write_manifest(run, {key: value for key, value in found.items() if key != "format_version"})
 
 
 class _Reading:

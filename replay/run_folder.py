@@ -123,7 +123,7 @@ def create(path: Path, *, overwrite: bool) -> RunFolder:
     except FileExistsError:
         raise RunError(f"{path}: is a file; give a folder for the run") from None
     except OSError as error:
-        raise OutputError(f"{path}: {error.strerror}; choose a folder you may write to") from None
+        raise cannot_write(path, error) from None
     if leftovers and not overwrite:
         raise RunError(f"{path}: holds files already; give another folder or --overwrite")
     if leftovers and not _looks_like_run(leftovers):
@@ -189,11 +189,20 @@ def locked(run: RunFolder) -> Iterator[None]:
     except OSError as error:
         raise cannot_write(path, error) from None
     try:
+        _sweep(run.path)
         yield
     finally:
         # Gone from the folder before it is free, so that nobody waits for a file without a name.
         path.unlink(missing_ok=True)
         os.close(handle)
+
+
+def _sweep(folder: Path) -> None:
+    """Take away what killed processes left half written."""
+    for entry in folder.glob(f".*{PARTIAL}"):
+        pid = entry.name.removesuffix(PARTIAL).rpartition(".")[2]
+        if pid.isdigit() and not Path(f"/proc/{pid}").exists():
+            _drop(entry)
 
 
 def _lock_file(path: Path) -> int:
@@ -212,14 +221,23 @@ def _lock_file(path: Path) -> int:
                 is_ours = True
             _refuse_if_held(path, os.read(handle, 4096), is_ours=is_ours)
             if is_ours and _is_still(handle, path):
-                me = f"{os.getpid()} {socket.gethostname()} {_boot_id()}"
-                os.ftruncate(handle, 0)
-                os.pwrite(handle, me.encode(), 0)
+                _sign(handle, path)
                 return handle
         except BaseException:
             os.close(handle)
             raise
         os.close(handle)
+
+
+def _sign(handle: int, path: Path) -> None:
+    """Write into the lock who holds it; a lock that cannot be written is taken away."""
+    me = f"{os.getpid()} {socket.gethostname()} {_boot_id()}"
+    try:
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, me.encode(), 0)
+    except OSError:
+        _drop(path)
+        raise
 
 
 def _is_still(handle: int, path: Path) -> bool:

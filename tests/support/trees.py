@@ -19,7 +19,11 @@ def tree(folder: Path) -> dict[str, str]:
 def _hash(path: Path) -> str:
     content = path.read_bytes()
     if path.name == "manifest.json":
-        manifest = json.loads(content)
-        manifest.pop("timings", None)
-        content = json.dumps(manifest, sort_keys=True).encode()
+        content = json.dumps(_without_timings(json.loads(content)), sort_keys=True).encode()
     return hashlib.sha256(content).hexdigest()
+
+
+def _without_timings(value: object) -> object:
+    if isinstance(value, dict):
+        return {k: _without_timings(v) for k, v in value.items() if k != "timings"}
+    return [_without_timings(one) for one in value] if isinstance(value, list) else value
