@@ -77,11 +77,12 @@ class FrameCues:
     """What one frame says.
 
     Attributes:
-        counts: From each cue that was looked for to how many there were; 0 is looked and not found.
+        counts: From each cue that was looked for, a user's own among them, to how many there were;
+            0 is looked and not found.
         road: Shares of road, where a detector segments.
     """
 
-    counts: Mapping[Cue, int]
+    counts: Mapping[str, int]
     road: RoadShares | None
 
 
@@ -100,28 +101,38 @@ class CuePass:
 
     def __call__(self, frame: Seen) -> FrameCues:
         """The cues of the next frame."""
-        counts: dict[Cue, int] = {}
+        counts: dict[str, int] = {}
         if frame.objects:
             counts |= self._objects(frame.objects) | self._cars(frame.objects)
         if frame.signs:
-            counts |= {cue: _count(frame.signs, (label,), 0.0) for label, cue in SIGN_CUES.items()}
+            counts |= {
+                cue.value: _count(frame.signs, (label,), 0.0) for label, cue in SIGN_CUES.items()
+            }
+        if frame.objects or frame.signs:
+            boxes = (*frame.objects, *frame.signs)
+            for name, own in self.vehicle.cues.own.items():
+                counts[name] = _count(boxes, own.labels, own.score)
         road = frame.road
         if isinstance(road, RoadMask):
             road = road_shares(road, self.vehicle.regions)
         if road is not None:
             sides = (Cue.ROAD_LEFT, Cue.ROAD_STRAIGHT, Cue.ROAD_RIGHT)
             positive = road.positive(self.vehicle.cues.road_share)
-            counts |= {cue: int(is_road) for cue, is_road in zip(sides, positive, strict=True)}
+            counts |= {
+                cue.value: int(is_road) for cue, is_road in zip(sides, positive, strict=True)
+            }
         return FrameCues(counts, road)
 
-    def _objects(self, boxes: Sequence[Detections]) -> dict[Cue, int]:
+    def _objects(self, boxes: Sequence[Detections]) -> dict[str, int]:
         cues = self.vehicle.cues
         return {
-            Cue.STOP_SIGN: _count(boxes, cues.stop_sign_labels, cues.stop_sign_score),
-            Cue.TRAFFIC_LIGHT: _count(boxes, cues.traffic_light_labels, cues.traffic_light_score),
+            Cue.STOP_SIGN.value: _count(boxes, cues.stop_sign_labels, cues.stop_sign_score),
+            Cue.TRAFFIC_LIGHT.value: _count(
+                boxes, cues.traffic_light_labels, cues.traffic_light_score
+            ),
         }
 
-    def _cars(self, boxes: Sequence[Detections]) -> dict[Cue, int]:
+    def _cars(self, boxes: Sequence[Detections]) -> dict[str, int]:
         now = car_shapes(boxes, self.vehicle.cars)
         before, self._before = self._before, now
         if before is None:
@@ -130,10 +141,10 @@ class CuePass:
         moving = cross_traffic(pairs, self.vehicle.cars)
         parked = parked_cars(pairs, self.vehicle.cars)
         return {
-            Cue.CROSS_TRAFFIC_LEFT: moving.left,
-            Cue.CROSS_TRAFFIC_RIGHT: moving.right,
-            Cue.PARKED_LEFT: parked.left,
-            Cue.PARKED_RIGHT: parked.right,
+            Cue.CROSS_TRAFFIC_LEFT.value: moving.left,
+            Cue.CROSS_TRAFFIC_RIGHT.value: moving.right,
+            Cue.PARKED_LEFT.value: parked.left,
+            Cue.PARKED_RIGHT.value: parked.right,
         }
 
 

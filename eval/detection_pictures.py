@@ -61,7 +61,7 @@ def draw(pixels: Bytes, result: FrameResult, cues: FrameCues) -> Bytes:
     for found in result.found:
         if isinstance(found, Detections):
             _boxes(canvas, found)
-    positive = [f"{cue.value} {count}" for cue, count in cues.counts.items() if count]
+    positive = [f"{cue} {count}" for cue, count in cues.counts.items() if count]
     text = "  ".join(positive) or "no cue"
     place = (10, canvas.shape[0] - 14)
     cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 4)

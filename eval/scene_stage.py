@@ -143,11 +143,7 @@ class _Scene:
 
     def step(self, frame: StoredFrame, past: PastCues | None, without: frozenset[str]) -> None:
         seen = frame.seen
-        counts = {
-            cue.value: count
-            for cue, count in self.cues(seen).counts.items()
-            if cue.value not in without
-        }
+        counts = {cue: count for cue, count in self.cues(seen).counts.items() if cue not in without}
         signs = tuple(
             sign
             for sign in sign_ranges(seen.objects, frame.heights_px, self.vehicle)

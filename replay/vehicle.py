@@ -15,10 +15,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from .errors import VehicleError
-from .fusion_settings import Fusion, RangeFilter
+from .fusion_settings import CUES, Fusion, Name, RangeFilter
 from .past_settings import Past
 from .settings_section import Finite, NotNegative, Positive, Section
 
@@ -172,6 +172,13 @@ class Regions(Section):
     right: Polygon = ((0.8, 0.55), (1.0, 0.55), (1.0, 0.7), (0.8, 0.7))
 
 
+class OwnCue(Section):
+    """A cue of one's own: so many detections with one of these labels and a higher score."""
+
+    labels: Annotated[tuple[str, ...], Field(min_length=1)]
+    score: Share = 0.5
+
+
 class Cues(Section):
     """When a detection is a cue; the numbers are the source's for Mask R-CNN."""
 
@@ -181,6 +188,16 @@ class Cues(Section):
     traffic_light_score: Share = 0.9
     road_share: Share = 0.2
     """More road than this in a region is a cue (eq. 14)."""
+    own: dict[Name, OwnCue] = Field(default_factory=dict)
+    """By name; what each says of an intersection stands under [fusion.cues]."""
+
+    @field_validator("own")
+    @classmethod
+    def _new_names(cls, own: dict[str, OwnCue]) -> dict[str, OwnCue]:
+        for name in own:
+            if name in CUES:
+                raise ValueError(f"{name}: a cue of this name is there already; choose another")
+        return own
 
 
 class Cars(Section):

@@ -188,3 +188,38 @@ def test_a_car_without_a_camera_goes_on_and_says_so(
 
     assert "no detector has looked at the camera" in capsys.readouterr().out
     assert not RunFolder(tmp_path / "run").file("belief.parquet").exists()
+
+
+def test_a_cue_and_a_feature_of_ones_own_are_lines_of_configuration(
+    drive: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(drive / "run", tmp_path / "run")
+    shutil.copy(drive / "simulated_car.dbc", tmp_path)
+    (tmp_path / "v.toml").write_text(
+        (drive / "vehicle.toml").read_text()
+        + "\n[cues.own.any_car]\nlabels = ['car']\nscore = 0.5\n"
+        + "\n[fusion.features]\nbusy = {}\n"
+        + "\n[fusion.cues]\nany_car = { precision = 0.8, supports = ['busy'] }\n"
+    )
+
+    assert (
+        run(["estimate", str(tmp_path / "run"), "-q", "--vehicle", str(tmp_path / "v.toml")]) == 0
+    )
+
+    folder = open_run(tmp_path / "run")
+    counts = [row["count"] for row in folder.table("cues").to_pylist() if row["cue"] == "any_car"]
+    assert len(counts) == folder.table("frames").num_rows
+    assert max(counts) > 0
+    assert folder.table("belief")["busy"].to_pylist()[-1] > 0.9
+
+
+def test_a_cue_of_ones_own_may_not_take_a_name_that_is_there(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (drive / "vehicle.toml").read_text() + "\n[cues.own.stop_sign]\nlabels = ['x']\n"
+    (tmp_path / "v.toml").write_text(text)
+
+    arguments = ["estimate", str(drive / "run"), "--vehicle", str(tmp_path / "v.toml")]
+    assert run(arguments) != 0
+
+    assert "a cue of this name is there already" in capsys.readouterr().err
