@@ -1,0 +1,136 @@
+"""Estimating again from cached detections: drive time over run time.
+
+A simulated ten-minute town drive (no scene in its pictures) with a camera of 10 pictures a second,
+150 kB each, and stored detections as dense as a busy street's: six objects with masks a frame. What
+is timed is ``crosscue estimate`` as a library call: reading the log's other topics, pose, cues,
+range and belief, all tables written. Run it as ``python benchmarks/estimate.py [MINUTES]``.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from crosscue.datasets.simulated_drive import DriveSettings, drive, sense, vehicle_text
+from crosscue.datasets.simulated_log import BUS, GYRO, MAGNETOMETER, sensor_blocks
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections, Found, Frame, View
+from crosscue.detectors.registry import Choice
+from crosscue.eval.detect_stage import detect_drive
+from crosscue.eval.estimate_run import estimate_run
+from crosscue.replay.columns import Block, Images, Messages, Topic
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import EVERYTHING, open_log
+from crosscue.replay.run_folder import create, open_run
+from crosscue.replay.vehicle import parse
+from crosscue.replay.writing import LogWriter
+
+ROUNDS = 5
+PICTURE_BYTES = 150_000
+CAMERA = Topic("/camera", "crosscue/Images", "columns")
+SIZE = (1280, 720)
+SECONDS_PER_BLOCK = 15.0
+LABELS = ("car", "car", "car", "car", "stop sign", "traffic light")
+RANGES = """
+[ranges.stop_sign]
+parameters = [800.0]
+residual_sd_m = 1.7
+[ranges.traffic_light]
+parameters = [1000.0]
+residual_sd_m = 5.9
+"""
+
+
+class Busy:
+    """Six objects with masks in every frame; its pictures are not looked at."""
+
+    view = View(least_width_px=64)
+    identity = "busy 1"
+
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        """Objects of a seed that each frame's time gives."""
+        return [self._of(frame) for frame in frames]
+
+    def _of(self, frame: Frame) -> Found:
+        rng = np.random.default_rng(frame.t_ns % 2**32)
+        corner = np.column_stack([rng.integers(0, 1100, 6), rng.integers(100, 600, 6)])
+        boxes = np.hstack([corner, corner + np.array([120, 45])]).astype(np.float64)
+        mask = np.arange(45)[:, None] >= 20 - 15 * np.sin(np.arange(120)[None, :] / 40)
+        masks = tuple(rle.encode(mask, (int(x), int(y)), SIZE) for x, y in corner)
+        return Detections(frame.t_ns, SIZE, boxes, np.full(6, 0.99), LABELS, masks)
+
+
+def build() -> Busy:
+    """For ``--detectors``."""
+    return Busy()
+
+
+def pictures(times: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Block:
+    """A grey JPEG for each time, padded to a usual size with noise that no codec can shrink."""
+    import cv2
+
+    _, coded = cv2.imencode(".jpg", np.full((SIZE[1], SIZE[0], 3), 128, np.uint8))
+    head, rest = coded.tobytes()[:2], coded.tobytes()[2:]
+    rng = np.random.default_rng(int(times[0]))
+    count = 1 + (PICTURE_BYTES - len(rest)) // 60_000
+    mark = b"\xff\xfe" + (60_000 + 2).to_bytes(2, "big")
+    each = [head + b"".join(mark + rng.bytes(60_000) for _ in range(count)) + rest for _ in times]
+    length = len(each[0])
+    start = np.arange(len(times), dtype=np.int64) * length
+    messages = Messages(np.frombuffer(b"".join(each), np.uint8), start, start + length)
+    return Block(CAMERA.name, times, Images(messages, ("jpeg",) * len(times)), header_ns=times)
+
+
+def write_log(path: Path, settings: DriveSettings) -> float:
+    """The log; its length in seconds."""
+    motion = drive(settings)
+    first, last = int(motion.t_ns[0]), int(motion.t_ns[-1])
+    with LogWriter(path, Ledger(str(path))) as writer:
+        for topic in (BUS, GYRO, MAGNETOMETER, CAMERA):
+            writer.add_topic(topic)
+        sensors = sensor_blocks(sense(motion, settings), settings.seed)
+        at = first
+        for block in sensors:
+            stop = int(block.log_ns[-1])
+            if stop - at > 1_000_000_000:
+                writer.write(pictures(np.arange(at, stop, 100_000_000, dtype=np.int64)))
+                at = stop
+            writer.write(block)
+    return (last - first) * 1e-9
+
+
+def main() -> None:
+    """Make the drive once, estimate it several times."""
+    minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 10.0
+    settings = DriveSettings(blocks=max(4, round(minutes * 60.0 / SECONDS_PER_BLOCK)))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        seconds = write_log(folder / "drive.mcap", settings)
+        dbc = Path(__file__).parent.parent / "datasets" / "simulated_car.dbc"
+        vehicle = parse(vehicle_text(settings, str(dbc)) + RANGES, "benchmark")
+        choice = Choice("busy", f"{__name__}:build")
+        run = create(folder / "run", overwrite=False)
+        with open_log(folder / "drive.mcap") as log:
+            detect_drive([log], vehicle, run, EVERYTHING, [choice])
+        size = (folder / "drive.mcap").stat().st_size
+        taken, cpu = [], []
+        for _ in range(ROUNDS):
+            began, began_cpu = time.perf_counter(), time.process_time()
+            outcome = estimate_run(open_run(run.path))
+            taken.append(time.perf_counter() - began)
+            cpu.append(time.process_time() - began_cpu)
+        scene = outcome.scene
+        assert scene is not None
+        print(f"simulated drive of {seconds:.0f} s, {size / 1e6:.0f} MB, {scene.frames:,} frames")
+        print(f"estimate: {median(taken):.2f} s wall, {median(cpu):.2f} s CPU; "
+              f"{seconds / median(taken):.0f} times real time")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
