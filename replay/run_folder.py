@@ -31,6 +31,8 @@ MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
 FORMAT_VERSION: Final = 1
 PARTIAL: Final = ".partial"
+GROUP_ROWS: Final = 8192
+"""Rows of a table held back before they are written."""
 WITHOUT_LOCKS: Final = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL})
 """What file systems answer that cannot lock; the lock file's text must do there."""
 
@@ -81,6 +83,24 @@ class RunFolder:
         try:
             with path.open("rb") as file:
                 return pq.read_table(file, columns=columns, page_checksum_verification=True)
+        except FileNotFoundError:
+            raise RunError(f"{path}: not there; run crosscue replay again") from None
+        except (OSError, pa.ArrowException) as error:
+            raise RunError(f"{path}: damaged ({error}); run crosscue replay again") from None
+
+    def schema(self, name: str) -> pa.Schema:
+        """Columns of ``NAME.parquet``.
+
+        Raises:
+            RunError: Not there or damaged.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        path = self.file(f"{name}.parquet")
+        try:
+            with path.open("rb") as file:
+                return pq.read_schema(file).remove_metadata()
         except FileNotFoundError:
             raise RunError(f"{path}: not there; run crosscue replay again") from None
         except (OSError, pa.ArrowException) as error:
@@ -350,7 +370,10 @@ def _finite(value: object) -> object:
 
 
 class TableSink:
-    """A Parquet file written a batch at a time and named when whole; a context manager."""
+    """A Parquet file written a batch at a time and named when whole; a context manager.
+
+    Small batches are held back until they make a row group worth its header.
+    """
 
     def __init__(self, run: RunFolder, name: str, schema: pa.Schema) -> None:
         """Begin ``NAME.parquet``."""
@@ -359,6 +382,8 @@ class TableSink:
         self._path: Final = run.file(f"{name}.parquet")
         self._partial: Final = self._path.with_name(f".{name}.{os.getpid()}{PARTIAL}")
         self._schema: Final = schema
+        self._held: list[pa.Table] = []
+        self._rows = 0
         try:
             self._file: Final = self._partial.open("wb")
         except OSError as error:
@@ -379,10 +404,22 @@ class TableSink:
         """
         import pyarrow as pa
 
+        table = pa.table(dict(columns), schema=self._schema)
+        self._held.append(table)
+        self._rows += table.num_rows
+        if self._rows < GROUP_ROWS:
+            return
         try:
-            self._writer.write_table(pa.table(dict(columns), schema=self._schema))
+            self._flush()
         except OSError as error:
             raise cannot_write(self._path, error) from None
+
+    def _flush(self) -> None:
+        import pyarrow as pa
+
+        held, self._held, self._rows = self._held, [], 0
+        if held:
+            self._writer.write_table(pa.concat_tables(held).combine_chunks())
 
     def __enter__(self) -> TableSink:
         return self
@@ -400,6 +437,7 @@ class TableSink:
             self._give_up()
             return
         try:
+            self._flush()
             self._writer.close()
             self._file.flush()
             os.fsync(self._file.fileno())
