@@ -16,11 +16,13 @@ from crosscue.replay.fusion_settings import Fusion, RangeFilter
 from support.fusion import NONE_SEEN, SECOND_NS, drive, light, sign
 
 FRAME_NS = SECOND_NS // 10
+PLAIN = RangeFilter(sd_share=0.0, fade_m=0.0)
+"""As in the source, so that ranges can be worked out by hand."""
 
 
-def approaches(fusion: Fusion | None = None, range_filter: RangeFilter | None = None) -> Approaches:
+def approaches(fusion: Fusion | None = None, range_filter: RangeFilter = PLAIN) -> Approaches:
     fusion = fusion or Fusion()
-    return Approaches(graph_of(fusion), fusion, range_filter or RangeFilter())
+    return Approaches(graph_of(fusion), fusion, range_filter)
 
 
 def steps(
@@ -293,7 +295,7 @@ def test_several_signs_of_one_kind_count_as_their_mean() -> None:
 
 
 def test_a_signs_sd_may_grow_with_its_range() -> None:
-    loop = approaches(range_filter=RangeFilter(sd_share=0.1))
+    loop = approaches(range_filter=RangeFilter(sd_share=0.1, fade_m=0.0))
 
     (step,) = steps([replace(frame(0), signs=(sign(30.0, 4.0),))], loop)
 

@@ -121,7 +121,9 @@ def test_errors_are_as_large_as_the_filter_says() -> None:
             track = advance(track, 1.0 + rng.normal(0.0, 0.1), 0.01, 20.0)
             if rng.random() < 0.5:
                 seen_m = truth_m + rng.normal(0.0, 1.7)
-                track, _ = measure(track, seen_m, 1.7**2, RangeFilter(gate_nis=None), 20.0)
+                track, _ = measure(
+                    track, seen_m, 1.7**2, RangeFilter(gate_nis=None, fade_m=0.0), 20.0
+                )
         if track.belief is not None:
             nees.append((track.belief.mean_m - truth_m) ** 2 / track.belief.var_m2)
 
