@@ -25,11 +25,12 @@ from crosscue.replay.run_folder import write_text
 from crosscue.replay.writing import LogWriter
 
 from .camera import Camera
+from .car_file import vehicle_text
 from .coco import Objects
 from .conditions import Conditions, conditions_of
 from .cues import CueRuns, present
 from .layout import Layout, layout_named
-from .mobileye import MOUNTING, Device
+from .mobileye import Device
 from .render import DEFAULTS, Picture, PictureSettings, Renderer
 from .world import World, build
 
@@ -221,15 +222,11 @@ class _Record:
     def vehicle_text(self) -> str:
         """The vehicle file that fits."""
         camera = self.settings.camera
-        return VEHICLE.format(
+        return vehicle_text(
+            camera,
             mounting_yaw_rad=self._car.mounting_yaw_rad,
             declination_rad=self._car.declination_rad,
-            heading_rad=round(self._heading_rad, 6),
-            mobileye_x_m=MOUNTING.x_m,
-            camera_x_m=camera.x_m,
-            camera_z_m=camera.z_m,
-            focal_px=camera.focal,
-            center_px=list(camera.centre_px),
+            heading_rad=self._heading_rad,
         )
 
     def write_truth(self, folder: Path) -> Path:
@@ -307,48 +304,3 @@ def _calibration(times: Int64s, log_ns: Int64s, camera: Camera) -> Block:
     stop = np.arange(1, n + 1, dtype=np.int64) * rows.shape[1]
     messages = Messages(np.ascontiguousarray(rows).ravel(), stop - rows.shape[1], stop)
     return Block(CALIBRATION, np.maximum.accumulate(log_ns), messages)
-
-
-VEHICLE: Final = """\
-# A car of crosscue's simulated intersections.
-version = 1
-name = "crosscue simulated car"
-
-[topics]
-camera = "/camera/image/compressed"
-
-[can]
-bus = "/can/car"
-dbc = ["simulated_car.dbc"]
-
-[can.wheel_speeds]
-front_left = "WHEEL_SPEEDS.FRONT_LEFT"
-front_right = "WHEEL_SPEEDS.FRONT_RIGHT"
-rear_left = "WHEEL_SPEEDS.REAR_LEFT"
-rear_right = "WHEEL_SPEEDS.REAR_RIGHT"
-
-[mobileye]
-bus = "/can/mobileye"
-revision = "classic"
-x_m = {mobileye_x_m}
-
-[odometry]
-wheelbase_m = 2.7
-track_width_m = 1.55
-
-[compass]
-mounting_yaw_rad = {mounting_yaw_rad}
-declination_rad = {declination_rad}
-heading_sd_rad = 0.16
-interval_s = 8.0
-
-[start]
-heading_rad = {heading_rad}
-heading_sd_rad = 0.05
-
-[camera]
-x_m = {camera_x_m}
-z_m = {camera_z_m}
-focal_px = {focal_px}
-center_px = {center_px}
-"""

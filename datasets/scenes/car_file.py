@@ -1,0 +1,93 @@
+"""The vehicle file of the simulated car.
+
+Curves, regions and thresholds were chosen on layouts L alone; none of them has seen A to H.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from .camera import Camera
+from .mobileye import MOUNTING
+
+STOP_SIGN_M: Final = (0.80956, 1.11674)
+"""Range is focal length times the first over the height in pixels, plus the second.
+
+``crosscue fit ranges --truth`` on L200 to L214 and L301 to L310: 819 pairs, residual 2.40 m.
+"""
+TRAFFIC_LIGHT_M: Final = (1.12344, 1.53496)
+"""The same: 2897 pairs, residual 2.21 m."""
+
+
+def vehicle_text(
+    camera: Camera, *, mounting_yaw_rad: float, declination_rad: float, heading_rad: float
+) -> str:
+    """The file's text for a camera and compass; the heading is where the drive begins."""
+    stop, light = STOP_SIGN_M, TRAFFIC_LIGHT_M
+    return VEHICLE.format(
+        mounting_yaw_rad=mounting_yaw_rad,
+        declination_rad=declination_rad,
+        heading_rad=round(heading_rad, 6),
+        mobileye_x_m=MOUNTING.x_m,
+        camera_x_m=camera.x_m,
+        camera_z_m=camera.z_m,
+        focal_px=camera.focal,
+        center_px=list(camera.centre_px),
+        stop_sign=[round(stop[0] * camera.focal, 3), stop[1]],
+        traffic_light=[round(light[0] * camera.focal, 3), light[1]],
+    )
+
+
+VEHICLE: Final = """\
+# A car of crosscue's simulated intersections.
+version = 1
+name = "crosscue simulated car"
+
+[topics]
+camera = "/camera/image/compressed"
+
+[can]
+bus = "/can/car"
+dbc = ["simulated_car.dbc"]
+
+[can.wheel_speeds]
+front_left = "WHEEL_SPEEDS.FRONT_LEFT"
+front_right = "WHEEL_SPEEDS.FRONT_RIGHT"
+rear_left = "WHEEL_SPEEDS.REAR_LEFT"
+rear_right = "WHEEL_SPEEDS.REAR_RIGHT"
+
+[mobileye]
+bus = "/can/mobileye"
+revision = "classic"
+x_m = {mobileye_x_m}
+
+[odometry]
+wheelbase_m = 2.7
+track_width_m = 1.55
+
+[compass]
+mounting_yaw_rad = {mounting_yaw_rad}
+declination_rad = {declination_rad}
+heading_sd_rad = 0.16
+interval_s = 8.0
+
+[start]
+heading_rad = {heading_rad}
+heading_sd_rad = 0.05
+
+[camera]
+x_m = {camera_x_m}
+z_m = {camera_z_m}
+focal_px = {focal_px}
+center_px = {center_px}
+
+[ranges.stop_sign]
+family = "pinhole-offset"
+parameters = {stop_sign}
+residual_sd_m = 2.40
+
+[ranges.traffic_light]
+family = "pinhole-offset"
+parameters = {traffic_light}
+residual_sd_m = 2.21
+"""
