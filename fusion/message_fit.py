@@ -29,7 +29,8 @@ from .factor_graph import CueNode, FactorGraph, log_odds
 from .fade_fit import FadeFit, fit_fade
 
 LEAST_PLACES: Final = 3
-"""With the feature and without, each; fewer do not tell a rate or an exponent."""
+"""With the feature and without, each; fewer do not tell a rate or an exponent. A rate also needs as
+many that were positive at all: of a cue never seen nothing is known but what was published."""
 PULL_PLACES: Final = 1.0
 """So many places at the pooled rate are added to either side."""
 EXPONENTS: Final = np.linspace(0.05, 1.0, 96)
@@ -111,8 +112,9 @@ def _rate(
     there = _side([a for a in approaches if a.features.get(feature) is True], cue, near, fade)
     missing = _side([a for a in approaches if a.features.get(feature) is False], cue, near, fade)
     rates = None
-    if min(there.places, missing.places) >= LEAST_PLACES:
-        seen = (*there.rates, *missing.rates)
+    seen = (*there.rates, *missing.rates)
+    positive = sum(rate > 0.0 for rate in seen)
+    if min(there.places, missing.places, positive) >= LEAST_PLACES:
         pooled = (sum(seen) + 0.5) / (len(seen) + 1.0)
         if_there, if_not = (
             (sum(side.rates) + PULL_PLACES * pooled) / (side.places + PULL_PLACES)

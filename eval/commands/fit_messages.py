@@ -27,6 +27,7 @@ from crosscue.eval.message_fit_job import (
 from crosscue.fusion.fade_fit import FadeFit
 from crosscue.fusion.message_fit import MessageFit, RateFit, Side, fit_messages
 from crosscue.replay.errors import UsageError
+from crosscue.replay.fusion_settings import Rates
 from crosscue.replay.run_folder import open_run, write_text
 
 from .common import print_json, with_progress
@@ -78,11 +79,10 @@ def run(args: argparse.Namespace) -> int:
 def _told(fitted: MessageFit, used: Counter[str], runs: int) -> str:
     lines = [f"{runs} runs, {fitted.approaches} approaches to learn from"]
     lines += [f"  {count:5} {what}" for what, count in sorted(used.items())]
-    lines += [
-        "",
-        "shares of positive looks where the feature is there and where not (95 % intervals)",
-    ]
-    lines += [_rate_told(one) for one in fitted.rates]
+    lines += ["", "shares of positive looks, feature there and not there (95 % intervals)"]
+    lines += [_rate_told(one, one.rates) for one in fitted.rates if one.rates is not None]
+    lines += ["", "too little seen, so the published message stands"]
+    lines += [_unlearned_told(one) for one in fitted.rates if one.rates is None]
     lines += ["", "looks become independent over"]
     lines += [_fade_told(one) for one in fitted.fades]
     scales = ", ".join(f"{name} {value:.2f}" for name, value in fitted.calibrated.exponents.items())
@@ -90,21 +90,26 @@ def _told(fitted: MessageFit, used: Counter[str], runs: int) -> str:
     return "\n".join(lines)
 
 
-def _rate_told(one: RateFit) -> str:
-    name = f"{one.cue} -> {one.feature}, {'near' if one.near else 'far'}"
-    if one.rates is None:
-        return f"  {name}\n    not learned: {_too_few(one)}; the published message stands"
-    says = math.log(one.rates.if_there / one.rates.if_not)
-    silence = math.log((1.0 - one.rates.if_there) / (1.0 - one.rates.if_not))
+def _name_of(one: RateFit) -> str:
+    return f"  {one.cue} -> {one.feature}, {'near' if one.near else 'far'}"
+
+
+def _rate_told(one: RateFit, rates: Rates) -> str:
+    says = math.log(rates.if_there / rates.if_not)
+    silence = math.log((1.0 - rates.if_there) / (1.0 - rates.if_not))
     return (
-        f"  {name}\n    there     {_side_told(one.there)}\n"
+        f"{_name_of(one)}\n    there     {_side_told(one.there)}\n"
         f"    not there {_side_told(one.missing)}\n"
         f"    log odds of a detection {says:+.2f}, of none {silence:+.2f}"
     )
 
 
-def _too_few(one: RateFit) -> str:
-    return f"{one.there.places} places with it, {one.missing.places} without"
+def _unlearned_told(one: RateFit) -> str:
+    positive = sum(rate > 0.0 for rate in (*one.there.rates, *one.missing.rates))
+    return (
+        f"{_name_of(one)}: {one.there.places} places with it, {one.missing.places} without, "
+        f"{positive} positive"
+    )
 
 
 def _side_told(side: Side) -> str:
@@ -119,7 +124,7 @@ def _side_told(side: Side) -> str:
 def _fade_told(one: FadeFit) -> str:
     fade = one.fade
     scale = f"{fade.way_m:.1f} m" if fade.way_m is not None else f"{fade.time_s:.2f} s"
-    why = "" if one.is_learned else ", not learned: too few positive"
+    why = "" if one.is_learned else ", not learned: too few positive, or always so"
     return f"  {one.cue:20} {scale:>8}  {one.positives} positive of {one.looks} frames{why}"
 
 
