@@ -12,13 +12,14 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
 
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.limits import MIB
-from crosscue.replay.run_folder import RunFolder
+from crosscue.replay.run_folder import MANIFEST, RunFolder, open_run
 
 from .metric_values import MetricValue, metric_values
 from .score_run import FOLDER, METRICS
@@ -172,10 +173,10 @@ def read_tolerance(text: str) -> Tolerance:
 def compare_runs(
     first: RunFolder, second: RunFolder, tolerances: Sequence[Tolerance] = ()
 ) -> Comparison:
-    """Compare two finished runs.
+    """Compare two finished runs, or the pooled scores of several.
 
     Args:
-        first: The one that was good.
+        first: The one that was good; see ``open_scored``.
         second: The one to judge.
         tolerances: The last one whose pattern fits a metric counts; without any, none.
 
@@ -201,7 +202,22 @@ def compare_runs(
     return Comparison(changes, tuple(tables), metrics, same, metrics_same, "")
 
 
+def open_scored(path: Path) -> RunFolder:
+    """A finished run, or the folder that ``crosscue score -o`` wrote for several runs.
+
+    Raises:
+        RunError: Neither.
+    """
+    return RunFolder(path) if _is_pooled(path) else open_run(path)
+
+
+def _is_pooled(path: Path) -> bool:
+    return not (path / MANIFEST).exists() and (path / METRICS).exists()
+
+
 def _settings_of(run: RunFolder) -> dict[str, object]:
+    if _is_pooled(run.path):
+        return {}
     manifest = run.manifest()
     return dict(_leaves({name: manifest[name] for name in COMPARED if name in manifest}, ""))
 
@@ -218,7 +234,7 @@ def _leaves(value: object, path: str) -> Iterator[tuple[str, object]]:
 
 
 def _metrics_of(run: RunFolder) -> dict[str, MetricValue] | None:
-    path = run.file(FOLDER) / METRICS
+    path = run.file(METRICS) if _is_pooled(run.path) else run.file(FOLDER) / METRICS
     try:
         if path.stat().st_size > MOST_BYTES:
             raise RunError(f"{path}: over {MOST_BYTES // MIB} MiB; run crosscue score again")

@@ -40,7 +40,6 @@ class RunScored:
         run: Its folder.
         truth_path: Where the truth is.
         truth: The truth.
-        tables: What the run says.
         judged: Everything but the pose.
         pose: None where it was not scored.
         why_no_pose: Empty where it was.
@@ -49,7 +48,6 @@ class RunScored:
     run: RunFolder
     truth_path: Path
     truth: DriveTruth
-    tables: RunTables
     judged: DriveJudged
     pose: PoseScore | None
     why_no_pose: str
@@ -97,7 +95,7 @@ def judge_run(
     if why and {"cues", "belief", "range"} <= nothing.keys():
         reasons = "; ".join(dict.fromkeys([*nothing.values(), why]))
         raise SchemaError(f"{truth_path}: nothing of {run.path} can be scored: {reasons}")
-    return RunScored(run, truth_path, truth, tables, judged, pose, why)
+    return RunScored(run, truth_path, truth, judged, pose, why)
 
 
 def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
@@ -157,8 +155,22 @@ def metrics_of(scored: Sequence[RunScored], scores: Scores) -> dict[str, Any]:
         tree["truth"] = only.truth.truth.model_dump(mode="json")
         tree["pose"] = None if only.pose is None else asdict(only.pose)
     else:
+        tree["coverage"]["same_log"] = same_logs(scored)
         tree["pose"] = _poses(poses)
     return tree
+
+
+def same_logs(scored: Sequence[RunScored]) -> list[tuple[str, str]]:
+    """Pairs of runs of one log: pooled, such a drive counts twice."""
+    first: dict[str, str] = {}
+    pairs: list[tuple[str, str]] = []
+    for one in scored:
+        name = str(one.run.path)
+        logs = one.run.manifest().get("logs", [])
+        for digest in {digest for log in logs for digest in log.get("sha256", {}).values()}:
+            if first.setdefault(digest, name) != name:
+                pairs.append((first[digest], name))
+    return sorted(set(pairs))
 
 
 def _poses(poses: Mapping[str, PoseScore]) -> dict[str, Any]:

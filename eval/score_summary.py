@@ -35,6 +35,11 @@ def summary(scores: Scores, why_no_pose: str = "") -> str:
     return "\n".join(part for line in lines for part in _wrapped(line))
 
 
+def told_line(label: str, text: str) -> str:
+    """One labelled line, going on below where it is too long."""
+    return "\n".join(_wrapped(_line(label, text)))
+
+
 def gate_lines(results: Sequence[GateResult]) -> str:
     """One line for each gate, failures last."""
     ordered = sorted(results, key=lambda one: bool(one.failure))

@@ -136,6 +136,21 @@ def test_tables_that_cannot_be_compared_row_by_row_say_why(tmp_path: Path) -> No
     assert found["range"].what == "only in the first run"
 
 
+def test_pooled_scores_of_several_runs_are_compared_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, worse = _pair(tmp_path)
+    for name, runs in (("good", [good]), ("both", [good, worse])):
+        more = [] if len(runs) > 1 else [run_folder(tmp_path / "c").path]
+        argv = ["score", *map(str, [*runs, *more]), "-o", str(tmp_path / name), "-q"]
+        assert cli.run(argv) == 0
+
+    assert cli.run(["compare", str(tmp_path / "good"), str(tmp_path / "both")]) == 1
+    assert "WORSE      cues.stop_sign.precision: 1 -> 0.970149" in capsys.readouterr().out
+    assert cli.run(["compare", str(tmp_path / "good"), str(tmp_path)]) == 1
+    assert "not a run folder" in capsys.readouterr().err
+
+
 def test_damaged_scores_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     good, worse = _pair(tmp_path)
     for text in ("{", "[]", "[" * 100_000):

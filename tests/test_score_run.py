@@ -1,6 +1,9 @@
 """``crosscue score`` on run folders: files, gates, exit status, and what is refused."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -14,6 +17,7 @@ from crosscue.eval import cli
 from crosscue.eval.gates import Gate, check_gates, load_gates
 from crosscue.eval.junit import junit_text
 from crosscue.eval.metric_values import MetricValue, metric_values
+from crosscue.eval.run_list import runs_of
 from crosscue.replay.errors import UsageError
 from support.scoring import (
     BELIEF,
@@ -334,3 +338,66 @@ def test_no_truth_anywhere_is_told_with_the_places_looked_at(
     run = run_folder(tmp_path / "run")
 
     assert "give --truth" in _fails(capsys, "score", run.path)
+
+
+def test_runs_are_found_in_folders_by_patterns_and_in_lists(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        truth_folder(tmp_path / "drives" / name)
+        run_folder(tmp_path / "runs" / name, logs=_log_of(tmp_path / "drives" / name))
+    (tmp_path / "runs" / "notes").mkdir()
+    (tmp_path / "list.txt").write_text("# both\nruns/b\n\nruns/a\n")
+    both = (tmp_path / "runs" / "a", tmp_path / "runs" / "b")
+
+    assert runs_of([str(tmp_path / "runs")]) == both
+    assert runs_of([str(tmp_path / "runs" / "[ab]")]) == both
+    assert runs_of([f"@{tmp_path}/list.txt"]) == both[::-1]
+    assert runs_of([str(tmp_path / "gone")]) == (tmp_path / "gone",)
+    for arguments, said in (
+        ([str(tmp_path / "x*")], "nothing matches"),
+        ([str(both[0]), str(tmp_path / "runs")], "named twice"),
+        ([f"@{tmp_path}/none.txt"], "give a text file"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            runs_of(arguments)
+
+
+def _log_of(folder: Path) -> list[dict[str, Any]]:
+    return [{"path": str(folder / "drive.mcap"), "sha256": {"drive.mcap": folder.name}}]
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_a_run_that_cannot_be_scored_does_not_stop_the_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], workers: str
+) -> None:
+    for name in ("a", "b", "c"):
+        truth_folder(tmp_path / "drives" / name)
+        run_folder(tmp_path / "runs" / name, logs=_log_of(tmp_path / "drives" / name))
+    (tmp_path / "runs" / "b" / "manifest.json").unlink()
+    argv = ["score", str(tmp_path / "runs"), "-o", str(tmp_path / "all"), "--workers", workers]
+
+    assert cli.run(argv) == 3
+    told = capsys.readouterr()
+    assert "runs/b: no manifest.json" in told.err
+    assert "failed     1 of 3 runs" in told.out
+    pooled = json.loads((tmp_path / "all" / "metrics.json").read_text())
+    assert [one["drive"][-6:] for one in pooled["coverage"]["by_drive"]] == ["runs/a", "runs/c"]
+    assert list(pooled["coverage"]["failed"]) == [str(tmp_path / "runs" / "b")]
+
+
+def test_two_runs_of_one_log_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth_folder(tmp_path)
+    runs = [str(run_folder(tmp_path / name).path) for name in ("a", "b")]
+
+    assert cli.run(["score", *runs]) == 0
+    assert "are runs of one log" in capsys.readouterr().out
+
+
+def test_neither_hash_seed_nor_zone_nor_locale_changes_a_byte(tmp_path: Path) -> None:
+    run = _one(tmp_path)
+    seen = []
+    for seed, zone, locale in (("0", "UTC", "C"), ("7", "Asia/Tokyo", "C.UTF-8")):
+        environment = os.environ | {"PYTHONHASHSEED": seed, "TZ": zone, "LC_ALL": locale}
+        command = [sys.executable, "-c", "from crosscue.eval.cli import main; main()", "score"]
+        subprocess.run([*command, str(run), "-q"], env=environment, check=True)
+        seen.append([path.read_bytes() for path in sorted((run / "score").iterdir())])
+    assert seen[0] == seen[1]

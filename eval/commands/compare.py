@@ -4,6 +4,7 @@ Exit status 1 when the second run is worse: a metric moved in its bad direction 
 tolerance, or is no longer scored. Without --tolerance none is allowed. A tolerance is a number in
 the metric's unit, a share of the first run's value (2%), or either for the metrics of a pattern;
 the last that fits counts. If a run was not scored, every difference of a table counts as worse.
+Folders that crosscue score -o wrote for several runs can be compared as well.
 
 examples:
   crosscue compare runs/before runs/after
@@ -24,10 +25,10 @@ from crosscue.eval.compare_runs import (
     MetricChange,
     TableChange,
     compare_runs,
+    open_scored,
     read_tolerance,
 )
 from crosscue.eval.plain_text import visible
-from crosscue.replay.run_folder import open_run
 
 from .common import print_json
 
@@ -49,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Compare, tell, and give 1 when the second run is worse."""
     tolerances = [read_tolerance(text) for text in args.tolerance]
-    found = compare_runs(open_run(args.first), open_run(args.second), tolerances)
+    found = compare_runs(open_scored(args.first), open_scored(args.second), tolerances)
     if args.json:
         print_json(asdict(found) | {"worse": found.worse})
     elif not args.quiet:

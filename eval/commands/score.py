@@ -1,8 +1,9 @@
 """Score runs against truth: metrics, figures, report, gates.
 
-Every run gets metrics.json and figures in RUN/score. Several runs are scored together as well; the
-pooled result goes to the folder given by -o. Without --truth, each run's truth is the truth.json
-beside its log.
+Every run gets metrics.json and figures in RUN/score. Several runs (folders, a folder of runs, a
+quoted pattern, @list.txt) are scored together as well; the pooled result goes to the folder given
+by -o. A run that cannot be scored does not stop the rest. Without --truth, each run's truth is the
+truth.json beside its log.
 
 A gate file (TOML) sets bounds on metrics; a gate that fails makes the exit status 1:
   version = 1
@@ -13,15 +14,15 @@ A gate file (TOML) sets bounds on metrics; a gate that fails makes the exit stat
 
 examples:
   crosscue score runs/A-01 --truth drives/A-01/truth.json
-  crosscue score runs/* -o scored --gate gates.toml
+  crosscue score runs -o scored --gate gates.toml --workers 8
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -33,33 +34,26 @@ from crosscue.eval.attribution import (
     attribution_tree,
     estimate_of,
 )
-from crosscue.eval.gates import GateResult, check_gates, load_gates
+from crosscue.eval.gates import Gate, GateResult, check_gates, load_gates
 from crosscue.eval.junit import write_junit
 from crosscue.eval.metric_values import metric_values
 from crosscue.eval.plain_text import visible
-from crosscue.eval.report import write_report
-from crosscue.eval.score_drives import DEFAULTS, ScoreSettings
+from crosscue.eval.run_list import runs_of
+from crosscue.eval.score_drives import DEFAULTS, Scores, ScoreSettings
+from crosscue.eval.score_many import Failed, Scored, ScoreWork, score_runs
 from crosscue.eval.score_pose import summary as pose_summary
-from crosscue.eval.score_run import (
-    FOLDER,
-    RunScored,
-    find_truth,
-    judge_run,
-    metrics_of,
-    scores_of,
-    write_scores,
-)
-from crosscue.eval.score_summary import gate_lines, headline, summary
-from crosscue.eval.smooth_pose import score_smoother, told
+from crosscue.eval.score_run import FOLDER, metrics_of, scores_of, write_scores
+from crosscue.eval.score_summary import gate_lines, headline, summary, told_line
+from crosscue.eval.smooth_pose import told
 from crosscue.replay.errors import UsageError
-from crosscue.replay.run_folder import locked, open_run
+from crosscue.replay.run_folder import locked
 
-from .common import print_json
+from .common import print_json, with_progress
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folders")
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folders, or folders of them")
     parser.add_argument(
         "--truth", type=Path, metavar="T.json",
         help="the truth of all runs (default: the truth.json beside each run's log)",
@@ -85,6 +79,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--smoother", choices=("gtsam",),
         help="beside the filter, a batch smoother over the same measurements",
     )  # fmt: skip
+    parser.add_argument("--workers", type=int, default=1, metavar="N",
+                        help="runs scored at a time (default: 1)")  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the metrics as JSON")
 
 
@@ -96,99 +92,134 @@ def _metres(text: str) -> float:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Score every run, then all together; a failed gate gives 1."""
-    if len({path.resolve() for path in args.runs}) != len(args.runs):
-        raise UsageError("score: a run is named twice; name each once")
-    if args.gate is not None and len(args.runs) > 1 and args.output is None:
+    """Score every run, then all together; 1 for a failed gate, 3 when some runs failed."""
+    paths = runs_of(args.runs)
+    if args.gate is not None and len(paths) > 1 and args.output is None:
         raise UsageError("score: several runs and --gate: say with -o DIR where junit.xml goes")
+    if args.workers < 1:
+        raise UsageError(f"--workers {args.workers}: want 1 or more")
     try:
         settings = ScoreSettings(threshold=args.threshold)
     except ValueError as error:
         raise UsageError(f"--threshold: {error}") from None
-    gates = None if args.gate is None else load_gates(args.gate)
-    scored: list[RunScored] = []
-    trees: dict[str, dict[str, Any]] = {}
-    for path in args.runs:
-        one, tree = _score_run(path, settings, args)
-        scored.append(one)
-        trees[str(path)] = tree
-    pooled = trees[str(args.runs[0])] if len(scored) == 1 else _pool(scored, settings, args)
-    results: tuple[GateResult, ...] = ()
-    if gates is not None:
-        results = check_gates(gates, metric_values(pooled), pooled["coverage"]["not_scored"])
-        folder = args.output or scored[0].run.file(FOLDER)
-        write_junit(folder / "junit.xml", results, " ".join(str(path) for path in args.runs))
+    gates = () if args.gate is None else load_gates(args.gate)
+    work = ScoreWork(args.truth, settings, tuple(args.rpe), args.smoother is not None)
+    scored, failed = _score_all(paths, work, args)
+    if len(paths) == 1:
+        tree = _tell_one(scored[0], settings, args)
+    else:
+        tree = _pool(scored, failed, settings, args)
+    results = _gate(gates, tree, args.output or scored[0].one.run.file(FOLDER), paths)
     if args.json:
-        print_json({"metrics": pooled, "runs": trees, "gates": _as_json(results)})
+        print_json({"metrics": tree, "gates": _as_json(results),
+                    "runs": {str(one.one.run.path): one.metrics for one in scored}})  # fmt: skip
     elif results and not args.quiet:
         print(gate_lines(results))
-    return 1 if any(one.failure for one in results) else 0
+    return 1 if any(one.failure for one in results) else 3 if failed else 0
 
 
-def _score_run(
-    path: Path, settings: ScoreSettings, args: argparse.Namespace
-) -> tuple[RunScored, dict[str, Any]]:
-    """Score one run and write its files."""
-    folder = open_run(path)
-    truth_path = find_truth(folder, args.truth)
-    with locked(folder):
-        one = judge_run(folder, truth_path, settings, args.rpe)
-        scores = scores_of([one], settings)
-        tree = metrics_of([one], scores)
-        smoothed = None if args.smoother is None else score_smoother(folder, truth_path)
-        if smoothed is not None:
-            tree["smoother"] = asdict(smoothed)
-        # Of several runs it is asked once, of all together.
-        worth = {} if len(args.runs) > 1 else _attribution([one], tree, settings, args)
-        write_scores(folder.file(FOLDER), [one], tree)
-        report = None if one.pose is None else write_report(folder, one.truth.truth, one.pose)
+def _score_all(
+    paths: Sequence[Path], work: ScoreWork, args: argparse.Namespace
+) -> tuple[list[Scored], list[Failed]]:
+    """All that can be scored; if nothing can, the first error ends the command."""
+    scored: list[Scored] = []
+    failed: list[Failed] = []
+
+    def share() -> float:
+        return (len(scored) + len(failed)) / len(paths)
+
+    for one in with_progress(score_runs(paths, work, args.workers), share, args, "scoring"):
+        if isinstance(one, Scored):
+            scored.append(one)
+            if len(paths) > 1 and not (args.json or args.quiet):
+                print(headline(str(one.one.run.path), metric_values(one.metrics)))
+            continue
+        failed.append(one)
+        if len(paths) > 1:
+            line = visible(" ".join(str(one.error).split()))
+            print(f"crosscue: {line}; this run is left out", file=sys.stderr)
+    if not scored:
+        raise failed[0].error
+    return scored, failed
+
+
+def _tell_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) -> dict[str, Any]:
+    """Print one run's scores; its metrics come back."""
+    one = found.one
+    scores = scores_of([one], settings)
+    worth = _attribution([found], found.metrics, settings, args)
+    if worth:
+        with locked(one.run):
+            write_scores(one.run.file(FOLDER), [one], found.metrics)
     if args.json or args.quiet:
-        return one, tree
-    if len(args.runs) > 1:
-        print(headline(str(path), metric_values(tree)))
-        return one, tree
-    print(f"run        {visible(str(path))}")
-    print(summary(scores, one.why_no_pose))
+        return found.metrics
+    print(f"run        {visible(str(one.run.path))}")
+    _print_scores(scores, one.why_no_pose, worth)
     if one.pose is not None:
         print("\n" + pose_summary(one.pose))
-    if smoothed is not None:
-        print(told(smoothed))
+    if found.smoothed is not None:
+        print(told(found.smoothed))
+    print(f"written to {visible(str(found.report or one.run.file(FOLDER)))}")
+    return found.metrics
+
+
+def _print_scores(scores: Scores, why_no_pose: str, worth: dict[str, Attribution]) -> None:
+    print(summary(scores, why_no_pose))
     if worth:
         print("\n" + "\n".join(attribution_lines(worth)))
-    print(f"written to {visible(str(report or folder.file(FOLDER)))}")
-    return one, tree
 
 
 def _attribution(
-    scored: Sequence[RunScored], tree: dict[str, Any], settings: ScoreSettings,
+    scored: Sequence[Scored], tree: dict[str, Any], settings: ScoreSettings,
     args: argparse.Namespace,
 ) -> dict[str, Attribution]:  # fmt: skip
     """What each cue was worth, also put into the metrics; nothing unless asked for."""
     if not args.attribution:
         return {}
-    drives = [Drive(one.judged, one.truth, estimate_of(one.run)) for one in scored]
+    ones = [found.one for found in scored]
+    drives = [Drive(one.judged, one.truth, estimate_of(one.run)) for one in ones]
     found = attribute(drives, settings=settings)
     tree["attribution"] = attribution_tree(found)
     return found
 
 
 def _pool(
-    scored: Sequence[RunScored], settings: ScoreSettings, args: argparse.Namespace
-) -> dict[str, Any]:
-    """Score all runs together, as pooled in the folder asked for."""
-    scores = scores_of(scored, settings)
-    tree = metrics_of(scored, scores)
+    scored: Sequence[Scored], failed: Sequence[Failed], settings: ScoreSettings,
+    args: argparse.Namespace,
+) -> dict[str, Any]:  # fmt: skip
+    """Score all runs together, into the folder asked for."""
+    ones = [found.one for found in scored]
+    scores = scores_of(ones, settings)
+    tree = metrics_of(ones, scores)
+    tree["coverage"]["failed"] = {str(one.path): str(one.error) for one in failed}
     worth = _attribution(scored, tree, settings, args)
     if args.output is not None:
-        write_scores(args.output, scored, tree)
-    if not (args.json or args.quiet):
-        why = scored[0].why_no_pose if all(one.pose is None for one in scored) else ""
-        print("\n" + summary(scores, why))
-        if worth:
-            print("\n" + "\n".join(attribution_lines(worth)))
-        if args.output is not None:
-            print(f"written to {visible(str(args.output))}")
+        write_scores(args.output, ones, tree)
+    if args.json or args.quiet:
+        return tree
+    print()
+    if failed:
+        print(f"failed     {len(failed)} of {len(failed) + len(scored)} runs, left out")
+    for first, second in tree["coverage"].get("same_log", ()):
+        names = f"{visible(first)} and {visible(second)}"
+        print(told_line("twice", f"{names} are runs of one log, which therefore counts twice"))
+    why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
+    _print_scores(scores, why, worth)
+    if args.output is not None:
+        print(f"written to {visible(str(args.output))}")
     return tree
+
+
+def _gate(
+    gates: Sequence[Gate], tree: dict[str, Any], folder: Path, paths: Sequence[Path]
+) -> tuple[GateResult, ...]:
+    """Hold the gates against the metrics and write ``junit.xml``; nothing without gates."""
+    if not gates:
+        return ()
+    results = check_gates(gates, metric_values(tree), tree["coverage"]["not_scored"])
+    suite = str(paths[0]) if len(paths) == 1 else f"{len(paths)} runs"
+    write_junit(folder / "junit.xml", results, suite)
+    return results
 
 
 def _as_json(results: Sequence[GateResult]) -> list[dict[str, Any]]:

@@ -1,0 +1,110 @@
+"""Many runs scored, side by side if asked; one that fails does not stop the rest."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.run_folder import locked, open_run
+
+from .report import write_report
+from .score_drives import ScoreSettings
+from .score_run import (
+    FOLDER,
+    RunScored,
+    find_truth,
+    judge_run,
+    metrics_of,
+    scores_of,
+    write_scores,
+)
+from .smooth_pose import SmootherScore, score_smoother
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """A run that was scored, its files written.
+
+    Attributes:
+        one: Laid beside its truth.
+        metrics: What its ``metrics.json`` holds.
+        report: Its page, or None where there is none.
+        smoothed: The batch smoother beside the filter, if asked for.
+    """
+
+    one: RunScored
+    metrics: dict[str, Any]
+    report: Path | None
+    smoothed: SmootherScore | None
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """A run that could not be scored.
+
+    Attributes:
+        path: Its folder.
+        error: What would have ended the command for this run alone.
+    """
+
+    path: Path
+    error: CrosscueError
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreWork:
+    """What is done for one run, here or in another process.
+
+    Attributes:
+        truth: The truth of all runs, or None for the one beside each run's log.
+        settings: Of the scores.
+        rpe_m: Distances of the relative pose error.
+        has_smoother: Run the batch smoother as well?
+    """
+
+    truth: Path | None
+    settings: ScoreSettings
+    rpe_m: tuple[float, ...]
+    has_smoother: bool = False
+
+    def __call__(self, path: Path) -> Scored:
+        """Score one run and write its files.
+
+        Raises:
+            CrosscueError: It cannot be scored.
+        """
+        folder = open_run(path)
+        truth_path = find_truth(folder, self.truth)
+        with locked(folder):
+            one = judge_run(folder, truth_path, self.settings, self.rpe_m)
+            metrics = metrics_of([one], scores_of([one], self.settings))
+            smoothed = score_smoother(folder, truth_path) if self.has_smoother else None
+            if smoothed is not None:
+                metrics["smoother"] = asdict(smoothed)
+            write_scores(folder.file(FOLDER), [one], metrics)
+            report = None if one.pose is None else write_report(folder, one.truth.truth, one.pose)
+        return Scored(one, metrics, report, smoothed)
+
+    def attempt(self, path: Path) -> Scored | Failed:
+        """Score one run; an error of ours becomes a result."""
+        try:
+            return self(path)
+        except CrosscueError as error:
+            return Failed(path, error)
+
+
+def score_runs(
+    paths: Sequence[Path], work: ScoreWork, workers: int = 1
+) -> Iterator[Scored | Failed]:
+    """Score runs, in order; with several workers in as many processes."""
+    if workers == 1 or len(paths) == 1:
+        yield from map(work.attempt, paths)
+        return
+    fresh = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(paths)), mp_context=fresh) as pool:
+        yield from pool.map(work.attempt, paths)
