@@ -1,7 +1,8 @@
 """Estimating again from cached detections: drive time over run time.
 
 A simulated ten-minute town drive (no scene in its pictures) with a camera of 10 pictures a second,
-150 kB each, and stored detections as dense as a busy street's: six objects with masks a frame. What
+150 kB each, and stored detections as dense as a busy street's: six objects with masks a frame, two
+of them cars seen from the side. What
 is timed is ``crosscue estimate`` as a library call: reading the log's other topics, pose, cues,
 range and belief, all tables written. Run it as ``python benchmarks/estimate.py [MINUTES]``.
 """
@@ -60,10 +61,21 @@ class Busy:
     def _of(self, frame: Frame) -> Found:
         rng = np.random.default_rng(frame.t_ns % 2**32)
         corner = np.column_stack([rng.integers(0, 1100, 6), rng.integers(100, 600, 6)])
-        boxes = np.hstack([corner, corner + np.array([120, 45])]).astype(np.float64)
-        mask = np.arange(45)[:, None] >= 20 - 15 * np.sin(np.arange(120)[None, :] / 40)
-        masks = tuple(rle.encode(mask, (int(x), int(y)), SIZE) for x, y in corner)
+        size = np.array([(120, 45), (120, 45), (90, 80), (60, 52), (30, 31), (14, 34)])
+        boxes = np.hstack([corner, corner + size]).astype(np.float64)
+        masks = tuple(
+            rle.encode(_outline(w, h), (int(x), int(y)), SIZE)
+            for (x, y), (w, h) in zip(corner, size.tolist(), strict=True)
+        )
         return Detections(frame.t_ns, SIZE, boxes, np.full(6, 0.99), LABELS, masks)
+
+
+def _outline(width: int, height: int) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
+    top = 0.45 - 0.33 * np.sin(np.arange(width)[None, :] / 40)
+    shape: np.ndarray[tuple[int, int], np.dtype[np.bool_]] = (
+        np.arange(height)[:, None] >= top * height
+    )
+    return shape
 
 
 def build() -> Busy:

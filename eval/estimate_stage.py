@@ -108,6 +108,7 @@ def estimate_into(
     landmarks: LandmarkDatabase | None = None,
     detected: DetectOutcome | None = None,
     earlier: Mapping[str, Any] | None = None,
+    told: Sequence[Mapping[str, object]] | None = None,
 ) -> Outcome:
     """Write pose, cues, ranges, beliefs and the manifest into a run folder that is locked.
 
@@ -120,6 +121,7 @@ def estimate_into(
         landmarks: Camera frames are compared with these, where given.
         detected: The detect stage, if it ran just now.
         earlier: The manifest's part on the detect stage, if it ran earlier.
+        told: ``log_rows(logs)``, if they have been hashed already.
 
     Raises:
         VehicleError: The vehicle file does not fit the logs.
@@ -157,7 +159,7 @@ def estimate_into(
     write_manifest(run, {
         "stage": "estimate",
         "versions": versions(),
-        "logs": log_rows(logs),
+        "logs": _hashed(logs, found) if told is None else list(told),
         "selection": selection_told(selection),
         "settings": vehicle.model_dump(mode="json"),
         "sources": _sources(reading.planned, logs),
@@ -181,6 +183,12 @@ def estimate_into(
         run, reading.ledgers, tally.rows, tally.travelled_m, tally.major_axis_m, notices,
         seconds + before, tally.seconds, stage.landmarks.counts(), detected, scene,
     )  # fmt: skip
+
+
+def _hashed(logs: Sequence[Log], found: Mapping[str, Any] | None) -> Sequence[Mapping[str, object]]:
+    """Paths and hashes of the logs; the detect stage of this very run has taken them already."""
+    told: Sequence[Mapping[str, object]] = log_rows(logs) if found is None else found["logs"]
+    return told
 
 
 def _begin_again(run: RunFolder, found: Mapping[str, Any] | None) -> None:
