@@ -35,19 +35,20 @@ from crosscue.eval.many_drives import (
     Engine,
     Job,
     exit_status_of,
+    files_named_in,
     fingerprint_of,
-    in_turn,
     run_many,
 )
 from crosscue.eval.many_drives import Progress as DrivesDone
+from crosscue.eval.merge_runs import FOLDER, merge_runs
 from crosscue.eval.plain_text import terminal_width, visible, wrapped
 from crosscue.eval.replay_drive import Detecting, replay_drive
 from crosscue.eval.scene_stage import ApproachSummary, SceneOutcome
 from crosscue.eval.worker_pool import Processes
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.ledger import NOT_ASKED_TOPIC
 from crosscue.replay.log import open_logs
-from crosscue.replay.run_folder import create
+from crosscue.replay.run_folder import create, open_run
 from crosscue.replay.vehicle import Vehicle, load
 
 from .common import add_part_arguments, first_ns, print_json, selection_of
@@ -70,8 +71,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--each", action="store_true", help="every LOG is a drive of its own")
     parser.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="drives at a time (default: 1)"
-    )
+        "--workers", type=int, metavar="N",
+        help="drives at a time (default: 1; with --ray, as many as the cluster has cores)",
+    )  # fmt: skip
     parser.add_argument("--ray", metavar="ADDRESS", help="on a Ray cluster; local starts one here")
     add_detector_arguments(parser)
     parser.add_argument(
@@ -124,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
     drives = drives_of(args.logs, each=args.each)
     if drives.is_many:
         return _run_many(args, drives)
-    if args.workers != 1 or args.ray is not None:
+    if args.workers is not None or args.ray is not None:
         raise UsageError("--workers, --ray: for many drives; this is one (--each makes it many)")
     progress = Progress("replaying", not args.quiet and sys.stderr.isatty())
     outcome = _replay(drives.drives[0], args.output, args, progress)
@@ -178,16 +180,9 @@ class _Work:
 
 def _run_many(args: argparse.Namespace, drives: DriveList) -> int:
     engine = engine_of(args.workers, args.ray)
-    flags = {
-        name: str(getattr(args, name))
-        for name in ("detectors", "draw", "start", "end", "topics", "landmarks")
-    }
     jobs = [
         Job(
-            drive.name, drive.logs, args.output / drive.name,
-            fingerprint_of(
-                _vehicle(args.vehicle, drive.vehicle).model_dump(mode="json"), flags, versions()
-            ),
+            drive.name, drive.logs, args.output / drive.name, _fingerprint(args, drive),
             drive.vehicle, drive.truth,
         )
         for drive in drives.drives
@@ -195,26 +190,59 @@ def _run_many(args: argparse.Namespace, drives: DriveList) -> int:
     line = DriveProgress(not args.quiet and sys.stderr.isatty())
     done = run_many(jobs, _Work(args), engine, overwrite=args.overwrite, on_progress=line)
     line.end()
+    status = exit_status_of(done)
+    where, why = str(args.output / FOLDER), None
+    try:
+        _merge(done, args.output / FOLDER)
+    except CrosscueError as error:
+        # The drives are done, and that must be told, whatever became of their common table.
+        status, why = status or 3, str(error)
     if args.json:
-        print_json({"drives": [_drive_as_json(one) for one in done]})
+        told = [_drive_as_json(one) for one in done]
+        print_json({"drives": told, "merged": where, "not_merged": why})
     elif not args.quiet:
-        print("\n".join(_drive_lines(done)))
-    return exit_status_of(done)
+        tables = where if why is None else f"not merged: {why}"
+        print("\n".join([*_drive_lines(done), f"tables   {visible(tables)}"]))
+    return status
 
 
-def engine_of(workers: int, ray: str | None) -> Engine:
+def _merge(done: Sequence[Done[Outcome]], folder: Path) -> None:
+    merge_runs(
+        {one.job.name: open_run(one.job.run) for one in done if one.error is None},
+        create(folder, overwrite=True),
+        {one.job.name: one.error for one in done if one.error is not None},
+    )
+
+
+def _fingerprint(args: argparse.Namespace, drive: DriveInput) -> str:
+    """Of everything that decides a drive's run besides its logs."""
+    flags = {
+        name: None if getattr(args, name) is None else str(getattr(args, name))
+        for name in ("detectors", "draw", "start", "end", "topics", "landmarks")
+    }
+    try:
+        settings: object = _vehicle(args.vehicle, drive.vehicle).model_dump(mode="json")
+    except CrosscueError as error:
+        # This drive's own attempt tells it; the others must not suffer.
+        settings = str(error)
+    return fingerprint_of(
+        settings, flags, versions(), files_named_in([settings, str(args.landmarks)])
+    )
+
+
+def engine_of(workers: int | None, ray: str | None) -> Engine:
     """Where many drives are worked on.
 
     Raises:
         UsageError: Too few workers.
     """
-    if workers < 1:
+    if workers is not None and workers < 1:
         raise UsageError(f"--workers {workers}: want 1 or more")
     if ray is not None:
         from crosscue.eval.ray_drives import OnRay
 
-        return OnRay(ray)
-    return in_turn if workers == 1 else Processes(workers)
+        return OnRay(ray, workers)
+    return Processes(workers or 1)
 
 
 class DriveProgress:

@@ -1,0 +1,48 @@
+"""What many drives leave behind: a table of all, and a failure for a drive's own vehicle file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from crosscue.datasets.simulated_drive import DriveSettings
+from crosscue.datasets.simulated_log import write_drive
+from crosscue.eval.cli import run
+from crosscue.eval.run_list import runs_of
+from crosscue.replay.run_folder import open_run
+
+
+@pytest.fixture
+def drives(tmp_path: Path) -> Path:
+    for name, seed in (("monday", 1), ("tuesday", 2)):
+        write_drive(tmp_path / "drives" / name, DriveSettings(seed=seed))
+    return tmp_path / "drives"
+
+
+def test_a_broken_vehicle_file_costs_its_own_drive_and_an_edited_dbc_is_seen(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (drives / "tuesday" / "vehicle.toml").write_text("version = ")
+    argv = ["replay", str(drives), "-o", str(tmp_path / "runs"), "--json"]
+
+    assert run(argv) == 3
+
+    told = {one["name"]: one for one in json.loads(capsys.readouterr().out)["drives"]}
+    assert told["monday"]["error"] is None
+    assert "not TOML" in told["tuesday"]["error"]
+    assert runs_of([str(tmp_path / "runs")]) == (tmp_path / "runs" / "monday",)
+    merged = open_run(tmp_path / "runs" / "merged")
+    assert set(merged.table("pose")["drive"].to_pylist()) == {"monday"}
+    assert list(merged.manifest()["failures"]) == ["tuesday"]
+    accounts = merged.manifest()["accounts"].values()
+    assert sum(one["used"] for one in accounts) > 1000
+    for one in accounts:
+        assert one["in_file"] == one["used"] + sum(one["skipped"].values())
+
+    (dbc,) = drives.joinpath("monday").glob("*.dbc")
+    dbc.write_text(dbc.read_text() + "\n")
+    assert run([*argv, "-q"]) == 1
+    told = {one["name"]: one for one in json.loads(capsys.readouterr().out)["drives"]}
+    assert "other logs, settings or versions" in told["monday"]["error"]

@@ -1,0 +1,64 @@
+"""Which runs a command line means."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from crosscue.eval.run_list import runs_of
+from crosscue.replay.errors import CrosscueError
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    for name, stage in (("a", "estimate"), ("b", "estimate"), ("deep/c", "estimate"),
+                        ("merged", "merged")):  # fmt: skip
+        folder = tmp_path / "runs" / name
+        folder.mkdir(parents=True)
+        text = json.dumps({"format_version": 1, "stage": stage})
+        folder.joinpath("manifest.json").write_text(text)
+    (tmp_path / "runs" / "cut-short").mkdir()
+    (tmp_path / "runs" / ".drives").mkdir()
+    return tmp_path / "runs"
+
+
+def test_a_folder_stands_for_the_runs_in_it_but_not_their_merger(runs: Path) -> None:
+    assert runs_of([str(runs)]) == (runs / "a", runs / "b", runs / "deep" / "c")
+
+
+def test_a_run_is_itself_even_a_merged_one(runs: Path) -> None:
+    assert runs_of([str(runs / "b"), str(runs / "merged")]) == (runs / "b", runs / "merged")
+
+
+def test_each_run_counts_once(runs: Path) -> None:
+    assert runs_of([str(runs / "b"), str(runs)]) == (runs / "b", runs / "a", runs / "deep" / "c")
+
+
+def test_patterns_and_lists(runs: Path) -> None:
+    runs.parent.joinpath("runs.txt").write_text("# two\nruns/b\n\nruns/a\n")
+
+    assert runs_of([f"{runs}/[ab]"]) == (runs / "a", runs / "b")
+    assert runs_of([f"@{runs.parent}/runs.txt"]) == (runs / "b", runs / "a")
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("{}/cut-short", "neither a run folder nor a folder of some"),
+        ("{}/z*", "no folder matches"),
+        ("@{}/gone", "No such file"),
+        ("@{}/a/manifest.json", "neither|names no run|no run folder"),
+    ],
+)
+def test_errors_are_one_line(runs: Path, argument: str, said: str) -> None:
+    if "manifest" in argument:
+        (runs / "a" / "manifest.json").write_text("# nothing\n")
+
+    with pytest.raises(CrosscueError, match=said) as caught:
+        runs_of([argument.format(runs)])
+
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_not_there_is_left_to_be_told_when_opened(tmp_path: Path) -> None:
+    assert runs_of([str(tmp_path / "gone")]) == (tmp_path / "gone",)
