@@ -40,7 +40,7 @@ class ApproachSummary:
     """One approach as the run itself saw it; no truth is asked.
 
     Attributes:
-        number: From 0 in the order of the drive.
+        number: From 1 in the order of the drive.
         start_ns: First step.
         end_ns: Last step.
         detected_ns: When the intersection was first held present with a range known.

@@ -13,7 +13,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, get_origin
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
@@ -369,19 +369,26 @@ def explain(error: ValidationError, text: str, where: str, root: type[BaseModel]
 
 def _suggestion(keys: list[str], root: type[BaseModel]) -> str:
     section: type[BaseModel] | None = root
+    is_table = False
     for key in keys[:-1]:
-        section = _section_of(section, key) if section else None
+        if is_table:
+            # The name of one entry in a table of sections; the section itself is known already.
+            is_table = False
+        elif section is not None:
+            section, is_table = _section_of(section, key)
     known = sorted(section.model_fields) if section else []
     close = difflib.get_close_matches(keys[-1], known, n=1, cutoff=0.6)
     return f"did you mean {close[0]}?" if close else f"there are: {', '.join(known)}"
 
 
-def _section_of(section: type[BaseModel], key: str) -> type[BaseModel] | None:
+def _section_of(section: type[BaseModel], key: str) -> tuple[type[BaseModel] | None, bool]:
+    """The section below ``key``, and whether it stands there under names of the user's."""
     field = section.model_fields.get(key)
     if field is None:
-        return None
+        return None, False
     kinds = (field.annotation, *getattr(field.annotation, "__args__", ()))
-    return next((k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)), None)
+    below = (k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel))
+    return next(below, None), get_origin(field.annotation) is dict
 
 
 def _line_of(keys: list[str], text: str) -> int:

@@ -41,3 +41,9 @@ def test_dbc_files_are_found_beside_the_vehicle_file(tmp_path: Path) -> None:
 def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
     with pytest.raises(VehicleError, match="crosscue vehicle init"):
         load(tmp_path / "none.toml")
+
+
+def test_a_typo_inside_a_named_entry_is_met_with_the_right_name() -> None:
+    with pytest.raises(VehicleError, match="no such key; did you mean precision"):
+        parse("version = 1\n[fusion.cues]\nzebra = { precison = 0.8, precision = 0.8, "
+              "supports = ['left'] }\n", "v.toml")  # fmt: skip
