@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
@@ -12,25 +13,28 @@ from crosscue.replay.run_folder import MANIFEST, RunFolder
 
 from .merge_runs import is_merged
 
+METRICS: Final = "metrics.json"
+"""What a folder of pooled scores holds, which has tables, too."""
 DEPTH: Final = 4
 LIST_BYTES: Final = 64 << 20
 
 
 def runs_of(arguments: Sequence[str]) -> tuple[Path, ...]:
-    """The run folders that RUN arguments mean, each once, in the order given.
+    """The run folders that RUN arguments mean, in the order given.
 
-    A folder with a manifest is a run; any other stands for the runs in it, without those that were
-    merged of others; ``@runs.txt`` names one a line; a pattern that the shell left alone stands
-    for what it matches.
+    A folder with a manifest or tables is a run, whole or cut short; any other stands for the runs
+    in it, without those that were merged of others; ``@runs.txt`` names one a line; a pattern that
+    the shell left alone stands for what it matches.
 
     Raises:
         RunError: A folder that neither is nor holds a run.
-        UsageError: A pattern without a match, or a list that cannot be read.
+        UsageError: A pattern without a match, a list that cannot be read, or a run named twice.
     """
-    found: dict[Path, None] = {}
-    for text in arguments:
-        found |= dict.fromkeys(_expanded(text))
-    return tuple(found)
+    found = tuple(path for text in arguments for path in _expanded(text))
+    for path, count in Counter(path.resolve() for path in found).items():
+        if count > 1:
+            raise UsageError(f"{path}: a run named twice; name each once")
+    return found
 
 
 def _expanded(text: str) -> Iterator[Path]:
@@ -40,7 +44,7 @@ def _expanded(text: str) -> Iterator[Path]:
     elif glob.has_magic(text) and not Path(text).exists():
         matched = [path for path in sorted(glob.glob(text)) if Path(path).is_dir()]  # noqa: PTH207
         if not matched:
-            raise UsageError(f"{text}: no folder matches; check the pattern")
+            raise UsageError(f"{text}: nothing matches; give folders of runs")
         for path in matched:
             yield from _expanded(path)
     else:
@@ -48,7 +52,7 @@ def _expanded(text: str) -> Iterator[Path]:
 
 
 def _in_folder(folder: Path) -> Iterator[Path]:
-    if folder.joinpath(MANIFEST).exists() or not folder.is_dir():
+    if _is_run(folder) or not folder.is_dir():
         # What is wrong with it, if anything, is told when it is opened.
         yield folder
         return
@@ -64,11 +68,26 @@ def _below(folder: Path, depth: int) -> Iterator[Path]:
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror}; check its owner and mode") from None
     for entry in entries:
-        if entry.joinpath(MANIFEST).exists():
-            if not is_merged(RunFolder(entry)):
+        if _is_run(entry):
+            if not _is_merged(entry):
                 yield entry
         elif depth > 1 and entry.is_dir() and not entry.is_symlink():
             yield from _below(entry, depth - 1)
+
+
+def _is_run(folder: Path) -> bool:
+    """Does it hold what a run writes? Cut short it must be told of, not passed over."""
+    if folder.joinpath(MANIFEST).exists():
+        return True
+    is_scored = folder.joinpath(METRICS).exists()
+    return not is_scored and next(folder.glob("*.parquet"), None) is not None
+
+
+def _is_merged(folder: Path) -> bool:
+    try:
+        return is_merged(RunFolder(folder))
+    except RunError:
+        return False
 
 
 def _lines(path: Path) -> list[str]:

@@ -17,7 +17,7 @@ def runs(tmp_path: Path) -> Path:
         folder.mkdir(parents=True)
         text = json.dumps({"format_version": 1, "stage": stage})
         folder.joinpath("manifest.json").write_text(text)
-    (tmp_path / "runs" / "cut-short").mkdir()
+    (tmp_path / "runs" / "empty").mkdir()
     (tmp_path / "runs" / ".drives").mkdir()
     return tmp_path / "runs"
 
@@ -30,8 +30,16 @@ def test_a_run_is_itself_even_a_merged_one(runs: Path) -> None:
     assert runs_of([str(runs / "b"), str(runs / "merged")]) == (runs / "b", runs / "merged")
 
 
-def test_each_run_counts_once(runs: Path) -> None:
-    assert runs_of([str(runs / "b"), str(runs)]) == (runs / "b", runs / "a", runs / "deep" / "c")
+def test_a_run_cut_short_is_not_passed_over(runs: Path) -> None:
+    (runs / "b" / "manifest.json").unlink()
+    (runs / "b" / "pose.parquet").touch()
+
+    assert runs / "b" in runs_of([str(runs)])
+
+
+def test_a_run_named_twice_is_refused(runs: Path) -> None:
+    with pytest.raises(CrosscueError, match="named twice"):
+        runs_of([str(runs / "b"), str(runs)])
 
 
 def test_patterns_and_lists(runs: Path) -> None:
@@ -44,8 +52,8 @@ def test_patterns_and_lists(runs: Path) -> None:
 @pytest.mark.parametrize(
     ("argument", "said"),
     [
-        ("{}/cut-short", "neither a run folder nor a folder of some"),
-        ("{}/z*", "no folder matches"),
+        ("{}/empty", "neither a run folder nor a folder of some"),
+        ("{}/z*", "nothing matches"),
         ("@{}/gone", "No such file"),
         ("@{}/a/manifest.json", "neither|names no run|no run folder"),
     ],
