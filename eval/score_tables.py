@@ -51,11 +51,19 @@ class RangeRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BeliefRows:
-    """N steps; ``features`` maps a feature's name to its N probabilities, NaN where missing."""
+    """N steps.
+
+    Attributes:
+        t_ns: Shape (N,).
+        approach: Shape (N,); ``NONE`` outside approaches.
+        features: A feature's name to its N probabilities, NaN where missing.
+        established: Shape (N,): presence of the intersection is established.
+    """
 
     t_ns: Int64s
     approach: Int64s
     features: Mapping[str, Floats]
+    established: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +170,11 @@ def _belief(table: pa.Table, where: str) -> BeliefRows:
         if ((values < 0.0) | (values > 1.0)).any():
             raise RunError(f"{where}: {name}: a probability outside 0 to 1; replay again")
         features[name] = values
-    return BeliefRows(_whole(table, "t_ns", where), _approach(table, where), features)
+    established = np.zeros(table.num_rows, np.bool_)
+    if "established" in table.column_names:
+        told = table["established"].fill_null(False)
+        established = told.to_numpy(zero_copy_only=False).astype(np.bool_)
+    return BeliefRows(_whole(table, "t_ns", where), _approach(table, where), features, established)
 
 
 def _column(table: pa.Table, name: str, where: str) -> pa.ChunkedArray:

@@ -59,6 +59,18 @@ def test_a_probable_intersection_is_not_detected_before_it_has_a_range() -> None
         assert judged.results[0].full_m == 15.0
 
 
+def test_without_sign_or_light_established_presence_stands_for_the_intersection() -> None:
+    roads_only = {name: changes for name, changes in BELIEF.items() if name != "intersection"}
+    unsaid = belief_table({"intersection": {}, **roads_only})
+
+    judged = judge_approaches(tables(belief=unsaid, ranges=range_table(8, 45)), truth())
+
+    assert judged is not None
+    (one,) = judged.results
+    assert one.detected_m is None
+    assert one.full_m == 15.0
+
+
 def test_exactly_the_threshold_is_not_above_it() -> None:
     run = tables(belief=belief_table({"intersection": {0: 0.9}}), ranges=range_table(0, 40))
     judged = judge_approaches(run, truth())

@@ -98,7 +98,10 @@ def belief_table(
             now = changes.get(frame, now)
             values.append(now)
         columns[name] = pa.array(values, pa.float64())
-    columns["established"] = pa.array([True] * len(frames), pa.bool_())
+    open_doors = [columns[name].to_pylist() for name in ("intersection", "left", "right")
+                  if name in columns]  # fmt: skip
+    sure = [any(v[i] > 0.9 for v in open_doors) for i in range(len(frames))]
+    columns["established"] = pa.array([any(sure[: i + 1]) for i in range(len(frames))], pa.bool_())
     return pa.table(columns)
 
 
