@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from crosscue.eval.recording import TruthTrack, save
@@ -52,9 +54,16 @@ def _open(path: Path, web: bool) -> int:
         command.append("--serve-web")
     environment = {**os.environ, "RERUN_ANALYTICS": "0"}
     try:
-        status = subprocess.run(command, env=environment, check=False).returncode
+        viewer = subprocess.Popen(command, env=environment, process_group=0)
     except OSError as error:
         raise CrosscueError(f"rerun: cannot be started ({error.strerror}); open {path}") from None
+    try:
+        status = viewer.wait()
+    finally:
+        # Rerun's command starts the viewer as a child of its own, which outlives it if let.
+        with suppress(ProcessLookupError):
+            os.killpg(viewer.pid, signal.SIGTERM)
+        viewer.wait()
     if status:
         raise CrosscueError(f"rerun: ended with status {status}; open {path} with another viewer")
     return 0
