@@ -50,6 +50,8 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     ),
     "train frames": ("train_frames", "pictures of simulated intersections to train on, with COCO"),
     "train mask-rcnn": ("train_mask_rcnn", "a Mask R-CNN on COCO annotations"),
+    "study range": ("study_range", "how far without landmarks: thousands of simulated drives"),
+    "study landmarks": ("study_landmarks", "who reaches the goal, by strategy, density and rate"),
     "demo": ("demo", "make a small drive, replay it, score it, show it"),
 }
 

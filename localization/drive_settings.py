@@ -1,8 +1,8 @@
 """Settings of a simulated drive: city, car, sensors, navigation; SI units, degrees where named.
 
 The source gives the sizes of cities, the compass's uncertainty and the limits of 50 and 100 m.
-Everything else is ours; ``compass.interval_m`` is the one number calibrated to a published result
-(9.3 km at 30 degrees).
+Everything else is ours; ``sensors.compass_interval_m`` is the one number calibrated to a published
+result (9.3 km at 30 degrees).
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ class Sensors(Section):
 
     compass_2sigma_deg: Annotated[float, Field(gt=0.0, le=180.0)] | None = 30.0
     """None: no compass."""
-    compass_interval_m: Annotated[float, Field(ge=1.0, le=100.0)] = 1.5
-    """Distance between readings with errors of their own."""
+    compass_interval_m: Annotated[float, Field(ge=1.0, le=100.0)] = 1.876
+    """Distance between readings with errors of their own; ``study range --calibrate`` finds it."""
     slip_per_sqrt_m: NotNegative = 0.003
     """S.d. of a wheel's path after one metre."""
     encoder_step_m: Positive = 0.02

@@ -1,0 +1,20 @@
+"""Measured numbers in words."""
+
+from __future__ import annotations
+
+import math
+
+from .intervals import Measured
+
+
+def km(value: Measured, digits: int = 2) -> str:
+    """Kilometres with their interval."""
+    if math.isinf(value.value):
+        return "beyond"
+    high = "beyond" if math.isinf(value.high) else f"{value.high / 1e3:.{digits}f}"
+    return f"{value.value / 1e3:.{digits}f} ({value.low / 1e3:.{digits}f}..{high})"
+
+
+def percent(value: Measured) -> str:
+    """A share with its interval."""
+    return f"{100 * value.value:.1f} % ({100 * value.low:.1f}..{100 * value.high:.1f})"
