@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crosscue.datasets.truth import FILE, Truth
-from crosscue.replay.errors import SchemaError, UsageError
+from crosscue.replay.errors import RunError, SchemaError, UsageError
 from crosscue.replay.run_folder import RunFolder, strict_json, write_text, write_whole
 
-from . import intervals, score_pose, score_truth
+from . import intervals, merge_runs, score_pose, score_truth
 from .score_approaches import FEATURES
 from .score_drives import DEFAULTS, DriveJudged, Scores, ScoreSettings, as_metrics, judge, score
 from .score_pose import PoseScore
@@ -81,9 +81,13 @@ def judge_run(
     """Lay a run beside its truth; pose tracks and figures go into its ``score`` folder.
 
     Raises:
-        RunError: A table is damaged.
+        RunError: A table is damaged, or it holds many drives merged.
         SchemaError: The truth does not fit the run, or there is nothing to score.
     """
+    if run.manifest().get("stage") == merge_runs.STAGE:
+        raise RunError(
+            f"{run.path}: many drives merged, whose times are mixed; score their run folders"
+        )
     truth = score_truth.load(truth_path, str(run.path))
     _check_log(run, truth.truth, truth_path)
     tables = tables_of(run)

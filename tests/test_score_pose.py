@@ -199,8 +199,8 @@ def test_the_score_command_prints_json_and_refuses_a_foreign_folder(
     found = json.loads(capsys.readouterr().out)
     assert found["metrics"]["pose"]["coverage"]["truth_poses"] == 680
     assert found["runs"] == {str(run.path): found["metrics"]}
-    assert cli.run(["score", str(tmp_path), "--truth", str(path)]) == 1
-    assert "not a run folder" in capsys.readouterr().err
+    assert cli.run(["score", str(path.parent), "--truth", str(path)]) == 1
+    assert "neither a run folder" in capsys.readouterr().err
 
 
 def test_the_viewer_listens_on_this_machine_only(
