@@ -9,7 +9,9 @@ bootstrap; Davison and Hinkley, *Bootstrap Methods*, section 3.8). Trust the wid
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -19,6 +21,8 @@ from crosscue.replay.columns import Floats, Int64s
 CONFIDENCE: Final = 0.95
 ROUNDS: Final = 2000
 SEED: Final = 0
+MOST_KEPT: Final = 500
+"""Draws for so many clusters are kept for the next interval; they take 8 MB."""
 LEAST_CLUSTERS: Final = 5
 """Of fewer, resampling can only give back the smallest and the largest: no interval is given."""
 
@@ -148,8 +152,29 @@ def resampled(
         return UNKNOWN
     total = np.bincount(which, values, n)
     rows = np.bincount(which, minlength=n).astype(np.float64)
-    drawn = np.random.default_rng(seed).multinomial(n, np.full(n, 1.0 / n), ROUNDS)
-    means = (drawn @ total) / (drawn @ rows)
+    means = np.concatenate([(part @ total) / (part @ rows) for part in _draws(n, seed)])
     tail = 50.0 * (1.0 - confidence)
     low, high = np.percentile(means, [tail, 100.0 - tail])
     return Interval(float(low), float(high))
+
+
+def _draws(n: int, seed: int) -> Iterator[Floats]:
+    """How often each of ``n`` clusters is drawn, in parts of a bounded size, rounds by clusters."""
+    if n <= MOST_KEPT:
+        yield _drawn(n, seed, ROUNDS)
+        return
+    step = max(ROUNDS * MOST_KEPT // n, 1)
+    for part, first in enumerate(range(0, ROUNDS, step)):
+        yield _draw(n, (seed, n, part), min(step, ROUNDS - first))
+
+
+@lru_cache(maxsize=16)
+def _drawn(n: int, seed: int, rounds: int) -> Floats:
+    return _draw(n, (seed, n), rounds)
+
+
+def _draw(n: int, seed: tuple[int, ...], rounds: int) -> Floats:
+    counts = np.random.default_rng(seed).multinomial(n, np.full(n, 1.0 / n), rounds)
+    drawn = counts.astype(np.float64)
+    drawn.setflags(write=False)
+    return drawn

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,18 @@ def cluster_numbers(drives: Sequence[str], approaches: Sequence[Int64s]) -> Int6
         drives: Names.
         approaches: For each drive, shape (N,): the approach that each row belongs to.
     """
-    names: list[Hashable] = [
-        (drive, one)
-        for drive, rows in zip(drives, approaches, strict=True)
-        for one in rows.tolist()
-    ]
-    numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
-    return np.array([numbers[name] for name in names], np.int64)
+    numbers = [np.empty(0, np.int64)]
+    drive_of: dict[str, dict[int, int]] = {}
+    count = 0
+    for drive, rows in zip(drives, approaches, strict=True):
+        known = drive_of.setdefault(drive, {})
+        own, which = np.unique(rows, return_inverse=True)
+        for one in own.tolist():
+            if one not in known:
+                known[one] = count
+                count += 1
+        numbers.append(np.array([known[one] for one in own.tolist()], np.int64)[which])
+    return np.concatenate(numbers)
 
 
 def summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:

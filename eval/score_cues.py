@@ -283,15 +283,27 @@ class _Pooled:
 
     rows: Sequence[CueJudged]
     cluster: Int64s = field(init=False)
-    tags: list[tuple[str, ...]] = field(init=False)
 
     def __post_init__(self) -> None:
         self.cluster = cluster_numbers(
             [one.drive for one in self.rows], [one.approach for one in self.rows]
         )
-        self.tags = [
-            one.conditions.get(int(a), ()) for one in self.rows for a in one.approach
-        ]  # fmt: skip
+
+    def tag_masks(self) -> dict[str, NDArray[np.bool_]]:
+        """Which rows belong to approaches with each tag; ``no tag`` for the others."""
+        tags: dict[int, tuple[str, ...]] = {}
+        first = 0
+        for one in self.rows:
+            cluster = self.cluster[first : first + len(one.approach)]
+            first += len(one.approach)
+            for place in np.unique(cluster, return_index=True)[1].tolist():
+                approach = int(one.approach[place])
+                tags[int(cluster[place])] = one.conditions.get(approach, ())
+        by_cluster = [tags[number] for number in range(len(tags))]
+        names = sorted({name for one in by_cluster for name in one})
+        has = {name: [name in one for one in by_cluster] for name in names}
+        has["no tag"] = [not one for one in by_cluster]
+        return {name: np.array(holds, np.bool_)[self.cluster] for name, holds in has.items()}
 
     def ints(self, name: str) -> Int64s:
         return np.concatenate([getattr(one, name) for one in self.rows]).astype(np.int64)
@@ -366,7 +378,7 @@ def _judgement(
         },
         by_condition={
             tag: cut.part(known & mask)
-            for tag, mask in _tag_masks(pooled.tags).items()
+            for tag, mask in pooled.tag_masks().items()
             if (known & mask).any()
         },
     )
@@ -404,13 +416,6 @@ def distance_bins(distance_m: Floats, borders_m: Sequence[float]) -> dict[str, N
     found[f"over {borders_m[-1]:g}"] = distance_m >= borders_m[-1]
     found["unknown"] = np.isnan(distance_m)
     return found
-
-
-def _tag_masks(tags: Sequence[tuple[str, ...]]) -> dict[str, NDArray[np.bool_]]:
-    names = sorted({tag for one in tags for tag in one})
-    masks = {name: np.array([name in one for one in tags], np.bool_) for name in names}
-    masks["no tag"] = np.array([not one for one in tags], np.bool_)
-    return masks
 
 
 def _things(pooled: _Pooled) -> Things:

@@ -7,7 +7,17 @@ from hypothesis import strategies as st
 
 from crosscue.eval.intervals import mean, resampled, share, wilson
 from crosscue.eval.score_cues import CLAIMS, judge_cues, score_cues
-from support.scoring import approach, at, cue_table, good_tables, good_truth, span, tables, truth
+from support.scoring import (
+    ENTER,
+    approach,
+    at,
+    cue_table,
+    good_tables,
+    good_truth,
+    span,
+    tables,
+    truth,
+)
 
 
 @settings(max_examples=50, deadline=None)
@@ -52,6 +62,14 @@ def test_resampling_agrees_with_the_central_limit_where_clusters_are_single_rows
 
     assert high - low == pytest.approx(2 * 1.96 * values.std() / 20.0, rel=0.1)
     assert resampled(values, np.arange(400), seed=1) == (low, high)
+
+
+def test_many_clusters_are_resampled_in_parts_with_the_same_spread() -> None:
+    values = np.random.default_rng(3).normal(5.0, 2.0, 3000)
+    low, high = resampled(values, np.arange(3000))
+
+    assert high - low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(3000.0), rel=0.1)
+    assert low < values.mean() < high
 
 
 def test_a_hand_counted_drive() -> None:
@@ -151,3 +169,49 @@ def test_the_order_of_rows_does_not_matter(frames: dict[int, int]) -> None:
     first = score_cues(judge_cues(run_tables("made up", cues_table=table), good_truth()))
     second = score_cues(judge_cues(shuffled, good_truth()))
     assert repr(first) == repr(second)
+
+
+SPANS = st.lists(
+    st.tuples(st.integers(0, 39), st.integers(1, 15), st.booleans()), min_size=1, max_size=4
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(SPANS, st.dictionaries(st.integers(0, 59), st.integers(0, 2), min_size=1))
+def test_counting_frame_by_frame_gives_the_same(
+    spans: list[tuple[int, int, bool]], found: dict[int, int]
+) -> None:
+    told = [span("stop_sign", first, first + length, there) for first, length, there in spans]
+    score = score_cues(judge_cues(tables({"stop_sign": found}), truth(told)))["stop_sign"]
+
+    positives = rights = theres = hits = 0
+    for frame, count in found.items():
+        said = [there for first, length, there in spans if first <= frame < first + length]
+        if said:
+            positives += count > 0
+            rights += count > 0 and any(said)
+            theres += any(said)
+            hits += any(said) and count > 0
+    objects = score.readings["object"]
+    assert objects.recall is not None
+    assert (objects.positives, objects.precision.right) == (positives, rights)
+    assert (objects.recall.of, objects.recall.right) == (theres, hits)
+    features = score.readings["feature"]
+    assert features.precision.right == sum(n > 0 for frame, n in found.items() if frame < ENTER)
+    assert features.precision.of == features.precision.right
+
+
+def test_parts_by_distance_sum_up_and_tags_belong_to_their_approach() -> None:
+    wet = approach(id=1, conditions=("rain", "dusk"), start_ns=at(0), enter_ns=at(20))
+    dry = approach(id=2, conditions=(), start_ns=at(130), enter_ns=at(150))
+    drive = truth(
+        [span("stop_sign", 0, 20), span("stop_sign", 130, 150, False)], [wet, dry], end=160
+    )
+    found = {"stop_sign": dict.fromkeys(range(160), 1)}
+    score = score_cues(judge_cues(tables(found), drive))["stop_sign"].readings["object"]
+
+    assert sum(part.frames for part in score.by_distance.values()) == score.scored == 40
+    assert {
+        tag: (part.frames, part.precision.value) for tag, part in score.by_condition.items()
+    } == {"rain": (20, 1.0), "dusk": (20, 1.0), "no tag": (20, 0.0)}
+    assert set(score.by_distance) == {"0-10", "10-20", "20-30"}
