@@ -21,7 +21,9 @@ from .base import Detector
 GROUP: Final = "crosscue.detectors"
 
 BUILTIN: Final[Mapping[str, str]] = {
+    "mask-rcnn": "crosscue.detectors.mask_rcnn:build",
     "model": "crosscue.detectors.model_detector:build",
+    "road": "crosscue.detectors.road_detector:build",
     "signs": "crosscue.detectors.sign_detector:build",
 }
 """From name to ``module:factory``."""

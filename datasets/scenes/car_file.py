@@ -81,6 +81,12 @@ z_m = {camera_z_m}
 focal_px = {focal_px}
 center_px = {center_px}
 
+# Chosen on layouts L700 to L731 so that none of their roads is missed near by and no other is seen.
+[regions]
+left = [[0.18, 0.52], [0.38, 0.52], [0.3, 0.555], [0.18, 0.555]]
+straight = [[0.45, 0.495], [0.53, 0.495], [0.53, 0.518], [0.45, 0.518]]
+right = [[0.55, 0.52], [0.74, 0.52], [0.74, 0.56], [0.58, 0.56]]
+
 [ranges.stop_sign]
 family = "pinhole-offset"
 parameters = {stop_sign}

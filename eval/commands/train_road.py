@@ -47,6 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="go on after an interruption, from OUT.state")  # fmt: skip
     parser.add_argument("--each", type=int, default=12, help="pictures of each layout")
     parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--stop-at", type=int, metavar="N",
+                        help="end after so many of the schedule's steps")  # fmt: skip
     parser.add_argument("--batch", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--width", type=int, default=384, help="of the network's input (9/16 high)")
@@ -64,8 +66,8 @@ def run(args: argparse.Namespace) -> int:
         raise OutputError(f"{args.output}: exists; give another name or --overwrite")
     if args.width % 16 or not 128 <= args.width <= 1024:
         raise UsageError(f"--width {args.width}: want a multiple of 16 from 128 to 1024")
-    if min(args.each, args.steps, args.batch) < 1:
-        raise UsageError("--each, --steps, --batch: want 1 or more")
+    if min(args.each, args.steps, args.batch, args.stop_at or 1) < 1:
+        raise UsageError("--each, --steps, --stop-at, --batch: want 1 or more")
     import torch
 
     from crosscue.detectors.road_checkpoint import RoadFacts, load_road, save_road
@@ -82,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     loss = _trained(training, learn, args)
     recipe: dict[str, str | int | float] = {
         "layouts": " ".join(args.layouts or []), "pictures": len(learn), "steps": args.steps,
-        "batch": args.batch, "seed": args.seed, "loss": round(loss, 5),
+        "stopped_at": training.done, "batch": args.batch, "seed": args.seed, "loss": round(loss, 5),
         **_measured(training, "held_out", held),
         **_measured(training, "scored", _scored(args)),
     }  # fmt: skip
@@ -111,6 +113,8 @@ def _trained(training: RoadTraining, learn: RoadFrames, args: argparse.Namespace
         loss = now
         if done % SAVED_EVERY == 0:
             training.save(state)
+        if done == args.stop_at:
+            break
     return loss
 
 
