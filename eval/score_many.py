@@ -65,12 +65,14 @@ class ScoreWork:
         settings: Of the scores.
         rpe_m: Distances of the relative pose error.
         has_smoother: Run the batch smoother as well?
+        any_log: Take truth that names the hash of another file?
     """
 
     truth: Path | None
     settings: ScoreSettings
     rpe_m: tuple[float, ...]
     has_smoother: bool = False
+    any_log: bool = False
 
     def __call__(self, path: Path) -> Scored:
         """Score one run and write its files.
@@ -81,7 +83,9 @@ class ScoreWork:
         folder = open_run(path)
         truth_path = find_truth(folder, self.truth)
         with locked(folder):
-            one = judge_run(folder, truth_path, self.settings, self.rpe_m)
+            one = judge_run(
+                folder, truth_path, self.settings, self.rpe_m, any_log=self.any_log
+            )
             metrics = metrics_of([one], scores_of([one], self.settings))
             smoothed = score_smoother(folder, truth_path) if self.has_smoother else None
             if smoothed is not None:

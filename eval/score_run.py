@@ -77,8 +77,17 @@ def judge_run(
     truth_path: Path,
     settings: ScoreSettings = DEFAULTS,
     rpe_m: Sequence[float] = (10.0, 100.0),
+    *,
+    any_log: bool = False,
 ) -> RunScored:
     """Lay a run beside its truth; pose tracks and figures go into its ``score`` folder.
+
+    Args:
+        run: A finished run.
+        truth_path: Its truth.
+        settings: Of the scores.
+        rpe_m: Distances of the relative pose error.
+        any_log: Take the truth though it names the hash of another file: the same drive, converted.
 
     Raises:
         RunError: A table is damaged, or it holds many drives merged.
@@ -89,7 +98,8 @@ def judge_run(
             f"{run.path}: many drives merged, whose times are mixed; score their run folders"
         )
     truth = score_truth.load(truth_path, str(run.path))
-    _check_log(run, truth.truth, truth_path)
+    if not any_log:
+        _check_log(run, truth.truth, truth_path)
     tables = tables_of(run)
     _check_times(run, truth.truth, tables, truth_path)
     judged = judge(tables, truth, settings)
@@ -110,7 +120,7 @@ def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
         names = ", ".join(log["path"] for log in logs)
         raise SchemaError(
             f"{path}: belongs to {truth.log or 'another log'} by its hash, not to {names}; "
-            "give the truth of that log"
+            "give the truth of that log, or --any-log for the same drive in another file"
         )
 
 

@@ -223,6 +223,7 @@ def test_truth_of_another_log_is_refused_by_time_and_by_hash(
 
     assert "another log or clock" in _fails(capsys, "score", run, "--truth", other)
     assert "b.mcap by its hash" in _fails(capsys, "score", run, "--truth", hashed)
+    assert cli.run(["score", str(run), "--truth", str(hashed), "-q", "--any-log"]) == 0
     hashed.write_text(json.dumps(tree | {"log_sha256": {"drive.mcap": "00"}}))
     assert cli.run(["score", str(run), "--truth", str(hashed), "-q"]) == 0
 
@@ -349,7 +350,8 @@ def test_merged_drives_are_not_scored_as_one(
 
 
 def _log_of(folder: Path) -> list[dict[str, Any]]:
-    return [{"path": str(folder / "drive.mcap"), "sha256": {"drive.mcap": folder.name}}]
+    digest = {"drive.mcap": folder.name}
+    return [{"path": str(folder / "drive.mcap"), "format": "mcap", "sha256": digest}]
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])

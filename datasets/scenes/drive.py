@@ -21,7 +21,7 @@ from crosscue.replay.columns import Block, Images, Int64s, Messages, Topic
 from crosscue.replay.encode.outgoing import standard_type
 from crosscue.replay.encode.template import filled, template_of
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.run_folder import write_text
+from crosscue.replay.run_folder import sha256_of, write_text
 from crosscue.replay.writing import LogWriter
 
 from .camera import Camera
@@ -249,7 +249,8 @@ class _Record:
             conditions=self.conditions.tags(layout), length_m=layout.end_m,
         )  # fmt: skip
         return save(
-            Truth(version=1, log="drive.mcap", start_ns=start_ns,
+            Truth(version=1, log="drive.mcap", log_sha256=sha256_of(folder / "drive.mcap"),
+                  start_ns=start_ns,
                   end_ns=int(motion.t_ns[-1]) + step, pose="pose.tum", source=SOURCE,
                   approaches=(approach,), cues=self._cues.finished(), objects="objects.json",
                   ranges="ranges.csv"),

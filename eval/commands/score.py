@@ -59,6 +59,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the truth of all runs (default: the truth.json beside each run's log)",
     )  # fmt: skip
     parser.add_argument(
+        "--any-log", action="store_true",
+        help="take truth that names the hash of another file: the same drive, converted",
+    )  # fmt: skip
+    parser.add_argument(
         "-o", "--output", type=Path, metavar="DIR",
         help="folder for the pooled metrics and junit.xml of several runs",
     )  # fmt: skip
@@ -103,7 +107,9 @@ def run(args: argparse.Namespace) -> int:
     except ValueError as error:
         raise UsageError(f"--threshold: {error}") from None
     gates = () if args.gate is None else load_gates(args.gate)
-    work = ScoreWork(args.truth, settings, tuple(args.rpe), args.smoother is not None)
+    work = ScoreWork(
+        args.truth, settings, tuple(args.rpe), args.smoother is not None, args.any_log
+    )
     scored, failed = _score_all(paths, work, args)
     if len(paths) == 1:
         tree = _tell_one(scored[0], settings, args)
