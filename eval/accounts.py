@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from crosscue.replay.clocks import Clock
 from crosscue.replay.ledger import Ledger, TopicAccount
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.remote import RemoteLog
 from crosscue.replay.run_folder import RunFolder, TableSink, sha256_of
 from crosscue.replay.signals import Extractor
 
@@ -118,10 +119,15 @@ def versions() -> dict[str, str]:
 
 
 def log_rows(logs: Sequence[Log]) -> list[dict[str, object]]:
-    """Path, format and hash of every log, for the manifest."""
-    return [
-        {"path": str(log.path), "format": log.format, "sha256": sha256_of(log.path)} for log in logs
-    ]
+    """Path, format and hash of every log, for the manifest; of a fetched one its URL, too."""
+    return [_log_row(log) for log in logs]
+
+
+def _log_row(log: Log) -> dict[str, object]:
+    row: dict[str, object] = {
+        "path": str(log.path), "format": log.format, "sha256": sha256_of(log.path),
+    }  # fmt: skip
+    return row | {"url": log.url} if isinstance(log, RemoteLog) else row
 
 
 def write_skipped(run: RunFolder, ledgers: Sequence[Ledger], kept: pa.Table | None = None) -> None:

@@ -59,20 +59,27 @@ def estimate_run(
 
 def _reopened(run: RunFolder, said: Mapping[str, Any]) -> Log:
     path = Path(said["path"])
-    if not path.exists():
+    if not path.exists() and "url" not in said:
         raise RunError(f"{run.path}: its log {path} is gone; put it back, or replay again")
-    log = open_log(path)
-    if not _is_older(path, run) and log_rows([log])[0]["sha256"] != said["sha256"]:
+    # What was fetched may have had to make room for others.
+    log = open_log(said.get("url", path))
+    if not _is_older(log.path, run) and log_rows([log])[0]["sha256"] != said["sha256"]:
         log.close()
         raise RunError(f"{run.path}: its log {path} has changed since; replay again")
     return log
 
 
 def _is_older(log: Path, run: RunFolder) -> bool:
-    """Has nobody written to the log since the run hashed it? Then there is no need to read it all.
+    """Has nobody touched the log since the run hashed it? Then there is no need to read it all.
 
-    A file put in its place with an older time of its own is not noticed: replay hashes, always.
+    The time of its entry counts, too: a file put in its place may bring an older time of its own.
     """
     files = [log] if log.is_file() else [entry for entry in log.rglob("*") if entry.is_file()]
     hashed_ns = run.file(MANIFEST).stat().st_mtime_ns
-    return all(entry.stat().st_mtime_ns < hashed_ns for entry in files)
+    touched = (time for entry in files for time in _times(entry))
+    return all(time < hashed_ns for time in touched)
+
+
+def _times(file: Path) -> tuple[int, int]:
+    found = file.stat()
+    return found.st_mtime_ns, found.st_ctime_ns

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
+import uuid
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -46,3 +50,40 @@ def test_a_broken_vehicle_file_costs_its_own_drive_and_an_edited_dbc_is_seen(
     assert run([*argv, "-q"]) == 1
     told = {one["name"]: one for one in json.loads(capsys.readouterr().out)["drives"]}
     assert "other logs, settings or versions" in told["monday"]["error"]
+
+
+def test_a_log_on_an_object_store_is_replayed_and_fetched_again_for_an_estimate(
+    drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = tmp_path / "store"
+    monkeypatch.setenv("CROSSCUE_STORE", str(store))
+    bucket = f"bucket-{uuid.uuid4().hex}"
+    system = import_module("fsspec").filesystem("memory")
+    system.pipe(f"/{bucket}/drive.mcap", (drives / "monday" / "drive.mcap").read_bytes())
+    url, vehicle = f"memory://{bucket}/drive.mcap", drives / "monday" / "vehicle.toml"
+    run_path = tmp_path / "run"
+
+    assert run(["replay", url, "--vehicle", str(vehicle), "-o", str(run_path), "-q"]) == 0
+    before = (run_path / "pose.parquet").read_bytes()
+    (said,) = open_run(run_path).manifest()["logs"]
+    assert said["url"] == url
+    shutil.rmtree(store)
+    assert run(["estimate", str(run_path), "-q"]) == 0
+
+    assert (run_path / "pose.parquet").read_bytes() == before
+    assert Path(said["path"]).exists()
+    assert run(["info", url, "--json"]) == 0
+    system.rm(f"/{bucket}", recursive=True)
+
+
+def test_a_log_put_in_place_of_another_is_noticed_whatever_its_time(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, run_path = drives / "monday" / "drive.mcap", tmp_path / "run"
+    assert run(["replay", str(drives / "monday"), "-o", str(run_path), "-q"]) == 0
+    shutil.copy(drives / "tuesday" / "drive.mcap", log)
+    os.utime(log, (1_000_000_000, 1_000_000_000))
+
+    assert run(["estimate", str(run_path)]) == 1
+
+    assert "has changed since" in capsys.readouterr().err

@@ -8,7 +8,6 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import TypeVar
 
 from crosscue.replay.errors import UsageError
@@ -21,7 +20,9 @@ T = TypeVar("T")
 
 def add_log_arguments(parser: argparse.ArgumentParser) -> None:
     """``LOG...``, ``--from``, ``--to`` and ``--topics``."""
-    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recordings of one drive")
+    parser.add_argument(
+        "logs", nargs="+", metavar="LOG", help="recordings of one drive; paths or URLs"
+    )
     add_part_arguments(parser)
 
 

@@ -14,7 +14,6 @@ import argparse
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import Enum
-from pathlib import Path
 
 from crosscue.eval.log_summary import (
     LogSummary,
@@ -37,7 +36,7 @@ LOSSES_SHOWN = 10
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recordings to look at")
+    parser.add_argument("logs", nargs="+", metavar="LOG", help="recordings to look at")
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     parser.add_argument(
         "--quick", action="store_true", help="only what the log declares; do not read its body"
