@@ -12,7 +12,7 @@ from typing import Any
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.run_folder import locked, open_run
 
-from .report import write_report
+from .report_page import write_report
 from .score_drives import ScoreSettings
 from .score_run import (
     FOLDER,
@@ -33,13 +33,13 @@ class Scored:
     Attributes:
         one: Laid beside its truth.
         metrics: What its ``metrics.json`` holds.
-        report: Its page, or None where there is none.
+        report: Its page.
         smoothed: The batch smoother beside the filter, if asked for.
     """
 
     one: RunScored
     metrics: dict[str, Any]
-    report: Path | None
+    report: Path
     smoothed: SmootherScore | None
 
 
@@ -86,12 +86,13 @@ class ScoreWork:
             one = judge_run(
                 folder, truth_path, self.settings, self.rpe_m, any_log=self.any_log
             )
-            metrics = metrics_of([one], scores_of([one], self.settings))
+            scores = scores_of([one], self.settings)
+            metrics = metrics_of([one], scores)
             smoothed = score_smoother(folder, truth_path) if self.has_smoother else None
             if smoothed is not None:
                 metrics["smoother"] = asdict(smoothed)
             write_scores(folder.file(FOLDER), [one], metrics)
-            report = None if one.pose is None else write_report(folder, one.truth.truth, one.pose)
+            report = write_report(folder.file(FOLDER), [one], scores, metrics)
         return Scored(one, metrics, report, smoothed)
 
     def attempt(self, path: Path) -> Scored | Failed:

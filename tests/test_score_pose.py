@@ -1,7 +1,6 @@
 """A run's pose against truth: what a perfect run scores, and what is refused."""
 
 import json
-import subprocess
 import warnings
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,8 +14,9 @@ from crosscue.datasets.tum import Trajectory, planar, write_tum
 from crosscue.eval import cli
 from crosscue.eval.recording import save as save_recording
 from crosscue.eval.replay_drive import replay_drive
-from crosscue.eval.report import write_report
+from crosscue.eval.report_page import write_report
 from crosscue.eval.score_pose import PoseScore, load_truth, score, truth_track
+from crosscue.eval.score_run import FOLDER, judge_run, metrics_of, scores_of
 from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
@@ -153,14 +153,20 @@ class _Elements(HTMLParser):
         self.links += [value or "" for name, value in attrs if name in ("src", "href")]
 
 
+def _reported(run: RunFolder, path: Path) -> Path:
+    one = judge_run(run, path)
+    scores = scores_of([one])
+    return write_report(run.file(FOLDER), [one], scores, metrics_of([one], scores))
+
+
 def test_the_report_needs_no_network_and_hostile_names_stay_text(tmp_path: Path) -> None:
-    run, path, result = _scored(tmp_path)
+    run, path, _ = _scored(tmp_path)
     manifest = json.loads(run.file("manifest.json").read_text())
     manifest["logs"][0]["path"] = "</td><script>alert(1)</script>"
     manifest["notices"] = ["{{ 7 * 7 }} <img src=x onerror=alert(1)>"]
     run.file("manifest.json").write_text(json.dumps(manifest))
 
-    page = write_report(run, load_truth(path)[0], result).read_text()
+    page = _reported(run, path).read_text()
 
     seen = _Elements()
     seen.feed(page)
@@ -174,11 +180,12 @@ def test_the_same_run_gives_the_same_report_and_figures(tmp_path: Path) -> None:
     pages = []
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        run, path, result = _scored(tmp_path / name)
-        write_report(run, load_truth(path)[0], result)
-        pages.append((run.file("score") / "pose_plan.png").read_bytes())
+        run, path, _ = _scored(tmp_path / name)
+        page = _reported(run, path).read_text().replace(f"{name}/run", "run")
+        pages.append(((run.file("score") / "pose_plan.png").read_bytes(), page))
 
-    assert pages[0] == pages[1]
+    assert pages[0][0] == pages[1][0]
+    assert pages[0][1] == pages[1][1]
 
 
 def test_a_recording_is_written_with_and_without_truth(tmp_path: Path) -> None:
@@ -201,24 +208,6 @@ def test_the_score_command_prints_json_and_refuses_a_foreign_folder(
     assert found["runs"] == {str(run.path): found["metrics"]}
     assert cli.run(["score", str(path.parent), "--truth", str(path)]) == 1
     assert "neither a run folder" in capsys.readouterr().err
-
-
-def test_the_viewer_listens_on_this_machine_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run, _, _ = _scored(tmp_path)
-    commands: list[list[str]] = []
-
-    def started(command: list[str], **_: object) -> subprocess.CompletedProcess[bytes]:
-        commands.append(command)
-        return subprocess.CompletedProcess(command, 0)
-
-    monkeypatch.setattr(subprocess, "run", started)
-
-    assert cli.run(["view", str(run.path), "--web"]) == 0
-    ((*_, bind, address, path, web),) = commands
-    assert (bind, address, web) == ("--bind", "127.0.0.1", "--serve-web")
-    assert Path(path) == run.file("drive.rrd")
 
 
 def test_pictures_pass_into_the_recording_as_stored(tmp_path: Path) -> None:

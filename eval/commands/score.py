@@ -38,6 +38,7 @@ from crosscue.eval.gates import Gate, GateResult, check_gates, load_gates
 from crosscue.eval.junit import write_junit
 from crosscue.eval.metric_values import metric_values
 from crosscue.eval.plain_text import visible
+from crosscue.eval.report_page import REPORT, write_report
 from crosscue.eval.run_list import runs_of
 from crosscue.eval.score_drives import DEFAULTS, Scores, ScoreSettings
 from crosscue.eval.score_many import Failed, Scored, ScoreWork, score_runs
@@ -157,6 +158,7 @@ def _tell_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) 
     if worth:
         with locked(one.run):
             write_scores(one.run.file(FOLDER), [one], found.metrics)
+            write_report(one.run.file(FOLDER), [one], scores, found.metrics)
     if args.json or args.quiet:
         return found.metrics
     print(f"run        {visible(str(one.run.path))}")
@@ -165,7 +167,7 @@ def _tell_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) 
         print("\n" + pose_summary(one.pose))
     if found.smoothed is not None:
         print(told(found.smoothed))
-    print(f"written to {visible(str(found.report or one.run.file(FOLDER)))}")
+    print(f"written to {visible(str(found.report))}")
     return found.metrics
 
 
@@ -201,6 +203,7 @@ def _pool(
     worth = _attribution(scored, tree, settings, args)
     if args.output is not None:
         write_scores(args.output, ones, tree)
+        write_report(args.output, ones, scores, tree)
     if args.json or args.quiet:
         return tree
     print()
@@ -212,7 +215,7 @@ def _pool(
     why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
     _print_scores(scores, why, worth)
     if args.output is not None:
-        print(f"written to {visible(str(args.output))}")
+        print(f"written to {visible(str(args.output / REPORT))}")
     return tree
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crosscue.eval.score_truth import TrueRanges
+from crosscue.eval.stored_pictures import camera_of
 from crosscue.replay.columns import Floats
 from crosscue.replay.run_folder import RunFolder, write_whole
 from crosscue.replay.vehicle import of_manifest
@@ -47,7 +48,6 @@ def save(
     """
     import rerun as rr
 
-    from .camera import camera_of
     from .drive_time import time_of
     from .layout import Shown, blueprint
     from .scene_rows import scene_rows
@@ -94,7 +94,7 @@ def _log_all(
         series.log_ranges(recording, time, scene, true_ranges)
         series.log_cues(recording, time, scene)
         _log_marks(recording, time, run, manifest)
-    stored = camera.camera_of(run)
+    stored = camera_of(run)
     if stored is not None:
         left_out = camera.log_pictures(recording, stored, time)
         if left_out:

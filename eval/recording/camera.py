@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import rerun as rr
 
-from crosscue.replay.clocks import Clock
-from crosscue.replay.columns import Block, Images, Topic
-from crosscue.replay.errors import LogError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Selection, open_log
-from crosscue.replay.roles import Role, role_of
-from crosscue.replay.run_folder import RunFolder
-from crosscue.replay.signals import Extractor, Plan, Source
-from crosscue.replay.vehicle import Vehicle
+from crosscue.eval.stored_pictures import StoredCamera, read_pictures
+from crosscue.replay.columns import Block, Images
 
 from .drive_time import DriveTime
 
@@ -28,64 +18,14 @@ ENTITY: Final = "camera/picture"
 BATCH_BYTES: Final = 4 << 20
 
 
-@dataclass(frozen=True, slots=True)
-class StoredCamera:
-    """Where a run's pictures lie.
-
-    Attributes:
-        log: Path.
-        topic: In it.
-        clock: Whose times the run's tables have.
-        selection: What part of the log the run looked at.
-    """
-
-    log: Path
-    topic: Topic
-    clock: Clock
-    selection: Selection
-
-
-def camera_of(run: RunFolder) -> StoredCamera | None:
-    """The camera, where its log is still at hand and no choice is left."""
-    manifest = run.manifest()
-    detected = manifest if manifest.get("stage") == "detect" else manifest.get("detect")
-    named = manifest["settings"]["topics"]["camera"] if detected is None else detected["camera"]
-    found: list[tuple[Path, Topic]] = []
-    for entry in manifest["logs"]:
-        path = Path(entry["path"])
-        # The log may have gone since it was replayed; the rest of the run can still be seen.
-        with suppress(LogError), open_log(path) as log:
-            found += [(path, topic) for topic in log.topics if role_of(topic) is Role.CAMERA]
-    if named is not None:
-        found = [(path, topic) for path, topic in found if topic.name == named]
-    if len(found) != 1:
-        return None
-    path, topic = found[0]
-    part = manifest["selection"]
-    selection = Selection(frozenset({topic.name}), part["start_ns"], part["end_ns"])
-    return StoredCamera(path, topic, _clock(detected, topic.name), selection)
-
-
-def _clock(detected: Mapping[str, Any] | None, topic: str) -> Clock:
-    for told in [] if detected is None else detected["clocks"]:
-        if topic in told:
-            return Clock(told[topic]["used"])
-    return Clock.LOG
-
-
 def log_pictures(recording: rr.RecordingStream, camera: StoredCamera, time: DriveTime) -> int:
-    """Send all pictures; returns how many the viewer could not show, which are left out."""
-    source = Source(0, camera.topic, ())
+    """Send all pictures; returns how many the viewer could not show, which are left out.
+
+    Raises:
+        LogError: The log cannot be opened.
+    """
     sink = _Sink(recording, time)
-    ledger = Ledger(str(camera.log))
-    extractor = Extractor(
-        Plan((source,), {}), Vehicle(version=1), 0, ledger, {camera.topic.name: camera.clock},
-        on_pictures=sink.add,
-    )  # fmt: skip
-    with open_log(camera.log) as log:
-        for block in log.read(ledger, camera.selection):
-            for _ in extractor(block):
-                pass
+    read_pictures(camera, sink.add)
     return sink.left_out
 
 

@@ -1,0 +1,101 @@
+"""The pictures of a run, read again from its log, on the clock that the run's tables have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from crosscue.replay.clocks import Clock
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.errors import LogError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Selection, open_log
+from crosscue.replay.roles import Role, role_of
+from crosscue.replay.run_folder import RunFolder
+from crosscue.replay.signals import Extractor, Plan, Source
+from crosscue.replay.vehicle import Vehicle
+
+AROUND_NS: Final = 2_000_000_000
+"""A picture's own clock and the log's may differ by this much."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredCamera:
+    """Where a run's pictures lie.
+
+    Attributes:
+        log: Path.
+        topic: In it.
+        clock: Whose times the run's tables have.
+        selection: What part of the log the run looked at.
+    """
+
+    log: Path
+    topic: Topic
+    clock: Clock
+    selection: Selection
+
+
+def camera_of(run: RunFolder) -> StoredCamera | None:
+    """The camera, where its log is still at hand and no choice is left.
+
+    Raises:
+        RunError: The manifest cannot be read.
+    """
+    manifest = run.manifest()
+    detected = manifest if manifest.get("stage") == "detect" else manifest.get("detect")
+    named = None if detected is None else detected["camera"]
+    if detected is None:
+        named = manifest["settings"].get("topics", {}).get("camera")
+    found: list[tuple[Path, Topic]] = []
+    for entry in manifest["logs"]:
+        path = Path(entry["path"])
+        # The log may have gone since it was replayed; the rest of the run can still be seen.
+        with suppress(LogError), open_log(path) as log:
+            found += [(path, topic) for topic in log.topics if role_of(topic) is Role.CAMERA]
+    if named is not None:
+        found = [(path, topic) for path, topic in found if topic.name == named]
+    if len(found) != 1:
+        return None
+    path, topic = found[0]
+    part = manifest.get("selection", {})
+    selection = Selection(frozenset({topic.name}), part.get("start_ns"), part.get("end_ns"))
+    return StoredCamera(path, topic, _clock(detected, topic.name), selection)
+
+
+def _clock(detected: Mapping[str, Any] | None, topic: str) -> Clock:
+    for told in [] if detected is None else detected["clocks"]:
+        if topic in told:
+            return Clock(told[topic]["used"])
+    return Clock.LOG
+
+
+def read_pictures(
+    camera: StoredCamera, on_pictures: Callable[[Block], None], around_ns: int | None = None
+) -> None:
+    """Give every block of pictures to ``on_pictures``.
+
+    Args:
+        camera: Where they lie.
+        on_pictures: Told of blocks of ``Images`` with times as in the run's tables.
+        around_ns: Only those about this time.
+
+    Raises:
+        LogError: The log cannot be opened.
+    """
+    ledger = Ledger(str(camera.log))
+    extractor = Extractor(
+        Plan((Source(0, camera.topic, ()),), {}), Vehicle(version=1), 0, ledger,
+        {camera.topic.name: camera.clock}, on_pictures=on_pictures,
+    )  # fmt: skip
+    selection = camera.selection
+    if around_ns is not None:
+        begin, end = around_ns - AROUND_NS, around_ns + AROUND_NS
+        selection = Selection(selection.topics, begin, end)
+    with open_log(camera.log) as log:
+        for block in log.read(ledger, selection):
+            for _ in extractor(block):
+                pass
