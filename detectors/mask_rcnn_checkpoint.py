@@ -9,7 +9,6 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -103,7 +102,7 @@ def _stored(value: Tensor, halve: bool) -> Tensor:
 
 def embedded_path() -> Path:
     """The checkpoint that comes with crosscue."""
-    return Path(str(resources.files("crosscue.detectors"))) / "checkpoints" / EMBEDDED
+    return Path(__file__).with_name("checkpoints") / EMBEDDED
 
 
 def load_checkpoint(path: Path) -> Checkpoint:

@@ -19,6 +19,7 @@ from safetensors.torch import save
 from torch import Tensor
 from torchvision.models.detection.roi_heads import paste_masks_in_image
 
+from crosscue.datasets.scenes.camera import Camera
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.mask_rcnn import (
@@ -38,13 +39,17 @@ from crosscue.detectors.mask_rcnn_checkpoint import (
     Calibration,
     Checkpoint,
     Facts,
+    embedded_path,
     load_checkpoint,
     save_checkpoint,
 )
 from crosscue.detectors.mask_rcnn_coco import coco_checkpoint
 from crosscue.detectors.mask_rcnn_network import Plan, build_network, set_limits
+from crosscue.detectors.model_detector import overlaps
+from crosscue.detectors.registry import Choice, make
 from crosscue.replay.errors import CrosscueError, VehicleError
 from support.mask_rcnn import CLASSES, CPU, noise_frame, plan_of, random_checkpoint
+from support.scenes import picture_at, world
 
 
 def _detector(checkpoint: Checkpoint | None = None, **changes: Any) -> MaskRcnnDetector:
@@ -419,3 +424,46 @@ def test_coco_weights_come_with_the_names_of_their_classes() -> None:
     names = checkpoint.facts.plan.classes
     assert [names[i - 1] for i in (3, 10, 13)] == ["car", "traffic light", "stop sign"]
     assert names[11] is None
+
+
+def test_the_registry_knows_it() -> None:
+    assert isinstance(make(Choice("mine", "mask-rcnn", {"device": "cpu"})), MaskRcnnDetector)
+    with pytest.raises(VehicleError, match="proposals"):
+        make(Choice("mine", "mask-rcnn", {"proposals": 0}))
+
+
+def test_the_checkpoint_in_the_package_is_small_and_says_what_it_is() -> None:
+    facts = load_checkpoint(embedded_path()).facts
+
+    assert embedded_path().stat().st_size < 25e6
+    assert facts.plan.classes == CLASSES
+    assert set(facts.calibration) == set(CLASSES)
+    assert {"box", "mask", "box car", "mask stop sign"} <= set(facts.measured)
+    assert facts.recipe["held_out_pictures"] == 300
+
+
+@pytest.mark.parametrize(
+    ("layout", "x_m", "category", "label"),
+    [("A", -20.0, "stop_sign", "stop sign"), ("E", -25.0, "traffic_light", "traffic light"),
+     ("C", -15.0, "car", "car")],
+)  # fmt: skip
+def test_the_checkpoint_in_the_package_sees_what_stands_at_intersections_it_never_saw(
+    layout: str, x_m: float, category: str, label: str
+) -> None:
+    picture = picture_at(world(layout), x_m, Camera())
+    largest = max(
+        (one for one in picture.seen if one.thing.category == category),
+        key=lambda one: int(one.mask.sum()),
+    )
+    frame = Frame(0, "", np.ascontiguousarray(picture.rgb[:, :, ::-1]), (1280, 720))
+
+    (found,) = build(device="cpu")([frame])
+
+    assert isinstance(found, Detections)
+    kept = [i for i, name in enumerate(found.labels) if name == label]
+    share = overlaps(np.array(largest.box_px, np.float64), found.boxes_px[kept])
+    assert share.max() > 0.5
+    best = kept[int(share.argmax())]
+    x0, y0, x1, y1 = largest.box_px
+    mask = rle.decode(found.masks[best], (1280, 720))[y0:y1, x0:x1]
+    assert (mask & largest.mask).sum() > 0.6 * (mask | largest.mask).sum()

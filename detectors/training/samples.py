@@ -38,12 +38,14 @@ class Window:
         height_px: Of a sample.
         zoom: Least and most, of the scale that the network will see.
         mirror: Chance.
+        balance: 0 picks each object as often, 1 each class as often, whatever their numbers.
     """
 
     width_px: int = 544
     height_px: int = 288
     zoom: tuple[float, float] = (0.5, 1.25)
     mirror: float = 0.5
+    balance: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +107,7 @@ class Sampler:
         ]
         labels = np.array([labelled.pictures[i].objects[j].label for i, j in places], np.int64)
         counts = np.maximum(np.bincount(labels, minlength=len(labelled.classes)), 1)
-        weight = (1.0 / np.sqrt(counts))[labels]
+        weight = (counts.astype(np.float64) ** -window.balance)[labels]
         self._places, self._chance = places, weight / max(weight.sum(), 1e-12)
 
     def __call__(self, number: int) -> Sample:

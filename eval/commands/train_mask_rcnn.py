@@ -50,6 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bottom", type=float, default=0.0, help="share not looked at")
     parser.add_argument("--window", type=int, nargs=2, default=[544, 288], metavar=("W", "H"),
                         help="size of the parts of pictures learnt from")  # fmt: skip
+    parser.add_argument("--balance", type=float, default=1.0, metavar="SHARE",
+                        help="0 learns from each object as often, 1 from each class")  # fmt: skip
     parser.add_argument("--check-every", type=int, default=500, help="steps between validations")
     parser.add_argument("--check-pictures", type=int, default=60, help="in validations on the way")
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda", "mps"])
@@ -96,6 +98,8 @@ def _check(args: argparse.Namespace) -> None:
             raise UsageError(f"--{name.replace('_', '-')}: want 1 or more")
     if not 0.0 < args.rate < 1.0 or args.seed < 0:
         raise UsageError("--rate, --seed: want a rate between 0 and 1, and a seed of 0 or more")
+    if not 0.0 <= args.balance <= 1.0:
+        raise UsageError(f"--balance {args.balance}: want 0 to 1")
     if min(args.window) < 64 or any(side % 32 for side in args.window):
         raise UsageError(
             f"--window {args.window[0]} {args.window[1]}: want multiples of 32 from 64"
@@ -138,10 +142,11 @@ def _job(args: argparse.Namespace) -> Job:
         first = error.errors(include_url=False)[0]
         raise UsageError(f"train mask-rcnn: {first['loc']}: {first['msg'].lower()}") from None
     schedule = Schedule(args.steps, args.batch, args.rate, min(100, args.steps), seed=args.seed)
-    window = Window(args.window[0], args.window[1])
+    window = Window(args.window[0], args.window[1], balance=args.balance)
     return Job(
         args.start, plan, schedule, window, args.output, args.check_every, args.check_pictures,
-        args.device, args.threads, {"data": args.data.parent.name, "window": str(args.window)},
+        args.device, args.threads, {"data": args.data.parent.name, "window": str(args.window),
+         "balance": args.balance},
     )  # fmt: skip
 
 
