@@ -18,6 +18,7 @@ from pathlib import Path
 
 from crosscue.eval.recording import TruthTrack, save
 from crosscue.eval.score_pose import truth_track
+from crosscue.eval.score_truth import TrueRanges, load
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.run_folder import RunFolder, open_run
 
@@ -28,14 +29,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--save", type=Path, metavar="X.rrd", help="write the recording only")
     how.add_argument("--web", action="store_true", help="serve it on 127.0.0.1 for a browser")
-    parser.add_argument("--truth", type=Path, metavar="T.json", help="draw the true track too")
+    parser.add_argument(
+        "--truth", type=Path, metavar="T.json", help="draw the true track and ranges too"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Write drive.rrd into the run, or where asked, and open it."""
     folder = open_run(args.run)
     path = args.save or folder.file("drive.rrd")
-    save(folder, path, _truth(args, folder))
+    track, ranges = _truth(args, folder)
+    save(folder, path, track, ranges)
     if args.save is not None:
         if not args.quiet:
             print(path)
@@ -43,8 +47,15 @@ def run(args: argparse.Namespace) -> int:
     return _open(path, args.web)
 
 
-def _truth(args: argparse.Namespace, folder: RunFolder) -> TruthTrack | None:
-    return truth_track(args.truth, folder) if args.truth is not None else None
+def _truth(
+    args: argparse.Namespace, folder: RunFolder
+) -> tuple[TruthTrack | None, TrueRanges | None]:
+    """What the truth tells: the track, where run and truth have one, and the ranges."""
+    if args.truth is None:
+        return None, None
+    told = load(args.truth, str(folder.path))
+    has_track = told.truth.pose is not None and folder.file("pose.parquet").exists()
+    return truth_track(args.truth, folder) if has_track else None, told.ranges
 
 
 def _open(path: Path, web: bool) -> int:
