@@ -12,11 +12,12 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Final, Generic, Protocol, TypeVar
+from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
 from crosscue.replay.errors import CrosscueError, RunError, UsageError
 from crosscue.replay.remote import version_of
@@ -85,13 +86,16 @@ class Done(Generic[R]):
         return self.attempts == 0 and self.error is None
 
 
+Events: TypeAlias = Generator[Done[R] | None, None, None]
+
+
 class Engine(Protocol):
     """How jobs are worked through."""
 
-    def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Iterator[Done[R] | None]:
+    def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
         """Yield each job once, as it ends, and None about once a second in between.
 
-        Closing the iterator stops all work within seconds and leaves no process behind.
+        Closing the generator stops all work within seconds and leaves no process behind.
         """
         ...
 
@@ -172,15 +176,18 @@ def run_many(
         done_now = len(found) - earlier_count
         on_progress(Progress(len(jobs), earlier_count - refused, done_now, failed, now))
 
-    for done in engine(missing, work) if missing else ():
-        if done is not None:
-            found[done.job.name] = done
-            failed += done.error is not None
-        tell()
+    if missing:
+        # Closed here and now whatever happens, so that no worker outlives an interrupt.
+        with closing(engine(missing, work)) as events:
+            for done in events:
+                if done is not None:
+                    found[done.job.name] = done
+                    failed += done.error is not None
+                tell()
     return tuple(found[job.name] for job in jobs)
 
 
-def in_turn(jobs: Sequence[Job], work: Callable[[Job], R]) -> Iterator[Done[R] | None]:
+def in_turn(jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
     """The simplest engine: here, one after another; a crash in a library ends it all."""
     for job in jobs:
         yield attempt(work, job)

@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -22,7 +22,7 @@ from typing import Any, Final
 from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.run_folder import LOCK
 
-from .many_drives import Done, Job, R, after_death, attempt, told
+from .many_drives import Done, Events, Job, R, after_death, attempt, told
 from .worker_pool import GRACE_S, THREAD_VARIABLES, TICK_S
 
 LOCAL: Final = "local"
@@ -44,7 +44,7 @@ class OnRay:
     workers: int | None = None
     attempts: int = 3
 
-    def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Iterator[Done[R] | None]:
+    def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
         """Work; see ``many_drives.Engine``.
 
         Raises:

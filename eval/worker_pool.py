@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -22,7 +22,7 @@ from pickle import PicklingError
 from types import FrameType
 from typing import Any, Final, NoReturn
 
-from .many_drives import Done, Job, R, after_death, attempt, told
+from .many_drives import Done, Events, Job, R, after_death, attempt, told
 
 TICK_S: Final = 1.0
 GRACE_S: Final = 5.0
@@ -62,7 +62,7 @@ class Processes:
         if min(self.workers, self.attempts, self.threads or 1) < 1:
             raise ValueError(f"want counts of 1 or more, got {self}")
 
-    def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Iterator[Done[R] | None]:
+    def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
         """Work; see ``many_drives.Engine``."""
         waiting = deque((job, 1) for job in jobs)
         threads = self.threads or max(1, (os.cpu_count() or 1) // self.workers)

@@ -225,6 +225,11 @@ def test_a_signal_stops_all_workers(tmp_path: Path, number: signal.Signals, stat
     assert not list(tmp_path.rglob(".lock"))
     assert "Traceback" not in said
 
+    for log in (tmp_path / "drives").glob("*.txt"):
+        log.write_text("healed")
+    again = run_many(made_jobs(tmp_path / "drives", ["healed"] * 3), letters, in_turn)
+    assert [(done.error, done.attempts) for done in again] == [(None, 1)] * 3
+
 
 def _wait_for_two(folder: Path) -> list[int]:
     _wait_until(lambda: len([p for p in folder.glob("*.begun") if p.read_text()]) == 2)
