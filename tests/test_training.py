@@ -358,3 +358,21 @@ def test_wrong_flags_are_told_before_any_work(
 
     assert run([*base, *flags]) == 2
     assert why in capsys.readouterr().err
+
+
+def test_what_is_of_no_wanted_class_is_looked_at_too_but_not_learnt_as_one(tmp_path: Path) -> None:
+    labelled = _changed(
+        tmp_path,
+        images=lambda rows: rows[:1],
+        annotations=lambda rows: [rows[0], {**rows[1], "category_id": 9}],
+    )
+    sampler = Sampler(labelled, plan_of(256), Window(64, 64, zoom=(1.0, 1.0), mirror=0.0), 0)
+
+    samples = [sampler(number) for number in range(40)]
+
+    # The two bars lie in the left and the right half, too far apart for one window.
+    assert len(labelled.pictures[0].decoys_px) == 1
+    is_bright = [bool((one.pixels[0] > 1.0).sum() > 200) for one in samples]
+    has_car = [len(one.labels) > 0 for one in samples]
+    assert sum(has_car) >= 8
+    assert sum(bright and not car for bright, car in zip(is_bright, has_car, strict=True)) >= 8

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeGuard
+from typing import Any, Final, TypeAlias, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ from crosscue.replay.errors import SchemaError
 MOST_BYTES: Final = 2 << 30
 """Largest file read."""
 MOST_SIDE_PX: Final = 32768
+
+Box: TypeAlias = tuple[float, float, float, float]
+"""x0, y0, x1, y1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +42,7 @@ class Labelled:
     """
 
     label: int
-    box_px: tuple[float, float, float, float]
+    box_px: Box
     mask: bytes | tuple[tuple[float, ...], ...]
     is_crowd: bool
 
@@ -52,11 +55,13 @@ class LabelledPicture:
         path: Its file.
         size_px: Width and height as annotated.
         objects: All of the classes wanted.
+        decoys_px: Boxes of objects of other classes, which may look like them.
     """
 
     path: Path
     size_px: tuple[int, int]
     objects: tuple[Labelled, ...]
+    decoys_px: tuple[Box, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,14 +103,17 @@ def read_coco(path: Path, folder: Path, classes: Sequence[str]) -> LabelledSet:
         raise SchemaError(f"{path}: none of its pictures is in {folder}; give the folder of images")
     numbers = {name: i for i, name in enumerate(classes)}
     objects: dict[Any, list[Labelled]] = {key: [] for key in pictures}
+    decoys: dict[Any, list[Box]] = {key: [] for key in pictures}
     for row in _rows(tree, "annotations", path):
         found = _labelled(row, pictures, names, numbers, left_out)
-        if found is not None:
+        if isinstance(found, Labelled):
             objects[row["image_id"]].append(found)
+        elif found is not None:
+            decoys[row["image_id"]].append(found)
     if not any(objects.values()):
         raise SchemaError(f"{path}: no usable annotation of {', '.join(classes)}{_why(left_out)}")
     whole = tuple(
-        LabelledPicture(picture, size, tuple(objects[key]))
+        LabelledPicture(picture, size, tuple(objects[key]), tuple(decoys[key]))
         for key, (picture, size) in pictures.items()
     )
     return LabelledSet(path, tuple(classes), whole, dict(left_out))
@@ -161,7 +169,8 @@ def _labelled(
     names: Mapping[Any, Any],
     numbers: Mapping[str, int],
     left_out: Counter[str],
-) -> Labelled | None:
+) -> Labelled | Box | None:
+    """The object, or only its box if its class is not wanted; None where it cannot be used."""
     picture, category = row.get("image_id"), row.get("category_id")
     if not isinstance(picture, int | str) or picture not in pictures:
         left_out["annotations of other pictures"] += 1
@@ -169,10 +178,10 @@ def _labelled(
     if not isinstance(category, int | str) or category not in names:
         left_out["annotations of unknown classes"] += 1
         return None
+    size = pictures[picture][1]
     if names[category] not in numbers:
         left_out["annotations of other classes"] += 1
-        return None
-    size = pictures[picture][1]
+        return _box(row.get("bbox"), size, Counter())
     box = _box(row.get("bbox"), size, left_out)
     if box is None:
         return None
@@ -183,9 +192,7 @@ def _labelled(
     return Labelled(numbers[names[category]], box, mask, bool(row.get("iscrowd", 0)))
 
 
-def _box(
-    given: object, size: tuple[int, int], left_out: Counter[str]
-) -> tuple[float, float, float, float] | None:
+def _box(given: object, size: tuple[int, int], left_out: Counter[str]) -> Box | None:
     if not _is_numbers(given) or len(given) != 4:
         left_out["annotations without a box"] += 1
         return None

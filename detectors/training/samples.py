@@ -18,7 +18,7 @@ from crosscue.detectors.mask_rcnn_network import MEAN, SPREAD, Plan
 from crosscue.replay.columns import Bytes, Floats
 from crosscue.replay.errors import SchemaError
 
-from .annotations import Labelled, LabelledPicture, LabelledSet, mask_of
+from .annotations import Box, Labelled, LabelledPicture, LabelledSet, mask_of
 
 NEAR_OBJECT: Final = 0.85
 """Share of windows that are laid about an object."""
@@ -99,15 +99,17 @@ class Sampler:
     def __init__(self, labelled: LabelledSet, plan: Plan, window: Window, seed: int) -> None:
         """Count classes."""
         self._set, self._plan, self._window, self._seed = labelled, plan, window, seed
-        places = [
-            (i, j)
-            for i, picture in enumerate(labelled.pictures)
-            for j, one in enumerate(picture.objects)
-            if not one.is_crowd and _is_big_enough(one, picture, plan)
-        ]
-        labels = np.array([labelled.pictures[i].objects[j].label for i, j in places], np.int64)
-        counts = np.maximum(np.bincount(labels, minlength=len(labelled.classes)), 1)
-        weight = (counts.astype(np.float64) ** -window.balance)[labels]
+        places: list[tuple[int, Box]] = []
+        kinds: list[int] = []
+        for i, picture in enumerate(labelled.pictures):
+            own = [(one.label, one.box_px) for one in picture.objects if not one.is_crowd]
+            # What is none of the classes but was worth annotating is what they are mistaken for.
+            for kind, box in own + [(len(labelled.classes), box) for box in picture.decoys_px]:
+                if _is_big_enough(box, picture, plan):
+                    places.append((i, box))
+                    kinds.append(kind)
+        counts = np.maximum(np.bincount(kinds, minlength=len(labelled.classes) + 1), 1)
+        weight = (counts.astype(np.float64) ** -window.balance)[kinds]
         self._places, self._chance = places, weight / max(weight.sum(), 1e-12)
 
     def __call__(self, number: int) -> Sample:
@@ -117,10 +119,9 @@ class Sampler:
             SchemaError: As ``read_picture``.
         """
         rng = np.random.default_rng([self._seed, number])
-        about: Labelled | None = None
+        about: Box | None = None
         if self._places and rng.random() < NEAR_OBJECT:
-            i, j = self._places[int(rng.choice(len(self._places), p=self._chance))]
-            about = self._set.pictures[i].objects[j]
+            i, about = self._places[int(rng.choice(len(self._places), p=self._chance))]
         else:
             i = int(rng.integers(len(self._set.pictures)))
         picture = self._set.pictures[i]
@@ -136,14 +137,14 @@ class Sampler:
         return _sample(pixels, picture, warp, self._window)
 
 
-def _is_big_enough(one: Labelled, picture: LabelledPicture, plan: Plan) -> bool:
+def _is_big_enough(box: Box, picture: LabelledPicture, plan: Plan) -> bool:
     scale = plan.width_px / picture.size_px[0]
-    x0, y0, x1, y1 = one.box_px
+    x0, y0, x1, y1 = box
     return min(x1 - x0, y1 - y0) * scale >= LEAST_SIDE_PX
 
 
 def _corner(
-    size_px: tuple[int, int], about: Labelled | None, scale: float, window: Window, plan: Plan,
+    size_px: tuple[int, int], about: Box | None, scale: float, window: Window, plan: Plan,
     rng: Generator,
 ) -> Floats:  # fmt: skip
     """Top left of the window in the picture; it may stick out where the picture is smaller."""
@@ -153,7 +154,7 @@ def _corner(
     low, high = np.minimum(low, high), np.maximum(low, high)
     if about is None:
         return np.asarray(rng.uniform(low, high))
-    x0, y0, x1, y1 = about.box_px
+    x0, y0, x1, y1 = about
     middle = np.array([x0 + x1, y0 + y1]) / 2.0
     room = np.maximum(span - [x1 - x0, y1 - y0], 0.2 * span)
     corner = middle - span / 2.0 + rng.uniform(-0.5, 0.5, 2) * room
