@@ -37,14 +37,3 @@ class DriveTime:
 def time_of(first_ns: int) -> DriveTime:
     """For a drive that begins then."""
     return DriveTime(first_ns > YEAR_2000_NS)
-
-
-def row_counts(rows_ns: Int64s, frames_ns: Int64s) -> Int64s:
-    """How many rows each frame has, shape (N,).
-
-    Args:
-        rows_ns: Shape (M,), sorted; rows at other times than a frame's belong to none.
-        frames_ns: Shape (N,), sorted, each time once.
-    """
-    first = np.searchsorted(rows_ns, frames_ns, side="left")
-    return np.asarray(np.searchsorted(rows_ns, frames_ns, side="right") - first, np.int64)

@@ -63,7 +63,7 @@ def log_belief(
         _line([*BELIEF, name], name, of_feature(name, number), recording, width=2.0)
         _send(recording, time, [*BELIEF, name], t_ns, scene.belief[name].to_numpy(), approach)
     ends = np.array([min(scene.frames_ns[0], t_ns[0]), max(scene.frames_ns[-1], t_ns[-1])])
-    entity = [*BELIEF, "established above"]
+    entity = [*BELIEF, "established_above"]
     _line(entity, f"{vehicle.fusion.established:g}", QUIET, recording)
     _send(recording, time, entity, ends, np.full(2, vehicle.fusion.established))
 
@@ -83,18 +83,20 @@ def log_ranges(
         two_sd_m = 2.0 * np.sqrt(rows["var_m2"].to_numpy())
         for name, values, width in (
             (reference, mean_m, 2.0),
-            (f"{reference} + 2 sd", mean_m + two_sd_m, 0.7),
-            (f"{reference} - 2 sd", mean_m - two_sd_m, 0.7),
+            (f"{reference} plus 2 sd", mean_m + two_sd_m, 0.7),
+            (f"{reference} less 2 sd", mean_m - two_sd_m, 0.7),
         ):
-            _line([*RANGE, name], name, colour, recording, width)
-            _send(recording, time, [*RANGE, name], t_ns, values, approach)
+            entity = [*RANGE, _path_part(name)]
+            _line(entity, name, colour, recording, width)
+            _send(recording, time, entity, t_ns, values, approach)
         _log_measured(recording, time, rows, reference, colour)
     if truth is not None:
         for reference, values in (("start", truth.start_m), ("end", truth.end_m)):
             if np.isfinite(values).any():
                 name = f"true {reference}"
-                _line([*RANGE, name], name, TRUTH, recording, width=1.5)
-                _send(recording, time, [*RANGE, name], truth.t_ns, values, truth.approach)
+                entity = [*RANGE, _path_part(name)]
+                _line(entity, name, TRUTH, recording, width=1.5)
+                _send(recording, time, entity, truth.t_ns, values, truth.approach)
 
 
 def _log_measured(
@@ -102,8 +104,9 @@ def _log_measured(
 ) -> None:
     measured = rows.filter(pc.is_valid(rows["measured_m"]))
     if measured.num_rows:
-        entity = [*RANGE, f"{reference} measured"]
-        style = rr.SeriesPoints(colors=[colour], names=[entity[-1]], marker_sizes=[2.0])
+        name = f"{reference} measured"
+        entity = [*RANGE, _path_part(name)]
+        style = rr.SeriesPoints(colors=[colour], names=[name], marker_sizes=[2.0])
         recording.log(rr.new_entity_path([*entity]), style, static=True)
         _send(recording, time, entity, measured["t_ns"].to_numpy(),
               measured["measured_m"].to_numpy())  # fmt: skip
@@ -142,6 +145,10 @@ def _changes(t_ns: Int64s, is_found: NDArray[np.bool_], frames_ns: Int64s) -> tu
     everywhere = np.isin(frames_ns, t_ns[is_found]).astype(np.int64)
     turns = np.flatnonzero(np.diff(everywhere, prepend=-1))
     return frames_ns[turns], everywhere[turns]
+
+
+def _path_part(name: str) -> str:
+    return name.replace(" ", "_")
 
 
 def _line(

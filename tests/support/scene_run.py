@@ -1,0 +1,125 @@
+"""The made-up drive of ``support.scoring`` with a camera: pictures in a log, detections, a pose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import pyarrow as pa
+
+from crosscue.detectors import rle
+from crosscue.eval.detect_stage import schemas
+from crosscue.eval.pose_tables import pose_schema
+from crosscue.replay.columns import Block, Images, Messages, Topic
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.run_folder import RunFolder
+from crosscue.replay.vehicle import Vehicle
+from crosscue.replay.writing import LogWriter
+
+from .scoring import BELIEF, CUES, at, belief_table, cue_table, frame_table, range_table, run_folder
+
+FRAMES: Final = 50
+SIZE: Final = (160, 90)
+LABEL: Final = "<img src=x onerror=alert(1)>"
+TOPIC: Final = "/camera/[red]<script>alert(1)</script>"
+ACCOUNT: Final[dict[str, Any]] = {
+    "log": "drive.mcap", "integrity": "not checkable", "is_whole": False, "notices": [],
+    "topics": {TOPIC: {"in_file": FRAMES, "used": FRAMES - 1, "skipped": {},
+                       "lost": {"<b>cut</b>": 1}, "lost_unknown": []}},
+}  # fmt: skip
+
+
+def write_pictures(path: Path, frames: int = FRAMES) -> int:
+    """A log with one JPEG a frame; how many bytes of JPEG it holds."""
+    noise = np.random.default_rng(1).integers(0, 255, (frames, SIZE[1], SIZE[0], 3), np.uint8)
+    jpegs = [cv2.imencode(".jpg", picture)[1].ravel() for picture in noise]
+    edges = np.cumsum([0, *map(len, jpegs)])
+    images = Images(Messages(np.concatenate(jpegs), edges[:-1], edges[1:]), ("jpeg",) * frames)
+    times = np.array([at(frame) for frame in range(frames)], np.int64)
+    with LogWriter(path, Ledger(str(path))) as writer:
+        writer.add_topic(Topic(TOPIC, "crosscue/Images", "columns"))
+        writer.write(Block(TOPIC, times, images))
+    return int(edges[-1])
+
+
+def detections(frames: int = FRAMES) -> pa.Table:
+    """A side view of a car that drives to the right, and a thing with a hostile name."""
+    rows: list[dict[str, Any]] = []
+    for frame in range(frames):
+        x = 20.0 + frame
+        mask = rle.encode(np.ones((12, 40), np.bool_), (int(x), 40), SIZE)
+        for label, score, box, runs in (
+            ("car", 0.97, (x, 40.0, x + 40.0, 52.0), mask),
+            (LABEL, 0.5, (5.0, 5.0, 15.0, 15.0), None),
+        ):
+            names = zip(("x0", "y0", "x1", "y1"), box, strict=True)
+            rows.append({
+                "frame": frame, "t_ns": at(frame), "camera": TOPIC, "detector": "finder",
+                "label": label, "score": score, **dict(names), "mask": runs, "height_px": 12.0,
+                "range_m": None, "picture_width_px": SIZE[0], "picture_height_px": SIZE[1],
+            })  # fmt: skip
+    return pa.Table.from_pylist(rows, schema=schemas()["detections"])
+
+
+def road(frames: int = FRAMES) -> pa.Table:
+    """The lower half of every picture is road."""
+    mask = rle.encode(np.ones((5, 16), np.bool_), (0, 4), (16, 9))
+    rows = [
+        {"frame": frame, "t_ns": at(frame), "camera": TOPIC, "share_left": 1.0,
+         "share_straight": 1.0, "share_right": 0.1, "mask": mask, "mask_width_px": 16,
+         "mask_height_px": 9}
+        for frame in range(frames)
+    ]  # fmt: skip
+    return pa.Table.from_pylist(rows, schema=schemas()["road"])
+
+
+def frames_seen(frames: int = FRAMES) -> pa.Table:
+    """As the detect stage tells them."""
+    times = frame_table(frames)["t_ns"].to_pylist()
+    rows = [
+        {"frame": i, "t_ns": t, "camera": TOPIC, "width_px": SIZE[0], "height_px": SIZE[1]}
+        for i, t in enumerate(times)
+    ]
+    return pa.Table.from_pylist(rows, schema=schemas()["frames"])
+
+
+def poses(frames: int = FRAMES) -> pa.Table:
+    """Straight to the east at 10 m/s."""
+    schema = pose_schema()
+    rows = [
+        {name: None if name == "landmark" else 1.0 for name in schema.names}
+        | {"t_ns": at(frame), "x_m": float(frame), "y_m": 0.0, "heading_rad": 0.0,
+           "cov_xy_m2": 0.0}
+        for frame in range(frames)
+    ]  # fmt: skip
+    return pa.Table.from_pylist(rows, schema=schema)
+
+
+def scene_run(folder: Path, *, without: frozenset[str] = frozenset()) -> RunFolder:
+    """A finished run ``folder/run`` over ``folder/drive.mcap``.
+
+    Args:
+        folder: Made.
+        without: Tables to leave out.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_pictures(folder / "drive.mcap")
+    cues = {**CUES, "cross_traffic_right": {frame: int(frame > 20) for frame in range(1, FRAMES)}}
+    tables = {
+        "frames": frames_seen(), "detections": detections(), "road": road(), "pose": poses(),
+        "cues": cue_table(cues), "belief": belief_table(BELIEF), "range": range_table(8, 45, 0.5),
+    }  # fmt: skip
+    detect = {
+        "camera": TOPIC, "clocks": [{TOPIC: {"used": "log time"}}], "notices": [],
+        "detectors": [{"name": "finder", "role": "objects"}, {"name": "network", "role": "road"}],
+    }  # fmt: skip
+    return run_folder(
+        folder / "run",
+        {name: table for name, table in tables.items() if name not in without},
+        stage="estimate", detect=detect, accounts=[ACCOUNT],
+        settings=Vehicle(version=1).model_dump(mode="json"),
+        selection={"start_ns": None, "end_ns": None, "topics": None},
+        notices=["[here](http://example.org) ![x](http://example.org/x.png) </td><script>"],
+    )  # fmt: skip
