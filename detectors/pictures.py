@@ -6,7 +6,6 @@ is ignored: calibration belongs to the pixels as the sensor gave them.
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from crosscue.replay.columns import Bytes, Images
 from crosscue.replay.errors import LogFormatError, LogTooLargeError
+from crosscue.replay.picture_sizes import size_in_header
 from crosscue.replay.readers.picture_bytes import damage_of
 
 from .base import View
@@ -22,8 +22,6 @@ MOST_PIXELS: Final = 64_000_000
 """Largest picture decoded: 192 MB of colour."""
 _REDUCTIONS: Final = (8, 4, 2)
 """What a JPEG decoder can leave out by itself."""
-_JPEG_SIZES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_JPEG_BARE: Final = frozenset({0x01, *range(0xD0, 0xD8)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +59,7 @@ def size_of(picture: Encoded) -> tuple[int, int]:
     if picture.layout is not None:
         size: tuple[int, int] | None = picture.layout[:2]
     else:
-        size = _header_size(bytes(picture.content[:32]), picture)
+        size = size_in_header(picture.content, picture.coding)
     if size is None:
         raise LogFormatError(f"{picture.coding} picture without a size, or not decoded here")
     if min(size) < 1:
@@ -170,49 +168,3 @@ def channels_as(pixels: Bytes, is_grey: bool) -> Bytes:
         return pixels
     turn = cv2.COLOR_BGR2GRAY if is_grey else cv2.COLOR_GRAY2BGR
     return np.asarray(cv2.cvtColor(pixels, turn), np.uint8)
-
-
-def _header_size(head: bytes, picture: Encoded) -> tuple[int, int] | None:
-    if picture.coding == "png" and head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) >= 24:
-        width, height = struct.unpack_from(">II", head, 16)
-        return width, height
-    if picture.coding == "jpeg" and head.startswith(b"\xff\xd8\xff"):
-        return _jpeg_size(picture.content)
-    if picture.coding == "webp" and head[:4] == b"RIFF" and head[8:12] == b"WEBP":
-        return _webp_size(head) if len(head) >= 30 else None
-    if picture.coding == "bmp" and head.startswith(b"BM") and len(head) >= 26:
-        width, height = struct.unpack_from("<ii", head, 18)
-        return width, abs(height)
-    return None
-
-
-def _jpeg_size(content: memoryview) -> tuple[int, int] | None:
-    """Walk the segments up to the frame header (ITU T.81, B.1 and B.2.2)."""
-    at = 2
-    while at + 9 <= len(content) and content[at] == 0xFF:
-        marker = content[at + 1]
-        if marker == 0xFF:
-            at += 1
-        elif marker in _JPEG_BARE:
-            at += 2
-        elif marker in _JPEG_SIZES:
-            height, width = struct.unpack_from(">HH", content, at + 5)
-            return width, height
-        else:
-            at += 2 + max(int.from_bytes(content[at + 2 : at + 4], "big"), 2)
-    return None
-
-
-def _webp_size(head: bytes) -> tuple[int, int] | None:
-    """From the first chunk (RFC 9649, sections 2.5 to 2.7)."""
-    kind = head[12:16]
-    if kind == b"VP8X":
-        width = int.from_bytes(head[24:27], "little") + 1
-        return width, int.from_bytes(head[27:30], "little") + 1
-    if kind == b"VP8L":
-        bits = int.from_bytes(head[21:25], "little")
-        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    if kind == b"VP8 ":
-        width, height = struct.unpack_from("<HH", head, 26)
-        return width & 0x3FFF, height & 0x3FFF
-    return None

@@ -6,7 +6,6 @@ the picture's own header has said how large it will be: a megabyte of PNG can as
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -16,12 +15,11 @@ import numpy as np
 from crosscue.replay.columns import Bytes, Images
 from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
 from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.picture_sizes import size_in_header
 from crosscue.replay.readers.picture_bytes import damage_of
 
 MOST_PIXELS: Final = 64_000_000
 """Largest picture decoded: 64 MB of grey."""
-_JPEG_SIZES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_JPEG_BARE: Final = frozenset({0x01, *range(0xD0, 0xD8)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +90,7 @@ def grey_of(picture: EncodedPicture) -> Bytes:
     """
     if picture.coding == "raw":
         return _raw_grey(picture)
-    size = _size_of(picture.content, picture.coding)
+    size = size_in_header(picture.content, picture.coding)
     if size is None:
         raise LogFormatError(f"{picture.coding} picture: no size in it, or a coding not decoded")
     _check_size(*size)
@@ -154,47 +152,4 @@ def _coding_of(content: bytes) -> str | None:
         return "jpeg"
     if content.startswith(b"RIFF") and content[8:12] == b"WEBP":
         return "webp"
-    return None
-
-
-def _size_of(content: bytes, coding: str) -> tuple[int, int] | None:
-    """Width and height as the header says; None where it says nothing."""
-    if _coding_of(content) != coding:
-        return None
-    if coding == "png":
-        return struct.unpack_from(">II", content, 16) if len(content) >= 24 else None
-    if coding == "jpeg":
-        return _jpeg_size(content)
-    return _webp_size(content) if len(content) >= 30 else None
-
-
-def _jpeg_size(content: bytes) -> tuple[int, int] | None:
-    """Walk the segments up to the frame header (ITU T.81, B.1 and B.2.2)."""
-    at = 2
-    while at + 9 <= len(content) and content[at] == 0xFF:
-        marker = content[at + 1]
-        if marker == 0xFF:
-            at += 1
-        elif marker in _JPEG_BARE:
-            at += 2
-        elif marker in _JPEG_SIZES:
-            height, width = struct.unpack_from(">HH", content, at + 5)
-            return width, height
-        else:
-            at += 2 + max(int.from_bytes(content[at + 2 : at + 4], "big"), 2)
-    return None
-
-
-def _webp_size(content: bytes) -> tuple[int, int] | None:
-    """From the first chunk (RFC 9649, sections 2.5 to 2.7)."""
-    kind = content[12:16]
-    if kind == b"VP8X":
-        width = int.from_bytes(content[24:27], "little") + 1
-        return width, int.from_bytes(content[27:30], "little") + 1
-    if kind == b"VP8L":
-        bits = int.from_bytes(content[21:25], "little")
-        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    if kind == b"VP8 ":
-        width, height = struct.unpack_from("<HH", content, 26)
-        return width & 0x3FFF, height & 0x3FFF
     return None
