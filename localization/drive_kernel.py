@@ -194,11 +194,13 @@ class Traced:
         result: As ``drive_simulator.drive`` gives it.
         steps: Shape (S, 16), as ``drive_row`` tells.
         events: Shape (E, 6), likewise.
+        first_belief: x, y, heading of the filter before the first step.
     """
 
     result: Result
     steps: Floats
     events: Floats
+    first_belief: tuple[float, float, float]
 
     def of_kind(self, *kinds: int) -> Floats:
         """Shape (K, 6): events of these kinds."""
@@ -216,8 +218,13 @@ def drive_traced(settings: settings_of.Drive, seed: int) -> Traced:
     first = as_result(drive_many(settings, np.array([key], np.uint64))[0])
     most = 2 * (first.goals + 1) + first.landmarks + first.passed
     steps, events = np.empty((first.steps, TRACED)), np.full((most, EVENT), np.nan)
-    drive_row(numbers_of(settings), *ziggurat(), key, np.empty(FIELDS), steps, events)
-    return Traced(first, steps, events[~np.isnan(events[:, 0])])
+    row = np.empty(FIELDS + 3)
+    drive_row(numbers_of(settings), *ziggurat(), key, row, steps, events)
+    begin = row[FIELDS:]
+    return Traced(
+        first, steps, events[~np.isnan(events[:, 0])],
+        (float(begin[0]), float(begin[1]), float(begin[2])),
+    )  # fmt: skip
 
 
 def as_result(row: Floats) -> Result:
@@ -633,7 +640,7 @@ def drive_row(
         edge: Of ``ziggurat``.
         inner: Likewise.
         seed: Of this drive.
-        row: Shape (22,): its ``Result``.
+        row: Shape (22,): its ``Result``; with three more, the filter's first x, y, heading follow.
         trace: Shape (S, 16): true x, y, heading, speed; left and right wheel's path as read;
             compass, NaN where none was read; then the filter's x, y, heading and their covariance
             xx, xy, xh, yy, yh, hh.
@@ -695,6 +702,8 @@ def drive_row(
     off, noise = _normal(noise, noise_step, edge, inner)
     bh = _wrap(heading + n.start_heading_sd_rad * off)
     bc, bs = math.cos(bh), math.sin(bh)
+    if len(row) > FIELDS:
+        row[FIELDS], row[FIELDS + 1], row[FIELDS + 2] = bx, by, bh
     xx = yy = n.start_position_sd_m**2
     hh = n.start_heading_sd_rad**2
     xy = xh = yh = 0.0
