@@ -15,6 +15,7 @@ from crosscue.replay.run_folder import strict_json, write_text
 from .accounts import versions
 from .estimate_stage import Outcome
 from .intersection_figures import draw_beliefs, draw_distances, draw_reliability
+from .intersection_sheet import write_sheet
 from .intersection_study import StudyScores, StudySettings
 from .intersection_tables import (
     PUBLISHED_DETECTED_M,
@@ -31,6 +32,7 @@ from .score_run import metrics_of, write_scores
 
 PAGE: Final = "study.html"
 TABLES: Final = "study.json"
+SHEET: Final = "detections.jpg"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +42,7 @@ class StudyFiles:
     page: Path
     tables: Path
     metrics: Path
+    sheet: Path
 
 
 def write_study(
@@ -75,7 +78,8 @@ def write_study(
         figures=_figures(out, scored, approaches),
     )
     write_text(out / PAGE, page)
-    return StudyFiles(out / PAGE, out / TABLES, folder / "metrics.json")
+    write_sheet(scored.scored, out / SHEET)
+    return StudyFiles(out / PAGE, out / TABLES, folder / "metrics.json", out / SHEET)
 
 
 def _tables(
@@ -164,7 +168,12 @@ def summary(done: Sequence[Done[Outcome]], scored: StudyScores, written: StudyFi
             f"{row['cue']:<20}{_number(row['precision'], 2):>10}{ends:>16}"
             f"{row['positives']:>11,}{row['published']:>11.2f}"
         )
-    lines += ["", f"page       {written.page}", f"tables     {written.tables}"]
+    lines += [
+        "",
+        f"page       {written.page}",
+        f"tables     {written.tables}",
+        f"pictures   {written.sheet}: a frame of each drive, with what was found",
+    ]
     return "\n".join(lines)
 
 

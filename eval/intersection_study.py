@@ -7,6 +7,7 @@ intersection about as often; a second start goes on with what is missing.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -16,15 +17,18 @@ from crosscue.datasets.scenes.camera import Camera
 from crosscue.datasets.scenes.drive import SceneSettings, write_scene
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.truth import FILE
+from crosscue.fusion.message_fit import fit_messages
 from crosscue.replay.errors import RunError, UsageError, VehicleError
+from crosscue.replay.fusion_settings import Calibrated
 from crosscue.replay.log import EVERYTHING, open_log
-from crosscue.replay.run_folder import RunFolder, create, open_run
+from crosscue.replay.run_folder import create, open_run
 from crosscue.replay.vehicle import Vehicle, load, of_manifest
 
 from .accounts import versions
 from .detect_stage import choices_of
 from .estimate_stage import Outcome
 from .many_drives import Done, Engine, Job, Progress, fingerprint_of, run_many
+from .message_fit_job import Annotated, annotate, graph_of_runs
 from .replay_drive import Detecting, replay_drive
 from .scene_variants import GROUPS, scene_tables
 from .score_belief import BeliefDifference, compare_belief
@@ -32,6 +36,8 @@ from .score_drives import DriveJudged, Scores, judge, score
 from .score_run import RunScored, judge_run
 from .score_tables import run_tables
 
+LEAST_PLACES: Final = 3
+"""Intersections, so that messages for one can be learned at two others or more."""
 LOG: Final = "drive.mcap"
 VEHICLE: Final = "vehicle.toml"
 
@@ -145,7 +151,8 @@ class StudyScores:
         scored: Every drive beside its truth.
         scores: All together.
         without: All again with each of the nine cues left out.
-        calibrated: All again with learned messages; None where none are given.
+        calibrated: All again, each intersection with messages learned at the others; None where
+            there are too few.
         difference: Calibrated less source, by feature.
     """
 
@@ -174,8 +181,8 @@ def score_study(out: Path, names: Sequence[str], *, attribution: bool = True) ->
             for group, cues in GROUPS.items()
         }
     first = [one.judged for one in scored]
-    learned = [_calibrated(one.run) for one in scored]
-    if any(vehicle is None for vehicle in learned):
+    learned = calibrated_vehicles(scored)
+    if learned is None:
         return StudyScores(scored, score(first), without, None, {})
     second = [
         _variant(one, vehicle, frozenset()) for one, vehicle in zip(scored, learned, strict=True)
@@ -192,12 +199,40 @@ def score_study(out: Path, names: Sequence[str], *, attribution: bool = True) ->
     )
 
 
-def _calibrated(run: RunFolder) -> Vehicle | None:
-    """The run's settings with the other fusion, where messages have been learned."""
-    vehicle = of_manifest(run.manifest()["settings"])
-    if vehicle.fusion.calibrated is None:
+def calibrated_vehicles(scored: Sequence[RunScored]) -> list[Vehicle] | None:
+    """For each drive the settings with messages learned elsewhere: from all other intersections.
+
+    No drive is judged by messages that its own intersection had a part in. None where there are
+    too few intersections to learn from the others, or nothing could be learned.
+    """
+    places = [_place(one) for one in scored]
+    if len(set(places)) < LEAST_PLACES or any(not place for place in places):
         return None
-    fusion = vehicle.fusion.model_copy(update={"kind": "calibrated"})
+    fits = {
+        place: _learned([one for one, at in zip(scored, places, strict=True) if at != place])
+        for place in sorted(set(places))
+    }
+    if not any(fit.rates for fit in fits.values()):
+        return None
+    return [_with_messages(one, fits[place]) for one, place in zip(scored, places, strict=True)]
+
+
+def _place(one: RunScored) -> str:
+    approaches = one.truth.truth.approaches
+    return approaches[0].intersection if approaches else ""
+
+
+def _learned(scored: Sequence[RunScored]) -> Calibrated:
+    graph, vehicle = graph_of_runs([one.run for one in scored])
+    found = Annotated([], Counter())
+    for one in scored:
+        annotate(one.run, one.truth.truth, vehicle, found)
+    return fit_messages(found.approaches, graph).calibrated
+
+
+def _with_messages(one: RunScored, learned: Calibrated) -> Vehicle:
+    vehicle = of_manifest(one.run.manifest()["settings"])
+    fusion = vehicle.fusion.model_copy(update={"kind": "calibrated", "calibrated": learned})
     return vehicle.model_copy(update={"fusion": fusion})
 
 

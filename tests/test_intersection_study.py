@@ -10,7 +10,9 @@ import pytest
 
 from crosscue.eval import intersection_study
 from crosscue.eval.cli import run
+from crosscue.eval.commands import study_intersections
 from crosscue.eval.intersection_tables import PUBLISHED_CUES, cue_rows
+from crosscue.eval.many_drives import in_turn
 from crosscue.eval.scene_variants import GROUPS
 from crosscue.replay.vehicle import DetectorSection, RangeCurve, Ranges, Vehicle
 from crosscue.replay.vehicle import load as load_vehicle
@@ -33,11 +35,17 @@ def _with_oracle(path: Path) -> Vehicle:
     return vehicle.model_copy(update={"detectors": {"oracle": oracle}, "ranges": ranges})
 
 
+def _stay_here(patch: pytest.MonkeyPatch) -> None:
+    """No process of its own for a drive: it would not know of the patched detectors."""
+    patch.setattr(intersection_study, "load", _with_oracle)
+    patch.setattr(study_intersections, "engine_of", lambda *_args: in_turn)
+
+
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(intersection_study, "load", _with_oracle)
+        _stay_here(patch)
         assert run(["study", "intersections", "-o", str(out), *ARGUMENTS, "-q"]) == 0
     return out
 
@@ -58,6 +66,7 @@ def test_the_tables_say_that_they_are_simulated_and_stand_beside_the_published(s
     page = (study / "study.html").read_text()
     assert "simulated" in page
     assert "http" not in page.replace("http-equiv", "")
+    assert (study / "detections.jpg").stat().st_size > 10_000
 
 
 def test_truth_told_as_detections_gives_right_cues(study: Path) -> None:
@@ -77,7 +86,7 @@ def test_without_stop_signs_an_intersection_with_one_is_lost(study: Path) -> Non
 
 def test_a_second_start_does_nothing_again(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = (study / "study.json").read_bytes()
-    monkeypatch.setattr(intersection_study, "load", _with_oracle)
+    _stay_here(monkeypatch)
     monkeypatch.setattr(
         intersection_study, "replay_drive", lambda *_args, **_more: pytest.fail("ran again")
     )
