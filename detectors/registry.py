@@ -28,6 +28,9 @@ BUILTIN: Final[Mapping[str, str]] = {
 }
 """From name to ``module:factory``."""
 
+EMBEDDED: Final = "mask-rcnn,road,signs"
+"""What demo and studies run: networks that come along and know simulated scenes only."""
+
 
 @dataclass(frozen=True, slots=True)
 class Choice:

@@ -17,8 +17,9 @@ from crosscue.datasets.scenes.camera import Camera
 from crosscue.datasets.scenes.drive import SceneSettings, write_scene
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.truth import FILE
+from crosscue.detectors.registry import EMBEDDED, chosen
 from crosscue.fusion.message_fit import fit_messages
-from crosscue.replay.errors import RunError, UsageError, VehicleError
+from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.fusion_settings import Calibrated
 from crosscue.replay.log import EVERYTHING, open_log
 from crosscue.replay.run_folder import create, open_run
@@ -52,6 +53,7 @@ class StudySettings:
         seed: Of everything that differs from run to run.
         width_px: Of the pictures, 9/16 high.
         vehicle: A vehicle file to replay with; each drive's own, if left out.
+        detectors: Comma-separated, as ``replay`` takes them.
     """
 
     layouts: tuple[str, ...] = tuple(SCORED)
@@ -59,6 +61,7 @@ class StudySettings:
     seed: int = 0
     width_px: int = 1280
     vehicle: Path | None = None
+    detectors: str = EMBEDDED
 
     def __post_init__(self) -> None:
         """Refuse what cannot be.
@@ -92,12 +95,14 @@ class Work:
         drives: Folder of the simulated drives.
         scenes: By name.
         vehicle: A vehicle file to replay with, or None.
+        detectors: Comma-separated.
         cache: Where detectors' results are kept.
     """
 
     drives: Path
     scenes: Mapping[str, SceneSettings]
     vehicle: Path | None
+    detectors: str
     cache: Path
 
     def __call__(self, job: Job) -> Outcome:
@@ -106,9 +111,7 @@ class Work:
         if not (folder / FILE).exists():
             write_scene(folder, self.scenes[job.name], overwrite=True)
         vehicle = load(self.vehicle or folder / VEHICLE)
-        choices = tuple(choices_of(vehicle).values())
-        if not choices:
-            raise VehicleError(f"{self.vehicle}: no [detectors]; the study needs some")
+        choices = chosen(self.detectors, choices_of(vehicle))
         # One cache a drive: workers never wait for one another.
         detecting = Detecting(choices, self.cache / f"{job.name}.sqlite")
         run = create(job.run, overwrite=True)
@@ -135,11 +138,11 @@ def run_drives(
             name=name,
             logs=(),
             run=out / "runs" / name,
-            fingerprint=fingerprint_of(asdict(scene), vehicle, versions()),
+            fingerprint=fingerprint_of(asdict(scene), vehicle, settings.detectors, versions()),
         )
         for name, scene in scenes.items()
     ]
-    work = Work(out / "drives", scenes, settings.vehicle, out / "cache")
+    work = Work(out / "drives", scenes, settings.vehicle, settings.detectors, out / "cache")
     return run_many(jobs, work, engine, overwrite=True, on_progress=on_progress)
 
 

@@ -17,7 +17,7 @@ from crosscue.eval.scene_variants import GROUPS
 from crosscue.replay.vehicle import DetectorSection, RangeCurve, Ranges, Vehicle
 from crosscue.replay.vehicle import load as load_vehicle
 
-ARGUMENTS = ("--layouts", "A,E", "--runs", "1", "--width", "320")
+ARGUMENTS = ("--layouts", "A,E", "--runs", "1", "--width", "320", "--detectors", "oracle")
 
 
 def _with_oracle(path: Path) -> Vehicle:

@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 
 from crosscue.datasets.scenes.layout import SCORED
+from crosscue.detectors.registry import EMBEDDED
 from crosscue.eval.intersection_report import TABLES, summary, write_study
 from crosscue.eval.intersection_study import StudySettings, run_drives, score_study
 from crosscue.eval.many_drives import exit_status_of
@@ -34,6 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--width", type=int, default=1280, help="of the picture (9/16 high)")
     parser.add_argument("--vehicle", type=Path, metavar="V.toml",
                         help="replay with it instead of each drive's own")  # fmt: skip
+    parser.add_argument("--detectors", default=EMBEDDED, metavar="NAMES",
+                        help=f"comma-separated (default: {EMBEDDED})")  # fmt: skip
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="drives at a time")
     parser.add_argument("--ray", metavar="ADDRESS",
                         help="on a Ray cluster that shares DIR; local starts one here")  # fmt: skip
@@ -48,6 +51,7 @@ def run(args: argparse.Namespace) -> int:
     settings = StudySettings(
         layouts=tuple(name.strip() for name in args.layouts.split(",") if name.strip()),
         runs=args.runs, seed=args.seed, width_px=args.width, vehicle=args.vehicle,
+        detectors=args.detectors,
     )  # fmt: skip
     line = DriveProgress(not args.quiet and sys.stderr.isatty())
     done = run_drives(args.output, settings, engine, line)
