@@ -29,9 +29,6 @@ DETECTORS = """
 kind = "support.oracle:build"
 [detectors.oracle.settings]
 objects = "{}"
-[ranges.stop_sign]
-parameters = [200.0]
-residual_sd_m = 3.0
 """
 
 
