@@ -36,6 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--crop-top", type=float, default=0.0, help="share not searched")
     parser.add_argument("--crop-bottom", type=float, default=0.25, help="share not searched")
+    parser.add_argument(
+        "--enlarge", type=float, default=1.5, help="the first level, for small signs"
+    )
+    parser.add_argument("--levels", type=int, default=7, help="of the pyramid, each 1.25 smaller")
+    parser.add_argument("--points", type=int, default=1500, help="kept at a level")
     parser.add_argument("--precision", type=float, default=0.95, help="wanted, 0 to 1")
     parser.add_argument(
         "--overlap", type=float, default=0.4, help="with the true box, to be right (0 to 1)"
@@ -54,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
     detector = build(
         kinds=tuple(args.kinds), least_score=LOWEST,
         crop_top=args.crop_top, crop_bottom=args.crop_bottom,
+        enlarge=args.enlarge, levels=args.levels, points=args.points,
     )  # fmt: skip
     fitted = judged_pictures(chosen_on, detector, args.label, args.overlap)
     if not fitted.signs:
