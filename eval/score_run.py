@@ -119,7 +119,7 @@ def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
     if told and found and not told & found:
         names = ", ".join(log["path"] for log in logs)
         raise SchemaError(
-            f"{path}: belongs to {truth.log or 'another log'} by its hash, not to {names}; "
+            f"{path}: by its hash it belongs to another {truth.log or 'log'}, not to {names}; "
             "give the truth of that log, or --any-log for the same drive in another file"
         )
 

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -13,7 +14,9 @@ from crosscue.eval import cli
 from crosscue.eval.compare_runs import compare_metrics, compare_runs, read_tolerance
 from crosscue.eval.metric_values import MetricValue
 from crosscue.replay.errors import UsageError
+from crosscue.replay.fusion_settings import Fusion
 from crosscue.replay.run_folder import open_run
+from crosscue.replay.vehicle import Vehicle
 from support.scoring import (
     BELIEF,
     CUES,
@@ -28,15 +31,21 @@ from support.scoring import (
 WORSE_CUES = {**CUES, "stop_sign": {frame: int(frame >= 3) for frame in range(40)}}
 
 
+def _settings(established: float) -> dict[str, Any]:
+    """As a manifest has them."""
+    vehicle = Vehicle(version=1, fusion=Fusion(established=established))
+    return vehicle.model_dump(mode="json")
+
+
 def _pair(tmp_path: Path, *, scored: bool = True, threshold: float = 0.3) -> tuple[Path, Path]:
     """A good run and one with two false stop signs that is established at another threshold."""
     truth_folder(tmp_path)
-    good = run_folder(tmp_path / "a", settings={"fusion": {"established": 0.9}})
+    good = run_folder(tmp_path / "a", settings=_settings(0.9))
     worse = run_folder(
         tmp_path / "b",
         {"frames": frame_table(50), "cues": cue_table(WORSE_CUES), "belief": belief_table(BELIEF),
          "range": range_table(8, 45, 0.5)},
-        settings={"fusion": {"established": threshold}},
+        settings=_settings(threshold),
     )  # fmt: skip
     if scored:
         assert cli.run(["score", str(good.path), "-q"]) == 0
@@ -141,7 +150,7 @@ def test_pooled_scores_of_several_runs_are_compared_too(
 ) -> None:
     good, worse = _pair(tmp_path)
     for name, runs in (("good", [good]), ("both", [good, worse])):
-        more = [] if len(runs) > 1 else [run_folder(tmp_path / "c").path]
+        more = [] if len(runs) > 1 else [run_folder(tmp_path / "c", settings=_settings(0.9)).path]
         argv = ["score", *map(str, [*runs, *more]), "-o", str(tmp_path / name), "-q"]
         assert cli.run(argv) == 0
 

@@ -1,5 +1,6 @@
 """``crosscue score`` on run folders: files, gates, exit status, and what is refused."""
 
+import errno
 import json
 import os
 import subprocess
@@ -222,7 +223,9 @@ def test_truth_of_another_log_is_refused_by_time_and_by_hash(
     hashed.write_text(json.dumps(tree | {"log": "b.mcap", "log_sha256": {"b.mcap": "11"}}))
 
     assert "another log or clock" in _fails(capsys, "score", run, "--truth", other)
-    assert "b.mcap by its hash" in _fails(capsys, "score", run, "--truth", hashed)
+    assert "by its hash it belongs to another b.mcap" in _fails(
+        capsys, "score", run, "--truth", hashed
+    )
     assert cli.run(["score", str(run), "--truth", str(hashed), "-q", "--any-log"]) == 0
     hashed.write_text(json.dumps(tree | {"log_sha256": {"drive.mcap": "00"}}))
     assert cli.run(["score", str(run), "--truth", str(hashed), "-q"]) == 0
@@ -390,3 +393,31 @@ def test_neither_hash_seed_nor_zone_nor_locale_changes_a_byte(tmp_path: Path) ->
         subprocess.run([*command, str(run), "-q"], env=environment, check=True)
         seen.append([path.read_bytes() for path in sorted((run / "score").iterdir())])
     assert seen[0] == seen[1]
+
+
+def test_a_disk_that_fills_up_at_any_place_leaves_no_half_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = _one(tmp_path)
+    gate = _gates(tmp_path, 'metric = "approaches.full"\nmin = 1.0')
+    whole = os.fsync
+    for fails_at in range(1, 60):
+        calls = 0
+
+        def fsync(handle: int, fails_at: int = fails_at) -> None:
+            nonlocal calls
+            calls += 1
+            if calls == fails_at:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            whole(handle)
+
+        monkeypatch.setattr(os, "fsync", fsync)
+        status = cli.run(["score", str(run), "-q", "--gate", gate])
+        assert not list(run.rglob("*.partial"))
+        if status == 0:
+            break
+        assert status == 1
+        line = capsys.readouterr().err
+        assert "the disk is full" in line
+        assert line.count("\n") == 1
+    assert calls == fails_at - 1 >= 8
