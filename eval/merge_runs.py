@@ -10,6 +10,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.replay.errors import RunError
@@ -19,6 +20,7 @@ from crosscue.replay.run_folder import (
     TableSink,
     clear,
     locked,
+    open_run,
     write_manifest,
 )
 
@@ -207,6 +209,18 @@ def _versions(drives: Sequence[_Drive]) -> dict[str, list[str]]:
         for library, version in one.manifest.get("versions", {}).items():
             found.setdefault(library, set()).add(version)
     return {library: sorted(used) for library, used in sorted(found.items())}
+
+
+def open_one(path: Path) -> RunFolder:
+    """The run of one drive.
+
+    Raises:
+        RunError: It holds many drives; else as ``open_run``.
+    """
+    run = open_run(path)
+    if is_merged(run):
+        raise RunError(f"{path}: holds the tables of many drives; give one of the runs beside it")
+    return run
 
 
 def is_merged(run: RunFolder) -> bool:

@@ -63,8 +63,10 @@ def drive() -> Iterator[Drive]:
     # Not below pytest's own folder, which only its owner may look into.
     folder = Path(tempfile.mkdtemp(prefix="crosscue-kill-"))
     folder.chmod(0o755)
-    yield Drive(folder)
-    shutil.rmtree(folder)
+    try:
+        yield Drive(folder)
+    finally:
+        shutil.rmtree(folder)
 
 
 def _some(count: int, of: int, seed: int) -> list[int]:

@@ -5,6 +5,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
+from crosscue.eval import cli
 from crosscue.eval.many_drives import in_turn, run_many
 from crosscue.eval.merge_runs import is_merged, merge_runs
 from crosscue.replay.errors import RunError
@@ -80,6 +81,16 @@ def test_columns_that_do_not_fit_are_told(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"belief\.parquet does not fit those of other drives"):
         merge_runs(runs, create(tmp_path / "out", overwrite=False), {})
     assert not (tmp_path / "out" / "manifest.json").exists()
+
+
+def test_commands_for_one_drive_refuse_many(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    merged = str(_merged(tmp_path, ["abc", "de"]).path)
+
+    for argv in (["estimate", merged], ["view", merged, "--save", str(tmp_path / "x.rrd")]):
+        assert cli.run(argv) == 1
+        assert "holds the tables of many drives" in capsys.readouterr().err
 
 
 def test_no_drive_at_all_is_an_empty_run(tmp_path: Path) -> None:

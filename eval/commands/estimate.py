@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 from crosscue.eval.estimate_run import estimate_run
-from crosscue.replay.run_folder import open_run
+from crosscue.eval.merge_runs import open_one
 from crosscue.replay.vehicle import load
 
 from .common import print_json
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Estimate; 3 when something was lost."""
-    folder = open_run(args.run)
+    folder = open_one(args.run)
     vehicle = load(args.vehicle) if args.vehicle else None
     progress = Progress("estimating", not args.quiet and sys.stderr.isatty())
     outcome = estimate_run(folder, vehicle, progress.at_time)

@@ -16,11 +16,12 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from crosscue.eval.merge_runs import open_one
 from crosscue.eval.recording import TruthTrack, save
 from crosscue.eval.score_pose import truth_track
 from crosscue.eval.score_truth import TrueRanges, load
 from crosscue.replay.errors import CrosscueError
-from crosscue.replay.run_folder import RunFolder, open_run
+from crosscue.replay.run_folder import RunFolder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write drive.rrd into the run, or where asked, and open it."""
-    folder = open_run(args.run)
+    folder = open_one(args.run)
     path = args.save or folder.file("drive.rrd")
     track, ranges = _truth(args, folder)
     save(folder, path, track, ranges)
