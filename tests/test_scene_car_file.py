@@ -8,7 +8,6 @@ import pytest
 from crosscue.datasets.scenes.camera import Camera
 from crosscue.datasets.scenes.car_file import vehicle_text
 from crosscue.detectors.ranges import range_of
-from crosscue.detectors.registry import Choice, make
 from crosscue.replay.vehicle import Vehicle, parse
 from support.scenes import picture_at, world
 
@@ -28,14 +27,6 @@ def test_a_sign_half_as_high_in_half_the_picture_is_as_far_away() -> None:
     far = range_of(height, large.stop_sign)
 
     np.testing.assert_allclose(range_of(height / 2, small.stop_sign), far, rtol=1e-3)
-
-
-def test_its_sign_detector_can_be_built() -> None:
-    section = vehicle(1280).detectors["signs"]
-
-    detector = make(Choice("signs", section.kind, section.settings))
-
-    assert detector.view.is_grey
 
 
 @pytest.mark.parametrize("x_m", [-12.0, -22.0, -35.0])

@@ -81,16 +81,6 @@ z_m = {camera_z_m}
 focal_px = {focal_px}
 center_px = {center_px}
 
-# Threshold for precision 0.95, chosen on layouts L800 to L838, held on L840 to L878.
-[detectors.signs]
-kind = "signs"
-
-[detectors.signs.settings]
-enlarge = 2.5
-levels = 9
-points = 4000
-least_score = 0.065
-
 # Chosen on layouts L700 to L731 so that none of their roads is missed near by and no other is seen.
 [regions]
 left = [[0.18, 0.52], [0.38, 0.52], [0.3, 0.555], [0.18, 0.555]]

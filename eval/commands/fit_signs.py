@@ -37,10 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--crop-top", type=float, default=0.0, help="share not searched")
     parser.add_argument("--crop-bottom", type=float, default=0.25, help="share not searched")
     parser.add_argument(
-        "--enlarge", type=float, default=1.5, help="the first level, for small signs"
+        "--enlarge", type=float, default=2.5, help="the first level, for small signs"
     )
-    parser.add_argument("--levels", type=int, default=7, help="of the pyramid, each 1.25 smaller")
-    parser.add_argument("--points", type=int, default=1500, help="kept at a level")
+    parser.add_argument("--levels", type=int, default=9, help="of the pyramid, each 1.25 smaller")
+    parser.add_argument("--points", type=int, default=4000, help="kept at a level")
     parser.add_argument("--precision", type=float, default=0.95, help="wanted, 0 to 1")
     parser.add_argument(
         "--overlap", type=float, default=0.4, help="with the true box, to be right (0 to 1)"
