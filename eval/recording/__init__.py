@@ -98,7 +98,7 @@ def _log_all(
     if stored is not None:
         left_out = camera.log_pictures(recording, stored, time)
         if left_out:
-            more.append(f"{stored.topic.name}: {left_out} pictures of a coding not shown here")
+            more.append(f"{stored.topic.name}: {left_out} pictures that cannot be decoded")
     recording.log("notes", notes(run, more), static=True)
 
 

@@ -1,4 +1,4 @@
-"""The camera's pictures, their bytes passed through as the log stores them."""
+"""The camera's pictures: JPEG and PNG pass through as the log stores them, others become JPEG."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ from typing import Final
 
 import rerun as rr
 
+from crosscue.detectors.base import View
+from crosscue.detectors.pictures import Encoded, decode, encoded
 from crosscue.eval.stored_pictures import StoredCamera, read_pictures
 from crosscue.replay.columns import Block, Images
+from crosscue.replay.errors import LogError
 
 from .drive_time import DriveTime
 
@@ -16,10 +19,11 @@ PASSED_THROUGH: Final = ("jpeg", "png")
 """Codings that the viewer decodes itself."""
 ENTITY: Final = "camera/picture"
 BATCH_BYTES: Final = 4 << 20
+QUALITY: Final = 90
 
 
 def log_pictures(recording: rr.RecordingStream, camera: StoredCamera, time: DriveTime) -> int:
-    """Send all pictures; returns how many the viewer could not show, which are left out.
+    """Send all pictures; returns how many could not be decoded, which are left out.
 
     Raises:
         LogError: The log cannot be opened.
@@ -39,25 +43,41 @@ class _Sink:
         """Send a block's pictures some megabytes at a time."""
         images = block.rows
         assert isinstance(images, Images)
-        rows = [i for i, coding in enumerate(images.coding) if coding in PASSED_THROUGH]
-        self.left_out += len(images) - len(rows)
-        held: list[int] = []
+        held: list[tuple[int, bytes, str]] = []
         size = 0
-        for i in rows:
-            held.append(i)
-            size += len(images.bytes_.payload(i))
+        for i, coding in enumerate(images.coding):
+            is_stored = coding in PASSED_THROUGH
+            content = bytes(images.bytes_.payload(i)) if is_stored else shown(encoded(images, i))
+            if content is None:
+                self.left_out += 1
+                continue
+            kind = f"image/{coding}" if is_stored else "image/jpeg"
+            held.append((int(block.log_ns[i]), content, kind))
+            size += len(content)
             if size > BATCH_BYTES:
-                self._send(block, images, held)
+                self._send(held)
                 held, size = [], 0
         if held:
-            self._send(block, images, held)
+            self._send(held)
 
-    def _send(self, block: Block, images: Images, rows: list[int]) -> None:
+    def _send(self, held: list[tuple[int, bytes, str]]) -> None:
         self.recording.send_columns(
             ENTITY,
-            indexes=self.time.column(block.log_ns[rows]),
+            indexes=self.time.column([t_ns for t_ns, _, _ in held]),
             columns=rr.EncodedImage.columns(
-                blob=[bytes(images.bytes_.payload(i)) for i in rows],
-                media_type=[f"image/{images.coding[i]}" for i in rows],
+                blob=[content for _, content, _ in held],
+                media_type=[kind for _, _, kind in held],
             ),
         )
+
+
+def shown(picture: Encoded) -> bytes | None:
+    """A picture as JPEG, or None where it cannot be decoded."""
+    import cv2
+
+    try:
+        pixels, _ = decode(picture, View())
+    except LogError:
+        return None
+    ok, jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return jpeg.tobytes() if ok else None

@@ -72,7 +72,7 @@ def _scene(shown: Shown) -> rrb.Container:
     if shown.pose is not None:
         tabs = [_plan(shown, shown.pose), *_pose_series(), *tabs]
     return rrb.Horizontal(
-        rrb.Vertical(*left, row_shares=[3, 2][-len(left) :]),
+        rrb.Vertical(*left, row_shares=[5, 4][-len(left) :]),
         ahead,
         rrb.Vertical(belief, ranges, rrb.Tabs(*tabs), row_shares=[2, 2, 2]),
         column_shares=[10, 4, 7],

@@ -38,10 +38,11 @@ CAR: Final = (80, 170, 255)
 STOP_SIGN: Final = (255, 70, 70)
 TRAFFIC_LIGHT: Final = (255, 200, 40)
 SIGN: Final = (240, 90, 230)
+OWN: Final = (150, 220, 90)
 UNSURE: Final = (150, 150, 150)
 ROAD: Final = (40, 210, 190)
 REGION: Final = (220, 220, 220)
-REGION_WITH_ROAD: Final = (90, 230, 90)
+REGION_WITH_ROAD: Final = (60, 190, 70)
 CROSSING: Final = (255, 130, 30)
 PARKED: Final = (190, 130, 255)
 HATCH_ROWS: Final = 4
@@ -115,7 +116,8 @@ class Marks:
         ):
             if label in labels and score > least:
                 return colour
-        return UNSURE
+        is_own = any(label in one.labels and score > one.score for one in cues.own.values())
+        return OWN if is_own else UNSURE
 
     def _regions(self, road: RoadMask | RoadShares | None, size_px: tuple[int, int]) -> None:
         """Polygons, green where there is road; none where no detector looks for road."""
