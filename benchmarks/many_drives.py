@@ -23,7 +23,7 @@ from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
 
-import estimate
+import estimate  # type: ignore[import-not-found]  # beside this script
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
