@@ -27,6 +27,7 @@ from .score_truth import DriveTruth
 CLIP: Final = 1e-6
 """Log scores are taken of probabilities clipped to this and one minus this."""
 BINS: Final = 10
+SILENT: Final = "frames ahead of an intersection without any belief"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +41,7 @@ class BeliefJudged:
         approach: Shape (N,): ids of true approaches; ``NONE`` where no intersection is ahead.
         probability: Shape (N,).
         is_there: Shape (N,).
-        left_out: From reason to steps that could not be judged.
+        left_out: From reason to steps that could not be judged, and to frames without a step.
     """
 
     drive: str
@@ -76,7 +77,7 @@ class BeliefScore:
     """One feature over all drives.
 
     Attributes:
-        steps: All.
+        steps: All, and frames ahead of a true intersection for which there is none.
         scored: With truth.
         left_out: Reason to steps.
         share_there: How often the feature is there.
@@ -128,6 +129,9 @@ def judge_belief(tables: RunTables, truth: DriveTruth) -> list[BeliefJudged]:
     belief = tables.belief
     at, crossing = truth.approach_at(belief.t_ns), truth.is_crossing(belief.t_ns)
     told = truth.is_told(belief.t_ns)
+    frames = np.empty(0, np.int64) if tables.frames_ns is None else tables.frames_ns
+    ahead = frames[truth.approach_at(frames) != NONE]
+    silent = int((~np.isin(ahead, belief.t_ns)).sum())
     order = [name for name in FEATURES if name in belief.features]
     order += sorted(set(belief.features) - set(FEATURES))
     judged = []
@@ -142,6 +146,8 @@ def judge_belief(tables: RunTables, truth: DriveTruth) -> list[BeliefJudged]:
             "the truth does not know this feature": label == NONE,
         }
         left, left_out = first_reasons(np.ones(len(values), np.bool_), reasons)
+        if silent:
+            left_out[SILENT] = silent
         judged.append(
             BeliefJudged(truth.drive, name, belief.t_ns[left], at[left], values[left],
                          label[left] == 1, left_out)

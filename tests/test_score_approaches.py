@@ -193,6 +193,15 @@ def test_belief_is_judged_until_the_car_enters_and_the_rest_is_told() -> None:
     assert scores["straight"].brier.value == pytest.approx((30 * 0.25 + 10 * 0.04) / 40)
 
 
+def test_frames_for_which_the_run_believes_nothing_are_told() -> None:
+    run = tables(belief=belief_table(BELIEF, frames=range(15, 50)), frames=50)
+    score = score_belief(judge_belief(run, truth()))["left"]
+
+    silent = "frames ahead of an intersection without any belief"
+    assert score.left_out == {"in the intersection": 10, silent: 15}
+    assert (score.steps, score.scored) == (50, 25)
+
+
 def test_where_no_intersection_is_ahead_only_its_absence_is_judged() -> None:
     far = approach(start_ns=at(20), enter_ns=at(40))
     scores = score_belief(judge_belief(good_tables(), truth([], [far])))
