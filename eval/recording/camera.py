@@ -69,6 +69,8 @@ class _Sink:
                 media_type=[kind for _, _, kind in held],
             ),
         )
+        # Without it pictures are taken in faster than the disk takes them, and memory grows.
+        self.recording.flush()
 
 
 def shown(picture: Encoded) -> bytes | None:
