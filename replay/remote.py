@@ -278,7 +278,7 @@ def _opened(url: str) -> tuple[_System, str]:
         url_to_fs = import_module("fsspec.core").url_to_fs
     except ImportError:
         raise LogError(
-            f"{url}: reading from object stores needs fsspec; pip install 'crosscue[remote]'"
+            f"{url}: reading from object stores needs fsspec; pip install fsspec"
         ) from None
     try:
         system, address = url_to_fs(url)
