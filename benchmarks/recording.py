@@ -1,0 +1,155 @@
+"""A run to Rerun: ours in bulk columns beside a logger frame by frame, in one run.
+
+    python benchmarks/recording.py [MINUTES]
+
+A simulated town drive (no scene in its pictures) with 10 pictures a second of 150 kB and six masked
+objects in each, as in ``estimate.py``. The peer does what tutorials do: set the time, log the
+picture, boxes with labels, masks as a segmentation image, beliefs and ranges, frame by frame; it
+draws neither map nor way ahead, cars, regions or cues, which ours does. Cases run in rotation;
+ratios are taken round by round. Peak memory of ours is told for the drive and for one twice as
+long, each in a process of its own: it should hardly grow.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import rerun as rr
+from estimate import RANGES, SECONDS_PER_BLOCK, write_log
+
+from crosscue.datasets.simulated_drive import DriveSettings, vehicle_text
+from crosscue.detectors import rle
+from crosscue.detectors.registry import Choice
+from crosscue.eval.detect_stage import detect_drive
+from crosscue.eval.estimate_run import estimate_run
+from crosscue.eval.recording import save
+from crosscue.eval.stored_frames import stored_frames
+from crosscue.eval.stored_pictures import camera_of, read_pictures
+from crosscue.replay.columns import Block, Images
+from crosscue.replay.log import EVERYTHING, open_log
+from crosscue.replay.run_folder import RunFolder, create, open_run
+from crosscue.replay.vehicle import parse
+
+ROUNDS = 5
+CLASSES = {"car": 1, "stop sign": 2, "traffic light": 3}
+MEMORY = """
+import resource, sys
+from pathlib import Path
+from crosscue.eval.recording import save
+from crosscue.replay.run_folder import open_run
+save(open_run(Path(sys.argv[1])), Path(sys.argv[2]))
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+"""
+
+
+def make_run(folder: Path, minutes: float) -> tuple[RunFolder, float]:
+    """A finished run, and its drive's length in seconds."""
+    settings = DriveSettings(blocks=max(4, round(minutes * 60.0 / SECONDS_PER_BLOCK)))
+    folder.mkdir()
+    seconds = write_log(folder / "drive.mcap", settings)
+    dbc = Path(__file__).parent.parent / "datasets" / "simulated_car.dbc"
+    vehicle = parse(vehicle_text(settings, str(dbc)) + RANGES, "benchmark")
+    run = create(folder / "run", overwrite=False)
+    with open_log(folder / "drive.mcap") as log:
+        detect_drive([log], vehicle, run, EVERYTHING, [Choice("busy", "estimate:build")])
+    estimate_run(open_run(run.path))
+    return run, seconds
+
+
+def picture_bytes(run: RunFolder) -> int:
+    """Bytes of all JPEGs."""
+    total = 0
+
+    def add(block: Block) -> None:
+        nonlocal total
+        assert isinstance(block.rows, Images)
+        total += int((block.rows.bytes_.stop - block.rows.bytes_.start).sum())
+
+    camera = camera_of(run)
+    assert camera is not None
+    read_pictures(camera, add)
+    return total
+
+
+def frame_by_frame(run: RunFolder, path: Path) -> None:
+    """The peer."""
+    recording = rr.RecordingStream("naive")
+    recording.save(path)
+
+    def picture(block: Block) -> None:
+        assert isinstance(block.rows, Images)
+        for i, t_ns in enumerate(block.log_ns.tolist()):
+            recording.set_time("drive", timestamp=np.datetime64(t_ns, "ns"))
+            content = bytes(block.rows.bytes_.payload(i))
+            recording.log("camera", rr.EncodedImage(contents=content, media_type="image/jpeg"))
+
+    camera = camera_of(run)
+    assert camera is not None
+    read_pictures(camera, picture)
+    for frame in stored_frames(run, run.manifest()["detect"]["detectors"]):
+        recording.set_time("drive", timestamp=np.datetime64(frame.seen.t_ns, "ns"))
+        for found in frame.seen.objects:
+            classes = np.zeros(found.size_px[::-1], np.uint8)
+            for label, mask in zip(found.labels, found.masks, strict=True):
+                classes[rle.decode(mask, found.size_px)] = CLASSES[label]
+            labels = [f"{a} {b:.2f}" for a, b in zip(found.labels, found.scores, strict=True)]
+            boxes = rr.Boxes2D(
+                array=found.boxes_px, array_format=rr.Box2DFormat.XYXY, labels=labels
+            )
+            recording.log("camera/boxes", boxes)
+            recording.log("camera/masks", rr.SegmentationImage(classes))
+    for table, names in (
+        ("belief", ("intersection", "left", "right", "straight")), ("range", ("range_m",)),
+        ("pose", ("x_m", "y_m", "speed_mps", "major_axis_m")),
+    ):  # fmt: skip
+        for row in run.table(table).to_pylist():
+            recording.set_time("drive", timestamp=np.datetime64(row["t_ns"], "ns"))
+            for name in names:
+                recording.log(f"{table}/{name}", rr.Scalars(row[name]))
+    recording.flush()
+    recording.disconnect()
+
+
+def main() -> None:
+    """Make the drive once, record it several times both ways."""
+    minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 2.0
+    cases: dict[str, Callable[[RunFolder, Path], None]] = {
+        "crosscue, bulk columns": save, "frame by frame": frame_by_frame,
+    }  # fmt: skip
+    with tempfile.TemporaryDirectory() as name:
+        run, seconds = make_run(Path(name) / "one", minutes)
+        jpegs = picture_bytes(run)
+        taken: dict[str, list[float]] = {case: [] for case in cases}
+        sizes: dict[str, int] = {}
+        for _ in range(ROUNDS):
+            for case, record in cases.items():
+                path = Path(name) / "drive.rrd"
+                began = time.perf_counter()
+                record(run, path)
+                taken[case].append(time.perf_counter() - began)
+                sizes[case] = path.stat().st_size
+        print(f"simulated drive of {seconds:.0f} s, {jpegs / 1e6:.1f} MB of JPEG; {ROUNDS} rounds")
+        print(f"{'':24}{'wall s':>8}{'x real time':>13}{'file / JPEGs':>14}{'against ours':>14}")
+        ours = taken["crosscue, bulk columns"]
+        for case, times in taken.items():
+            ratio = median(a / b for a, b in zip(times, ours, strict=True))
+            print(f"{case:24}{median(times):8.2f}{seconds / median(times):13.0f}"
+                  f"{sizes[case] / jpegs:14.3f}{ratio:14.2f}")  # fmt: skip
+        twice, longer = make_run(Path(name) / "two", 2.0 * minutes)
+        for one, length in ((run, seconds), (twice, longer)):
+            told = subprocess.run(
+                [sys.executable, "-c", MEMORY, str(one.path), str(Path(name) / "m.rrd")],
+                capture_output=True, text=True, check=True,
+            )  # fmt: skip
+            print(f"peak memory over {length:.0f} s of drive: {told.stdout.strip()} MiB")
+
+
+if __name__ == "__main__":
+    main()
