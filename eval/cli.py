@@ -52,6 +52,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "train mask-rcnn": ("train_mask_rcnn", "a Mask R-CNN on COCO annotations"),
     "study range": ("study_range", "how far without landmarks: thousands of simulated drives"),
     "study landmarks": ("study_landmarks", "who reaches the goal, by strategy, density and rate"),
+    "study field": ("study_field", "the field protocol, simulated, through logs and the replay"),
     "study drive": ("study_drive", "one simulated drive: picture, log, replay, recording"),
     "demo": ("demo", "make a small drive, replay it, score it, show it"),
 }

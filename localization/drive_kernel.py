@@ -207,6 +207,12 @@ class Traced:
         chosen: Floats = self.events[np.isin(self.events[:, 1], kinds)]
         return chosen
 
+    def goal_to_goal_m(self) -> float:
+        """From the start to each goal reached, as the crow flies, added up."""
+        begin = np.array(self.first_belief[:2])
+        ways = np.diff(np.vstack([begin, self.of_kind(GOAL_SET)[: self.result.goals, 2:4]]), axis=0)
+        return float(np.hypot(ways[:, 0], ways[:, 1]).sum())
+
 
 def drive_traced(settings: settings_of.Drive, seed: int) -> Traced:
     """Drive once and keep every step.

@@ -5,17 +5,20 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from crosscue.replay.errors import UsageError
 
 from .common import print_json, with_progress
 
 if TYPE_CHECKING:
-    from crosscue.eval.studies.settings import LandmarkStudy, RangeStudy
+    from crosscue.eval.studies.settings import FieldStudy, LandmarkStudy, RangeStudy
     from crosscue.eval.studies.whole import Made
 
+FLAGS: Final = ("drives", "seed", "range_runs", "landmark_runs", "minutes")
+
 S = TypeVar("S", "RangeStudy", "LandmarkStudy")
+AnyStudy = TypeVar("AnyStudy", "RangeStudy", "LandmarkStudy", "FieldStudy")
 
 
 def add_study_arguments(parser: argparse.ArgumentParser, folder: str) -> None:
@@ -38,7 +41,7 @@ def add_cluster_arguments(parser: argparse.ArgumentParser) -> None:
                         help="drive on a Ray cluster: its address, auto, or local")  # fmt: skip
 
 
-def study_of(args: argparse.Namespace, kind: type[S]) -> S:
+def study_of(args: argparse.Namespace, kind: type[AnyStudy]) -> AnyStudy:
     """The study asked for: the published one, or a file's, with flags on top.
 
     Raises:
@@ -50,14 +53,16 @@ def study_of(args: argparse.Namespace, kind: type[S]) -> S:
     from crosscue.eval.studies.settings import load_study
 
     study = kind() if args.settings is None else load_study(args.settings, kind)
-    flags = {name: getattr(args, name, None) for name in ("drives", "seed")}
+    flags = {name: getattr(args, name, None) for name in FLAGS}
     changed = {name: value for name, value in flags.items() if value is not None}
     try:
         return kind.model_validate({**dict(study), **changed})
     except ValidationError as error:
         first = error.errors()[0]
         flag = str(first["loc"][0])
-        raise UsageError(f"--{flag} {changed.get(flag)}: {first['msg'].lower()}") from None
+        raise UsageError(
+            f"--{flag.replace('_', '-')} {changed.get(flag)}: {first['msg'].lower()}"
+        ) from None
 
 
 def workers_of(args: argparse.Namespace) -> int:
