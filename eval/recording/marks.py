@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -160,37 +159,35 @@ def _told(found: Detections) -> Iterator[tuple[Floats, str, int]]:
 
 def outline(mask: bytes, size_px: tuple[int, int], box_px: Floats) -> list[Floats]:
     """Closed strips of shape (N, 2) around a mask, to a pixel; none for an empty mask."""
-    import cv2
-
     if not mask:
         return []
     x0, y0 = (int(v) for v in np.maximum(np.floor(box_px[:2]) - 1, 0))
     x1, y1 = (int(v) for v in np.ceil(box_px[2:]) + 1)
-    inside = np.ascontiguousarray(rle.decode(mask, size_px)[y0:y1, x0:x1]).view(np.uint8)
-    found, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    rounded = [cv2.approxPolyDP(line, 1.0, closed=True)[:, 0, :] for line in found]
-    corner = np.array([x0 + 0.5, y0 + 0.5])
-    return [corner + np.vstack([line, line[:1]]) for line in rounded if len(line) > 2]
+    return _borders(rle.decode(mask, size_px)[y0:y1, x0:x1], (x0, y0))
 
 
 def road_lines(road: RoadMask) -> list[Floats]:
     """Outline of the road and a line along every few rows of it, in the picture's pixels."""
     width, height = road.mask_size_px
     scale = np.array(road.size_px, np.float64) / (width, height)
-    whole = np.array([0.0, 0.0, width, height])
-    lines = outline(road.mask, road.mask_size_px, whole)
     is_road = rle.decode(road.mask, road.mask_size_px)
-    hatch = chain.from_iterable(
-        [np.array([[a, row + 0.5], [b, row + 0.5]]) for a, b in _spans(is_road[row])]
-        for row in range(0, height, HATCH_ROWS)
-    )
-    return [line * scale for line in chain(lines, hatch)]
+    padded = np.zeros((-(-height // HATCH_ROWS), width + 2), np.int8)
+    padded[:, 1:-1] = is_road[::HATCH_ROWS]
+    # Runs begin and end in turn along a row, so each two neighbours of a row are one run's ends.
+    rows, columns = np.nonzero(np.diff(padded, axis=1))
+    hatch = np.stack([columns, HATCH_ROWS * rows + 0.5], axis=1).reshape(-1, 2, 2)
+    return [line * scale for line in (*_borders(is_road, (0, 0)), *hatch)]
 
 
-def _spans(row: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Begin and end of each run of true, shape (N, 2)."""
-    turns = np.flatnonzero(np.diff(row, prepend=False, append=False))
-    return turns.reshape(-1, 2)
+def _borders(mask: NDArray[np.bool_], corner_px: tuple[int, int]) -> list[Floats]:
+    """Closed strips around the parts of a mask whose top-left pixel is ``corner_px``."""
+    import cv2
+
+    inside = np.ascontiguousarray(mask).view(np.uint8)
+    found, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    rounded = [cv2.approxPolyDP(line, 1.0, closed=True)[:, 0, :] for line in found]
+    corner = np.array(corner_px, np.float64) + 0.5
+    return [corner + np.vstack([line, line[:1]]) for line in rounded if len(line) > 2]
 
 
 def log_styles(recording: rr.RecordingStream) -> None:
