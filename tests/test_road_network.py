@@ -165,13 +165,14 @@ def test_own_pictures_with_masks_train_too(
 ) -> None:
     data = folder(tmp_path / "own", 11)
     out = tmp_path / "own.safetensors"
-    argv = ["train", "road", "--data", str(data), "-o", str(out), "--steps", "2", "--batch", "2",
-            "--width", "128", "--device", "cpu", "--json"]  # fmt: skip
+    argv = ["train", "road", "--data", str(data), "-o", str(out), "--steps", "4",
+            "--stop-at", "2", "--batch", "2", "--width", "128", "--device", "cpu", "--json"]  # fmt: skip
 
     assert run(argv) == 0
 
     assert '"held_out_pictures": 2' in capsys.readouterr().out
-    assert load_road(out).facts.recipe["pictures"] == 9
+    recipe = load_road(out).facts.recipe
+    assert (recipe["pictures"], recipe["steps"], recipe["stopped_at"]) == (9, 4, 2)
     assert not out.with_suffix(".state").exists()
     assert run(argv) == 1  # it is there already
 
