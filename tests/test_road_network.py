@@ -166,7 +166,8 @@ def test_own_pictures_with_masks_train_too(
     data = folder(tmp_path / "own", 11)
     out = tmp_path / "own.safetensors"
     argv = ["train", "road", "--data", str(data), "-o", str(out), "--steps", "4",
-            "--stop-at", "2", "--batch", "2", "--width", "128", "--device", "cpu", "--json"]  # fmt: skip
+            "--stop-at", "2", "--batch", "2", "--width", "128", "--device", "cpu",
+            "--json"]  # fmt: skip
 
     assert run(argv) == 0
 
