@@ -22,7 +22,11 @@ from statistics import median
 
 import numpy as np
 import rerun as rr
-from estimate import RANGES, SECONDS_PER_BLOCK, write_log
+from estimate import (  # type: ignore[import-not-found]  # a script beside this one
+    RANGES,
+    SECONDS_PER_BLOCK,
+    write_log,
+)
 
 from crosscue.datasets.simulated_drive import DriveSettings, vehicle_text
 from crosscue.detectors import rle

@@ -93,8 +93,9 @@ def draw_belief(curve: Curve, cues: Sequence[CueJudged], threshold: float = THRE
         (one, found) for one in cues
         for found in [(one.count > 0) & (one.approach == curve.approach)] if found.any()
     ]  # fmt: skip
-    far = float(np.nanmax(curve.distance_m)) if np.isfinite(curve.distance_m).any() else 1.0
-    panel = Panel(112, 30, WIDTH - 96, 170, (max(far, 1.0), 0.0), (0.0, 1.0))
+    seen_m = [one.distance_m[found] for one, found in shown]
+    far = max([1.0, *_known(np.concatenate([curve.distance_m, *seen_m]).tolist())])
+    panel = Panel(112, 30, WIDTH - 96, 170, (far, 0.0), (0.0, 1.0))
     lanes = Panel(112, panel.bottom + 38, WIDTH - 96, 14.0 * len(shown), panel.x_range, (0, 1))
     drawing = Drawing(
         WIDTH + 24, lanes.bottom + 8, f"Probability against distance: {curve.intersection}",

@@ -139,6 +139,36 @@ def test_the_same_scores_give_the_same_bytes(tmp_path: Path) -> None:
     assert _written(tmp_path / "b", again) == first
 
 
+def test_what_a_cue_was_worth_is_told_beside_the_others(tmp_path: Path) -> None:
+    nothing = {"value": 0.0, "low": None, "high": None}
+    worth = {
+        "stop_sign": {
+            "detected_m": nothing | {"value": 12.34}, "full_m": nothing | {"value": None},
+            "detected_only_with": 3, "full_only_with": 2, "full_only_without": 1,
+            "belief": {"left": {"log_score": nothing | {"value": -0.5}}},
+        }
+    }  # fmt: skip
+    one = _scored(tmp_path / "drive")
+
+    page = _written(tmp_path, one, attribution=worth)
+
+    row = re.findall(r"<tr><td>stop sign</td><td>([+].*?)</tr>", page)[0]
+    cells = re.split(r"</?td>+", row)
+    assert [cell for cell in cells if cell] == [
+        "+12.3",
+        "3",
+        "-",
+        "2",
+        "1",
+        "-",
+        "-0.500",
+        "-",
+        "-",
+    ]
+    assert "crosscue score --attribution" not in page
+    assert "crosscue score --attribution" in _written(tmp_path, one)
+
+
 def test_several_drives_make_one_page(tmp_path: Path) -> None:
     drives = [_scored(tmp_path / name, name) for name in ("one", "two", "three")]
     failed = {"runs/<four>": "runs/<four>: no manifest.json"}
