@@ -4,6 +4,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,8 +13,10 @@ from rerun.chunk import RrdReader
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
+from crosscue.detectors.pictures import Encoded
 from crosscue.eval import cli
 from crosscue.eval.recording import TruthTrack, save
+from crosscue.eval.recording.camera import shown
 from crosscue.eval.recording.drive_time import time_of
 from crosscue.eval.recording.layout import Shown, blueprint
 from crosscue.eval.recording.marks import outline, road_lines
@@ -119,6 +122,19 @@ def test_the_file_is_hardly_larger_than_its_pictures(tmp_path: Path) -> None:
     size = _saved(tmp_path).stat().st_size
 
     assert bytes_ < size < 1.05 * bytes_ + 300_000
+
+
+def test_pictures_that_the_viewer_cannot_read_become_jpeg() -> None:
+    pixels = np.full((20, 30, 3), (10, 200, 30), np.uint8)
+    layout = (30, 20, 90, "bgr8")
+
+    jpeg = shown(Encoded("raw", memoryview(pixels.tobytes()), layout))
+
+    assert jpeg is not None
+    again = cv2.imdecode(np.frombuffer(jpeg, np.uint8), 1)
+    assert again is not None
+    assert np.abs(again.astype(int) - pixels).max() < 12
+    assert shown(Encoded("raw", memoryview(b"too short"), layout)) is None
 
 
 def test_view_takes_truth_without_a_track(
