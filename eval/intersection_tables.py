@@ -47,7 +47,11 @@ Row = dict[str, Any]
 
 
 def cue_rows(cues: Mapping[str, CueScore]) -> list[Row]:
-    """One row a cue of Table 5: precision with interval, pooled over its columns."""
+    """One row a cue of Table 5, pooled over its columns.
+
+    ``precision`` asks whether the thing itself is there (lane lines and vehicles past: whether the
+    road goes on); ``feature_precision`` whether what the cue says of the intersection is so.
+    """
     rows: list[Row] = []
     for published in PUBLISHED_CUES:
         some = [cues[name] for name in published.columns if name in cues]
@@ -58,6 +62,7 @@ def cue_rows(cues: Mapping[str, CueScore]) -> list[Row]:
         lows = [one.precision.clusters_low for one in some if one.precision.of]
         highs = [one.precision.clusters_high for one in some if one.precision.of]
         recalls = [one.recall for one in some if one.recall is not None]
+        ways = [one.readings["feature"].precision for one in some if "feature" in one.readings]
         rows.append({
             "cue": published.name,
             "published": published.precision,
@@ -68,6 +73,7 @@ def cue_rows(cues: Mapping[str, CueScore]) -> list[Row]:
             "clusters_low": min(lows, default=math.nan),
             "clusters_high": max(highs, default=math.nan),
             "positives": of,
+            "feature_precision": _pooled(ways),
             "recall": _pooled(recalls),
             "recall_of": sum(one.of for one in recalls),
         })  # fmt: skip
