@@ -439,7 +439,7 @@ def test_the_checkpoint_in_the_package_is_small_and_says_what_it_is() -> None:
     assert facts.plan.classes == CLASSES
     assert set(facts.calibration) == set(CLASSES)
     assert {"box", "mask", "box car", "mask stop sign"} <= set(facts.measured)
-    assert facts.recipe["held_out_pictures"] == 300
+    assert facts.recipe["held_out_pictures"] == 600
 
 
 @pytest.mark.parametrize(
