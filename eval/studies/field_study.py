@@ -39,9 +39,9 @@ NOTES: Final = (
     "In a town of 1 km2 no goal is 6.9 km from the start; the source's Euclidean distance can only "
     "be a sum over successive goals, which is what stands here as the way from goal to goal.",
     "Range runs last longer than the published 'nearly 10 km': blocks are short and turns many, so "
-    "that the error of a heading, which persists for some 130 m, is spread over both axes and partly "
-    "undone; and a simulated compass is as bad everywhere, while the source's was worse in some "
-    "streets, which is how the source explains its own long runs.",
+    "that the error of a heading, which persists for some 130 m, is spread over both axes and "
+    "partly undone; and a simulated compass is as bad everywhere, while the source's was worse in "
+    "some streets, which is how the source explains its own long runs.",
 )
 
 

@@ -40,8 +40,8 @@ NOTES: Final = (
     "cities of at most 100 km2 gave. Intervals: 95 %, bootstrap over drives.",
     "Extra distance: ratio of the ways driven by the same seeds where both strategies reached "
     "the goal.",
-    "Gains are told only for cells where both ranges are within the farthest goal, which leaves out "
-    "those in which looking for landmarks helps most.",
+    "Gains are told only for cells where both ranges are within the farthest goal, which leaves "
+    "out those in which looking for landmarks helps most.",
     "The source says nothing of the landmarks' own uncertainty, nor where in a city they stand "
     "(here: at intersections, 5 m s.d.), nor when a landmark is given up as a target.",
 )
