@@ -92,7 +92,7 @@ def draw_beliefs(curves: Sequence[Curve], path: Path) -> None:
         axes.axis("off")
     for feature, colour in COLOURS.items():
         grid[0, 0].plot([], [], color=colour, label=feature)
-    figure.legend(loc="outside lower center", ncols=len(COLOURS), fontsize=8)
+    figure.legend(loc="outside upper center", ncols=len(COLOURS), fontsize=8)
     figure.supxlabel("true distance to the intersection, m (simulated)", fontsize=8)
     figure.supylabel("probability", fontsize=8)
     _save(figure, path)

@@ -255,7 +255,9 @@ def _result(
     never = np.zeros(len(steps.t_ns), np.bool_)
     likely = above.get("intersection", never)
     ranged = _has_range(tables, number, steps.t_ns)
-    known = above | {"intersection": likely | steps.established}
+    # Where a sign or light stands, it is what must be found; elsewhere nothing could speak of it.
+    sure = likely | steps.established if one.control == "none" else likely
+    known = above | {"intersection": sure}
     full = np.ones(len(steps.t_ns), np.bool_)
     for name in present:
         full &= known.get(name, never)

@@ -1,6 +1,8 @@
 """Approaches, belief and range against truth, on drives small enough to check by hand."""
 
 import math
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -59,16 +61,23 @@ def test_a_probable_intersection_is_not_detected_before_it_has_a_range() -> None
         assert judged.results[0].full_m == 15.0
 
 
-def test_without_sign_or_light_established_presence_stands_for_the_intersection() -> None:
+@pytest.mark.parametrize(("control", "full_m"), [("none", 15.0), ("stop_sign", None)])
+def test_only_without_sign_or_light_established_presence_stands_for_the_intersection(
+    control: Literal["none", "stop_sign"], full_m: float | None
+) -> None:
     roads_only = {name: changes for name, changes in BELIEF.items() if name != "intersection"}
     unsaid = belief_table({"intersection": {}, **roads_only})
+    told = truth()
+    (one,) = told.truth.approaches
+    approaches = (one.model_copy(update={"control": control}),)
+    told = replace(told, truth=told.truth.model_copy(update={"approaches": approaches}))
 
-    judged = judge_approaches(tables(belief=unsaid, ranges=range_table(8, 45)), truth())
+    judged = judge_approaches(tables(belief=unsaid, ranges=range_table(8, 45)), told)
 
     assert judged is not None
-    (one,) = judged.results
-    assert one.detected_m is None
-    assert one.full_m == 15.0
+    (result,) = judged.results
+    assert result.detected_m is None
+    assert result.full_m == full_m
 
 
 def test_exactly_the_threshold_is_not_above_it() -> None:
