@@ -83,9 +83,7 @@ class ScoreWork:
         folder = open_run(path)
         truth_path = find_truth(folder, self.truth)
         with locked(folder):
-            one = judge_run(
-                folder, truth_path, self.settings, self.rpe_m, any_log=self.any_log
-            )
+            one = judge_run(folder, truth_path, self.settings, self.rpe_m, any_log=self.any_log)
             scores = scores_of([one], self.settings)
             metrics = metrics_of([one], scores)
             smoothed = score_smoother(folder, truth_path) if self.has_smoother else None

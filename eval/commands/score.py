@@ -108,9 +108,7 @@ def run(args: argparse.Namespace) -> int:
     except ValueError as error:
         raise UsageError(f"--threshold: {error}") from None
     gates = () if args.gate is None else load_gates(args.gate)
-    work = ScoreWork(
-        args.truth, settings, tuple(args.rpe), args.smoother is not None, args.any_log
-    )
+    work = ScoreWork(args.truth, settings, tuple(args.rpe), args.smoother is not None, args.any_log)
     scored, failed = _score_all(paths, work, args)
     if len(paths) == 1:
         tree = _tell_one(scored[0], settings, args)
