@@ -381,8 +381,7 @@ def test_the_score_shows_filter_and_batch_smoother_side_by_side(
     capsys.readouterr()
     assert cli.run([*command, "--json"]) == 0
 
-    (score,) = json.loads(capsys.readouterr().out).values()
-    smoother = score["smoother"]
+    smoother = json.loads(capsys.readouterr().out)["metrics"]["smoother"]
     assert smoother["poses"] > 20
     assert smoother["smoother_rmse_m"] < smoother["filter_rmse_m"]
     assert abs(smoother["smoother_end_m"] - smoother["filter_end_m"]) < 0.5

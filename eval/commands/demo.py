@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("-o", "--output", type=Path, default=Path("demo"), metavar="DIR",
                         help="folder for drive, run and report (default: demo)")  # fmt: skip
-    parser.add_argument("--layout", default="A", choices=SCORED, help="which intersection")
+    parser.add_argument("--layout", default="C", choices=SCORED, help="which intersection")
     parser.add_argument("--run", type=int, default=1, metavar="N", help="which drive up to it")
     parser.add_argument("--seed", type=int, default=0, help="of what differs from run to run")
     parser.add_argument("--width", type=int, default=1280, help="of the picture (9/16 high)")

@@ -210,7 +210,9 @@ def _on_threads(
             while waiting and len(running) < 2 * workers:
                 chunk = waiting.popleft()
                 running[pool.submit(drive, chunk.settings, chunk.seeds())] = chunk
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
+            done = wait(running, return_when=FIRST_COMPLETED).done
+            # Failures last: what has been finished beside them is kept.
+            for future in sorted(done, key=lambda one: one.exception() is not None):
                 yield running.pop(future), _result(future.result)
     finally:
         pool.shutdown(cancel_futures=True)
