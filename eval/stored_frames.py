@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -38,28 +39,29 @@ class _Rows:
 
     batches: Iterator[Any]
     names: Sequence[str]
-    _columns: dict[str, list[Any]] = field(default_factory=dict)
+    _frames: list[int] = field(default_factory=list)
+    _rows: list[tuple[Any, ...]] = field(default_factory=list)
     _next: int = 0
-    _count: int = 0
 
     def of(self, frame: int) -> list[tuple[Any, ...]]:
         """Rows of a frame; call with frames in order."""
         rows: list[tuple[Any, ...]] = []
         while self._fill():
-            if self._columns["frame"][self._next] > frame:
+            start = bisect_left(self._frames, frame, self._next)
+            self._next = bisect_right(self._frames, frame, start)
+            rows += self._rows[start : self._next]
+            if self._next < len(self._frames):
                 break
-            if self._columns["frame"][self._next] == frame:
-                rows.append(tuple(self._columns[name][self._next] for name in self.names))
-            self._next += 1
         return rows
 
     def _fill(self) -> bool:
-        while self._next == self._count:
+        while self._next == len(self._frames):
             batch = next(self.batches, None)
             if batch is None:
                 return False
-            self._columns = {name: batch[name].to_pylist() for name in ("frame", *self.names)}
-            self._next, self._count = 0, batch.num_rows
+            self._frames = batch["frame"].to_pylist()
+            columns = (batch[name].to_pylist() for name in self.names)
+            self._rows, self._next = list(zip(*columns, strict=True)), 0
         return True
 
 
