@@ -38,4 +38,5 @@ def test_a_stop_sign_measures_the_way_to_the_start(x_m: float) -> None:
     assert curve is not None
     height = np.array([float(sign.box_px[3] - sign.box_px[1])])
 
-    assert range_of(height, curve)[0] == pytest.approx(-x_m, abs=2.0)
+    # The curve is one for what a network finds; a true outline may differ from that by its error.
+    assert range_of(height, curve)[0] == pytest.approx(-x_m, abs=2.0 * curve.residual_sd_m)
