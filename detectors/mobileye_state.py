@@ -30,9 +30,6 @@ class MobileyeState:
     lanes: Floats | None
 
 
-NOTHING_SAID = MobileyeState(None, None)
-
-
 def state_at(
     obstacles: Samples | None, lanes: Samples | None, t_ns: int, past: Past
 ) -> MobileyeState:

@@ -22,6 +22,7 @@ from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import Any, BinaryIO, Final, Protocol, Self, TypeVar, cast
 
+from .closing import Closing
 from .columns import Block, Topic
 from .errors import CrosscueError, LogError, LogTooLargeError, OutputError, UsageError
 from .ledger import Ledger
@@ -104,7 +105,7 @@ class _Object:
     version: str
 
 
-class Fetched:
+class Fetched(Closing):
     """A log on this machine, held against removal until closed; a context manager."""
 
     def __init__(self, path: Path, hold: int | None) -> None:
@@ -117,17 +118,6 @@ class Fetched:
         if self._hold is not None:
             os.close(self._hold)
             self._hold = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def fetch(url: str, store: Store | None = None) -> Fetched:

@@ -6,7 +6,6 @@ that are rare among the annotations are picked more often.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -243,8 +242,3 @@ def _warped_mask(mask: NDArray[np.bool_], warp: Floats, window: Window) -> Bytes
         flags=cv2.INTER_LINEAR,
     )  # fmt: skip
     return np.asarray(np.asarray(grey) >= 128, np.uint8)
-
-
-def batch_numbers(step: int, batch: int) -> Sequence[int]:
-    """The samples that a step is made of."""
-    return range(step * batch, (step + 1) * batch)

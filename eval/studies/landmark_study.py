@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 SUCCESS: Final = 0.8
 STRAIGHT: Final = "straight to goal"
 PUBLISHED_EXTRA: Final = {"landmark to landmark": 0.31, "hybrid": 0.15}
-PUBLISHED_GAIN_M: Final = (1000.0, 2000.0)
 PUBLISHED_POINT: Final = (0.55, 0.6, 6900.0)
 """Landmarks per km2, detection rate, and the distance that 8 of 10 field tests reached."""
 DENSE_PER_KM2: Final = 10.0

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
 DPI: Final = 130
 COLOURS: Final = ("#2ca02c", "#1f77b4", "#d62728", "#7f7f7f", "#9467bd", "#8c564b", "#e377c2")
-STATED: Final = "simulated by crosscue"
 
 
 def figure(columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:

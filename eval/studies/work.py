@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 CHUNK_DRIVES: Final = 100
 CHUNKS: Final = "chunks"
 DRIVES: Final = "drives"
-CONDITIONS: Final = ("compass_2sigma_deg", "strategy", "landmarks_per_km2", "detection_rate")
-
 DriveMany = Callable[[Drive, Keys], Floats]
 
 
