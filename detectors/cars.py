@@ -91,27 +91,27 @@ def car_shapes(found: Sequence[Detections], settings: Cars) -> CarShapes:
     rows = [
         (box, mask)
         for detections in found
-        for box, score, label, mask in zip(
-            detections.boxes_px, detections.scores, detections.labels, detections.masks, strict=True
+        for label, score, box, mask in zip(
+            detections.labels, detections.scores.tolist(), detections.boxes_px.tolist(),
+            detections.masks, strict=True,
         )
         if label in settings.labels and score > settings.score and _is_long(box, settings)
-    ]
+    ]  # fmt: skip
     boxes = np.array([box for box, _ in rows], np.float64).reshape(-1, 4)
-    box_areas = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
     # Counting pixels by column gives both area and nose from one reading of the runs.
     heights = [rle.column_heights_px(mask, size) if mask else None for _, mask in rows]
     areas = [
-        float(area) if columns is None else float(columns.sum())
-        for columns, area in zip(heights, box_areas, strict=True)
+        (box[2] - box[0]) * (box[3] - box[1]) if columns is None else float(columns.sum())
+        for columns, (box, _) in zip(heights, rows, strict=True)
     ]
     noses = [0 if columns is None else nose_of(columns) for columns in heights]
     center = (boxes[:, :2] + boxes[:, 2:]) / 2.0
     return CarShapes(t_ns, size, center, np.array(areas), np.array(noses, np.int64))
 
 
-def _is_long(box: Floats, settings: Cars) -> bool:
-    length, height = box[2] - box[0], box[3] - box[1]
-    return bool(length > settings.length_per_height * height)
+def _is_long(box: Sequence[float], settings: Cars) -> bool:
+    x0, y0, x1, y1 = box
+    return x1 - x0 > settings.length_per_height * (y1 - y0)
 
 
 def nose_of(heights_px: Floats) -> int:
@@ -122,13 +122,13 @@ def nose_of(heights_px: Floats) -> int:
     Args:
         heights_px: Shape (width,): mask pixels in each column.
     """
-    columns = np.flatnonzero(heights_px)
+    (columns,) = heights_px.nonzero()
     if len(columns) < 4:
         return 0
     heights = heights_px[columns[0] : columns[-1] + 1]
     quarter = max(len(heights) // 4, 1)
-    difference = float(heights[-quarter:].sum() - heights[:quarter].sum())
-    return -int(np.sign(difference))
+    difference = heights[-quarter:].sum() - heights[:quarter].sum()
+    return int(difference < 0) - int(difference > 0)
 
 
 def pair_cars(before: CarShapes, now: CarShapes, settings: Cars) -> Pairs:

@@ -56,22 +56,36 @@ def runs(text: bytes) -> Int64s:
     Raises:
         ValueError: Not such a text.
     """
-    codes = np.frombuffer(text, np.uint8).astype(np.int64) - _BASE
-    if len(codes) == 0 or codes.min() < 0 or codes.max() > 63 or codes[-1] & _MORE:
+    # Texts are short and many, so what counts here is how few calls it takes.
+    codes = np.frombuffer(text, np.uint8) - np.uint8(_BASE)
+    if len(codes) == 0 or codes.max() > 63 or codes[-1] & _MORE:
         raise ValueError(f"not a compressed mask: {text[:20]!r}")
-    is_last = (codes & _MORE) == 0
+    is_last = codes < _MORE
     last = np.flatnonzero(is_last)
-    first = np.concatenate([[0], last[:-1] + 1])
-    if int((last - first).max()) >= _LONGEST:
-        raise ValueError(f"not a compressed mask, a run is too long: {text[:20]!r}")
-    place = np.arange(len(codes)) - np.repeat(first, last - first + 1)
-    values = np.add.reduceat((codes & 0x1F) << (5 * place), first)
-    values -= np.where(codes[last] & _SIGN, 1 << (5 * (last - first + 1)), 0)
-    values[1::2] = np.cumsum(values[1::2])
-    values[2::2] = np.cumsum(values[2::2])
+    values: Int64s = ((codes[last] ^ _SIGN).astype(np.int64)) - _SIGN
+    if len(last) < len(codes):
+        _prepend(values, codes, last, np.flatnonzero(~is_last), text)
+    values[1::2] = values[1::2].cumsum()
+    values[2::2] = values[2::2].cumsum()
     if values.min() < 0:
         raise ValueError(f"not a compressed mask, a run is negative: {text[:20]!r}")
-    return np.asarray(values, np.int64)
+    return values
+
+
+def _prepend(
+    values: Int64s, codes: NDArray[np.uint8], last: NDArray[np.intp], before: NDArray[np.intp],
+    text: bytes,
+) -> None:  # fmt: skip
+    """Put the lower groups of five bits under those that end each value."""
+    owner = last.searchsorted(before)
+    first = np.zeros_like(last)
+    first[1:] = last[:-1] + 1
+    more = last - first
+    if more.max() >= _LONGEST:
+        raise ValueError(f"not a compressed mask, a run is too long: {text[:20]!r}")
+    values <<= 5 * more
+    low = (codes[before] & 0x1F).astype(np.int64) << (5 * (before - first[owner]))
+    np.add.at(values, owner, low)
 
 
 def area_px(text: bytes) -> int:
@@ -88,18 +102,20 @@ def column_heights_px(text: bytes, size_px: tuple[int, int]) -> Floats:
     width, height = size_px
     lengths = _checked(text, size_px)
     heights = np.zeros(width)
-    objects = lengths[1::2]
-    if not objects.sum():
-        return heights
-    edges = np.concatenate([[0], np.cumsum(lengths)])
+    edges = np.zeros(len(lengths) + 1)
+    lengths.cumsum(out=edges[1:])
     counted = np.zeros(len(edges))
-    counted[2::2] = np.cumsum(objects)
+    lengths[1::2].cumsum(out=counted[2::2])
+    if not counted[2::2].any():
+        return heights
     counted[3::2] = counted[2:-1:2]
     # Only columns that the object touches: a car is a tenth of the picture.
-    first, last = int(edges[1]) // height, -(-int(edges[2 * len(objects)]) // height)
+    objects = len(lengths) // 2
+    first, last = int(edges[1]) // height, -(-int(edges[2 * objects]) // height)
     borders = np.arange(first, last + 1) * height
     # Between two edges the count grows evenly, so looking it up at column borders is exact.
-    heights[first:last] = np.diff(np.interp(borders, edges, counted))
+    below = np.interp(borders, edges, counted)
+    np.subtract(below[1:], below[:-1], out=heights[first:last])
     return heights
 
 
@@ -120,9 +136,9 @@ def decode(text: bytes, size_px: tuple[int, int]) -> NDArray[np.bool_]:
 
 def _checked(text: bytes, size_px: tuple[int, int]) -> Int64s:
     lengths = runs(text)
-    pixels = size_px[0] * size_px[1]
-    if int(lengths.sum()) not in (pixels, pixels - int(lengths[-1])) or lengths.sum() > pixels:
-        raise ValueError(f"mask of {int(lengths.sum())} pixels: want {size_px[0]} x {size_px[1]}")
+    pixels, told = size_px[0] * size_px[1], int(lengths.sum())
+    if told > pixels or told not in (pixels, pixels - int(lengths[-1])):
+        raise ValueError(f"mask of {told} pixels: want {size_px[0]} x {size_px[1]}")
     return lengths
 
 
