@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any, Final
 from crosscue.replay.run_folder import strict_json, write_text
 
 from .accounts import versions
+from .approach_causes import Finding, by_cause, condition_costs, findings
 from .estimate_stage import Outcome
 from .intersection_figures import draw_beliefs, draw_distances, draw_reliability
 from .intersection_sheet import write_sheet
@@ -60,12 +61,13 @@ def write_study(
     folder = out / "score"
     metrics = metrics_of(scored.scored, scored.scores)
     write_scores(folder, scored.scored, metrics)
-    tables = _tables(settings, done, scored, approaches)
+    found = findings([one.judged for one in scored.scored])
+    tables = _tables(settings, done, scored, approaches, found)
     write_text(out / TABLES, strict_json(tables) + "\n")
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.globals |= {"number": _number, "signed": _signed}
+    environment.globals |= {"number": _number, "signed": _signed, "between": _between}
     source = files("crosscue.eval").joinpath("intersection_report.html.j2")
     page = environment.from_string(source.read_text(encoding="utf-8")).render(
         **tables,
@@ -84,7 +86,7 @@ def write_study(
 
 def _tables(
     settings: StudySettings, done: Sequence[Done[Outcome]], scored: StudyScores,
-    approaches: ApproachScore,
+    approaches: ApproachScore, found: Sequence[Finding],
 ) -> dict[str, Any]:  # fmt: skip
     learned = None if scored.calibrated is None else scored.calibrated.approaches
     flags = f"--runs {settings.runs} --seed {settings.seed} --width {settings.width_px}"
@@ -103,6 +105,9 @@ def _tables(
         "calibrated_detected_m": "" if learned is None else told(learned.detected_m),
         "calibrated_full_m": "" if learned is None else told(learned.full_m),
         "intersections": intersection_rows(approaches.results),
+        "findings": [asdict(one) for one in found],
+        "causes": by_cause(found),
+        "conditions": [asdict(one) for one in condition_costs(approaches.results)],
         "quoted": quoted_rows(scored),
         "cues": cue_rows(scored.scores.cues),
         "attribution": attribution_rows(scored),
@@ -161,6 +166,10 @@ def summary(done: Sequence[Done[Outcome]], scored: StudyScores, written: StudyFi
             f"{_number(row['detected_m']):>9}{_of(row['full'], row['approaches']):>12}"
             f"{_number(row['full_m']):>9}"
         )
+    lines += ["", "late, missing or invented (drives):"]
+    for cause, places in by_cause(findings([one.judged for one in scored.scored])).items():
+        told_places = ", ".join(f"{place} {drives}" for place, drives in places.items())
+        lines.append(f"  {cause:<20} {told_places}")
     lines += ["", f"{'cue':<20}{'precision':>10}{'95 %':>16}{'positives':>11}{'published':>11}"]
     for row in cue_rows(scored.scores.cues):
         ends = f"{_number(row['wilson_low'], 2)} to {_number(row['wilson_high'], 2)}"
@@ -175,6 +184,14 @@ def summary(done: Sequence[Done[Outcome]], scored: StudyScores, written: StudyFi
         f"pictures   {written.sheet}: a frame of each drive, with what was found",
     ]
     return "\n".join(lines)
+
+
+def _between(mean: Mapping[str, Any]) -> str:
+    """A difference as ``asdict`` gives it, with its interval."""
+    value, low, high = mean["value"], mean["low"], mean["high"]
+    if math.isnan(value):
+        return "-"
+    return f"{value:+.1f}" + ("" if math.isnan(low) else f" ({low:+.1f} to {high:+.1f})")
 
 
 def _of(some: int, of: int) -> str:
