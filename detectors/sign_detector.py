@@ -20,7 +20,7 @@ from crosscue.replay.columns import Bytes, Floats, Int64s
 from .base import Detections, Detector, Found, Frame, View
 from .settings import Settings, Share, identity_of, settings_of
 from .sign_drawings import AMERICAN, LABELS, Drawing, Kind, drawings
-from .sign_votes import Words, nearest, window_counts
+from .sign_votes import Counts, Words, nearest, window_counts
 
 VERSION: Final = 1
 _CELL_PX: Final = 4
@@ -90,13 +90,16 @@ def orb_points(grey: Bytes, most: int, fast: int = 10) -> Points:
     orb = cv2.ORB.create(
         nfeatures=most, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=fast
     )  # fmt: skip
-    keypoints = orb.detect(grey, None)
+    # ORB's detection is FAST, then a choice of the best and angles: needless where all may stay.
+    keypoints = cv2.FastFeatureDetector.create(fast).detect(grey, None)
+    if len(keypoints) > most:
+        keypoints = orb.detect(grey, None)
     for keypoint in keypoints:
         keypoint.angle = 0.0
     keypoints, descriptors = orb.compute(grey, keypoints)
     if descriptors is None or not len(keypoints):
         return Points(np.empty((0, 2)), np.empty((0, 4), np.uint64))
-    at = np.array([keypoint.pt for keypoint in keypoints], np.float64)
+    at = np.asarray(cv2.KeyPoint.convert(keypoints), np.float64)
     return Points(at, np.ascontiguousarray(descriptors).view(np.uint64))
 
 
@@ -194,9 +197,11 @@ class SignDetector:
         )
         found: list[tuple[float, Kind, Floats]] = []
         for k, drawing in enumerate(self.gallery.drawn):
-            which = np.flatnonzero(matched[:, k] >= 0)
-            at = matched[which, k]
-            which, at = which[np.argsort(at, kind="stable")], np.sort(at)
+            which = np.flatnonzero(matched[k] >= 0)
+            at = matched[k, which]
+            # Small numbers sort by radix.
+            order = np.argsort((at - self.gallery.first[k]).astype(np.uint16), kind="stable")
+            which, at = which[order], at[order]
             votes = points.at_px[which] + self.gallery.to_middle_px[at]
             points_drawn = int(self.gallery.first[k + 1] - self.gallery.first[k])
             found += self._windows(votes, at, level.shape, drawing, points_drawn, scale)
@@ -216,6 +221,8 @@ class SignDetector:
         cells = np.floor(votes / _CELL_PX).astype(np.int64)
         counts = window_counts(cells, at, rows, columns, reach)
         least = max(self.settings.least_share * points_drawn, self.settings.least_votes)
+        if counts.max(initial=0) < least:
+            return []
         half = np.array(drawing.size_px) / 2.0
         found = []
         for row, column in np.argwhere(_is_peak(counts, reach) & (counts >= least)):
@@ -225,7 +232,7 @@ class SignDetector:
         return found
 
 
-def _is_peak(counts: Int64s, reach: int) -> NDArray[np.bool_]:
+def _is_peak(counts: Counts, reach: int) -> NDArray[np.bool_]:
     import cv2
 
     # A window that no other within reach beats; OpenCV's dilation gives the largest near by.

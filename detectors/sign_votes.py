@@ -7,6 +7,8 @@ ratio test; Lowe, 2004). Signs stand upright, and so do the descriptors.
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -14,22 +16,52 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import Int64s
 
 Words = NDArray[np.uint64]
+Counts = NDArray[np.int32]
+_BITS_AT: Final = np.uint64(32)
+_PLACE: Final = np.uint64(0xFFFFFFFF)
+_NONE: Final = np.uint64(257 << 32)
+"""More bits than a descriptor has."""
 
 
 @njit(cache=True)
-def _ones(word: np.uint64) -> np.int64:
-    # The pattern that LLVM knows as one machine instruction.
+def _ones(word: np.uint64) -> np.uint64:
+    # The pattern that LLVM knows as one machine instruction, several words at a time.
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + (
         (word >> np.uint64(2)) & np.uint64(0x3333333333333333)
     )
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
+    return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
+
+
+@njit(cache=True)
+def _keys(point: Words, a: Words, b: Words, c: Words, d: Words, keys: Words) -> None:
+    # Bits that differ, then the place: no two keys are equal, and the least is the first.
+    p, q, r, s = point[0], point[1], point[2], point[3]
+    for j in range(keys.size):
+        bits = _ones(p ^ a[j]) + _ones(q ^ b[j]) + _ones(r ^ c[j]) + _ones(s ^ d[j])
+        keys[j] = (bits << _BITS_AT) | np.uint64(j)
+
+
+@njit(cache=True)
+def _least_above(keys: Words, floor: np.uint64) -> np.uint64:
+    least = _NONE
+    for j in range(keys.size):
+        least = min(least, keys[j] if keys[j] > floor else _NONE)
+    return least
+
+
+@njit(cache=True)
+def _least(keys: Words) -> np.uint64:
+    least = _NONE
+    for j in range(keys.size):
+        least = min(least, keys[j])
+    return least
 
 
 @njit(cache=True, nogil=True)
 def nearest(points: Words, drawn: Words, first: Int64s, ratio: float, most: int) -> Int64s:
-    """For each point and drawing the drawing's descriptor that passes the ratio test, else -1.
+    """For each drawing and point the drawing's descriptor that passes the ratio test, else -1.
 
     Args:
         points: Shape (N, 4), uint64: descriptors of the picture.
@@ -39,31 +71,27 @@ def nearest(points: Words, drawn: Words, first: Int64s, ratio: float, most: int)
         most: Bits in which the nearest may differ.
 
     Returns:
-        Shape (N, K), int64.
+        Shape (K, N), int64.
     """
-    found = np.full((len(points), len(first) - 1), -1, np.int64)
+    found = np.full((len(first) - 1, len(points)), -1, np.int64)
+    columns = drawn.T.copy()
+    a, b, c, d = columns[0], columns[1], columns[2], columns[3]
+    keys = np.empty(len(drawn), np.uint64)
     for i in range(len(points)):
-        a, b, c, d = points[i, 0], points[i, 1], points[i, 2], points[i, 3]
+        _keys(points[i], a, b, c, d, keys)
         for k in range(len(first) - 1):
-            best, second, at = 257, 257, -1
-            for j in range(first[k], first[k + 1]):
-                bits = int(
-                    _ones(a ^ drawn[j, 0])
-                    + _ones(b ^ drawn[j, 1])
-                    + _ones(c ^ drawn[j, 2])
-                    + _ones(d ^ drawn[j, 3])
-                )
-                if bits < best:
-                    second, best, at = best, bits, j
-                elif bits < second:
-                    second = bits
-            if best <= most and best < ratio * second:
-                found[i, k] = at
+            of_drawing = keys[first[k] : first[k + 1]]
+            best = _least(of_drawing)
+            bits = np.int64(best >> _BITS_AT)
+            if bits <= most:
+                second = np.int64(_least_above(of_drawing, best) >> _BITS_AT)
+                if bits < ratio * second:
+                    found[k, i] = np.int64(best & _PLACE)
     return found
 
 
 @njit(cache=True, nogil=True)
-def window_counts(at_cell: Int64s, drawn: Int64s, rows: int, columns: int, reach: int) -> Int64s:
+def window_counts(at_cell: Int64s, drawn: Int64s, rows: int, columns: int, reach: int) -> Counts:
     """How many different points of one drawing vote for the window around each cell of a grid.
 
     A texture that repeats one point of the drawing a hundred times still counts once.
@@ -76,10 +104,10 @@ def window_counts(at_cell: Int64s, drawn: Int64s, rows: int, columns: int, reach
         reach: Cells to each side of the middle one that belong to a window.
 
     Returns:
-        Shape (rows, columns), int64.
+        Shape (rows, columns), int32.
     """
-    counts = np.zeros((rows, columns), np.int64)
-    last = np.full((rows, columns), -1, np.int64)
+    counts = np.zeros((rows, columns), np.int32)
+    last = np.full((rows, columns), -1, np.int32)
     for i in range(len(drawn)):
         x, y = at_cell[i, 0], at_cell[i, 1]
         for row in range(max(y - reach, 0), min(y + reach + 1, rows)):

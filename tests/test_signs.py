@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.model_detector import overlaps
-from crosscue.detectors.sign_detector import build
+from crosscue.detectors.sign_detector import build, orb_points
 from crosscue.detectors.sign_drawings import AMERICAN, Kind
 from crosscue.detectors.sign_threshold import (
     Judged,
@@ -97,8 +97,24 @@ def test_the_ratio_test_agrees_with_opencv(seed: int) -> None:
 
     got = nearest(points.view(np.uint64), drawn.view(np.uint64), np.array([0, 9]), 0.8, 256)
 
-    assert got[:, 0].tolist() == want
-    assert got[4, 0] == 2
+    assert got[0].tolist() == want
+    assert got[0, 4] == 2
+
+
+@pytest.mark.parametrize("most", [100, 20_000])
+def test_points_are_those_of_upright_orb_whether_or_not_it_must_choose(most: int) -> None:
+    grey = clutter(5)
+    orb = cv2.ORB.create(nfeatures=most, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=6)
+    keypoints = orb.detect(grey, None)
+    for keypoint in keypoints:
+        keypoint.angle = 0.0
+    keypoints, descriptors = orb.compute(grey, keypoints)
+
+    points = orb_points(grey, most, 6)
+
+    assert len(keypoints) == most if most == 100 else 100 < len(keypoints) < most
+    np.testing.assert_array_equal(points.at_px, [keypoint.pt for keypoint in keypoints])
+    np.testing.assert_array_equal(points.words.view(np.uint8), descriptors)
 
 
 @settings(deadline=None, max_examples=25)
