@@ -1,0 +1,114 @@
+"""What the wrong car cues of a simulated study were: each positive car beside the true one.
+
+Run it as ``python benchmarks/car_cues.py STUDY`` on the folder of ``crosscue study intersections``.
+Every car that counted as cross traffic (eq. 15) or parked (eq. 16) is looked up in the drive's
+``objects.json``: the true car whose box overlaps it most, and what that one does there.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crosscue.datasets.truth import Truth, load
+from crosscue.detectors.cars import CarShapes, car_shapes, pair_cars
+from crosscue.eval.estimate_stage import detected_part
+from crosscue.eval.score_truth import cue_at
+from crosscue.eval.stored_frames import stored_frames
+from crosscue.replay.run_folder import RunFolder, open_run
+from crosscue.replay.vehicle import Vehicle, of_manifest
+
+LEAST_NEAR = 0.5
+"""A true car counts where its middle is so near, in lengths of its box."""
+KINDS = {
+    "cross": "car on the crossroad that moves",
+    "parked_cross": "car parked on the crossroad",
+    "other": "car in a lot or driveway, or parked at the own road",
+    "oncoming": "oncoming car",
+    "outgoing": "car ahead",
+    "parked_past": "car parked past the intersection",
+}
+
+
+def true_cars(drive: Path) -> dict[int, list[dict[str, Any]]]:
+    """From a frame's time to its cars."""
+    content = json.loads((drive / "objects.json").read_text())
+    times = {one["id"]: one["t_ns"] for one in content["images"]}
+    car = next(one["id"] for one in content["categories"] if one["name"] == "car")
+    cars: dict[int, list[dict[str, Any]]] = {t_ns: [] for t_ns in times.values()}
+    for one in content["annotations"]:
+        if one["category_id"] == car:
+            cars[times[one["image_id"]]].append(one)
+    return cars
+
+
+def what_is_at(cars: list[dict[str, Any]], x: float, y: float) -> str:
+    """What the nearest true car does, or that there is none."""
+    best, nearest = "no car", LEAST_NEAR
+    for one in cars:
+        x0, y0, width, height = one["bbox"]
+        away = float(np.hypot(x - x0 - width / 2, y - y0 - height / 2)) / max(width, height)
+        if away < nearest:
+            best, nearest = KINDS[one["role"]], away
+    return best
+
+
+def claims(run: RunFolder, vehicle: Vehicle) -> Iterator[tuple[int, str, float, float]]:
+    """Time, cue and place of every car that counted."""
+    found = detected_part(run.manifest())
+    assert found is not None
+    before: CarShapes | None = None
+    rules = vehicle.cars
+    for frame in stored_frames(run, found["detectors"]):
+        now = car_shapes(frame.seen.objects, rules)
+        if before is not None:
+            pairs = pair_cars(before, now, rules)
+            least = rules.still_change * pairs.width_px
+            for step, (x, y), nose in zip(
+                pairs.step_px.tolist(), pairs.center_px.tolist(), pairs.nose.tolist(), strict=True
+            ):
+                if abs(step[0]) > least and abs(step[1]) <= rules.slope * abs(step[0]):
+                    yield now.t_ns, f"cross_traffic_{'left' if step[0] < 0 else 'right'}", x, y
+                elif max(abs(step[0]), abs(step[1])) <= least and nose:
+                    yield now.t_ns, f"parked_{'left' if nose < 0 else 'right'}", x, y
+        before = now
+
+
+def is_true(truth: Truth, cue: str, t_ns: int) -> bool | None:
+    """Whether the thing is there in the frame, whichever car was meant; None unknown."""
+    at = cue_at([one for one in truth.cues if one.cue == cue], np.array([t_ns], np.int64))
+    return None if at.present[0] < 0 else bool(at.present[0])
+
+
+def main() -> None:
+    """Count over all drives of the study."""
+    study = Path(sys.argv[1])
+    right: Counter[str] = Counter()
+    wrong: dict[str, Counter[str]] = {}
+    runs = sorted(path.parent for path in (study / "runs").glob("*/manifest.json"))
+    for path in runs:
+        run, drive = open_run(path), study / "drives" / path.name
+        truth, cars = load(drive / "truth.json"), true_cars(drive)
+        for t_ns, cue, x, y in claims(run, of_manifest(run.manifest()["settings"])):
+            kind = cue.rpartition("_")[0]
+            verdict = is_true(truth, cue, t_ns)
+            if verdict:
+                right[kind] += 1
+            elif verdict is False:
+                wrong.setdefault(kind, Counter())[what_is_at(cars.get(t_ns, []), x, y)] += 1
+    print(f"{len(runs)} simulated drives; cars that counted, one by one")
+    for kind in sorted(wrong):
+        total = right[kind] + wrong[kind].total()
+        print(f"\n{kind.replace('_', ' ')}: {right[kind]} of {total} in frames that have one")
+        for what, times in wrong[kind].most_common():
+            print(f"  wrong: {what:<52} {times:5}")
+
+
+if __name__ == "__main__":
+    main()
