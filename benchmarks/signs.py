@@ -1,84 +1,140 @@
 """Our sign search beside one ORB for every window of every level, on the same simulated scenes.
 
-Both look for the same three drawings at two sizes, on the same levels, with the same ratio test;
-the peer's windows are 16 pixels apart. Prints median times a picture, the ratio, and signs found.
+Both look for the same drawings on the same levels of the pyramid, with points of the same kind and
+the same ratio test. The peer slides one window of each of the drawings' sizes, 16 pixels a step,
+and runs ORB once in each window, for all drawings of that size; a window's score is the share of a
+drawing's points that it has. "one size" does it with a single window that is as large as the
+largest drawing, which is as few runs of ORB as can be.
+
+On small pictures (our drawings over clutter) both look everywhere and the signs found are counted.
+In simulated streets of a usual camera's size the peer looks at every 40th window, on all levels
+alike, and its time is scaled up; what shrinking the picture takes it is not charged for.
 """
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from crosscue.datasets.scenes.drive import SceneSettings, world_of
+from crosscue.datasets.scenes.render import Renderer
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.model_detector import overlaps
-from crosscue.detectors.sign_detector import SignSettings, build
-from crosscue.detectors.sign_drawings import AMERICAN, Drawing, Kind, drawings
+from crosscue.detectors.sign_detector import SignSettings, build, orb_points
+from crosscue.detectors.sign_drawings import AMERICAN, Kind, drawings
 from crosscue.replay.columns import Bytes, Floats
-from support.sign_scenes import Scene, clutter, scene
+from support.sign_scenes import scene
 
 STRIDE_PX = 16
 ROUNDS = 5
-RULES = SignSettings(crop_bottom=0.0, least_score=0.1)
+SCENES = 6
+ONE_IN = 40
+RULES = SignSettings(crop_bottom=0.0)
+LEAST_SHARE = 0.1
+Size = tuple[int, int]
 Found = list[tuple[str, Floats]]
 
 
-class NaiveSearch:
+class Drawn(NamedTuple):
+    """A drawing as the peer compares it."""
+
+    kind: Kind
+    size_px: Size
+    described: Bytes
+
+
+class Window(NamedTuple):
+    """A place where the peer looks: a view of a level, and where that is in the picture."""
+
+    pixels: Bytes
+    box: Floats
+
+
+class WindowSearch:
     """The source's way: a window slides over each level; ORB and the matcher run in each."""
 
-    def __init__(self) -> None:
+    def __init__(self, has_one_size: bool) -> None:
         """Describe the drawings once."""
         self._orb = cv2.ORB.create(
             nfeatures=500, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=RULES.fast
         )
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
-        self._drawn = [
-            (one, self._described(one.grey)) for one in drawings(AMERICAN, RULES.heights_px)
-        ]
+        drawn = drawings(AMERICAN, RULES.heights_px)
+        shapes = [(one.grey.shape[1], one.grey.shape[0]) for one in drawn]
+        largest = (max(w for w, _ in shapes), max(h for _, h in shapes))
+        self._by_size: dict[Size, list[Drawn]] = {}
+        for one, shape in zip(drawn, shapes, strict=True):
+            words = orb_points(one.grey, 500, RULES.drawing_fast).words
+            of_size = self._by_size.setdefault(largest if has_one_size else shape, [])
+            of_size.append(Drawn(one.kind, one.size_px, words.view(np.uint8)))
 
     def __call__(self, grey: Bytes) -> Found:
         """The best window, if a tenth of a drawing's points are in it."""
-        best: tuple[float, str, Floats] = (0.1, "", np.zeros(4))
+        best: tuple[float, str, Floats] = (LEAST_SHARE, "", np.zeros(4))
+        for size, of_size in self._by_size.items():
+            for window in self._windows(grey, size):
+                best = max(best, *self._shares(window, of_size), key=lambda one: one[0])
+        return [(best[1], best[2])] if best[1] else []
+
+    def seconds(self, grey: Bytes, first: int) -> float:
+        """What a search takes, from every ``ONE_IN``-th window after ``first`` of each level."""
+        taken, looked, there = 0.0, 0, 0
+        for size, of_size in self._by_size.items():
+            for number, window in enumerate(self._windows(grey, size)):
+                there += 1
+                if number % ONE_IN == first:
+                    looked += 1
+                    began = time.perf_counter()
+                    self._shares(window, of_size)
+                    taken += time.perf_counter() - began
+        return taken / looked * there
+
+    def _windows(self, grey: Bytes, size: Size) -> Iterator[Window]:
+        width, height = size
         for level in range(RULES.levels):
             scale = RULES.enlarge / RULES.factor**level
             small = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale), np.uint8)
-            for one, described in self._drawn:
-                best = max(best, self._level(small, one, described, scale), key=lambda b: b[0])
-        return [(best[1], best[2])] if best[1] else []
-
-    def _level(
-        self, level: Bytes, one: Drawing, described: Bytes, scale: float
-    ) -> tuple[float, str, Floats]:
-        height, width = one.grey.shape
-        best: tuple[float, str, Floats] = (0.0, "", np.zeros(4))
-        for y in range(0, level.shape[0] - height, STRIDE_PX):
-            for x in range(0, level.shape[1] - width, STRIDE_PX):
-                share = self._share(level[y : y + height, x : x + width], described)
-                if share > best[0]:
+            for y in range(0, small.shape[0] - height + 1, STRIDE_PX):
+                for x in range(0, small.shape[1] - width + 1, STRIDE_PX):
                     box = np.array([x, y, x + width, y + height], np.float64) / scale
-                    best = (share, one.kind, box)
-        return best
+                    yield Window(small[y : y + height, x : x + width], box)
 
-    def _share(self, window: Bytes, described: Bytes) -> float:
-        points = self._described(window)
-        if len(points) < 2:
-            return 0.0
-        pairs = self._matcher.knnMatch(points, described, k=2)
-        alike = {a.trainIdx for a, b in pairs if a.distance < RULES.ratio * b.distance
-                 and a.distance <= RULES.most_bits}  # fmt: skip
-        return len(alike) / len(described)
+    def _shares(self, window: Window, drawn: list[Drawn]) -> list[tuple[float, str, Floats]]:
+        points = self._described(window.pixels)
+        if len(points) < RULES.least_votes:
+            return [(0.0, "", window.box)]
+        found: list[tuple[float, str, Floats]] = []
+        for one in drawn:
+            pairs = self._matcher.knnMatch(points, one.described, k=2)
+            alike = {a.trainIdx for a, b in pairs if a.distance < RULES.ratio * b.distance
+                     and a.distance <= RULES.most_bits}  # fmt: skip
+            found.append((len(alike) / len(one.described), one.kind, _about(window, one.size_px)))
+        return found
 
     def _described(self, grey: Bytes) -> Bytes:
+        # As fast as OpenCV's one call for both; upright, or left and right arrows look alike.
         keypoints = self._orb.detect(grey, None)
         for keypoint in keypoints:
             keypoint.angle = 0.0
         _, descriptors = self._orb.compute(grey, keypoints)
         return np.empty((0, 32), np.uint8) if descriptors is None else np.asarray(descriptors)
+
+
+def _about(window: Window, size_px: Size) -> Floats:
+    """The sign's box in the middle of a window."""
+    scale = window.pixels.shape[1] / (window.box[2] - window.box[0])
+    middle = (window.box[:2] + window.box[2:]) / 2.0
+    half = np.array(size_px) / (2.0 * scale)
+    return np.concatenate([middle - half, middle + half])
 
 
 def ours(grey: Bytes) -> Found:
@@ -93,37 +149,71 @@ def is_right(found: Found, kind: str, box: Floats) -> bool:
     return any(label == kind and overlaps(box, b[None])[0] > 0.25 for label, b in found)
 
 
-def large_scene(kind: Kind, seed: int) -> Scene:
-    """A scene in the middle of a picture of a usual camera's size."""
-    small, box = scene(kind, seed)
-    grey = clutter(seed, (1280, 720))
-    grey[180:540, 320:960] = small
-    return Scene(grey, box + np.array([320, 180, 320, 180]))
+def streets() -> list[Bytes]:
+    """Pictures of simulated approaches to intersections, as a drive has them."""
+    found = []
+    for i in range(ROUNDS):
+        settings = SceneSettings(f"L{800 + i}", i + 1)
+        _, _, world = world_of(settings)
+        t_s = float(np.argmax(world.approach.motion.x_m >= -20.0)) / 100.0
+        rgb = Renderer(world, settings.camera, settings.picture).picture(t_s).rgb
+        found.append(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8))
+    return found
 
 
 DETECTOR = build(**RULES.model_dump())
+PEERS = {"one ORB a window": WindowSearch(False), "one size": WindowSearch(True)}
 
 
-def main() -> None:
-    """Both in turn on each scene."""
-    cv2.setNumThreads(1)
-    naive = NaiveSearch()
-    scenes = [(AMERICAN[i % 3], large_scene(AMERICAN[i % 3], 40 + i)) for i in range(ROUNDS + 1)]
-    ours(scenes[0][1].grey)
-    seconds: dict[str, list[float]] = {"ours": [], "one ORB per window": []}
-    right = dict.fromkeys(seconds, 0)
-    for kind, (grey, box) in scenes:
-        for name, search in (("ours", ours), ("one ORB per window", naive)):
+def timed(search: Callable[[], object]) -> float:
+    """Seconds."""
+    began = time.perf_counter()
+    search()
+    return time.perf_counter() - began
+
+
+def signs_found() -> None:
+    """Whole searches on small pictures."""
+    searches: dict[str, Callable[[Bytes], Found]] = {"ours": ours, **PEERS}
+    kinds = [AMERICAN[i % 3] for i in range(SCENES)]
+    scenes = [scene(kind, 40 + i) for i, kind in enumerate(kinds)]
+    seconds: dict[str, list[float]] = {name: [] for name in searches}
+    right = dict.fromkeys(searches, 0)
+    for kind, (grey, box) in zip(kinds, scenes, strict=True):
+        for name, search in searches.items():
             began = time.perf_counter()
             found = search(grey)
             seconds[name].append(time.perf_counter() - began)
             right[name] += is_right(found, kind, box)
-    base = median(seconds["ours"])
-    print(f"{'1280 x 720, simulated':22} {'ms':>10} {'times ours':>11} {'signs found':>12}")
+    print_table("640 x 360, all windows", seconds)
+    for name, count in right.items():
+        print(f"  {name}: {count} of {SCENES} signs found")
+
+
+def speed() -> None:
+    """Pictures of a usual camera's size, the peers in parts."""
+    seconds: dict[str, list[float]] = {name: [] for name in ("ours", *PEERS)}
+    for i, grey in enumerate(streets()):
+        seconds["ours"].append(median(timed(partial(ours, grey)) for _ in range(5)))
+        for name, peer in PEERS.items():
+            seconds[name].append(peer.seconds(grey, 8 * i))
+    print_table(f"1280 x 720, peers 1 window in {ONE_IN}", seconds)
+
+
+def print_table(what: str, seconds: dict[str, list[float]]) -> None:
+    """Medians, and medians of the ratio on the same picture."""
+    print(f"{what:34} {'ms':>10} {'times ours':>11}")
     for name, taken in seconds.items():
-        middle = median(taken)
-        share = f"{right[name]} of {len(scenes)}"
-        print(f"{name:22} {middle * 1e3:10.1f} {middle / base:11.1f} {share:>12}")
+        ratio = median(a / b for a, b in zip(taken, seconds["ours"], strict=True))
+        print(f"{name:34} {median(taken) * 1e3:10.1f} {ratio:11.1f}")
+
+
+def main() -> None:
+    """Signs found, then speed."""
+    cv2.setNumThreads(1)
+    ours(scene(AMERICAN[0], 1).grey)
+    signs_found()
+    speed()
 
 
 if __name__ == "__main__":
