@@ -215,35 +215,46 @@ def _by_number(annotations: Annotations, log: LogPictures) -> Placed:
     return Placed(tuple(times), "by frame number, the first being 0")
 
 
-def meanings(annotations: Annotations, own: Mapping[str, str]) -> dict[str, str | None]:
+def meanings(
+    annotations: Annotations, own: Mapping[str, str], own_cues: Sequence[str] = (),
+    *, any_thing: bool = False,
+) -> dict[str, str | None]:  # fmt: skip
     """From label to cue; None for things that are no cue.
 
     Args:
         annotations: With labels.
         own: From label to cue as the user says; an empty cue for a thing that is none.
+        own_cues: Cues beside the usual ones.
+        any_thing: A label that is not nearly a cue's name may be a thing nobody has heard of.
 
     Raises:
         UsageError: ``own`` names a label or cue that there is not.
         SchemaError: A label is neither a cue nor a known thing.
     """
+    cues = (*CUES, *own_cues)
     for label, cue in own.items():
         if label not in annotations.labels:
             raise UsageError(
                 f"--map {label}={cue}: no such label; {_there_are(annotations.labels)}"
             )
-        if cue and cue not in CUES:
-            raise UsageError(f"--map {label}={cue}: no such cue; {_there_are(CUES)}")
+        if cue and cue not in cues:
+            raise UsageError(
+                f"--map {label}={cue}: no such cue; {_there_are(cues)}; --vehicle names your own"
+            )
     found: dict[str, str | None] = {}
     for label in annotations.labels:
         plain = re.sub(r"[^a-z0-9]+", "_", label.lower()).strip("_")
         if label in own:
             found[label] = own[label] or None
-        elif plain in CUES:
+        elif plain in cues:
             found[label] = plain
         elif plain in OTHER_THINGS:
             found[label] = None
         else:
-            close = difflib.get_close_matches(plain, CUES, n=1, cutoff=0.6)
+            close = difflib.get_close_matches(plain, cues, n=1, cutoff=0.6)
+            if any_thing and not close:
+                found[label] = None
+                continue
             hint = close[0] if close else ""
             raise SchemaError(
                 f"{annotations.where}: class {label!r} is neither a cue nor a known thing; say "
@@ -286,7 +297,9 @@ def cue_truths(
     annotations: Annotations, placed: Placed, cues: Mapping[str, str | None]
 ) -> tuple[CueTruth, ...]:
     """One statement for each annotated picture and each cue that could have been labelled."""
-    known = [cue for cue in CUES if cue in cues.values()]
+    meant = {cue for cue in cues.values() if cue is not None}
+    known: list[str] = [cue for cue in CUES if cue in meant]
+    known += sorted(meant.difference(known))
     told: list[CueTruth] = []
     for t_ns, picture in sorted(
         zip(placed.t_ns, annotations.pictures, strict=True), key=lambda pair: pair[0]
@@ -303,9 +316,16 @@ def cue_truths(
     return tuple(told)
 
 
-def coco_tree(annotations: Annotations, placed: Placed) -> dict[str, Any]:
-    """The labelled objects as a COCO tree, pictures with their log times."""
-    numbers = {label: number for number, label in enumerate(annotations.labels, start=1)}
+def coco_tree(
+    annotations: Annotations, placed: Placed, cues: Mapping[str, str | None]
+) -> dict[str, Any]:
+    """The labelled objects as a COCO tree, pictures with their log times, cues by their names."""
+    plain = {
+        label: label if (cue := cues[label]) is None else cue.replace("_", " ")
+        for label in annotations.labels
+    }
+    names = {name: number for number, name in enumerate(dict.fromkeys(plain.values()), start=1)}
+    numbers = {label: names[name] for label, name in plain.items()}
     images: list[dict[str, Any]] = []
     things: list[dict[str, Any]] = []
     for number, (picture, t_ns) in enumerate(
@@ -321,7 +341,7 @@ def coco_tree(annotations: Annotations, placed: Placed) -> dict[str, Any]:
         "info": {"description": f"imported from {annotations.where}"},
         "images": images,
         "annotations": things,
-        "categories": [{"id": number, "name": label} for label, number in numbers.items()],
+        "categories": [{"id": number, "name": name} for name, number in names.items()],
     }
 
 

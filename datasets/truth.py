@@ -6,6 +6,7 @@ section may be missing.
 
 from __future__ import annotations
 
+import difflib
 import json
 from importlib import import_module
 from pathlib import Path
@@ -61,6 +62,9 @@ CUES: Final[tuple[Cue, ...]] = get_args(Cue)
 lane lines and vehicles past the intersection."""
 
 
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
+
+
 class Features(Section):
     """Where one may drive on from an intersection."""
 
@@ -91,7 +95,8 @@ class Approach(Section):
 class CueTruth(Section):
     """Whether what a cue stands for is there, at one time or over a half-open span."""
 
-    cue: Cue
+    cue: Annotated[Name, Field(json_schema_extra={"examples": [*CUES]})]
+    """One of ``CUES``, or of the file's ``own_cues``."""
     present: bool
     t_ns: int | None = None
     start_ns: int | None = None
@@ -123,6 +128,9 @@ class Truth(Section):
     """Who measured it, and how well."""
     approaches: tuple[Approach, ...] = ()
     cues: tuple[CueTruth, ...] = ()
+    own_cues: tuple[Name, ...] = ()
+    """Cues beside the usual ones that this file tells of, as the vehicle file's ``[cues.own]``
+    names them."""
     objects: str | None = None
     """COCO file of labelled objects beside this one, images by ``t_ns``."""
     ranges: str | None = None
@@ -202,8 +210,13 @@ def _check_approaches(truth: Truth, path: Path) -> None:
 
 def _check_cues(truth: Truth, path: Path) -> None:
     numbers = {one.id for one in truth.approaches}
+    known = (*CUES, *truth.own_cues)
     for place, one in enumerate(truth.cues):
         where = f"{path}: cues.{place} ({one.cue})"
+        if one.cue not in known:
+            near = difflib.get_close_matches(one.cue, known, 1)
+            meant = f", meant: {near[0]}" if near else ""
+            raise SchemaError(f"{where}: no such cue{meant}; one of your own goes into own_cues")
         spans = one.start_ns is not None and one.end_ns is not None
         if spans == (one.t_ns is not None) or (one.start_ns is None) != (one.end_ns is None):
             raise SchemaError(f"{where}: want either t_ns, or start_ns and end_ns; mend it")

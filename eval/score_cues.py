@@ -195,7 +195,8 @@ def judge_cues(tables: RunTables, truth: DriveTruth) -> list[CueJudged]:
     frames = np.unique(rows.t_ns)
     if tables.frames_ns is not None:
         frames = np.union1d(frames, tables.frames_ns)
-    others = sorted(set(np.unique(rows.cue).tolist()) - set(CUES))
+    told = {one.cue for one in truth.truth.cues}
+    others = sorted({*np.unique(rows.cue).tolist(), *told} - {*CUES})
     return [_judge(cue, rows, frames, truth) for cue in (*CUES, *others)]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -113,7 +113,7 @@ def check_truth(path: Path, log_path: Path, vehicle: Vehicle) -> TruthFit:
         pictures = log_pictures(log_path, vehicle)
     if truth.objects is not None:
         assert pictures is not None
-        objects = _check_objects(folder / truth.objects, pictures)
+        objects = _check_objects(folder / truth.objects, pictures, truth.own_cues)
     matched = 0 if pictures is None else int(np.isin(moments, pictures.t_ns).sum())
     if len(moments) and not matched:
         raise SchemaError(
@@ -156,9 +156,9 @@ def _check_overlap(what: str, t_ns: np.typing.NDArray[np.int64], truth: Truth, p
         )
 
 
-def _check_objects(path: Path, pictures: LogPictures) -> int:
+def _check_objects(path: Path, pictures: LogPictures, own_cues: Sequence[str]) -> int:
     annotations = read_coco(path)
-    meanings(annotations, {})
+    meanings(annotations, {}, own_cues, any_thing=True)
     place(annotations, pictures)
     check_boxes(annotations)
     return sum(len(picture.things) for picture in annotations.pictures)
@@ -189,7 +189,7 @@ def import_annotations(
         source: COCO or CVAT.
         log_path: The log whose pictures were annotated.
         output: The truth file to write; labelled objects go beside it.
-        vehicle: Names the camera where the log has several.
+        vehicle: Names the camera where the log has several, and cues of the user's own.
         own: From label to cue, see ``meanings``.
         add: Keep everything but cues and objects of the truth file that is there.
 
@@ -198,7 +198,7 @@ def import_annotations(
         OutputError: The files cannot be written.
     """
     annotations = read_annotations(source)
-    cues = meanings(annotations, own)
+    cues = meanings(annotations, own, tuple(vehicle.cues.own))
     check_boxes(annotations)
     pictures = log_pictures(log_path, vehicle)
     placed = place(annotations, pictures)
@@ -207,10 +207,11 @@ def import_annotations(
         before = truth_file.load(output)
         kept = {"start_ns": min(before.start_ns, truth.start_ns),
                 "end_ns": max(before.end_ns, truth.end_ns), "cues": truth.cues,
+                "own_cues": truth.own_cues,
                 "objects": truth.objects, "log_sha256": truth.log_sha256}  # fmt: skip
         truth = before.model_copy(update=kept)
     objects = output.parent / OBJECTS
-    write_text(objects, strict_json(coco_tree(annotations, placed)) + "\n")
+    write_text(objects, strict_json(coco_tree(annotations, placed, cues)) + "\n")
     write_text(output, strict_json(truth.model_dump(mode="json")) + "\n")
     there: dict[str, int] = {}
     for one in truth.cues:
@@ -234,5 +235,6 @@ def _truth(
         end_ns=int(pictures.t_ns[-1]) + 1,
         source=f"annotations in {source.name}",
         cues=cue_truths(annotations, placed, cues),
+        own_cues=tuple(sorted({cue for cue in cues.values() if cue} - {*truth_file.CUES})),
         objects=OBJECTS,
     )

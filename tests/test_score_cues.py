@@ -140,6 +140,17 @@ def test_things_hidden_do_not_count_in_the_recall_of_what_can_be_seen() -> None:
     assert (score.recall.value, score.recall_seen.value) == (0.5, 1.0)
 
 
+def test_a_cue_of_ones_own_is_scored_and_told_where_nothing_looked_for_it() -> None:
+    drive = truth([span("zebra", 0, 10), span("zebra", 10, 40, present=False), span("gate", 0, 40)])
+    scores = score_cues(judge_cues(tables({"zebra": dict.fromkeys(range(5, 15), 1)}), drive))
+
+    zebra, gate = scores["zebra"], scores["gate"]
+    assert (zebra.precision.right, zebra.precision.of) == (5, 10)
+    assert zebra.reading == "object"
+    assert gate.scored == 0
+    assert gate.readings["object"].left_out["not looked for"] == 10
+
+
 def test_moments_without_a_frame_are_told() -> None:
     moment = span("stop_sign", 0, 1).model_copy(
         update={"start_ns": None, "end_ns": None, "t_ns": at(3) + 1}

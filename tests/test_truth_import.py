@@ -221,10 +221,31 @@ def test_labels_mean_what_the_user_says(
 
     assert _import(source, log, tmp_path / "t.json", "--map", "halt = stop=stop_sign", "dog=") == 0
     assert {one.cue for one in load(tmp_path / "t.json").cues} == {"stop_sign"}
+    assert cli.run(["truth", "check", str(tmp_path / "t.json"), "--log", str(log), "-q"]) == 0
     for own, said in (("cat=stop_sign", "no such label"), ("dog=sing", "no such cue"),
                       ("dog", "want LABEL=CUE")):  # fmt: skip
         assert _import(source, log, tmp_path / "u.json", "--map", own) == 2
         assert said in _refused(capsys)
+
+
+def test_a_cue_of_ones_own_is_told_as_the_vehicle_file_names_it(
+    tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tree = coco(categories=[{"id": 13, "name": "zebra crossing"}, {"id": 3, "name": "car"}])
+    source = _write(tmp_path / "coco.json", tree)
+    vehicle = tmp_path / "car.toml"
+    vehicle.write_text('version = 1\n[cues.own.zebra_crossing]\nlabels = ["zebra"]\nscore = 0.5\n')
+    path = tmp_path / "t.json"
+
+    assert _import(source, log, path) in (1, 4)
+    assert "neither a cue" in _refused(capsys)
+    assert _import(source, log, path, "--vehicle", str(vehicle)) == 0
+    truth = load(path)
+    assert truth.own_cues == ("zebra_crossing",)
+    assert {(one.cue, one.present) for one in truth.cues} == {
+        ("zebra_crossing", True), ("zebra_crossing", False)
+    }  # fmt: skip
+    assert cli.run(["truth", "check", str(path), "--log", str(log), "-q"]) == 0
 
 
 IMAGES_XML = f"""<?xml version="1.0" encoding="utf-8"?>
@@ -367,7 +388,8 @@ LATE = {"end_ns": START_NS + 10**12}
         (_truth(approaches=[_approach(0, 0.3), _approach(0.2, 0.4, 1)]), "0 and 1 overlap"),
         (_truth(**LATE, cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 10**11}]),
          "cues.0 \\(stop_sign\\)"),
-        (_truth(cues=[{"cue": "stop_sing", "present": True, "t_ns": START_NS}]), "cues.0.cue"),
+        (_truth(cues=[{"cue": "stop_sing", "present": True, "t_ns": START_NS}]), "meant: stop_s"),
+        (_truth(cues=[{"cue": "Zebra!", "present": True, "t_ns": START_NS}]), "cues.0.cue"),
         (_truth(cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 7}]),
          "at none of 1 moments"),
         (_truth(log_sha256={"a": "b"}), "by its hash"),
@@ -391,4 +413,4 @@ def test_the_schema_is_printed_and_names_every_cue(capsys: pytest.CaptureFixture
     schema = json.loads(capsys.readouterr().out)
 
     assert schema == json_schema() == Truth.model_json_schema()
-    assert tuple(schema["$defs"]["CueTruth"]["properties"]["cue"]["enum"]) == CUES
+    assert tuple(schema["$defs"]["CueTruth"]["properties"]["cue"]["examples"]) == CUES

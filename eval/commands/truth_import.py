@@ -4,7 +4,8 @@ Takes COCO (.json) and CVAT for images or video, XML 1.1 (.xml). Pictures find t
 by file name, or by the frame's number. A label that is a cue's name ("stop sign", "parked_left")
 says that the cue is there, and pictures annotated without it that it is not; --map says what other
 labels mean. Approaches are no part of such files: write them into the truth file by hand (see
-crosscue truth schema), and --add leaves them as they are.
+crosscue truth schema), and --add leaves them as they are. Cues of your own are those that the
+vehicle file has under [cues.own].
 
 examples:
   crosscue truth import coco.json --log drive.mcap -o truth.json
@@ -33,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="T.json",
                         help="the truth file, or a folder for it")  # fmt: skip
     parser.add_argument("--vehicle", type=Path, metavar="V.toml",
-                        help="names the camera where the log has several")  # fmt: skip
+                        help="names the camera of several, and cues of your own")  # fmt: skip
     parser.add_argument("--map", nargs="+", default=[], metavar="LABEL=CUE",
                         help="what labels mean; nothing after = for no cue")  # fmt: skip
     parser.add_argument("--add", action="store_true",
