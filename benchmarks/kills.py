@@ -1,0 +1,140 @@
+"""Replays killed at random moments: is a run folder ever taken for whole that is not?
+
+Run it as ``python benchmarks/kills.py [KILLS [SEED]]``. A replay of a small simulated drive, its
+detectors included, is killed (SIGKILL) after a random time; then the same command with ``--resume``
+runs to its end, and every file of the run is compared with those of a replay that nobody disturbed.
+The cache of detectors' results is kept from kill to kill in one half of the rounds and thrown away
+in the other, so that kills fall into detection as well.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from crosscue.datasets.scenes.camera import Camera
+from crosscue.datasets.scenes.drive import SceneSettings, write_scene
+from crosscue.detectors.base import Detections, Found, Frame, View
+from crosscue.eval import cli
+from crosscue.replay.errors import RunError
+from crosscue.replay.run_folder import open_run
+
+LEAST_S = 0.001
+
+
+class Bright:
+    """One box around the brightest pixel of each frame: quick, and every frame differs."""
+
+    view = View(least_width_px=64)
+    identity = "bright 1"
+
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        """A box a frame."""
+        return [self._of(frame) for frame in frames]
+
+    def _of(self, frame: Frame) -> Found:
+        grey = frame.pixels.sum(axis=2)
+        y, x = np.unravel_index(int(grey.argmax()), grey.shape)
+        box = np.array([[x, y, x + 2.0, y + 2.0]])
+        return Detections(frame.t_ns, frame.size_px, box, np.array([0.99]), ("car",), (b"",))
+
+
+def build() -> Bright:
+    """For ``--detectors``."""
+    return Bright()
+
+
+def contents(run: Path) -> dict[str, str]:
+    """From a file's name to the hash of what it holds; the manifest's times are left out."""
+    found = {}
+    for path in sorted(run.rglob("*")):
+        if path.is_file() and path.name != "manifest.json" and not path.name.startswith("."):
+            found[str(path.relative_to(run))] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
+
+
+def started(argv: list[str]) -> int:
+    """A process with everything imported already, running one command line in silence."""
+    child = os.fork()
+    if child:
+        return child
+    silent = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 1)
+    os.dup2(silent, 2)
+    os._exit(cli.run(argv))
+
+
+def ended(child: int) -> int:
+    """Its exit status; minus the signal's number if it was killed."""
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def main() -> None:
+    """Kill, resume, compare."""
+    kills = int(sys.argv[1]) if len(sys.argv) > 1 else 100
+    rng = random.Random(int(sys.argv[2]) if len(sys.argv) > 2 else 0)
+    sys.modules["kills"] = sys.modules[__name__]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        drive, run, cache = folder / "drive", folder / "run", folder / "cache.sqlite"
+        write_scene(drive, SceneSettings("C", camera=Camera(width_px=192, height_px=108)))
+        argv = [
+            "replay", str(drive / "drive.mcap"), "--vehicle", str(drive / "vehicle.toml"), "-q",
+            "--detectors", "kills:build", "--cache", str(cache), "-o", str(run),
+        ]  # fmt: skip
+        whole = folder / "whole"
+        for _ in range(2):
+            assert cli.run([*argv, "-o", str(whole), "--overwrite"]) == 0
+        right = contents(whole)
+        began = time.perf_counter()
+        assert ended(started([*argv, "-o", str(folder / "timed")])) == 0
+        usual_s = time.perf_counter() - began
+        outcomes: Counter[str] = Counter()
+        resumed_s: list[float] = []
+        for number in range(kills):
+            if number % 2:
+                for path in folder.glob("cache.sqlite*"):
+                    path.unlink()
+            child = started(argv)
+            time.sleep(rng.uniform(LEAST_S, 1.1 * usual_s))
+            os.kill(child, signal.SIGKILL)
+            outcomes["finished first" if ended(child) == 0 else "killed"] += 1
+            outcomes[after_kill(run, right)] += 1
+            began = time.perf_counter()
+            status = ended(started([*argv, "--resume"]))
+            resumed_s.append(time.perf_counter() - began)
+            same = status == 0 and contents(run) == right
+            outcomes["resumed to the same bytes" if same else "NOT THE SAME"] += 1
+            for path in sorted(run.rglob("*"), reverse=True):
+                path.unlink() if path.is_file() else path.rmdir()
+            run.rmdir()
+    print(f"simulated drive; a replay takes {usual_s:.2f} s, a resumed one "
+          f"{median(resumed_s):.2f} s (median)")  # fmt: skip
+    for outcome, times in outcomes.most_common():
+        print(f"  {outcome:<40} {times:5} of {kills}")
+
+
+def after_kill(run: Path, right: dict[str, str]) -> str:
+    """What a killed run passes for: it may be unfinished, but never wrong."""
+    try:
+        manifest = open_run(run).manifest()
+    except RunError:
+        return "left: not a run"
+    if manifest["stage"] != "estimate":
+        return "left: only detected"
+    return "left: whole" if contents(run) == right else "LEFT: TAKEN FOR WHOLE"
+
+
+if __name__ == "__main__":
+    main()
