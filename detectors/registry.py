@@ -92,7 +92,7 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
     if not colon:
         names = known({})
         close = difflib.get_close_matches(choice.kind, names, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names)}"
+        hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names)}."
         raise UsageError(f"detector {choice.kind!r}: no such name; {hint} Or give module:factory")
     try:
         build = cast("Callable[..., Detector]", getattr(import_module(module), factory))
