@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,7 @@ class RangeJudged:
         error_m: Estimate minus truth.
         var_m2: What the filter claims.
         left_out: From reason to rows that could not be judged.
+        controls: From approach id to what controls the intersection, as truth says.
     """
 
     drive: str
@@ -42,11 +43,12 @@ class RangeJudged:
     error_m: Floats
     var_m2: Floats
     left_out: dict[str, int]
+    controls: Mapping[int, str]
 
 
 @dataclass(frozen=True, slots=True)
 class RangeBin:
-    """Rows in one bin of true range."""
+    """Rows in one bin of true range, or at one kind of intersection."""
 
     rows: int
     bias_m: float
@@ -68,6 +70,8 @@ class RangeScore:
         p95_m: 95 % of errors are smaller.
         nees: With its band as if each approach were one independent error.
         by_distance: By true range.
+        by_control: By what controls the intersection. A range to the end where no light stands
+            was measured by something that is none.
     """
 
     rows: int
@@ -78,6 +82,7 @@ class RangeScore:
     p95_m: float
     nees: NeesSummary
     by_distance: dict[str, RangeBin]
+    by_control: dict[str, RangeBin]
 
 
 def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
@@ -87,6 +92,7 @@ def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
     rows = tables.ranges
     at = truth.approach_at(rows.t_ns)
     start, end = truth.ranges.at(rows.t_ns, at)
+    controls = {one.id: one.control for one in truth.truth.approaches}
     judged = []
     for reference, true_m in (("start", start), ("end", end)):
         mine = rows.reference == reference
@@ -101,7 +107,8 @@ def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
         mine, left_out = first_reasons(mine, reasons)
         judged.append(
             RangeJudged(truth.drive, reference, rows.t_ns[mine], at[mine], true_m[mine],
-                        rows.range_m[mine] - true_m[mine], rows.var_m2[mine], left_out)
+                        rows.range_m[mine] - true_m[mine], rows.var_m2[mine], left_out,
+                        controls)
         )  # fmt: skip
     return judged
 
@@ -135,7 +142,16 @@ def _score(rows: Sequence[RangeJudged], bins_m: Sequence[float], seed: int) -> R
             for name, mask in distance_bins(true_m, bins_m).items()
             if mask.any()
         },
+        by_control={
+            name: _bin(error[mask], nees[mask]) for name, mask in _by_control(rows).items()
+        },
     )
+
+
+def _by_control(rows: Sequence[RangeJudged]) -> dict[str, NDArray[np.bool_]]:
+    names = [one.controls.get(number, "") for one in rows for number in one.approach.tolist()]
+    found = np.array(names, np.str_)
+    return {name: found == name for name in sorted(set(names) - {""})}
 
 
 def _rms(error: Floats) -> float:

@@ -179,6 +179,12 @@ def _range(ranges: Mapping[str, RangeScore]) -> list[str]:
             f"{_number(one.rmse_m, 2):>6}m  {_number(one.nees.mean, 2):>9}  "
             f"{_number(inside, 0):>9} %"
         )
+        for control, part in one.by_control.items() if len(one.by_control) > 1 else ():
+            lines.append(
+                f"  {control.replace('_', ' '):12} {part.rows:6} {'':8} "
+                f"{_number(part.bias_m, 2):>6}m {_number(part.rmse_m, 2):>6}m  "
+                f"{_number(part.nees, 2):>9}  {_number(100.0 * part.share_inside_95, 0):>9} %"
+            )
     return lines
 
 

@@ -276,6 +276,19 @@ def test_range_errors_by_reference_and_what_the_filter_claims() -> None:
     assert scores["start"].by_distance["0-10"].rows == 9
 
 
+def test_ranges_are_told_apart_by_what_stands_at_the_intersection() -> None:
+    lit = truth([], [approach(control="traffic_light")], drive="lit")
+    found = tables(ranges=range_table(0, 40, 1.0, reference="end"))
+    phantom = tables(ranges=range_table(0, 20, 9.0, reference="end"))
+    score = score_range([*judge_range(found, lit), *judge_range(phantom, truth())])["end"]
+
+    assert {name: part.rows for name, part in score.by_control.items()} == {
+        "stop_sign": 20, "traffic_light": 40
+    }  # fmt: skip
+    assert score.by_control["traffic_light"].nees == pytest.approx(1.0)
+    assert score.by_control["stop_sign"].bias_m == pytest.approx(9.0)
+
+
 def test_true_ranges_hold_between_rows_but_not_far_from_any() -> None:
     ranges = true_ranges([approach()])
     times = np.array([at(10) + 50_000_000, at(39) + 50_000_000, at(39) + 600_000_000], np.int64)
