@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 
 from crosscue.replay.run_folder import RunFolder
+from crosscue.replay.vehicle import Vehicle
 
 from .intervals import Mean, mean
 from .metric_values import metric_values
@@ -33,7 +34,8 @@ from .score_tables import RunTables, run_tables
 from .score_truth import DriveTruth
 
 SHOWN: Final = ("approaches", "belief", "range")
-PASSED_OVER: Final = frozenset({"by_intersection", "by_condition", "by_distance", "failures"})
+PASSED_OVER: Final = frozenset({"by_intersection", "by_condition", "by_distance", "by_control",
+                                    "failures"})  # fmt: skip
 
 
 class EstimateWithout(Protocol):
@@ -90,15 +92,19 @@ class Attribution:
     belief: dict[str, BeliefDifference]
 
 
-def estimate_of(run: RunFolder) -> EstimateWithout:
+def estimate_of(run: RunFolder, vehicle: Vehicle | None = None) -> EstimateWithout:
     """Estimates from a run's own detections and pose; no picture is opened.
+
+    Args:
+        run: With a finished detect stage.
+        vehicle: Other settings; the run's, if left out.
 
     Raises (when called):
         RunError: No detector has looked at the run's camera.
     """
 
     def estimate(cues: frozenset[str], /) -> RunTables:
-        tables = scene_tables(run, without=cues)
+        tables = scene_tables(run, vehicle, cues)
         columns = {f"{name}_table": table for name, table in tables.items()}
         return run_tables(str(run.path), frames_table=run.table("frames", ["t_ns"]), **columns)
 

@@ -186,12 +186,14 @@ def summary(done: Sequence[Done[Outcome]], scored: StudyScores, written: StudyFi
     return "\n".join(lines)
 
 
-def _between(mean: Mapping[str, Any]) -> str:
+def _between(mean: Mapping[str, Any], digits: int = 1) -> str:
     """A difference as ``asdict`` gives it, with its interval."""
     value, low, high = mean["value"], mean["low"], mean["high"]
     if math.isnan(value):
         return "-"
-    return f"{value:+.1f}" + ("" if math.isnan(low) else f" ({low:+.1f} to {high:+.1f})")
+    if math.isnan(low):
+        return f"{value:+.{digits}f}"
+    return f"{value:+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
 
 
 def _of(some: int, of: int) -> str:

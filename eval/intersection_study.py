@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from crosscue.datasets.scenes.camera import Camera
 from crosscue.datasets.scenes.drive import SceneSettings, write_scene
@@ -26,16 +26,15 @@ from crosscue.replay.run_folder import create, open_run
 from crosscue.replay.vehicle import Vehicle, load, of_manifest
 
 from .accounts import versions
+from .attribution import Attribution, Drive, attribute, estimate_of
 from .detect_stage import choices_of
 from .estimate_stage import Outcome
 from .many_drives import Done, Engine, Job, Progress, fingerprint_of, run_many
 from .message_fit_job import Annotated, annotate, graph_of_runs
 from .replay_drive import Detecting, replay_drive
-from .scene_variants import GROUPS, scene_tables
 from .score_belief import BeliefDifference, compare_belief
-from .score_drives import DriveJudged, Scores, judge, score
+from .score_drives import Scores, judge, score
 from .score_run import RunScored, judge_run
-from .score_tables import run_tables
 
 LEAST_PLACES: Final = 3
 """Intersections, so that messages for one can be learned at two others or more."""
@@ -153,7 +152,7 @@ class StudyScores:
     Attributes:
         scored: Every drive beside its truth.
         scores: All together.
-        without: All again with each of the nine cues left out.
+        worth: What each of the nine cues was worth; empty where that was not asked.
         calibrated: All again, each intersection with messages learned at the others; None where
             there are too few.
         difference: Calibrated less source, by feature.
@@ -161,7 +160,7 @@ class StudyScores:
 
     scored: tuple[RunScored, ...]
     scores: Scores
-    without: dict[str, Scores]
+    worth: dict[str, Attribution]
     calibrated: Scores | None
     difference: dict[str, BeliefDifference]
 
@@ -177,23 +176,21 @@ def score_study(out: Path, names: Sequence[str], *, attribution: bool = True) ->
     )
     if not scored:
         raise RunError(f"{out}: not one drive is done, so there is nothing to score")
-    without = {}
+    worth = {}
     if attribution:
-        without = {
-            group: score([_variant(one, None, frozenset(cues)) for one in scored])
-            for group, cues in GROUPS.items()
-        }
+        worth = attribute([Drive(one.judged, one.truth, estimate_of(one.run)) for one in scored])
     first = [one.judged for one in scored]
     learned = calibrated_vehicles(scored)
     if learned is None:
-        return StudyScores(scored, score(first), without, None, {})
+        return StudyScores(scored, score(first), worth, None, {})
     second = [
-        _variant(one, vehicle, frozenset()) for one, vehicle in zip(scored, learned, strict=True)
+        judge(estimate_of(one.run, vehicle)(frozenset()), one.truth)
+        for one, vehicle in zip(scored, learned, strict=True)
     ]
     return StudyScores(
         scored,
         score(first),
-        without,
+        worth,
         score(second),
         compare_belief(
             [part for one in first for part in one.belief],
@@ -237,10 +234,3 @@ def _with_messages(one: RunScored, learned: Calibrated) -> Vehicle:
     vehicle = of_manifest(one.run.manifest()["settings"])
     fusion = vehicle.fusion.model_copy(update={"kind": "calibrated", "calibrated": learned})
     return vehicle.model_copy(update={"fusion": fusion})
-
-
-def _variant(one: RunScored, vehicle: Vehicle | None, without: frozenset[str]) -> DriveJudged:
-    tables: dict[str, Any] = scene_tables(one.run, vehicle, without)
-    columns = {f"{name}_table": table for name, table in tables.items()}
-    frames = one.run.table("frames", ["t_ns"])
-    return judge(run_tables(str(one.run.path), frames_table=frames, **columns), one.truth)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from .intersection_study import StudyScores
@@ -132,25 +132,25 @@ def quoted_rows(scored: StudyScores) -> list[Row]:
 
 
 def attribution_rows(scored: StudyScores) -> list[Row]:
-    """What each cue was worth: the study without it, less the study with it."""
+    """What each cue was worth; distances and log scores are compared approach by approach."""
     whole = scored.scores
     rows: list[Row] = []
-    for group, without in scored.without.items():
-        row: Row = {"cue": group}
-        if whole.approaches is not None and without.approaches is not None:
-            a, b = whole.approaches, without.approaches
-            row |= {
-                "detected": b.detected.right - a.detected.right,
-                "detected_m": b.detected_m.value - a.detected_m.value,
-                "full": b.full.right - a.full.right,
-                "full_m": b.full_m.value - a.full_m.value,
-                "false_features": b.false_features.right - a.false_features.right,
-            }
-        row["log_score"] = {
-            feature: without.belief[feature].log_score.value - score.log_score.value
-            for feature, score in whole.belief.items()
-            if feature in without.belief
+    for group, one in scored.worth.items():
+        without = one.scores
+        row: Row = {
+            "cue": group,
+            "detected_lost": one.detected_only_with,
+            "detected_gained": one.detected_only_without,
+            "detected_m": asdict(one.detected_m),
+            "full_lost": one.full_only_with,
+            "full_gained": one.full_only_without,
+            "full_m": asdict(one.full_m),
+            "log_score": {name: asdict(belief.log_score) for name, belief in one.belief.items()},
         }
+        if whole.approaches is not None and without.approaches is not None:
+            row["false_features"] = (
+                without.approaches.false_features.right - whole.approaches.false_features.right
+            )
         rows.append(row)
     return rows
 

@@ -80,8 +80,8 @@ def test_truth_told_as_detections_gives_right_cues(study: Path) -> None:
 def test_without_stop_signs_an_intersection_with_one_is_lost(study: Path) -> None:
     rows = {row["cue"]: row for row in _tables(study)["attribution"]}
 
-    assert rows["stop_sign"]["detected"] == -1
-    assert rows["lanes_past"]["detected"] == 0
+    assert rows["stop_sign"]["detected_lost"] == 1
+    assert rows["lanes_past"]["detected_lost"] == 0
 
 
 def test_a_second_start_does_nothing_again(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
