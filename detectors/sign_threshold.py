@@ -53,7 +53,13 @@ class Rates:
         return self.right / self.signs if self.signs else float("nan")
 
 
-def judge(boxes_px: Floats, scores: Floats, truth_px: Floats, least_overlap: float) -> Judged:
+def judge(
+    boxes_px: Floats,
+    scores: Floats,
+    truth_px: Floats,
+    least_overlap: float,
+    least_height_px: float = 0.0,
+) -> Judged:
     """Which detections of one frame are right: each true sign counts once, the best first.
 
     Args:
@@ -61,17 +67,21 @@ def judge(boxes_px: Floats, scores: Floats, truth_px: Floats, least_overlap: flo
         scores: Shape (N,).
         truth_px: Shape (M, 4): boxes of the true signs.
         least_overlap: Intersection over union that makes a detection right.
+        least_height_px: True signs that are lower do not count, whether they are found or not.
     """
+    heights = truth_px[:, 3] - truth_px[:, 1]
     order = np.argsort(-scores, kind="stable")
-    is_right = np.zeros(len(scores), np.bool_)
+    is_right, counts = np.zeros(len(scores), np.bool_), np.ones(len(scores), np.bool_)
     left = set(range(len(truth_px)))
     for i in order.tolist():
         shares = overlaps(boxes_px[i], truth_px) if len(truth_px) else np.empty(0)
         fits = [k for k in left if shares[k] >= least_overlap]
         if fits:
-            left.remove(max(fits, key=lambda k: float(shares[k])))
+            taken = max(fits, key=lambda k: float(shares[k]))
+            left.remove(taken)
             is_right[i] = True
-    return Judged(scores, is_right, len(truth_px))
+            counts[i] = heights[taken] >= least_height_px
+    return Judged(scores[counts], is_right[counts], int((heights >= least_height_px).sum()))
 
 
 def together(parts: list[Judged]) -> Judged:

@@ -22,8 +22,10 @@ from crosscue.detectors.sign_threshold import (
 )
 from crosscue.detectors.sign_votes import nearest, window_counts
 from crosscue.eval.cli import run
-from crosscue.replay.columns import Bytes
+from crosscue.replay.columns import Block, Bytes, Images, Messages, Topic
 from crosscue.replay.errors import VehicleError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.writing import LogWriter
 from support.data import shared
 from support.sign_scenes import clutter, scene
 
@@ -207,6 +209,83 @@ def test_several_labels_share_a_threshold_and_coco_files_serve_too(
     told = json.loads(capsys.readouterr().out)
     assert (told["chosen_on"]["signs"], told["other_frames"]["signs"]) == (4, 4)
     assert told["other_frames"]["precision"] == 1.0
+
+
+def drive(folder: Path, seeds: range) -> Path:
+    """A drive with a sign in every second picture, and its truth."""
+    folder.mkdir()
+    times = [1_700_000_000_000_000_000 + 10**8 * i for i in range(len(seeds))]
+    pictures, images, annotations = [], [], []
+    for number, (t_ns, seed) in enumerate(zip(times, seeds, strict=True)):
+        grey, (x0, y0, x1, y1) = scene("one way left", seed)
+        has_sign = number % 2 == 0
+        pictures.append(cv2.imencode(".png", grey if has_sign else clutter(seed))[1].ravel())
+        images.append({"id": number, "t_ns": t_ns, "file_name": f"{t_ns}.jpg"})
+        if has_sign:
+            annotations.append({"id": number, "image_id": number, "category_id": 101,
+                                "bbox": [x0, y0, x1 - x0, y1 - y0]})  # fmt: skip
+    edges = np.cumsum([0, *map(len, pictures)])
+    rows = Images(
+        Messages(np.concatenate(pictures), edges[:-1], edges[1:]), ("png",) * len(pictures)
+    )
+    with LogWriter(folder / "drive.mcap", Ledger("drive.mcap")) as writer:
+        writer.add_topic(Topic("/camera", "crosscue/Images", "columns"))
+        writer.write(Block("/camera", np.array(times), rows))
+    tree = {"images": images, "annotations": annotations,
+            "categories": [{"id": 101, "name": "one way left"}]}  # fmt: skip
+    (folder / "objects.json").write_text(json.dumps(tree))
+    return folder
+
+
+def test_drives_measure_a_threshold_with_an_interval_by_drive(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fitted = coco(tmp_path / "a", range(4))
+    drives = [str(drive(tmp_path / f"d{i}", range(10 * i, 10 * i + 2))) for i in range(5)]
+    left = ["--label", "one way left", "--json"]
+
+    assert run(["fit", "signs", str(fitted), "--test", *drives, *left]) == 0
+    whole = json.loads(capsys.readouterr().out)["other_frames"]
+    assert run(["fit", "signs", drives[0], "--test", *drives, *left, "--every", "2"]) == 0
+    half = json.loads(capsys.readouterr().out)
+
+    assert whole["signs"] == half["other_frames"]["signs"] == 5
+    assert half["chosen_on"]["signs"] == 1
+    low, high = whole["recall_interval_by_drive"]
+    assert 0.0 <= low <= whole["recall"] <= high <= 1.0
+
+
+def test_a_drive_without_objects_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = drive(tmp_path / "d", range(2))
+    (folder / "objects.json").unlink()
+
+    assert run(["fit", "signs", str(folder), "--label", "stop"]) == 1
+    assert "objects.json: " in capsys.readouterr().err
+
+
+def test_a_given_threshold_is_measured_not_chosen(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fitted = str(coco(tmp_path / "a", range(4)))
+
+    assert run(["fit", "signs", fitted, "--label", "one way left", "--score", "0.99"]) == 0
+
+    told = capsys.readouterr().out
+    assert "least_score = 0.990" in told
+    assert "recall    0.00 (0 of 2; " in told
+
+
+def test_signs_too_low_to_matter_are_neither_found_nor_missed() -> None:
+    truth = np.array([[0, 0, 10, 8], [50, 50, 60, 70]], np.float64)
+    boxes = np.vstack([truth, [[90, 90, 99, 99]]])
+
+    judged = judge(boxes, np.array([0.9, 0.8, 0.7]), truth, 0.4, 12.0)
+
+    assert judged.scores.tolist() == [0.8, 0.7]
+    assert judged.is_right.tolist() == [True, False]
+    assert judged.signs == 1
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"images": [], "annotations": [], "categories": []}'])
