@@ -22,6 +22,8 @@ CHANNELS: Final = 64
 MEAN: Final = (0.485, 0.456, 0.406)
 SPREAD: Final = (0.229, 0.224, 0.225)
 """Mean and standard deviation of red, green and blue, as torchvision's weights want them."""
+STRIDE: Final = 32
+"""Pictures are padded to a multiple of it, as torchvision pads them."""
 ANCHORS_PX: Final = ((6, 11), (20, 36), (64, 112), (176, 288))
 ASPECTS: Final = (0.45, 1.0, 2.6)
 """Height over width: an upright light, a sign, a car from the side."""
@@ -193,16 +195,3 @@ def forward_training(network: Any, pictures: Tensor, targets: list[dict[str, Ten
     proposals, of_proposals = network.rpn(images, features, targets)
     _, of_objects = network.roi_heads(features, proposals, images.image_sizes, targets)
     return torch.stack([*of_proposals.values(), *of_objects.values()]).sum()
-
-
-def forward_detecting(network: Any, pictures: Tensor) -> list[dict[str, Tensor]]:
-    """Boxes in the pixels given, labels, scores and masks (M, 1, 28, 28), never pasted."""
-    from torchvision.models.detection.image_list import ImageList
-
-    size = (int(pictures.shape[2]), int(pictures.shape[3]))
-    images = ImageList(pictures, [size] * len(pictures))
-    features = network.backbone(pictures)
-    proposals, _ = network.rpn(images, features)
-    found: list[dict[str, Tensor]]
-    found, _ = network.roi_heads(features, proposals, images.image_sizes)
-    return found

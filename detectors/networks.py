@@ -22,6 +22,7 @@ from crosscue.replay.errors import VehicleError
 
 from .model_card import Weights
 from .onnx_input import input_shape
+from .openvino_silent import import_openvino
 
 Array = NDArray[np.generic]
 _EXTERNAL: Final = b"\x0a\x08location"
@@ -137,8 +138,7 @@ def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
 
 
 def _in_openvino(weights: Weights, threads: int) -> Network:
-    ov: Any = import_module("openvino")
-
+    ov = import_openvino()
     core = ov.Core()
     core.set_property("CPU", {"INFERENCE_NUM_THREADS": threads})
     # Speed hints may pick half precision, and results must not depend on the processor.

@@ -25,7 +25,6 @@ from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.mask_rcnn import (
     MaskRcnnDetector,
     MaskRcnnSettings,
-    as_input,
     build,
     calibrated,
     chosen_device,
@@ -45,8 +44,10 @@ from crosscue.detectors.mask_rcnn_checkpoint import (
 )
 from crosscue.detectors.mask_rcnn_coco import coco_checkpoint
 from crosscue.detectors.mask_rcnn_network import Plan, build_network, set_limits
+from crosscue.detectors.mask_rcnn_parts import Body, Parts, as_input
 from crosscue.detectors.model_detector import overlaps
 from crosscue.detectors.registry import Choice, make
+from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import CrosscueError, VehicleError
 from support.mask_rcnn import CLASSES, CPU, noise_frame, plan_of, random_checkpoint
 from support.scenes import picture_at, world
@@ -162,26 +163,29 @@ def test_what_is_cut_off_does_not_shift_what_is_found() -> None:
 
 @dataclass
 class _Small:
-    """A network whose device holds so many pictures at a time."""
+    """A back end whose device holds so many pictures at a time."""
 
-    within: Any
+    within: Parts
     most: int
     tried: list[int] = field(default_factory=list)
 
-    def backbone(self, pictures: Tensor) -> Any:
+    def body(self, pictures: Bytes, /) -> Body:
         self.tried.append(len(pictures))
         if len(pictures) > self.most:
             raise torch.OutOfMemoryError("no memory")
-        return self.within.backbone(pictures)
+        return self.within.body(pictures)
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.within, name)
+    def boxes(self, pooled: Tensor, /) -> tuple[Tensor, Tensor]:
+        return self.within.boxes(pooled)
+
+    def masks(self, pooled: Tensor, /) -> Tensor:
+        return self.within.masks(pooled)
 
 
 def _with_memory(most: int) -> tuple[MaskRcnnDetector, _Small]:
     plenty = _detector(batch=8)
-    small = _Small(plenty.checkpoint.network, most)
-    return replace(plenty, checkpoint=replace(plenty.checkpoint, network=small)), small
+    small = _Small(plenty.parts, most)
+    return replace(plenty, parts=small), small
 
 
 def test_when_memory_runs_out_the_batch_shrinks_and_nothing_is_lost() -> None:
