@@ -1,8 +1,10 @@
 """A whole simulated drive compiled: city, decisions, car, controllers, sensors and filter.
 
 ``drive_simulator`` is the version to read; this one gives the same results number for number, up
-to rounding, a thousand times as fast, and tests hold the two equal. Three things differ in form:
+to rounding, thousands of times as fast, and tests hold the two equal. Four things differ in form:
 
+* Sixteen drives go on side by side, one step at a time, as vectors of the processor; what does not
+  happen at every step is done for each drive alone. No drive depends on its neighbours.
 * The speed in the filter's state is left out: odometry carries the pose, so speed and pose never
   share a covariance, and no result depends on it.
 * Sines and cosines of headings are turned along with the car, by the series of ``ekf.arc``, and
@@ -18,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple, TypeVar, cast, get_type_hints
+from typing import Final, NamedTuple, TypeAlias, TypeVar, cast, get_type_hints
 
 import numpy as np
 from numba import njit
@@ -42,7 +44,7 @@ from .drive_simulator import (
     Result,
 )
 from .navigation import Strategy
-from .random_stream import Stream, key_of, ziggurat
+from .random_stream import Stream, key_of
 
 Function = TypeVar("Function", bound=Callable[..., object])
 Number = TypeVar("Number", np.int64, np.float64)
@@ -68,6 +70,7 @@ FEW: Final = random_stream.FEW_TRANSITIONS
 TO_UNIT: Final = random_stream.TO_UNIT
 TAIL_FROM: Final = random_stream.TAIL_FROM
 LAYER: Final = np.uint64(random_stream.LAYERS - 1)
+EDGE, INNER = random_stream.ziggurat()
 ZERO, ONE, U11, U27, U30, U31 = (np.uint64(n) for n in (0, 1, 11, 27, 30, 31))
 CITY_KEY, PLACE_KEY, SENSOR_KEY = (
     np.uint64(stream) for stream in (CITY_STREAM, PLACE_STREAM, SENSOR_STREAM)
@@ -83,9 +86,39 @@ B1, B2, B3, B4 = -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800
 C0, C1, C2, C3, C4 = -1 / 3, 1 / 30, -1 / 840, 1 / 45360, -1 / 3991680
 D1, D2, D3, D4 = -1 / 8, 1 / 144, -1 / 5760, 1 / 403200
 PI: Final = math.pi
+LANES: Final = 16
+"""Drives side by side: twice as many as the widest vectors hold."""
+(
+    X, Y, H, C, S, V, ACCEL, BESIDE_SUM, SLOW_SUM, TRAVELLED, STEPS,
+    STREET_C, STREET_S, NODE_X, NODE_Y, BRAKES, ENTRY, NOTICE_AT,
+    IN_ARC, CENTRE_X, CENTRE_Y, RADIUS, SIDE, CURVATURE, ARC_LENGTH, ARC_M,
+    UNREAD_LEFT, UNREAD_RIGHT, SINCE, LEFT, RIGHT, COMPASS,
+    BX, BY, BH, BC, BS, XX, XY, XH, YY, YH, HH,
+    GOAL_X, GOAL_Y, START_X, START_Y, AREA,
+    FIRST_GOAL, FIRST_AXIS, GOAL_ERROR, FURTHEST, LONGEST_GAP, LAST_FIX,
+    Z_LEFT, Z_RIGHT, Z_COMPASS, RARE, DISTANCE, TURNED, BEND, SHIFT,
+    ALONG, ACROSS, ALONG_BY, ACROSS_BY, NOTABLE,
+) = range(0, 67 * LANES, LANES)  # fmt: skip
+"""Where the lanes' numbers begin: truth, path, sensors, belief, goals, what a step makes."""
+(
+    ROW, OUTCOME, WAY, NODE, TURN, ARCS, ARC, GOAL, LANDMARK_COUNT, KNOWN, OPTIONS, NOTED,
+    PASSED, DETECTED, REFUSED, DECISIONS, TURNS, GOALS,
+) = range(0, 18 * LANES, LANES)  # fmt: skip
+NOISE, NOISE_STEP, NOISE_2, NOISE_3, PLACES, PLACES_STEP = range(0, 6 * LANES, LANES)
+FLOATS, WHOLES, STATES = 67, 18, 6
+ROOM: Final = 64
+"""For places and options at first."""
+FILTERED: Final = (BX, BY, BH, XX, XY, XH, YY, YH, HH)
+TRACED_FROM: Final = (X, Y, H, V, LEFT, RIGHT, COMPASS, *FILTERED)
 STRATEGIES: Final = tuple(Strategy)
 LANDMARKS: Final = STRATEGIES.index(Strategy.LANDMARKS)
 HYBRID: Final = STRATEGIES.index(Strategy.HYBRID)
+
+
+State: TypeAlias = tuple[
+    float, float, float, float, float, float, float, float, float, float, float
+]
+"""x, y, heading, its cosine and sine; covariance xx, xy, xh, yy, yh, hh."""
 
 
 class Numbers(NamedTuple):
@@ -177,7 +210,7 @@ def drive_many(settings: settings_of.Drive, seeds: Keys) -> Floats:
         ValueError: The settings gave a city that nobody can drive in; said as ``city`` says it.
     """
     rows = np.empty((len(seeds), FIELDS))
-    drive_rows(numbers_of(settings), *ziggurat(), seeds, rows)
+    drive_rows(numbers_of(settings), seeds, rows, np.empty((0, TRACED)), np.empty((0, EVENT)))
     failed = np.flatnonzero(rows[:, 0] == NO_CITY)
     if failed.size:
         seed = int(seeds[failed[0]])
@@ -192,7 +225,7 @@ class Traced:
 
     Attributes:
         result: As ``drive_simulator.drive`` gives it.
-        steps: Shape (S, 16), as ``drive_row`` tells.
+        steps: Shape (S, 16), as ``drive_rows`` tells.
         events: Shape (E, 6), likewise.
         first_belief: x, y, heading of the filter before the first step.
     """
@@ -224,9 +257,9 @@ def drive_traced(settings: settings_of.Drive, seed: int) -> Traced:
     first = as_result(drive_many(settings, np.array([key], np.uint64))[0])
     most = 2 * (first.goals + 1) + first.landmarks + first.passed
     steps, events = np.empty((first.steps, TRACED)), np.full((most, EVENT), np.nan)
-    row = np.empty(FIELDS + 3)
-    drive_row(numbers_of(settings), *ziggurat(), key, row, steps, events)
-    begin = row[FIELDS:]
+    rows = np.empty((1, FIELDS + 3))
+    drive_rows(numbers_of(settings), np.array([key], np.uint64), rows, steps, events)
+    begin = rows[0, FIELDS:]
     return Traced(
         first, steps, events[~np.isnan(events[:, 0])],
         (float(begin[0]), float(begin[1]), float(begin[2])),
@@ -246,6 +279,11 @@ def compiled(function: Function) -> Function:
         return cast("Function", njit(cache=True, nogil=True, error_model="numpy")(function))
     except RuntimeError:  # no folder to keep compiled code in
         return cast("Function", njit(nogil=True, error_model="numpy")(function))
+
+
+def inlined(function: Function) -> Function:
+    """Part of whatever calls it, so that loops over lanes become vectors."""
+    return cast("Function", njit(forceinline=True, nogil=True, error_model="numpy")(function))
 
 
 # -- Random numbers: ``random_stream`` ------------------------------------------------------------
@@ -287,37 +325,22 @@ def _below(state: np.uint64, step: np.uint64, n: int) -> tuple[int, np.uint64]:
 
 
 @compiled
-def _normal(
-    state: np.uint64, step: np.uint64, edge: Floats, inner: Floats
-) -> tuple[float, np.uint64]:
-    state += step
-    bits = _mix(state)
-    layer = np.int64(bits & LAYER)
-    share = 2.0 * np.int64(bits >> U11) * TO_UNIT - 1.0
-    if abs(share) < inner[layer]:
-        return share * edge[layer], state
-    return _rare_normal(state, step, edge, inner, layer, share)
-
-
-@compiled
-def _rare_normal(
-    state: np.uint64, step: np.uint64, edge: Floats, inner: Floats, layer: np.int64, share: float
-) -> tuple[float, np.uint64]:
+def _normal(state: np.uint64, step: np.uint64) -> tuple[float, np.uint64]:
     while True:
-        if abs(share) < inner[layer]:
-            return share * edge[layer], state
-        if layer == 0:
-            return _tail(state, step, share < 0.0)
-        x = share * edge[layer]
-        low = math.exp(-0.5 * (edge[layer] ** 2 - x * x))
-        high = math.exp(-0.5 * (edge[layer + 1] ** 2 - x * x))
-        height, state = _uniform(state, step)
-        if high + height * (low - high) < 1.0:
-            return x, state
         state += step
         bits = _mix(state)
         layer = np.int64(bits & LAYER)
         share = 2.0 * np.int64(bits >> U11) * TO_UNIT - 1.0
+        if abs(share) < INNER[layer]:
+            return share * EDGE[layer], state
+        if layer == 0:
+            return _tail(state, step, bool(share < 0.0))
+        x = share * EDGE[layer]
+        low = math.exp(-0.5 * (EDGE[layer] ** 2 - x * x))
+        high = math.exp(-0.5 * (EDGE[layer + 1] ** 2 - x * x))
+        height, state = _uniform(state, step)
+        if high + height * (low - high) < 1.0:
+            return x, state
 
 
 @compiled
@@ -350,26 +373,46 @@ def _streets(
 
 
 @compiled
-def _reach(
-    ways: Bytes, columns: int, start: int, backward: bool, seen: NDArray[np.bool_], queue: Ints
-) -> int:
-    """Mark what can be reached (or from where); how many there are comes back."""
-    seen[:] = False
-    seen[start] = True
-    queue[0], head, count = start, 0, 1
+def _reach(roads: Bytes, columns: int, queue: Ints, count: int, seen: NDArray[np.bool_]) -> int:
+    """See what can be reached along ``roads`` from the queue's places, which then holds it all.
+
+    Without branches: a closed road leads to where one is, which was seen.
+    """
+    head = 0
     while head < count:
         node = queue[head]
         head += 1
-        for way in range(4):
-            there = node + (1, columns, -1, -columns)[way]
-            if there < 0 or there >= len(ways) or seen[there]:
-                continue
-            open_ = ways[there] >> ((way + 2) & 3) if backward else ways[node] >> way
-            if open_ & 1:
-                seen[there] = True
-                queue[count] = there
-                count += 1
+        open_ = np.int64(roads[node])
+        there = node + (open_ & 1)
+        queue[count] = there
+        count += not seen[there]
+        seen[there] = True
+        there = node + columns * ((open_ >> 1) & 1)
+        queue[count] = there
+        count += not seen[there]
+        seen[there] = True
+        there = node - ((open_ >> 2) & 1)
+        queue[count] = there
+        count += not seen[there]
+        seen[there] = True
+        there = node - columns * ((open_ >> 3) & 1)
+        queue[count] = there
+        count += not seen[there]
+        seen[there] = True
     return count
+
+
+@compiled
+def _roads_back(ways: Bytes, columns: int) -> Bytes:
+    """Of each place the ways on which one comes from there, as bits."""
+    back = np.zeros_like(ways)
+    for node in range(len(ways) - 1):
+        back[node] |= (ways[node + 1] >> 2) & 1
+        back[node + 1] |= (ways[node] & 1) << 2
+    for node in range(len(ways) - columns):
+        back[node] |= (ways[node + columns] >> 2) & 2
+        back[node + columns] |= (ways[node] & 2) << 2
+    return back
 
 
 @compiled
@@ -388,40 +431,51 @@ def _make_dead_end(ways: Bytes, columns: int, node: int, keep: int) -> None:
 
 @compiled
 def _largest_part(ways: Bytes, columns: int, queue: Ints) -> NDArray[np.bool_]:
-    either = ways.copy()
+    either = _roads_back(ways, columns)
     for node in range(len(ways)):
-        for way in range(4):
-            if (ways[node] >> way) & 1:
-                either[node + (1, columns, -1, -columns)[way]] |= np.uint8(1 << ((way + 2) & 3))
-    best, most = np.zeros(len(ways), np.bool_), 0
-    part, left = np.empty(len(ways), np.bool_), np.ones(len(ways), np.bool_)
+        either[node] |= ways[node]
+    best, seen, most = np.zeros(len(ways), np.bool_), np.zeros(len(ways), np.bool_), 0
     for start in range(len(ways)):
-        if left[start]:
-            size = _reach(either, columns, start, False, part, queue)
-            left &= ~part
+        if not seen[start]:
+            queue[0], seen[start] = start, True
+            size = _reach(either, columns, queue, 1, seen)
             if size > most:
                 most = size
-                best[:] = part
+                best = np.zeros(len(ways), np.bool_)
+                for i in range(size):
+                    best[queue[i]] = True
     return best
 
 
 @compiled
 def _open_traps(ways: Bytes, columns: int, inside: NDArray[np.bool_], queue: Ints) -> None:
-    root = int(np.argmax(inside))
-    onward, homeward = np.empty(len(ways), np.bool_), np.empty(len(ways), np.bool_)
-    while True:
-        _reach(ways, columns, root, False, onward, queue)
-        _reach(ways, columns, root, True, homeward, queue)
-        both = onward & homeward
-        if np.array_equal(both, inside):
-            return
+    """Later rounds go on from where roads were opened."""
+    root, back = int(np.argmax(inside)), _roads_back(ways, columns)
+    onward, homeward = np.zeros(len(ways), np.bool_), np.zeros(len(ways), np.bool_)
+    onward[root] = homeward[root] = True
+    home_queue = np.empty_like(queue)
+    queue[0] = home_queue[0] = root
+    ahead = behind = 1
+    while ahead or behind:
+        _reach(ways, columns, queue, ahead, onward)
+        _reach(back, columns, home_queue, behind, homeward)
+        ahead = behind = 0
         for node in range(len(ways)):
-            if not inside[node]:
+            if onward[node] & homeward[node] or not inside[node]:
                 continue
+            # Roads between what is in and what is not, both ways: this node is the end that is not.
             for way in range(4):
                 there = node + (1, columns, -1, -columns)[way]
-                if (ways[node] >> way) & 1 and both[node] != both[there]:
-                    ways[there] |= np.uint8(1 << ((way + 2) & 3))
+                mine, theirs = np.uint8(1 << way), np.uint8(1 << ((way + 2) & 3))
+                if not (ways[node] | back[node]) & mine or not onward[there] & homeward[there]:
+                    continue
+                ways[node] |= mine
+                back[node] |= mine
+                ways[there] |= theirs
+                back[there] |= theirs
+                queue[ahead] = home_queue[behind] = there
+                ahead += 1
+                behind += 1
 
 
 @compiled
@@ -441,7 +495,7 @@ def _is_city(ways: Bytes, columns: int) -> bool:
     return False
 
 
-@compiled
+@inlined
 def _make_city(
     key: np.uint64, n: Numbers
 ) -> tuple[Floats, Floats, Bytes, NDArray[np.bool_], float]:
@@ -453,16 +507,12 @@ def _make_city(
     ys, state = _streets(state, step, side_m, n)
     columns, size = len(xs), len(xs) * len(ys)
     ways = np.full(size, 15, np.uint8)
-    for node in range(size):
-        row, column = node // columns, node % columns
-        if column == columns - 1:
-            ways[node] &= 14
-        if row == len(ys) - 1:
-            ways[node] &= 13
-        if column == 0:
-            ways[node] &= 11
-        if row == 0:
-            ways[node] &= 7
+    for node in range(0, size, columns):
+        ways[node] &= 11
+        ways[node + columns - 1] &= 14
+    for column in range(columns):
+        ways[column] &= 7
+        ways[size - columns + column] &= 13
     for _ in range(int(n.dead_end_share * size)):
         node, state = _below(state, step, size)
         way, state = _below(state, step, 4)
@@ -475,7 +525,7 @@ def _make_city(
             there = node + (1, columns, -1, -columns)[way]
             if ways[there] & back:
                 ways[there] &= ~back
-    queue = np.empty(size, np.int64)
+    queue = np.empty(5 * size + 1, np.int64)
     inside = _largest_part(ways, columns, queue)
     for node in range(size):
         if not inside[node]:
@@ -519,27 +569,66 @@ def _wrap(angle: float) -> float:
     return angle - TWO_PI * math.ceil((angle - PI) / TWO_PI)
 
 
+@inlined
+def _small_arc(t: float) -> tuple[float, float, float, float]:
+    """``_arc`` of an angle below ``SERIES_RAD``."""
+    u = t * t
+    along = 1.0 + u * (A1 + u * (A2 + u * (A3 + u * A4)))
+    across = t * (0.5 + u * (B1 + u * (B2 + u * (B3 + u * B4))))
+    along_by = t * (C0 + u * (C1 + u * (C2 + u * (C3 + u * C4))))
+    across_by = 0.5 + u * (D1 + u * (D2 + u * (D3 + u * D4)))
+    return along, across, along_by, across_by
+
+
 @compiled
 def _arc(t: float) -> tuple[float, float, float, float]:
     """Per metre of an arc that turns by ``t``: along, across, and their derivatives by ``t``."""
     if abs(t) < SERIES_RAD:
-        u = t * t
-        along = 1.0 + u * (A1 + u * (A2 + u * (A3 + u * A4)))
-        across = t * (0.5 + u * (B1 + u * (B2 + u * (B3 + u * B4))))
-        along_by = t * (C0 + u * (C1 + u * (C2 + u * (C3 + u * C4))))
-        across_by = 0.5 + u * (D1 + u * (D2 + u * (D3 + u * D4)))
-        return along, across, along_by, across_by
+        return _small_arc(t)
     sine = math.sin(t)
     along, across = sine / t, 2.0 * math.sin(t / 2.0) ** 2 / t
     return along, across, (math.cos(t) - along) / t, (sine - across) / t
 
 
-@compiled
-def _turned(c: float, s: float, t: float) -> tuple[float, float]:
-    """Cosine and sine of a heading that has turned by ``t``."""
-    along, across, _, _ = _arc(t)
-    dc, ds = 1.0 - t * across, t * along
-    return c * dc - s * ds, s * dc + c * ds
+@inlined
+def _predicted(
+    state: State, gone: float, bend: float, gone_var: float, bend_var: float,
+    arc: tuple[float, float, float, float],
+) -> State:  # fmt: skip
+    """``ekf.predict_odometry`` along an arc of these values of ``_arc``."""
+    bx, by, bh, bc, bs, xx, xy, xh, yy, yh, hh = state
+    along, across, along_by, across_by = arc
+    fx, fy = bc * along - bs * across, bs * along + bc * across
+    tx = gone * (bc * along_by - bs * across_by)
+    ty = gone * (bs * along_by + bc * across_by)
+    mx, my = gone * fx, gone * fy
+    dc, ds = 1.0 - bend * across, bend * along
+    return (
+        bx + mx, by + my, _wrap(bh + bend), bc * dc - bs * ds, bs * dc + bc * ds,
+        xx + (my * (my * hh - 2.0 * xh) + fx * fx * gone_var + tx * tx * bend_var),
+        xy + (mx * xh - my * yh - mx * my * hh + fx * fy * gone_var + tx * ty * bend_var),
+        xh + (tx * bend_var - my * hh),
+        yy + (mx * (mx * hh + 2.0 * yh) + fy * fy * gone_var + ty * ty * bend_var),
+        yh + (ty * bend_var + mx * hh),
+        hh + bend_var,
+    )  # fmt: skip
+
+
+@inlined
+def _weighed(state: State, compass: float, compass_var: float) -> tuple[float, State]:
+    """``ekf.update_heading``; the change of heading, and the state after it."""
+    bx, by, bh, bc, bs, xx, xy, xh, yy, yh, hh = state
+    innovation = _wrap(compass - bh)
+    per = 1.0 / (hh + compass_var)
+    kx, ky, kh, keep = xh * per, yh * per, hh * per, compass_var * per
+    shift = kh * innovation
+    along, across, _, _ = _small_arc(shift)
+    dc, ds = 1.0 - shift * across, shift * along
+    return shift, (
+        bx + kx * innovation, by + ky * innovation, _wrap(bh + shift),
+        bc * dc - bs * ds, bs * dc + bc * ds,
+        xx - kx * xh, xy - kx * yh, xh * keep, yy - ky * yh, yh * keep, hh * keep,
+    )  # fmt: skip
 
 
 @compiled
@@ -604,7 +693,8 @@ def _landmark_ahead(
 @compiled
 def _doubled(numbers: NDArray[Number]) -> NDArray[Number]:
     larger = np.empty(2 * len(numbers), numbers.dtype)
-    larger[: len(numbers)] = numbers
+    for i in range(len(numbers)):
+        larger[i] = numbers[i]
     return larger
 
 
@@ -623,41 +713,107 @@ def _note(
     return noted + 1
 
 
-# -- The drive ------------------------------------------------------------------------------------
+# -- The drives -----------------------------------------------------------------------------------
+
+
+class Lanes(NamedTuple):
+    """As many drives side by side; see ``X`` and its like for where a lane keeps its numbers."""
+
+    f: Floats
+    k: Ints
+    u: Keys
+    arcs: Floats
+    xs: list[Floats]
+    ys: list[Floats]
+    ways: list[Bytes]
+    inside: list[NDArray[np.bool_]]
+    landmark_at: list[Ints]
+    landmarks: list[Ints]
+    is_visited: list[NDArray[np.bool_]]
+    place_x: list[Floats]
+    place_y: list[Floats]
+    place_first: list[Ints]
+    option_next: list[Ints]
+    option_h: list[Floats]
+    option_times: list[Floats]
+
+
+@inlined
+def _lanes() -> Lanes:
+    return Lanes(
+        np.zeros(FLOATS * LANES), np.full(WHOLES * LANES, -1, np.int64),
+        np.zeros(STATES * LANES, np.uint64), np.empty((LANES, 3, 5)),
+        [np.empty(0)] * LANES, [np.empty(0)] * LANES, [np.empty(0, np.uint8)] * LANES,
+        [np.empty(0, np.bool_)] * LANES, [np.empty(0, np.int64)] * LANES,
+        [np.empty(0, np.int64)] * LANES, [np.empty(0, np.bool_)] * LANES,
+        [np.empty(0)] * LANES, [np.empty(0)] * LANES,
+        [np.empty(0, np.int64)] * LANES, [np.empty(0, np.int64)] * LANES,
+        [np.empty(0)] * LANES, [np.empty(0)] * LANES,
+    )  # fmt: skip
 
 
 @compiled
-def drive_rows(n: Numbers, edge: Floats, inner: Floats, seeds: Keys, rows: Floats) -> None:
-    """Fill ``rows`` with the result of each seed's drive."""
-    none = np.empty((0, TRACED)), np.empty((0, EVENT))
-    for i in range(len(seeds)):
-        drive_row(n, edge, inner, seeds[i], rows[i], none[0], none[1])
+def drive_rows(n: Numbers, seeds: Keys, rows: Floats, trace: Floats, events: Floats) -> None:
+    """Fill ``rows`` with the result of each seed's drive, several drives at a time.
 
-
-@compiled
-def drive_row(
-    n: Numbers, edge: Floats, inner: Floats, seed: np.uint64, row: Floats, trace: Floats,
-    events: Floats,
-) -> None:  # fmt: skip
-    """Drive once; ``trace`` and ``events`` are filled as far as they go, none where they are empty.
+    A lane that is done begins the next drive, so that no lane waits for the longest.
 
     Args:
         n: Settings.
-        edge: Of ``ziggurat``.
-        inner: Likewise.
-        seed: Of this drive.
-        row: Shape (22,): its ``Result``; with three more, the filter's first x, y, heading follow.
-        trace: Shape (S, 16): true x, y, heading, speed; left and right wheel's path as read;
-            compass, NaN where none was read; then the filter's x, y, heading and their covariance
-            xx, xy, xh, yy, yh, hh.
-        events: Shape (E, 6): step, kind, x, y of goal or landmark, x, y that a landmark gave.
+        seeds: Shape (N,).
+        rows: Shape (N, 22): each drive's ``Result``; with three more columns, the filter's first x,
+            y, heading follow.
+        trace: Shape (S, 16), of the first drive: true x, y, heading, speed; left and right wheel's
+            path as read; compass, NaN where none was read; then the filter's x, y, heading and
+            their covariance xx, xy, xh, yy, yh, hh. Filled as far as it goes.
+        events: Shape (E, 6), likewise: step, kind, x, y of goal or landmark, x, y that a landmark
+            gave.
     """
+    lanes = _lanes()
+    f, k = lanes.f, lanes.k
+    none = np.empty((0, EVENT))
+    under_way, following, kept, has_room = 0, 0, 0, True
+    while True:
+        if has_room:
+            for lane in range(LANES):
+                while k[ROW + lane] < 0 and following < len(seeds):
+                    of_first = events if following == 0 else none
+                    under_way += _start(n, lanes, lane, following, seeds, rows, of_first)
+                    following += 1
+            has_room = False
+        if under_way == 0:
+            return
+        _step(n, f, lanes.u)
+        if kept < len(trace):
+            _keep(f, trace[kept])
+            kept += 1
+        for lane in range(LANES):
+            if f[NOTABLE + lane] != 0.0 and k[ROW + lane] >= 0:
+                of_first = events if k[ROW + lane] == 0 else none
+                if _attend(n, lanes, lane, of_first):
+                    _finish(n, lanes, lane, rows[k[ROW + lane]])
+                    k[ROW + lane] = -1
+                    under_way -= 1
+                    has_room = True
+
+
+@inlined
+def _start(
+    n: Numbers, lanes: Lanes, lane: int, number: int, seeds: Keys, rows: Floats, events: Floats
+) -> bool:
+    """Begin a drive in a lane; False where its city is none."""
+    f, k, u, seed, row = lanes.f, lanes.k, lanes.u, seeds[number], rows[number]
     xs, ys, ways, inside, area_km2 = _make_city(_key_of(seed, CITY_KEY), n)
     columns = len(xs)
-    row[:] = np.nan
+    for i in range(len(row)):
+        row[i] = np.nan
     if not _is_city(ways, columns):
         row[0] = NO_CITY
-        return
+        return False
+    for i in range(FLOATS):
+        f[i * LANES + lane] = 0.0
+    for i in range(WHOLES):
+        k[i * LANES + lane] = 0
     # Start, goal, landmarks.
     places = _key_of(seed, PLACE_KEY)
     places_step = _step_of(places)
@@ -665,7 +821,6 @@ def drive_row(
     way, places = _below(places, places_step, 4)
     while not (ways[start] >> way) & 1:
         way = (way + 1) & 3
-    node = start + (1, columns, -1, -columns)[way]
     landmark_at = np.full(len(ways), -1, np.int64)
     goal, places = _draw_goal(places, places_step, xs, ys, inside, start, n.goal_at_least_m)
     if n.landmark_per_goal:
@@ -684,7 +839,6 @@ def drive_row(
             while landmark_at[there] >= 0:
                 there, places = _draw_place(places, places_step, inside)
             landmark_at[there], landmarks[i] = i, there
-    is_visited = np.zeros(max(landmark_count, 1), np.bool_)
     noted = _note(events, 0, 0, GOAL_SET, xs, ys, goal, np.nan, np.nan)
     for i in range(landmark_count):
         noted = _note(events, noted, 0, LANDMARK_SET, xs, ys, landmarks[i], np.nan, np.nan)
@@ -693,358 +847,645 @@ def drive_row(
     row[4] = math.hypot(goal_x - start_x, goal_y - start_y)
     row[5] = abs(goal_x - start_x) + abs(goal_y - start_y)
     row[6], row[7] = area_km2, landmark_count
+    lanes.xs[lane], lanes.ys[lane], lanes.ways[lane], lanes.inside[lane] = xs, ys, ways, inside
+    lanes.landmark_at[lane], lanes.landmarks[lane] = landmark_at, landmarks
+    lanes.is_visited[lane] = np.zeros(max(landmark_count, 1), np.bool_)
+    lanes.place_x[lane], lanes.place_y[lane] = np.empty(ROOM), np.empty(ROOM)
+    lanes.place_first[lane] = np.empty(ROOM, np.int64)
+    lanes.option_next[lane] = np.empty(ROOM, np.int64)
+    lanes.option_h[lane], lanes.option_times[lane] = np.empty(ROOM), np.empty(ROOM)
+    k[ROW + lane], k[WAY + lane], k[TURN + lane], k[GOAL + lane] = number, way, -1, goal
+    k[NODE + lane] = start + (1, columns, -1, -columns)[way]
+    k[LANDMARK_COUNT + lane], k[NOTED + lane] = landmark_count, noted
+    u[PLACES + lane], u[PLACES_STEP + lane] = places, places_step
+    f[START_X + lane], f[START_Y + lane] = start_x, start_y
+    f[GOAL_X + lane], f[GOAL_Y + lane] = goal_x, goal_y
+    f[AREA + lane] = area_km2
+    f[FIRST_GOAL + lane] = f[FIRST_AXIS + lane] = f[GOAL_ERROR + lane] = np.nan
     # The car, and what it believes at first.
+    _face(n, lanes, lane, way)
     noise = _key_of(seed, SENSOR_KEY)
     noise_step = _step_of(noise)
     street_c, street_s = COSINES[way], SINES[way]
-    node_x, node_y = xs[node % columns], ys[node // columns]
     x = start_x + n.lane_offset_m * street_s
     y = start_y - n.lane_offset_m * street_c
-    heading, c, s, speed = HEADINGS_RAD[way], street_c, street_s, n.turn_mps
-    off, noise = _normal(noise, noise_step, edge, inner)
-    bx = x + n.start_position_sd_m * off
-    off, noise = _normal(noise, noise_step, edge, inner)
-    by = y + n.start_position_sd_m * off
-    off, noise = _normal(noise, noise_step, edge, inner)
-    bh = _wrap(heading + n.start_heading_sd_rad * off)
-    bc, bs = math.cos(bh), math.sin(bh)
+    f[X + lane], f[Y + lane], f[H + lane] = x, y, HEADINGS_RAD[way]
+    f[C + lane], f[S + lane], f[V + lane] = street_c, street_s, n.turn_mps
+    off, noise = _normal(noise, noise_step)
+    f[BX + lane] = x + n.start_position_sd_m * off
+    off, noise = _normal(noise, noise_step)
+    f[BY + lane] = y + n.start_position_sd_m * off
+    off, noise = _normal(noise, noise_step)
+    heading = _wrap(HEADINGS_RAD[way] + n.start_heading_sd_rad * off)
+    f[BH + lane], f[BC + lane], f[BS + lane] = heading, math.cos(heading), math.sin(heading)
+    u[NOISE + lane], u[NOISE_STEP + lane] = noise, noise_step
+    f[XX + lane] = f[YY + lane] = n.start_position_sd_m**2
+    f[HH + lane] = n.start_heading_sd_rad**2
     if len(row) > FIELDS:
-        row[FIELDS], row[FIELDS + 1], row[FIELDS + 2] = bx, by, bh
-    xx = yy = n.start_position_sd_m**2
-    hh = n.start_heading_sd_rad**2
-    xy = xh = yh = 0.0
-    # Path: no arc under way, no decision taken.
-    arc_x, arc_y, arc_h = np.empty(3), np.empty(3), np.empty(3)
-    arc_k, arc_length = np.empty(3), np.empty(3)
-    arcs = arc = 0
-    centre_x = centre_y = radius = side = along_m = entry_m = 0.0
-    turn = -1
-    # Where it decided before: places with a chain of options each.
-    place_x, place_y = np.empty(64), np.empty(64)
-    place_first, option_next = np.empty(64, np.int64), np.empty(64, np.int64)
-    option_h, option_times = np.empty(64), np.empty(64)
-    known = options = 0
-    beside_sum = slow_sum = accel = unread_left = unread_right = since_compass = 0.0
-    travelled_m = last_fix_m = longest_gap_m = furthest_m = 0.0
-    first_goal_m = first_goal_axis_m = goal_error_m = math.nan
-    steps = passed = detected = refused = decisions = turns = goals = 0
-    # What stays the same at every step.
-    step_s, half_track = n.step_s, 0.5 * n.track_width_m
-    per_count, per_track = 1.0 / n.encoder_step_m, 1.0 / n.track_width_m
-    per_wheelbase, per_step = 1.0 / n.wheelbase_m, 1.0 / n.step_s
-    slip_var = n.slip_per_sqrt_m**2
-    turn_var_per_m = 2.0 * slip_var / n.track_width_m**2
-    compass_var = n.compass_sd_rad**2
-    lost_16 = n.lost_above_m**2 / 16.0
-    arrive_2 = n.arrive_within_m**2
-    has_compass = n.compass_sd_rad >= 0.0
-    while True:
-        # Truth: how the car lies to its lane.
-        if arcs:
-            out_x, out_y = x - centre_x, y - centre_y
-            apart = math.sqrt(out_x * out_x + out_y * out_y)
-            beside = side * (abs(radius) - apart)
-            growth = side * (-out_y * s - out_x * c) / apart
-            curvature, wanted = 1.0 / radius, n.turn_mps
-        else:
-            beside = street_c * (y - node_y) - street_s * (x - node_x) + n.lane_offset_m
-            growth = street_c * s - street_s * c
-            curvature, wanted = 0.0, n.cruise_mps
-            if turn > 0:
-                room = street_c * (node_x - x) + street_s * (node_y - y) - entry_m
-                wanted = n.turn_mps
-                if room > 0.0:
-                    wanted = min(n.cruise_mps, math.sqrt(n.turn_mps**2 + 2.0 * n.accel_mps2 * room))
+        row[FIELDS], row[FIELDS + 1], row[FIELDS + 2] = f[BX + lane], f[BY + lane], heading
+    return True
+
+
+@inlined
+def _face(n: Numbers, lanes: Lanes, lane: int, way: int) -> None:
+    """Keep what the steps need of the street ahead."""
+    f, node, xs = lanes.f, lanes.k[NODE + lane], lanes.xs[lane]
+    f[STREET_C + lane], f[STREET_S + lane] = COSINES[way], SINES[way]
+    f[NODE_X + lane], f[NODE_Y + lane] = xs[node % len(xs)], lanes.ys[lane][node // len(xs)]
+    f[BRAKES + lane], f[ENTRY + lane], f[NOTICE_AT + lane] = 0.0, 0.0, n.decide_at_m
+
+
+# -- One step of all lanes ------------------------------------------------------------------------
+
+
+@inlined
+def _step(n: Numbers, f: Floats, u: Keys) -> None:
+    """Truth, wheels, compass and filter go on by a step; lanes with more to do become notable.
+
+    Loops over lanes hold no calls and no branches, so that the compiler makes vectors of them; what
+    is rare (normals near a layer's edge, angles too large for a series) is done again after them.
+    """
+    if _draw_normals(f, u):
+        _draw_rare_normals(f, u)
+    if _control(n, f):
+        for lane in range(LANES):
+            if abs(f[TURNED + lane]) >= SERIES_RAD:
+                f[ALONG + lane], f[ACROSS + lane], _, _ = _arc(f[TURNED + lane])
+    _move(n, f)
+    for lane in range(LANES):
+        is_read = f[COMPASS + lane] == f[COMPASS + lane]
+        u[NOISE + lane] = u[NOISE_3 + lane] if is_read else u[NOISE_2 + lane]
+    _filter(n, f)
+    _look(n, f)
+
+
+@inlined
+def _filter(n: Numbers, f: Floats) -> None:
+    """The belief after what wheels and compass told."""
+    if _odometry(n, f):
+        for lane in range(LANES):
+            if abs(f[BEND + lane]) >= SERIES_RAD:
+                arc = _arc(f[BEND + lane])
+                f[ALONG + lane], f[ACROSS + lane] = arc[0], arc[1]
+                f[ALONG_BY + lane], f[ACROSS_BY + lane] = arc[2], arc[3]
+    if _estimate(n, f):
+        for lane in range(LANES):
+            if abs(f[SHIFT + lane]) >= SERIES_RAD:
+                heading = f[BH + lane]
+                f[BC + lane], f[BS + lane] = math.cos(heading), math.sin(heading)
+
+
+@compiled
+def filter_rows(n: Numbers, first: Floats, readings: Floats, ends: Floats) -> None:
+    """The filter alone, on what 16 drives' wheels and compasses told.
+
+    Args:
+        n: Settings.
+        first: Shape (3, 16): x, y, heading before the first step.
+        readings: Shape (S, 3, 16): left and right wheel's path, compass or NaN.
+        ends: Shape (9, 16), filled: x, y, heading, covariance xx, xy, xh, yy, yh, hh.
+    """
+    f = np.zeros(FLOATS * LANES)
+    for lane in range(LANES):
+        f[BX + lane], f[BY + lane], f[BH + lane] = first[0, lane], first[1, lane], first[2, lane]
+        f[BC + lane], f[BS + lane] = math.cos(first[2, lane]), math.sin(first[2, lane])
+        f[XX + lane] = f[YY + lane] = n.start_position_sd_m**2
+        f[HH + lane] = n.start_heading_sd_rad**2
+    for reading in readings:
+        for lane in range(LANES):
+            f[LEFT + lane], f[RIGHT + lane] = reading[0, lane], reading[1, lane]
+            f[COMPASS + lane] = reading[2, lane]
+        _filter(n, f)
+    for i in range(9):
+        for lane in range(LANES):
+            ends[i, lane] = f[FILTERED[i] + lane]
+
+
+@inlined
+def _draw_normals(f: Floats, u: Keys) -> int:
+    """Three for each lane, the third in case the compass is read; is any of them a rare one?"""
+    rare = 0
+    for lane in range(LANES):
+        step = u[NOISE_STEP + lane]
+        first = u[NOISE + lane] + step
+        second = first + step
+        third = second + step
+        u[NOISE_2 + lane], u[NOISE_3 + lane] = second, third
+        bits = _mix(first)
+        layer = np.int64(bits & LAYER)
+        share = 2.0 * np.int64(bits >> U11) * TO_UNIT - 1.0
+        misses = abs(share) >= INNER[layer]
+        f[Z_LEFT + lane] = share * EDGE[layer]
+        bits = _mix(second)
+        layer = np.int64(bits & LAYER)
+        share = 2.0 * np.int64(bits >> U11) * TO_UNIT - 1.0
+        misses |= abs(share) >= INNER[layer]
+        f[Z_RIGHT + lane] = share * EDGE[layer]
+        bits = _mix(third)
+        layer = np.int64(bits & LAYER)
+        share = 2.0 * np.int64(bits >> U11) * TO_UNIT - 1.0
+        misses |= abs(share) >= INNER[layer]
+        f[Z_COMPASS + lane] = share * EDGE[layer]
+        f[RARE + lane] = 1.0 if misses else 0.0
+        rare |= misses
+    return rare
+
+
+@inlined
+def _draw_rare_normals(f: Floats, u: Keys) -> None:
+    for lane in range(LANES):
+        if f[RARE + lane] != 0.0:
+            state, step = u[NOISE + lane], u[NOISE_STEP + lane]
+            f[Z_LEFT + lane], state = _normal(state, step)
+            f[Z_RIGHT + lane], state = _normal(state, step)
+            u[NOISE_2 + lane] = state
+            f[Z_COMPASS + lane], state = _normal(state, step)
+            u[NOISE_3 + lane] = state
+
+
+@inlined
+def _control(n: Numbers, f: Floats) -> int:
+    """How the car lies to its lane, and what its controllers make of it."""
+    step_s, per_step, per_wheelbase = n.step_s, 1.0 / n.step_s, 1.0 / n.wheelbase_m
+    large = 0
+    for lane in range(LANES):
+        x, y, c, s, speed = f[X + lane], f[Y + lane], f[C + lane], f[S + lane], f[V + lane]
+        in_arc = f[IN_ARC + lane] != 0.0
+        street_c, street_s = f[STREET_C + lane], f[STREET_S + lane]
+        node_x, node_y = f[NODE_X + lane], f[NODE_Y + lane]
+        # On an arc.
+        out_x, out_y = x - f[CENTRE_X + lane], y - f[CENTRE_Y + lane]
+        apart = math.sqrt(out_x * out_x + out_y * out_y)
+        side = f[SIDE + lane]
+        arc_beside = side * (abs(f[RADIUS + lane]) - apart)
+        arc_growth = side * (-out_y * s - out_x * c) / apart
+        # Along a street.
+        beside = street_c * (y - node_y) - street_s * (x - node_x) + n.lane_offset_m
+        growth = street_c * s - street_s * c
+        room = street_c * (node_x - x) + street_s * (node_y - y) - f[ENTRY + lane]
+        brake = math.sqrt(n.turn_mps**2 + 2.0 * n.accel_mps2 * max(room, 0.0))
+        wanted = min(n.cruise_mps, brake) if room > 0.0 else n.turn_mps
+        wanted = wanted if f[BRAKES + lane] != 0.0 else n.cruise_mps
+        beside = arc_beside if in_arc else beside
+        growth = arc_growth if in_arc else growth
+        wanted = n.turn_mps if in_arc else wanted
+        curvature = f[CURVATURE + lane]
         # Controllers.
         slow = wanted - speed
-        slow_sum = min(max(slow_sum + slow * step_s, -WINDUP), WINDUP)
-        push = n.speed_p * slow + n.speed_i * slow_sum - n.speed_d * accel
+        slow_sum = min(max(f[SLOW_SUM + lane] + slow * step_s, -WINDUP), WINDUP)
+        push = n.speed_p * slow + n.speed_i * slow_sum - n.speed_d * f[ACCEL + lane]
         push = min(max(push, -BRAKE_SHARE * n.accel_mps2), n.accel_mps2)
         accel = max(push, (SLOWEST_MPS - speed) * per_step)
         steering = n.wheelbase_m * curvature - n.steering_p * beside
+        beside_sum = f[BESIDE_SUM + lane]
         steering -= n.steering_i * beside_sum + n.steering_d * growth
         steering = min(max(steering, -STEERING_LIMIT_RAD), STEERING_LIMIT_RAD)
-        # Bicycle model (eq. 5 and 6).
         distance = speed * step_s + 0.5 * accel * step_s**2
         turned = distance * steering * per_wheelbase
-        along, across, _, _ = _arc(turned)
-        x += distance * (c * along - s * across)
-        y += distance * (s * along + c * across)
+        f[SLOW_SUM + lane], f[ACCEL + lane], f[V + lane] = slow_sum, accel, speed + accel * step_s
+        f[BESIDE_SUM + lane] = min(max(beside_sum + beside * distance, -WINDUP), WINDUP)
+        arc_m = f[ARC_M + lane]
+        f[ARC_M + lane] = arc_m + distance / (1.0 - beside * curvature) if in_arc else arc_m
+        f[TRAVELLED + lane] += distance
+        f[DISTANCE + lane], f[TURNED + lane] = distance, turned
+        f[ALONG + lane], f[ACROSS + lane], _, _ = _small_arc(turned)
+        large |= abs(turned) >= SERIES_RAD
+    return large
+
+
+@inlined
+def _move(n: Numbers, f: Floats) -> None:
+    """Bicycle model (eq. 5 and 6); wheels, with slip, as their encoders tell; the compass."""
+    half_track, per_count = 0.5 * n.track_width_m, 1.0 / n.encoder_step_m
+    has_compass = n.compass_sd_rad >= 0.0
+    for lane in range(LANES):
+        c, s, distance, turned = f[C + lane], f[S + lane], f[DISTANCE + lane], f[TURNED + lane]
+        along, across = f[ALONG + lane], f[ACROSS + lane]
+        f[X + lane] += distance * (c * along - s * across)
+        f[Y + lane] += distance * (s * along + c * across)
         dc, ds = 1.0 - turned * across, turned * along
-        c, s = c * dc - s * ds, s * dc + c * ds
-        heading = _wrap(heading + turned)
-        speed += accel * step_s
-        travelled_m += distance
-        beside_sum = min(max(beside_sum + beside * distance, -WINDUP), WINDUP)
-        if arcs:
-            along_m += distance / (1.0 - beside * curvature)
-        # Wheels, with slip, as their encoders tell.
+        f[C + lane], f[S + lane] = c * dc - s * ds, s * dc + c * ds
+        heading = _wrap(f[H + lane] + turned)
+        f[H + lane] = heading
         half = half_track * turned
         path = distance - half
-        off, noise = _normal(noise, noise_step, edge, inner)
-        unread_left += path + n.slip_per_sqrt_m * math.sqrt(abs(path)) * off
-        left = np.floor(unread_left * per_count + 0.5) * n.encoder_step_m
-        unread_left -= left
+        slip = n.slip_per_sqrt_m * math.sqrt(abs(path)) * f[Z_LEFT + lane]
+        unread = f[UNREAD_LEFT + lane] + (path + slip)
+        left = np.floor(unread * per_count + 0.5) * n.encoder_step_m
+        f[UNREAD_LEFT + lane], f[LEFT + lane] = unread - left, left
         path = distance + half
-        off, noise = _normal(noise, noise_step, edge, inner)
-        unread_right += path + n.slip_per_sqrt_m * math.sqrt(abs(path)) * off
-        right = np.floor(unread_right * per_count + 0.5) * n.encoder_step_m
-        unread_right -= right
-        # Estimate: along the arc that odometry tells.
-        gone, bend = 0.5 * (left + right), (right - left) * per_track
-        gone_var, bend_var = 0.5 * slip_var * abs(gone), turn_var_per_m * abs(gone)
-        along, across, along_by, across_by = _arc(bend)
-        fx, fy = bc * along - bs * across, bs * along + bc * across
-        tx = gone * (bc * along_by - bs * across_by)
-        ty = gone * (bs * along_by + bc * across_by)
-        mx, my = gone * fx, gone * fy
-        bx, by, bh = bx + mx, by + my, _wrap(bh + bend)
-        dc, ds = 1.0 - bend * across, bend * along
-        bc, bs = bc * dc - bs * ds, bs * dc + bc * ds
-        xx += my * (my * hh - 2.0 * xh) + fx * fx * gone_var + tx * tx * bend_var
-        xy += mx * xh - my * yh - mx * my * hh + fx * fy * gone_var + tx * ty * bend_var
-        yy += mx * (mx * hh + 2.0 * yh) + fy * fy * gone_var + ty * ty * bend_var
-        xh += tx * bend_var - my * hh
-        yh += ty * bend_var + mx * hh
-        hh += bend_var
-        steps += 1
-        compass = np.nan
-        if has_compass:
-            since_compass += abs(gone)
-            if since_compass >= n.compass_interval_m:
-                since_compass -= n.compass_interval_m
-                off, noise = _normal(noise, noise_step, edge, inner)
-                compass = _wrap(heading + n.compass_sd_rad * off)
-                innovation = _wrap(compass - bh)
-                per = 1.0 / (hh + compass_var)
-                kx, ky, kh = xh * per, yh * per, hh * per
-                shift = kh * innovation
-                bx, by = bx + kx * innovation, by + ky * innovation
-                bh = _wrap(bh + shift)
-                bc, bs = _turned(bc, bs, shift)
-                xx -= kx * xh
-                xy -= kx * yh
-                yy -= ky * yh
-                keep = compass_var * per
-                xh, yh, hh = xh * keep, yh * keep, hh * keep
-        if steps <= len(trace):
-            kept = trace[steps - 1]
-            kept[0], kept[1], kept[2], kept[3] = x, y, heading, speed
-            kept[4], kept[5], kept[6] = left, right, compass
-            kept[7], kept[8], kept[9] = bx, by, bh
-            kept[10], kept[11], kept[12], kept[13], kept[14], kept[15] = xx, xy, xh, yy, yh, hh
-        # How does it end? Ellipse's full major axis = 4 sqrt(half sum + radius).
+        slip = n.slip_per_sqrt_m * math.sqrt(abs(path)) * f[Z_RIGHT + lane]
+        unread = f[UNREAD_RIGHT + lane] + (path + slip)
+        right = np.floor(unread * per_count + 0.5) * n.encoder_step_m
+        f[UNREAD_RIGHT + lane], f[RIGHT + lane] = unread - right, right
+        since = f[SINCE + lane] + abs(0.5 * (left + right))
+        is_read = has_compass & (since >= n.compass_interval_m)
+        f[SINCE + lane] = since - n.compass_interval_m if is_read else since
+        compass = _wrap(heading + n.compass_sd_rad * f[Z_COMPASS + lane])
+        f[COMPASS + lane] = compass if is_read else np.nan
+
+
+@inlined
+def _odometry(n: Numbers, f: Floats) -> int:
+    """The arc that the wheels tell; does any turn too much for the series?"""
+    per_track = 1.0 / n.track_width_m
+    large = 0
+    for lane in range(LANES):
+        bend = (f[RIGHT + lane] - f[LEFT + lane]) * per_track
+        f[BEND + lane] = bend
+        along, across, along_by, across_by = _small_arc(bend)
+        f[ALONG + lane], f[ACROSS + lane] = along, across
+        f[ALONG_BY + lane], f[ACROSS_BY + lane] = along_by, across_by
+        large |= abs(bend) >= SERIES_RAD
+    return large
+
+
+@inlined
+def _estimate(n: Numbers, f: Floats) -> int:
+    """Follow that arc; weigh in the compass where it is read. Did any heading shift too much?"""
+    slip_var = n.slip_per_sqrt_m**2
+    turn_var_per_m = 2.0 * slip_var / n.track_width_m**2
+    compass_var = n.compass_sd_rad**2
+    large = 0
+    for lane in range(LANES):
+        gone, bend = 0.5 * (f[LEFT + lane] + f[RIGHT + lane]), f[BEND + lane]
+        way = abs(gone)
+        state = _predicted(
+            (f[BX + lane], f[BY + lane], f[BH + lane], f[BC + lane], f[BS + lane], f[XX + lane],
+             f[XY + lane], f[XH + lane], f[YY + lane], f[YH + lane], f[HH + lane]),
+            gone, bend, 0.5 * slip_var * way, turn_var_per_m * way,
+            (f[ALONG + lane], f[ACROSS + lane], f[ALONG_BY + lane], f[ACROSS_BY + lane]),
+        )  # fmt: skip
+        compass = f[COMPASS + lane]
+        is_read = compass == compass
+        shift, weighed = _weighed(state, compass, compass_var)
+        f[SHIFT + lane] = shift if is_read else 0.0
+        large |= is_read & (abs(shift) >= SERIES_RAD)
+        f[BX + lane] = weighed[0] if is_read else state[0]
+        f[BY + lane] = weighed[1] if is_read else state[1]
+        f[BH + lane] = weighed[2] if is_read else state[2]
+        f[BC + lane] = weighed[3] if is_read else state[3]
+        f[BS + lane] = weighed[4] if is_read else state[4]
+        f[XX + lane] = weighed[5] if is_read else state[5]
+        f[XY + lane] = weighed[6] if is_read else state[6]
+        f[XH + lane] = weighed[7] if is_read else state[7]
+        f[YY + lane] = weighed[8] if is_read else state[8]
+        f[YH + lane] = weighed[9] if is_read else state[9]
+        f[HH + lane] = weighed[10] if is_read else state[10]
+    return large
+
+
+@inlined
+def _look(n: Numbers, f: Floats) -> None:
+    """Is there more to do than to go on?"""
+    lost_16, arrive_2 = n.lost_above_m**2 / 16.0, n.arrive_within_m**2
+    for lane in range(LANES):
+        steps = f[STEPS + lane] + 1.0
+        f[STEPS + lane] = steps
+        xx, xy, yy = f[XX + lane], f[XY + lane], f[YY + lane]
         half_sum, half_gap = 0.5 * (xx + yy), 0.5 * (xx - yy)
         room = lost_16 - half_sum
-        if room < 0.0 or half_gap * half_gap + xy * xy > room * room:
-            outcome = LOST
-            break
-        away_2 = (bx - goal_x) ** 2 + (by - goal_y) ** 2
-        if away_2 <= max(arrive_2, 8.0 * half_sum):
-            within_2 = 4.0 * (half_sum + math.sqrt(half_gap * half_gap + xy * xy))
-            if away_2 <= max(arrive_2, within_2):
-                goals += 1
-                goal_error_m = math.hypot(x - goal_x, y - goal_y)
-                furthest_m = max(furthest_m, math.hypot(goal_x - start_x, goal_y - start_y))
-                if goals == 1:
-                    first_goal_m, first_goal_axis_m = travelled_m, 2.0 * math.sqrt(within_2)
-                if goals == n.goals:
-                    outcome = REACHED
-                    break
-                goal, places = _draw_goal(
-                    places, places_step, xs, ys, inside, node, n.goal_at_least_m
-                )
-                goal_x, goal_y = xs[goal % columns], ys[goal // columns]
-                noted = _note(events, noted, steps, GOAL_SET, xs, ys, goal, np.nan, np.nan)
-                if n.landmark_per_goal:
-                    if landmark_count:
-                        landmark_at[landmarks[0]] = -1
-                    share, places = _uniform(places, places_step)
-                    landmark_count = 1 if share < n.landmarks_per_km2 * area_km2 else 0
-                    if landmark_count:
-                        landmarks[0], places = _draw_place(places, places_step, inside)
-                        landmark_at[landmarks[0]] = 0
-                        is_visited[0] = False
-                        noted = _note(
-                            events, noted, steps, LANDMARK_SET, xs, ys, landmarks[0], np.nan, np.nan
-                        )
-        if travelled_m > n.longest_m or steps * step_s > n.longest_s:
-            outcome = GIVEN_UP
-            break
-        # Path.
-        if arcs:
-            if along_m < arc_length[arc]:
-                continue
-            along_m -= arc_length[arc]
-            arc += 1
-            if arc == arcs:
-                arcs, along_m = 0, 0.0
-                continue
-        else:
-            remaining = street_c * (node_x - x) + street_s * (node_y - y)
-            if turn < 0 and remaining <= n.decide_at_m:
-                c, s = math.cos(heading), math.sin(heading)
-                bc, bs = math.cos(bh), math.sin(bh)
-                at_x, at_y = bx + remaining * bc, by + remaining * bs
-                # Goal, or the landmark sought on the way to it.
-                target_x, target_y = goal_x, goal_y
-                axis_4 = half_sum + math.sqrt(half_gap * half_gap + xy * xy)
-                seeks = n.strategy == LANDMARKS or (
-                    n.strategy == HYBRID and 4.0 * math.sqrt(axis_4) > n.hybrid_above_m
-                )
-                while seeks:
-                    found = _landmark_ahead(
-                        at_x, at_y, goal_x, goal_y, xs, ys, landmarks, landmark_count, is_visited
-                    )
-                    if found < 0:
-                        break
-                    lx, ly = xs[landmarks[found] % columns], ys[landmarks[found] // columns]
-                    if (lx - at_x) ** 2 + (ly - at_y) ** 2 > max(arrive_2, 4.0 * axis_4):
-                        target_x, target_y = lx, ly
-                        break
-                    is_visited[found] = True
-                # Eq. 4.
-                place = _recognised(place_x, place_y, known, at_x, at_y, n.recognise_within_m)
-                turn, least, chosen_h = 2, np.inf, _wrap(bh + QUARTER_TURNS[2])
-                for quarter in (0, 1, 3):
-                    if not (ways[node] >> ((way + quarter) & 3)) & 1:
-                        continue
-                    after = _wrap(bh + QUARTER_TURNS[quarter])
-                    bearing = math.atan2(
-                        target_y - (at_y + n.after_m * math.sin(after)),
-                        target_x - (at_x + n.after_m * math.cos(after)),
-                    )
-                    cost = abs(_wrap(after - bearing))
-                    if place >= 0:
-                        option = _option(
-                            place, place_first, option_next, option_h, after, n.same_option_rad
-                        )
-                        if option >= 0:
-                            cost += n.penalty_rad * option_times[option]
-                    if cost < least:
-                        turn, least, chosen_h = quarter, cost, after
-                # Remember.
-                if place < 0:
-                    if known == len(place_x):
-                        place_x, place_y = _doubled(place_x), _doubled(place_y)
-                        place_first = _doubled(place_first)
-                    place, place_x[known], place_y[known] = known, at_x, at_y
-                    place_first[known] = -1
-                    known += 1
-                option = _option(
-                    place, place_first, option_next, option_h, chosen_h, n.same_option_rad
-                )
-                if option < 0:
-                    if options == len(option_h):
-                        option_h, option_times = _doubled(option_h), _doubled(option_times)
-                        option_next = _doubled(option_next)
-                    option_h[options], option_times[options] = chosen_h, 1.0
-                    # New ones last: of options equally near, the first remembered counts.
-                    option_next[options] = -1
-                    if place_first[place] < 0:
-                        place_first[place] = options
-                    else:
-                        last = place_first[place]
-                        while option_next[last] >= 0:
-                            last = option_next[last]
-                        option_next[last] = options
-                    options += 1
-                else:
-                    option_times[option] += 1.0
-                decisions += 1
-                turns += turn != 0
-                entry_m = 0.0
-                if turn == 1:
-                    entry_m = n.left_radius_m - n.lane_offset_m
-                elif turn == 3:
-                    entry_m = n.right_radius_m + n.lane_offset_m
-            if turn < 0 or remaining > entry_m:
-                continue
-            # Enter the intersection; perhaps a landmark is recognised there.
-            if landmark_at[node] >= 0:
-                passed += 1
-                share, noise = _uniform(noise, noise_step)
-                if share >= n.detection_rate:
-                    noted = _note(
-                        events, noted, steps, LANDMARK_MISSED, xs, ys, node, np.nan, np.nan
-                    )
-                else:
-                    off, noise = _normal(noise, noise_step, edge, inner)
-                    seen_x = x + n.landmark_sd_m * off
-                    off, noise = _normal(noise, noise_step, edge, inner)
-                    seen_y = y + n.landmark_sd_m * off
-                    ix, iy = seen_x - bx, seen_y - by
-                    is_visited[landmark_at[node]] = True
-                    sxx, syy = xx + n.landmark_sd_m**2, yy + n.landmark_sd_m**2
-                    per = 1.0 / (sxx * syy - xy * xy)
-                    wx, wy = (syy * ix - xy * iy) * per, (sxx * iy - xy * ix) * per
-                    if ix * wx + iy * wy > n.landmark_gate_nis:
-                        refused += 1
-                        noted = _note(
-                            events, noted, steps, LANDMARK_REFUSED, xs, ys, node, seen_x, seen_y
-                        )
-                    else:
-                        detected += 1
-                        noted = _note(
-                            events, noted, steps, LANDMARK_TAKEN, xs, ys, node, seen_x, seen_y
-                        )
-                        longest_gap_m = max(longest_gap_m, travelled_m - last_fix_m)
-                        last_fix_m = travelled_m
-                        bx, by = bx + xx * wx + xy * wy, by + xy * wx + yy * wy
-                        bh = _wrap(bh + xh * wx + yh * wy)
-                        bc, bs = math.cos(bh), math.sin(bh)
-                        # P - P H' S^-1 H P, entry by entry.
-                        axx, axy = (syy * xx - xy * xy) * per, (sxx * xy - xy * xx) * per
-                        ayx, ayy = (syy * xy - xy * yy) * per, (sxx * yy - xy * xy) * per
-                        ahx, ahy = (syy * xh - xy * yh) * per, (sxx * yh - xy * xh) * per
-                        xx, xy, xh, yy, yh, hh = (
-                            xx - axx * xx - axy * xy, xy - axx * xy - axy * yy,
-                            xh - axx * xh - axy * yh, yy - ayx * xy - ayy * yy,
-                            yh - ayx * xh - ayy * yh, hh - ahx * xh - ahy * yh,
-                        )  # fmt: skip
-            arc, arcs, along_m = 0, 0, 0.0
-            if turn:
-                at_x = node_x - street_c * entry_m + street_s * n.lane_offset_m
-                at_y = node_y - street_s * entry_m - street_c * n.lane_offset_m
-                at_h = HEADINGS_RAD[way]
-                if turn == 2:
-                    # Out of the lane to the right, round to the left, and into the lane back.
-                    swing = math.acos(
-                        (n.lane_offset_m + n.right_radius_m) / (2.0 * n.right_radius_m)
-                    )
-                    for i in range(3):
-                        arc_k[i] = (1.0 if i == 1 else -1.0) / n.right_radius_m
-                        angle = PI + 2.0 * swing if i == 1 else swing
-                        arc_x[i], arc_y[i], arc_h[i] = at_x, at_y, at_h
-                        arc_length[i] = n.right_radius_m * angle
-                        bent = angle if i == 1 else -angle
-                        along, across, _, _ = _arc(bent)
-                        dx, dy = arc_length[i] * along, arc_length[i] * across
-                        at_c, at_s = math.cos(at_h), math.sin(at_h)
-                        at_x, at_y = at_x + at_c * dx - at_s * dy, at_y + at_s * dx + at_c * dy
-                        at_h += bent
-                    arcs = 3
-                else:
-                    arc_k[0] = 1.0 / n.left_radius_m if turn == 1 else -1.0 / n.right_radius_m
-                    arc_x[0], arc_y[0], arc_h[0] = at_x, at_y, at_h
-                    arc_length[0] = abs(1.0 / arc_k[0]) * PI / 2.0
-                    arcs = 1
-            way = (way + turn) & 3
-            node += (1, columns, -1, -columns)[way]
-            turn = -1
-            street_c, street_s = COSINES[way], SINES[way]
-            node_x, node_y = xs[node % columns], ys[node // columns]
-            if not arcs:
-                continue
-        radius = 1.0 / arc_k[arc]
-        side = 1.0 if radius > 0.0 else -1.0
-        centre_x = arc_x[arc] - radius * math.sin(arc_h[arc])
-        centre_y = arc_y[arc] + radius * math.cos(arc_h[arc])
-    ex, ey, eh = bx - x, by - y, _wrap(bh - heading)
-    row[0], row[1], row[2], row[3] = outcome, travelled_m, steps * step_s, steps
-    row[8], row[9], row[10], row[11], row[12] = passed, detected, refused, decisions, turns
-    row[13], row[14], row[15] = goals, first_goal_m, first_goal_axis_m
+        is_lost = (room < 0.0) | (half_gap * half_gap + xy * xy > room * room)
+        to_x, to_y = f[BX + lane] - f[GOAL_X + lane], f[BY + lane] - f[GOAL_Y + lane]
+        is_near = to_x * to_x + to_y * to_y <= max(arrive_2, 8.0 * half_sum)
+        is_over = (f[TRAVELLED + lane] > n.longest_m) | (steps * n.step_s > n.longest_s)
+        remaining = f[STREET_C + lane] * (f[NODE_X + lane] - f[X + lane]) + f[STREET_S + lane] * (
+            f[NODE_Y + lane] - f[Y + lane]
+        )
+        is_there = (
+            f[ARC_M + lane] >= f[ARC_LENGTH + lane]
+            if f[IN_ARC + lane] != 0.0
+            else remaining <= f[NOTICE_AT + lane]
+        )
+        f[NOTABLE + lane] = 1.0 if is_lost | is_near | is_over | is_there else 0.0
+
+
+@compiled
+def _keep(f: Floats, kept: Floats) -> None:
+    for i in range(TRACED):
+        kept[i] = f[TRACED_FROM[i]]
+
+
+# -- What is not of every step --------------------------------------------------------------------
+
+
+@inlined
+def _attend(n: Numbers, lanes: Lanes, lane: int, events: Floats) -> bool:
+    """Ends, goals and intersections; True when the drive is over."""
+    f, k = lanes.f, lanes.k
+    xx, xy, yy = f[XX + lane], f[XY + lane], f[YY + lane]
+    half_sum, half_gap = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    # Ellipse's full major axis = 4 sqrt(half sum + radius).
+    room = n.lost_above_m**2 / 16.0 - half_sum
+    if room < 0.0 or half_gap * half_gap + xy * xy > room * room:
+        k[OUTCOME + lane] = LOST
+        return True
+    away_2 = (f[BX + lane] - f[GOAL_X + lane]) ** 2 + (f[BY + lane] - f[GOAL_Y + lane]) ** 2
+    within_2 = 4.0 * (half_sum + math.sqrt(half_gap * half_gap + xy * xy))
+    if away_2 <= max(n.arrive_within_m**2, within_2):
+        _arrive(n, lanes, lane, 2.0 * math.sqrt(within_2), events)
+        if k[GOALS + lane] == n.goals:
+            k[OUTCOME + lane] = REACHED
+            return True
+    if f[TRAVELLED + lane] > n.longest_m or f[STEPS + lane] * n.step_s > n.longest_s:
+        k[OUTCOME + lane] = GIVEN_UP
+        return True
+    if f[IN_ARC + lane] != 0.0:
+        if f[ARC_M + lane] >= f[ARC_LENGTH + lane]:
+            _follow_arcs(lanes, lane, f[ARC_M + lane] - f[ARC_LENGTH + lane], k[ARC + lane] + 1)
+        return False
+    remaining = f[STREET_C + lane] * (f[NODE_X + lane] - f[X + lane]) + f[STREET_S + lane] * (
+        f[NODE_Y + lane] - f[Y + lane]
+    )
+    if k[TURN + lane] < 0 and remaining <= n.decide_at_m:
+        _decide(n, lanes, lane, remaining, within_2)
+    if k[TURN + lane] >= 0 and remaining <= f[ENTRY + lane]:
+        node = k[NODE + lane]
+        if lanes.landmark_at[lane][node] >= 0:
+            _pass_landmark(n, lanes, lane, node, events)
+        _enter(n, lanes, lane)
+    return False
+
+
+@inlined
+def _arrive(n: Numbers, lanes: Lanes, lane: int, axis_m: float, events: Floats) -> None:
+    """The car believes to be at its goal: perhaps a new one is drawn."""
+    f, k, u = lanes.f, lanes.k, lanes.u
+    goal_x, goal_y = f[GOAL_X + lane], f[GOAL_Y + lane]
+    k[GOALS + lane] += 1
+    f[GOAL_ERROR + lane] = math.hypot(f[X + lane] - goal_x, f[Y + lane] - goal_y)
+    f[FURTHEST + lane] = max(
+        f[FURTHEST + lane], math.hypot(goal_x - f[START_X + lane], goal_y - f[START_Y + lane])
+    )
+    if k[GOALS + lane] == 1:
+        f[FIRST_GOAL + lane], f[FIRST_AXIS + lane] = f[TRAVELLED + lane], axis_m
+    if k[GOALS + lane] == n.goals:
+        return
+    xs, ys, inside = lanes.xs[lane], lanes.ys[lane], lanes.inside[lane]
+    places, step = u[PLACES + lane], u[PLACES_STEP + lane]
+    goal, places = _draw_goal(places, step, xs, ys, inside, k[NODE + lane], n.goal_at_least_m)
+    k[GOAL + lane] = goal
+    f[GOAL_X + lane], f[GOAL_Y + lane] = xs[goal % len(xs)], ys[goal // len(xs)]
+    steps, noted = int(f[STEPS + lane]), k[NOTED + lane]
+    noted = _note(events, noted, steps, GOAL_SET, xs, ys, goal, np.nan, np.nan)
+    if n.landmark_per_goal:
+        landmarks, landmark_at = lanes.landmarks[lane], lanes.landmark_at[lane]
+        if k[LANDMARK_COUNT + lane]:
+            landmark_at[landmarks[0]] = -1
+        share, places = _uniform(places, step)
+        area_km2 = f[AREA + lane]
+        k[LANDMARK_COUNT + lane] = 1 if share < n.landmarks_per_km2 * area_km2 else 0
+        if k[LANDMARK_COUNT + lane]:
+            landmarks[0], places = _draw_place(places, step, inside)
+            landmark_at[landmarks[0]] = 0
+            lanes.is_visited[lane][0] = False
+            noted = _note(events, noted, steps, LANDMARK_SET, xs, ys, landmarks[0], np.nan, np.nan)
+    k[NOTED + lane], u[PLACES + lane] = noted, places
+
+
+@inlined
+def _follow_arcs(lanes: Lanes, lane: int, along_m: float, arc: int) -> None:
+    """Begin an arc of the turn, or leave it after the last."""
+    f, k = lanes.f, lanes.k
+    k[ARC + lane] = arc
+    if arc == k[ARCS + lane]:
+        k[ARCS + lane] = 0
+        f[ARC_M + lane] = f[IN_ARC + lane] = f[CURVATURE + lane] = 0.0
+        return
+    x, y, heading, curvature, length = lanes.arcs[lane, arc]
+    radius = 1.0 / curvature
+    f[ARC_M + lane], f[IN_ARC + lane], f[ARC_LENGTH + lane] = along_m, 1.0, length
+    f[RADIUS + lane], f[CURVATURE + lane] = radius, 1.0 / radius
+    f[SIDE + lane] = 1.0 if radius > 0.0 else -1.0
+    f[CENTRE_X + lane] = x - radius * math.sin(heading)
+    f[CENTRE_Y + lane] = y + radius * math.cos(heading)
+
+
+@inlined
+def _target(
+    n: Numbers, lanes: Lanes, lane: int, at_x: float, at_y: float, within_2: float
+) -> tuple[float, float]:
+    """The goal, or the landmark sought on the way to it."""
+    f = lanes.f
+    goal_x, goal_y = f[GOAL_X + lane], f[GOAL_Y + lane]
+    if n.strategy != LANDMARKS and (
+        n.strategy != HYBRID or 2.0 * math.sqrt(within_2) <= n.hybrid_above_m
+    ):
+        return goal_x, goal_y
+    xs, ys, landmarks = lanes.xs[lane], lanes.ys[lane], lanes.landmarks[lane]
+    is_visited, count = lanes.is_visited[lane], lanes.k[LANDMARK_COUNT + lane]
+    while True:
+        found = _landmark_ahead(at_x, at_y, goal_x, goal_y, xs, ys, landmarks, count, is_visited)
+        if found < 0:
+            return goal_x, goal_y
+        lx, ly = xs[landmarks[found] % len(xs)], ys[landmarks[found] // len(xs)]
+        if (lx - at_x) ** 2 + (ly - at_y) ** 2 > max(n.arrive_within_m**2, within_2):
+            return lx, ly
+        is_visited[found] = True
+
+
+@inlined
+def _decide(n: Numbers, lanes: Lanes, lane: int, remaining: float, within_2: float) -> None:
+    """Eq. 4 at the intersection ahead."""
+    f, k = lanes.f, lanes.k
+    heading, bh, way = f[H + lane], f[BH + lane], k[WAY + lane]
+    f[C + lane], f[S + lane] = math.cos(heading), math.sin(heading)
+    f[BC + lane], f[BS + lane] = math.cos(bh), math.sin(bh)
+    at_x, at_y = f[BX + lane] + remaining * f[BC + lane], f[BY + lane] + remaining * f[BS + lane]
+    target_x, target_y = _target(n, lanes, lane, at_x, at_y, within_2)
+    place = _recognised(
+        lanes.place_x[lane], lanes.place_y[lane], k[KNOWN + lane], at_x, at_y, n.recognise_within_m
+    )
+    turn, least, chosen_h = 2, np.inf, _wrap(bh + QUARTER_TURNS[2])
+    roads = lanes.ways[lane][k[NODE + lane]]
+    for quarter in (0, 1, 3):
+        if not (roads >> ((way + quarter) & 3)) & 1:
+            continue
+        after = _wrap(bh + QUARTER_TURNS[quarter])
+        bearing = math.atan2(
+            target_y - (at_y + n.after_m * math.sin(after)),
+            target_x - (at_x + n.after_m * math.cos(after)),
+        )
+        cost = abs(_wrap(after - bearing))
+        if place >= 0:
+            option = _option(
+                place, lanes.place_first[lane], lanes.option_next[lane], lanes.option_h[lane],
+                after, n.same_option_rad,
+            )  # fmt: skip
+            if option >= 0:
+                cost += n.penalty_rad * lanes.option_times[lane][option]
+        if cost < least:
+            turn, least, chosen_h = quarter, cost, after
+    _remember(n, lanes, lane, place, at_x, at_y, chosen_h)
+    k[TURN + lane] = turn
+    k[DECISIONS + lane] += 1
+    k[TURNS + lane] += turn != 0
+    entry_m = 0.0
+    if turn == 1:
+        entry_m = n.left_radius_m - n.lane_offset_m
+    elif turn == 3:
+        entry_m = n.right_radius_m + n.lane_offset_m
+    f[ENTRY + lane] = f[NOTICE_AT + lane] = entry_m
+    f[BRAKES + lane] = 1.0 if turn > 0 else 0.0
+
+
+@inlined
+def _remember(
+    n: Numbers, lanes: Lanes, lane: int, place: int, at_x: float, at_y: float, heading: float
+) -> None:
+    """Places where it decided before hold a chain of options each."""
+    k, known, options = lanes.k, lanes.k[KNOWN + lane], lanes.k[OPTIONS + lane]
+    if place < 0:
+        if known == len(lanes.place_x[lane]):
+            lanes.place_x[lane] = _doubled(lanes.place_x[lane])
+            lanes.place_y[lane] = _doubled(lanes.place_y[lane])
+            lanes.place_first[lane] = _doubled(lanes.place_first[lane])
+        place = known
+        lanes.place_x[lane][place], lanes.place_y[lane][place] = at_x, at_y
+        lanes.place_first[lane][place] = -1
+        k[KNOWN + lane] = known + 1
+    first = lanes.place_first[lane]
+    option = _option(
+        place, first, lanes.option_next[lane], lanes.option_h[lane], heading, n.same_option_rad
+    )
+    if option >= 0:
+        lanes.option_times[lane][option] += 1.0
+        return
+    if options == len(lanes.option_h[lane]):
+        lanes.option_h[lane] = _doubled(lanes.option_h[lane])
+        lanes.option_times[lane] = _doubled(lanes.option_times[lane])
+        lanes.option_next[lane] = _doubled(lanes.option_next[lane])
+    following = lanes.option_next[lane]
+    lanes.option_h[lane][options], lanes.option_times[lane][options] = heading, 1.0
+    # New ones last: of options equally near, the first remembered counts.
+    following[options] = -1
+    if first[place] < 0:
+        first[place] = options
+    else:
+        last = first[place]
+        while following[last] >= 0:
+            last = following[last]
+        following[last] = options
+    k[OPTIONS + lane] = options + 1
+
+
+@inlined
+def _pass_landmark(n: Numbers, lanes: Lanes, lane: int, node: int, events: Floats) -> None:
+    """Perhaps recognise it: then it gives the car's position."""
+    f, k, u = lanes.f, lanes.k, lanes.u
+    xs, ys, steps = lanes.xs[lane], lanes.ys[lane], int(f[STEPS + lane])
+    k[PASSED + lane] += 1
+    noise, step = u[NOISE + lane], u[NOISE_STEP + lane]
+    share, noise = _uniform(noise, step)
+    if share >= n.detection_rate:
+        u[NOISE + lane] = noise
+        k[NOTED + lane] = _note(
+            events, k[NOTED + lane], steps, LANDMARK_MISSED, xs, ys, node, np.nan, np.nan
+        )
+        return
+    off, noise = _normal(noise, step)
+    seen_x = f[X + lane] + n.landmark_sd_m * off
+    off, noise = _normal(noise, step)
+    seen_y = f[Y + lane] + n.landmark_sd_m * off
+    u[NOISE + lane] = noise
+    lanes.is_visited[lane][lanes.landmark_at[lane][node]] = True
+    is_taken = _weigh_position(f, lane, seen_x, seen_y, n.landmark_sd_m**2, n.landmark_gate_nis)
+    kind = LANDMARK_TAKEN if is_taken else LANDMARK_REFUSED
+    k[NOTED + lane] = _note(events, k[NOTED + lane], steps, kind, xs, ys, node, seen_x, seen_y)
+    if not is_taken:
+        k[REFUSED + lane] += 1
+        return
+    k[DETECTED + lane] += 1
+    gap_m = f[TRAVELLED + lane] - f[LAST_FIX + lane]
+    f[LONGEST_GAP + lane] = max(f[LONGEST_GAP + lane], gap_m)
+    f[LAST_FIX + lane] = f[TRAVELLED + lane]
+
+
+@inlined
+def _weigh_position(
+    f: Floats, lane: int, seen_x: float, seen_y: float, var: float, gate_nis: float
+) -> bool:
+    """P - P H' S^-1 H P, entry by entry, unless the gate refuses."""
+    xx, xy, xh = f[XX + lane], f[XY + lane], f[XH + lane]
+    yy, yh, hh = f[YY + lane], f[YH + lane], f[HH + lane]
+    ix, iy = seen_x - f[BX + lane], seen_y - f[BY + lane]
+    sxx, syy = xx + var, yy + var
+    per = 1.0 / (sxx * syy - xy * xy)
+    wx, wy = (syy * ix - xy * iy) * per, (sxx * iy - xy * ix) * per
+    if ix * wx + iy * wy > gate_nis:
+        return False
+    f[BX + lane] += xx * wx + xy * wy
+    f[BY + lane] += xy * wx + yy * wy
+    heading = _wrap(f[BH + lane] + xh * wx + yh * wy)
+    f[BH + lane], f[BC + lane], f[BS + lane] = heading, math.cos(heading), math.sin(heading)
+    axx, axy = (syy * xx - xy * xy) * per, (sxx * xy - xy * xx) * per
+    ayx, ayy = (syy * xy - xy * yy) * per, (sxx * yy - xy * xy) * per
+    ahx, ahy = (syy * xh - xy * yh) * per, (sxx * yh - xy * xh) * per
+    f[XX + lane] = xx - axx * xx - axy * xy
+    f[XY + lane] = xy - axx * xy - axy * yy
+    f[XH + lane] = xh - axx * xh - axy * yh
+    f[YY + lane] = yy - ayx * xy - ayy * yy
+    f[YH + lane] = yh - ayx * xh - ayy * yh
+    f[HH + lane] = hh - ahx * xh - ahy * yh
+    return True
+
+
+@inlined
+def _enter(n: Numbers, lanes: Lanes, lane: int) -> None:
+    """Lay the turn's arcs, and face the next intersection."""
+    f, k = lanes.f, lanes.k
+    way, turn, entry_m, arcs = k[WAY + lane], k[TURN + lane], f[ENTRY + lane], 0
+    street_c, street_s = COSINES[way], SINES[way]
+    at_x = f[NODE_X + lane] - street_c * entry_m + street_s * n.lane_offset_m
+    at_y = f[NODE_Y + lane] - street_s * entry_m - street_c * n.lane_offset_m
+    at_h = HEADINGS_RAD[way]
+    if turn == 2:
+        # Out of the lane to the right, round to the left, and into the lane back.
+        swing = math.acos((n.lane_offset_m + n.right_radius_m) / (2.0 * n.right_radius_m))
+        for i in range(3):
+            angle = PI + 2.0 * swing if i == 1 else swing
+            curvature = (1.0 if i == 1 else -1.0) / n.right_radius_m
+            _lay(lanes.arcs[lane, i], at_x, at_y, at_h, curvature, n.right_radius_m * angle)
+            bent = angle if i == 1 else -angle
+            along, across, _, _ = _arc(bent)
+            dx, dy = n.right_radius_m * angle * along, n.right_radius_m * angle * across
+            at_c, at_s = math.cos(at_h), math.sin(at_h)
+            at_x, at_y = at_x + at_c * dx - at_s * dy, at_y + at_s * dx + at_c * dy
+            at_h += bent
+        arcs = 3
+    elif turn:
+        curvature = 1.0 / n.left_radius_m if turn == 1 else -1.0 / n.right_radius_m
+        _lay(lanes.arcs[lane, 0], at_x, at_y, at_h, curvature, abs(1.0 / curvature) * PI / 2.0)
+        arcs = 1
+    way = (way + turn) & 3
+    k[WAY + lane], k[TURN + lane], k[ARCS + lane] = way, -1, arcs
+    columns = len(lanes.xs[lane])
+    k[NODE + lane] += (1, columns, -1, -columns)[way]
+    _face(n, lanes, lane, way)
+    if arcs:
+        _follow_arcs(lanes, lane, 0.0, 0)
+
+
+@compiled
+def _lay(arc: Floats, x: float, y: float, heading: float, curvature: float, length: float) -> None:
+    arc[0], arc[1], arc[2], arc[3], arc[4] = x, y, heading, curvature, length
+
+
+@inlined
+def _finish(n: Numbers, lanes: Lanes, lane: int, row: Floats) -> None:
+    """The drive's ``Result``, as far as its start did not tell it."""
+    f, k = lanes.f, lanes.k
+    xx, xy, yy = f[XX + lane], f[XY + lane], f[YY + lane]
+    half_sum, half_gap = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    ex, ey = f[BX + lane] - f[X + lane], f[BY + lane] - f[Y + lane]
+    eh = _wrap(f[BH + lane] - f[H + lane])
+    row[0], row[1] = k[OUTCOME + lane], f[TRAVELLED + lane]
+    row[2], row[3] = f[STEPS + lane] * n.step_s, f[STEPS + lane]
+    row[8], row[9], row[10] = k[PASSED + lane], k[DETECTED + lane], k[REFUSED + lane]
+    row[11], row[12], row[13] = k[DECISIONS + lane], k[TURNS + lane], k[GOALS + lane]
+    row[14], row[15] = f[FIRST_GOAL + lane], f[FIRST_AXIS + lane]
     row[16] = 4.0 * math.sqrt(half_sum + math.sqrt(half_gap * half_gap + xy * xy))
-    row[17], row[18] = math.hypot(ex, ey), _nees(ex, ey, eh, xx, xy, xh, yy, yh, hh)
-    row[19], row[20] = goal_error_m, furthest_m
-    row[21] = max(longest_gap_m, travelled_m - last_fix_m)
+    row[17] = math.hypot(ex, ey)
+    row[18] = _nees(ex, ey, eh, xx, xy, f[XH + lane], yy, f[YH + lane], f[HH + lane])
+    row[19], row[20] = f[GOAL_ERROR + lane], f[FURTHEST + lane]
+    row[21] = max(f[LONGEST_GAP + lane], f[TRAVELLED + lane] - f[LAST_FIX + lane])

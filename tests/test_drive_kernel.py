@@ -15,9 +15,12 @@ from crosscue.localization.drive_kernel import (
     LANDMARK_REFUSED,
     LANDMARK_SET,
     LANDMARK_TAKEN,
+    LANES,
     as_result,
     drive_many,
     drive_traced,
+    filter_rows,
+    numbers_of,
 )
 from crosscue.localization.drive_settings import City, Drive, Navigation, Sensors
 from crosscue.localization.drive_simulator import Outcome, Result, Trace, as_rows, drive
@@ -98,6 +101,39 @@ def test_events_tell_all_goals_and_landmarks() -> None:
     assert len(traced.of_kind(LANDMARK_REFUSED)) == result.refused
     passed = traced.of_kind(LANDMARK_MISSED, LANDMARK_TAKEN, LANDMARK_REFUSED)
     assert len(passed) == result.passed
+
+
+def test_the_filter_alone_is_the_filter_of_the_drive() -> None:
+    settings, steps = Drive(), 400
+    many = [drive_traced(settings, seed) for seed in range(LANES)]
+    first = np.array([traced.first_belief for traced in many]).T.copy()
+    readings = np.stack([traced.steps[:steps, 4:7] for traced in many], axis=2).copy()
+    ends = np.empty((9, LANES))
+
+    filter_rows(numbers_of(settings), first, readings, ends)
+
+    wanted = np.array([traced.steps[steps - 1, 7:16] for traced in many]).T
+    np.testing.assert_allclose(ends, wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_no_drive_depends_on_its_neighbours() -> None:
+    settings = KINDS["landmark to landmark"]
+    together = drive_many(settings, seeds(2 * LANES + 3))
+    alone = [drive_many(settings, seeds(1, seed))[0] for seed in (0, LANES - 1, LANES, 2 * LANES)]
+
+    assert together[[0, LANES - 1, LANES, 2 * LANES]].tobytes() == np.array(alone).tobytes()
+
+
+def test_turns_too_sharp_for_a_series_are_the_readable_ones() -> None:
+    """A short, slipping car that hardly knows which way it faces."""
+    settings = Drive(
+        city=City(largest_km2=1.5),
+        car=drive_settings.Car(wheelbase_m=0.8),
+        sensors=Sensors(slip_per_sqrt_m=0.2, start_heading_sd_deg=60.0),
+    )
+    readable = as_rows([drive(settings, seed) for seed in range(3)])
+
+    np.testing.assert_allclose(drive_many(settings, seeds(3)), readable, rtol=1e-9, atol=1e-9)
 
 
 def test_rows_and_records_are_the_same() -> None:
