@@ -1,23 +1,33 @@
 """Mask R-CNN: our detector beside a plain torchvision loop, with the same weights and pictures.
 
-Times are CPU seconds of one thread, in rotation, medians. The plain loop is torchvision's own:
-1000 proposals, scores from 0.05, every mask pasted into the picture. The embedded network must find
-the same things above a score; the ResNet-50 has random weights, so only its time counts. With
---coco and --images (see crosscue train frames) it also tells what fewer proposals cost.
+Times are of one thread, in rotation, medians: CPU seconds a picture, and how many times as fast as
+the plain loop by CPU and by wall time. The plain loop is torchvision's own: 1000 proposals, scores
+from 0.05, every mask pasted into the picture. Then it is counted which of its detections above a
+score ours has too (the same class, every side within half a pixel), and, since the pictures are
+simulated, what is true: right, a second time the same object, or false.
+
+The ResNet-50 has random weights, since COCO's are not at hand. Its scores are set by a proposal's
+rank (the 5 likeliest are sure, 60 compete, 20 detections remain), so its equal detections tell that
+levels, proposals and boxes agree, and nothing of what fewer proposals cost.
+
+With --coco and --images (see crosscue train frames) it also tells that cost as average precision.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 from torchvision.models.detection.transform import GeneralizedRCNNTransform
 
 from crosscue.datasets.scenes.drive import SceneSettings, world_of
@@ -29,107 +39,99 @@ from crosscue.detectors.mask_rcnn import (
     checkpoint_named,
     detector_of,
     place,
+    raw_score,
 )
-from crosscue.detectors.mask_rcnn_checkpoint import Checkpoint, Facts
+from crosscue.detectors.mask_rcnn_checkpoint import Calibration, Checkpoint, Facts
 from crosscue.detectors.mask_rcnn_network import MEAN, SPREAD, Plan, build_network, set_limits
 from crosscue.detectors.model_detector import overlaps
 from crosscue.detectors.training.annotations import read_coco
 from crosscue.detectors.training.scores import average_precisions, detections_on
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import VehicleError
 
-LAYOUTS = ("L991", "L992", "L993", "L994", "L995", "L996")
-TIMES_S = (4.0, 7.0)
-CPU = torch.device("cpu")
-SCORE = 0.5
-RESNET_ROUNDS = 3
+LAYOUTS: Final = ("L991", "L992", "L993", "L994", "L995", "L996")
+TIMES_S: Final = (4.0, 7.0)
+CPU: Final = torch.device("cpu")
+PLAIN: Final = "torchvision, 1000 proposals, pasted"
+SAME_PX: Final = 0.5
+RIGHT_OVERLAP: Final = 0.3
+CUE_SCORES: Final = {"car": 0.95, "stop sign": 0.9, "traffic light": 0.9}
+"""Calibrated scores from which the cues take a detection."""
+SURE, COMPETING, REMAINING = 5, 60, 20
+
+Way = Callable[[Frame], Any]
+Least = Callable[[str], float]
+"""From a class to the least raw score of its detections."""
 
 
-def frames() -> list[Frame]:
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A simulated picture and the objects in it."""
+
+    frame: Frame
+    truth: tuple[tuple[str, Floats], ...]
+
+
+def scenes() -> list[Scene]:
     """Simulated pictures of intersections that nothing was trained on."""
     taken = []
     for layout in LAYOUTS:
         _, _, world = world_of(SceneSettings(layout=layout))
         renderer = Renderer(world)
         for t_s in TIMES_S:
-            rgb = renderer.picture(t_s).rgb
-            bgr = np.ascontiguousarray(rgb[:, :, ::-1])
-            taken.append(Frame(round(t_s * 1e9), "", bgr, (1280, 720)))
+            picture = renderer.picture(t_s)
+            bgr = np.ascontiguousarray(picture.rgb[:, :, ::-1])
+            truth = tuple(
+                (one.thing.category.replace("_", " "), np.array(one.box_px, np.float64))
+                for one in picture.seen
+            )
+            taken.append(Scene(Frame(round(t_s * 1e9), "", bgr, (1280, 720)), truth))
     return taken
 
 
-def plain_loop(checkpoint: Checkpoint) -> Callable[[Frame], dict[str, Any]]:
+@dataclass(frozen=True, slots=True)
+class PlainLoop:
     """Torchvision's own way, on the part of the picture that ours looks at."""
-    plan = checkpoint.facts.plan
-    network = build_network(plan)
-    network.load_state_dict(checkpoint.network.state_dict())
-    set_limits(network, 1000, 0.05)
-    network.rpn._pre_nms_top_n["testing"] = 1000
-    network.eval()
 
-    def detect(frame: Frame) -> dict[str, Any]:
-        placed = place(frame.pixels, plan).pixels
+    network: Any
+    plan: Plan
+
+    def __call__(self, frame: Frame) -> dict[str, Tensor]:
+        """What it finds, masks pasted."""
+        placed = place(frame.pixels, self.plan).pixels
         height, width = placed.shape[:2]
         # A size equal to the picture's: torchvision's transform then scales nothing.
-        network.transform = GeneralizedRCNNTransform(height, width, list(MEAN), list(SPREAD))
+        self.network.transform = GeneralizedRCNNTransform(height, width, list(MEAN), list(SPREAD))
         rgb = np.ascontiguousarray(placed[:, :, ::-1].transpose(2, 0, 1))
         with torch.inference_mode():
-            (found,) = network([torch.from_numpy(rgb).float() / 255.0])
+            (found,) = self.network([torch.from_numpy(rgb).float() / 255.0])
         return dict(found)
 
-    return detect
+    def detections(self, frame: Frame) -> Detections:
+        """The same in the frame's pixels, without masks."""
+        found = self(frame)
+        placed = place(frame.pixels, self.plan)
+        boxes = found["boxes"].double().numpy() + np.tile(placed.corner_px, 2)
+        labels = tuple(str(self.plan.classes[i - 1]) for i in found["labels"].tolist())
+        return Detections(
+            frame.t_ns, frame.size_px, boxes / np.tile(placed.scale, 2),
+            found["scores"].double().numpy(), labels, (b"",) * len(labels),
+        )  # fmt: skip
 
 
-def raw_detector(checkpoint: Checkpoint, proposals: int) -> MaskRcnnDetector:
-    """Ours without calibration, so that scores can be compared."""
-    bare = replace(checkpoint, facts=Facts(plan=checkpoint.facts.plan))
-    return detector_of(bare, MaskRcnnSettings(score=SCORE, proposals=proposals), CPU)
+def plain_loop(checkpoint: Checkpoint) -> PlainLoop:
+    """A copy of the network with torchvision's own limits."""
+    network = copy.deepcopy(checkpoint.network)
+    set_limits(network, 1000, 0.05)
+    network.rpn._pre_nms_top_n["testing"] = 1000
+    return PlainLoop(network.eval(), checkpoint.facts.plan)
 
 
-def cpu_s(call: Callable[[], Any]) -> float:
-    """Processor time of one call."""
-    began = time.process_time()
-    call()
-    return time.process_time() - began
-
-
-def in_rotation(ways: dict[str, Callable[[Frame], Any]], pictures: list[Frame]) -> None:
-    """Print each way's median time and its ratio to the first, picture by picture."""
-    for way in ways.values():
-        way(pictures[0])
-    taken = {name: [0.0] * len(pictures) for name in ways}
-    for i, frame in enumerate(pictures):
-        for name, way in ways.items():
-            taken[name][i] = cpu_s(lambda way=way, frame=frame: way(frame))  # type: ignore[misc]
-    first = next(iter(taken.values()))
-    for name, each in taken.items():
-        ratio = median(a / b for a, b in zip(first, each, strict=True))
-        print(f"  {name:42} {median(each):8.3f} CPU s a picture   x {ratio:5.2f}")
-
-
-def told_equality(
-    plain: Callable[[Frame], dict[str, Any]], ours: MaskRcnnDetector, pictures: list[Frame]
-) -> None:
-    """How many of the plain loop's detections above the score are ours too, and the reverse."""
-    plan = ours.checkpoint.facts.plan
-    both = theirs_alone = ours_alone = 0
-    for frame in pictures:
-        theirs = plain(frame)
-        keep = theirs["scores"] >= SCORE
-        boxes = theirs["boxes"][keep].double().numpy()
-        placed = place(frame.pixels, plan)
-        boxes = (boxes + np.tile(placed.corner_px, 2)) / np.tile(placed.scale, 2)
-        labels = [str(plan.classes[i - 1]) for i in theirs["labels"][keep].tolist()]
-        found = one_result(ours, frame)
-        free = set(range(len(found)))
-        for box, label in zip(boxes, labels, strict=True):
-            shares = overlaps(box, found.boxes_px)
-            fits = [i for i in free if shares[i] > 0.9 and found.labels[i] == label]
-            if fits:
-                free.remove(max(fits, key=lambda i: float(shares[i])))
-                both += 1
-            else:
-                theirs_alone += 1
-        ours_alone += len(free)
-    print(f"  above {SCORE}: {both} in both, {theirs_alone} only plain, {ours_alone} only ours")
+def raw_detector(checkpoint: Checkpoint, **changes: Any) -> MaskRcnnDetector:
+    """Ours without calibration, so that scores can be compared; with limits of its own."""
+    network = copy.deepcopy(checkpoint.network)
+    bare = replace(checkpoint, network=network, facts=Facts(plan=checkpoint.facts.plan))
+    return detector_of(bare, MaskRcnnSettings.model_validate({"score": 0.5, **changes}), CPU)
 
 
 def one_result(detector: MaskRcnnDetector, frame: Frame) -> Detections:
@@ -139,14 +141,149 @@ def one_result(detector: MaskRcnnDetector, frame: Frame) -> Detections:
     return found
 
 
+def our_ways(checkpoint: Checkpoint, counts: Sequence[int]) -> dict[str, MaskRcnnDetector]:
+    """Ours with so many proposals, in every back end that is installed."""
+    ways = {}
+    for backend in ("torch", "openvino"):
+        try:
+            for count in counts:
+                ways[f"ours, {backend}, {count} proposals"] = raw_detector(
+                    checkpoint, proposals=count, backend=backend
+                )
+        except VehicleError as error:
+            print(f"  {error}")
+    return ways
+
+
+def in_rotation(ways: Mapping[str, Way], frames: Sequence[Frame]) -> None:
+    """Print each way's median time and how many times as fast as the first, frame by frame."""
+    for way in ways.values():
+        way(frames[0])
+    cpu_s: dict[str, list[float]] = {name: [] for name in ways}
+    wall_s: dict[str, list[float]] = {name: [] for name in ways}
+    for frame in frames:
+        for name, way in ways.items():
+            began_cpu, began_wall = time.process_time(), time.perf_counter()
+            way(frame)
+            cpu_s[name].append(time.process_time() - began_cpu)
+            wall_s[name].append(time.perf_counter() - began_wall)
+    first = next(iter(ways))
+    for name in ways:
+        print(f"  {name:36} {median(cpu_s[name]):7.3f} CPU s a picture   "
+              f"x {_faster(cpu_s[first], cpu_s[name]):5.2f} CPU   "
+              f"x {_faster(wall_s[first], wall_s[name]):5.2f} wall")  # fmt: skip
+
+
+def _faster(first: Sequence[float], other: Sequence[float]) -> float:
+    return median(a / b for a, b in zip(first, other, strict=True))
+
+
+def above(found: Detections, least: Least) -> list[int]:
+    """Those whose score is at least what their class asks, the best first."""
+    kept = [i for i, label in enumerate(found.labels) if found.scores[i] >= least(label)]
+    return sorted(kept, key=lambda i: -float(found.scores[i]))
+
+
+def matches(theirs: Detections, ours: Detections, least: Least) -> Counter[str]:
+    """How many are the same in both, and how many are in one alone."""
+    free, counts = set(above(ours, least)), Counter[str]()
+    for i in above(theirs, least):
+        apart_px = {
+            j: float(np.abs(ours.boxes_px[j] - theirs.boxes_px[i]).max())
+            for j in free
+            if ours.labels[j] == theirs.labels[i]
+        }
+        nearest = min(apart_px, key=apart_px.__getitem__, default=None)
+        if nearest is None or apart_px[nearest] > SAME_PX:
+            counts["only plain"] += 1
+        else:
+            free.remove(nearest)
+            counts["the same"] += 1
+    counts["only ours"] = len(free)
+    return counts
+
+
+def judged(found: Detections, scene: Scene, least: Least) -> Counter[str]:
+    """How many are right, how many find an object again, how many are false."""
+    counts, met = Counter[str](), set[int]()
+    for i in above(found, least):
+        shares = [
+            float(overlaps(box, found.boxes_px[i : i + 1])[0]) if name == found.labels[i] else 0.0
+            for name, box in scene.truth
+        ]
+        best = max(range(len(shares)), key=shares.__getitem__, default=None)
+        if best is None or shares[best] < RIGHT_OVERLAP:
+            counts["false"] += 1
+        else:
+            counts["doubles" if best in met else "right"] += 1
+            met.add(best)
+    return counts
+
+
+def told_equality(
+    plain: PlainLoop, ours: Mapping[str, MaskRcnnDetector], seen: Sequence[Scene],
+    levels: Mapping[str, Least], is_true: bool,
+) -> None:  # fmt: skip
+    """Print what ours finds of what the plain loop finds, and where truth counts, what is right."""
+    theirs = [plain.detections(scene.frame) for scene in seen]
+    found = {name: [one_result(d, s.frame) for s in seen] for name, d in ours.items()}
+    for level, least in levels.items():
+        print(f"  {level}")
+        for name, results in {PLAIN: theirs, **found}.items():
+            same = sum((matches(a, b, least) for a, b in zip(theirs, results, strict=True)),
+                       Counter[str]())  # fmt: skip
+            true = sum((judged(a, s, least) for a, s in zip(results, seen, strict=True)),
+                       Counter[str]())  # fmt: skip
+            told = f"    {name:36} {same['the same']:4} the same, {same['only plain']} only plain, "
+            told += f"{same['only ours']} only ours"
+            if is_true:
+                told += f"; {true['right']} right, {true['doubles']} doubles, {true['false']} false"
+            print(told)
+
+
+def score_levels(checkpoint: Checkpoint) -> dict[str, Least]:
+    """A raw score of one half, and the scores from which the cues take detections."""
+    by = checkpoint.facts.calibration
+    cues = {name: raw_score(least, by.get(name, Calibration()))
+            for name, least in CUE_SCORES.items()}  # fmt: skip
+    return {
+        "raw score of 0.5 and more": lambda name: 0.5,
+        "calibrated 0.9 and more, cars 0.95 (what the cues take)": lambda name: cues.get(name, 2.0),
+    }
+
+
+class Ranked(nn.Module):
+    """A box predictor whose boxes are its own and whose scores follow a proposal's rank."""
+
+    def __init__(self, plain: Any, classes: int) -> None:
+        """Rows of the table are ranks: sure, then competing, then background."""
+        super().__init__()
+        self.plain = plain
+        logits = torch.full((2000, classes), -12.0)
+        logits[:, 0] = 0.0
+        logits[:COMPETING, 1] = -1.5
+        logits[:SURE, 1] = 4.0 - 0.1 * torch.arange(SURE)
+        self.register_buffer("logits", logits)
+
+    def forward(self, pooled: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits of classes, and shifts."""
+        own, shifts = self.plain(pooled)
+        return self.logits[: own.shape[0]] + 0.0 * own, shifts
+
+
 def random_resnet() -> Checkpoint:
-    """A ResNet-50 with random weights whose scores are spread, so that masks are made."""
+    """A ResNet-50 with random weights and scores by rank."""
     torch.manual_seed(0)
     names = ("car", *(f"class {i}" for i in range(89)))
     plan = Plan(architecture="resnet50", classes=names, width_px=800)
     network = build_network(plan)
+    heads = network.roi_heads
     with torch.no_grad():
-        network.roi_heads.box_predictor.cls_score.weight.mul_(60.0)
+        # Shifts of a tenth of a box, as learnt ones are; else rounding moves boxes by pixels.
+        network.rpn.head.bbox_pred.weight.mul_(0.05)
+        heads.box_predictor.bbox_pred.weight.mul_(0.05)
+    heads.box_predictor = Ranked(heads.box_predictor, len(names) + 1)
+    heads.detections_per_img = REMAINING
     return Checkpoint(Facts(plan=plan), network.eval(), "")
 
 
@@ -154,10 +291,8 @@ def proposal_costs(checkpoint: Checkpoint, coco: Path, images: Path) -> None:
     """Average precision and time with more and fewer proposals."""
     classes = [name for name in checkpoint.facts.plan.classes if name]
     labelled = read_coco(coco, images, classes)
-    bare = replace(checkpoint, facts=Facts(plan=checkpoint.facts.plan))
-    for proposals in (1000, 300, 100, 50, 25):
-        settings = MaskRcnnSettings(score=0.02, proposals=proposals)
-        detector = detector_of(bare, settings, CPU)
+    for proposals in (1000, 300, 200, 100, 50):
+        detector = raw_detector(checkpoint, score=0.02, proposals=proposals)
         began = time.process_time()
         found = list(detections_on(labelled, detector))
         taken = (time.process_time() - began) / len(found)
@@ -166,34 +301,38 @@ def proposal_costs(checkpoint: Checkpoint, coco: Path, images: Path) -> None:
               f"{taken:.3f} CPU s a picture")  # fmt: skip
 
 
+def compare(
+    checkpoint: Checkpoint, counts: Sequence[int], seen: Sequence[Scene],
+    levels: Mapping[str, Least], is_true: bool,
+) -> None:  # fmt: skip
+    """Print times and equality of one network."""
+    plain, ours = plain_loop(checkpoint), our_ways(checkpoint, counts)
+    ways: dict[str, Way] = {PLAIN: plain}
+    for name, detector in ours.items():
+        ways[name] = lambda frame, d=detector: d([frame])  # type: ignore[misc]
+    in_rotation(ways, [scene.frame for scene in seen])
+    told_equality(plain, ours, seen, levels, is_true)
+
+
 def main() -> None:
     """Print all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--network", default="embedded", help="a checkpoint instead")
+    parser.add_argument("--resnet-pictures", type=int, default=4, help="how many; it is slow")
     parser.add_argument("--coco", type=Path, help="held-out annotations")
     parser.add_argument("--images", type=Path, help="their pictures")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    pictures = frames()
+    seen = scenes()
     own = checkpoint_named(args.network)
-    plain = plain_loop(own)
-    print(f"compact network, {own.facts.plan.width_px} pixels wide, {len(pictures)} pictures")
-    ways: dict[str, Callable[[Frame], Any]] = {"torchvision, 1000 proposals, pasted": plain}
-    for count in (1000, 100):
-        detector = raw_detector(own, count)
-        ways[f"ours, {count} proposals"] = lambda frame, d=detector: d([frame])  # type: ignore[misc]
-        told_equality(plain, detector, pictures)
-    # The network is shared and the last detector made sets its limits, so ours are timed apart.
-    del ways["ours, 1000 proposals"]
-    in_rotation(ways, pictures)
-    resnet = random_resnet()
-    few = raw_detector(resnet, 100)
-    print(f"ResNet-50 with random weights, {resnet.facts.plan.width_px} pixels wide")
-    in_rotation(
-        {"torchvision, 1000 proposals, pasted": plain_loop(resnet),
-         "ours, 100 proposals": lambda frame: few([frame])},
-        pictures[:RESNET_ROUNDS],
-    )  # fmt: skip
+    print(f"{args.network}, {own.facts.plan.width_px} pixels wide, {len(seen)} pictures")
+    compare(own, (100, 200, 300, 1000), seen, score_levels(own), is_true=True)
+    few = seen[: args.resnet_pictures]
+    if few:
+        resnet = random_resnet()
+        print(f"ResNet-50, random, {resnet.facts.plan.width_px} pixels wide, {len(few)} pictures")
+        half: dict[str, Least] = {"raw score of 0.5 and more": lambda name: 0.5}
+        compare(resnet, (100, 1000), few, half, is_true=False)
     if args.coco is not None:
         proposal_costs(own, args.coco, args.images)
 

@@ -13,6 +13,7 @@ from typing import Any, Final
 from urllib.error import URLError
 
 import torch
+from torch import nn
 
 from crosscue.replay.errors import VehicleError
 
@@ -24,6 +25,8 @@ COCO_NETWORKS: Final[Mapping[str, str]] = {
     "resnet50-v2": "MaskRCNN_ResNet50_FPN_V2_Weights",
 }
 """From our names to torchvision's sets of weights."""
+NO_EPSILON: Final = frozenset({"resnet50"})
+"""Learnt when torchvision's frozen normalisation added nothing to variances; so run that way."""
 WIDTH_PX: Final = 1333
 """Torchvision scales a 16:9 picture to this width."""
 
@@ -59,6 +62,10 @@ def coco_checkpoint(name: str, weights: Any, tensors: Mapping[str, Any]) -> Chec
     plan = Plan.model_validate({"architecture": name, "classes": classes, "width_px": WIDTH_PX})
     network = build_network(plan)
     network.load_state_dict(tensors)
+    if name in NO_EPSILON:
+        for module in network.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eps = 0.0
     # The file's name carries the start of its own hash, which torchvision has compared.
     digest = hashlib.sha256(weights.url.encode()).hexdigest()
     return Checkpoint(Facts(plan=plan), network.eval(), digest)

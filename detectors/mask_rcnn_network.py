@@ -27,6 +27,8 @@ STRIDE: Final = 32
 ANCHORS_PX: Final = ((6, 11), (20, 36), (64, 112), (176, 288))
 ASPECTS: Final = (0.45, 1.0, 2.6)
 """Height over width: an upright light, a sign, a car from the side."""
+MOST_BEFORE_SUPPRESSION: Final = 1000
+"""Boxes of a level that compete to be proposals; torchvision's own number."""
 
 
 class Plan(Settings):
@@ -76,7 +78,8 @@ def set_limits(network: Any, proposals: int, score: float) -> None:
     Boxes below the score never reach the mask head, so this is also where the masks' time is saved.
     """
     rpn, heads = network.rpn, network.roi_heads
-    rpn._pre_nms_top_n = {**rpn._pre_nms_top_n, "testing": 3 * proposals}
+    before = max(proposals, min(3 * proposals, MOST_BEFORE_SUPPRESSION))
+    rpn._pre_nms_top_n = {**rpn._pre_nms_top_n, "testing": before}
     rpn._post_nms_top_n = {**rpn._post_nms_top_n, "testing": proposals}
     heads.score_thresh = score
 

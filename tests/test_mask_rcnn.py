@@ -16,7 +16,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save
-from torch import Tensor
+from torch import Tensor, nn
 from torchvision.models.detection.roi_heads import paste_masks_in_image
 
 from crosscue.datasets.scenes.camera import Camera
@@ -42,7 +42,7 @@ from crosscue.detectors.mask_rcnn_checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from crosscue.detectors.mask_rcnn_coco import coco_checkpoint
+from crosscue.detectors.mask_rcnn_coco import COCO_NETWORKS, coco_checkpoint
 from crosscue.detectors.mask_rcnn_network import Plan, build_network, set_limits
 from crosscue.detectors.mask_rcnn_parts import Body, Parts, as_input
 from crosscue.detectors.model_detector import overlaps
@@ -428,6 +428,41 @@ def test_coco_weights_come_with_the_names_of_their_classes() -> None:
     names = checkpoint.facts.plan.classes
     assert [names[i - 1] for i in (3, 10, 13)] == ["car", "traffic light", "stop sign"]
     assert names[11] is None
+
+
+@pytest.mark.parametrize("name", ["resnet50", "resnet50-v2"])
+def test_coco_weights_give_the_levels_that_torchvisions_own_network_gives(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from torchvision.models import detection
+
+    weights = getattr(detection, COCO_NETWORKS[name]).DEFAULT
+    make = {"resnet50": detection.maskrcnn_resnet50_fpn,
+            "resnet50-v2": detection.maskrcnn_resnet50_fpn_v2}[name]  # fmt: skip
+    with torch.device("meta"):
+        empty = make(weights=None, weights_backbone=None).state_dict()
+    torch.manual_seed(0)
+    # Variances so small that an epsilon of 1e-5 is seen.
+    state = {
+        key: torch.full(value.shape, 1e-4) if key.endswith("running_var")
+        else torch.zeros(value.shape, dtype=value.dtype) if "tracked" in key
+        else torch.randn(value.shape) * 0.03
+        for key, value in empty.items()
+    }  # fmt: skip
+    monkeypatch.setattr(
+        "torchvision.models._api.load_state_dict_from_url", lambda *args, **given: dict(state)
+    )
+    monkeypatch.setattr(nn.init, "kaiming_uniform_", lambda tensor, **given: tensor)
+    picture = torch.randn(1, 3, 64, 64)
+
+    with torch.inference_mode():
+        theirs = make(weights=weights, progress=False).eval().backbone(picture)
+        ours = coco_checkpoint(name, weights, state).network.backbone(picture)
+
+    for level, value in theirs.items():
+        largest = float(value.abs().max())
+        assert largest > 0.0
+        assert float((ours[level] - value).abs().max()) < 1e-3 * largest
 
 
 def test_the_registry_knows_it() -> None:
