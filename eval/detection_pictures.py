@@ -50,22 +50,25 @@ class Drawer:
             write_whole(path, lambda partial: partial.write_bytes(encoded.tobytes()))
 
 
-def draw(pixels: Bytes, result: FrameResult, cues: FrameCues) -> Bytes:
-    """A copy with road tinted, boxes and labels, and the positive cues at the bottom."""
-    import cv2
+def draw(pixels: Bytes, result: FrameResult, cues: FrameCues, enlarge: float = 1.0) -> Bytes:
+    """A copy with road tinted, boxes and labels, and the positive cues at the bottom.
 
+    Args:
+        pixels: BGR.
+        result: What was found in it.
+        cues: And what follows.
+        enlarge: Text and lines, for a picture that will be shrunk.
+    """
     canvas = pixels.copy()
     for found in result.found:
         if isinstance(found, RoadMask):
             _tint(canvas, found)
     for found in result.found:
         if isinstance(found, Detections):
-            _boxes(canvas, found)
+            _boxes(canvas, found, enlarge)
     positive = [f"{cue} {count}" for cue, count in cues.counts.items() if count]
     text = "  ".join(positive) or "no cue"
-    place = (10, canvas.shape[0] - 14)
-    cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 4)
-    cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1)
+    _write(canvas, text, (10, canvas.shape[0] - 14), (255, 255, 255), 0.6 * enlarge)
     return canvas
 
 
@@ -78,13 +81,21 @@ def _tint(canvas: Bytes, road: RoadMask) -> None:
     canvas[is_road] = canvas[is_road] // 2 + np.array(BLUE, np.uint8) // 2
 
 
-def _boxes(canvas: Bytes, found: Detections) -> None:
+def _boxes(canvas: Bytes, found: Detections, enlarge: float) -> None:
     import cv2
 
     for box, score, label in zip(found.boxes_px, found.scores, found.labels, strict=True):
         x0, y0, x1, y1 = (round(float(side)) for side in box)
-        cv2.rectangle(canvas, (x0, y0), (x1, y1), GREEN, 2)
-        place = (x0, max(y0 - 4, 12))
-        text = f"{label} {score:.2f}"
-        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 3)
-        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, GREEN, 1)
+        cv2.rectangle(canvas, (x0, y0), (x1, y1), GREEN, round(2 * enlarge))
+        place = (x0, max(y0 - 4, round(12 * enlarge)))
+        _write(canvas, f"{label} {score:.2f}", place, GREEN, 0.5 * enlarge)
+
+
+def _write(
+    canvas: Bytes, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float
+) -> None:
+    import cv2
+
+    thick = max(round(2 * scale), 1)
+    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), thick + 2)
+    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thick)

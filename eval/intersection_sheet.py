@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -16,17 +16,35 @@ from crosscue.replay.columns import Block, Bytes, Images, Int64s
 from crosscue.replay.run_folder import RunFolder, write_whole
 
 from .detection_pictures import draw
-from .score_run import RunScored
+from .score_truth import DriveTruth
 from .stored_frames import StoredFrame, stored_frames
 from .stored_pictures import StoredCamera, camera_of, read_pictures
 
 AWAY_M: Final = 18.0
 """True distance to the intersection at which the frame is taken."""
 TILE_PX: Final = (480, 270)
+ENLARGE: Final = 2.0
+"""Text and lines, before a frame is shrunk to its tile."""
 QUALITY: Final = 80
 
 
-def write_sheet(scored: Sequence[RunScored], path: Path, columns: int = 8) -> None:
+class Shown(Protocol):
+    """A run and its truth."""
+
+    @property
+    def run(self) -> RunFolder:
+        """The run's folder, with what was detected."""
+        ...
+
+    @property
+    def truth(self) -> DriveTruth:
+        """Tells where it was when."""
+        ...
+
+
+def write_sheet(
+    drives: Sequence[Shown], path: Path, columns: int = 8, quality: int = QUALITY
+) -> None:
     """Write a JPEG with a tile a drive, ``columns`` beside one another.
 
     Raises:
@@ -35,16 +53,16 @@ def write_sheet(scored: Sequence[RunScored], path: Path, columns: int = 8) -> No
     """
     import cv2
 
-    tiles = [_tile(one) for one in scored]
+    tiles = [_tile(one) for one in drives]
     blank = np.zeros((TILE_PX[1], TILE_PX[0], 3), np.uint8)
     columns = min(columns, len(tiles))
     tiles += [blank] * (-len(tiles) % columns)
     rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
-    _, coded = cv2.imencode(".jpg", np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    _, coded = cv2.imencode(".jpg", np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, quality])
     write_whole(path, lambda partial: partial.write_bytes(coded.tobytes()))
 
 
-def _tile(one: RunScored) -> Bytes:
+def _tile(one: Shown) -> Bytes:
     import cv2
 
     camera = camera_of(one.run)
@@ -60,7 +78,7 @@ def _tile(one: RunScored) -> Bytes:
     return found
 
 
-def _frame_near(one: RunScored) -> StoredFrame | None:
+def _frame_near(one: Shown) -> StoredFrame | None:
     """The frame that was taken nearest to ``AWAY_M`` before the first intersection."""
     times: Int64s = one.run.table("frames", ["t_ns"])["t_ns"].to_numpy()
     inside = times[one.truth.approach_at(times) >= 0]
@@ -90,7 +108,7 @@ def _picture(camera: StoredCamera, frame: StoredFrame, run: RunFolder) -> Bytes 
                 picture = encoded(block.rows, i)
                 pixels, _ = decode(picture, View())
                 result = FrameResult(t_ns, frame.size_px, picture, tuple(found))
-                drawn.append(draw(pixels, result, FrameCues(_cues_at(run, t_ns), None)))
+                drawn.append(draw(pixels, result, FrameCues(_cues_at(run, t_ns), None), ENLARGE))
 
     read_pictures(camera, look, around_ns=t_ns)
     return drawn[0] if drawn else None
