@@ -263,7 +263,7 @@ class Ranked(nn.Module):
         logits[:, 0] = 0.0
         logits[:COMPETING, 1] = -1.5
         logits[:SURE, 1] = 4.0 - 0.1 * torch.arange(SURE)
-        self.register_buffer("logits", logits)
+        self.logits = nn.Parameter(logits, requires_grad=False)
 
     def forward(self, pooled: Tensor) -> tuple[Tensor, Tensor]:
         """Logits of classes, and shifts."""

@@ -7,7 +7,7 @@ pooling and suppression are torchvision's own functions, so that every back end 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from crosscue.replay.columns import Bytes
 
+from .box_pooling import Pooler
 from .mask_rcnn_network import MEAN, SPREAD
 
 
@@ -63,19 +64,29 @@ def detected(network: Any, parts: Parts, pictures: Bytes) -> list[dict[str, Tens
     heads = network.roi_heads
     sizes = [(int(pictures.shape[1]), int(pictures.shape[2]))] * len(pictures)
     body = parts.body(pictures)
-    names = [*heads.box_roi_pool.featmap_names, "pool"]
-    levels = OrderedDict(zip(names, body.levels, strict=True))
+    pooled = _pooler(heads, body, sizes)
     proposals = _proposals(network.rpn, body, sizes)
-    logits, shifts = parts.boxes(heads.box_roi_pool(levels, proposals, sizes))
+    logits, shifts = parts.boxes(pooled(heads.box_roi_pool, proposals))
     boxes, scores, labels = heads.postprocess_detections(logits, shifts, proposals, sizes)
     if any(len(of_one) for of_one in boxes):
-        masks = maskrcnn_inference(parts.masks(heads.mask_roi_pool(levels, boxes, sizes)), labels)
+        masks = maskrcnn_inference(parts.masks(pooled(heads.mask_roi_pool, boxes)), labels)
     else:
         masks = [logits.new_zeros((0, 1, 28, 28))] * len(boxes)
     return [
         {"boxes": of_one, "scores": score, "labels": label, "masks": mask}
         for of_one, score, label, mask in zip(boxes, scores, labels, masks, strict=True)
     ]
+
+
+def _pooler(
+    heads: Any, body: Body, sizes: list[tuple[int, int]]
+) -> Callable[[Any, list[Tensor]], Tensor]:
+    """What cuts boxes out of the levels: our own pooler on a processor, else torchvision's."""
+    names = heads.box_roi_pool.featmap_names
+    if body.levels[0].device.type == "cpu":
+        return Pooler(body.levels[: len(names)], sizes[0][0])
+    levels = OrderedDict(zip([*names, "pool"], body.levels, strict=True))
+    return lambda pool, boxes: pool(levels, boxes, sizes)
 
 
 def _proposals(rpn: Any, body: Body, sizes: list[tuple[int, int]]) -> list[Tensor]:

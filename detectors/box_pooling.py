@@ -1,0 +1,133 @@
+"""Boxes cut out of a pyramid's levels, each to the same small grid (RoIAlign; He et al. 2017).
+
+As torchvision's ``MultiScaleRoIAlign``, with the channels of a place side by side in memory, so
+that all of them are interpolated together: several times as fast on a processor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor
+
+from crosscue.replay.columns import Int64s
+
+Grid = NDArray[np.float32]
+_ROUNDING: Final = 1e-6
+"""Added before a level is rounded down, as torchvision does."""
+
+
+class Pooler:
+    """Pools boxes of the pictures of one batch."""
+
+    def __init__(self, levels: Sequence[Tensor], height_px: int) -> None:
+        """Of levels (N, channels, H, W) on a processor, finest first.
+
+        Args:
+            levels: All that boxes may be cut from.
+            height_px: Of the pictures.
+        """
+        self._levels: Final = [level.permute(0, 2, 3, 1).contiguous().numpy() for level in levels]
+        self._halvings: Final = [
+            round(float(np.log2(height_px / level.shape[1]))) for level in self._levels
+        ]
+
+    def __call__(self, pool: Any, boxes: Sequence[Tensor]) -> Tensor:
+        """Shape (M, channels, side, side): of all boxes, picture after picture.
+
+        Args:
+            pool: A ``MultiScaleRoIAlign``; its sizes are taken.
+            boxes: For each picture shape (M, 4), in pixels.
+        """
+        every = torch.cat(list(boxes))
+        pictures = np.repeat(np.arange(len(boxes)), [len(of_one) for of_one in boxes])
+        side = int(pool.output_size[0])
+        pooled = np.empty((len(every), self._levels[0].shape[3], side, side), np.float32)
+        wanted = self._levels_of(every, pool)
+        for number, (level, halvings) in enumerate(zip(self._levels, self._halvings, strict=True)):
+            rows = np.flatnonzero(wanted == number)
+            if rows.size:
+                _pool(level, np.float32(0.5**halvings), every.numpy(), pictures, rows,
+                      int(pool.sampling_ratio), pooled)  # fmt: skip
+        return torch.from_numpy(pooled)
+
+    def _levels_of(self, boxes: Tensor, pool: Any) -> Int64s:
+        """Larger boxes from coarser levels (Lin et al. 2017, eq. 1)."""
+        width, height = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
+        size = torch.sqrt(width * height) / pool.canonical_scale
+        exact = torch.floor(pool.canonical_level + torch.log2(size) + _ROUNDING)
+        kept = exact.clamp(self._halvings[0], self._halvings[-1]) - self._halvings[0]
+        return np.asarray(kept.nan_to_num(nan=0.0).long().numpy(), np.int64)
+
+
+@njit(cache=True)
+def _places(
+    start: np.float32, cell: np.float32, samples: int, size: int,
+    low: Int64s, high: Int64s, share: Grid,
+) -> None:  # fmt: skip
+    """Where samples fall between the places of a row, and how far from the lower one.
+
+    A sample more than one place outside has a lower place of -1.
+    """
+    for i in range(low.size):
+        # In torchvision's order of sums, so that both round alike.
+        at = start + np.float32(i // samples) * cell
+        at += (np.float32(i % samples) + np.float32(0.5)) * cell / np.float32(samples)
+        # Written so that a number that is none is outside too.
+        if not (at >= np.float32(-1.0) and at <= np.float32(size)):
+            low[i] = -1
+            continue
+        at = max(at, np.float32(0.0))
+        low[i] = min(np.int64(at), np.int64(size - 1))
+        high[i] = min(low[i] + 1, np.int64(size - 1))
+        share[i] = at - np.float32(low[i]) if low[i] < size - 1 else np.float32(0.0)
+
+
+@njit(cache=True, fastmath={"contract"})
+def _add(
+    into: Grid, a: Grid, b: Grid, c: Grid, d: Grid,
+    of_a: np.float32, of_b: np.float32, of_c: np.float32, of_d: np.float32,
+) -> None:  # fmt: skip
+    for i in range(into.size):
+        into[i] += of_a * a[i] + of_b * b[i] + of_c * c[i] + of_d * d[i]
+
+
+@njit(cache=True)
+def _pool(
+    level: Grid, scale: np.float32, boxes: Grid, pictures: Int64s, rows: Int64s, samples: int,
+    pooled: Grid,
+) -> None:  # fmt: skip
+    _, height, width, channels = level.shape
+    side = pooled.shape[2]
+    count, one = side * samples, np.float32(1.0)
+    left, right, top, bottom = np.empty((4, count), np.int64)
+    of_right, of_bottom = np.empty((2, count), np.float32)
+    cells = np.empty((side * side, channels), np.float32)
+    for row in rows:
+        box, picture = boxes[row] * scale, level[pictures[row]]
+        cell_x = max(box[2] - box[0], one) / np.float32(side)
+        cell_y = max(box[3] - box[1], one) / np.float32(side)
+        _places(box[0], cell_x, samples, width, left, right, of_right)
+        _places(box[1], cell_y, samples, height, top, bottom, of_bottom)
+        cells[:] = np.float32(0.0)
+        for y in range(count):
+            if top[y] < 0:
+                continue
+            upper, lower, v = picture[top[y]], picture[bottom[y]], of_bottom[y]
+            for x in range(count):
+                if left[x] < 0:
+                    continue
+                u = of_right[x]
+                _add(cells[y // samples * side + x // samples],
+                     upper[left[x]], upper[right[x]], lower[left[x]], lower[right[x]],
+                     (one - v) * (one - u), (one - v) * u, v * (one - u), v * u)  # fmt: skip
+        share = one / np.float32(samples * samples)
+        flat = pooled[row].reshape(channels, side * side)
+        for channel in range(channels):
+            for cell in range(side * side):
+                flat[channel, cell] = cells[cell, channel] * share
