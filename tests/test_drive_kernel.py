@@ -166,7 +166,7 @@ def test_parts_of_the_seeds_give_the_same_bytes_as_all_at_once() -> None:
     ids=["30 degrees", "20 degrees", "10 degrees", "landmarks"],
 )
 def test_errors_are_as_large_as_the_filter_says(settings: Drive) -> None:
-    """As far as 400 drives can tell; 2,000 show 8 % too much at 30 degrees."""
+    """As far as 400 drives can tell; 20,000 show 4 % too much at 20 to 30 degrees."""
     rows = many(settings, 400)
     low, high = mean_band(3, 400)
 
