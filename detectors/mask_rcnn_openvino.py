@@ -38,9 +38,9 @@ class OpenVinoParts:
         """
         try:
             self._openvino: Final = import_openvino()
-        except ModuleNotFoundError:
+        except ImportError as error:
             raise VehicleError(
-                "detector mask-rcnn: backend openvino: not installed; "
+                f"detector mask-rcnn: backend openvino: not installed or not whole ({error}); "
                 "pip install 'crosscue[openvino]', or set backend = \"torch\""
             ) from None
         self._core: Final = self._openvino.Core()
