@@ -17,7 +17,15 @@ from pydantic import ValidationError
 from crosscue.eval import cli
 from crosscue.eval.studies import work
 from crosscue.eval.studies.field_study import drive_field, finish_field
-from crosscue.eval.studies.intervals import logistic, mean_of, range_at, ratio_of, share_of
+from crosscue.eval.studies.intervals import (
+    logistic,
+    mean_of,
+    range_at,
+    ratio_of,
+    ratio_of_means,
+    share_of,
+)
+from crosscue.eval.studies.landmark_study import comparisons_of
 from crosscue.eval.studies.range_study import CALIBRATION_SEED, calibrate, summarise
 from crosscue.eval.studies.replayed import through_log
 from crosscue.eval.studies.settings import (
@@ -31,6 +39,7 @@ from crosscue.eval.studies.whole import drive_study, finish_landmarks, finish_ra
 from crosscue.eval.studies.work import WorkerError, assemble, chunks_of, run
 from crosscue.localization.drive_kernel import Keys, drive_many
 from crosscue.localization.drive_settings import City, Drive, Navigation, Sensors
+from crosscue.localization.drive_simulator import Result
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.run_folder import RunFolder
@@ -142,6 +151,24 @@ def test_a_larger_study_reuses_what_a_smaller_one_drove(tmp_path: Path) -> None:
     list(run(more, tmp_path, 1, drive=counting(calls)))
 
     assert len(calls) == len(more) - len(few)
+
+
+def test_ways_are_averaged_over_pairs_over_each_ones_own_goals_and_over_all() -> None:
+    study = SMALL.model_copy(update={"strategies": ("straight to goal", "hybrid"),
+                                     "densities_per_km2": (0.5,)})  # fmt: skip
+    ways = np.array([[1000.0, 2000.0, 9000.0], [1100.0, 2200.0, 12_000.0]])
+    outcomes = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    assert math.isnan(ratio_of_means(ways[0], outcomes[1], ways[1], outcomes[1]).value)
+    rows = [
+        {**dict.fromkeys(Result._fields, np.ones(3)), "travelled_m": way, "outcome": outcome}
+        for way, outcome in zip(ways, outcomes, strict=True)
+    ]
+    (found,) = comparisons_of(study, rows)
+
+    assert found.pairs == 2
+    assert found.extra.value == pytest.approx(0.1)
+    assert found.extra_reached.value == pytest.approx((15_300.0 / 3.0) / (3000.0 / 2.0) - 1.0)
+    assert found.extra_all.value == pytest.approx(15_300.0 / 12_000.0 - 1.0)
 
 
 def test_strategies_share_their_cities_and_conditions_do_not(tmp_path: Path) -> None:

@@ -67,6 +67,23 @@ def ratio_of(top: Floats, bottom: Floats) -> Measured:
     return measured((weights @ top) / (weights @ bottom))
 
 
+def ratio_of_means(top: Floats, of_top: Floats, bottom: Floats, of_bottom: Floats) -> Measured:
+    """Ratio of two means, each over the drives that its 0 or 1 chooses; drives are paired.
+
+    NaN where none is chosen; replicates without any are left out.
+    """
+    if not (of_top.any() and of_bottom.any()):
+        return Measured(math.nan, math.nan, math.nan)
+    weights = weights_of(len(top))
+    tops, bottoms = weights @ of_top, weights @ of_bottom
+    has_both = (tops > 0.0) & (bottoms > 0.0)
+    means = [
+        (weights[has_both] @ (way * chosen)) / count[has_both]
+        for way, chosen, count in ((top, of_top, tops), (bottom, of_bottom, bottoms))
+    ]
+    return measured(means[0] / means[1])
+
+
 def range_at(distances_m: Floats, is_success: Floats, share: float) -> Measured:
     """The distance at which success has fallen to ``share``, from a logistic curve.
 

@@ -1,0 +1,101 @@
+"""How far the studies' results hang on what the source does not tell: one assumption at a time.
+
+    python benchmarks/study_assumptions.py [--drives 200] [--field-drives 400] [--seed 77]
+
+First the landmark study on its 25 pairs of density and rate: how much farther than straight to goal
+the other two strategies drive, by three ways of averaging. Then the field protocol's range runs:
+distance at loss. Seeds are neither those of the studies nor of the calibration; drives of one row
+have the seeds of every other row. About four CPU minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from crosscue.eval.studies.intervals import mean_of
+from crosscue.eval.studies.landmark_study import comparisons_of
+from crosscue.eval.studies.settings import FieldStudy, LandmarkStudy
+from crosscue.eval.studies.words import km, percent
+from crosscue.eval.studies.work import chunks_of
+from crosscue.localization.drive_kernel import drive_many
+from crosscue.localization.drive_settings import City, Drive, Navigation, Sensors
+from crosscue.localization.drive_simulator import Outcome, Result
+from crosscue.localization.random_stream import key_of
+
+LANDMARKS = {
+    "as studied": Drive(),
+    "penalty 10 degrees (45)": Drive(navigation=Navigation(penalty_deg=10.0)),
+    "penalty 180 degrees": Drive(navigation=Navigation(penalty_deg=180.0)),
+    "intersections recognised within 15 m (30)": Drive(
+        navigation=Navigation(recognise_within_m=15.0)
+    ),
+    "intersections recognised within 60 m": Drive(navigation=Navigation(recognise_within_m=60.0)),
+    "landmark or goal given up within 5 m (20)": Drive(navigation=Navigation(arrive_within_m=5.0)),
+    "landmark or goal given up within 50 m": Drive(navigation=Navigation(arrive_within_m=50.0)),
+    "landmark position 1 m s.d. (5)": Drive(sensors=Sensors(landmark_sd_m=1.0)),
+    "landmark position 20 m s.d.": Drive(sensors=Sensors(landmark_sd_m=20.0)),
+    "blocks 50 to 100 m (50 to 300)": Drive(city=City(longest_block_m=100.0)),
+    "blocks 200 to 300 m": Drive(city=City(shortest_block_m=200.0)),
+    "no dead ends (3 %)": Drive(city=City(dead_end_share=0.0)),
+    "dead ends 15 %": Drive(city=City(dead_end_share=0.15)),
+    "no one-way streets (15 %)": Drive(city=City(one_way_share=0.0)),
+    "one-way streets 50 %": Drive(city=City(one_way_share=0.5)),
+    "all cities 10 km2 (1 to 100)": Drive(city=City(smallest_km2=10.0, largest_km2=10.0)),
+    "all cities 100 km2": Drive(city=City(smallest_km2=100.0)),
+}
+FIELD = {
+    "as studied": FieldStudy(),
+    "compass 30 degrees (25)": FieldStudy(compass_2sigma_deg=30.0),
+    "blocks 50 to 100 m (50 to 300)": FieldStudy(drive=Drive(city=City(longest_block_m=100.0))),
+    "blocks 200 to 300 m": FieldStudy(drive=Drive(city=City(shortest_block_m=200.0))),
+    "town of 4 km2 (1)": FieldStudy(town_km2=4.0),
+    "town of 25 km2": FieldStudy(town_km2=25.0),
+    "wheels slip a third (0.003)": FieldStudy(drive=Drive(sensors=Sensors(slip_per_sqrt_m=0.001))),
+    "wheels slip three times": FieldStudy(drive=Drive(sensors=Sensors(slip_per_sqrt_m=0.009))),
+    "wheels slip ten times": FieldStudy(drive=Drive(sensors=Sensors(slip_per_sqrt_m=0.03))),
+    "compass errors last 3.6 m (1.876)": FieldStudy(
+        drive=Drive(sensors=Sensors(compass_interval_m=3.6))
+    ),
+}
+
+
+def landmarks(drives: int, seed: int) -> None:
+    print(f"farther than straight to goal, {drives} drives in each of 25 x 3 cells, seed {seed}")
+    print(f"{'':42} {'reached by both':>24} {'reached, each its own':>24} {'all drives':>24}")
+    for name, drive in LANDMARKS.items():
+        study = LandmarkStudy(drives=drives, drive=drive, points=(), seed=seed)
+        parts: dict[int, list[np.ndarray[tuple[int, int], np.dtype[np.float64]]]] = {}
+        for chunk in chunks_of(study.cases(), drives, seed):
+            parts.setdefault(chunk.case, []).append(drive_many(chunk.settings, chunk.seeds()))
+        rows = [dict(zip(Result._fields, np.concatenate(parts[case]).T, strict=True))
+                for case in sorted(parts)]  # fmt: skip
+        for compared in comparisons_of(study, rows):
+            print(f"{name:42} {percent(compared.extra):>24} {percent(compared.extra_reached):>24} "
+                  f"{percent(compared.extra_all):>24}  {compared.strategy}")  # fmt: skip
+            name = ""
+
+
+def field(drives: int, seed: int) -> None:
+    print(f"\nrange runs of the field protocol, {drives} each, seed {seed}")
+    print(f"{'':42} {'lost after, km':>24} {'lost within 75 minutes':>24}")
+    seeds = np.array([key_of(seed, i) for i in range(drives)], dtype=np.uint64)
+    for name, study in FIELD.items():
+        rows = drive_many(study.settings(has_landmarks=False), seeds)
+        lost = rows[rows[:, 0] == Outcome.LOST, 1]
+        print(f"{name:42} {km(mean_of(lost), 1):>24} {100 * len(lost) / drives:22.0f} %")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--drives", type=int, default=200)
+    parser.add_argument("--field-drives", type=int, default=400)
+    parser.add_argument("--seed", type=int, default=77)
+    args = parser.parse_args()
+    field(args.field_drives, args.seed)
+    landmarks(args.drives, args.seed)
+
+
+if __name__ == "__main__":
+    main()
