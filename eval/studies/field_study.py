@@ -38,10 +38,11 @@ NOTES: Final = (
     "with crosscue replay and crosscue score.",
     "In a town of 1 km2 no goal is 6.9 km from the start; the source's Euclidean distance can only "
     "be a sum over successive goals, which is what stands here as the way from goal to goal.",
-    "Range runs last longer than the published 'nearly 10 km': blocks are short and turns many, so "
-    "that the error of a heading, which persists for some 130 m, is spread over both axes and "
-    "partly undone; and a simulated compass is as bad everywhere, while the source's was worse in "
-    "some streets, which is how the source explains its own long runs.",
+    "Range runs last longer than the published 'nearly 10 km': in a small town blocks are short "
+    "and turns many, so that a heading's error, which persists for a while, is spread over both "
+    "axes and partly undone. Towns of 25 km2, or wheels that forget a heading sooner, give 13 to "
+    "14 km (docs/studies.md). Streets in which the compass is worse, the source's explanation, "
+    "shorten a run only where the filter is told of them: the ellipse knows no true errors.",
 )
 
 
