@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import rerun as rr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rerun.chunk import RrdReader
@@ -21,6 +22,7 @@ from crosscue.eval.recording.drive_time import time_of
 from crosscue.eval.recording.layout import Shown, blueprint
 from crosscue.eval.recording.marks import outline, road_lines
 from crosscue.eval.recording.notes import inert
+from crosscue.eval.recording.plan import log_landmarks
 from support.scene_run import FRAMES, LABEL, TOPIC, scene_run, write_pictures
 from support.scoring import at, good_truth, truth_folder
 
@@ -196,3 +198,17 @@ def test_road_is_drawn_in_the_pictures_pixels() -> None:
 def test_a_clock_that_begins_with_the_machine_is_shown_as_durations() -> None:
     assert not time_of(5).is_date
     assert time_of(1_700_000_000_000_000_000).is_date
+
+
+def test_landmarks_weighed_in_are_on_the_map_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "landmarks.rrd"
+    recording = rr.RecordingStream("test")
+    recording.save(path)
+    pose = {"x_m": np.array([0.0, 5.0, 9.0]), "y_m": np.array([1.0, 1.0, 2.0])}
+    log_landmarks(recording, pose, [None, "wall 1", None])
+    recording.flush()
+    recording.disconnect()
+
+    text = path.read_bytes()
+    assert b"wall 1" in text
+    assert b"/plan/landmarks" in text

@@ -84,6 +84,7 @@ def _log_all(
     more: list[str] = []
     if pose is not None:
         plan.log_pose(recording, time, pose)
+        plan.log_landmarks(recording, pose, run.table("pose")["landmark"].to_pylist())
         plan.log_intersection(recording, time, pose, scene)
         series.log_pose_series(recording, time, pose)
     if truth is not None:

@@ -14,6 +14,7 @@ START: Final[Colour] = (225, 60, 60)
 END: Final[Colour] = (220, 150, 0)
 QUIET: Final[Colour] = (125, 125, 125)
 FAINT: Final[Colour] = (165, 165, 165)
+LANDMARK: Final[Colour] = (170, 70, 190)
 VEHICLE: Final[Colour] = (50, 130, 230)
 LANE: Final[Colour] = (140, 100, 220)
 FEATURES: Final[Mapping[str, Colour]] = {

@@ -86,7 +86,7 @@ def _pose_alone(shown: Shown) -> rrb.Container:
     if shown.camera is not None:
         left.insert(0, _camera(shown.camera))
     return rrb.Horizontal(
-        rrb.Vertical(*left, row_shares=[3] * (len(left) - 1) + [1]),
+        rrb.Vertical(*left, row_shares=[3, 5, 1][-len(left) :]),
         rrb.Vertical(*_pose_series()),
         column_shares=[3, 2],
     )
@@ -125,7 +125,7 @@ def _from_above(pose: Mapping[str, Floats]) -> rrb.EyeControls3D:
     """North up, the whole track in sight."""
     x, y = pose["x_m"], pose["y_m"]
     middle = (float(x.min() + x.max()) / 2, float(y.min() + y.max()) / 2)
-    height_m = 1.4 * max(float(np.ptp(x)), float(np.ptp(y)), 20.0)
+    height_m = 1.15 * max(float(np.ptp(x)), float(np.ptp(y)), 20.0)
     return rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital, position=(*middle, height_m), look_target=(*middle, 0.0),
         eye_up=(0.0, 1.0, 0.0),

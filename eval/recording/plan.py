@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -10,7 +10,7 @@ import rerun as rr
 
 from crosscue.replay.columns import Floats, Int64s
 
-from .colours import ELLIPSE, END, ESTIMATE, START, TRUTH
+from .colours import ELLIPSE, END, ESTIMATE, LANDMARK, START, TRUTH
 from .columns import Shapes, strips_above
 from .drive_time import DriveTime
 from .scene_rows import SceneRows
@@ -19,6 +19,11 @@ from .truth import TruthTrack
 PATH_POINTS: Final = 20_000
 ELLIPSES_PER_S: Final = 5.0
 HALF_ROAD_M: Final = 8.0
+CAR_M: Final = 8.0
+CAR_SHARE: Final = 0.02
+"""The car's arrow is at least this share of the track's extent, to be seen on a long drive."""
+LANDMARK_POINTS: Final = 6.0
+TRUE_CAR_POINTS: Final = 5.0
 
 
 def log_pose(recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, Floats]) -> None:
@@ -40,11 +45,32 @@ def log_pose(recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, 
     recording.log("plan/ellipse", rr.LineStrips3D.from_fields(colors=[ELLIPSE]), static=True)
     heading = pose["heading_rad"][some]
     ahead = np.stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))], axis=1)
+    car_m = max(CAR_M, CAR_SHARE * float(np.ptp(flat, axis=0).max()))
     recording.send_columns(
         "plan/car", indexes=times,
-        columns=rr.Arrows3D.columns(origins=flat[some], vectors=ahead * 8.0),
+        columns=rr.Arrows3D.columns(origins=flat[some], vectors=ahead * car_m),
     )  # fmt: skip
-    recording.log("plan/car", rr.Arrows3D.from_fields(colors=[ESTIMATE], radii=[0.8]), static=True)
+    recording.log(
+        "plan/car", rr.Arrows3D.from_fields(colors=[ESTIMATE], radii=[0.1 * car_m]), static=True
+    )
+
+
+def log_landmarks(
+    recording: rr.RecordingStream, pose: Mapping[str, Floats], names: Sequence[str | None]
+) -> None:
+    """Where landmarks were weighed in, by name."""
+    rows = [i for i, name in enumerate(names) if name is not None]
+    if not rows:
+        return
+    flat = np.stack([pose["x_m"][rows], pose["y_m"][rows], np.zeros(len(rows))], axis=1)
+    recording.log(
+        "plan/landmarks",
+        rr.Points3D(
+            flat, colors=[LANDMARK], radii=rr.Radius.ui_points(LANDMARK_POINTS),
+            labels=[str(names[i]) for i in rows],
+        ),
+        static=True,
+    )  # fmt: skip
 
 
 def log_truth(recording: rr.RecordingStream, time: DriveTime, truth: TruthTrack) -> None:
@@ -55,9 +81,8 @@ def log_truth(recording: rr.RecordingStream, time: DriveTime, truth: TruthTrack)
         "plan/true_car", indexes=time.column(truth.t_ns),
         columns=rr.Points3D.columns(positions=flat),
     )  # fmt: skip
-    recording.log(
-        "plan/true_car", rr.Points3D.from_fields(colors=[TRUTH], radii=[1.2]), static=True
-    )
+    dot = rr.Radius.ui_points(TRUE_CAR_POINTS)
+    recording.log("plan/true_car", rr.Points3D.from_fields(colors=[TRUTH], radii=dot), static=True)
 
 
 def log_intersection(

@@ -57,20 +57,17 @@ def draw(settings: Drive, traced: Traced, seed: int, folder: Path) -> Path:
     _places(axes, traced, LANDMARK_MISSED, "s", "w", 7, "landmark passed unnoticed")
     axes.plot(x[0], y[0], "o", color="k", ms=7, mfc="w", label="start")
     axes.set_aspect("equal", adjustable="box")
-    goals = traced.of_kind(GOAL_SET)[:, 2:4]
-    for limits, values, column in ((axes.set_xlim, x, 0), (axes.set_ylim, y, 1)):
-        low, high = (
-            min(values.min(), goals[:, column].min()),
-            max(values.max(), goals[:, column].max()),
-        )
-        limits(low - MARGIN_M, high + MARGIN_M)
+    shown = np.vstack([traced.steps[:, :2], traced.of_kind(GOAL_SET)[:, 2:4]])
+    middle, half_m = 0.5 * (shown.min(0) + shown.max(0)), 0.5 * np.ptp(shown, axis=0).max()
+    for limits, centre in ((axes.set_xlim, middle[0]), (axes.set_ylim, middle[1])):
+        limits(centre - half_m - MARGIN_M, centre + half_m + MARGIN_M)
     axes.set_xlabel("x, east (m)")
     axes.set_ylabel("y, north (m)")
     result = traced.result
     compass = settings.sensors.compass_2sigma_deg
     axes.set_title(
         f"Simulated drive, seed {seed}: {settings.navigation.strategy}, "
-        f"{'no compass' if compass is None else f'compass ±{compass:g}°'}; "
+        f"{'no compass' if compass is None else f'compass ±{compass:g}°'}\n"
         f"{ENDS[Outcome(result.outcome)]} after {result.travelled_m / 1e3:.1f} km, "
         f"error {result.error_m:.0f} m, major axis {result.major_axis_m:.0f} m",
         fontsize=9, loc="left", color="0.3",
