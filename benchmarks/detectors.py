@@ -1,7 +1,8 @@
-"""Cues from stored detections, and a detection run from the cache beside the first run.
+"""Cues from stored detections, pictures decoded as small as serves, a run from the cache.
 
-Prints frames a second of the two-frame car rules from stored masks, and for a camera of simulated
-pictures the time of a run that detects and of one that finds all in the cache.
+Prints frames a second of the two-frame car rules from stored masks (CPU time); for each width that
+a network asks for, a JPEG of 1280 x 720 decoded at full size and shrunk beside ours; and for a
+camera of made-up pictures the time of a run that detects and of one that finds all in the cache.
 """
 
 from __future__ import annotations
@@ -17,9 +18,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from crosscue.datasets.scenes.drive import SceneSettings, jpeg, world_of
+from crosscue.datasets.scenes.render import Renderer
 from crosscue.detectors import rle
-from crosscue.detectors.base import Detections
+from crosscue.detectors.base import Detections, View
 from crosscue.detectors.frame_cues import CuePass, Seen
+from crosscue.detectors.pictures import Encoded, decode
 from crosscue.detectors.registry import chosen
 from crosscue.eval.detect_stage import detect_drive
 from crosscue.replay.log import Selection, open_log
@@ -29,6 +33,7 @@ from crosscue.replay.vehicle import Vehicle
 ROUNDS = 5
 FRAMES = 1000
 PICTURES = 40
+WIDTHS = (160, 320, 480, 640, 1280)
 VEHICLE = Vehicle(version=1)
 
 
@@ -47,12 +52,38 @@ def stored_frames() -> list[Detections]:
 
 
 def cue_seconds(found: list[Detections]) -> float:
-    """One pass over all frames."""
+    """One pass over all frames, CPU time."""
     cues = CuePass(VEHICLE)
-    began = time.perf_counter()
+    began = time.process_time()
     for one in found:
         cues(Seen(one.t_ns, (one,)))
-    return time.perf_counter() - began
+    return time.process_time() - began
+
+
+def decode_seconds() -> None:
+    """A simulated picture for networks of several widths, ours and the peer in turn, CPU time."""
+    settings = SceneSettings("L800", 1)
+    _, _, world = world_of(settings)
+    shown = Renderer(world, settings.camera, settings.picture).picture(5.0)
+    coded = jpeg(shown, settings.picture.jpeg_quality)
+    picture = Encoded("jpeg", memoryview(coded))
+    print(f"{'JPEG of 1280 x 720':22} {'decoded':>10} {'ours, ms':>9} {'full, ms':>9} {'ratio':>6}")
+    for width in WIDTHS:
+        taken: dict[str, list[float]] = {"ours": [], "full": []}
+        for _ in range(ROUNDS * 4):
+            began = time.process_time()
+            ours, _ = decode(picture, View(least_width_px=width))
+            taken["ours"].append(time.process_time() - began)
+            size = (ours.shape[1], ours.shape[0])
+            began = time.process_time()
+            whole = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
+            assert whole is not None
+            if size != (1280, 720):
+                cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
+            taken["full"].append(time.process_time() - began)
+        own, full = (1e3 * median(seconds) for seconds in taken.values())
+        name = f"for {width} px wide"
+        print(f"{name:22} {size[0]:>10} {own:9.2f} {full:9.2f} {full / own:6.1f}")
 
 
 def camera(folder: Path) -> Path:
@@ -77,10 +108,12 @@ def detect_seconds(log_path: Path, run_path: Path, cache: Path) -> float:
 
 
 def main() -> None:
-    """Both subjects."""
+    """All subjects."""
+    cv2.setNumThreads(1)
     found = stored_frames()
     taken = median(cue_seconds(found) for _ in range(ROUNDS))
-    print(f"car rules, 5 masks a frame: {FRAMES / taken:,.0f} frames a second")
+    print(f"car rules, 5 masks a frame: {FRAMES / taken:,.0f} frames a CPU second")
+    decode_seconds()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         log = camera(folder / "camera")
