@@ -51,7 +51,6 @@ from crosscue.replay.columns import Floats
 SETTINGS = Drive()
 BEGUN = Drive(longest_m=1e-3)
 SHORT = Drive(city=City(largest_km2=2.0))
-SEED = 1
 STEPS = 3000
 WINDUP = drive_simulator.WINDUP
 
@@ -265,12 +264,10 @@ def largest_gap(a: Floats, b: Floats) -> float:
 
 def compare(rounds: int, drives: int) -> None:
     numbers = numbers_of(SETTINGS)
-    many = [t for t in (drive_traced(SETTINGS, i) for i in range(200)) if len(t.steps) >= STEPS]
-    traced = many[0]
-    seed = next(
-        i for i in range(200) if drive_traced(SETTINGS, i).first_belief == traced.first_belief
-    )
-    first, readings = compiled_alone(many[:LANES], STEPS)
+    long = [i for i, steps in enumerate(drive_many(SETTINGS, seeds(100))[:, 3]) if steps >= STEPS]
+    many = [drive_traced(SETTINGS, i) for i in long[:LANES]]
+    seed, traced = long[0], many[0]
+    first, readings = compiled_alone(many, STEPS)
     ends = np.empty((9, LANES))
     filter_rows(numbers, first, readings, ends)
     for states in (3, 4):
