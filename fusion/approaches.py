@@ -216,10 +216,9 @@ class Approaches:
             self._close(why)
 
     def _carried(self, track: RangeTrack, evidence: FrameEvidence, moved_m: float) -> RangeTrack:
-        most_sd_m = self._filter.most_sd_m
         if evidence.travelled_m is None or not _has_way(evidence):
-            return go_blind(track, moved_m, most_sd_m)
-        return advance(track, evidence.travelled_m, evidence.travelled_var_m2, most_sd_m)
+            return go_blind(track, moved_m, self._filter)
+        return advance(track, evidence.travelled_m, evidence.travelled_var_m2, self._filter)
 
     def _over(self, at_hand: _Open) -> str | None:
         """Why the approach is over, or None."""
@@ -320,6 +319,9 @@ class Approaches:
     ) -> tuple[RangeTrack, float | None]:
         near_m = self._fusion.dissent_within_m
         track, verdict = measure(track, range_m, var_m2, self._filter, near_m)
+        if verdict is Verdict.WAITS:
+            self.counts["ranges waiting for another look"] += 1
+            return track, None
         if verdict is Verdict.REFUSED:
             self.counts["ranges refused: outside the gate"] += 1
             return track, None

@@ -1,8 +1,9 @@
 """One reference's range over time: gating, missing odometry, and the way back from a bad start.
 
-A measurement outside the gate is refused. Refused ones that agree among themselves form a rival
-belief, which takes over once it has been seen often enough: otherwise one absurd first measurement
-would shut out all good ones.
+A range begins once measurements enough agree: a sign that is there is seen again in the next
+pictures, one that is not there mostly is not. A measurement outside the gate is refused. Refused
+ones that agree among themselves form a rival belief, which takes over once it has been seen often
+enough: otherwise one absurd first measurement would shut out all good ones.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from .intersection_range import RangeBelief, initialise, nis, predict, update
 class Verdict(StrEnum):
     """What became of a measurement."""
 
+    WAITS = "waits"
     BEGAN = "began"
     TAKEN = "taken"
     REFUSED = "refused"
@@ -30,10 +32,11 @@ class RangeTrack(NamedTuple):
     """What is believed of one reference.
 
     Attributes:
-        belief: None before the first measurement and after it was dropped.
-        rival: What refused measurements say that agree among themselves.
+        belief: None before measurements enough have agreed, and after it was dropped.
+        rival: What measurements say that agree among themselves but are no belief: the first
+            ones, or refused ones.
         rival_seen: How many of them in a row.
-        unseen_m: Way gone since the last measurement that was taken.
+        unseen_m: Way gone since the last measurement that was taken, or waits to be.
     """
 
     belief: RangeBelief | None = None
@@ -47,27 +50,38 @@ LEAST_WORTH: Final = 1e-9
 """Of a look from where the car stood at the last one: next to nothing, yet no division by zero."""
 
 
-def advance(track: RangeTrack, travelled_m: float, var_m2: float, most_sd_m: float) -> RangeTrack:
-    """The track after the car went on; without a belief once it is less sure than ``most_sd_m``."""
-    if track.belief is None:
+def advance(
+    track: RangeTrack, travelled_m: float, var_m2: float, settings: RangeFilter
+) -> RangeTrack:
+    """The track after the car went on.
+
+    A belief that has become less sure than ``most_sd_m`` is dropped, and first looks that nothing
+    has confirmed within ``begin_within_m`` are forgotten.
+    """
+    if track.belief is None and track.rival is None:
         return track
-    belief = predict(track.belief, travelled_m, var_m2)
-    if belief.var_m2 > most_sd_m * most_sd_m:
-        return NOTHING
     rival = None if track.rival is None else predict(track.rival, travelled_m, var_m2)
-    return RangeTrack(belief, rival, track.rival_seen, track.unseen_m + abs(travelled_m))
+    unseen_m = track.unseen_m + abs(travelled_m)
+    if track.belief is None:
+        is_stale = unseen_m > settings.begin_within_m
+        return NOTHING if is_stale else RangeTrack(None, rival, track.rival_seen, unseen_m)
+    belief = predict(track.belief, travelled_m, var_m2)
+    if belief.var_m2 > settings.most_sd_m * settings.most_sd_m:
+        return NOTHING
+    return RangeTrack(belief, rival, track.rival_seen, unseen_m)
 
 
-def go_blind(track: RangeTrack, widens_m: float, most_sd_m: float) -> RangeTrack:
+def go_blind(track: RangeTrack, widens_m: float, settings: RangeFilter) -> RangeTrack:
     """The track after a way that nobody measured: the mean stays, the s.d. grows by ``widens_m``.
 
     Standard deviations add, not variances: the unknown speed of one moment is that of the next.
     """
-    if track.belief is None:
+    first = track.rival if track.belief is None else track.belief
+    if first is None:
         return track
-    sd_m = math.sqrt(track.belief.var_m2)
-    blind = advance(track, 0.0, widens_m * (widens_m + 2.0 * sd_m), most_sd_m)
-    return blind._replace(unseen_m=track.unseen_m + widens_m)
+    sd_m = math.sqrt(first.var_m2)
+    gone = track._replace(unseen_m=track.unseen_m + widens_m)
+    return advance(gone, 0.0, widens_m * (widens_m + 2.0 * sd_m), settings)
 
 
 def measure(
@@ -83,21 +97,24 @@ def measure(
         track: Before the measurement, advanced to its time.
         measured_m: Distance to the track's reference.
         sensor_var_m2: Of the measurement.
-        settings: Gate, fade, and when a rival takes over.
+        settings: Gate, fade, how many looks begin a range, and when a rival takes over.
         restarts_beyond_m: No rival takes over from a belief nearer than this: signs further away
             are then the next intersection's.
     """
     belief = track.belief
-    if belief is None:
-        return RangeTrack(initialise(measured_m, sensor_var_m2)), Verdict.BEGAN
-    if _inside(belief, measured_m, sensor_var_m2, settings.gate_nis):
+    if belief is not None and _inside(belief, measured_m, sensor_var_m2, settings.gate_nis):
         worth = _worth(track.unseen_m, settings.fade_m)
         return RangeTrack(update(belief, measured_m, sensor_var_m2 / worth)), Verdict.TAKEN
     rival, seen = track.rival, track.rival_seen + 1
     if rival is not None and _inside(rival, measured_m, sensor_var_m2, settings.gate_nis):
-        rival = update(rival, measured_m, sensor_var_m2)
+        worth = 1.0 if belief is not None else _worth(track.unseen_m, settings.fade_m)
+        rival = update(rival, measured_m, sensor_var_m2 / worth)
     else:
         rival, seen = initialise(measured_m, sensor_var_m2), 1
+    if belief is None:
+        if seen >= settings.begin_after:
+            return RangeTrack(rival), Verdict.BEGAN
+        return RangeTrack(None, rival, seen), Verdict.WAITS
     if seen >= settings.restart_after and belief.mean_m > restarts_beyond_m:
         return RangeTrack(rival), Verdict.RESTARTED
     return RangeTrack(belief, rival, seen, track.unseen_m), Verdict.REFUSED

@@ -34,6 +34,12 @@ class RangeFilter(Section):
     """Measurements whose normalised innovation squared is larger are refused and counted."""
     most_m: Positive = 150.0
     """A sign measured further away than this is refused and counted."""
+    begin_after: Annotated[int, Field(ge=1)] = 2
+    """So many measurements that agree begin a range; the source has 1. On simulated layouts that
+    are not scored, lights that are not there are often seen once, those that are there again and
+    again."""
+    begin_within_m: Positive = 5.0
+    """A first look that none has confirmed within this way is forgotten."""
     restart_after: Annotated[int, Field(ge=1)] = 5
     """So many refused measurements in a row that agree among themselves replace the belief."""
     sd_share: NotNegative = 0.05

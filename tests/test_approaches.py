@@ -16,7 +16,7 @@ from crosscue.replay.fusion_settings import Fusion, RangeFilter
 from support.fusion import NONE_SEEN, SECOND_NS, drive, light, sign
 
 FRAME_NS = SECOND_NS // 10
-PLAIN = RangeFilter(sd_share=0.0, fade_m=0.0)
+PLAIN = RangeFilter(sd_share=0.0, fade_m=0.0, begin_after=1)
 """As in the source, so that ranges can be worked out by hand."""
 
 
@@ -53,6 +53,16 @@ def test_a_drive_past_one_intersection_is_one_approach() -> None:
     assert loop.counts == {
         "approaches opened": 1, "approaches established": 1, "approaches closed: passed": 1,
     }  # fmt: skip
+
+
+def test_a_sign_seen_once_opens_an_approach_but_tells_no_range() -> None:
+    loop = approaches(range_filter=RangeFilter())
+    once = replace(frame(1, stop_sign=1), signs=(sign(60.0),))
+    taken = steps([frame(0), once, *(frame(i) for i in range(2, 40))], loop)
+
+    assert taken[1].approach == 1
+    assert not any(step.ranges for step in taken)
+    assert loop.counts["ranges waiting for another look"] == 1
 
 
 def test_approaches_of_a_drive_are_numbered_and_begin_anew() -> None:
@@ -295,7 +305,7 @@ def test_several_signs_of_one_kind_count_as_their_mean() -> None:
 
 
 def test_a_signs_sd_may_grow_with_its_range() -> None:
-    loop = approaches(range_filter=RangeFilter(sd_share=0.1, fade_m=0.0))
+    loop = approaches(range_filter=RangeFilter(sd_share=0.1, fade_m=0.0, begin_after=1))
 
     (step,) = steps([replace(frame(0), signs=(sign(30.0, 4.0),))], loop)
 

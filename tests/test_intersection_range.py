@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.fusion.intersection_range import RangeBelief, initialise, nis, predict, update
-from crosscue.fusion.range_track import NOTHING, RangeTrack, Verdict, advance, measure
+from crosscue.fusion.range_track import NOTHING, RangeTrack, Verdict, advance, go_blind, measure
 from crosscue.replay.fusion_settings import RangeFilter
 
 METRES = st.floats(-200.0, 200.0)
@@ -118,7 +118,7 @@ def test_errors_are_as_large_as_the_filter_says() -> None:
         track = NOTHING
         for _ in range(30):
             truth_m -= 1.0
-            track = advance(track, 1.0 + rng.normal(0.0, 0.1), 0.01, 20.0)
+            track = advance(track, 1.0 + rng.normal(0.0, 0.1), 0.01, RangeFilter())
             if rng.random() < 0.5:
                 seen_m = truth_m + rng.normal(0.0, 1.7)
                 track, _ = measure(
@@ -142,13 +142,52 @@ def test_an_absurd_measurement_is_refused_and_changes_no_belief() -> None:
 
 def test_an_absurd_first_measurement_does_not_shut_out_the_good_ones() -> None:
     track, verdicts = NOTHING, []
+    source = RangeFilter(begin_after=1, restart_after=5)
     for measured_m in (120.0, 60.0, 59.0, 61.0, 60.0, 60.0):
-        track, verdict = measure(track, measured_m, 2.9, RangeFilter(restart_after=5), 20.0)
+        track, verdict = measure(track, measured_m, 2.9, source, 20.0)
         verdicts.append(verdict)
 
     assert verdicts == [Verdict.BEGAN, *[Verdict.REFUSED] * 4, Verdict.RESTARTED]
     assert track.belief is not None
     assert track.belief.mean_m == pytest.approx(60.0, abs=0.5)
+
+
+def test_what_is_seen_once_gives_no_range_and_is_forgotten() -> None:
+    once, verdict = measure(NOTHING, 60.0, 2.9, RangeFilter(), 20.0)
+    gone = advance(advance(once, 4.0, 0.1, RangeFilter()), 2.0, 0.1, RangeFilter())
+
+    assert verdict is Verdict.WAITS
+    assert once.belief is None
+    assert gone == NOTHING
+
+
+def test_a_second_look_that_agrees_begins_a_range_from_both() -> None:
+    independent = RangeFilter(fade_m=0.0)
+    once, _ = measure(NOTHING, 60.0, 2.0, independent, 20.0)
+    twice, verdict = measure(advance(once, 1.0, 0.0, independent), 61.0, 2.0, independent, 20.0)
+
+    assert verdict is Verdict.BEGAN
+    assert twice.belief == pytest.approx(RangeBelief(60.0, 1.0))
+
+
+def test_looks_that_contradict_each_other_begin_nothing() -> None:
+    track = NOTHING
+    for measured_m in (60.0, 20.0, 110.0, 45.0, 80.0):
+        track, verdict = measure(track, measured_m, 2.9, RangeFilter(), 20.0)
+        assert verdict is Verdict.WAITS
+
+    assert track.belief is None
+
+
+def test_a_first_look_waits_while_the_car_stands_and_widens_where_nobody_measured() -> None:
+    once, _ = measure(NOTHING, 60.0, 2.9, RangeFilter(), 20.0)
+    stood = advance(once, 0.0, 0.0, RangeFilter())
+    blind = go_blind(once, 3.0, RangeFilter())
+
+    assert stood.rival == once.rival
+    assert blind.rival is not None
+    assert math.sqrt(blind.rival.var_m2) == pytest.approx(math.sqrt(2.9) + 3.0)
+    assert go_blind(blind, 3.0, RangeFilter()) == NOTHING
 
 
 def test_absurd_measurements_that_contradict_each_other_never_take_over() -> None:
@@ -170,15 +209,15 @@ def test_the_next_intersections_sign_does_not_pull_away_one_that_is_near() -> No
 
 
 def test_a_range_that_has_become_too_unsure_is_dropped() -> None:
-    assert advance(RangeTrack(RangeBelief(50.0, 399.0)), 0.0, 2.0, 20.0) == NOTHING
+    assert advance(RangeTrack(RangeBelief(50.0, 399.0)), 0.0, 2.0, RangeFilter()) == NOTHING
 
 
 def test_a_look_from_the_same_place_says_nothing_new_where_errors_fade() -> None:
-    fading = RangeFilter(fade_m=2.0)
+    fading = RangeFilter(fade_m=2.0, begin_after=1)
     track, _ = measure(NOTHING, 40.0, 2.9, fading, 20.0)
 
     again, verdict = measure(track, 42.0, 2.9, fading, 20.0)
-    far, _ = measure(advance(track, 30.0, 0.0, 20.0), 12.0, 2.9, fading, 20.0)
+    far, _ = measure(advance(track, 30.0, 0.0, fading), 12.0, 2.9, fading, 20.0)
 
     assert verdict is Verdict.TAKEN
     assert again.belief == pytest.approx(RangeBelief(40.0, 2.9))
@@ -197,8 +236,8 @@ def test_errors_that_fade_along_the_way_are_as_large_as_the_filter_says() -> Non
             truth_m -= 1.0
             error_m = rho * error_m + math.sqrt(1.0 - rho**2) * float(rng.normal(0.0, sd_m))
             for fade in tracks:
-                gone = advance(tracks[fade], 1.0, 0.0, 20.0)
                 filters = RangeFilter(gate_nis=None, fade_m=fade)
+                gone = advance(tracks[fade], 1.0, 0.0, filters)
                 tracks[fade], _ = measure(gone, truth_m + error_m, sd_m**2, filters, 20.0)
         for fade, track in tracks.items():
             assert track.belief is not None
