@@ -38,7 +38,7 @@ class Pooler:
         ]
 
     def __call__(self, pool: Any, boxes: Sequence[Tensor]) -> Tensor:
-        """Shape (M, channels, side, side): of all boxes, picture after picture.
+        """Shape (M, channels, side, side), channels last: of all boxes, picture after picture.
 
         Args:
             pool: A ``MultiScaleRoIAlign``; its sizes are taken.
@@ -47,14 +47,14 @@ class Pooler:
         every = torch.cat(list(boxes))
         pictures = np.repeat(np.arange(len(boxes)), [len(of_one) for of_one in boxes])
         side = int(pool.output_size[0])
-        pooled = np.empty((len(every), self._levels[0].shape[3], side, side), np.float32)
+        pooled = np.empty((len(every), side, side, self._levels[0].shape[3]), np.float32)
         wanted = self._levels_of(every, pool)
         for number, (level, halvings) in enumerate(zip(self._levels, self._halvings, strict=True)):
             rows = np.flatnonzero(wanted == number)
             if rows.size:
                 _pool(level, np.float32(0.5**halvings), every.numpy(), pictures, rows,
                       int(pool.sampling_ratio), pooled)  # fmt: skip
-        return torch.from_numpy(pooled)
+        return torch.from_numpy(pooled).permute(0, 3, 1, 2)
 
     def _levels_of(self, boxes: Tensor, pool: Any) -> Int64s:
         """Larger boxes from coarser levels (Lin et al. 2017, eq. 1)."""
@@ -103,17 +103,17 @@ def _pool(
     pooled: Grid,
 ) -> None:  # fmt: skip
     _, height, width, channels = level.shape
-    side = pooled.shape[2]
+    side = pooled.shape[1]
     count, one = side * samples, np.float32(1.0)
     left, right, top, bottom = np.empty((4, count), np.int64)
     of_right, of_bottom = np.empty((2, count), np.float32)
-    cells = np.empty((side * side, channels), np.float32)
     for row in rows:
         box, picture = boxes[row] * scale, level[pictures[row]]
         cell_x = max(box[2] - box[0], one) / np.float32(side)
         cell_y = max(box[3] - box[1], one) / np.float32(side)
         _places(box[0], cell_x, samples, width, left, right, of_right)
         _places(box[1], cell_y, samples, height, top, bottom, of_bottom)
+        cells = pooled[row].reshape(side * side, channels)
         cells[:] = np.float32(0.0)
         for y in range(count):
             if top[y] < 0:
@@ -126,8 +126,4 @@ def _pool(
                 _add(cells[y // samples * side + x // samples],
                      upper[left[x]], upper[right[x]], lower[left[x]], lower[right[x]],
                      (one - v) * (one - u), (one - v) * u, v * (one - u), v * u)  # fmt: skip
-        share = one / np.float32(samples * samples)
-        flat = pooled[row].reshape(channels, side * side)
-        for channel in range(channels):
-            for cell in range(side * side):
-                flat[channel, cell] = cells[cell, channel] * share
+        cells *= one / np.float32(samples * samples)

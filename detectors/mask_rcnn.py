@@ -1,7 +1,7 @@
 """Mask R-CNN as a detector: boxes, scores and masks of cars, stop signs and traffic lights.
 
 Settings: ``network`` (``embedded``, ``resnet50``, ``resnet50-v2``, or a ``.safetensors`` file),
-``score``, ``proposals``, ``batch``, ``device``, ``backend``, ``threads``.
+``score``, ``proposals``, ``objectness``, ``batch``, ``device``, ``backend``, ``threads``.
 
 Faster than torchvision's own loop with equal results: masks only for boxes that pass the score, and
 laid into their box, never into the picture; on a processor also convolutions by Winograd's way
@@ -27,6 +27,7 @@ from crosscue.replay.errors import CrosscueError, VehicleError
 
 from . import rle
 from .base import Detections, Detector, Found, Frame, View
+from .box_screening import FEWEST, ScreenedParts, can_screen
 from .mask_rcnn_checkpoint import Calibration, Checkpoint, embedded_path, load_checkpoint
 from .mask_rcnn_coco import COCO_NETWORKS, load_coco
 from .mask_rcnn_cpu import for_cpu
@@ -35,7 +36,7 @@ from .mask_rcnn_openvino import OpenVinoParts
 from .mask_rcnn_parts import Parts, TorchParts, detected
 from .settings import Settings, Share, identity_of, settings_of
 
-VERSION: Final = 2
+VERSION: Final = 3
 """Counts up when the same pixels, weights and settings would give other numbers."""
 EMBEDDED: Final = "embedded"
 GPU_BATCH: Final = 8
@@ -51,7 +52,9 @@ class MaskRcnnSettings(Settings):
     score: Share = 0.5
     """Least score of a detection that is given; the cues have their own, higher ones."""
     proposals: Annotated[int, Field(ge=1, le=2000)] = PROPOSALS
-    """Places that are looked at more closely; torchvision's own number is 1000."""
+    """Most places that are looked at more closely; torchvision's own number is 1000."""
+    objectness: Share = 0.0
+    """Least probability that such a place holds anything; torchvision's own is 0."""
     batch: Annotated[int, Field(ge=1, le=256)] | None = None
     """Pictures at a time; without it 1 on a CPU and 8 on a GPU."""
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
@@ -129,7 +132,7 @@ def detector_of(
         raw_score(settings.score, checkpoint.facts.calibration.get(name or "", Calibration()))
         for name in checkpoint.facts.plan.classes
     )
-    set_limits(network, settings.proposals, lowest)
+    set_limits(network, settings.proposals, lowest, settings.objectness)
     batch = settings.batch or (1 if device.type == "cpu" else GPU_BATCH)
     with _threads(settings.threads, device):
         parts = _parts(network, settings, device)
@@ -140,7 +143,10 @@ def _parts(network: Any, settings: MaskRcnnSettings, device: torch.device) -> Pa
     if settings.backend == "openvino":
         return OpenVinoParts(network, settings.threads)
     if device.type == "cpu":
-        return TorchParts(for_cpu(network), device)
+        own = for_cpu(network)
+        if settings.proposals >= FEWEST and can_screen(own):
+            return ScreenedParts(own)
+        return TorchParts(own, device)
     return TorchParts(network.to(memory_format=torch.channels_last), device)
 
 
@@ -169,7 +175,9 @@ class MaskRcnnDetector:
     @property
     def identity(self) -> str:
         """Of weights, settings, device kind and torch."""
-        asked = self.settings.model_dump(include={"score", "proposals", "halve", "backend"})
+        asked = self.settings.model_dump(
+            include={"score", "proposals", "objectness", "halve", "backend"}
+        )
         return identity_of(
             "mask-rcnn", VERSION, self.checkpoint.sha256, asked, self.device.type,
             str(torch.__version__),

@@ -1,8 +1,9 @@
 """A copy of a Mask R-CNN that a processor runs faster, with the same results up to rounding.
 
-Batch normalisation is folded into the convolutions before it. Convolutions of 3 x 3 run by
-Winograd's way (Lavin and Gray 2016), which torch holds in NNPACK: two to three times fewer
-multiplications than there are in the plain sum, and errors no larger than those of folding.
+Batch normalisation is folded into the convolutions before it, and means of 2 x 2 places are sums
+of slices. Convolutions of 3 x 3 run by Winograd's way (Lavin and Gray 2016), which torch holds in
+NNPACK: two to three times fewer multiplications than there are in the plain sum, and errors no
+larger than those of folding.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ def for_cpu(network: Any) -> Any:
     """A copy for detecting on a processor; the network given stays as it is."""
     own = copy.deepcopy(network).eval().to(memory_format=torch.contiguous_format)
     _fold(own)
+    _take_slices(own.backbone)
     # Asking is also what makes NNPACK ready.
     if torch.backends.nnpack.is_available():  # type: ignore[no-untyped-call]
         for part in (own.backbone, own.rpn.head):
@@ -45,6 +47,14 @@ def _fold(module: nn.Module) -> None:
         before = name, child
 
 
+def _take_slices(module: nn.Module) -> None:
+    for name, child in list(module.named_children()):
+        if isinstance(child, nn.AvgPool2d) and (child.kernel_size, child.stride) == (2, 2):
+            setattr(module, name, Halved(child))
+        else:
+            _take_slices(child)
+
+
 def _take_winograd(module: nn.Module) -> None:
     for name, child in list(module.named_children()):
         if isinstance(child, nn.Conv2d) and _is_suited(child):
@@ -63,6 +73,23 @@ def _is_suited(convolution: nn.Conv2d) -> bool:
         and convolution.padding_mode == "zeros"
         and min(convolution.in_channels, convolution.out_channels) >= LEAST_CHANNELS
     )
+
+
+class Halved(nn.Module):
+    """Means of 2 x 2 places: several times as fast as torch's own pooling on one thread."""
+
+    def __init__(self, plain: nn.AvgPool2d) -> None:
+        """In place of a plain one, which is still asked where a side is odd."""
+        super().__init__()
+        self.plain = plain
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Half the size."""
+        if x.shape[2] % 2 or x.shape[3] % 2:
+            pooled: Tensor = self.plain(x)
+            return pooled
+        rows = x[:, :, ::2] + x[:, :, 1::2]
+        return (rows[..., ::2] + rows[..., 1::2]) * 0.25
 
 
 class Winograd(nn.Module):

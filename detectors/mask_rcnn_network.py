@@ -72,15 +72,23 @@ def build_network(plan: Plan) -> Any:
     return make(weights=None, weights_backbone=None, num_classes=classes)
 
 
-def set_limits(network: Any, proposals: int, score: float) -> None:
-    """How many places the network looks at more closely, and the least score of what it gives.
+def set_limits(network: Any, proposals: int, score: float, objectness: float = 0.0) -> None:
+    """Which places the network looks at more closely, and the least score of what it gives.
 
     Boxes below the score never reach the mask head, so this is also where the masks' time is saved.
+
+    Args:
+        network: A torchvision ``MaskRCNN``.
+        proposals: The most places of a picture.
+        score: Of a detection, from 0 to 1.
+        objectness: Least probability that a place holds anything, from 0 to 1; torchvision's own
+            is 0, so that most of its 1000 places are plain background.
     """
     rpn, heads = network.rpn, network.roi_heads
     before = max(proposals, min(3 * proposals, MOST_BEFORE_SUPPRESSION))
     rpn._pre_nms_top_n = {**rpn._pre_nms_top_n, "testing": before}
     rpn._post_nms_top_n = {**rpn._post_nms_top_n, "testing": proposals}
+    rpn.score_thresh = objectness
     heads.score_thresh = score
 
 
@@ -174,7 +182,9 @@ class Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """The same size, or half of it."""
-        return functional.relu(self.second(self.first(x)) + self.short_cut(x))
+        sum_of_both = self.second(self.first(x))
+        sum_of_both += self.short_cut(x)
+        return functional.relu_(sum_of_both)
 
 
 def _conv(inputs: int, outputs: int, stride: int) -> nn.Sequential:

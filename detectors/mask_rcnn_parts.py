@@ -1,7 +1,8 @@
 """Mask R-CNN in parts: the heavy ones behind whichever back end runs them, the rest in torchvision.
 
 A back end gives levels and scores of the whole picture, the box head and the mask head. Proposals,
-pooling and suppression are torchvision's own functions, so that every back end finds the same.
+pooling and suppression are the same for all: torchvision's own functions, and on a processor ours
+that give the same boxes.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from crosscue.replay.columns import Bytes
 
 from .box_pooling import Pooler
 from .mask_rcnn_network import MEAN, SPREAD
+from .proposal_choice import FEW, likeliest_apart
 
 
 class Body(NamedTuple):
@@ -95,29 +97,41 @@ def _proposals(rpn: Any, body: Body, sizes: list[tuple[int, int]]) -> list[Tenso
     That decodes every anchor and then takes the likeliest of each level; here the likeliest are
     taken first, which gives the same boxes.
     """
-    from torchvision.models.detection.image_list import ImageList
-
     pictures = len(sizes)
-    # Anchors need only the padded size, so an empty tensor of that shape stands for the pictures.
-    images = ImageList(body.levels[0].new_empty((pictures, 0, *sizes[0])), sizes)
-    anchors = rpn.anchor_generator(images, list(body.levels))[0]
-    begin = 0
     boxes, scores = [], []
-    for logits, shifts in zip(body.objectness, body.shifts, strict=True):
+    bases = rpn.anchor_generator.cell_anchors
+    for logits, shifts, base in zip(body.objectness, body.shifts, bases, strict=True):
         flat = logits.permute(0, 2, 3, 1).reshape(pictures, -1)
-        end = begin + flat.shape[1]
         best, at = flat.topk(min(rpn.pre_nms_top_n(), flat.shape[1]), dim=1)
         chosen = _flat_shifts(shifts, logits.shape[1]).gather(1, at[:, :, None].expand(-1, -1, 4))
-        decoded = rpn.box_coder.decode_single(
-            chosen.reshape(-1, 4), anchors[begin:end][at].reshape(-1, 4)
-        )
+        anchors = _anchors(base.to(at.device), at.reshape(-1), logits.shape[2:], sizes[0])
+        decoded = rpn.box_coder.decode_single(chosen.reshape(-1, 4), anchors)
         boxes.append(decoded.reshape(pictures, -1, 4))
         scores.append(best)
-        begin = end
     counts = [of_level.shape[1] for of_level in scores]
+    every, likely = torch.cat(boxes, 1), torch.cat(scores, 1)
+    if every.device.type == "cpu" and every.shape[1] > FEW:
+        levels = np.repeat(np.arange(len(counts)), counts)
+        return [likeliest_apart(rpn, every[i], likely[i], levels, size)
+                for i, size in enumerate(sizes)]  # fmt: skip
     kept: list[Tensor]
-    kept, _ = rpn.filter_proposals(torch.cat(boxes, 1), torch.cat(scores, 1), sizes, counts)
+    kept, _ = rpn.filter_proposals(every, likely, sizes, counts)
     return kept
+
+
+def _anchors(base: Tensor, at: Tensor, grid: Sequence[int], size_px: tuple[int, int]) -> Tensor:
+    """Anchors (M, 4) of a level by their numbers, as torchvision's generator counts them.
+
+    Args:
+        base: Shape (anchors, 4): of the first place.
+        at: Shape (M,): (row * columns + column) * anchors + anchor.
+        grid: Rows and columns of places.
+        size_px: Height and width of the picture.
+    """
+    place, which = at // len(base), at % len(base)
+    x = place % grid[1] * (size_px[1] // grid[1])
+    y = place // grid[1] * (size_px[0] // grid[0])
+    return torch.stack((x, y, x, y), 1) + base[which]
 
 
 def _flat_shifts(shifts: Tensor, anchors: int) -> Tensor:

@@ -216,6 +216,7 @@ def test_identity_changes_with_all_that_changes_results() -> None:
     assert _detector(threads=2, batch=3).identity == base
     assert _detector(score=0.41).identity != base
     assert _detector(proposals=50).identity != base
+    assert _detector(objectness=0.01).identity != base
     assert _detector(other).identity != base
 
 

@@ -22,6 +22,7 @@ from torch import nn
 from crosscue.datasets.scenes.camera import Camera
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.box_screening import ScreenedParts
 from crosscue.detectors.mask_rcnn import (
     MaskRcnnDetector,
     MaskRcnnSettings,
@@ -32,7 +33,7 @@ from crosscue.detectors.mask_rcnn import (
     place,
 )
 from crosscue.detectors.mask_rcnn_checkpoint import Checkpoint, Facts
-from crosscue.detectors.mask_rcnn_cpu import LEAST_PIXELS, Winograd, for_cpu
+from crosscue.detectors.mask_rcnn_cpu import LEAST_PIXELS, Halved, Winograd, for_cpu
 from crosscue.detectors.mask_rcnn_network import build_network
 from crosscue.detectors.mask_rcnn_parts import TorchParts, as_input
 from crosscue.replay.errors import VehicleError
@@ -83,22 +84,25 @@ def _simulated() -> tuple[Frame, ...]:
 
 
 @cache
-def _torchvision(network: Any) -> Any:
+def _torchvision(network: Any, objectness: float = 0.0) -> Any:
     """A copy that looks at as many places as torchvision's own loop and keeps its scores."""
     own = copy.deepcopy(network).eval()
     own.rpn._pre_nms_top_n["testing"] = own.rpn._post_nms_top_n["testing"] = 1000
+    own.rpn.score_thresh = objectness
     own.roi_heads.score_thresh = 0.05
     own.transform = nn.Identity()
     return own
 
 
-def _told_by_torchvision(checkpoint: Checkpoint, frame: Frame) -> Detections:
+def _told_by_torchvision(
+    checkpoint: Checkpoint, frame: Frame, objectness: float = 0.0
+) -> Detections:
     """Torchvision's own modules in torchvision's own order, above the score."""
     from torchvision.models.detection.image_list import ImageList
 
     plan = checkpoint.facts.plan
     placed = place(frame.pixels, plan)
-    network = _torchvision(checkpoint.network)
+    network = _torchvision(checkpoint.network, objectness)
     with torch.inference_mode():
         pictures = as_input(placed.pixels[None], CPU)
         sizes = [(int(pictures.shape[2]), int(pictures.shape[3]))]
@@ -133,7 +137,7 @@ def _assert_equal(ours: Detections, theirs: Detections) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("seed", [0, 5])
+@pytest.mark.parametrize("seed", [0, 7])
 def test_random_weights_find_what_torchvision_finds_with_them(backend: str, seed: int) -> None:
     checkpoint = random_checkpoint(seed)
     detector = _detector(checkpoint, backend)
@@ -144,6 +148,19 @@ def test_random_weights_find_what_torchvision_finds_with_them(backend: str, seed
         _assert_equal(_found(detector, frame), theirs)
         found += len(theirs)
     assert found > 10
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_places_that_look_empty_are_left_out_as_torchvision_leaves_them_out(backend: str) -> None:
+    checkpoint = random_checkpoint(0)
+    counts = []
+    for floor in (0.0, 0.5, 1.0):
+        theirs = _told_by_torchvision(checkpoint, noise_frame(), floor)
+        ours = _found(_detector(checkpoint, backend, objectness=floor), noise_frame())
+        _assert_equal(ours, theirs)
+        counts.append(len(theirs))
+
+    assert counts[0] > counts[1] > counts[2] == 0
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -202,6 +219,42 @@ def test_winograds_way_gives_the_plain_sum(
     np.testing.assert_allclose(got.numpy(), wanted.numpy(), atol=1e-4)
 
 
+@settings(max_examples=15, deadline=None)
+@given(st.integers(1, 9), st.integers(1, 9))
+def test_means_by_slices_are_those_of_torch(height: int, width: int) -> None:
+    plain = nn.AvgPool2d(2, ceil_mode=True)
+    x = torch.randn(2, 3, height, width)
+
+    np.testing.assert_allclose(Halved(plain)(x).numpy(), plain(x).numpy(), atol=1e-6)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_a_rough_look_loses_nothing_that_reaches_the_score(noise: float) -> None:
+    torch.manual_seed(4)
+    network = build_network(plan_of()).eval()
+    heads = network.roi_heads
+    with torch.no_grad():
+        # A first layer that thin matrices stand in for, and with noise one that they cannot.
+        first = heads.box_head.fc6.weight
+        thin = torch.randn(256, 8) @ torch.randn(8, first.shape[1])
+        first.copy_(0.02 * (thin + 10.0 * noise * torch.randn(first.shape)))
+        heads.box_predictor.cls_score.weight.mul_(4.0)
+    heads.score_thresh = SCORE
+    pooled = torch.randn(500, 64, 7, 7).contiguous(memory_format=torch.channels_last)
+
+    with torch.inference_mode():
+        ours, our_shifts = ScreenedParts(network).boxes(pooled)
+        logits, shifts = TorchParts(network, CPU).boxes(pooled)
+
+    mine, other = (torch.softmax(of, 1)[:, 1:].amax(1) for of in (ours, logits))
+    found = other >= SCORE
+    assert 10 < int(found.sum()) < 490
+    assert torch.equal(mine >= SCORE, found)
+    np.testing.assert_allclose(ours[found].numpy(), logits[found].numpy(), atol=1e-3)
+    np.testing.assert_allclose(our_shifts[found].numpy(), shifts[found].numpy(), atol=1e-3)
+    assert bool((our_shifts == 0.0).all(1).any()) == (noise == 0.0)
+
+
 def test_the_copy_for_a_cpu_has_the_levels_of_its_original_and_leaves_it_alone() -> None:
     torch.manual_seed(3)
     network = build_network(plan_of())
@@ -222,6 +275,7 @@ def test_the_copy_for_a_cpu_has_the_levels_of_its_original_and_leaves_it_alone()
         theirs = TorchParts(network, CPU).body(pictures)
 
     assert any(isinstance(m, Winograd) for m in own.modules())
+    assert any(isinstance(m, Halved) for m in own.modules())
     assert not any(isinstance(m, nn.BatchNorm2d) for m in own.modules())
     assert LEAST_PIXELS <= (192 // 8) * (256 // 8)
     for ours_of, theirs_of in zip(ours, theirs, strict=True):

@@ -1,0 +1,73 @@
+"""The likeliest boxes of a picture that do not cover each other, on a processor.
+
+As torchvision's ``RegionProposalNetwork.filter_proposals``, which compares every box of a level
+with all that follow it; here it ends as soon as there are as many as asked for.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor
+
+from crosscue.replay.columns import Int64s
+
+Boxes = NDArray[np.float32]
+FEW: Final = 1000
+"""Up to as many, torchvision compares boxes that it moved far apart, which rounds otherwise."""
+
+
+def likeliest_apart(
+    rpn: Any, boxes: Tensor, logits: Tensor, levels: Int64s, size_px: tuple[int, int]
+) -> Tensor:
+    """Those of one picture that are likely and large enough, the best first; shape (M, 4).
+
+    Args:
+        rpn: Its limits are taken.
+        boxes: Shape (N, 4), in pixels; cut off at the picture's rim.
+        logits: Shape (N,): of holding anything.
+        levels: Shape (N,): boxes of different levels never compete.
+        size_px: Height and width of the picture.
+    """
+    from torchvision.ops import boxes as box_ops
+
+    inside = box_ops.clip_boxes_to_image(boxes, size_px).float().numpy()
+    likely = torch.sigmoid(logits.float()).numpy()
+    sides = inside[:, 2:] - inside[:, :2]
+    usable = np.flatnonzero((sides >= rpn.min_size).all(1) & (likely >= rpn.score_thresh))
+    order = usable[np.argsort(-likely[usable], kind="stable")]
+    ordered = inside[order]
+    return torch.from_numpy(
+        ordered[_apart(ordered, levels[order], float(rpn.nms_thresh), rpn.post_nms_top_n())]
+    )
+
+
+@njit(cache=True)
+def _apart(boxes: Boxes, levels: Int64s, overlap: float, most: int) -> Int64s:
+    """Rows of boxes that no better kept one of their level overlaps more than that."""
+    kept = np.empty(min(most, len(boxes)), np.int64)
+    areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    count = 0
+    for i in range(len(boxes)):
+        if count == kept.size:
+            break
+        is_free = True
+        for j in kept[:count]:
+            if levels[j] != levels[i]:
+                continue
+            width = min(boxes[i, 2], boxes[j, 2]) - max(boxes[i, 0], boxes[j, 0])
+            height = min(boxes[i, 3], boxes[j, 3]) - max(boxes[i, 1], boxes[j, 1])
+            if width <= 0.0 or height <= 0.0:
+                continue
+            common = width * height
+            if common / (areas[i] + areas[j] - common) > overlap:
+                is_free = False
+                break
+        if is_free:
+            kept[count] = i
+            count += 1
+    return kept[:count]
