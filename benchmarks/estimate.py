@@ -37,6 +37,7 @@ PICTURE_BYTES = 150_000
 CAMERA = Topic("/camera", "crosscue/Images", "columns")
 SIZE = (1280, 720)
 SECONDS_PER_BLOCK = 15.0
+STAYS_NS = 3_000_000_000
 LABELS = ("car", "car", "car", "car", "stop sign", "traffic light")
 RANGES = """
 [ranges.stop_sign]
@@ -59,8 +60,10 @@ class Busy:
         return [self._of(frame) for frame in frames]
 
     def _of(self, frame: Frame) -> Found:
-        rng = np.random.default_rng(frame.t_ns % 2**32)
+        # Each object stays for some seconds and moves a little, so that cars are found again.
+        rng = np.random.default_rng(frame.t_ns // STAYS_NS)
         corner = np.column_stack([rng.integers(0, 1100, 6), rng.integers(100, 600, 6)])
+        corner[:, 0] += frame.t_ns % STAYS_NS * 50 // STAYS_NS
         size = np.array([(120, 45), (120, 45), (90, 80), (60, 52), (30, 31), (14, 34)])
         boxes = np.hstack([corner, corner + size]).astype(np.float64)
         masks = tuple(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,9 @@ class Sides(NamedTuple):
 
     left: int
     right: int
+
+
+NONE: Final = Sides(0, 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,13 +143,19 @@ def pair_cars(before: CarShapes, now: CarShapes, settings: Cars) -> Pairs:
     width = now.size_px[0]
     is_apart = not 0.0 < gap_s <= settings.most_gap_s or before.size_px != now.size_px
     if is_apart or not len(before) or not len(now):
-        return Pairs(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), width)
+        return _no_pairs(width)
     steps = now.center_px[None, :, :] - before.center_px[:, None, :]
     distance = np.hypot(steps[:, :, 0], steps[:, :, 1])
     change = np.abs(now.area_px[None, :] - before.area_px[:, None]) / before.area_px[:, None]
     fits = (change < settings.area_change) & (distance < settings.position_change * width)
+    if not fits.any():
+        return _no_pairs(width)
     first, second = _nearest(np.where(fits, distance, np.inf))
     return Pairs(steps[first, second], now.center_px[second], now.nose[second], width)
+
+
+def _no_pairs(width_px: int) -> Pairs:
+    return Pairs(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), width_px)
 
 
 def _nearest(cost: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -167,6 +176,8 @@ def _nearest(cost: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 def cross_traffic(pairs: Pairs, settings: Cars) -> Sides:
     """Cars that move to the left and to the right: horizontally, and not just a little (eq. 15)."""
+    if not len(pairs.nose):
+        return NONE
     x, y = pairs.step_px[:, 0], pairs.step_px[:, 1]
     least = settings.still_change * pairs.width_px
     is_moving = (np.abs(x) > least) & (np.abs(y) <= settings.slope * np.abs(x))
@@ -175,6 +186,8 @@ def cross_traffic(pairs: Pairs, settings: Cars) -> Sides:
 
 def parked_cars(pairs: Pairs, settings: Cars) -> Sides:
     """Cars that stand and face left, and right (eq. 16); an unknown nose says nothing."""
+    if not len(pairs.nose):
+        return NONE
     least = settings.still_change * pairs.width_px
     is_still = (np.abs(pairs.step_px) <= least).all(axis=1)
     return Sides(int(np.sum(is_still & (pairs.nose < 0))), int(np.sum(is_still & (pairs.nose > 0))))

@@ -64,7 +64,7 @@ def runs(text: bytes) -> Int64s:
     last = np.flatnonzero(is_last)
     values: Int64s = ((codes[last] ^ _SIGN).astype(np.int64)) - _SIGN
     if len(last) < len(codes):
-        _prepend(values, codes, last, np.flatnonzero(~is_last), text)
+        _prepend(values, codes, np.flatnonzero(~is_last).tolist(), text)
     values[1::2] = values[1::2].cumsum()
     values[2::2] = values[2::2].cumsum()
     if values.min() < 0:
@@ -72,20 +72,23 @@ def runs(text: bytes) -> Int64s:
     return values
 
 
-def _prepend(
-    values: Int64s, codes: NDArray[np.uint8], last: NDArray[np.intp], before: NDArray[np.intp],
-    text: bytes,
-) -> None:  # fmt: skip
-    """Put the lower groups of five bits under those that end each value."""
-    owner = last.searchsorted(before)
-    first = np.zeros_like(last)
-    first[1:] = last[:-1] + 1
-    more = last - first
-    if more.max() >= _LONGEST:
-        raise ValueError(f"not a compressed mask, a run is too long: {text[:20]!r}")
-    values <<= 5 * more
-    low = (codes[before] & 0x1F).astype(np.int64) << (5 * (before - first[owner]))
-    np.add.at(values, owner, low)
+def _prepend(values: Int64s, codes: NDArray[np.uint8], places: list[int], text: bytes) -> None:
+    """Put the lower groups of five bits, at ``places``, under those that end each value.
+
+    Runs are mostly shorter than 16 pixels apart, so there are few: a loop beats ten calls.
+    """
+    low, groups, before = 0, 0, -1
+    for number, place in enumerate(places):
+        if place != before + 1:
+            low, groups = 0, 0
+        low |= (int(codes[place]) & 0x1F) << (5 * groups)
+        groups += 1
+        before = place
+        if groups >= _LONGEST:
+            raise ValueError(f"not a compressed mask, a run is too long: {text[:20]!r}")
+        if number + 1 == len(places) or places[number + 1] != place + 1:
+            owner = place - number
+            values[owner] = (int(values[owner]) << (5 * groups)) + low
 
 
 def area_px(text: bytes) -> int:
@@ -100,23 +103,20 @@ def column_heights_px(text: bytes, size_px: tuple[int, int]) -> Floats:
         ValueError: Not such a text, or not for a picture of this size.
     """
     width, height = size_px
-    lengths = _checked(text, size_px)
-    heights = np.zeros(width)
-    edges = np.zeros(len(lengths) + 1)
-    lengths.cumsum(out=edges[1:])
-    counted = np.zeros(len(edges))
-    lengths[1::2].cumsum(out=counted[2::2])
-    if not counted[2::2].any():
-        return heights
+    lengths = runs(text)
+    edges = lengths.cumsum()
+    _check_pixels(int(edges[-1]), int(lengths[-1]), size_px)
+    objects, stops = lengths[1::2], edges[1::2]
+    column = (stops - objects) // height
+    if (column == (stops - 1) // height).all():
+        return np.asarray(np.bincount(column, objects, width), np.float64)
+    # A run goes on into the next column. Between two edges the count of object pixels grows
+    # evenly, so looking it up at the columns' borders is exact.
+    counted = np.zeros(len(edges) + 1)
+    objects.cumsum(out=counted[2::2])
     counted[3::2] = counted[2:-1:2]
-    # Only columns that the object touches: a car is a tenth of the picture.
-    objects = len(lengths) // 2
-    first, last = int(edges[1]) // height, -(-int(edges[2 * objects]) // height)
-    borders = np.arange(first, last + 1) * height
-    # Between two edges the count grows evenly, so looking it up at column borders is exact.
-    below = np.interp(borders, edges, counted)
-    np.subtract(below[1:], below[:-1], out=heights[first:last])
-    return heights
+    borders = np.arange(width + 1) * height
+    return np.diff(np.interp(borders, np.concatenate([[0], edges]), counted))
 
 
 def decode(text: bytes, size_px: tuple[int, int]) -> NDArray[np.bool_]:
@@ -136,10 +136,15 @@ def decode(text: bytes, size_px: tuple[int, int]) -> NDArray[np.bool_]:
 
 def _checked(text: bytes, size_px: tuple[int, int]) -> Int64s:
     lengths = runs(text)
-    pixels, told = size_px[0] * size_px[1], int(lengths.sum())
-    if told > pixels or told not in (pixels, pixels - int(lengths[-1])):
-        raise ValueError(f"mask of {told} pixels: want {size_px[0]} x {size_px[1]}")
+    _check_pixels(int(lengths.sum()), int(lengths[-1]), size_px)
     return lengths
+
+
+def _check_pixels(told: int, last: int, size_px: tuple[int, int]) -> None:
+    """A last run of background may be left out."""
+    pixels = size_px[0] * size_px[1]
+    if told > pixels or told not in (pixels, pixels - last):
+        raise ValueError(f"mask of {told} pixels: want {size_px[0]} x {size_px[1]}")
 
 
 def _to_text(lengths: Int64s) -> bytes:
