@@ -11,26 +11,28 @@ from __future__ import annotations
 from typing import Any, Final
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from .mask_rcnn_parts import TorchParts
 
 FEWEST: Final = 200
 """Proposals from which it pays."""
-RANK: Final = 1 / 4
+RANK: Final = 3 / 16
 """Of the thin matrices, as a share of the layer's outputs."""
-MARGIN: Final = 2.0
+MARGIN: Final = 2.5
 """Log-odds by which a rough score may be too low before a detection could be lost."""
 CHECKED: Final = 40
 """Every so many proposals one is looked at closely in any case, to see how wrong the rough is."""
 
 
 def can_screen(network: Any) -> bool:
-    """Whether its box head is torchvision's of two layers."""
+    """Whether its box head is torchvision's of two layers, with scores from a third."""
     from torchvision.models.detection.faster_rcnn import TwoMLPHead
 
-    return isinstance(network.roi_heads.box_head, TwoMLPHead)
+    heads = network.roi_heads
+    scores = getattr(heads.box_predictor, "cls_score", None)
+    return isinstance(heads.box_head, TwoMLPHead) and isinstance(scores, nn.Linear)
 
 
 class ScreenedParts(TorchParts):
@@ -43,12 +45,14 @@ class ScreenedParts(TorchParts):
         self._least: Final = float(torch.logit(torch.tensor(float(self._heads.score_thresh))))
         first = self._heads.box_head.fc6
         with torch.inference_mode():
-            left, sizes, right = torch.linalg.svd(first.weight, full_matrices=False)
+            # The left singular vectors, from a matrix that is small however wide the layer is.
+            _, left = torch.linalg.eigh(first.weight @ first.weight.T)
             rank = max(round(RANK * first.out_features), 1)
+            self._wide: Final = left[:, -rank:].contiguous()
             # Pooled boxes have their channels last, so that these rows have too.
-            thin = right[:rank].unflatten(1, (network.backbone.out_channels, -1))
+            thin = self._wide.T @ first.weight
+            thin = thin.unflatten(1, (network.backbone.out_channels, -1))
             self._narrow: Final = thin.transpose(1, 2).flatten(1).contiguous()
-            self._wide: Final = (left[:, :rank] * sizes[:rank]).contiguous()
 
     def boxes(self, pooled: Tensor, /) -> tuple[Tensor, Tensor]:
         """As ``Parts``; shifts are 0 where logits are rough."""

@@ -5,7 +5,8 @@ Settings: ``network`` (``embedded``, ``resnet50``, ``resnet50-v2``, or a ``.safe
 
 Faster than torchvision's own loop with equal results: masks only for boxes that pass the score, and
 laid into their box, never into the picture; on a processor also convolutions by Winograd's way
-(``mask_rcnn_cpu``) or OpenVINO (``mask_rcnn_openvino``). Fewer proposals save the rest.
+(``mask_rcnn_cpu``) or OpenVINO (``mask_rcnn_openvino``), and of many proposals a rough look first
+(``box_screening``). Fewer proposals save the rest.
 """
 
 from __future__ import annotations
