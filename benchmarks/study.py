@@ -65,7 +65,7 @@ def seeds(count: int) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
     return np.arange(count, dtype=np.uint64)
 
 
-class Odometry(ExtendedKalmanFilter):
+class Odometry(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
     """filterpy's filter on x, y, heading and, with four states, speed."""
 
     def __init__(self, first: tuple[float, float, float], states: int) -> None:
