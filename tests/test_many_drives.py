@@ -184,6 +184,7 @@ def test_a_fingerprint_changes_with_any_setting() -> None:
 
 
 RUNNER = """
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -198,6 +199,8 @@ def run(args):
     return 0
 
 if __name__ == "__main__":
+    # Whoever started the tests in a shell's background has made them deaf to this signal.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.exit(_guarded(types.SimpleNamespace(run=run), argparse.Namespace(verbose=False)))
 """
 

@@ -250,7 +250,7 @@ CUE: dict[str, Any] = {"cue": "stop_sign", "present": True}
         ({"approaches": [ONE | {"enter_ns": 101}]}, "from 0 to 100"),
         ({"approaches": [ONE | {"control": "yield"}]}, "approaches.0.control"),
         ({"cues": [CUE | {"t_ns": 100}]}, "from 0 to 100"),
-        ({"cues": [CUE | {"cue": "zebra", "t_ns": 5}]}, "cues.0.cue"),
+        ({"cues": [CUE | {"cue": "zebra", "t_ns": 5}]}, "no such cue"),
         ({"cues": [CUE]}, "either t_ns"),
         ({"cues": [CUE | {"t_ns": 5, "start_ns": 5, "end_ns": 6}]}, "either t_ns"),
         ({"cues": [CUE | {"start_ns": 5}]}, "either t_ns"),
