@@ -14,6 +14,7 @@ from crosscue.datasets.truth import FILE, load
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError, UsageError
 from crosscue.replay.limits import MIB
+from crosscue.replay.parquet_file import opened
 
 MOST_BYTES: Final = 256 * MIB
 LABELS: Final[Mapping[str, str]] = {"stop_sign": "stop sign", "traffic_light": "traffic light"}
@@ -101,7 +102,7 @@ def pairs_of_run(run: Path, truth: Path, cue: str, score: float) -> RangePairs:
     if not path.exists():
         raise UsageError(f"{path}: not there; run crosscue detect first")
     names = ["t_ns", "label", "score", "height_px"]
-    with path.open("rb") as file:
+    with opened(path) as file:
         table = pq.read_table(file, columns=names, page_checksum_verification=True)
     t_ns, label, scores, height = (table[name].to_pylist() for name in names)
     rows = [
@@ -168,6 +169,6 @@ def _parquet(path: Path) -> tuple[Floats, ...]:
     import pyarrow.parquet as pq
 
     names = list(RangePairs._fields)
-    with path.open("rb") as file:
+    with opened(path) as file:
         table = pq.read_table(file, columns=names, page_checksum_verification=True)
     return tuple(np.asarray(table[name].to_numpy(), np.float64) for name in names)

@@ -23,6 +23,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
 from .errors import OutputError, RunError
+from .parquet_file import opened
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -81,7 +82,7 @@ class RunFolder:
 
         path = self.file(f"{name}.parquet")
         try:
-            with path.open("rb") as file:
+            with opened(path) as file:
                 return pq.read_table(file, columns=columns, page_checksum_verification=True)
         except FileNotFoundError:
             raise RunError(f"{path}: not there; run crosscue replay again") from None
@@ -99,7 +100,7 @@ class RunFolder:
 
         path = self.file(f"{name}.parquet")
         try:
-            with path.open("rb") as file:
+            with opened(path) as file:
                 return pq.read_schema(file).remove_metadata()
         except FileNotFoundError:
             raise RunError(f"{path}: not there; run crosscue replay again") from None
@@ -120,7 +121,7 @@ class RunFolder:
         path = self.file(f"{name}.parquet")
         try:
             with (
-                path.open("rb") as handle,
+                opened(path) as handle,
                 pq.ParquetFile(handle, page_checksum_verification=True) as file,
             ):
                 yield from file.iter_batches(rows, columns=columns)
