@@ -16,7 +16,7 @@ import torch
 from pydantic import Field, ValidationError
 from torch import Tensor
 
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.errors import VehicleError, one_line
 from crosscue.replay.run_folder import write_whole
 
 from .mask_rcnn_network import Plan, build_network
@@ -143,7 +143,7 @@ def _tensors(content: bytes, path: Path) -> tuple[Mapping[str, str], dict[str, T
         size = int.from_bytes(content[:8], "little")
         header = json.loads(content[8 : 8 + size]).get("__metadata__", {})
     except (SafetensorError, ValueError, RecursionError) as error:
-        why = " ".join(str(error).split())[:120]
+        why = one_line(error, 120)
         raise VehicleError(f"{path}: no safetensors file ({why}); is it whole?") from None
     return header, tensors
 

@@ -15,7 +15,7 @@ from urllib.error import URLError
 import torch
 from torch import nn
 
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.errors import VehicleError, one_line
 
 from .mask_rcnn_checkpoint import Checkpoint, Facts
 from .mask_rcnn_network import Plan, build_network
@@ -49,7 +49,7 @@ def load_coco(name: str) -> Checkpoint:
             f'and put it at {place}, or take network = "embedded"'
         ) from None
     except (OSError, RuntimeError, ValueError) as error:
-        why = " ".join(str(error).split())[:160]
+        why = one_line(error, 160)
         raise VehicleError(
             f"detector mask-rcnn: {name}: {place} is not usable ({why}); delete it and run again"
         ) from None

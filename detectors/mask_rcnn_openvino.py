@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from crosscue.replay.columns import Bytes
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.errors import VehicleError, one_line
 
 from .mask_rcnn_network import MEAN, SPREAD, STRIDE
 from .mask_rcnn_parts import Body
@@ -114,7 +114,7 @@ class OpenVinoParts:
                     layers.eval(), example_input=example, input=[ov.PartialShape(shape)]
                 )
         except Exception as error:
-            why = " ".join(str(error).split())[:200]
+            why = one_line(error, 200)
             raise VehicleError(
                 f"detector mask-rcnn: backend openvino: openvino {ov.__version__} cannot take this "
                 f'network ({why}); set backend = "torch"'

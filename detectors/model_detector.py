@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Floats, Int64s
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.errors import VehicleError, one_line
 
 from . import rle
 from .base import Detections, Detector, Found, Frame, RoadMask, View
@@ -71,7 +71,7 @@ def _tried(detector: Detector, card: ModelCard, path: Path) -> Detector:
     except VehicleError:
         raise
     except Exception as error:
-        why = " ".join(str(error).split())[:200]
+        why = one_line(error, 200)
         raise VehicleError(
             f"{path}: the network does not run on input {size[0]} x {size[1]}, "
             f"{card.input.layout}, {card.input.dtype}: {why}; mend [input]"

@@ -18,7 +18,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.errors import VehicleError, one_line
 
 from .model_card import Weights
 from .onnx_input import input_shape
@@ -86,12 +86,8 @@ def load_network(weights: Weights, backend: str | None = None, threads: int = 1)
         raise
     except Exception as error:
         raise VehicleError(
-            f"{weights.name}: {name} cannot read it: {_one_line(error)}; is it whole?"
+            f"{weights.name}: {name} cannot read it: {one_line(error, 200)}; is it whole?"
         ) from None
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
 
 
 def _in_onnxruntime(weights: Weights, threads: int) -> Network:

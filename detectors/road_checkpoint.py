@@ -11,7 +11,7 @@ from typing import Annotated, Final
 import torch
 from pydantic import Field, ValidationError
 
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.errors import VehicleError, one_line
 from crosscue.replay.run_folder import write_whole
 
 from .road_network import RoadNetwork
@@ -88,7 +88,7 @@ def load_road(path: Path) -> RoadCheckpoint:
             f"{path}: not what crosscue train road wrote; give such a file"
         ) from None
     except (SafetensorError, ValueError, RecursionError, ValidationError) as error:
-        why = " ".join(str(error).split())[:120]
+        why = one_line(error, 120)
         raise VehicleError(f"{path}: no whole road network ({why}); train it again") from None
     network = RoadNetwork()
     if not all(bool(value.isfinite().all()) for value in tensors.values()):
@@ -96,7 +96,7 @@ def load_road(path: Path) -> RoadCheckpoint:
     try:
         network.load_state_dict(tensors)
     except RuntimeError as error:
-        why = " ".join(str(error).split())[:160]
+        why = one_line(error, 160)
         raise VehicleError(f"{path}: weights do not fit: {why}; train it again") from None
     return RoadCheckpoint(
         facts, network.eval().to(memory_format=torch.channels_last),

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from crosscue.replay.columns import Bytes
-from crosscue.replay.errors import SchemaError
+from crosscue.replay.errors import SchemaError, one_line
 from crosscue.replay.run_folder import write_whole
 
 from .road_network import RoadNetwork, logits_of
@@ -140,7 +140,7 @@ class RoadTraining:
             done, seed = int(state["done"]), int(state["seed"])
             self._fill(tensors)
         except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
-            why = " ".join(str(error).split())[:120]
+            why = one_line(error, 120)
             raise SchemaError(f"{path}: cannot go on from it ({why}); begin anew") from None
         if seed != self.schedule.seed:
             raise SchemaError(f"{path}: of seed {seed}, not {self.schedule.seed}; give that --seed")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from crosscue.replay.columns import Block, Bytes, Images
-from crosscue.replay.errors import CrosscueError, LogError, UsageError
+from crosscue.replay.errors import CrosscueError, LogError, UsageError, one_line
 
 from .base import Detector, Found, Frame, View
 from .pictures import Encoded, decode, encoded, reduction, size_of
@@ -155,7 +155,7 @@ class Runner:
         except CrosscueError:
             raise
         except Exception as error:
-            why = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+            why = f"{type(error).__name__}: {one_line(error, 200)}"
             raise CrosscueError(
                 f"detector {named.name}: failed at {frames[0].t_ns} ns: {why}; leave it out of "
                 "--detectors, or mend it"

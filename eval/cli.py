@@ -17,7 +17,7 @@ from importlib import import_module
 from types import FrameType
 from typing import Final, NoReturn, Protocol, cast
 
-from crosscue.replay.errors import CrosscueError
+from crosscue.replay.errors import CrosscueError, one_line
 
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "info": ("info", "topics, counts, clocks, gaps and health of a log"),
@@ -175,8 +175,7 @@ def _complain(error: BaseException, status: int, args: argparse.Namespace) -> in
         import traceback
 
         traceback.print_exc()
-    line = " ".join(str(error).split())
-    print("crosscue: " + visible(line), file=sys.stderr)
+    print("crosscue: " + visible(one_line(error)), file=sys.stderr)
     return status
 
 

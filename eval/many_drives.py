@@ -19,7 +19,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
-from crosscue.replay.errors import CrosscueError, RunError, UsageError
+from crosscue.replay.errors import CrosscueError, RunError, UsageError, one_line
 from crosscue.replay.remote import version_of
 from crosscue.replay.run_folder import MANIFEST, RunFolder, strict_json, write_text
 
@@ -251,7 +251,7 @@ def attempt(work: Callable[[Job], R], job: Job) -> Done[R]:
 def told(error: Exception) -> tuple[int, str]:
     """Exit status and one line for any error; the same as a command of its own would give."""
     if isinstance(error, CrosscueError):
-        return error.exit_status, " ".join(str(error).split())
+        return error.exit_status, one_line(error)
     if isinstance(error, MemoryError):
         return 1, "out of memory; use fewer workers or a machine with more"
     if isinstance(error, OSError):

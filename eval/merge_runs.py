@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.replay.errors import RunError
+from crosscue.replay.errors import RunError, one_line
 from crosscue.replay.run_folder import (
     MANIFEST,
     RunFolder,
@@ -130,7 +130,7 @@ def _schema(kind: str, holding: Sequence[_Drive]) -> pa.Schema:
         try:
             whole = pa.unify_schemas([whole, one.run.schema(kind)])
         except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
-            line = " ".join(str(error).split())
+            line = one_line(error)
             raise RunError(
                 f"{one.run.path}: {kind}.parquet does not fit those of other drives ({line}); "
                 "replay all with one version and one set of features"

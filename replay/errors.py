@@ -65,3 +65,13 @@ class RunError(CrosscueError):
 
 class OutputError(CrosscueError):
     """A result cannot be written."""
+
+
+def one_line(error: BaseException, most: int | None = None) -> str:
+    """What an error says, on one line: each run of white space, line ends too, becomes one space.
+
+    Args:
+        error: Often another library's, whose message may span lines and quote a whole file.
+        most: Keep this many characters; None keeps all.
+    """
+    return " ".join(str(error).split())[:most]

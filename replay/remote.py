@@ -24,7 +24,7 @@ from typing import Any, BinaryIO, Final, Protocol, Self, TypeVar, cast
 
 from .closing import Closing
 from .columns import Block, Topic
-from .errors import CrosscueError, LogError, LogTooLargeError, OutputError, UsageError
+from .errors import CrosscueError, LogError, LogTooLargeError, OutputError, UsageError, one_line
 from .ledger import Ledger
 from .log import EVERYTHING, Log, Selection
 from .run_folder import cannot_write
@@ -273,7 +273,7 @@ def _opened(url: str) -> tuple[_System, str]:
     try:
         system, address = url_to_fs(url)
     except (ImportError, ValueError) as error:
-        raise LogError(f"{url}: {' '.join(str(error).split())}") from None
+        raise LogError(f"{url}: {one_line(error)}") from None
     return cast("_System", system), str(address)
 
 
@@ -290,14 +290,10 @@ def _guarded(url: str, ask: Callable[[], T]) -> T:
     except FileNotFoundError:
         raise LogError(f"{url}: no such object; check the address") from None
     except PermissionError as error:
-        raise LogError(f"{url}: no permission ({_line(error)}); check credentials") from None
+        raise LogError(f"{url}: no permission ({one_line(error)}); check credentials") from None
     except Exception as error:
         kind = type(error).__name__
-        raise LogError(f"{url}: cannot be read ({kind}: {_line(error)}); try again") from None
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())
+        raise LogError(f"{url}: cannot be read ({kind}: {one_line(error)}); try again") from None
 
 
 def _objects(system: _System, address: str) -> list[_Object]:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from crosscue.detectors.mask_rcnn_network import forward_training
-from crosscue.replay.errors import CrosscueError, SchemaError
+from crosscue.replay.errors import CrosscueError, SchemaError, one_line
 from crosscue.replay.run_folder import write_whole
 
 from .samples import Sample, Sampler
@@ -218,7 +218,7 @@ class Training:
             whole = self._optimizer.state_dict()
             self._optimizer.load_state_dict({**whole, "state": state})
         except (RuntimeError, ValueError, KeyError) as error:
-            why = " ".join(str(error).split())[:120]
+            why = one_line(error, 120)
             raise SchemaError(f"{path}: does not fit this network ({why}); begin anew") from None
 
 

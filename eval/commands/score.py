@@ -46,7 +46,7 @@ from crosscue.eval.score_pose import summary as pose_summary
 from crosscue.eval.score_run import FOLDER, metrics_of, scores_of, write_scores
 from crosscue.eval.score_summary import gate_lines, headline, summary, told_line
 from crosscue.eval.smooth_pose import told
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import UsageError, one_line
 from crosscue.replay.run_folder import locked
 
 from .common import print_json, with_progress
@@ -141,7 +141,7 @@ def _score_all(
             continue
         failed.append(one)
         if len(paths) > 1:
-            line = visible(" ".join(str(one.error).split()))
+            line = visible(one_line(one.error))
             print(f"crosscue: {line}; this run is left out", file=sys.stderr)
     if not scored:
         raise failed[0].error

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.replay.errors import LogTooLargeError, SchemaError
+from crosscue.replay.errors import LogTooLargeError, SchemaError, one_line
 from crosscue.replay.limits import DEFAULT, Limits
 
 from .layout import CanMessage, CanSignal, layout_problem, overlaps
@@ -210,10 +210,10 @@ def _parse(source: DatabaseText, form: str) -> InternalDatabase:
             f"{source.path}: too large or too deeply nested to parse ({type(error).__name__})"
         ) from None
     except Exception as error:  # cantools documents none; whatever a damaged file provokes
-        words = " ".join(str(error).split()) or type(error).__name__
+        words = one_line(error, 300) or type(error).__name__
         line = source.line_of_error(str(error))
         raise SchemaError(
-            f"{source.path}:{line}: not a readable {form.upper()} file: {words[:300]}; "
+            f"{source.path}:{line}: not a readable {form.upper()} file: {words}; "
             "correct that line or get a whole copy of the file"
         ) from None
 

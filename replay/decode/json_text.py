@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Block, Messages, Table, Topic
-from crosscue.replay.errors import SchemaError
+from crosscue.replay.errors import SchemaError, one_line
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT
 
@@ -114,7 +114,7 @@ class _TableDecoder:
                 if len(row) > MAX_COLUMNS:
                     raise ValueError(f"over {MAX_COLUMNS} numbers")
             except _BAD as error:
-                why = " ".join(str(error).split())[:120]
+                why = one_line(error, 120)
                 ledger.skip(block.topic, MISFIT, 1, why, int(block.log_ns[i]))
                 continue
             kept.append(i)
@@ -176,7 +176,7 @@ class _PictureDecoder:
             try:
                 rows.append(_picture(_object(bytes(block.rows.payload(i))), pixels))
             except _BAD as error:
-                rows.append(" ".join(str(error).split())[:120])
+                rows.append(one_line(error, 120))
         buffer = np.frombuffer(bytes(pixels), np.uint8)
         return images_of(block, buffer, self.picture, rows, ledger)
 

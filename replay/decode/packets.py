@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crosscue.replay.columns import Block, Images, Messages
-from crosscue.replay.errors import LogError
+from crosscue.replay.errors import LogError, one_line
 from crosscue.replay.ledger import Ledger
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class PacketDecoder:
                 self._waiting += self._context.decode(packet)
                 self._taken += 1
             except av.FFmpegError as error:
-                why = " ".join(str(error).split())[:100]
+                why = one_line(error, 100)
                 self._ledger.skip(self._topic, NOT_DECODED, 1, why, t_ns)
             yield from self._full()
 

@@ -24,7 +24,7 @@ from google.protobuf.message import DecodeError, Message  # type: ignore[import-
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Block, Messages, Table, Topic
-from crosscue.replay.errors import SchemaError
+from crosscue.replay.errors import SchemaError, one_line
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT
 
@@ -82,7 +82,7 @@ def _descriptor(topic: Topic) -> Descriptor:
         _add(pool, files)
         return pool.FindMessageTypeByName(name)
     except (DecodeError, TypeError, KeyError, ValueError, RecursionError) as error:
-        said = " ".join(str(error).split())[:120]
+        said = one_line(error, 120)
         raise SchemaError(f"{name}: its protobuf descriptor cannot be used: {said}") from None
 
 
@@ -188,7 +188,7 @@ class _TableDecoder:
             try:
                 row = self._row(bytes(block.rows.payload(i)))
             except (DecodeError, ValueError, OverflowError, RecursionError) as error:
-                why = " ".join(str(error).split())[:120]
+                why = one_line(error, 120)
                 ledger.skip(block.topic, MISFIT, 1, why, int(block.log_ns[i]))
                 continue
             kept.append(i)
@@ -253,7 +253,7 @@ class _PictureDecoder:
             try:
                 rows.append(self._row(block.rows, i))
             except (ValueError, DecodeError, UnicodeDecodeError) as error:
-                rows.append(" ".join(str(error).split())[:120])
+                rows.append(one_line(error, 120))
         return images_of(block, block.rows.buffer, self.picture, rows, ledger)
 
     def _row(self, messages: Messages, i: int) -> PictureRow:
