@@ -3,31 +3,24 @@
 Every node needs this version of crosscue, and sees logs and run folders under the same paths (a
 shared file system, or logs on an object store). A drive is one task on one core. Ray's own retries
 are off: a drive whose worker died is begun again here, so that its lock is taken away first and
-the count of attempts is true. ``local`` starts a cluster on this machine and ends it; Ray opens
-ports on all of the machine's addresses, guarded by a token.
+the count of attempts is true.
 """
 
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any
 
-from crosscue.replay.errors import CrosscueError, UsageError, one_line
 from crosscue.replay.run_folder import LOCK
 
 from .many_drives import Done, Events, Job, R, after_death, attempt, told
+from .ray_cluster import LOCAL, joined
 from .worker_pool import GRACE_S, THREAD_VARIABLES, TICK_S
-
-LOCAL: Final = "local"
-STORE_BYTES: Final = 96 << 20
-"""Results are small; what a local cluster sets aside for them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +44,10 @@ class OnRay:
             UsageError: Ray is not installed.
             CrosscueError: The cluster cannot be reached or started.
         """
-        ray = _ray()
-        is_ours = self._connect(ray)
+        with joined(self.address, self.workers) as ray:
+            yield from self._on(ray, jobs, work)
+
+    def _on(self, ray: Any, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
         running: dict[Any, tuple[Job, int]] = {}
         try:
             limit = self.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
@@ -82,50 +77,11 @@ class OnRay:
                     yield None
         finally:
             _cancel(ray, list(running))
-            if is_ours:
-                ray.shutdown()
 
     def _environment(self) -> dict[str, str]:
         """Of a worker; on this machine it finds the modules that this process finds."""
         found = dict.fromkeys(THREAD_VARIABLES, "1")
         return found | ({"PYTHONPATH": os.pathsep.join(sys.path)} if self.address == LOCAL else {})
-
-    def _connect(self, ray: Any) -> bool:
-        """Join the cluster, or start one; True when it is this engine's to leave."""
-        if ray.is_initialized():
-            return False
-        is_main = threading.current_thread() is threading.main_thread()
-        before = signal.getsignal(signal.SIGTERM) if is_main else None
-        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
-        if self.address == LOCAL:
-            options |= {
-                "num_cpus": self.workers, "include_dashboard": False,
-                "object_store_memory": STORE_BYTES, "_node_ip_address": "127.0.0.1",
-            }  # fmt: skip
-        try:
-            ray.init(address=self.address, **options)
-        except (ConnectionError, RuntimeError, ValueError, OSError) as error:
-            line = one_line(error)
-            raise CrosscueError(
-                f"--ray {self.address}: no cluster ({line}); start one with ray start, or give "
-                f"{LOCAL}"
-            ) from None
-        finally:
-            if is_main:
-                # Ray installs a handler of its own, which would hide a SIGTERM from the command.
-                signal.signal(signal.SIGTERM, before)
-        # Of workers that die Ray tells on stdout, which belongs to results; we tell it ourselves.
-        ray._private.worker._worker_logs_enabled = False
-        return True
-
-
-def _ray() -> Any:
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        import ray
-    except ImportError:
-        raise UsageError("--ray: Ray is not installed; pip install 'crosscue[ray]'") from None
-    return ray
 
 
 def _taken(ray: Any, reference: Any, job: Job) -> Done[Any] | str:

@@ -1,7 +1,6 @@
 """Many drives on a Ray cluster on this machine, a worker killed midway."""
 
 import os
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import pytest
 
 from crosscue.eval.many_drives import exit_status_of, in_turn, run_many
 from crosscue.eval.ray_drives import OnRay
-from crosscue.replay.errors import UsageError
 from support.drive_work import letters, made_jobs
 from support.trees import tree
 
@@ -44,12 +42,3 @@ def test_a_cluster_does_what_one_process_does_though_workers_die(
     assert [tree(job.run) for job in there] == [tree(job.run) for job in here]
     assert all(tree(job.run) or job.name == "drive2" for job in here)
     assert capfd.readouterr().out == ""
-
-
-def test_without_ray_it_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-
-    with pytest.raises(UsageError, match=r"pip install 'crosscue\[ray\]'"):
-        run_many(made_jobs(tmp_path, ["plain"]), letters, OnRay("local"))

@@ -207,14 +207,6 @@ def test_ray_gives_the_same_bytes_and_tells_of_dead_workers(
         list(run(chunks, tmp_path / "dead", 1, ray_address="local"))
 
 
-def test_ray_without_a_cluster_is_one_line(tmp_path: Path) -> None:
-    pytest.importorskip("ray")
-    chunks = chunks_of(SMALL.cases(), 1, SMALL.seed)
-
-    with pytest.raises(UsageError, match="--ray no_address_at_all"):
-        list(run(chunks, tmp_path, 1, ray_address="no_address_at_all"))
-
-
 @pytest.mark.parametrize(
     ("text", "told"),
     [

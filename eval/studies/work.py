@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from crosscue.eval.ray_cluster import joined
 from crosscue.localization import drive_kernel
 from crosscue.localization.drive_kernel import Keys, drive_many
 from crosscue.localization.drive_settings import Drive
@@ -104,13 +105,14 @@ def run(
     Args:
         chunks: From ``chunks_of``.
         folder: Of the study; finished chunks lie in its folder ``chunks``.
-        workers: Threads on this machine.
+        workers: Threads on this machine, or cores of a local Ray cluster.
         ray_address: Of a Ray cluster that drives instead; ``local`` starts one here.
         drive: What drives.
 
     Raises:
         WorkerError: A worker died; finished chunks are kept.
-        UsageError: Ray is wanted and not installed, or does not answer.
+        UsageError: Ray is wanted and not installed.
+        CrosscueError: The cluster cannot be reached or started.
         OutputError: The disk is full.
     """
     kept = RunFolder(folder / CHUNKS)
@@ -123,7 +125,7 @@ def run(
     finished = (
         _on_threads(missing, workers, drive)
         if ray_address is None
-        else _on_ray(missing, ray_address)
+        else _on_ray(missing, workers, ray_address)
     )
     for chunk, rows in finished:
         with TableSink(kept, chunk.name, _chunk_schema()) as sink:
@@ -227,9 +229,8 @@ def _result(get: Callable[[], Floats]) -> Floats:
         ) from None
 
 
-def _on_ray(chunks: Sequence[Chunk], address: str) -> Iterator[tuple[Chunk, Floats]]:
-    ray = _connected(address)
-    try:
+def _on_ray(chunks: Sequence[Chunk], workers: int, address: str) -> Iterator[tuple[Chunk, Floats]]:
+    with joined(address, workers) as ray:
         drive = ray.remote(max_retries=2)(_drive_chunk)
         most = 2 * max(int(ray.cluster_resources().get("CPU", 1)), 1)
         waiting = deque(chunks)
@@ -241,28 +242,10 @@ def _on_ray(chunks: Sequence[Chunk], address: str) -> Iterator[tuple[Chunk, Floa
             ready, _ = ray.wait(list(running), num_returns=1)
             for reference in ready:
                 yield running.pop(reference), _from_ray(ray, reference)
-    finally:
-        ray.shutdown()
 
 
 def _drive_chunk(chunk: Chunk) -> Floats:
     return drive_many(chunk.settings, chunk.seeds())
-
-
-def _connected(address: str) -> Any:
-    try:
-        import ray
-    except ImportError:
-        raise UsageError(
-            "--ray: Ray is not installed; install it (pip install crosscue[ray]) or leave --ray out"
-        ) from None
-    try:
-        ray.init(address=address, log_to_driver=False, include_dashboard=False)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise UsageError(
-            f"--ray {address}: {error}; give the address of a running cluster, auto, or local"
-        ) from None
-    return ray
 
 
 def _from_ray(ray: Any, reference: Any) -> Floats:

@@ -1,0 +1,72 @@
+"""Joining a Ray cluster, or starting one on this machine, without Ray's own habits.
+
+Ray reports its use to its makers, takes SIGTERM for itself and tells of dead workers on stdout;
+none of that is wanted here. ``local`` starts a cluster on this machine and ends it; Ray opens ports
+on all of the machine's addresses, guarded by a token.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+from crosscue.replay.errors import CrosscueError, UsageError, one_line
+
+LOCAL: Final = "local"
+STORE_BYTES: Final = 96 << 20
+"""Results are small; what a local cluster sets aside for them."""
+
+
+@contextmanager
+def joined(address: str, workers: int | None = None) -> Iterator[Any]:
+    """The module ``ray``, connected; left again at the end if it was not connected before.
+
+    Args:
+        address: As Ray's clients take it (``auto``, ``10.0.0.1:6379``), or ``local``.
+        workers: Cores of a local cluster; None takes all there are.
+
+    Raises:
+        UsageError: Ray is not installed.
+        CrosscueError: The cluster cannot be reached or started.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray
+    except ImportError:
+        raise UsageError("--ray: Ray is not installed; pip install 'crosscue[ray]'") from None
+    is_ours = not ray.is_initialized()
+    if is_ours:
+        _connect(ray, address, workers)
+    try:
+        yield ray
+    finally:
+        if is_ours:
+            ray.shutdown()
+
+
+def _connect(ray: Any, address: str, workers: int | None) -> None:
+    is_main = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGTERM) if is_main else None
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+    if address == LOCAL:
+        options |= {
+            "num_cpus": workers, "include_dashboard": False,
+            "object_store_memory": STORE_BYTES, "_node_ip_address": "127.0.0.1",
+        }  # fmt: skip
+    try:
+        ray.init(address=address, **options)
+    except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+        raise CrosscueError(
+            f"--ray {address}: no cluster ({one_line(error)}); start one with ray start, or give "
+            f"{LOCAL}"
+        ) from None
+    finally:
+        if is_main:
+            # Ray installs a handler of its own, which would hide a SIGTERM from the command.
+            signal.signal(signal.SIGTERM, before)
+    # Of workers that die Ray tells on stdout, which belongs to results; we tell it ourselves.
+    ray._private.worker._worker_logs_enabled = False
