@@ -6,7 +6,6 @@ import base64
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,6 +14,7 @@ from crosscue.replay.run_folder import strict_json, write_text
 from .accounts import versions
 from .approach_causes import Finding, by_cause, condition_costs, findings
 from .estimate_stage import Outcome
+from .html_page import render_page
 from .intersection_figures import draw_beliefs, draw_distances, draw_reliability
 from .intersection_sheet import write_sheet
 from .intersection_study import StudyScores, StudySettings
@@ -32,6 +32,7 @@ from .score_approaches import ApproachScore
 from .score_run import metrics_of, write_scores
 
 PAGE: Final = "study.html"
+TEMPLATE: Final = "intersection_report.html.j2"
 TABLES: Final = "study.json"
 SHEET: Final = "detections.jpg"
 
@@ -54,8 +55,6 @@ def write_study(
     Raises:
         OutputError: They cannot be written.
     """
-    from jinja2 import Environment, StrictUndefined
-
     approaches = scored.scores.approaches
     assert approaches is not None
     folder = out / "score"
@@ -64,20 +63,18 @@ def write_study(
     found = findings([one.judged for one in scored.scored])
     tables = _tables(settings, done, scored, approaches, found)
     write_text(out / TABLES, strict_json(tables) + "\n")
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.globals |= {"number": _number, "signed": _signed, "between": _between}
-    source = files("crosscue.eval").joinpath("intersection_report.html.j2")
-    page = environment.from_string(source.read_text(encoding="utf-8")).render(
+    content = {
         **tables,
-        coverage=metrics["coverage"],
-        approaches=approaches,
-        belief=scored.scores.belief,
-        range=scored.scores.range,
-        difference=scored.difference,
-        calibrated=None if scored.calibrated is None else scored.calibrated.approaches,
-        figures=_figures(out, scored, approaches),
+        "coverage": metrics["coverage"],
+        "approaches": approaches,
+        "belief": scored.scores.belief,
+        "range": scored.scores.range,
+        "difference": scored.difference,
+        "calibrated": None if scored.calibrated is None else scored.calibrated.approaches,
+        "figures": _figures(out, scored, approaches),
+    }
+    page = render_page(
+        TEMPLATE, content, {"number": _number, "signed": _signed, "between": _between}
     )
     write_text(out / PAGE, page)
     write_sheet(scored.scored, out / SHEET)

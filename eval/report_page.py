@@ -11,13 +11,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.replay.fusion_settings import CUES
 from crosscue.replay.run_folder import strict_json, write_text
 
+from .html_page import render_page
 from .report_frames import WorstFrame, worst_frames
 from .score_drives import Scores
 from .score_run import RunScored
@@ -88,17 +88,10 @@ def write_report(
         RunError: A run's manifest or tables cannot be read.
         OutputError: It cannot be written.
     """
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.globals |= {
-        "number": _number, "signed": _signed, "never": _never, "span": _span, "ends": _ends,
-    }  # fmt: skip
-    source = files("crosscue.eval").joinpath(TEMPLATE).read_text(encoding="utf-8")
-    page = environment.from_string(source).render(
-        **_content(folder, scored, metrics), figures=_figures(scored, scores)
+    page = render_page(
+        TEMPLATE,
+        {**_content(folder, scored, metrics), "figures": _figures(scored, scores)},
+        {"number": _number, "signed": _signed, "never": _never, "span": _span, "ends": _ends},
     )
     write_text(folder / REPORT, page)
     return folder / REPORT
