@@ -10,15 +10,15 @@ import numpy as np
 
 from crosscue.detectors.base import Found, RoadMask, View
 from crosscue.detectors.frame_cues import FrameCues
-from crosscue.detectors.pictures import decode, encoded
+from crosscue.detectors.pictures import decode
 from crosscue.detectors.runner import FrameResult
-from crosscue.replay.columns import Block, Bytes, Images, Int64s
+from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.run_folder import RunFolder, write_whole
 
 from .detection_pictures import draw
 from .score_truth import DriveTruth
 from .stored_frames import StoredFrame, stored_frames
-from .stored_pictures import StoredCamera, camera_of, read_pictures
+from .stored_pictures import StoredCamera, camera_of, picture_at
 
 AWAY_M: Final = 18.0
 """True distance to the intersection at which the frame is taken."""
@@ -100,18 +100,12 @@ def _picture(camera: StoredCamera, frame: StoredFrame, run: RunFolder) -> Bytes 
     found: list[Found] = [*frame.seen.objects, *frame.seen.signs]
     if isinstance(frame.seen.road, RoadMask):
         found.insert(0, frame.seen.road)
-    drawn: list[Bytes] = []
-
-    def look(block: Block) -> None:
-        if isinstance(block.rows, Images):
-            for i in np.flatnonzero(block.log_ns == t_ns).tolist():
-                picture = encoded(block.rows, i)
-                pixels, _ = decode(picture, View())
-                result = FrameResult(t_ns, frame.size_px, picture, tuple(found))
-                drawn.append(draw(pixels, result, FrameCues(_cues_at(run, t_ns), None), ENLARGE))
-
-    read_pictures(camera, look, around_ns=t_ns)
-    return drawn[0] if drawn else None
+    picture = picture_at(camera, t_ns)
+    if picture is None:
+        return None
+    pixels, _ = decode(picture, View())
+    result = FrameResult(t_ns, frame.size_px, picture, tuple(found))
+    return draw(pixels, result, FrameCues(_cues_at(run, t_ns), None), ENLARGE)
 
 
 def _cues_at(run: RunFolder, t_ns: int) -> dict[str, int]:

@@ -12,9 +12,8 @@ import numpy as np
 from crosscue.detectors.base import Detections, View
 from crosscue.detectors.cue_names import Cue
 from crosscue.detectors.frame_cues import SIGN_CUES, FrameCues
-from crosscue.detectors.pictures import Encoded, decode, encoded
+from crosscue.detectors.pictures import Encoded, decode
 from crosscue.detectors.runner import FrameResult
-from crosscue.replay.columns import Block, Images
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.run_folder import RunFolder
 from crosscue.replay.vehicle import Vehicle, of_manifest
@@ -23,7 +22,7 @@ from .detection_pictures import draw
 from .scene_figures import is_wrong
 from .score_cues import CueJudged
 from .score_run import RunScored
-from .stored_pictures import StoredCamera, camera_of, read_pictures
+from .stored_pictures import camera_of, picture_at
 
 MOST: Final = 6
 APART_NS: Final = 2_000_000_000
@@ -143,22 +142,11 @@ def _with_picture(one: WorstFrame, run: RunFolder) -> WorstFrame:
     labels = _labels(one.cue, of_manifest(run.manifest()["settings"]))
     rows = [row for row in _scores(run, {one.t_ns}).get(one.t_ns, []) if row["label"] in labels]
     try:
-        picture = _picture_at(camera, one.t_ns)
+        picture = picture_at(camera, one.t_ns)
         return one if picture is None else _drawn(picture, one, rows)
     except CrosscueError:
         # The report is about the run; a picture that has gone or cannot be read is left out.
         return one
-
-
-def _picture_at(camera: StoredCamera, t_ns: int) -> Encoded | None:
-    found: list[Encoded] = []
-
-    def keep(block: Block) -> None:
-        assert isinstance(block.rows, Images)
-        found.extend(encoded(block.rows, int(i)) for i in np.flatnonzero(block.log_ns == t_ns))
-
-    read_pictures(camera, keep, around_ns=t_ns)
-    return found[0] if found else None
 
 
 def _drawn(picture: Encoded, one: WorstFrame, rows: Sequence[Mapping[str, Any]]) -> WorstFrame:

@@ -8,8 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
+from crosscue.detectors.pictures import Encoded, encoded
 from crosscue.replay.clocks import Clock
-from crosscue.replay.columns import Block, Topic
+from crosscue.replay.columns import Block, Images, Topic
 from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Selection, open_log
@@ -71,6 +74,22 @@ def _clock(detected: Mapping[str, Any] | None, topic: str) -> Clock:
         if topic in told:
             return Clock(told[topic]["used"])
     return Clock.LOG
+
+
+def picture_at(camera: StoredCamera, t_ns: int) -> Encoded | None:
+    """The picture taken at exactly this time of the run's tables; None where there is none.
+
+    Raises:
+        LogError: The log cannot be opened.
+    """
+    found: list[Encoded] = []
+
+    def keep(block: Block) -> None:
+        assert isinstance(block.rows, Images)
+        found.extend(encoded(block.rows, int(i)) for i in np.flatnonzero(block.log_ns == t_ns))
+
+    read_pictures(camera, keep, around_ns=t_ns)
+    return found[0] if found else None
 
 
 def read_pictures(
