@@ -80,6 +80,17 @@ def test_usage(
     capsys.readouterr()
 
 
+@pytest.mark.parametrize("length", ["0", "-1", "inf", "nan", "far"])
+@pytest.mark.parametrize(
+    "flag", ["score run --rpe", "landmarks add db --every", "fit landmarks --near"]
+)
+def test_a_length_is_above_nothing(
+    flag: str, length: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(f"{flag}={length}".split()) == 2
+    assert f"'{length}': want metres, above 0" in capsys.readouterr().err
+
+
 def test_a_slip_of_the_pen_gets_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["replya"]) == 2
     assert "did you mean 'replay'" in capsys.readouterr().err

@@ -36,6 +36,21 @@ def add_part_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="only these topics")
 
 
+def metres(text: str) -> float:
+    """A length from the command line.
+
+    Raises:
+        argparse.ArgumentTypeError: Not a finite number above 0.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r}: want metres, above 0")
+    return value
+
+
 def selection_of(args: argparse.Namespace, logs: Sequence[Log]) -> Selection:
     """The part asked for by ``--from``, ``--to`` and ``--topics``.
 

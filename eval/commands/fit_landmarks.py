@@ -13,7 +13,6 @@ example:
 from __future__ import annotations
 
 import argparse
-import math
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -29,7 +28,7 @@ from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import write_text
 from crosscue.replay.vehicle import Vehicle, load, parse
 
-from .common import add_part_arguments, print_json, selection_of
+from .common import add_part_arguments, metres, print_json, selection_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ("--far", 50.0, "landmarks from here on show another"),
     ):
         parser.add_argument(
-            flag, type=_metres, default=default, metavar="M", help=f"{what} (default: {default:g})"
+            flag, type=metres, default=default, metavar="M", help=f"{what} (default: {default:g})"
         )
     parser.add_argument(
         "--most", type=int, default=50, metavar="N", help="landmarks for one frame (default: 50)"
@@ -63,13 +62,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _share(text: str) -> float:
     value = float(text)
     if not 0.0 <= value < 1.0:
-        raise ValueError(text)
-    return value
-
-
-def _metres(text: str) -> float:
-    value = float(text)
-    if not (math.isfinite(value) and value > 0.0):
         raise ValueError(text)
     return value
 

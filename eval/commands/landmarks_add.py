@@ -12,7 +12,6 @@ example:
 from __future__ import annotations
 
 import argparse
-import math
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -33,7 +32,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import open_logs
 from crosscue.replay.vehicle import Vehicle, load
 
-from .common import add_part_arguments, print_json, selection_of
+from .common import add_part_arguments, metres, print_json, selection_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,11 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--coordinates", type=Path, metavar="FILE.csv", help="where each picture was taken"
     )
     parser.add_argument(
-        "--every", type=_metres, default=10.0, metavar="M",
+        "--every", type=metres, default=10.0, metavar="M",
         help="distance between landmarks from a log (default: 10)",
     )  # fmt: skip
     parser.add_argument(
-        "--sd", type=_metres, default=3.0, metavar="M",
+        "--sd", type=metres, default=3.0, metavar="M",
         help="how far the car may be off when it matches, added to the poses' own error "
         "(default: 3)",
     )  # fmt: skip
@@ -61,13 +60,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--matcher", metavar="NAME", help="orb, or module:factory of your own")
     add_part_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print the counts as JSON")
-
-
-def _metres(text: str) -> float:
-    value = float(text)
-    if not (math.isfinite(value) and value > 0.0):
-        raise ValueError(text)
-    return value
 
 
 def run(args: argparse.Namespace) -> int:

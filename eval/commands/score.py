@@ -20,7 +20,6 @@ examples:
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,7 +48,7 @@ from crosscue.eval.smooth_pose import told
 from crosscue.replay.errors import UsageError, one_line
 from crosscue.replay.run_folder import locked
 
-from .common import print_json, with_progress
+from .common import metres, print_json, with_progress
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a feature is detected above this probability (default: 0.9)",
     )  # fmt: skip
     parser.add_argument(
-        "--rpe", nargs="+", type=_metres, default=[10.0, 100.0], metavar="M",
+        "--rpe", nargs="+", type=metres, default=[10.0, 100.0], metavar="M",
         help="distances of the relative pose error in metres (default: 10 100)",
     )  # fmt: skip
     parser.add_argument(
@@ -87,13 +86,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=1, metavar="N",
                         help="runs scored at a time (default: 1)")  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the metrics as JSON")
-
-
-def _metres(text: str) -> float:
-    value = float(text)
-    if not (math.isfinite(value) and value > 0.0):
-        raise ValueError(text)
-    return value
 
 
 def run(args: argparse.Namespace) -> int:
