@@ -19,6 +19,8 @@ from typing import Final, NoReturn, Protocol, cast
 
 from crosscue.replay.errors import CrosscueError, one_line
 
+from .plain_text import visible
+
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "info": ("info", "topics, counts, clocks, gaps and health of a log"),
     "convert": ("convert", "any log or data set to MCAP with ROS 2 types"),
@@ -177,12 +179,6 @@ def _complain(error: BaseException, status: int, args: argparse.Namespace) -> in
         traceback.print_exc()
     print("crosscue: " + visible(one_line(error)), file=sys.stderr)
     return status
-
-
-def visible(text: str) -> str:
-    """``text`` with control characters and undecodable bytes shown, not executed."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
-                   for c in text)  # fmt: skip
 
 
 def _command_of(argv: Sequence[str]) -> str | None:
