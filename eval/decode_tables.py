@@ -15,9 +15,10 @@ from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.mobileye.admit import all_ids
 from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.ros import RosMobileye
-from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting
+from crosscue.replay.mobileye.samples import settings_of
 from crosscue.replay.roles import Role, role_of
 from crosscue.replay.run_folder import RunFolder, TableSink, clear, locked, write_manifest
 from crosscue.replay.vehicle import Vehicle
@@ -34,21 +35,6 @@ ROWS_HELD: Final = 8192
 
 class _BlockDecoder(Protocol):
     def __call__(self, block: Block) -> list[Block]: ...
-
-
-def mobileye_settings(vehicle: Vehicle, is_shared_bus: bool) -> MobileyeSettings:
-    """The vehicle file's Mobileye section as the decoder takes it."""
-    section = vehicle.mobileye
-    mounting = None
-    if section.x_m is not None:
-        mounting = Mounting(section.x_m, section.y_m, section.yaw_rad)
-    return MobileyeSettings(
-        revision=section.revision,
-        family=section.family,
-        slots=section.slots,
-        mounting=mounting,
-        is_shared_bus=is_shared_bus,
-    )
 
 
 @dataclass(slots=True, eq=False)
@@ -166,7 +152,7 @@ def _ros_mobileye(log: Log, vehicle: Vehicle, ledger: Ledger) -> RosMobileye | N
     types = {t.name: t.type_name for t in log.topics if role_of(t) is Role.MOBILEYE}
     if not types:
         return None
-    return RosMobileye("ros", types, ledger, mobileye_settings(vehicle, is_shared_bus=False))
+    return RosMobileye("ros", types, ledger, settings_of(vehicle.mobileye, is_shared_bus=False))
 
 
 def _decoder(topic: Topic, ledger: Ledger) -> Decoder | None:
@@ -188,6 +174,8 @@ def _bus_decoders(
     decoders: list[_BlockDecoder] = []
     mobileyes: list[MobileyeDecoder] = []
     has_dbc = bool(vehicle.can.dbc) and vehicle.can.bus in (None, bus)
+    settings = settings_of(vehicle.mobileye, is_shared_bus=has_dbc)
+    has_mobileye = vehicle.mobileye.bus == bus
     if has_dbc:
         from crosscue.replay.can.database import CanDatabase
         from crosscue.replay.can.decode import BusDecoder
@@ -195,9 +183,10 @@ def _bus_decoders(
         database = CanDatabase.load([Path(name) for name in vehicle.can.dbc])
         for sentence in database.notices:
             ledger.notice(sentence)
-        decoders.append(BusDecoder(database, bus, ledger))
-    if vehicle.mobileye.bus == bus:
-        mobileyes.append(MobileyeDecoder(bus, ledger, mobileye_settings(vehicle, has_dbc)))
+        elsewhere = all_ids(settings) if has_mobileye else ()
+        decoders.append(BusDecoder(database, bus, ledger, elsewhere=elsewhere))
+    if has_mobileye:
+        mobileyes.append(MobileyeDecoder(bus, ledger, settings))
         decoders += mobileyes
     return decoders, mobileyes
 

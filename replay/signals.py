@@ -396,7 +396,7 @@ class Extractor:
         return self._mobileye
 
     def _from_can(self, block: Block, source: Source) -> Iterator[Samples]:
-        decoder = self._bus_decoder(block.topic)
+        decoder = self._bus_decoder(source)
         tables = {part.topic.rsplit("/", 1)[1]: part for part in decoder(block)}
         can = self.vehicle.can
         if can.wheel_speeds is not None:
@@ -416,15 +416,21 @@ class Extractor:
             if section is not None:
                 yield from _angle_samples(tables, section, signal, key)
 
-    def _bus_decoder(self, bus: str) -> BusDecoder:
+    def _bus_decoder(self, source: Source) -> BusDecoder:
+        bus = source.topic.name
         if bus not in self._buses:
             from .can.decode import BusDecoder
+            from .mobileye.admit import all_ids
+            from .mobileye.samples import settings_of
 
             database = _database(self.vehicle.can.dbc)
             for sentence in database.notices:
                 self.ledger.notice(sentence)
             wanted = check_signals(database, self.vehicle)
-            self._buses[bus] = BusDecoder(database, bus, self.ledger, wanted)
+            is_shared = not {*source.signals}.isdisjoint(MOBILEYE_SIGNALS)
+            settings = settings_of(self.vehicle.mobileye, is_shared_bus=is_shared)
+            elsewhere = all_ids(settings) if is_shared else ()
+            self._buses[bus] = BusDecoder(database, bus, self.ledger, wanted, elsewhere=elsewhere)
         return self._buses[bus]
 
 

@@ -104,6 +104,7 @@ class BusDecoder:
         ledger: Ledger,
         wanted: Wanted | None = None,
         settings: DecodeSettings = DecodeSettings(),
+        elsewhere: Collection[int] = (),
     ) -> None:
         """Prepare the columns.
 
@@ -113,12 +114,15 @@ class BusDecoder:
             ledger: Told of every frame that is not decoded; the reader has counted those found.
             wanted: Message names, or (message, signal) pairs; None for everything.
             settings: How strictly and by what means.
+            elsewhere: 11-bit identifiers that another decoder of this bus reads and accounts for;
+                those that the database lacks, too, are not unknown.
 
         Raises:
             ValueError: ``wanted`` names a message or signal that the database lacks.
         """
         self._bus = bus
         self._ledger = ledger
+        self._elsewhere = frozenset(elsewhere)
         self._engine_name = settings.engine
         self._frames_seen = 0
         self.counts: dict[CountKey, int] = {}
@@ -190,6 +194,8 @@ class BusDecoder:
         for identifier in np.flatnonzero(grouped.unknown).tolist():
             count = int(grouped.unknown[identifier])
             left -= count
+            if identifier in self._elsewhere:
+                continue
             if not self._add((identifier, False, UNKNOWN_ID), count):
                 mine = is_data & (ids == identifier) & ~frames.is_extended
                 self._tell((identifier, False, UNKNOWN_ID), count, log_ns, mine)

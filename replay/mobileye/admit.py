@@ -64,7 +64,7 @@ class Admission:
     def __init__(self, bus: str, ledger: Ledger, settings: MobileyeSettings) -> None:
         self._bus = bus
         self._ledger = ledger
-        self._tells_foreign = not settings.is_shared_bus
+        self._is_shared_bus = settings.is_shared_bus
         messages = layout().messages
         self._message = np.full(_STANDARD_IDS + 1, -1, dtype=np.int64)
         self._instance = np.zeros(_STANDARD_IDS + 1, dtype=np.int64)
@@ -94,6 +94,9 @@ class Admission:
     def _tell(
         self, frames: CanFrames, message: Int64s, bad: NDArray[np.bool_], log_ns: Int64s
     ) -> None:
+        if self._is_shared_bus:
+            # The bus's own decoder tells of the rest; these identifiers it leaves to this one.
+            bad = bad & (frames.kind == DATA) & ~frames.is_extended & (message >= 0)
         rows = np.flatnonzero(bad)
         which = np.select(
             [
@@ -108,7 +111,7 @@ class Admission:
         )
         for number, reason in enumerate(_REASONS):
             of_reason = rows[which == number]
-            if not len(of_reason) or (reason != WRONG_LENGTH and not self._tells_foreign):
+            if not len(of_reason):
                 continue
             detail = _ids_text(frames.arbitration_id[of_reason])
             first_ns = int(log_ns[of_reason[0]])
@@ -118,6 +121,11 @@ class Admission:
 def ids_of(message: Message, settings: MobileyeSettings) -> tuple[int, ...]:
     """The identifiers that ``message`` has on this device."""
     return message.ids[: settings.slots] if message.table == "obstacles" else message.ids
+
+
+def all_ids(settings: MobileyeSettings) -> frozenset[int]:
+    """Every identifier of this device."""
+    return frozenset(i for message in layout().messages for i in ids_of(message, settings))
 
 
 def lengths_of(message: Message, settings: MobileyeSettings) -> tuple[int, ...]:

@@ -45,7 +45,7 @@ class MobileyeSettings:
         repeat_within_ns: A status frame equal to the one before and this close after it is a
             repetition, not a new image.
         least_latency_ns: What the fastest frame took from image to log; the log alone cannot tell.
-        is_shared_bus: Another decoder reads the same bus and accounts for foreign identifiers.
+        is_shared_bus: Another decoder reads the same bus and accounts for what is not the device's.
         ros_lane_sign: Which way lanes in ROS messages are positive; ``auto`` looks at which side
             the left and right lane lie.
     """

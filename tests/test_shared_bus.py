@@ -1,0 +1,57 @@
+"""A bus that carries the car's signals and a Mobileye: every frame is accounted for, once."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
+from crosscue.replay.can.layout import CanMessage, CanSignal
+from crosscue.replay.columns import DATA, ERROR, REMOTE, Block, CanFrames
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.mobileye.admit import Admission, all_ids
+from crosscue.replay.mobileye.settings import MobileyeSettings
+
+SPEED = CanMessage("Speed", 0x100, False, 2, (CanSignal("kph", 0, 16, scale=0.01, unit="km/h"),))
+TWIN = CanMessage("Twin", 0x739, True, 8, (CanSignal("raw", 0, 16),))
+TEN_SLOTS = MobileyeSettings(slots=10, is_shared_bus=True)
+FRAME = st.tuples(
+    # The car's, a stranger's, the device's first obstacle, and one of thirteen slots, not ten.
+    st.sampled_from([0x100, 0x123, 0x738, 0x739, 0x757]),
+    st.sampled_from([DATA, DATA, DATA, REMOTE, ERROR]),
+    st.booleans(),
+    st.booleans(),
+    st.sampled_from([0, 2, 7, 8]),
+)
+
+
+@settings(deadline=None)
+@given(frames=st.lists(FRAME, min_size=1, max_size=30), engine=st.sampled_from(["numpy", "numba"]))
+def test_every_frame_is_decoded_or_told_of_by_one_of_the_two(
+    frames: list[tuple[int, int, bool, bool, int]], engine: EngineName
+) -> None:
+    ids, kinds, extended, fd, lengths = (np.array(column) for column in zip(*frames, strict=True))
+    rows = CanFrames(
+        ids.astype(np.uint32), extended, kinds.astype(np.uint8), lengths.astype(np.uint8),
+        np.zeros((len(frames), 8), np.uint8), fd,
+    )  # fmt: skip
+    log_ns = np.arange(len(frames), dtype=np.int64)
+    ledger = Ledger("made up")
+    car = BusDecoder(
+        CanDatabase.of([SPEED, TWIN]), "can0", ledger, None, DecodeSettings(engine=engine),
+        elsewhere=all_ids(TEN_SLOTS),
+    )  # fmt: skip
+
+    decoded = sum(len(block) for block in car(Block("can0", log_ns, rows)))
+    admitted = len(Admission("can0", ledger, TEN_SLOTS)(rows, log_ns))
+
+    assert decoded + admitted + ledger.topic("can0").skipped.total() == len(frames)
+
+
+def test_the_devices_frames_are_not_unknown_to_the_car() -> None:
+    ids = all_ids(MobileyeSettings())
+
+    assert {0x700, 0x738, 0x739, 0x756, 0x760} <= ids
+    assert ids - all_ids(TEN_SLOTS) == set(range(0x757, 0x760))
