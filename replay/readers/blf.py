@@ -35,7 +35,7 @@ from .blf_objects import (
     chain_of,
     rows_of,
 )
-from .can_rows import BUSES_MAX, FrameRows, blocks_by_bus, bus_name, bus_topic, keep_memory
+from .can_rows import FrameRows, blocks_by_bus, bus_number, bus_topic, keep_memory
 from .digits import NANOS, within_range
 
 _HEADER: Final = struct.Struct("<4sL8BQQLL8H8H")
@@ -237,20 +237,14 @@ class _Pass:
         if not len(rows):
             return rows
         channels, codes = np.unique(rows.bus, return_inverse=True)
-        bus = np.array([self._code(str(channel)) for channel in channels.tolist()], np.int64)
+        bus = np.array(
+            [bus_number(str(channel), self._names) for channel in channels.tolist()], np.int64
+        )
         named = FrameRows(rows.place, bus[codes], rows.log_ns, rows.frames)
         if bool((bus < 0).any()):
             self.tally.damage("more buses than a log can have", "")
             return named.take(named.bus >= 0)
         return named
-
-    def _code(self, channel: str) -> int:
-        name = bus_name(channel)
-        if name not in self._names:
-            if len(self._names) >= BUSES_MAX:
-                return -1
-            self._names[name] = len(self._names)
-        return self._names[name]
 
     def _contents(self, file: BufferedReader) -> Iterator[tuple[bytes | None, str]]:
         """What the outer objects hold, in order; None where something is missing."""

@@ -36,6 +36,14 @@ def bus_name(spelled: str) -> str:
     return f"can/{int(spelled)}" if spelled.isascii() and spelled.isdigit() else spelled
 
 
+def bus_number(spelled: str, names: dict[str, int]) -> int:
+    """A bus's place among those met so far, which it joins; -1 when there are ``BUSES_MAX``."""
+    name = bus_name(spelled)
+    if name not in names and len(names) >= BUSES_MAX:
+        return -1
+    return names.setdefault(name, len(names))
+
+
 def bus_topic(name: str, declared: int | None = None) -> Topic:
     """The topic of one bus."""
     return Topic(name, "crosscue/CanFrames", "columns", declared=declared)

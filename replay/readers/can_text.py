@@ -26,10 +26,10 @@ from crosscue.replay.log import EVERYTHING, Selection
 
 from .can_lines import Lines, Overlong, Tail, lines_of
 from .can_rows import (
-    BUSES_MAX,
     FrameRows,
     blocks_by_bus,
     bus_name,
+    bus_number,
     bus_topic,
     joined,
     keep_memory,
@@ -277,7 +277,7 @@ class _Scribe:
     def _sort_in(self, odd: _Odd, i: int, number: int, line: bytes, outcome: Outcome) -> None:
         match outcome:
             case Frame():
-                code = self._code(outcome.bus)
+                code = bus_number(outcome.bus, self._names)
                 if code < 0:
                     self._lost("", "more buses than a log can have", number, line)
                 else:
@@ -334,22 +334,16 @@ class _Scribe:
         rows = fast.rows
         if not len(rows):
             return rows
-        if len(fast.names) == 1 and self._code(fast.names[0]) == 0:
+        if len(fast.names) == 1 and bus_number(fast.names[0], self._names) == 0:
             return rows
         uses = np.bincount(rows.bus, minlength=len(fast.names)).tolist()
         named = zip(fast.names, uses, strict=True)
-        codes = np.array([self._code(name) if used else -1 for name, used in named], np.int64)
+        codes = np.array(
+            [bus_number(name, self._names) if used else -1 for name, used in named], np.int64
+        )
         bus = codes[rows.bus]
         renamed = FrameRows(rows.place, bus, rows.log_ns, rows.frames)
         return renamed.take(bus >= 0) if bool((bus < 0).any()) else renamed
-
-    def _code(self, spelled: str) -> int:
-        name = bus_name(spelled)
-        if name not in self._names:
-            if len(self._names) >= BUSES_MAX:
-                return -1
-            self._names[name] = len(self._names)
-        return self._names[name]
 
 
 def _left_over(lines: Lines, rows: FrameRows) -> list[int]:

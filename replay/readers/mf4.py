@@ -28,7 +28,7 @@ from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, Log, Selection
 
-from .can_rows import BUSES_MAX, FrameRows, blocks_by_bus, bus_name, bus_topic, in_time
+from .can_rows import FrameRows, blocks_by_bus, bus_number, bus_topic, in_time
 from .mf4_blocks import (
     MASTER,
     REMOTE_MASTER,
@@ -208,7 +208,9 @@ class Mf4Log(Closing):
 
     def _named(self, rows: FrameRows, ledger: Ledger) -> FrameRows:
         channels, codes = np.unique(rows.bus, return_inverse=True)
-        bus = np.array([self._code(str(channel)) for channel in channels.tolist()], np.int64)
+        bus = np.array(
+            [bus_number(str(channel), self._buses) for channel in channels.tolist()], np.int64
+        )
         named = FrameRows(
             rows.place, bus[codes] if len(bus) else rows.bus, rows.log_ns, rows.frames
         )
@@ -218,14 +220,6 @@ class Mf4Log(Closing):
             ledger.lose("", "more buses than a log can have", extra)
             return named.take(is_known)
         return named
-
-    def _code(self, channel: str) -> int:
-        name = bus_name(channel)
-        if name not in self._buses:
-            if len(self._buses) >= BUSES_MAX:
-                return -1
-            self._buses[name] = len(self._buses)
-        return self._buses[name]
 
     def _table(
         self, source: _Source, records: Records, ledger: Ledger, selection: Selection
