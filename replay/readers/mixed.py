@@ -14,6 +14,8 @@ from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import Selection
 
+from .timed_files import is_inside
+
 TOO_LARGE: Final = "message over the size limit"
 
 
@@ -94,11 +96,6 @@ def _within_time(
 ) -> NDArray[np.intp]:
     if selection.start_ns is None and selection.end_ns is None:
         return picked
-    log_ns = rows.log_ns[picked]
-    inside = np.ones(len(picked), dtype=np.bool_)
-    if selection.start_ns is not None:
-        inside &= log_ns >= selection.start_ns
-    if selection.end_ns is not None:
-        inside &= log_ns < selection.end_ns
+    inside = is_inside(rows.log_ns[picked], selection)
     ledger.skip(name, NOT_ASKED_TIME, int(len(picked) - inside.sum()))
     return picked[inside]

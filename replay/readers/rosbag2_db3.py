@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.replay.closing import Closing
 from crosscue.replay.columns import Block, Int64s, Messages, Topic
@@ -24,6 +23,7 @@ from .rosbag2_inflate import DAMAGED, inflated
 from .rosbag2_rows import FIRST_ROWID, LAST_ROWID, Row, RowScan, index_times
 from .rosbag2_sqlite import FAULTS, Database, open_database
 from .rosbag2_tables import Tables, fetched, read_tables
+from .timed_files import is_inside
 
 DAMAGED_PAGE: Final = "damaged page in the database"
 DISORDER: Final = "row out of order in a damaged page"
@@ -182,7 +182,7 @@ class _Pass:
         if self._indexed is not None:
             self._drop_disputed(np.fromiter(ids, dtype=np.int64, count=len(rows)), log_ns, place)
         if self._in_time_by_index is not None:
-            self._in_time += int(_within(log_ns, self._selection).sum())
+            self._in_time += int(is_inside(log_ns, self._selection).sum())
         yield from self._grouped(messages, place, log_ns)
 
     def _grouped(self, messages: Messages, place: Int64s, log_ns: Int64s) -> Iterator[Block]:
@@ -286,15 +286,6 @@ class _Pass:
                 reason = NOT_ASKED_TIME if self._selection.wants(name) else NOT_ASKED_TOPIC
                 self._ledger.find(name, rest)
                 self._ledger.skip(name, reason, rest)
-
-
-def _within(log_ns: Int64s, asked: Selection) -> NDArray[np.bool_]:
-    inside = np.ones(len(log_ns), dtype=np.bool_)
-    if asked.start_ns is not None:
-        inside &= log_ns >= asked.start_ns
-    if asked.end_ns is not None:
-        inside &= log_ns < asked.end_ns
-    return inside
 
 
 def _stamp(path: Path) -> tuple[int, int]:
