@@ -24,7 +24,7 @@ from .checksum import crc32
 from .columns import Int64s
 from .errors import OutputError
 from .mcap_assembly import ChunkRows, Stretch, merged
-from .run_folder import cannot_write
+from .run_folder import cannot_write, sync
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = "crosscue"
@@ -261,7 +261,7 @@ class McapWriter:
         os.fsync(self._file.fileno())
         self._file.close()
         self._partial.replace(self.path)
-        _sync_folder(self.path.parent)
+        sync(self.path.parent)
 
     def _summary_section(self, start: int) -> tuple[bytes, bytes]:
         summary = self._summary
@@ -359,11 +359,3 @@ def _compressor(compression: Compression) -> Callable[[bytes | memoryview], byte
 
         return squeeze
     return lambda records: records
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

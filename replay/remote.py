@@ -27,7 +27,7 @@ from .columns import Block, Topic
 from .errors import CrosscueError, LogError, LogTooLargeError, OutputError, UsageError, one_line
 from .ledger import Ledger
 from .log import EVERYTHING, Log, Selection
-from .run_folder import cannot_write
+from .run_folder import cannot_write, is_still
 
 URL: Final = re.compile(r"^[a-z][a-z0-9+.-]+://")
 CHUNK_BYTES: Final = 8 << 20
@@ -340,17 +340,9 @@ def _locked(entry: Path) -> int:
         with suppress(FileNotFoundError):
             hold = os.open(entry / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
             fcntl.flock(hold, fcntl.LOCK_EX)
-            if _is_still(hold, entry / LOCK):
+            if is_still(hold, entry / LOCK):
                 return hold
             os.close(hold)
-
-
-def _is_still(hold: int, path: Path) -> bool:
-    """Is the open file the one that has this name now?"""
-    try:
-        return os.path.samestat(os.fstat(hold), path.stat())
-    except FileNotFoundError:
-        return False
 
 
 def _make_room(store: Store, entry: Path, size: int) -> None:

@@ -241,7 +241,7 @@ def _lock_file(path: Path) -> int:
                     raise
                 is_ours = True
             _refuse_if_held(path, os.read(handle, 4096), is_ours=is_ours)
-            if is_ours and _is_still(handle, path):
+            if is_ours and is_still(handle, path):
                 _sign(handle, path)
                 return handle
         except BaseException:
@@ -261,7 +261,7 @@ def _sign(handle: int, path: Path) -> None:
         raise
 
 
-def _is_still(handle: int, path: Path) -> bool:
+def is_still(handle: int, path: Path) -> bool:
     """Is the open file the one that has this name now?"""
     try:
         return os.path.samestat(os.fstat(handle), path.stat())
@@ -308,9 +308,9 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(partial)
-        _sync(partial)
+        sync(partial)
         partial.replace(path)
-        _sync(path.parent)
+        sync(path.parent)
     except OSError as error:
         _drop(partial)
         raise cannot_write(path, error) from None
@@ -336,7 +336,12 @@ def cannot_write(path: Path, error: OSError) -> OutputError:
     return OutputError(f"{path}: {error.strerror or error}; choose a place you may write to")
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Have a file's bytes, or the names in a folder, on the disk itself.
+
+    Raises:
+        OSError: Not there, or the disk cannot.
+    """
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
