@@ -271,7 +271,7 @@ def _result(
         conditions=one.conditions,
         present=present,
         run_approach=number,
-        overlap_s=_overlap_s(one, steps),
+        overlap_s=_overlap_s(steps),
         splits=splits,
         steps=len(steps.t_ns),
         detected_m=_first(likely & ranged, distance),
@@ -286,7 +286,7 @@ def _result(
     )
 
 
-def _overlap_s(one: Approach, steps: BeliefRows) -> float:
+def _overlap_s(steps: BeliefRows) -> float:
     return float(steps.t_ns[-1] - steps.t_ns[0]) * 1e-9 if len(steps.t_ns) else 0.0
 
 

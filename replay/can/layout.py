@@ -14,7 +14,6 @@ from enum import Enum
 from typing import Final
 
 EXACT_IN_FLOAT64: Final = 2**53
-MAX_FRAME_BYTES: Final = 64
 _FD_LENGTHS: Final = (12, 16, 20, 24, 32, 48, 64)
 
 

@@ -93,11 +93,6 @@ class Field:
             highest -= 1
         return lowest, highest
 
-    @property
-    def quantum(self) -> float:
-        """Size of one step of the raw number, in ``unit``."""
-        return abs(self.scale) / self.per
-
 
 @dataclass(frozen=True, slots=True)
 class Message:

@@ -222,7 +222,6 @@ _KINDS: Final = (
     ((2,), _ERROR_PLAIN),
     ((104,), _ERROR_FD64),
 )
-_BODY_BYTES: Final = {type_: body.itemsize for types, body in _KINDS for type_ in types}
 
 
 def rows_of(stream: Bytes, start: Int64s, start_ns: int, tally: Tally, place: str) -> FrameRows:
