@@ -15,7 +15,7 @@ from crosscue.fusion.approaches import Approaches, FrameEvidence, SignRange, Ste
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.fusion_settings import Calibrated, Fusion, RangeFilter, Rates
-from support.fusion import SECOND_NS
+from support.fusion import SECOND_NS, other_side
 
 SOURCE = Fusion()
 CALIBRATED = Fusion(
@@ -97,15 +97,9 @@ def test_the_hour_of_the_day_does_not_matter(fusion: Fusion, drive: list[FrameEv
 
 
 def mirrored(one: FrameEvidence) -> FrameEvidence:
-    counts = {_other_side(cue): n for cue, n in one.counts.items()}
+    counts = {other_side(cue): n for cue, n in one.counts.items()}
     turned_rad = None if one.turned_rad is None else -one.turned_rad
     return replace(one, counts=counts, turned_rad=turned_rad)
-
-
-def _other_side(name: str) -> str:
-    if "left" in name:
-        return name.replace("left", "right")
-    return name.replace("right", "left")
 
 
 @KINDS
@@ -120,7 +114,7 @@ def test_in_the_mirror_a_whole_drive_changes_sides(
     for step, other in zip(steps, in_mirror, strict=True):
         assert step.approach == other.approach
         assert step.ranges == other.ranges
-        swapped = {_other_side(name): p for name, p in step.probabilities.items()}
+        swapped = {other_side(name): p for name, p in step.probabilities.items()}
         assert swapped == pytest.approx(dict(other.probabilities), rel=1e-9)
 
 

@@ -19,11 +19,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.columns import Block, Images, Table, Topic
-from crosscue.replay.decode import Decoder, decoder_for
+from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.ros import MISFIT
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
-from support.ros_messages import block_of
+from support.ros_messages import block_of, must_decode
 
 F = descriptor_pb2.FieldDescriptorProto
 QUICK = settings(max_examples=60, deadline=None)
@@ -82,12 +82,6 @@ def message_class(schema: bytes, name: str) -> Any:
 
 def proto_topic(name: str, fields: Any) -> Topic:
     return Topic("/t", f"foxglove.{name}", "protobuf", schema_of(name, fields), "protobuf")
-
-
-def must_decode(topic: Topic) -> Decoder:
-    decoder = decoder_for(topic)
-    assert decoder is not None
-    return decoder
 
 
 def same_stamp(cls: Any, seconds: int, nanos: int) -> Any:

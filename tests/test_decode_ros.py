@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
-from crosscue.replay.decode import Decoder, decoder_for
+from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.fields import WalkedFields
 from crosscue.replay.decode.ros import MISFIT, WRONG_CODING, RosDecoder
 from crosscue.replay.decode.standard import Kind, generic
@@ -23,6 +23,7 @@ from crosscue.replay.ledger import Ledger
 from support.ros_messages import (
     block_of,
     messages_of,
+    must_decode,
     numbers_in,
     random_definition,
     random_message,
@@ -34,12 +35,6 @@ from support.ros_messages import (
 
 SEEDS = st.integers(0, 2**32 - 1)
 QUICK = settings(max_examples=40, deadline=None)
-
-
-def must_decode(topic: Topic) -> Decoder:
-    decoder = decoder_for(topic)
-    assert decoder is not None
-    return decoder
 
 
 def plain(topic: Topic) -> RosDecoder:

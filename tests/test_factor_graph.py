@@ -30,7 +30,7 @@ from crosscue.fusion.factor_graph import (
     probability,
 )
 from crosscue.replay.fusion_settings import CUES, Fusion
-from support.fusion import graphs, graphs_heard, situation
+from support.fusion import graphs, graphs_heard, other_side, situation
 
 FEW = settings(max_examples=60, deadline=None)
 USUAL = graph_of(Fusion())
@@ -170,12 +170,6 @@ def test_log_odds_and_probability_are_each_others_inverse(p: float) -> None:
 def test_certainty_has_no_log_odds(bad: float) -> None:
     with pytest.raises(ValueError, match="want inside"):
         log_odds(bad)
-
-
-def other_side(name: str) -> str:
-    if "left" in name:
-        return name.replace("left", "right")
-    return name.replace("right", "left")
 
 
 @FEW

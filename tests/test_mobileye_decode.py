@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Floats, Table
+from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.layout import VARIANTS
 from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting
-from support.mobileye_frames import MS, frames, join, random_drive, status, triple
+from support.mobileye_frames import MS, frames, join, random_drive, status, triple, values
 
 HERE = Mounting()
 AS_IT_COMES = MobileyeSettings(mounting=HERE)
@@ -57,10 +57,6 @@ def frames_in(tables: dict[str, Table]) -> int:
 
 def skipped(ledger: Ledger) -> Counter[str]:
     return ledger.topic("can1").skipped
-
-
-def values(table: Table, name: str) -> Floats:
-    return table[name].astype(np.float64)
 
 
 def test_a_whole_burst_gives_a_row_per_obstacle() -> None:

@@ -17,7 +17,7 @@ from crosscue.replay.mobileye.layout import Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting
 from crosscue.replay.mobileye.tables import LEFT, RIGHT, table_block
 from crosscue.replay.mobileye.wire import Columns
-from support.mobileye_frames import MS, block_of, random_drive, random_words
+from support.mobileye_frames import MS, block_of, random_drive, random_words, values
 
 MOUNTED = MobileyeSettings(mounting=Mounting(1.85, -0.1, 0.02))
 STRAIGHT = MobileyeSettings(mounting=Mounting(1.85, -0.1))
@@ -35,10 +35,6 @@ def table(blocks: list[Block], name: str) -> Table:
     rows = [b.rows for b in blocks if b.topic.endswith(f"/{name}")]
     tables = [r for r in rows if isinstance(r, Table)]
     return Table({n: np.concatenate([t[n] for t in tables]) for n in tables[0].columns})
-
-
-def values(rows: Table, name: str) -> Floats:
-    return rows[name].astype(np.float64)
 
 
 def assert_same_frames(got: Block, want: Block) -> None:

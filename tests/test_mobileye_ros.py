@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.columns import Block, CanFrames, Floats, Table
+from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.decode import MobileyeDecoder
@@ -19,7 +19,16 @@ from crosscue.replay.mobileye.layout import layout
 from crosscue.replay.mobileye.ros import RosMobileye, tables_from_ros
 from crosscue.replay.mobileye.ros_sign import VOTES_WANTED
 from crosscue.replay.mobileye.settings import LaneSign, MobileyeSettings, Mounting
-from support.mobileye_frames import MS, frames, join, random_drive, random_words, status, triple
+from support.mobileye_frames import (
+    MS,
+    frames,
+    join,
+    random_drive,
+    random_words,
+    status,
+    triple,
+    values,
+)
 from support.mobileye_ros import TOPIC_TYPES, as_cdr, messages_of
 
 AS_ON_WIRE = MobileyeSettings(mounting=Mounting(1.9, 0.1), family="extended", ros_lane_sign="right")
@@ -46,10 +55,6 @@ def from_bag(
 ) -> tuple[dict[str, Table], Ledger]:
     ledger = Ledger("log")
     return tables_of(list(tables_from_ros(blocks, TOPIC_TYPES, ledger, how))), ledger
-
-
-def values(table: Table, name: str) -> Floats:
-    return table[name].astype(np.float64)
 
 
 def by_time(table: Table) -> Table:

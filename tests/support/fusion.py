@@ -139,3 +139,10 @@ def annotated(seed: int, many: int, frames: int = 60) -> list[AnnotatedApproach]
         near = np.arange(frames) >= frames - 20
         out.append(AnnotatedApproach(way_m, way_m * 0.1, near, always, counts, features, f"L{i}"))
     return out
+
+
+def other_side(name: str) -> str:
+    """A cue's or a feature's name in the mirror."""
+    if "left" in name:
+        return name.replace("left", "right")
+    return name.replace("right", "left")

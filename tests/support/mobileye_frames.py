@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from crosscue.replay.columns import DATA, Block, CanFrames, Int64s
+from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table
 from crosscue.replay.mobileye.bits import Words, payloads_of, place
 from crosscue.replay.mobileye.layout import Field, Message, layout
 
@@ -163,3 +163,8 @@ def _burst(
         np.array(lengths, dtype=np.int64),
         log_ns + np.arange(n, dtype=np.int64) * step_ns,
     )
+
+
+def values(table: Table, name: str) -> Floats:
+    """A column in float64, whatever it is stored in."""
+    return table[name].astype(np.float64)

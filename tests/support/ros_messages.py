@@ -13,6 +13,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from crosscue.replay.columns import Block, Messages, Topic
+from crosscue.replay.decode import Decoder, decoder_for
 
 PRIMITIVES = (
     "bool", "byte", "char", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64",
@@ -174,3 +175,10 @@ def ros1_topic(name: str, type_name: str, text: str | None = None) -> Topic:
     if text is None:
         text, _ = ros1_store().generate_msgdef(type_name)
     return Topic(name, type_name, "ros1", text.encode(), "ros1msg")
+
+
+def must_decode(topic: Topic) -> Decoder:
+    """The decoder of a topic that has one."""
+    decoder = decoder_for(topic)
+    assert decoder is not None
+    return decoder
