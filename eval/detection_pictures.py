@@ -54,7 +54,7 @@ def draw(pixels: Bytes, result: FrameResult, cues: FrameCues, enlarge: float = 1
     """A copy with road tinted, boxes and labels, and the positive cues at the bottom.
 
     Args:
-        pixels: BGR.
+        pixels: Shape (H, W, 3), uint8, blue first.
         result: What was found in it.
         cues: And what follows.
         enlarge: Text and lines, for a picture that will be shrunk.

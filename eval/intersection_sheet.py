@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.run_folder import RunFolder, write_whole
 
 from .detection_pictures import draw
-from .score_truth import DriveTruth
+from .score_run import RunScored
 from .stored_frames import StoredFrame, stored_frames
 from .stored_pictures import StoredCamera, camera_of, picture_at
 
@@ -28,24 +28,16 @@ ENLARGE: Final = 2.0
 QUALITY: Final = 80
 
 
-class Shown(Protocol):
-    """A run and its truth."""
-
-    @property
-    def run(self) -> RunFolder:
-        """The run's folder, with what was detected."""
-        ...
-
-    @property
-    def truth(self) -> DriveTruth:
-        """Tells where it was when."""
-        ...
-
-
 def write_sheet(
-    drives: Sequence[Shown], path: Path, columns: int = 8, quality: int = QUALITY
+    drives: Sequence[RunScored], path: Path, columns: int = 8, quality: int = QUALITY
 ) -> None:
-    """Write a JPEG with a tile a drive, ``columns`` beside one another.
+    """Write a JPEG with a tile a drive.
+
+    Args:
+        drives: Runs with a finished detect stage; one without its log has a black tile.
+        path: Of the JPEG.
+        columns: Most tiles beside one another.
+        quality: Of the JPEG, 1 to 100.
 
     Raises:
         RunError: A table is damaged.
@@ -62,7 +54,7 @@ def write_sheet(
     write_whole(path, lambda partial: partial.write_bytes(coded.tobytes()))
 
 
-def _tile(one: Shown) -> Bytes:
+def _tile(one: RunScored) -> Bytes:
     import cv2
 
     camera = camera_of(one.run)
@@ -78,7 +70,7 @@ def _tile(one: Shown) -> Bytes:
     return found
 
 
-def _frame_near(one: Shown) -> StoredFrame | None:
+def _frame_near(one: RunScored) -> StoredFrame | None:
     """The frame that was taken nearest to ``AWAY_M`` before the first intersection."""
     times: Int64s = one.run.table("frames", ["t_ns"])["t_ns"].to_numpy()
     inside = times[one.truth.approach_at(times) >= 0]

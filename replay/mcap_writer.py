@@ -151,6 +151,9 @@ class McapWriter:
             type_name: ROS 2 spelling (``sensor_msgs/msg/Imu``).
             schema: Complete definition with all dependencies.
             schema_encoding: ``ros2msg`` or ``ros2idl``.
+
+        Raises:
+            OutputError: More topics than an MCAP file can number.
         """
         key = (topic, type_name)
         if key in self._ids:
