@@ -2,7 +2,7 @@
 
 Run it as ``python benchmarks/car_cues.py STUDY`` on the folder of ``crosscue study intersections``.
 Every car that counted as cross traffic (eq. 15) or parked (eq. 16) is looked up in the drive's
-``objects.json``: the true car whose box overlaps it most, and what that one does there.
+``objects.json``: the true car whose middle is nearest, and what that one does there.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from crosscue.datasets.truth import Truth, load
-from crosscue.detectors.cars import CarShapes, car_shapes, pair_cars
+from crosscue.detectors.cars import CarShapes, car_shapes, cross_traffic, pair_cars, parked_cars
 from crosscue.eval.estimate_stage import detected_part
 from crosscue.eval.score_truth import cue_at
 from crosscue.eval.stored_frames import stored_frames
@@ -69,14 +70,15 @@ def claims(run: RunFolder, vehicle: Vehicle) -> Iterator[tuple[int, str, float, 
         now = car_shapes(frame.seen.objects, rules)
         if before is not None:
             pairs = pair_cars(before, now, rules)
-            least = rules.still_change * pairs.width_px
-            for step, (x, y), nose in zip(
-                pairs.step_px.tolist(), pairs.center_px.tolist(), pairs.nose.tolist(), strict=True
-            ):
-                if abs(step[0]) > least and abs(step[1]) <= rules.slope * abs(step[0]):
-                    yield now.t_ns, f"cross_traffic_{'left' if step[0] < 0 else 'right'}", x, y
-                elif max(abs(step[0]), abs(step[1])) <= least and nose:
-                    yield now.t_ns, f"parked_{'left' if nose < 0 else 'right'}", x, y
+            for i, (x, y) in enumerate(pairs.center_px.tolist()):
+                part = slice(i, i + 1)
+                one = replace(pairs, step_px=pairs.step_px[part], nose=pairs.nose[part])
+                told = {
+                    "cross_traffic": cross_traffic(one, rules), "parked": parked_cars(one, rules)
+                }  # fmt: skip
+                for cue, (left, right) in told.items():
+                    if left or right:
+                        yield now.t_ns, f"{cue}_{'left' if left else 'right'}", x, y
         before = now
 
 
