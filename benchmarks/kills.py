@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import os
 import random
+import shutil
 import signal
 import sys
 import tempfile
@@ -80,11 +81,28 @@ def ended(child: int) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
+def kill_and_resume(
+    argv: list[str], run: Path, after_s: float, right: dict[str, str]
+) -> tuple[list[str], float]:
+    """What became of one replay, of what it left, and of the resumed one; how long that took."""
+    child = started(argv)
+    time.sleep(after_s)
+    os.kill(child, signal.SIGKILL)
+    outcomes = ["finished first" if ended(child) == 0 else "killed", after_kill(run, right)]
+    began = time.perf_counter()
+    status = ended(started([*argv, "--resume"]))
+    took_s = time.perf_counter() - began
+    same = status == 0 and contents(run) == right
+    return [*outcomes, "resumed to the same bytes" if same else "NOT THE SAME"], took_s
+
+
 def main() -> None:
     """Kill, resume, compare."""
     kills = int(sys.argv[1]) if len(sys.argv) > 1 else 100
     rng = random.Random(int(sys.argv[2]) if len(sys.argv) > 2 else 0)
     sys.modules["kills"] = sys.modules[__name__]
+    outcomes: Counter[str] = Counter()
+    resumed_s: list[float] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         drive, run, cache = folder / "drive", folder / "run", folder / "cache.sqlite"
@@ -100,25 +118,15 @@ def main() -> None:
         began = time.perf_counter()
         assert ended(started([*argv, "-o", str(folder / "timed")])) == 0
         usual_s = time.perf_counter() - began
-        outcomes: Counter[str] = Counter()
-        resumed_s: list[float] = []
         for number in range(kills):
             if number % 2:
                 for path in folder.glob("cache.sqlite*"):
                     path.unlink()
-            child = started(argv)
-            time.sleep(rng.uniform(LEAST_S, 1.1 * usual_s))
-            os.kill(child, signal.SIGKILL)
-            outcomes["finished first" if ended(child) == 0 else "killed"] += 1
-            outcomes[after_kill(run, right)] += 1
-            began = time.perf_counter()
-            status = ended(started([*argv, "--resume"]))
-            resumed_s.append(time.perf_counter() - began)
-            same = status == 0 and contents(run) == right
-            outcomes["resumed to the same bytes" if same else "NOT THE SAME"] += 1
-            for path in sorted(run.rglob("*"), reverse=True):
-                path.unlink() if path.is_file() else path.rmdir()
-            run.rmdir()
+            after_s = rng.uniform(LEAST_S, 1.1 * usual_s)
+            found, took_s = kill_and_resume(argv, run, after_s, right)
+            outcomes.update(found)
+            resumed_s.append(took_s)
+            shutil.rmtree(run)
     print(f"simulated drive; a replay takes {usual_s:.2f} s, a resumed one "
           f"{median(resumed_s):.2f} s (median)")  # fmt: skip
     for outcome, times in outcomes.most_common():
