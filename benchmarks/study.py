@@ -54,6 +54,8 @@ SHORT = Drive(city=City(largest_km2=2.0))
 STEPS = 3000
 WINDUP = drive_simulator.WINDUP
 
+Case = tuple[Callable[[], object], int]
+
 
 def cpu_s(work: Callable[[], object]) -> float:
     began = time.process_time()
@@ -262,56 +264,83 @@ def largest_gap(a: Floats, b: Floats) -> float:
     return float(gap.max())
 
 
-def compare(rounds: int, drives: int) -> None:
-    numbers = numbers_of(SETTINGS)
+class Recorded(NamedTuple):
+    """The same drives as every side wants them.
+
+    Attributes:
+        seed: Of the first drive.
+        many: As many drives as go side by side.
+        start: Where the first one begins: x, y, heading.
+        lanes: What its controllers are told, step by step.
+        first: Shape (3, LANES): x, y and heading believed at the start, of all of them.
+        readings: Shape (STEPS, 3, LANES): wheels and compass.
+        ends: Shape (9, LANES): filled in by the compiled filter.
+    """
+
+    seed: int
+    many: list[Traced]
+    start: tuple[float, float, float]
+    lanes: list[Lane]
+    first: Floats
+    readings: Floats
+    ends: Floats
+
+
+def recorded() -> Recorded:
     long = [i for i, steps in enumerate(drive_many(SETTINGS, seeds(100))[:, 3]) if steps >= STEPS]
     many = [drive_traced(SETTINGS, i) for i in long[:LANES]]
-    seed, traced = long[0], many[0]
-    first, readings = compiled_alone(many, STEPS)
-    ends = np.empty((9, LANES))
-    filter_rows(numbers, first, readings, ends)
+    recorder = Recorder(SETTINGS, long[0], drive_simulator.Trace())
+    start = recorder.x, recorder.y, recorder.heading
+    lanes = recorder.run_lanes(STEPS)
+    return Recorded(long[0], many, start, lanes, *compiled_alone(many, STEPS), np.empty((9, LANES)))
+
+
+def check(one: Recorded) -> None:
+    """Both sides end in the same state, or nothing is worth timing."""
+    traced = one.many[0]
+    filter_rows(numbers_of(SETTINGS), one.first, one.readings, one.ends)
     for states in (3, 4):
-        gap = largest_gap(filterpy_alone(traced, STEPS, states), ends[:3, 0].copy())
+        gap = largest_gap(filterpy_alone(traced, STEPS, states), one.ends[:3, 0].copy())
         print(
             f"filter alone, {STEPS} steps: filterpy's {states} states and ours differ by {gap:.1e}"
         )
         assert gap < 1e-9
-    recorder = Recorder(SETTINGS, seed, drive_simulator.Trace())
-    start = recorder.x, recorder.y, recorder.heading
-    lanes = recorder.run_lanes(STEPS)
-    noise = Stream(key_of(seed, SENSOR_STREAM))
+    noise = Stream(key_of(one.seed, SENSOR_STREAM))
     for _ in range(3):
         noise.normal()
-    found = np.array(python_loop(lanes, start, traced.first_belief, 3, noise.normal))
+    found = np.array(python_loop(one.lanes, one.start, traced.first_belief, 3, noise.normal))
     row = traced.steps[STEPS - 1]
     gap = max(largest_gap(found[:3], row[:3].copy()), largest_gap(found[3:], row[7:10].copy()))
     print(f"whole drive, {STEPS} steps: the Python loop and ours differ by {gap:.1e}\n")
     assert gap < 1e-9
+
+
+def cases_of(one: Recorded, drives: int) -> dict[str, Case]:
+    """Work and its trial-steps."""
     gauss = random.Random(1).gauss
+    numbers, traced = numbers_of(SETTINGS), one.many[0]
     compiled_steps = int(drive_many(SETTINGS, seeds(drives))[:, 3].sum())
 
     def loop(states: int) -> None:
-        python_loop(lanes, start, traced.first_belief, states, lambda: gauss(0.0, 1.0))
+        python_loop(one.lanes, one.start, traced.first_belief, states, lambda: gauss(0.0, 1.0))
 
-    cases: dict[str, tuple[Callable[[], object], int]] = {
+    return {
         "Python loop, filterpy, 3 states": (lambda: loop(3), STEPS),
         "Python loop, filterpy, 4 states": (lambda: loop(4), STEPS),
         "filterpy alone, 3 states": (lambda: filterpy_alone(traced, STEPS, 3), STEPS),
         "filterpy alone, 4 states": (lambda: filterpy_alone(traced, STEPS, 4), STEPS),
         "ours, filter alone": (
-            lambda: [filter_rows(numbers, first, readings, ends) for _ in range(20)],
+            lambda: [filter_rows(numbers, one.first, one.readings, one.ends) for _ in range(20)],
             20 * STEPS * LANES,
         ),
-        "ours, whole drive": (
-            lambda: drive_many(SETTINGS, seeds(drives)),
-            compiled_steps,
-        ),
-        "ours, making the cities": (
-            lambda: drive_many(BEGUN, seeds(drives)),
-            compiled_steps,
-        ),
+        "ours, whole drive": (lambda: drive_many(SETTINGS, seeds(drives)), compiled_steps),
+        "ours, making the cities": (lambda: drive_many(BEGUN, seeds(drives)), compiled_steps),
         "ours, readable, whole drive": (lambda: drive(SHORT, 0), drive(SHORT, 0).steps),
-    }  # fmt: skip
+    }
+
+
+def in_rotation(cases: dict[str, Case], rounds: int) -> dict[str, list[float]]:
+    """Nanoseconds a trial-step of each case, round by round."""
     spent: dict[str, list[float]] = {name: [] for name in cases}
     for _ in range(rounds):
         for name, (work, count) in cases.items():
@@ -322,6 +351,13 @@ def compare(rounds: int, drives: int) -> None:
             spent["ours, whole drive"], spent["ours, making the cities"], strict=True
         )
     ]
+    return spent
+
+
+def compare(rounds: int, drives: int) -> None:
+    one = recorded()
+    check(one)
+    spent = in_rotation(cases_of(one, drives), rounds)
     print("CPU time a trial-step              ns, median [least..most]")
     for name, values in spent.items():
         print(f"{name:34} {statistics.median(values):9.1f} [{min(values):.1f}..{max(values):.1f}]")
@@ -332,20 +368,14 @@ def compare(rounds: int, drives: int) -> None:
         ("filter alone", "filterpy alone", "ours, filter alone"),
         ("their filter, our whole drive", "filterpy alone", "ours, whole drive"),
     ):
-        ratios = [
-            statistics.median(
-                p / v for p, v in zip(spent[f"{peer}, {states} states"], spent[our], strict=True)
-            )
-            for states in (3, 4)
-        ]
-        print(f"{name:34} {ratios[0]:9.0f}  {ratios[1]:9.0f}")
-    readable = statistics.median(
-        p / v
-        for p, v in zip(
-            spent["ours, readable, whole drive"], spent["ours, whole drive"], strict=True
-        )
-    )
+        three, four = (faster(spent, f"{peer}, {states} states", our) for states in (3, 4))
+        print(f"{name:34} {three:9.0f}  {four:9.0f}")
+    readable = faster(spent, "ours, readable, whole drive", "ours, whole drive")
     print(f"whole drive, our readable one {readable:14.0f}")
+
+
+def faster(spent: dict[str, list[float]], peer: str, our: str) -> float:
+    return statistics.median(p / v for p, v in zip(spent[peer], spent[our], strict=True))
 
 
 def growth() -> None:
