@@ -7,6 +7,7 @@ that table: a module with a function ``open_PATH(path, limits) -> Log``, importe
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -222,14 +223,8 @@ def _holds(folder: Path, marker: str) -> bool:
         return False
 
 
-def open_logs(paths: Sequence[Path | str], limits: Limits = DEFAULT) -> tuple[Log, ...]:
-    """Open several logs of one drive; on failure those already open are closed."""
-    opened: list[Log] = []
-    try:
-        for path in paths:
-            opened.append(open_log(path, limits))
-    except BaseException:
-        for log in opened:
-            log.close()
-        raise
-    return tuple(opened)
+@contextmanager
+def open_logs(paths: Sequence[Path | str], limits: Limits = DEFAULT) -> Iterator[tuple[Log, ...]]:
+    """Several logs of one drive, open as long as the ``with`` block lasts; as ``open_log``."""
+    with ExitStack() as stack:
+        yield tuple(stack.enter_context(open_log(path, limits)) for path in paths)

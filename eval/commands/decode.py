@@ -7,7 +7,6 @@ example:
 from __future__ import annotations
 
 import argparse
-from contextlib import ExitStack
 from pathlib import Path
 
 from crosscue.eval.accounts import account_of
@@ -31,10 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Decode; 3 when something was lost."""
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
-    with ExitStack() as stack:
-        logs = open_logs(args.logs)
-        for log in logs:
-            stack.enter_context(log)
+    with open_logs(args.logs) as logs:
         folder = create(args.output, overwrite=args.overwrite)
         rows, ledgers = decode_tables(logs, vehicle, folder, selection_of(args, logs))
     if args.json:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 
 from crosscue.detectors.registry import known
@@ -47,10 +46,7 @@ def run(args: argparse.Namespace) -> int:
     choices = detectors_of(args, vehicle)
     if not choices:
         raise UsageError(f"--detectors: none named; there are: {', '.join(known({}))}")
-    with ExitStack() as stack:
-        logs = open_logs(args.logs)
-        for log in logs:
-            stack.enter_context(log)
+    with open_logs(args.logs) as logs:
         selection = selection_of(args, logs)
         folder = create(args.output, overwrite=args.overwrite)
         progress = Progress("detecting", not args.quiet and sys.stderr.isatty())

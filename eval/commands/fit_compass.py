@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from contextlib import ExitStack
 from pathlib import Path
 
 from crosscue.eval.compass_job import fit, section_of, with_section
@@ -37,10 +36,7 @@ def run(args: argparse.Namespace) -> int:
     if args.write and args.vehicle is None:
         raise UsageError("--write: give the file to write into with --vehicle V.toml")
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
-    with ExitStack() as stack:
-        logs = open_logs(args.logs)
-        for log in logs:
-            stack.enter_context(log)
+    with open_logs(args.logs) as logs:
         fitted = fit(logs, vehicle, selection_of(args, logs))
     if args.write:
         text = with_section(args.vehicle.read_text(encoding="utf-8"), fitted)

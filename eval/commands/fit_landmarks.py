@@ -13,7 +13,6 @@ example:
 from __future__ import annotations
 
 import argparse
-from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
@@ -98,11 +97,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _pairs_of_logs(args: argparse.Namespace, vehicle: Vehicle, matcher: Matcher) -> ScoredPairs:
     poses = read_poses(args.poses, vehicle)
-    with ExitStack() as stack:
-        database = stack.enter_context(open_for(args.database, matcher))
-        logs = open_logs(args.logs)
-        for log in logs:
-            stack.enter_context(log)
+    with open_for(args.database, matcher) as database, open_logs(args.logs) as logs:
         ledgers = [Ledger(str(log.path)) for log in logs]
         frames = camera_frames(logs, vehicle, selection_of(args, logs), ledgers)
         return pairs_of_drive(

@@ -49,15 +49,11 @@ def run(args: argparse.Namespace) -> int:
     Returns:
         0 when all logs are whole, 3 when something is lost.
     """
-    logs = open_logs(args.logs)
-    try:
+    with open_logs(args.logs) as logs:
         if args.quick:
             summaries = [quick_summary(log) for log in logs]
         else:
             summaries = [summarise(log, _progress(args)) for log in logs]
-    finally:
-        for log in logs:
-            log.close()
     common = together(summaries) if len(summaries) > 1 and not args.quick else None
     if args.json:
         print_json({"logs": [plain(s) for s in summaries], "together": plain(common)})

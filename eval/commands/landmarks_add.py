@@ -12,7 +12,6 @@ example:
 from __future__ import annotations
 
 import argparse
-from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
@@ -91,10 +90,7 @@ def _add_logs(
     args: argparse.Namespace, vehicle: Vehicle, matcher: Matcher
 ) -> tuple[AddCounts, bool]:
     poses = read_poses(args.poses, vehicle)
-    with ExitStack() as stack:
-        logs = open_logs(args.logs)
-        for log in logs:
-            stack.enter_context(log)
+    with open_logs(args.logs) as logs:
         ledgers = [Ledger(str(log.path)) for log in logs]
         frames = camera_frames(logs, vehicle, selection_of(args, logs), ledgers)
         source = visible(args.source or args.logs[0].resolve().stem)

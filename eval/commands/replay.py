@@ -151,9 +151,7 @@ def _replay(
         detectors_of(args, vehicle), cache_of(args), args.draw, args.resume, progress.at_frame
     )
     with ExitStack() as stack:
-        logs = open_logs(drive.logs)
-        for log in logs:
-            stack.enter_context(log)
+        logs = stack.enter_context(open_logs(drive.logs))
         selection = selection_of(args, logs)
         landmarks = None
         if args.landmarks:

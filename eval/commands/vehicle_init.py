@@ -7,7 +7,6 @@ example:
 from __future__ import annotations
 
 import argparse
-from contextlib import ExitStack
 from pathlib import Path
 
 from crosscue.eval.vehicle_draft import draft
@@ -34,10 +33,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output is not None and args.output.exists() and not args.overwrite:
         raise UsageError(f"{args.output}: exists; give another name or --overwrite")
     folder = args.output.parent if args.output is not None else Path.cwd()
-    with ExitStack() as stack:
-        logs = open_logs(args.logs)
-        for log in logs:
-            stack.enter_context(log)
+    with open_logs(args.logs) as logs:
         text = draft(logs, args.dbc, folder)
     parse(text, "the draft")
     if args.output is not None:

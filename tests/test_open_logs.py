@@ -1,0 +1,61 @@
+"""Several logs at a time: all are closed, whatever happens to one of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from crosscue.replay import log as log_module
+from crosscue.replay.errors import LogError
+from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.log import Log, open_logs
+from support.memory_log import MemoryLog
+
+
+class Opened:
+    """Opens made-up logs, refuses one, and remembers which were closed."""
+
+    def __init__(self) -> None:
+        self.closed: list[str] = []
+
+    def __call__(self, path: Path | str, limits: Limits = DEFAULT) -> Log:
+        """A log, unless its name is ``broken``."""
+        if str(path) == "broken":
+            raise LogError("broken: not a log")
+        closed = self.closed
+
+        class Told(MemoryLog):
+            def close(self) -> None:
+                closed.append(str(self.path))
+
+        return Told((), (), Path(path))
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> Opened:
+    made = Opened()
+    monkeypatch.setattr(log_module, "open_log", made)
+    return made
+
+
+def test_logs_come_in_the_order_asked_for_and_are_closed_at_the_end(opened: Opened) -> None:
+    with open_logs(["a", "b"]) as logs:
+        assert [str(one.path) for one in logs] == ["a", "b"]
+        assert opened.closed == []
+
+    assert sorted(opened.closed) == ["a", "b"]
+
+
+def test_when_one_cannot_be_opened_those_before_it_are_closed(opened: Opened) -> None:
+    with pytest.raises(LogError, match="broken"), open_logs(["a", "broken", "c"]):
+        pytest.fail("it was opened")
+
+    assert opened.closed == ["a"]
+
+
+def test_when_the_work_fails_all_are_closed(opened: Opened) -> None:
+    with pytest.raises(ZeroDivisionError), open_logs(["a", "b"]):
+        raise ZeroDivisionError
+
+    assert sorted(opened.closed) == ["a", "b"]
