@@ -10,10 +10,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval.cli import run
-from crosscue.replay.columns import Block, Images
+from crosscue.replay.columns import Images
 from crosscue.replay.errors import LogError, LogFormatError
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
-from crosscue.replay.log import EVERYTHING, Selection, open_log
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
+from crosscue.replay.log import Selection, open_log
+from support.accounted import read
 from support.videos import number_of, numbers_at_times, video
 
 S = 1_000_000_000
@@ -23,16 +24,6 @@ REORDERING = {"bf": "3", "b-adapt": "0", "g": "12"}
 ODD_S = [100.0 + 0.05 * i + (0.3 if i > 9 else 0.0) for i in range(N)]
 ODD_NS = [round(t * 1000) * 1_000_000 for t in ODD_S]
 ODD_LINES = "\n".join(f"{t:.3f}" for t in ODD_S)
-
-
-def read(path: Path, selection: Selection = EVERYTHING) -> tuple[list[Block], Ledger]:
-    ledger = Ledger(str(path))
-    with open_log(path) as log:
-        blocks = list(log.read(ledger, selection))
-    for account in ledger.accounts.values():
-        assert account.found == account.used + account.skipped.total()
-    assert sum(len(b) for b in blocks) == sum(a.used for a in ledger.accounts.values())
-    return blocks, ledger
 
 
 CASES = [

@@ -15,26 +15,15 @@ from hypothesis import strategies as st
 
 from crosscue.replay.columns import BLOCK_BYTES, Block, Images
 from crosscue.replay.errors import LogError, LogFormatError, UnknownFormatError
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import EVERYTHING, Selection, open_log
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import Selection, open_log
+from support.accounted import read
 from support.data import shared
 from support.pictures import picture, picture_folder
 
 S = 1_000_000_000
 FIVE = "0.5\n1.5\n2.5\n3.5\n4.5\n"
-
-
-def read(
-    folder: Path, selection: Selection = EVERYTHING, limits: Limits = DEFAULT
-) -> tuple[list[Block], Ledger]:
-    ledger = Ledger(str(folder))
-    with open_log(folder, limits) as log:
-        blocks = list(log.read(ledger, selection))
-    for account in ledger.accounts.values():
-        assert account.found == account.used + account.skipped.total()
-    assert sum(len(b) for b in blocks) == sum(a.used for a in ledger.accounts.values())
-    return blocks, ledger
 
 
 def shades(blocks: list[Block]) -> list[tuple[float, bytes]]:

@@ -1,0 +1,28 @@
+"""Reading a whole log, with every row accounted for."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+from crosscue.replay.columns import Block
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.log import EVERYTHING, Selection, open_log
+
+
+def read(
+    path: Path, selection: Selection = EVERYTHING, limits: Limits = DEFAULT
+) -> tuple[list[Block], Ledger]:
+    """All blocks; what was found was used or skipped, and used is what was handed on."""
+    ledger = Ledger(str(path))
+    with open_log(path, limits) as log:
+        blocks = list(log.read(ledger, selection))
+    given = Counter[str]()
+    for block in blocks:
+        given[block.topic] += len(block)
+    for name, account in ledger.accounts.items():
+        assert account.found == account.used + account.skipped.total()
+        assert given.pop(name, 0) == account.used
+    assert not given
+    return blocks, ledger
