@@ -2,9 +2,9 @@
 
 A simulated ten-minute town drive (no scene in its pictures) with a camera of 10 pictures a second,
 150 kB each, and stored detections as dense as a busy street's: six objects with masks a frame, two
-of them cars seen from the side. What
-is timed is ``crosscue estimate`` as a library call: reading the log's other topics, pose, cues,
-range and belief, all tables written. Run it as ``python benchmarks/estimate.py [MINUTES]``.
+of them cars seen from the side. What is timed is ``crosscue estimate`` as a library call: reading
+the log's other topics, pose, cues, range and belief, all tables written. Run it as
+``python benchmarks/estimate.py [MINUTES]``.
 """
 
 from __future__ import annotations
