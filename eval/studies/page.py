@@ -11,13 +11,23 @@ from typing import Final
 
 from crosscue.replay.run_folder import write_text
 
+HEAD: Final = """\
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy"
+ content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">"""
 STYLE: Final = """\
-body{font:15px/1.5 system-ui,sans-serif;max-width:75rem;margin:2rem auto;padding:0 1rem;color:#222}
+:root{color-scheme:light dark;--ink:#222;--soft:#555;--line:#ddd;--paper:#fff}
+@media (prefers-color-scheme:dark){
+:root{--ink:#e6edf3;--soft:#9198a1;--line:#30363d;--paper:#0d1117}}
+body{font:15px/1.5 system-ui,sans-serif;max-width:75rem;margin:2rem auto;padding:0 1rem;
+color:var(--ink);background:var(--paper)}
+.scroll{overflow-x:auto}
 table{border-collapse:collapse;margin:1rem 0;font-variant-numeric:tabular-nums}
-th,td{padding:.25rem .7rem;border-bottom:1px solid #ddd;text-align:right}
+th,td{padding:.25rem .7rem;border-bottom:1px solid var(--line);text-align:right}
 th:first-child,td:first-child{text-align:left}
-img{max-width:100%}
-p.note{color:#555}"""
+img{max-width:100%;background:#fff}
+p.note{color:var(--soft)}"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +75,7 @@ def write_page(
     body = "\n".join(parts)
     write_text(
         path,
-        f'<!doctype html>\n<html lang="en"><meta charset="utf-8">\n<title>{html.escape(title)}'
+        f'<!doctype html>\n<html lang="en">\n{HEAD}\n<title>{html.escape(title)}'
         f"</title>\n<style>{STYLE}</style>\n<body>\n{body}\n</body></html>\n",
     )
 
@@ -76,4 +86,7 @@ def _table(table: Table) -> str:
         "<tr>" + "".join(f"<td>{html.escape(entry)}</td>" for entry in row) + "</tr>\n"
         for row in table.rows
     )
-    return f"<h2>{html.escape(table.heading)}</h2>\n<table><tr>{head}</tr>\n{rows}</table>"
+    return (
+        f"<h2>{html.escape(table.heading)}</h2>\n"
+        f'<div class="scroll"><table><tr>{head}</tr>\n{rows}</table></div>'
+    )
