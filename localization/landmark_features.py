@@ -105,7 +105,7 @@ def make_matcher(name: str, camera: CameraGeometry = CameraGeometry()) -> Matche
     """Build a matcher by its name in ``MATCHERS`` or as ``module:factory``.
 
     Raises:
-        UsageError: No such name, module or factory.
+        UsageError: No such name, module or factory; or it makes no matcher.
     """
     target = MATCHERS.get(name, name)
     module, colon, factory = target.partition(":")
@@ -116,4 +116,15 @@ def make_matcher(name: str, camera: CameraGeometry = CameraGeometry()) -> Matche
         build = cast("Callable[[CameraGeometry], Matcher]", getattr(import_module(module), factory))
     except (ImportError, AttributeError) as error:
         raise UsageError(f"matcher {name!r}: {error}; check module and factory") from None
-    return build(camera)
+    try:
+        made = build(camera)
+    except TypeError as error:
+        raise UsageError(
+            f"matcher {name!r}: {error}; a factory takes a CameraGeometry and gives a Matcher"
+        ) from error
+    lacks = [part for part in ("kind", "describe", "match") if not hasattr(made, part)]
+    if lacks:
+        raise UsageError(
+            f"matcher {name!r}: what the factory gives has no {lacks[0]}; want a Matcher"
+        )
+    return made

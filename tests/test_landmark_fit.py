@@ -151,6 +151,16 @@ def test_bad_tables_are_refused(
     assert why in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("flags", "why"), [(["--most", "0"], "--most 0"), (["--near", "60"], "--near 60: want less")]
+)
+def test_flags_that_leave_no_pairs_are_refused(
+    capsys: pytest.CaptureFixture[str], flags: list[str], why: str
+) -> None:
+    assert cli.run(["fit", "landmarks", "--pairs", "pairs.csv", *flags]) == 2
+    assert why in capsys.readouterr().err
+
+
 def test_a_real_drive_with_poses_fits_a_threshold(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -235,6 +235,15 @@ def test_a_near_that_is_none_is_refused(town: Town, capsys: pytest.CaptureFixtur
         assert (status, "want x,y,radius in metres" in err) == (2, True)
 
 
+def test_fewer_than_none_cannot_be_shown(town: Town, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    database = str(town.database)
+
+    for command in (("list", database, "--limit=-1"), ("match", database, "x.png", "--best=0")):
+        status, err = refused(capsys, "landmarks", *command)
+        assert (status, "want" in err) == (2, True)
+
+
 def photos(folder: Path, table: str) -> tuple[Path, Path]:
     folder.mkdir()
     for i in range(2):

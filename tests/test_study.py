@@ -26,6 +26,7 @@ from crosscue.eval.studies.intervals import (
     share_of,
 )
 from crosscue.eval.studies.landmark_study import comparisons_of
+from crosscue.eval.studies.page import Table, write_page
 from crosscue.eval.studies.range_study import CALIBRATION_SEED, calibrate, summarise
 from crosscue.eval.studies.replayed import through_log
 from crosscue.eval.studies.settings import (
@@ -220,7 +221,14 @@ def test_ray_gives_the_same_bytes_and_tells_of_dead_workers(
         ('version = 2\nkind = "range"\n', "version"),
         ('version = 1\nkind = "range"\ndrives = 0\n', ":3: drives"),
         ('version = 1\nkind = "range"\ncompass_2sigma_deg = [500.0]\n', ":3: compass_2sigma_deg"),
-        ('version = 1\nkind = "range"\n[drive]\ngoals = 3\n', "drive.goals: is what this study"),
+        (
+            'version = 1\nkind = "range"\n[drive]\ngoals = 3\n',
+            r":4: drive\.goals: this study varies or fixes it itself",
+        ),
+        (
+            'version = 1\nkind = "range"\ncompass_2sigma_deg = []\nwithout_compass = false\n',
+            ":4: without_compass: .*nothing to drive",
+        ),
         ("version = 1\nkind = \n", "not TOML"),
     ],
 )
@@ -241,6 +249,34 @@ def test_a_study_file_that_is_not_there_is_one_line(
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.count("\n") == 1
+
+
+def test_a_study_file_that_never_ends_is_not_read() -> None:
+    with pytest.raises(StudyFileError, match="/dev/zero: no regular file"):
+        load_study(Path("/dev/zero"), RangeStudy)
+
+
+@pytest.mark.parametrize(
+    ("flag", "value"), [("--compass", "-5"), ("--rate", "1.5"), ("--landmarks", "101")]
+)
+def test_a_drive_that_cannot_be_names_its_flag(
+    tmp_path: Path, flag: str, value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["study", "drive", "-o", str(tmp_path), f"{flag}={value}"]) == 2
+    assert f"{flag} {value}" in capsys.readouterr().err
+
+
+def test_the_page_is_one_for_light_dark_and_small_screens(tmp_path: Path) -> None:
+    table = Table("<heading>", ("what", "km"), (("<b>", "1.0"),))
+    write_page(tmp_path / "p.html", "Title", ["a & b"], [table, table], [])
+    page = (tmp_path / "p.html").read_text()
+
+    assert "prefers-color-scheme:dark" in page
+    assert 'name="viewport"' in page
+    assert page.count('<div class="scroll"><table>') == page.count("<table>") == 2
+    assert "<b>" not in page
+    assert "default-src 'none'" in page
+    assert "http" not in page.replace("http-equiv", "")
 
 
 @pytest.mark.parametrize("density", [-1.0, 101.0, math.nan])

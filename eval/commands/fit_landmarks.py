@@ -72,6 +72,10 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("fit landmarks: give --pairs, or LOG... with --database and --poses")
     if args.write and args.vehicle is None:
         raise UsageError("--write: give the file to write into with --vehicle V.toml")
+    if args.most < 1:
+        raise UsageError(f"--most {args.most}: want 1 or more")
+    if args.near >= args.far:
+        raise UsageError(f"--near {args.near:g}: want less than --far {args.far:g}")
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     matcher = matcher_for(vehicle, args.matcher)
     if args.pairs:

@@ -14,6 +14,7 @@ from pathlib import Path
 from crosscue.eval.landmark_job import near_of
 from crosscue.eval.plain_text import visible
 from crosscue.localization.landmark_database import LandmarkDatabase, Place
+from crosscue.replay.errors import UsageError
 
 from .common import print_json
 
@@ -33,10 +34,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """List."""
     near = near_of(args.near)
+    if args.limit < 0:
+        raise UsageError(f"--limit {args.limit}: want 0 or more")
     with LandmarkDatabase(args.database) as database:
         total = len(database)
         found = iter(database) if near is None else database.within(*near)
-        places = [one.place for one in islice(found, max(args.limit, 0))]
+        places = [one.place for one in islice(found, args.limit)]
         kind = database.kind
     if args.json:
         listed = [_as_json(place) for place in places]

@@ -15,6 +15,7 @@ from crosscue.eval.landmark_stage import matcher_for, open_for
 from crosscue.eval.plain_text import visible
 from crosscue.localization.landmark_features import Match
 from crosscue.localization.landmark_pictures import grey_of, read_picture
+from crosscue.replay.errors import UsageError
 from crosscue.replay.vehicle import Vehicle, load
 
 from .common import print_json
@@ -38,6 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Match."""
     near = near_of(args.near)
+    if args.best < 1:
+        raise UsageError(f"--best {args.best}: want 1 or more")
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     matcher = matcher_for(vehicle, args.matcher)
     seen = matcher.describe(grey_of(read_picture(args.image)))
@@ -49,9 +52,9 @@ def run(args: argparse.Namespace) -> int:
             compared += 1
             # Of equal scores the first added comes first.
             best.append((match.score, -one.key, match, one.place.name))
-            if len(best) > 2 * max(args.best, 1):
-                best = heapq.nlargest(max(args.best, 1), best, key=lambda found: found[:2])
-    best = heapq.nlargest(max(args.best, 1), best, key=lambda found: found[:2])
+            if len(best) > 2 * args.best:
+                best = heapq.nlargest(args.best, best, key=lambda found: found[:2])
+    best = heapq.nlargest(args.best, best, key=lambda found: found[:2])
     needed = vehicle.landmarks.min_score
     if args.json:
         rows = [

@@ -74,6 +74,8 @@ def _settings(args: argparse.Namespace) -> Drive:
 
     from crosscue.localization.drive_settings import Drive, Navigation, Sensors
 
+    flags = {"compass_2sigma_deg": "compass", "detection_rate": "rate",
+             "landmarks_per_km2": "landmarks"}  # fmt: skip
     try:
         return Drive(
             sensors=Sensors(compass_2sigma_deg=args.compass or None, detection_rate=args.rate),
@@ -82,4 +84,5 @@ def _settings(args: argparse.Namespace) -> Drive:
         )
     except ValidationError as error:
         first = error.errors()[0]
-        raise UsageError(f"{first['loc'][-1]} {first['input']}: {first['msg'].lower()}") from None
+        flag = flags[str(first["loc"][-1])]
+        raise UsageError(f"--{flag} {first['input']}: {first['msg'].lower()}") from None

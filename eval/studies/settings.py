@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Final, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from crosscue.localization.drive_settings import City, Drive, Share
 from crosscue.replay.errors import CrosscueError
@@ -26,7 +27,7 @@ from crosscue.replay.vehicle import explain, tuples
 
 VERSION: Final = 1
 UNTIL_LOST: Final = 1_000_000
-VARIED: Final = "is what this study varies or fixes itself; leave it out"
+VARIED: Final = "this study varies or fixes it itself, a file leaves it out"
 LARGEST_FILE: Final = 1 << 20
 
 StrategyName = Literal["straight to goal", "landmark to landmark", "hybrid"]
@@ -70,7 +71,7 @@ class _Study(Section):
             for name in outer:
                 section = getattr(section, name)
             if last in section.model_fields_set:
-                raise ValueError(f"drive.{path}: {VARIED}")
+                raise _misfit(VARIED, getattr(section, last), "drive", *outer, last)
         return self
 
 
@@ -84,6 +85,12 @@ class RangeStudy(_Study):
     without_compass: bool = True
 
     varied: ClassVar[tuple[str, ...]] = ("sensors.compass_2sigma_deg", "goals", "landmarks_per_km2")
+
+    @model_validator(mode="after")
+    def _has_a_compass_or_none(self) -> Self:
+        if not self.compass_2sigma_deg and not self.without_compass:
+            raise _misfit("no compass and none without: nothing to drive", False, "without_compass")
+        return self
 
     def cases(self) -> tuple[Case, ...]:
         """One for each compass."""
@@ -187,6 +194,8 @@ def load_study(path: Path, kind: type[Study]) -> Study:
             with the line.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise StudyFileError(f"{path}: no regular file; give a study file")
         if path.stat().st_size > LARGEST_FILE:
             raise StudyFileError(f"{path}: larger than {LARGEST_FILE} bytes; give a study file")
         text = path.read_text(encoding="utf-8")
@@ -202,24 +211,21 @@ def load_study(path: Path, kind: type[Study]) -> Study:
         raise StudyFileError(f'{path}: kind: want "{wanted}" here, got {tree.get("kind")!r}')
     if "version" not in tree:
         raise StudyFileError(f"{path}:1: version: missing; add version = {VERSION}")
-    for name in kind.varied:
-        if _holds(tree.get("drive"), name.split(".")):
-            raise StudyFileError(f"{path}: drive.{name}: {VARIED}")
     try:
         return TypeAdapter(kind).validate_python(tuples(tree))
     except ValidationError as error:
         raise StudyFileError(explain(error, text, str(path), kind)) from None
 
 
+def _misfit(why: str, given: object, *keys: str) -> ValidationError:
+    """An error that names its key, which a model's validator cannot do by a ValueError."""
+    kind = PydanticCustomError("misfit", "{why}", {"why": why})
+    return ValidationError.from_exception_data(
+        why, [InitErrorDetails(type=kind, loc=keys, input=given)]
+    )
+
+
 def _landmarks(drive: Drive, strategy: str, per_km2: float, rate: float) -> Drive:
     return changed(
         drive, strategy=strategy, landmarks_per_km2=per_km2, detection_rate=rate, goals=1
     )
-
-
-def _holds(tree: object, keys: list[str]) -> bool:
-    for key in keys:
-        if not isinstance(tree, dict) or key not in tree:
-            return False
-        tree = tree[key]
-    return True
