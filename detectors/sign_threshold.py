@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,13 +109,3 @@ def threshold_for(judged: Judged, precision: float) -> float | None:
             break
         chosen = score
     return chosen
-
-
-def wilson(right: int, of: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's interval of a share (1927), 95 % unless told otherwise; (0, 1) for no trial."""
-    if not of:
-        return 0.0, 1.0
-    share, spread = right / of, z * z / of
-    middle = (share + spread / 2.0) / (1.0 + spread)
-    half = z * sqrt(share * (1.0 - share) / of + spread / (4.0 * of)) / (1.0 + spread)
-    return max(middle - half, 0.0), min(middle + half, 1.0)

@@ -49,8 +49,15 @@ def pairs_of_table(path: Path) -> RangePairs:
         if path.stat().st_size > MOST_BYTES:
             raise UsageError(f"{path}: over {MOST_BYTES // MIB} MiB; give fewer rows")
         columns = _parquet(path) if path.suffix == ".parquet" else _csv(path, RangePairs._fields)
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: {error}; give a table") from None
+    except OSError as error:
+        raise UsageError(
+            f"{path}: {error.strerror or error}; give a table (CSV or Parquet) with height_px and "
+            "range_m"
+        ) from None
+    except UnicodeDecodeError:
+        raise UsageError(
+            f"{path}: is no text; give a table (CSV or .parquet) with height_px and range_m"
+        ) from None
     except (KeyError, ValueError):
         raise UsageError(f"{path}: want the columns height_px and range_m, all numbers") from None
     return RangePairs(*columns)

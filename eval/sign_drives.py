@@ -41,8 +41,12 @@ def _boxes(path: Path) -> dict[int, Boxes]:
         if path.stat().st_size > MOST_BYTES:
             raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SchemaError(f"{path}: {error}; labels of a drive's signs stand there") from None
+    except OSError as error:
+        raise SchemaError(
+            f"{path}: {error.strerror}; labels of a drive's signs stand there"
+        ) from None
+    except UnicodeDecodeError:
+        raise SchemaError(f"{path}: is no text; labels of a drive's signs stand there") from None
     found: dict[int, Boxes] = {}
     for image, boxes in coco_boxes(text, path):
         if not isinstance(image.get("t_ns"), int):

@@ -15,7 +15,7 @@ from crosscue.replay.limits import MIB
 
 COLUMNS: Final = ("picture", "label", "x0", "y0", "x1", "y1")
 MOST_BYTES: Final = 64 * MIB
-
+_WANTED: Final = "give a CSV or COCO file of boxes, or a drive's folder"
 
 Boxes = dict[str, list[tuple[float, float, float, float]]]
 """From label to boxes (x0, y0, x1, y1) in pixels."""
@@ -51,10 +51,10 @@ def _text(path: Path) -> str:
         if path.stat().st_size > MOST_BYTES:
             raise UsageError(f"{path}: over {MOST_BYTES // MIB} MiB; split it")
         return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(
-            f"{path}: {error}; give a CSV or COCO file of boxes, or a drive's folder"
-        ) from None
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}; {_WANTED}") from None
+    except UnicodeDecodeError:
+        raise UsageError(f"{path}: is no text; {_WANTED}") from None
 
 
 def _of_coco(text: str, path: Path) -> list[Labelled]:

@@ -14,7 +14,7 @@ from crosscue.detectors.pictures import Encoded, decode
 from crosscue.detectors.sign_threshold import Judged, judge, together
 from crosscue.replay.columns import Floats
 from crosscue.replay.decode.coding import MAGIC_BYTES, coding_of
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import LogError, UsageError
 from crosscue.replay.limits import DEFAULT
 
 from .sign_drives import drive_pictures
@@ -52,7 +52,6 @@ def judged_pictures(path: Path, detector: Detector, rules: Rules, every: slice) 
 
     Raises:
         UsageError: No such file, a picture that cannot be read, or a box outside its picture.
-        LogFormatError: One that does not decode.
         LogError: A drive's log cannot be read.
         SchemaError: A drive has no truth, or it does not fit.
     """
@@ -66,7 +65,10 @@ def _labelled(path: Path) -> Iterator[Labelled]:
 
 def _judged(one: Labelled, detector: Detector, rules: Rules) -> Judged:
     picture = _read(one.picture) if isinstance(one.picture, Path) else one.picture
-    pixels, size = decode(picture, detector.view)
+    try:
+        pixels, size = decode(picture, detector.view)
+    except LogError as error:
+        raise UsageError(f"{one.name}: {error}; mend the picture or leave it out") from None
     width, height = size
     found = detector([Frame(0, one.name, pixels, size)])[0]
     if not isinstance(found, Detections):

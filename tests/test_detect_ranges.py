@@ -72,6 +72,19 @@ def test_a_table_without_its_columns_is_told(
     assert "want the columns height_px and range_m" in capsys.readouterr().err
 
 
+def test_a_table_that_is_none_is_told_with_its_path_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "wild.csv").write_bytes(b"\xff\xd8\xff")
+
+    for name, said in (("none.csv", "No such file"), ("wild.csv", "is no text")):
+        path = tmp_path / name
+        assert run(["fit", "ranges", str(path), "--cue", "stop_sign"]) == 2
+        told = capsys.readouterr().err
+        assert f"{path}: {said}" in told
+        assert told.count(name) == 1
+
+
 HEIGHTS = {"stop_sign": 750.0, "traffic_light": 1000.0}
 
 

@@ -18,7 +18,6 @@ from crosscue.detectors.sign_threshold import (
     judge,
     rates_at,
     threshold_for,
-    wilson,
 )
 from crosscue.detectors.sign_votes import nearest, window_counts
 from crosscue.eval.cli import run
@@ -150,13 +149,6 @@ def test_the_threshold_is_the_lowest_that_keeps_the_precision() -> None:
     assert rates_at(judged, 0.8).precision == 1.0
     assert rates_at(judged, 0.8).recall == 0.5
     assert threshold_for(Judged(np.array([0.9]), np.array([False]), 1), 0.95) is None
-
-
-def test_wilsons_interval_is_the_books() -> None:
-    # Brown, Cai, DasGupta (2001): 0 of 10 gives 0 to 0.2775.
-    assert wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
-    assert wilson(10, 10) == pytest.approx((0.7225, 1.0), abs=1e-4)
-    assert wilson(0, 0) == (0.0, 1.0)
 
 
 def test_fit_signs_chooses_on_some_frames_and_measures_on_others(
@@ -316,6 +308,30 @@ def test_labels_that_do_not_fit_are_told_in_one_line(
     assert run(["fit", "signs", str(labels), "--label", "stop"]) == 2
 
     assert said in capsys.readouterr().err
+
+
+def test_a_picture_cut_short_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, coded = cv2.imencode(".jpg", scene(AMERICAN[0], 3).grey)
+    (tmp_path / "cut.jpg").write_bytes(coded.tobytes()[:2000])
+    labels = tmp_path / "labels.csv"
+    labels.write_text("picture,label,x0,y0,x1,y1\ncut.jpg,stop,1,2,30,40\n")
+
+    assert run(["fit", "signs", str(labels), "--label", "stop"]) == 2
+    assert "cut.jpg: jpeg picture cut short; mend the picture" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("none.csv", "none.csv: No such file"), ("wild.csv", "wild.csv: is no text")]
+)
+def test_a_file_of_labels_that_is_none_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, said: str
+) -> None:
+    (tmp_path / "wild.csv").write_bytes(b"\xff\xd8\xff")
+
+    assert run(["fit", "signs", str(tmp_path / name), "--label", "stop"]) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count(str(tmp_path)) == 1
 
 
 def test_a_real_no_entry_sign_is_found_in_a_photo() -> None:
