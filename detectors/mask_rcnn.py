@@ -29,6 +29,7 @@ from crosscue.replay.errors import CrosscueError, VehicleError
 from . import rle
 from .base import Detections, Detector, Found, Frame, View
 from .box_screening import FEWEST, ScreenedParts, can_screen
+from .devices import chosen_device
 from .mask_rcnn_checkpoint import Calibration, Checkpoint, embedded_path, load_checkpoint
 from .mask_rcnn_coco import COCO_NETWORKS, load_coco
 from .mask_rcnn_cpu import for_cpu
@@ -99,29 +100,13 @@ def checkpoint_named(name: str) -> Checkpoint:
 
 def _device_of(settings: MaskRcnnSettings) -> torch.device:
     if settings.backend == "torch":
-        return chosen_device(settings.device)
+        return chosen_device(settings.device, "detector mask-rcnn")
     if settings.device not in ("auto", "cpu"):
         raise VehicleError(
             f"detector mask-rcnn: backend {settings.backend} runs on a cpu only, got device "
             f'{settings.device}; set device = "cpu", or backend = "torch"'
         )
     return torch.device("cpu")
-
-
-def chosen_device(asked: str) -> torch.device:
-    """The device asked for; by itself CUDA, else MPS, else the CPU.
-
-    Raises:
-        VehicleError: It is not there.
-    """
-    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-    if asked == "auto":
-        asked = next((name for name, is_there in there.items() if is_there), "cpu")
-    elif not there.get(asked, True):
-        raise VehicleError(
-            f"detector mask-rcnn: device {asked}: not there or not in this torch; use auto or cpu"
-        )
-    return torch.device(asked)
 
 
 def detector_of(

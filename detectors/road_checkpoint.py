@@ -52,14 +52,15 @@ def save_road(path: Path, network: RoadNetwork, facts: RoadFacts) -> None:
     Raises:
         OutputError: It cannot be written.
     """
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     kept = {
         name: value.detach().cpu().contiguous().half() if value.is_floating_point() else value.cpu()
         for name, value in network.state_dict().items()
     }
     header = {KEY: json.dumps(facts.model_dump(mode="json"), sort_keys=True)}
-    write_whole(path, lambda place: save_file(kept, place, header))
+    content = save(kept, header)
+    write_whole(path, lambda place: place.write_bytes(content))
 
 
 def load_road(path: Path) -> RoadCheckpoint:

@@ -18,8 +18,9 @@ from crosscue.replay.columns import Bytes
 
 from . import rle
 from .base import Found, Frame, RoadMask, View
+from .devices import chosen_device
 from .road_checkpoint import RoadCheckpoint, load_road
-from .road_network import device_of, embedded_path, logits_of
+from .road_network import embedded_path, logits_of
 from .settings import Settings, identity_of, settings_of
 
 VERSION: Final = 1
@@ -44,7 +45,7 @@ def build(**given: Any) -> RoadNetworkDetector:
     """
     settings = settings_of(RoadSettings, given, "detector road")
     path = embedded_path() if settings.checkpoint is None else Path(settings.checkpoint)
-    device = device_of(settings.device)
+    device = chosen_device(settings.device, "detector road")
     checkpoint = load_road(path)
     checkpoint.network.to(device)
     return RoadNetworkDetector(checkpoint, settings, device)

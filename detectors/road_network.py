@@ -7,7 +7,7 @@ in as ``checkpoint``.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
@@ -86,15 +86,6 @@ def _grown(small: Tensor, like: Tensor) -> Tensor:
 def embedded_path() -> Path:
     """The checkpoint that comes with crosscue."""
     return Path(__file__).parent / "checkpoints" / "road.safetensors"
-
-
-def device_of(asked: Literal["auto", "cpu", "cuda", "mps"]) -> torch.device:
-    """The device asked for; ``auto`` takes the fastest there is."""
-    if asked != "auto":
-        return torch.device(asked)
-    if torch.cuda.is_available():
-        return torch.device("cuda")
-    return torch.device("mps" if torch.backends.mps.is_available() else "cpu")
 
 
 def logits_of(network: Any, pictures: Tensor) -> Tensor:

@@ -113,7 +113,7 @@ class RoadTraining:
         Raises:
             OutputError: It cannot be written.
         """
-        from safetensors.torch import save_file
+        from safetensors.torch import save
 
         tensors = {f"network.{k}": v.detach().cpu().contiguous().clone()
                    for k, v in self.network.state_dict().items()}  # fmt: skip
@@ -121,7 +121,8 @@ class RoadTraining:
             for name, value in slot.items():
                 tensors[f"optimizer.{number}.{name}"] = value.detach().cpu().contiguous().clone()
         header = {STATE_KEY: json.dumps({"done": self.done, "seed": self.schedule.seed})}
-        write_whole(path, lambda place: save_file(tensors, place, header))
+        content = save(tensors, header)
+        write_whole(path, lambda place: place.write_bytes(content))
 
     def resume(self, path: Path) -> None:
         """Go on where ``save`` left off.

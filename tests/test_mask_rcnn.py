@@ -22,12 +22,12 @@ from torchvision.models.detection.roi_heads import paste_masks_in_image
 from crosscue.datasets.scenes.camera import Camera
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.devices import chosen_device
 from crosscue.detectors.mask_rcnn import (
     MaskRcnnDetector,
     MaskRcnnSettings,
     build,
     calibrated,
-    chosen_device,
     detector_of,
     laid_in,
     place,
@@ -398,8 +398,8 @@ def test_a_wrong_name_or_setting_says_what_there_is(tmp_path: Path) -> None:
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
 def test_a_device_that_is_not_there_is_named() -> None:
     with pytest.raises(VehicleError, match="device cuda: not there"):
-        chosen_device("cuda")
-    assert chosen_device("cpu").type == "cpu"
+        chosen_device("cuda", "detector road")
+    assert chosen_device("cpu", "detector road").type == "cpu"
 
 
 def test_without_a_network_it_says_where_coco_weights_go(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -195,6 +196,12 @@ def test_a_picture_without_its_mask_or_of_another_size_is_told(tmp_path: Path) -
         (["--layouts", "A"], "only for scoring"),
         (["--layouts", "L1", "--held", "L1"], "also trained on"),
         (["--layouts", "Q"], "is no layout"),
+        (["--layouts", "L2-L1"], "want the lower one first"),
+        (["--layouts", "L1", "--score", "Z"], "is no layout"),
+        (["--layouts", "L1", "L0-L3"], "L1: named twice"),
+        (["--layouts", "L1", "--seed", "-1"], "want 0 or more"),
+        (["--layouts", "L1", "--threads", "-1"], "want 0 or more"),
+        (["--measure", "embedded", "--score", "A"], "not with -o"),
         ([], "give --layouts"),
     ],
 )
@@ -203,3 +210,27 @@ def test_wrong_usage_is_told(
 ) -> None:
     assert run(["train", "road", *flags, "-o", str(tmp_path / "o.safetensors")]) == 2
     assert says in capsys.readouterr().err
+
+
+def test_a_network_is_measured_without_training(capsys: pytest.CaptureFixture[str]) -> None:
+    measure = ["train", "road", "--measure", "embedded"]
+
+    assert run([*measure, "--score", "L640", "--each", "2", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["measured_pictures"] == 2
+    assert told["measured_iou"] > 0.95
+    assert run(measure) == 2
+    assert "give --score with layouts" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+def test_a_device_that_is_not_there_is_told() -> None:
+    with pytest.raises(VehicleError, match="detector road: device cuda: not there"):
+        build(device="cuda")
+
+
+def test_a_place_that_cannot_be_written_to_is_told_before_any_work(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(["train", "road", "--layouts", "L1", "-o", "/proc/nowhere/o.safetensors"]) == 1
+    assert "choose a place you may write to" in capsys.readouterr().err

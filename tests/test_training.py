@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
-from crosscue.detectors.mask_rcnn_checkpoint import load_checkpoint
+from crosscue.detectors.mask_rcnn_checkpoint import Facts, load_checkpoint, save_checkpoint
 from crosscue.detectors.mask_rcnn_network import build_network
 from crosscue.detectors.sign_threshold import Judged
 from crosscue.detectors.training.annotations import LabelledSet, mask_of, read_coco
@@ -328,7 +328,7 @@ def test_from_simulated_pictures_to_a_checkpoint_by_commands_alone(
     assert "--overwrite begins anew" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("layout", ["A", "H", "L", "L9-L3", "L1-A", "L-1"])
+@pytest.mark.parametrize("layout", ["A", "H", "A-C", "L", "L9-L3", "L1-A", "L-1", "L0-L999999999"])
 def test_nothing_is_rendered_for_training_of_what_is_scored(
     tmp_path: Path, layout: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -344,7 +344,11 @@ def test_nothing_is_rendered_for_training_of_what_is_scored(
         (["--steps", "0"], "--steps: want 1 or more"),
         (["--rate", "nan"], "--rate"),
         (["--window", "100", "64"], "multiples of 32"),
+        (["--window", "64", "1000000000"], "multiples of 32 from 64 to 4096"),
         (["--classes", "car", "car"], "named twice"),
+        (["--classes", ""], "empty or named twice"),
+        (["--width", "10"], "width_px: input should be greater than or equal to 64"),
+        (["--measure", "embedded"], "not with -o"),
         (["--val-data", "x.json"], "give both or none"),
         (["--top", "0.6", "--bottom", "0.6"], "less than a tenth"),
     ],
@@ -355,6 +359,66 @@ def test_wrong_flags_are_told_before_any_work(
     path = write_bars(tmp_path / "set", 11)
     base = ["train", "mask-rcnn", "--data", str(path), "--images", str(path.parent / "images"),
             "-o", str(tmp_path / "out.safetensors")]  # fmt: skip
+
+    assert run([*base, *flags]) == 2
+    assert why in capsys.readouterr().err
+
+
+def test_a_place_that_cannot_be_written_to_is_told_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_bars(tmp_path / "set", 11)
+    base = ["train", "mask-rcnn", "--data", str(path), "--images", str(path.parent / "images")]
+
+    assert run([*base, "-o", "/proc/nowhere/out.safetensors"]) == 1
+    told = capsys.readouterr()
+    assert "choose a place you may write to" in told.err
+    assert "training" not in told.out
+
+
+def test_a_network_is_measured_without_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = tmp_path / "frames"
+    run(["train", "frames", "L901", "--each", "3", "-o", str(frames), "-q"])
+    base = ["train", "mask-rcnn", "--measure", "embedded", "--data", str(frames / "coco.json"),
+            "--images", str(frames / "images")]  # fmt: skip
+
+    assert run([*base, "--pictures", "1:", "--proposals", "100", "200", "--json"]) == 0
+    tree = json.loads(capsys.readouterr().out)
+    assert tree["pictures"] == 2
+    assert [row["proposals"] for row in tree["measured"]] == [100, 200]
+    first = tree["measured"][0]
+    assert 0.0 < first["ap"]["box"] <= 100.0
+    by_score = [row for row in first["rates"] if row["label"] == "car"]
+    assert [row["score"] for row in by_score] == [0.5, 0.9, 0.95]
+    assert [row["found"] for row in by_score] == sorted(
+        (row["found"] for row in by_score), reverse=True
+    )
+
+    assert run(base) == 0
+    told = capsys.readouterr().out
+    assert "embedded on 3 pictures, 100 proposals" in told
+    assert "score from 0.95" in told
+
+
+@pytest.mark.parametrize(
+    ("flags", "why"),
+    [
+        (["--pictures", "9"], "want A:B:N"),
+        (["--pictures", "::0"], "want A:B:N"),
+        (["--pictures", "90:"], "none of 4 pictures"),
+        (["--proposals", "0"], "want 1 to 2000"),
+    ],
+)
+def test_a_measurement_of_nothing_is_refused(
+    tmp_path: Path, flags: list[str], why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_bars(tmp_path / "set", 4)
+    torch_file = tmp_path / "bars.safetensors"
+    save_checkpoint(torch_file, build_network(plan_of(256)), Facts(plan=plan_of(256)))
+    base = ["train", "mask-rcnn", "--measure", str(torch_file), "--data", str(path),
+            "--images", str(path.parent / "images")]  # fmt: skip
 
     assert run([*base, *flags]) == 2
     assert why in capsys.readouterr().err

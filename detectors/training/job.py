@@ -13,13 +13,10 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from crosscue.detectors.base import Detections
+from crosscue.detectors.devices import chosen_device
 from crosscue.detectors.mask_rcnn import (
     MaskRcnnSettings,
-    calibrated,
     checkpoint_named,
-    chosen_device,
-    detector_of,
 )
 from crosscue.detectors.mask_rcnn_checkpoint import (
     Calibration,
@@ -29,21 +26,18 @@ from crosscue.detectors.mask_rcnn_checkpoint import (
 )
 from crosscue.detectors.mask_rcnn_coco import COCO_NETWORKS
 from crosscue.detectors.mask_rcnn_network import Plan, build_network
-from crosscue.detectors.sign_threshold import Judged, rates_at
+from crosscue.detectors.sign_threshold import Judged
 from crosscue.replay.errors import OutputError
 from crosscue.replay.run_folder import strict_json, write_text
 
 from .annotations import LabelledSet
 from .calibration import fitted, judged
 from .loop import Schedule, Training
+from .measure import rates_by_score, raw_detections
 from .samples import Sampler, Window
-from .scores import average_precisions, detections_on
+from .scores import average_precisions
 
 COMPACT: Final = "compact"
-LEAST_SCORE: Final = 0.02
-"""Detections below it are left out of the average precision."""
-AIMS: Final = (0.5, 0.9, 0.95)
-"""Scores at which precision and recall are told; the last two are the cues' own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +110,7 @@ def run_job(
     """
     if not resume:
         _check_place(job, overwrite)
-    device = chosen_device(job.device)
+    device = chosen_device(job.device, "train mask-rcnn")
     torch.set_num_threads(job.threads)
     training = Training(lambda: starting_network(job), job.schedule, device)
     points: list[Point] = []
@@ -176,7 +170,10 @@ def _learned(
             continue
         seconds = before_s + time.monotonic() - began - checking_s
         checked = time.monotonic()
-        found = _found(job, training.averaged, some, training.device)
+        found = raw_detections(
+            job.plan, training.averaged, some, MaskRcnnSettings(threads=job.threads),
+            training.device,
+        )  # fmt: skip
         point = Point(step, float(np.mean(losses or [math.nan])), round(seconds, 1),
                       average_precisions(some, found))  # fmt: skip
         points.append(point)
@@ -193,18 +190,13 @@ def _spread(pictures: tuple[Any, ...], most: int) -> tuple[Any, ...]:
     return tuple(pictures[i] for i in np.linspace(0, len(pictures) - 1, most).astype(int))
 
 
-def _found(job: Job, network: Any, labelled: LabelledSet, device: torch.device) -> list[Detections]:
-    bare = Checkpoint(Facts(plan=job.plan), network, "")
-    settings = MaskRcnnSettings(score=LEAST_SCORE, threads=job.threads)
-    return list(detections_on(labelled, detector_of(bare, settings, device)))
-
-
 def finished_facts(job: Job, network: Any, held_out: LabelledSet, device: torch.device) -> Facts:
     """What the checkpoint says: its measured average precision, and calibrated scores.
 
     The first half of the held-out pictures calibrates, the second half tells how well.
     """
-    found = _found(job, network, held_out, device)
+    settings = MaskRcnnSettings(threads=job.threads)
+    found = raw_detections(job.plan, network, held_out, settings, device)
     half = len(found) // 2
     first = replace(held_out, pictures=held_out.pictures[:half])
     second = replace(held_out, pictures=held_out.pictures[half:])
@@ -220,10 +212,8 @@ def finished_facts(job: Job, network: Any, held_out: LabelledSet, device: torch.
 
 def told_rates(name: str, rows: Judged, by: Calibration) -> dict[str, float | None]:
     """Precision and recall of a class at calibrated scores, in percent; None where undefined."""
-    scores = np.array([calibrated(score, by) for score in rows.scores.tolist()])
     told: dict[str, float | None] = {}
-    for aim in AIMS:
-        at = rates_at(Judged(scores, rows.is_right, rows.signs), aim)
+    for aim, at in rates_by_score(rows, by).items():
         for what, share in (("precision", at.precision), ("recall", at.recall)):
             told[f"{what} {name} at {aim}"] = (
                 round(100.0 * share, 2) if math.isfinite(share) else None

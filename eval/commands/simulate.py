@@ -98,6 +98,8 @@ def _sheet(wanted: list[SceneSettings], args: argparse.Namespace) -> int:
 def _wanted(args: argparse.Namespace) -> list[SceneSettings]:
     if args.all == bool(args.layouts):
         raise UsageError("simulate: give layouts (A to H, L0, L1, ...), or --all")
+    if len(set(args.layouts)) != len(args.layouts):
+        raise UsageError("simulate: a layout is named twice; name each once")
     if (args.output is None) == (args.sheet is None):
         raise UsageError("simulate: give -o DIR for drives, or --sheet JPEG for pictures of them")
     if args.jobs < 1:

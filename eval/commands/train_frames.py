@@ -11,7 +11,6 @@ examples:
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 
 from crosscue.datasets.scenes.camera import Camera
@@ -21,6 +20,7 @@ from crosscue.datasets.scenes.training_frames import frames, joined
 from crosscue.replay.errors import OutputError, UsageError
 
 from .common import print_json, with_progress
+from .common_training import check_place, learnt_layouts_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,14 +36,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Render and write."""
-    wanted = [_settings(number, args) for text in args.layouts for number in _numbers(text)]
-    if args.each < 1 or args.jobs < 1:
-        raise UsageError("--each, --jobs: want 1 or more")
+    if args.each < 1 or args.jobs < 1 or args.seed < 0:
+        raise UsageError("--each, --jobs: want 1 or more; --seed: want 0 or more")
+    wanted = [_settings(name, args) for name in learnt_layouts_of(args.layouts, "train frames")]
     target = args.output / "coco.json"
     if target.exists():
         raise OutputError(f"{target}: exists; give another folder")
     images = args.output / "images"
-    images.mkdir(parents=True, exist_ok=True)
+    check_place(images / "any")
     parts: list[Objects] = []
     made = frames(wanted, args.each, images, args.jobs)
     for part in with_progress(made, lambda: len(parts) / len(wanted), args, "rendering"):
@@ -58,24 +58,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _numbers(text: str) -> range:
-    match = re.fullmatch(r"L(\d{1,9})(?:-L(\d{1,9}))?", text)
-    if match is None:
-        raise UsageError(
-            f"train frames: {text!r} is no training layout; want L0 or L0-L99 "
-            "(A to H are only for scoring)"
-        )
-    first = int(match[1])
-    numbers = range(first, int(match[2] or first) + 1)
-    if not numbers:
-        raise UsageError(f"train frames: {text}: want the lower number first")
-    return numbers
-
-
-def _settings(number: int, args: argparse.Namespace) -> SceneSettings:
+def _settings(layout: str, args: argparse.Namespace) -> SceneSettings:
     # Conditions come in ten kinds; layout and run count up together, so each kind comes as often.
-    run = number % 10 + 1
+    run = int(layout[1:]) % 10 + 1
     if not 64 <= args.width <= 3840 or args.width % 16:
         raise UsageError(f"--width {args.width}: want a multiple of 16 from 64 to 3840")
     camera = Camera(width_px=args.width, height_px=args.width * 9 // 16)
-    return SceneSettings(layout=f"L{number}", run=run, seed=args.seed, camera=camera)
+    return SceneSettings(layout=layout, run=run, seed=args.seed, camera=camera)

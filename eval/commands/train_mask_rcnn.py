@@ -1,7 +1,8 @@
 r"""Train a Mask R-CNN on COCO annotations: a compact one from nothing, or go on with another.
 
 OUT is a checkpoint (.safetensors) for the detector mask-rcnn. Beside it lie OUT's curve (JSON and
-PNG) and, until the training ends, the state that --resume goes on with.
+PNG) and, until the training ends, the state that --resume goes on with. --measure trains nothing:
+it tells average precision (COCO's rules), and precision and recall at the scores that cues take.
 
 examples:
   crosscue train frames L0-L319 --each 8 -o frames
@@ -9,17 +10,21 @@ examples:
   crosscue train mask-rcnn --data frames/coco.json --images frames/images \
       --val-data held_out/coco.json --val-images held_out/images -o mine.safetensors
   crosscue train mask-rcnn --data own.json --images photos --from resnet50 -o own.safetensors
+  crosscue train mask-rcnn --measure embedded --data held_out/coco.json --images held_out/images
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from crosscue.eval.measured_network import measured_text, measured_tree
 from crosscue.replay.errors import UsageError
 
 from .common import print_json
+from .common_training import check_place
 
 if TYPE_CHECKING:
     from crosscue.detectors.mask_rcnn_checkpoint import Facts
@@ -28,6 +33,10 @@ if TYPE_CHECKING:
 
 CLASSES = ("car", "stop sign", "traffic light")
 EVERY = 10
+PROPOSALS = 100
+"""The detector's own."""
+MOST_WINDOW_PX = 4096
+"""As wide as the widest picture."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +46,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--val-data", type=Path, metavar="COCO",
                         help=f"held out (default: every {EVERY}th picture of --data)")  # fmt: skip
     parser.add_argument("--val-images", type=Path, metavar="DIR", help="their pictures")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT")
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT")
+    parser.add_argument("--measure", metavar="NETWORK",
+                        help="train nothing, measure this one: as --from")  # fmt: skip
+    parser.add_argument("--pictures", metavar="A:B:N",
+                        help="measure on these of --data: ::4 is every 4th")  # fmt: skip
+    parser.add_argument("--proposals", type=int, nargs="+", default=[PROPOSALS], metavar="N",
+                        help="measure with so many places looked at; several in turn")  # fmt: skip
     parser.add_argument("--from", dest="start", default="compact", metavar="NETWORK",
                         help="compact, resnet50, resnet50-v2, embedded, or a file")  # fmt: skip
     parser.add_argument("--classes", nargs="+", default=list(CLASSES), metavar="NAME")
@@ -66,6 +81,10 @@ def run(args: argparse.Namespace) -> int:
     from crosscue.detectors.training.job import run_job
 
     _check(args)
+    if args.measure is not None:
+        return _measure(args)
+    job = _job(args)
+    check_place(args.output)
     train, held_out = _sets(args)
     if not args.quiet:
         for name, one in (("training", train), ("held out", held_out)):
@@ -83,7 +102,6 @@ def run(args: argparse.Namespace) -> int:
                 flush=True,
             )
 
-    job = _job(args)
     facts = run_job(job, train, held_out, resume=args.resume, overwrite=args.overwrite, tell=tell)
     _draw(job)
     _tell(facts, job, args)
@@ -91,6 +109,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
+    if args.measure is not None:
+        if args.output is not None or args.val_data is not None:
+            raise UsageError("--measure: trains nothing, so not with -o or --val-data; leave those")
+        if not all(1 <= count <= 2000 for count in args.proposals):
+            raise UsageError("--proposals: want 1 to 2000")
+        return
+    if args.output is None:
+        raise UsageError("train mask-rcnn: give -o OUT.safetensors, or --measure")
     if args.output.suffix != ".safetensors":
         raise UsageError(f"-o {args.output}: want a name that ends in .safetensors")
     for name in ("steps", "batch", "check_every", "check_pictures", "threads"):
@@ -100,14 +126,56 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("--rate, --seed: want a rate between 0 and 1, and a seed of 0 or more")
     if not 0.0 <= args.balance <= 1.0:
         raise UsageError(f"--balance {args.balance}: want 0 to 1")
-    if min(args.window) < 64 or any(side % 32 for side in args.window):
+    if any(side % 32 or not 64 <= side <= MOST_WINDOW_PX for side in args.window):
         raise UsageError(
-            f"--window {args.window[0]} {args.window[1]}: want multiples of 32 from 64"
+            f"--window {args.window[0]} {args.window[1]}: want multiples of 32 from 64 to "
+            f"{MOST_WINDOW_PX}"
         )
-    if len(set(args.classes)) != len(args.classes):
-        raise UsageError("--classes: one is named twice; name each once")
+    if not all(args.classes) or len(set(args.classes)) != len(args.classes):
+        raise UsageError("--classes: one is empty or named twice; name each once")
     if (args.val_data is None) != (args.val_images is None):
         raise UsageError("--val-data, --val-images: give both or none")
+
+
+def _measure(args: argparse.Namespace) -> int:
+    """Tell how good a network is."""
+    from dataclasses import replace
+
+    from crosscue.detectors.devices import chosen_device
+    from crosscue.detectors.mask_rcnn import MaskRcnnSettings, checkpoint_named
+    from crosscue.detectors.training.annotations import read_coco
+    from crosscue.detectors.training.measure import measure
+
+    device = chosen_device(args.device, "train mask-rcnn")
+    checkpoint = checkpoint_named(args.measure)
+    classes = [name for name in checkpoint.facts.plan.classes if name]
+    whole = read_coco(args.data, args.images, classes)
+    labelled = replace(whole, pictures=whole.pictures[_slice(args.pictures)])
+    if not labelled.pictures:
+        count = len(whole.pictures)
+        raise UsageError(f"--pictures {args.pictures}: none of {count} pictures; name others")
+    told = []
+    for proposals in args.proposals:
+        settings = MaskRcnnSettings(proposals=proposals, threads=args.threads)
+        reached = measure(checkpoint, labelled, settings, device)
+        told.append(measured_tree(proposals, reached))
+        if not args.quiet and not args.json:
+            print(measured_text(args.measure, len(labelled.pictures), proposals, reached))
+    if args.json:
+        print_json({"network": args.measure, "pictures": len(labelled.pictures), "measured": told})
+    return 0
+
+
+def _slice(text: str | None) -> slice:
+    """Of ``A:B:N``, any of which may be missing.
+
+    Raises:
+        UsageError: It is none.
+    """
+    match = re.fullmatch(r"(\d{0,9}):(\d{0,9})(?::([1-9]\d{0,8})?)?", text or ":")
+    if match is None:
+        raise UsageError(f"--pictures {text}: want A:B:N, as 300: or 300:600 or ::4")
+    return slice(*(int(part) if part else None for part in match.groups()))
 
 
 def _sets(args: argparse.Namespace) -> tuple[LabelledSet, LabelledSet]:
@@ -140,7 +208,8 @@ def _job(args: argparse.Namespace) -> Job:
         })  # fmt: skip
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        raise UsageError(f"train mask-rcnn: {first['loc']}: {first['msg'].lower()}") from None
+        name = ".".join(str(part) for part in first["loc"]) or "--top, --bottom"
+        raise UsageError(f"train mask-rcnn: {name}: {first['msg'].lower()}") from None
     schedule = Schedule(args.steps, args.batch, args.rate, min(100, args.steps), seed=args.seed)
     window = Window(args.window[0], args.window[1], balance=args.balance)
     return Job(
