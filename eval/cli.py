@@ -8,6 +8,7 @@ and one line in ``COMMANDS``.
 from __future__ import annotations
 
 import argparse
+import errno
 import io
 import os
 import signal
@@ -149,7 +150,9 @@ def _guarded(module: Command, args: argparse.Namespace) -> int:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         hint = (
-            "free some space and run again" if error.errno == 28 else "check the path and its mode"
+            "free some space and run again"
+            if error.errno == errno.ENOSPC
+            else "check the path and its mode"
         )
         return _complain(OSError(f"{where}{error.strerror or error}; {hint}"), 1, args)
     except Exception as error:

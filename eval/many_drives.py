@@ -249,7 +249,7 @@ def attempt(work: Callable[[Job], R], job: Job) -> Done[R]:
 
 
 def told(error: Exception) -> tuple[int, str]:
-    """Exit status and one line for any error; the same as a command of its own would give."""
+    """For any error the exit status that a command of its own would give, and one line."""
     if isinstance(error, CrosscueError):
         return error.exit_status, one_line(error)
     if isinstance(error, MemoryError):
