@@ -15,6 +15,7 @@ from typing import Annotated, Any, Final, Literal, Protocol, cast, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from crosscue.replay.errors import SchemaError, UsageError
+from crosscue.replay.misfit import explain
 from crosscue.replay.run_folder import strict_json, write_text
 
 VERSION: Final = 1
@@ -176,9 +177,7 @@ def load(path: Path) -> Truth:
         tree = json.loads(text, object_pairs_hook=_no_twins)
         truth = Truth.model_validate(tree)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise SchemaError(f"{path}: {place}: {first['msg'].lower()}; mend it") from None
+        raise SchemaError(explain(error, None, str(path), Truth)) from None
     except FileNotFoundError:
         raise SchemaError(
             f"{path}: no such truth file; for a data set make it with: crosscue truth LOG -o DIR"

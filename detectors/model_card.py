@@ -25,7 +25,8 @@ from pydantic import Field, ValidationError
 
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.limits import MIB
-from crosscue.replay.vehicle import explain, tuples
+from crosscue.replay.misfit import explain
+from crosscue.replay.vehicle import tuples
 
 from .settings import Settings, Share
 

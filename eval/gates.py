@@ -25,6 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from crosscue.replay.errors import UsageError
 from crosscue.replay.limits import MIB
+from crosscue.replay.misfit import explain
 
 from .metric_values import MetricValue
 
@@ -94,14 +95,14 @@ def load_gates(path: Path) -> tuple[Gate, ...]:
     try:
         if path.stat().st_size > MOST_BYTES:
             raise UsageError(f"{path}: over {MOST_BYTES // MIB} MiB; this is no gate file")
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-        return GateFile.model_validate(tree).gate
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"{path}: {place}: {first['msg'].lower()}; mend it") from None
+        text = path.read_text(encoding="utf-8")
+        tree = tomllib.loads(text)
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise UsageError(f"{path}: not readable as TOML ({error}); mend it") from None
+    try:
+        return GateFile.model_validate(tree).gate
+    except ValidationError as error:
+        raise UsageError(explain(error, text, str(path), GateFile)) from None
 
 
 def check_gates(

@@ -7,18 +7,17 @@ REP-103: x forward, y left, heading counter-clockwise. Every default is written 
 
 from __future__ import annotations
 
-import difflib
 import math
-import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, get_origin
+from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator
 
 from .errors import VehicleError
 from .fusion_settings import CUES, Fusion, Name, RangeFilter
+from .misfit import explain
 from .past_settings import Past
 from .settings_section import Finite, NotNegative, Positive, Section
 
@@ -327,7 +326,7 @@ def parse(text: str, where: str) -> Vehicle:
     try:
         return Vehicle.model_validate(tuples(tree))
     except ValidationError as error:
-        raise VehicleError(explain(error, text, where)) from None
+        raise VehicleError(explain(error, text, where, Vehicle)) from None
 
 
 def of_manifest(settings: Mapping[str, Any]) -> Vehicle:
@@ -352,61 +351,3 @@ def tuples(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: tuples(item) for key, item in value.items()}
     return tuple(tuples(item) for item in value) if isinstance(value, list) else value
-
-
-def explain(error: ValidationError, text: str, where: str, root: type[BaseModel] = Vehicle) -> str:
-    """One line for a file that does not fit its model: place with line, what, what to do."""
-    first, *others = error.errors(include_url=False)
-    keys = [str(part) for part in first["loc"]]
-    more = f" (and {len(others)} more)" if others else ""
-    place = f"{where}:{_line_of(keys, text)}: {'.'.join(keys)}"
-    if first["type"] == "extra_forbidden":
-        return f"{place}: no such key; {_suggestion(keys, root)}{more}"
-    if first["type"] == "missing":
-        return f"{place}: missing; add it{more}"
-    return f"{place}: {first['msg'].lower()}, got {first['input']!r}; mend the value{more}"
-
-
-def _suggestion(keys: list[str], root: type[BaseModel]) -> str:
-    section: type[BaseModel] | None = root
-    is_table = False
-    for key in keys[:-1]:
-        if is_table:
-            # The name of one entry in a table of sections; the section itself is known already.
-            is_table = False
-        elif section is not None:
-            section, is_table = _section_of(section, key)
-    known = sorted(section.model_fields) if section else []
-    close = difflib.get_close_matches(keys[-1], known, n=1, cutoff=0.6)
-    return f"did you mean {close[0]}?" if close else f"there are: {', '.join(known)}"
-
-
-def _section_of(section: type[BaseModel], key: str) -> tuple[type[BaseModel] | None, bool]:
-    """The section below ``key``, and whether it stands there under names of the user's."""
-    field = section.model_fields.get(key)
-    if field is None:
-        return None, False
-    kinds = (field.annotation, *getattr(field.annotation, "__args__", ()))
-    below = (k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel))
-    return next(below, None), get_origin(field.annotation) is dict
-
-
-def _line_of(keys: list[str], text: str) -> int:
-    """Line of the deepest of ``keys`` that the text spells out; 1 where none is."""
-    names = [key for key in keys if not key.isdigit()]
-    table: list[str] = []
-    best, best_depth = 1, 0
-    for number, line in enumerate(text.splitlines(), 1):
-        header = re.match(r"\s*\[+\s*([^\]]+?)\s*\]+", line)
-        entry = re.match(r"\s*([\w.\"'-]+)\s*=", line)
-        if header:
-            table = [part.strip("\"' ") for part in header[1].split(".")]
-            here = table
-        elif entry:
-            here = table + [part.strip("\"' ") for part in entry[1].split(".")]
-        else:
-            continue
-        depth = len(here)
-        if here == names[:depth] and depth > best_depth:
-            best, best_depth = number, depth
-    return best

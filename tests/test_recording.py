@@ -139,6 +139,18 @@ def test_pictures_that_the_viewer_cannot_read_become_jpeg() -> None:
     assert shown(Encoded("raw", memoryview(b"too short"), layout)) is None
 
 
+def test_a_recording_never_replaces_what_is_no_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    letter = tmp_path / "letter.md"
+    letter.write_text("keep me")
+
+    assert cli.run(["view", str(tmp_path), "--save", str(letter)]) == 2
+
+    assert "letter.md: want a name that ends in .rrd" in capsys.readouterr().err
+    assert letter.read_text() == "keep me"
+
+
 def test_view_takes_truth_without_a_track(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

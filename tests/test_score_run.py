@@ -129,7 +129,14 @@ def test_gates_decide_the_exit_status_and_leave_a_junit_file(tmp_path: Path) -> 
         ('metric = "cues.stop_sign.precision"', "want min, max or both"),
         ('metric = "cues.stop_sign.precision"\nmin = nan', "finite number"),
         ('metric = "a"\nmin = 2\nmax = 1', "min 2 is above max 1"),
-        ('metric = "a"\nmin = 0.9\nwarn = true', "gate.0.warn"),
+        (
+            'metric = "a"\nmin = 0.9\nleest = 5',
+            "gates.toml:5: gate.0.leest: no such key; did you mean least?",
+        ),
+        (
+            'metric = "a"\nmin = 0.9\n[[gate]]\nmetric = "b"\nmin = 1\nwarn = true',
+            "gates.toml:8: gate.1.warn: no such key; there are: least, max, metric, min, use",
+        ),
         ("metric = [", "not readable as TOML"),
     ],
 )

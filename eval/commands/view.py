@@ -20,7 +20,7 @@ from crosscue.eval.merge_runs import open_one
 from crosscue.eval.recording import TruthTrack, save
 from crosscue.eval.score_pose import truth_track
 from crosscue.eval.score_truth import TrueRanges, load
-from crosscue.replay.errors import CrosscueError
+from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.run_folder import RunFolder
 
 
@@ -37,6 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write drive.rrd into the run, or where asked, and open it."""
+    if args.save is not None and args.save.suffix != ".rrd":
+        raise UsageError(f"{args.save}: want a name that ends in .rrd")
     folder = open_one(args.run)
     path = args.save or folder.file("drive.rrd")
     track, ranges = _truth(args, folder)

@@ -22,8 +22,9 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from crosscue.localization.drive_settings import City, Drive, Share
 from crosscue.replay.errors import CrosscueError
+from crosscue.replay.misfit import explain
 from crosscue.replay.settings_section import Section
-from crosscue.replay.vehicle import explain, tuples
+from crosscue.replay.vehicle import tuples
 
 VERSION: Final = 1
 UNTIL_LOST: Final = 1_000_000

@@ -1,0 +1,103 @@
+"""What is wrong with a settings file, in one line, from the errors of its model."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections import Counter
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final, get_args, get_origin
+
+from pydantic import BaseModel
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
+GIVEN_CHARACTERS: Final = 80
+"""So much of a wrong value is shown."""
+
+
+def explain(error: ValidationError, text: str | None, where: str, root: type[BaseModel]) -> str:
+    """One line for a file that does not fit its model: place, what, what to do.
+
+    Args:
+        error: Of its validation.
+        text: The file's, when it is TOML: its line is told.
+        where: Name of the file.
+        root: The model.
+    """
+    first, *others = error.errors(include_url=False)
+    keys = [str(part) for part in first["loc"]]
+    more = f" (and {len(others)} more)" if others else ""
+    line = "" if text is None else f":{_line_of(keys, text)}"
+    place = f"{where}{line}: {'.'.join(keys)}"
+    if first["type"] == "extra_forbidden":
+        return f"{place}: no such key; {_suggestion(keys, root)}{more}"
+    if first["type"] == "missing":
+        return f"{place}: missing; add it{more}"
+    given = repr(first["input"])
+    if len(given) > GIVEN_CHARACTERS:
+        given = f"{given[:GIVEN_CHARACTERS]}..."
+    return f"{place}: {first['msg'].lower()}, got {given}; mend the value{more}"
+
+
+def _suggestion(keys: list[str], root: type[BaseModel]) -> str:
+    section: type[BaseModel] | None = root
+    is_table = False
+    for key in keys[:-1]:
+        if key.isdigit():
+            # The place of one entry in a list of sections; the section itself is known already.
+            continue
+        if is_table:
+            # The name of one entry in a table of sections; the section itself is known already.
+            is_table = False
+        elif section is not None:
+            section, is_table = _section_of(section, key)
+    known = sorted(section.model_fields) if section else []
+    close = difflib.get_close_matches(keys[-1], known, n=1, cutoff=0.6)
+    if close:
+        return f"did you mean {close[0]}?"
+    return f"there are: {', '.join(known)}" if known else "take it out"
+
+
+def _section_of(section: type[BaseModel], key: str) -> tuple[type[BaseModel] | None, bool]:
+    """The section below ``key``, and whether it stands there under names of the user's."""
+    field = section.model_fields.get(key)
+    if field is None:
+        return None, False
+    return next(_models(field.annotation), None), get_origin(field.annotation) is dict
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _models(part)
+
+
+def _line_of(keys: list[str], text: str) -> int:
+    """Line of the deepest of ``keys`` that the text spells out; 1 where none is."""
+    names = [key for key in keys if not key.isdigit()]
+    places = {key: int(at) for key, at in pairwise(keys) if at.isdigit()}
+    seen: Counter[str] = Counter()
+    table: list[str] = []
+    best, best_depth = 1, 0
+    for number, line in enumerate(text.splitlines(), 1):
+        header = re.match(r"\s*(\[+)\s*([^\]]+?)\s*\]+", line)
+        entry = re.match(r"\s*([\w.\"'-]+)\s*=", line)
+        if header:
+            table = [part.strip("\"' ") for part in header[2].split(".")]
+            here = table
+            seen[table[-1]] += len(header[1]) > 1
+        elif entry:
+            here = table + [part.strip("\"' ") for part in entry[1].split(".")]
+        else:
+            continue
+        if any(seen[key] - 1 != at for key, at in places.items() if seen[key]):
+            # Another entry of a list of sections.
+            continue
+        depth = len(here)
+        if here == names[:depth] and depth > best_depth:
+            best, best_depth = number, depth
+    return best
