@@ -32,7 +32,7 @@ from .bursts import (
 from .clock import CounterClock
 from .family import FamilyEvidence
 from .layout import UNKNOWN, Message, layout
-from .settings import AT_REAR_AXLE, DEFAULTS, MobileyeSettings
+from .settings import DEFAULTS, MobileyeSettings, mounting_of
 from .status import Statuses, by_length
 from .tables import lane_places, table_block, to_vehicle
 from .wire import Columns, Variant, columns_of, values_of, variant_number
@@ -65,7 +65,6 @@ class MobileyeDecoder:
         self._bus = bus
         self._ledger = ledger
         self._settings = settings
-        self._mounting = settings.mounting or AT_REAR_AXLE
         self._admit = Admission(bus, ledger, settings)
         self._clock = CounterClock(settings.least_latency_ns)
         self._family = FamilyEvidence(bus, settings.family)
@@ -73,11 +72,7 @@ class MobileyeDecoder:
         self._open = no_parts()
         self._is_closed = False
         self._lanes = {table: no_parts() for table in _LANE_PARTS}
-        if settings.mounting is None:
-            ledger.notice(
-                f"{bus}: where the Mobileye's reference point lies is not given; distances count "
-                "from it as if it were the rear axle; calibrate x_m and y_m in the vehicle file"
-            )
+        self._mounting = mounting_of(settings, bus, ledger)
 
     def __call__(self, block: Block) -> list[Block]:
         """Decode the frames of a block.

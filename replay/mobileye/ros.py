@@ -33,7 +33,7 @@ from .clock import CounterClock
 from .layout import Message, layout
 from .ros_bursts import Obstacles, RosBursts
 from .ros_sign import LaneSignVotes
-from .settings import AT_REAR_AXLE, DEFAULTS, MobileyeSettings
+from .settings import DEFAULTS, MobileyeSettings, mounting_of
 from .tables import LEFT, RIGHT, table_block, to_vehicle
 from .wire import Columns, blank_dependent, columns_of, from_given, variant_number
 
@@ -88,7 +88,6 @@ class RosMobileye:
         """
         self._bus = bus
         self._ledger = ledger
-        self._mounting = settings.mounting or AT_REAR_AXLE
         self._types = {
             topic: name.split("/")[-1]
             for topic, name in types.items()
@@ -100,11 +99,7 @@ class RosMobileye:
         self._clock = CounterClock(settings.least_latency_ns)
         self._votes = {name: LaneSignVotes(says, settings.ros_lane_sign) for name, says in _SIDED}
         self._waiting: dict[str, list[Block]] = {name: [] for name, _ in _SIDED}
-        if settings.mounting is None:
-            ledger.notice(
-                f"{bus}: where the Mobileye's reference point lies is not given; distances count "
-                "from it as if it were the rear axle; calibrate x_m and y_m in the vehicle file"
-            )
+        self._mounting = mounting_of(settings, bus, ledger)
 
     def __call__(self, block: Block) -> list[Block]:
         """The tables that a block of decoded messages adds to."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias
 
+from crosscue.replay.ledger import Ledger
+
 Revision: TypeAlias = Literal["auto", "classic", "2.32"]
 Family: TypeAlias = Literal["auto", "extended", "tsr"]
 LaneSign: TypeAlias = Literal["auto", "right", "left"]
@@ -74,3 +76,13 @@ class MobileyeSettings:
 
 
 DEFAULTS: Final = MobileyeSettings()
+
+
+def mounting_of(settings: MobileyeSettings, bus: str, ledger: Ledger) -> Mounting:
+    """Where the reference point lies; where nobody says, at the rear axle, which is told."""
+    if settings.mounting is None:
+        ledger.notice(
+            f"{bus}: where the Mobileye's reference point lies is not given; distances count "
+            "from it as if it were the rear axle; calibrate x_m and y_m in the vehicle file"
+        )
+    return settings.mounting or AT_REAR_AXLE
