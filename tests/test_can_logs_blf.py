@@ -163,6 +163,15 @@ def test_what_is_no_blf_log_is_refused_in_one_line(
         open_log(_log(tmp_path, content))
 
 
+def _peer(path: Path) -> list[can.Message]:
+    """As python-can reads it; it counts channels from 0."""
+    peer = list(can.BLFReader(path))
+    for message in peer:
+        assert isinstance(message.channel, int)
+        message.channel += 1
+    return peer
+
+
 def test_python_can_writes_what_we_read(tmp_path: Path) -> None:
     path = tmp_path / "x.blf"
     frames = made(3000)
@@ -181,19 +190,9 @@ def test_python_can_writes_what_we_read(tmp_path: Path) -> None:
                     channel=int(f.bus) - 1,
                 )
             )
-    peer = list(can.BLFReader(path))
-    for message in peer:
-        assert isinstance(message.channel, int)
-        message.channel += 1
-
-    same_as_python_can(path, peer, "can/{}")
+    same_as_python_can(path, _peer(path), "can/{}")
 
 
 def test_the_real_log_reads_as_python_can_reads_it() -> None:
     path = shared("can", "python_can", "issue_1905.blf")
-    peer = list(can.BLFReader(path))
-    for message in peer:
-        assert isinstance(message.channel, int)
-        message.channel += 1
-
-    same_as_python_can(path, peer, "can/{}")
+    same_as_python_can(path, _peer(path), "can/{}")

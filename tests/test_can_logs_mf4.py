@@ -120,26 +120,24 @@ def test_signals_equal_what_asammdf_gives_on_a_log_of_many_layouts(tmp_path: Pat
         np.testing.assert_array_equal(blocks[0].rows[name], expected)
 
 
+def _peer(path: Path) -> list[can.Message]:
+    """As python-can reads it, which warns of what it leaves out."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with can.MF4Reader(path) as reader:
+            return list(reader)
+
+
 @pytest.mark.parametrize("compression", [0, 2])
 def test_bus_logs_read_as_python_can_reads_them(tmp_path: Path, compression: int) -> None:
     frames = [f for f in made(500) if f.kind == 0]
     path = _bus_log(tmp_path / "x.mf4", frames, compression)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with can.MF4Reader(path) as reader:
-            peer = list(reader)
-
-    same_as_python_can(path, peer, "can/{}", within_ns=2_000)
+    same_as_python_can(path, _peer(path), "can/{}", within_ns=2_000)
 
 
 def test_the_real_log_reads_as_python_can_reads_it() -> None:
     path = shared(*REAL)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with can.MF4Reader(path) as reader:
-            peer = list(reader)
-
-    same_as_python_can(path, peer, "can/{}", within_ns=2_000)
+    same_as_python_can(path, _peer(path), "can/{}", within_ns=2_000)
 
 
 def test_only_what_was_asked_for_comes_and_the_rest_is_counted(tmp_path: Path) -> None:

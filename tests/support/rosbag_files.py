@@ -16,6 +16,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.ledger import Ledger
@@ -81,6 +82,11 @@ def write_bag(
     elif compression != "none":
         writer.set_compression(Writer1.CompressionFormat[compression.upper()])
     writer.chunk_threshold = chunk_bytes
+    _write_rows(writer, rows, store)
+    return path
+
+
+def _write_rows(writer: Writer1 | Writer2, rows: Sequence[Row], store: Typestore) -> None:
     with writer:
         links: dict[str, Connection] = {}
         for row in rows:
@@ -88,7 +94,6 @@ def write_bag(
                 type_name = next(t for name, t, _ in TOPICS if name == row.topic)
                 links[row.topic] = writer.add_connection(row.topic, type_name, typestore=store)
             writer.write(links[row.topic], row.log_ns, row.payload)
-    return path
 
 
 def unclosed(bag: bytes) -> bytes:
@@ -109,13 +114,7 @@ def write_folder(
     writer = Writer2(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
     if compression != "none":
         writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
-    with writer:
-        links: dict[str, Connection] = {}
-        for row in rows:
-            if row.topic not in links:
-                type_name = next(t for name, t, _ in TOPICS if name == row.topic)
-                links[row.topic] = writer.add_connection(row.topic, type_name, typestore=store)
-            writer.write(links[row.topic], row.log_ns, row.payload)
+    _write_rows(writer, rows, store)
     return path
 
 
