@@ -18,6 +18,8 @@ from crosscue.replay.run_folder import write_whole
 
 GREEN: Final = (80, 220, 60)
 BLUE: Final = (255, 140, 0)
+MARGIN_PX: Final = 10
+"""Left and right of the cues' line."""
 
 
 @dataclass(slots=True)
@@ -68,8 +70,20 @@ def draw(pixels: Bytes, result: FrameResult, cues: FrameCues, enlarge: float = 1
             _boxes(canvas, found, enlarge)
     positive = [f"{cue} {count}" for cue, count in cues.counts.items() if count]
     text = "  ".join(positive) or "no cue"
-    _write(canvas, text, (10, canvas.shape[0] - 14), (255, 255, 255), 0.6 * enlarge)
+    scale = _fitting(text, canvas.shape[1] - 2 * MARGIN_PX, 0.6 * enlarge)
+    _write(canvas, text, (MARGIN_PX, canvas.shape[0] - 14), (255, 255, 255), scale)
     return canvas
+
+
+def _fitting(text: str, width_px: int, scale: float) -> float:
+    """The scale, or a smaller one at which the text is no wider than that."""
+    import cv2
+
+    # Strokes are whole pixels, so a text at half the scale is not half as wide: look again.
+    for _ in range(4):
+        (wide, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, _thickness(scale) + 2)
+        scale *= min(1.0, width_px / wide)
+    return scale
 
 
 def _tint(canvas: Bytes, road: RoadMask) -> None:
@@ -96,6 +110,11 @@ def _write(
 ) -> None:
     import cv2
 
-    thick = max(round(2 * scale), 1)
+    thick = _thickness(scale)
     cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), thick + 2)
     cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thick)
+
+
+def _thickness(scale: float) -> int:
+    """Of a text's strokes, pixels."""
+    return max(round(2 * scale), 1)

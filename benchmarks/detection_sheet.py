@@ -1,0 +1,42 @@
+"""Draw docs/simulated_detections.jpg: what was found in some drives of a study, in one picture.
+
+    crosscue study intersections --runs 10 -o study
+    python benchmarks/detection_sheet.py study -o docs/simulated_detections.jpg
+
+Each intersection has a row; runs 1, 4, 6 and 9 are clear light, glare, rain and rain at dusk.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Final
+
+from crosscue.datasets.scenes.layout import SCORED
+from crosscue.eval.intersection_sheet import write_sheet
+from crosscue.eval.score_run import judge_run
+from crosscue.replay.run_folder import open_run
+
+RUNS: Final = (1, 4, 6, 9)
+QUALITY: Final = 60
+"""Of the JPEG; the page that shows it should load quickly."""
+
+
+def main() -> None:
+    """Draw."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("study", type=Path, help="what crosscue study intersections wrote")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="JPEG")
+    parser.add_argument("--runs", type=int, nargs="+", default=list(RUNS), metavar="N")
+    args = parser.parse_args()
+    names = [f"{layout}-{run:02d}" for layout in SCORED for run in args.runs]
+    drives = [
+        judge_run(open_run(args.study / "runs" / name), args.study / "drives" / name / "truth.json")
+        for name in names
+    ]
+    write_sheet(drives, args.output, columns=len(args.runs), quality=QUALITY)
+    print(f"{args.output}: {len(drives)} drives, {args.output.stat().st_size // 1000} kB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""Pictures for people: boxes where they belong, road tinted, the cues' line within the picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections, RoadMask
+from crosscue.detectors.frame_cues import FrameCues
+from crosscue.detectors.pictures import Encoded
+from crosscue.detectors.runner import FrameResult
+from crosscue.eval.detection_pictures import BLUE, GREEN, MARGIN_PX, draw
+
+SIZE = (640, 360)
+GREY = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
+
+
+def _drawn(
+    found: tuple[Detections | RoadMask, ...], cues: dict[str, int], enlarge: float = 1.0
+) -> np.typing.NDArray[np.uint8]:
+    result = FrameResult(0, SIZE, Encoded("jpeg", memoryview(b"")), found)
+    return draw(GREY, result, FrameCues(cues, None), enlarge)
+
+
+def test_a_box_is_drawn_on_its_sides_and_nowhere_inside() -> None:
+    box = np.array([[100.0, 200.0, 180.0, 260.0]])
+    found = Detections(0, SIZE, box, np.ones(1), ("car",), (b"",))
+
+    drawn = _drawn((found,), {})
+
+    assert (drawn[230, [100, 180]] == GREEN).all()
+    assert (drawn[[200, 260], 140] == GREEN).all()
+    assert (drawn[205:255, 105:175] == 128).all()
+    assert (GREY == 128).all()
+
+
+def test_road_alone_is_tinted() -> None:
+    mask = np.zeros((36, 64), np.bool_)
+    mask[18:30, :32] = True
+    road = RoadMask(0, SIZE, rle.encode(mask, (0, 0), (64, 36)), (64, 36))
+
+    drawn = _drawn((road,), {})
+
+    assert (drawn[190:290, 5:315] == np.array(BLUE) // 2 + 64).all()
+    assert (drawn[30:330, 325:] == 128).all()
+
+
+@pytest.mark.parametrize("enlarge", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("count", [1, 5, 20])
+def test_the_line_of_cues_lies_within_the_picture(count: int, enlarge: float) -> None:
+    drawn = _drawn((), {f"cross_traffic_{i}": 1 for i in range(count)}, enlarge)
+
+    assert (drawn != 128).any()
+    assert (drawn[:, -MARGIN_PX // 2 :] == 128).all()
+
+
+def test_cues_that_are_not_there_are_not_named() -> None:
+    assert (_drawn((), {"stop_sign": 0}) == _drawn((), {})).all()
+    assert (_drawn((), {"stop_sign": 1}) != _drawn((), {})).any()
