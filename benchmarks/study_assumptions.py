@@ -1,11 +1,13 @@
 """How far the studies' results hang on what the source does not tell: one assumption at a time.
 
-    python benchmarks/study_assumptions.py [--drives 200] [--field-drives 400] [--seed 77]
+    python benchmarks/study_assumptions.py [--only field|nees|landmarks] [--drives 200]
+        [--field-drives 400] [--nees-drives 20000] [--seed 77]
 
-First the landmark study on its 25 pairs of density and rate: how much farther than straight to goal
-the other two strategies drive, by three ways of averaging. Then the field protocol's range runs:
-distance at loss. Seeds are neither those of the studies nor of the calibration; drives of one row
-have the seeds of every other row. About four CPU minutes.
+First the field protocol's range runs: distance at loss. Then how wrong the filter is against what
+it says, with the encoders as they are and with fine ones. Last the landmark study on its 25 pairs
+of density and rate: how much farther than straight to goal the other two strategies drive, by three
+ways of averaging. Seeds are neither those of the studies nor of the calibration; drives of one row
+have the seeds of every other row. About five CPU minutes.
 """
 
 from __future__ import annotations
@@ -14,16 +16,22 @@ import argparse
 
 import numpy as np
 
+from crosscue.eval.chi_square import mean_band
+from crosscue.eval.studies.consistency import nees_along_the_arc
 from crosscue.eval.studies.intervals import mean_of
 from crosscue.eval.studies.landmark_study import comparisons_of
-from crosscue.eval.studies.settings import FieldStudy, LandmarkStudy
+from crosscue.eval.studies.range_study import law_m
+from crosscue.eval.studies.settings import UNTIL_LOST, FieldStudy, LandmarkStudy
 from crosscue.eval.studies.words import km, percent
 from crosscue.eval.studies.work import chunks_of
-from crosscue.localization.drive_kernel import drive_many
+from crosscue.localization.drive_kernel import Keys, drive_many, drive_traced
 from crosscue.localization.drive_settings import City, Drive, Navigation, Sensors
 from crosscue.localization.drive_simulator import Outcome, Result
 from crosscue.localization.random_stream import key_of
 
+NEES = Result._fields.index("nees")
+FINE_M = 1e-4
+PARTS = ("field", "nees", "landmarks")
 LANDMARKS = {
     "as studied": Drive(),
     "penalty 10 degrees (45)": Drive(navigation=Navigation(penalty_deg=10.0)),
@@ -80,21 +88,71 @@ def landmarks(drives: int, seed: int) -> None:
 def field(drives: int, seed: int) -> None:
     print(f"\nrange runs of the field protocol, {drives} each, seed {seed}")
     print(f"{'':42} {'lost after, km':>24} {'lost within 75 minutes':>24}")
-    seeds = np.array([key_of(seed, i) for i in range(drives)], dtype=np.uint64)
     for name, study in FIELD.items():
-        rows = drive_many(study.settings(has_landmarks=False), seeds)
+        rows = drive_many(study.settings(has_landmarks=False), seeds_of(seed, drives))
         lost = rows[rows[:, 0] == Outcome.LOST, 1]
         print(f"{name:42} {km(mean_of(lost), 1):>24} {100 * len(lost) / drives:22.0f} %")
+    straight_m = law_m(FieldStudy().settings(has_landmarks=False))
+    print(f"straight driving as studied, by the law r ds D: {straight_m / 1e3:.1f} km")
+
+
+def nees(drives: int, seed: int) -> None:
+    print(f"\nmean NEES of x, y, heading at the end, 3 where honest; seed {seed}")
+    print(f"{'':42} {'as it is':>24} {f'encoders of {FINE_M * 1e3:g} mm':>24} {'honest':>18}")
+    fewer = 3 * drives // 40
+    for name, compass_deg, goals, count in (
+        ("10 degrees, to the goal", 10.0, 1, drives),
+        ("20 degrees, to the goal", 20.0, 1, drives),
+        ("30 degrees, to the goal", 30.0, 1, drives),
+        ("10 degrees, 60 km", 10.0, UNTIL_LOST, fewer),
+        ("20 degrees, until lost", 20.0, UNTIL_LOST, drives // 5),
+        ("30 degrees, until lost", 30.0, UNTIL_LOST, 2 * drives // 5),
+        ("no compass, to the goal", None, 1, drives),
+    ):
+        both = [
+            drive_many(one, seeds_of(seed, count)) for one in coarse_and_fine(compass_deg, goals)
+        ]
+        told(name, count, [float(rows[:, NEES].mean()) for rows in both])
+    told("no compass, errors along an arc", fewer, [
+        float(np.mean([nees_along_the_arc(drive_traced(one, int(s)).steps[-1])
+                       for s in seeds_of(seed, fewer)]))
+        for one in coarse_and_fine(None, 1)
+    ])  # fmt: skip
+
+
+def coarse_and_fine(compass_deg: float | None, goals: int) -> list[Drive]:
+    return [
+        Drive(sensors=Sensors(compass_2sigma_deg=compass_deg, encoder_step_m=step_m), goals=goals)
+        for step_m in (Sensors().encoder_step_m, FINE_M)
+    ]
+
+
+def told(name: str, count: int, means: list[float]) -> None:
+    low, high = mean_band(3, count)
+    print(
+        f"{f'{name}, {count}':42} {means[0]:24.2f} {means[1]:24.2f} {f'{low:.2f}..{high:.2f}':>18}"
+    )
+
+
+def seeds_of(seed: int, count: int) -> Keys:
+    return np.array([key_of(seed, i) for i in range(count)], dtype=np.uint64)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", choices=PARTS)
     parser.add_argument("--drives", type=int, default=200)
     parser.add_argument("--field-drives", type=int, default=400)
+    parser.add_argument("--nees-drives", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=77)
     args = parser.parse_args()
-    field(args.field_drives, args.seed)
-    landmarks(args.drives, args.seed)
+    parts = PARTS if args.only is None else (args.only,)
+    if "field" in parts:
+        field(args.field_drives, args.seed)
+    if "nees" in parts:
+        nees(args.nees_drives, args.seed)
+    if "landmarks" in parts:
+        landmarks(args.drives, args.seed)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from crosscue.eval.chi_square import mean_band
-from crosscue.localization.angles import wrap, wrap_all
+from crosscue.eval.studies.consistency import nees_along_the_arc
+from crosscue.localization.angles import wrap_all
 from crosscue.localization.drive_kernel import (
     LANDMARK_REFUSED,
     LANDMARK_TAKEN,
@@ -53,24 +54,6 @@ def landmark_nis(traced: Traced) -> list[float]:
         off = event[4:6] - row[7:9]
         found.append(float(off @ np.linalg.solve(spread, off)))
     return found
-
-
-def nees_along_the_arc(row: Floats) -> float:
-    """NEES of the turn and shift that carry the estimate to the truth: errors on an arc.
-
-    Long, Wolfe, Mashner, Chirikjian, *The banana distribution is Gaussian*, RSS 2012.
-    """
-    x, y, heading = row[:3]
-    at_x, at_y, at_heading = row[7:10]
-    xx, xy, xh, yy, yh, hh = row[10:16]
-    cov = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
-    turn = wrap(heading - at_heading)
-    half = 0.5 * turn
-    along = half / math.tan(half)
-    dx, dy = x - at_x, y - at_y
-    # With the estimate as origin, turn and shift have the covariance of the pose.
-    error = np.array([along * dx + half * dy, along * dy - half * dx, turn])
-    return float(error @ np.linalg.solve(cov, error))
 
 
 @pytest.mark.parametrize("goals", [1, 1_000_000], ids=["to the goal", "as far as allowed"])

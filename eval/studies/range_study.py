@@ -124,6 +124,16 @@ def points(rows: dict[str, Floats]) -> tuple[Floats, Floats]:
     return distance[is_point], axis[is_point]
 
 
+def law_m(settings: Drive) -> float:
+    """Where a car that drives straight on is lost, by the law r ds D; NaN without a compass."""
+    compass = settings.sensors.compass_2sigma_deg
+    if compass is None:
+        return math.nan
+    variance = math.radians(compass / 2.0) ** 2
+    half_m = settings.navigation.lost_above_m / 4.0
+    return half_m**2 / (variance * settings.sensors.compass_interval_m)
+
+
 def calibrate(drive: Drive, workers: int, tolerance: float = 2e-3) -> float:
     """The compass interval with which cars at 30 degrees are lost after the published mean.
 
@@ -162,11 +172,6 @@ def _of_case(settings: Drive, rows: dict[str, Floats]) -> CompassResult:
     is_lost = rows["outcome"] == Outcome.LOST
     lost_m = rows["travelled_m"][is_lost]
     compass = sensors.compass_2sigma_deg
-    law_m = math.nan
-    if compass is not None:
-        variance = math.radians(compass / 2.0) ** 2
-        half_m = settings.navigation.lost_above_m / 4.0
-        law_m = half_m**2 / (variance * sensors.compass_interval_m)
     return CompassResult(
         compass_2sigma_deg=compass,
         drives=n,
@@ -177,7 +182,7 @@ def _of_case(settings: Drive, rows: dict[str, Floats]) -> CompassResult:
         shortest_m=float(lost_m.min()) if len(lost_m) else math.nan,
         longest_m=float(lost_m.max()) if len(lost_m) else math.nan,
         share_lost=share_of(int(is_lost.sum()), n),
-        law_m=law_m,
+        law_m=law_m(settings),
         growth=fit_growth(
             *points(rows), 4.0 * sensors.start_position_sd_m, settings.navigation.lost_above_m
         ),

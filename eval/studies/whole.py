@@ -98,8 +98,9 @@ RANGE_NOTES: Final = (
     "variance over two axes and lengthen it.",
     "NEES: squared error of x, y, heading in units of the covariance claimed, 3 where honest. "
     "Without a compass the filter is too sure: after a heading error of 5 degrees the true "
-    "positions lie on an arc, its ellipse is straight. With one it is too sure by about 4 per "
-    "cent, because it does not know of the steps of the wheels' encoders (docs/studies.md).",
+    "positions lie on an arc, its ellipse is straight. With one it is too sure by a few per cent, "
+    "at 10 degrees because it does not know of the steps of the wheels' encoders "
+    "(docs/studies.md).",
 )
 
 

@@ -1,0 +1,31 @@
+"""Is a simulated drive's filter as wrong as it says? A measure for errors that lie on an arc."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from crosscue.localization.angles import wrap
+from crosscue.replay.columns import Floats
+
+
+def nees_along_the_arc(row: Floats) -> float:
+    """NEES of the turn and shift that carry the estimate to the truth: errors on an arc.
+
+    Long, Wolfe, Mashner, Chirikjian, *The banana distribution is Gaussian*, RSS 2012.
+
+    Args:
+        row: Shape (16,): one of ``Traced.steps``.
+    """
+    x, y, heading = row[:3]
+    at_x, at_y, at_heading = row[7:10]
+    xx, xy, xh, yy, yh, hh = row[10:16]
+    cov = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
+    turn = wrap(heading - at_heading)
+    half = 0.5 * turn
+    along = half / math.tan(half)
+    dx, dy = x - at_x, y - at_y
+    # With the estimate as origin, turn and shift have the covariance of the pose.
+    error = np.array([along * dx + half * dy, along * dy - half * dx, turn])
+    return float(error @ np.linalg.solve(cov, error))
