@@ -226,7 +226,7 @@ def _absent(
     return Finding(
         drive=result.drive,
         intersection=result.intersection,
-        conditions=tuple(tag for tag in result.conditions if tag not in GOOD),
+        conditions=_bad(result),
         feature=feature,
         failing="missing" if at_m is None else "late",
         at_m=at_m,
@@ -266,7 +266,7 @@ def _invented(result: ApproachResult, feature: str, cues: Mapping[str, CueEviden
     return Finding(
         drive=result.drive,
         intersection=result.intersection,
-        conditions=tuple(tag for tag in result.conditions if tag not in GOOD),
+        conditions=_bad(result),
         feature=feature,
         failing="invented",
         at_m=loud[0].first_m if loud else None,
@@ -274,6 +274,10 @@ def _invented(result: ApproachResult, feature: str, cues: Mapping[str, CueEviden
         told=told or "no cue of its own: only what others left over",
         cues=tuple(for_it),
     )
+
+
+def _bad(result: ApproachResult) -> tuple[str, ...]:
+    return tuple(tag for tag in result.conditions if tag not in GOOD)
 
 
 def _shares(cues: Sequence[CueEvidence]) -> str:

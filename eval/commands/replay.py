@@ -359,9 +359,8 @@ def summary(outcome: Outcome) -> str:
         lines.append(f"marks    {_landmarks(outcome.landmark_counts)}")
     lines += [f"  note   {sentence}" for sentence in outcome.notices]
     speed = outcome.drive_seconds / max(outcome.seconds, 1e-9)
-    lines.append(
-        f"took     {outcome.seconds:.2f} s, {speed:.{0 if speed >= 10 else 1}f} times real time"
-    )
+    digits = 0 if speed >= 10 else 1
+    lines.append(f"took     {outcome.seconds:.2f} s, {speed:.{digits}f} times real time")
     width = min(terminal_width(), 80)
     return "\n".join(
         wrapped(visible(line[9:]), width, lead=line[:9]) if len(line) > width else visible(line)
