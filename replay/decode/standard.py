@@ -85,11 +85,13 @@ def _table(**sources: str) -> Kind:
     return Kind(tuple(sources.values()), build)
 
 
-def _xyz(columns: str, path: str) -> dict[str, str]:
+def xyz(columns: str, path: str) -> dict[str, str]:
+    """From column to field for the parts of a vector; ``columns`` has {} for the axis."""
     return {columns.format(axis): f"{path}.{axis}" for axis in "xyz"}
 
 
-def _quat(path: str) -> dict[str, str]:
+def quat(path: str) -> dict[str, str]:
+    """The same for a quaternion."""
     return {f"quat_{axis}": f"{path}.{axis}" for axis in "xyzw"}
 
 
@@ -246,9 +248,9 @@ def _camera_info_doubts(fields: Fields) -> Iterator[Doubt]:
 
 
 _IMU: Final = {
-    "linear_acceleration": _xyz("accel_{}_mps2", "linear_acceleration"),
-    "angular_velocity": _xyz("gyro_{}_radps", "angular_velocity"),
-    "orientation": _quat("orientation"),
+    "linear_acceleration": xyz("accel_{}_mps2", "linear_acceleration"),
+    "angular_velocity": xyz("gyro_{}_radps", "angular_velocity"),
+    "orientation": quat("orientation"),
 }
 
 
@@ -264,8 +266,8 @@ def _imu(fields: Fields) -> Table:
     return Table(columns)
 
 
-_POSE: Final = _xyz("{}_m", "pose.position") | _quat("pose.orientation")
-_POSE_COV: Final = _xyz("{}_m", "pose.pose.position") | _quat("pose.pose.orientation")
+_POSE: Final = xyz("{}_m", "pose.position") | quat("pose.orientation")
+_POSE_COV: Final = xyz("{}_m", "pose.pose.position") | quat("pose.pose.orientation")
 
 BY_TYPE: Final[Mapping[str, Kind]] = {
     "can_msgs/msg/Frame": Kind(
@@ -296,7 +298,7 @@ BY_TYPE: Final[Mapping[str, Kind]] = {
         + tuple(f"{estimate}_covariance:9" for estimate in _IMU),
         _imu,
     ),
-    "sensor_msgs/msg/MagneticField": _table(**_xyz("mag_{}_t", "magnetic_field")),
+    "sensor_msgs/msg/MagneticField": _table(**xyz("mag_{}_t", "magnetic_field")),
     "sensor_msgs/msg/NavSatFix": _table(
         latitude_deg="latitude",
         longitude_deg="longitude",

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import Block, Table
 from crosscue.replay.decode.plan import Plan
+from crosscue.replay.decode.standard import quat, xyz
 from crosscue.replay.ledger import Ledger
 
 from .outgoing import Outgoing, Ros2Type, own_type, stamps, standard_type, with_rows
@@ -54,16 +55,8 @@ class Standard:
         return all(columns[name].dtype.kind in "fiub" for name in names)
 
 
-def _axes(column: str, path: str) -> dict[str, str]:
-    return {column.format(axis): f"{path}.{axis}" for axis in "xyz"}
-
-
 _QUAT: Final = frozenset(f"quat_{axis}" for axis in "xyzw")
 _XY: Final = frozenset({"x_m", "y_m"})
-
-
-def _quat(path: str) -> dict[str, str]:
-    return {f"quat_{axis}": f"{path}.{axis}" for axis in "xyzw"}
 
 
 def _imu_rest(columns: Columns, size: int) -> Columns:
@@ -99,16 +92,16 @@ STANDARDS: Final = (
     Standard(
         "sensor_msgs/msg/Imu",
         (_ACCEL, _GYRO),
-        _axes("accel_{}_mps2", "linear_acceleration")
-        | _axes("gyro_{}_radps", "angular_velocity")
-        | _quat("orientation"),
+        xyz("accel_{}_mps2", "linear_acceleration")
+        | xyz("gyro_{}_radps", "angular_velocity")
+        | quat("orientation"),
         (_ACCEL, _GYRO, _QUAT),
         _imu_rest,
     ),
     Standard(
         "sensor_msgs/msg/MagneticField",
         (frozenset(f"mag_{axis}_t" for axis in "xyz"),),
-        _axes("mag_{}_t", "magnetic_field"),
+        xyz("mag_{}_t", "magnetic_field"),
     ),
     Standard(
         "sensor_msgs/msg/NavSatFix",
@@ -119,13 +112,13 @@ STANDARDS: Final = (
     Standard(
         "geometry_msgs/msg/PoseStamped",
         (_XY | _QUAT,),
-        _axes("{}_m", "pose.position") | _quat("pose.orientation"),
+        xyz("{}_m", "pose.position") | quat("pose.orientation"),
     ),
     Standard(
         "nav_msgs/msg/Odometry",
         (_XY | _QUAT | {"speed_x_mps"}, _XY | _QUAT | {"yaw_rate_radps"}),
-        _axes("{}_m", "pose.pose.position")
-        | _quat("pose.pose.orientation")
+        xyz("{}_m", "pose.pose.position")
+        | quat("pose.pose.orientation")
         | {
             "speed_x_mps": "twist.twist.linear.x",
             "speed_y_mps": "twist.twist.linear.y",
