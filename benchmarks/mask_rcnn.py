@@ -10,7 +10,7 @@ The ResNet-50 has random weights, since COCO's are not at hand. Its scores are s
 rank (the 5 likeliest are sure, 60 compete, 20 detections remain), so its equal detections tell that
 levels, proposals and boxes agree, and nothing of what fewer proposals cost.
 
-With --coco and --images (see crosscue train frames) it also tells that cost as average precision.
+That cost as average precision: crosscue train mask-rcnn --measure embedded --proposals 100 1000.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
@@ -44,8 +43,6 @@ from crosscue.detectors.mask_rcnn import (
 from crosscue.detectors.mask_rcnn_checkpoint import Calibration, Checkpoint, Facts
 from crosscue.detectors.mask_rcnn_network import MEAN, SPREAD, Plan, build_network, set_limits
 from crosscue.detectors.model_detector import overlaps
-from crosscue.detectors.training.annotations import read_coco
-from crosscue.detectors.training.scores import average_precisions, detections_on
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import VehicleError
 
@@ -287,20 +284,6 @@ def random_resnet() -> Checkpoint:
     return Checkpoint(Facts(plan=plan), network.eval(), "")
 
 
-def proposal_costs(checkpoint: Checkpoint, coco: Path, images: Path) -> None:
-    """Average precision and time with more and fewer proposals."""
-    classes = [name for name in checkpoint.facts.plan.classes if name]
-    labelled = read_coco(coco, images, classes)
-    for proposals in (1000, 300, 200, 100, 50):
-        detector = raw_detector(checkpoint, score=0.02, proposals=proposals)
-        began = time.process_time()
-        found = list(detections_on(labelled, detector))
-        taken = (time.process_time() - began) / len(found)
-        ap = average_precisions(labelled, found)
-        print(f"  {proposals:5} proposals: box AP {ap['box']:6.2f}  mask AP {ap['mask']:6.2f}  "
-              f"{taken:.3f} CPU s a picture")  # fmt: skip
-
-
 def compare(
     checkpoint: Checkpoint, counts: Sequence[int], seen: Sequence[Scene],
     levels: Mapping[str, Least], is_true: bool,
@@ -319,8 +302,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--network", default="embedded", help="a checkpoint instead")
     parser.add_argument("--resnet-pictures", type=int, default=4, help="how many; it is slow")
-    parser.add_argument("--coco", type=Path, help="held-out annotations")
-    parser.add_argument("--images", type=Path, help="their pictures")
     args = parser.parse_args()
     torch.set_num_threads(1)
     seen = scenes()
@@ -333,8 +314,6 @@ def main() -> None:
         print(f"ResNet-50, random, {resnet.facts.plan.width_px} pixels wide, {len(few)} pictures")
         half: dict[str, Least] = {"raw score of 0.5 and more": lambda name: 0.5}
         compare(resnet, (100, 1000), few, half, is_true=False)
-    if args.coco is not None:
-        proposal_costs(own, args.coco, args.images)
 
 
 if __name__ == "__main__":
