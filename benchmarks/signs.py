@@ -29,7 +29,7 @@ from crosscue.datasets.scenes.drive import SceneSettings, world_of
 from crosscue.datasets.scenes.render import Renderer
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.model_detector import overlaps
-from crosscue.detectors.sign_detector import SignSettings, build, orb_points
+from crosscue.detectors.sign_detector import POINTS_DRAWN, SignSettings, build, orb_points
 from crosscue.detectors.sign_drawings import AMERICAN, Kind, drawings
 from crosscue.replay.columns import Bytes, Floats
 from support.sign_scenes import scene
@@ -65,7 +65,11 @@ class WindowSearch:
     def __init__(self, has_one_size: bool) -> None:
         """Describe the drawings once."""
         self._orb = cv2.ORB.create(
-            nfeatures=500, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=RULES.fast
+            nfeatures=POINTS_DRAWN,
+            nlevels=1,
+            edgeThreshold=8,
+            patchSize=16,
+            fastThreshold=RULES.fast,
         )
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
         drawn = drawings(AMERICAN, RULES.heights_px)
@@ -73,7 +77,7 @@ class WindowSearch:
         largest = (max(w for w, _ in shapes), max(h for _, h in shapes))
         self._by_size: dict[Size, list[Drawn]] = {}
         for one, shape in zip(drawn, shapes, strict=True):
-            words = orb_points(one.grey, 500, RULES.drawing_fast).words
+            words = orb_points(one.grey, POINTS_DRAWN, RULES.drawing_fast).words
             of_size = self._by_size.setdefault(largest if has_one_size else shape, [])
             of_size.append(Drawn(one.kind, one.size_px, words.view(np.uint8)))
 

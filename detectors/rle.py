@@ -105,7 +105,7 @@ def column_heights_px(text: bytes, size_px: tuple[int, int]) -> Floats:
     width, height = size_px
     lengths = runs(text)
     edges = lengths.cumsum()
-    _check_pixels(int(edges[-1]), int(lengths[-1]), size_px)
+    _check_pixels(int(edges[-1]), size_px)
     objects, stops = lengths[1::2], edges[1::2]
     column = (stops - objects) // height
     if (column == (stops - 1) // height).all():
@@ -136,14 +136,12 @@ def decode(text: bytes, size_px: tuple[int, int]) -> NDArray[np.bool_]:
 
 def _checked(text: bytes, size_px: tuple[int, int]) -> Int64s:
     lengths = runs(text)
-    _check_pixels(int(lengths.sum()), int(lengths[-1]), size_px)
+    _check_pixels(int(lengths.sum()), size_px)
     return lengths
 
 
-def _check_pixels(told: int, last: int, size_px: tuple[int, int]) -> None:
-    """A last run of background may be left out."""
-    pixels = size_px[0] * size_px[1]
-    if told > pixels or told not in (pixels, pixels - last):
+def _check_pixels(told: int, size_px: tuple[int, int]) -> None:
+    if told != size_px[0] * size_px[1]:
         raise ValueError(f"mask of {told} pixels: want {size_px[0]} x {size_px[1]}")
 
 

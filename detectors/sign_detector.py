@@ -23,7 +23,12 @@ from .sign_drawings import AMERICAN, LABELS, Drawing, Kind, drawings
 from .sign_votes import Counts, Words, nearest, window_counts
 
 VERSION: Final = 1
+POINTS_DRAWN: Final = 500
+"""More than any drawing has."""
+LEAST_SIDE_PX: Final = 32
+"""Of a level; ORB's border of 8 pixels and patch of 16 leave next to nothing of less."""
 _CELL_PX: Final = 4
+"""Side of the squares that votes are counted in."""
 _SAME_SIGN: Final = 0.5
 """Windows that overlap more (intersection over union) speak of one sign."""
 
@@ -43,10 +48,10 @@ class SignSettings(Settings):
     points: Annotated[int, Field(ge=50, le=20000)] = 4000
     """Kept at a level."""
     drawing_fast: Annotated[int, Field(ge=1, le=100)] = 6
-    """The same of the drawings' points."""
+    """Least contrast of a drawing's point (FAST)."""
     ratio: Share = 0.9
     fast: Annotated[int, Field(ge=1, le=100)] = 6
-    """Least contrast of a point (FAST)."""
+    """The same of a picture's."""
     reach: Share = 0.1
     """A vote may miss the middle by this share of the sign's height."""
     crop_top: Share = 0.0
@@ -115,7 +120,7 @@ class _Gallery:
 
 def _gallery(settings: SignSettings) -> _Gallery:
     drawn = drawings(settings.kinds, settings.heights_px)
-    found = [orb_points(one.grey, 500, settings.drawing_fast) for one in drawn]
+    found = [orb_points(one.grey, POINTS_DRAWN, settings.drawing_fast) for one in drawn]
     first = np.concatenate([[0], np.cumsum([len(p.words) for p in found])]).astype(np.int64)
     middles = [
         np.array(one.grey.shape[::-1]) / 2.0 - p.at_px for one, p in zip(drawn, found, strict=True)
@@ -183,7 +188,7 @@ class SignDetector:
         import cv2
 
         size = (round(grey.shape[1] * scale), round(grey.shape[0] * scale))
-        if min(size) < 32:
+        if min(size) < LEAST_SIDE_PX:
             return []
         mode = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
         level = np.asarray(cv2.resize(grey, size, interpolation=mode), np.uint8)

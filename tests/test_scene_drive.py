@@ -21,9 +21,9 @@ from crosscue.datasets.scenes.drive import (
     write_scene,
 )
 from crosscue.datasets.scenes.mobileye import SETTINGS, Faults
-from crosscue.datasets.scenes.rle import decode
 from crosscue.datasets.truth import load
 from crosscue.datasets.tum import heading_rad, read_tum
+from crosscue.detectors import rle
 from crosscue.eval.cli import run
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder
@@ -204,7 +204,7 @@ def test_annotations_lie_in_their_pictures_and_masks_in_their_boxes(files: Scene
     for one in objects["annotations"][::7]:
         wide, high = size[one["image_id"]]
         x, y, w, h = one["bbox"]
-        mask = decode(one["segmentation"]["counts"], wide, high)
+        mask = rle.decode(one["segmentation"]["counts"].encode(), (wide, high))
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
         assert [columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1] == [x, y, w, h]
         assert mask.sum() == one["area"]

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from crosscue.datasets.scenes.camera import Camera, view_at
@@ -16,7 +13,6 @@ from crosscue.datasets.scenes.ground import TEXELS_PER_M, X_M, Y_M
 from crosscue.datasets.scenes.kernels import compiled
 from crosscue.datasets.scenes.layout import TABLE_6, any_layout, layout_named
 from crosscue.datasets.scenes.render import Picture, Seen
-from crosscue.datasets.scenes.rle import decode, encode
 from crosscue.datasets.scenes.world import build
 from support.scenes import SMALL, mirrored, picture_at, renderer, when_at, world
 
@@ -163,35 +159,6 @@ def _side_view(kind: str, *, nose_left: bool) -> NDArray[np.bool_]:
         108.0, covered, 0, 0,
     )  # fmt: skip
     return covered.astype(np.bool_)
-
-
-@given(
-    mask=arrays(np.bool_, st.tuples(st.integers(1, 7), st.integers(1, 7))),
-    left=st.integers(0, 3),
-    top=st.integers(0, 3),
-)
-@settings(max_examples=80, deadline=None)
-def test_run_lengths_give_the_mask_back(mask: NDArray[np.bool_], left: int, top: int) -> None:
-    high, wide = mask.shape
-    whole = np.zeros((top + high + 1, left + wide), np.bool_)
-    whole[top : top + high, left : left + wide] = mask
-
-    text = encode(mask, left, top, whole.shape[1], whole.shape[0])
-
-    assert np.array_equal(decode(text, whole.shape[1], whole.shape[0]), whole)
-
-
-def test_run_lengths_are_written_as_coco_writes_them() -> None:
-    corner = np.array([[True]])
-
-    assert encode(corner, 0, 0, 2, 2) == "013"  # none, one, three
-    # 40 = 8 + 32: five bits "8" with the mark for more (8 + 32 + 48 = 'X'), then 1 ('1').
-    assert encode(corner, 0, 40, 1, 41) == "X11"
-
-
-def test_a_mask_outside_its_picture_is_refused() -> None:
-    with pytest.raises(ValueError, match="not within 4x4"):
-        encode(np.ones((2, 2), np.bool_), 3, 0, 4, 4)
 
 
 def test_layouts_from_seeds_are_none_of_the_scored_ones() -> None:

@@ -141,6 +141,28 @@ def test_runs_come_back_as_they_went(h: int, w: int, x: int, y: int, seed: int) 
     np.testing.assert_allclose(rle.column_heights_px(text, size), whole.sum(axis=0))
 
 
+def test_runs_are_written_as_coco_writes_them() -> None:
+    corner = np.array([[True]])
+
+    assert rle.encode(corner, (0, 0), (2, 2)) == b"013"  # none, one, three
+    # 40 = 8 + 32: five bits "8" with the mark for more (8 + 32 + 48 = 'X'), then 1 ('1').
+    assert rle.encode(corner, (0, 40), (1, 41)) == b"X11"
+
+
+def test_a_mask_outside_its_picture_is_refused() -> None:
+    with pytest.raises(ValueError, match="not inside 4 x 4"):
+        rle.encode(np.ones((2, 2), np.bool_), (3, 0), (4, 4))
+
+
+@pytest.mark.parametrize("size", [(8, 9), (8, 7), (9, 8)])
+def test_a_mask_of_a_picture_of_another_size_is_refused(size: tuple[int, int]) -> None:
+    full = rle.encode(np.ones((8, 8), np.bool_), (0, 0), (8, 8))
+
+    for read in (rle.decode, rle.column_heights_px):
+        with pytest.raises(ValueError, match="mask of 64 pixels"):
+            read(full, size)
+
+
 @pytest.mark.parametrize("text", [b"", b"\x00", b"o", b"zzzz", b"0" * 3 + b"\xff"])
 def test_bytes_that_are_no_mask_are_refused(text: bytes) -> None:
     with pytest.raises(ValueError, match="mask"):

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from crosscue.detectors.rle import encode
 from crosscue.replay.run_folder import strict_json, write_text
 
 from .cues import LEAST_PIXELS
 from .render import Picture
-from .rle import encode
 from .world import CATEGORIES
 
 COCO_IDS: Final = {
@@ -45,7 +45,7 @@ class Objects:
                 "category_id": COCO_IDS[seen.thing.category][0],
                 "bbox": [x0, y0, x1 - x0, y1 - y0], "area": area, "iscrowd": 0,
                 "segmentation": {"size": [high, wide],
-                                 "counts": encode(seen.mask, x0, y0, wide, high)},
+                                 "counts": encode(seen.mask, (x0, y0), (wide, high)).decode("ascii")},
                 "track_id": seen.thing.number, "role": seen.thing.role,
                 "visible": round(seen.visible, 3), "in_picture": round(seen.in_picture, 3),
                 "distance_m": round(seen.distance_m, 3),
