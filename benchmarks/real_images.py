@@ -64,6 +64,8 @@ def print_road(run: RunFolder, other: RunFolder) -> None:
     """Agreement over all frames' pixels."""
     row = run.table("frames", ["width_px", "height_px"]).slice(0, 1).to_pylist()[0]
     size = (row["width_px"], row["height_px"])
+    if run.table("road", ["t_ns"]) != other.table("road", ["t_ns"]):
+        raise SystemExit(f"--road {other.path}: not of the same pictures as {run.path}")
     both = own = its = 0
     for a, b in zip(road_masks(run, size), road_masks(other, size), strict=True):
         both += int((a & b).sum())
@@ -86,7 +88,7 @@ def main() -> None:
         run = open_run(path)
         print_found(run, args.scores)
         print_cues(run)
-        if args.road is not None and run.table("road", ["frame"]).num_rows:
+        if args.road is not None:
             print_road(run, open_run(args.road))
 
 

@@ -40,12 +40,12 @@ class Objects:
             if area < LEAST_PIXELS:
                 continue
             x0, y0, x1, y1 = seen.box_px
+            counts = encode(seen.mask, (x0, y0), (wide, high)).decode("ascii")
             self.annotations.append({
                 "id": len(self.annotations) + 1, "image_id": number,
                 "category_id": COCO_IDS[seen.thing.category][0],
                 "bbox": [x0, y0, x1 - x0, y1 - y0], "area": area, "iscrowd": 0,
-                "segmentation": {"size": [high, wide],
-                                 "counts": encode(seen.mask, (x0, y0), (wide, high)).decode("ascii")},
+                "segmentation": {"size": [high, wide], "counts": counts},
                 "track_id": seen.thing.number, "role": seen.thing.role,
                 "visible": round(seen.visible, 3), "in_picture": round(seen.in_picture, 3),
                 "distance_m": round(seen.distance_m, 3),
