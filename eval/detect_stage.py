@@ -133,7 +133,7 @@ def detect_into(
         selection: Which part of the logs.
         choices: Detectors, in order.
         cache: File with results of earlier runs, or None for none.
-        draw: How many pictures to write with detections drawn.
+        draw: How many pictures to write at most, with detections drawn, spread over the drive.
         on_frames: Told how many frames are done, and of how many where the log declares it.
 
     Raises:

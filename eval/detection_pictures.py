@@ -24,32 +24,47 @@ MARGIN_PX: Final = 10
 
 @dataclass(slots=True)
 class Drawer:
-    """Writes the first ``most`` frames it is given, every ``every``-th.
+    """Writes pictures of frames, evenly along the drive, however long it turns out to be.
+
+    Every frame at first; whenever there are too many, each second one goes, and half as many come.
 
     Attributes:
         folder: Made when first needed.
         most: How many pictures at most.
-        every: Frames from one picture to the next.
     """
 
     folder: Path
     most: int
-    every: int = 10
     _seen: int = field(default=0)
+    _every: int = field(default=1)
+    _written: list[Path] = field(default_factory=list)
 
     def __call__(self, result: FrameResult, cues: FrameCues) -> None:
-        """Look at one frame."""
+        """Look at one frame.
+
+        Raises:
+            OutputError: A picture cannot be written.
+        """
         number, self._seen = self._seen, self._seen + 1
-        if number % self.every or number // self.every >= self.most:
+        if not self.most or number % self._every:
             return
+        if len(self._written) == self.most:
+            self._thin()
+            if number % self._every:
+                return
         import cv2
 
         pixels, _ = decode(result.picture, View())
-        drawn = draw(pixels, result, cues)
-        ok, encoded = cv2.imencode(".jpg", drawn)
-        if ok:
-            path = self.folder / f"{result.t_ns}.jpg"
-            write_whole(path, lambda partial: partial.write_bytes(encoded.tobytes()))
+        _, encoded = cv2.imencode(".jpg", draw(pixels, result, cues))
+        path = self.folder / f"{result.t_ns}.jpg"
+        write_whole(path, lambda partial: partial.write_bytes(encoded.tobytes()))
+        self._written.append(path)
+
+    def _thin(self) -> None:
+        for path in self._written[1::2]:
+            path.unlink(missing_ok=True)
+        del self._written[1::2]
+        self._every *= 2
 
 
 def draw(pixels: Bytes, result: FrameResult, cues: FrameCues, enlarge: float = 1.0) -> Bytes:

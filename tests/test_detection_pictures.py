@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.frame_cues import FrameCues
 from crosscue.detectors.pictures import Encoded
 from crosscue.detectors.runner import FrameResult
-from crosscue.eval.detection_pictures import BLUE, GREEN, MARGIN_PX, draw
+from crosscue.eval.detection_pictures import BLUE, GREEN, MARGIN_PX, Drawer, draw
 
 SIZE = (640, 360)
 GREY = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
@@ -58,3 +64,19 @@ def test_the_line_of_cues_lies_within_the_picture(count: int, enlarge: float) ->
 def test_cues_that_are_not_there_are_not_named() -> None:
     assert (_drawn((), {"stop_sign": 0}) == _drawn((), {})).all()
     assert (_drawn((), {"stop_sign": 1}) != _drawn((), {})).any()
+
+
+@given(frames=st.integers(0, 40), most=st.integers(0, 9))
+@settings(max_examples=40, deadline=None)
+def test_pictures_are_spread_evenly_over_a_drive_of_any_length(frames: int, most: int) -> None:
+    _, coded = cv2.imencode(".jpg", GREY[:16, :16])
+    with TemporaryDirectory() as name:
+        drawer = Drawer(Path(name) / "pictures", most)
+        for t_ns in range(frames):
+            picture = Encoded("jpeg", memoryview(coded.tobytes()))
+            drawer(FrameResult(t_ns, (16, 16), picture, ()), FrameCues({}, None))
+        drawn = sorted(int(path.stem) for path in Path(name).glob("pictures/*"))
+
+    assert len(drawn) <= most
+    assert len(drawn) >= min(frames, (most + 1) // 2)
+    assert drawn == list(range(0, frames, drawn[1] if len(drawn) > 1 else max(frames, 1)))[:most]

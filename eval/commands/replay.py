@@ -95,7 +95,7 @@ def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--draw", type=int, default=0, metavar="N",
-        help="write N pictures with what was found, of every tenth frame",
+        help="write up to N pictures with what was found, spread over the drive",
     )  # fmt: skip
     parser.add_argument("--cache", type=Path, metavar="FILE", help="where results are kept")
     parser.add_argument("--no-cache", action="store_true", help="run every detector again")
