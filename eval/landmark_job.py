@@ -12,11 +12,11 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.datasets.tum import heading_rad
+from crosscue.detectors.pictures import Encoded
 from crosscue.localization.angles import interpolate_angle
 from crosscue.localization.landmark_database import LandmarkWriter, Place
 from crosscue.localization.landmark_features import Matcher
 from crosscue.localization.landmark_pictures import (
-    EncodedPicture,
     grey_of,
     picture_of,
     read_picture,
@@ -81,7 +81,7 @@ class Frame(NamedTuple):
 
     t_ns: int
     topic: str
-    picture: EncodedPicture
+    picture: Encoded
 
 
 def read_poses(path: Path, vehicle: Vehicle) -> CameraPoses:

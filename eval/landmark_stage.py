@@ -9,10 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from crosscue.detectors.pictures import Encoded
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmark_database import LandmarkDatabase
 from crosscue.localization.landmark_features import CameraGeometry, Features, Matcher, make_matcher
-from crosscue.localization.landmark_pictures import EncodedPicture, grey_of, picture_of
+from crosscue.localization.landmark_pictures import grey_of, picture_of
 from crosscue.localization.landmark_update import (
     LandmarkSearch,
     LandmarkSettings,
@@ -91,7 +92,7 @@ class NoLandmarks(NoLooks):
 class _Frame:
     t_ns: int
     topic: str = field(compare=False)
-    picture: EncodedPicture = field(compare=False)
+    picture: Encoded = field(compare=False)
 
 
 @dataclass(slots=True)

@@ -17,12 +17,13 @@ import pytest
 from crosscue.datasets.simulated_drive import DriveSettings
 from crosscue.datasets.simulated_log import DriveFiles, write_drive
 from crosscue.datasets.tum import read_tum
+from crosscue.detectors.pictures import Encoded
 from crosscue.eval import cli
 from crosscue.eval.landmark_stage import LandmarkStage, looking
 from crosscue.eval.measurements import read_measured
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmark_database import LandmarkDatabase
-from crosscue.localization.landmark_pictures import EncodedPicture, grey_of
+from crosscue.localization.landmark_pictures import grey_of
 from crosscue.localization.landmark_update import best_of
 from crosscue.replay.columns import Block, Bytes, Floats, Images, Messages
 from crosscue.replay.ledger import Ledger
@@ -367,7 +368,7 @@ def test_real_frames_find_the_landmarks_of_their_own_street(tmp_path: Path) -> N
     apart = []
     for i in range(2, 51, 4):
         picture = (folder / "image_l" / f"{i:06d}.png").read_bytes()
-        seen = stage.search.matcher.describe(grey_of(EncodedPicture("png", picture)))
+        seen = stage.search.matcher.describe(grey_of(Encoded("png", memoryview(picture))))
         everything = tuple(stage.search.database)
         best = best_of(seen, everything, stage.search.database, stage.search.matcher)
         assert best is not None

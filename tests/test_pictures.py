@@ -6,6 +6,8 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import View
@@ -100,6 +102,32 @@ def test_a_bomb_is_refused_by_its_header() -> None:
 
     with pytest.raises(LogTooLargeError, match=f"60000 x 60000 pixels: more than {MOST_PIXELS:,}"):
         decode(Encoded("png", memoryview(bytes(png))), COLOUR)
+    jpeg = bytearray(_encode(_ramp(), ".jpg").content)
+    frame = jpeg.index(b"\xff\xc0")
+    jpeg[frame + 5 : frame + 9] = struct.pack(">HH", 65_000, 65_000)
+    with pytest.raises(LogTooLargeError, match="65000 x 65000"):
+        decode(Encoded("jpeg", memoryview(bytes(jpeg))), COLOUR)
+    with pytest.raises(LogTooLargeError, match="100000 x 100000"):
+        decode(Encoded("raw", memoryview(b"0"), (100_000, 100_000, 100_000, "mono8")), GREY)
+
+
+@given(
+    where=st.integers(0, 100_000),
+    flip=st.integers(1, 255),
+    suffix=st.sampled_from([".png", ".jpg", ".webp"]),
+)
+@settings(max_examples=60, deadline=None)
+def test_a_damaged_picture_is_told_or_still_a_picture(where: int, flip: int, suffix: str) -> None:
+    whole = _encode(_ramp(), suffix)
+    damaged = bytearray(whole.content)
+    damaged[where % len(damaged)] ^= flip
+
+    try:
+        pixels, (width, height) = decode(Encoded(whole.coding, memoryview(bytes(damaged))), GREY)
+    except LogError:
+        return
+    assert pixels.dtype == np.uint8
+    assert pixels.shape == (height, width)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
