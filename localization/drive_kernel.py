@@ -76,6 +76,8 @@ CITY_KEY, PLACE_KEY, SENSOR_KEY = (
     np.uint64(stream) for stream in (CITY_STREAM, PLACE_STREAM, SENSOR_STREAM)
 )
 
+ONWARD, HOMEWARD, EITHER = 1, 2, 4
+"""Kinds of reach in a city: from a place along roads, to it, and whichever way roads lead."""
 COSINES: Final = tuple(math.cos(heading) for heading in HEADINGS_RAD)
 SINES: Final = tuple(math.sin(heading) for heading in HEADINGS_RAD)
 QUARTER_TURNS: Final = HEADINGS_RAD
@@ -373,46 +375,58 @@ def _streets(
 
 
 @compiled
-def _reach(roads: Bytes, columns: int, queue: Ints, count: int, seen: NDArray[np.bool_]) -> int:
-    """See what can be reached along ``roads`` from the queue's places, which then holds it all.
-
-    Without branches: a closed road leads to where one is, which was seen.
-    """
-    head = 0
-    while head < count:
-        node = queue[head]
-        head += 1
-        open_ = np.int64(roads[node])
-        there = node + (open_ & 1)
-        queue[count] = there
-        count += not seen[there]
-        seen[there] = True
-        there = node + columns * ((open_ >> 1) & 1)
-        queue[count] = there
-        count += not seen[there]
-        seen[there] = True
-        there = node - ((open_ >> 2) & 1)
-        queue[count] = there
-        count += not seen[there]
-        seen[there] = True
-        there = node - columns * ((open_ >> 3) & 1)
-        queue[count] = there
-        count += not seen[there]
-        seen[there] = True
-    return count
+def _gates_of(ways: Bytes, columns: int) -> Bytes:
+    """Shape (4, N): which kinds of reach come into each place, from the neighbour on each side."""
+    size = len(ways)
+    gates = np.zeros((4, size), np.uint8)
+    for way, apart in ((0, 1), (1, columns)):
+        for i in range(size - apart):
+            there, back = (ways[i] >> way) & 1, (ways[i + apart] >> (way + 2)) & 1
+            either = (there | back) << 2
+            gates[way, i] = back | there << 1 | either
+            gates[way + 2, i + apart] = there | back << 1 | either
+    return gates
 
 
 @compiled
-def _roads_back(ways: Bytes, columns: int) -> Bytes:
-    """Of each place the ways on which one comes from there, as bits."""
-    back = np.zeros_like(ways)
-    for node in range(len(ways) - 1):
-        back[node] |= (ways[node + 1] >> 2) & 1
-        back[node + 1] |= (ways[node] & 1) << 2
-    for node in range(len(ways) - columns):
-        back[node] |= (ways[node + columns] >> 2) & 2
-        back[node + columns] |= (ways[node] & 2) << 2
-    return back
+def _spread(reach: Bytes, gates: Bytes, columns: int) -> None:
+    """Let all three kinds of reach go on through the gates, sweep by sweep, until none grows.
+
+    Cities are mostly open: a few sweeps do, each as quick as a look at all places.
+    """
+    rows = len(reach) // columns
+    grid, sides = reach.reshape((rows, columns)), gates.reshape((4, rows, columns))
+    grows = True
+    while grows:
+        grows = False
+        for row in range(rows):
+            if row:
+                _spread_over(grid[row - 1], grid[row], sides[3, row])
+            line, gate, here = grid[row], sides[2, row], np.uint8(0)
+            for i in range(columns):
+                here = line[i] | (here & gate[i])
+                line[i] = here
+        for row in range(rows - 1, -1, -1):
+            if row + 1 < rows and _spread_over(grid[row + 1], grid[row], sides[1, row]):
+                grows = True
+            line, gate, here = grid[row], sides[0, row], np.uint8(0)
+            change = np.uint8(0)
+            for i in range(columns - 1, -1, -1):
+                here = line[i] | (here & gate[i])
+                change |= here ^ line[i]
+                line[i] = here
+            grows |= change != 0
+
+
+@inlined
+def _spread_over(known: Bytes, line: Bytes, gate: Bytes) -> bool:
+    """From one row of places to the next; does that grow?"""
+    change = np.uint8(0)
+    for i in range(len(line)):
+        more = line[i] | (known[i] & gate[i])
+        change |= more ^ line[i]
+        line[i] = more
+    return bool(change)
 
 
 @compiled
@@ -430,52 +444,51 @@ def _make_dead_end(ways: Bytes, columns: int, node: int, keep: int) -> None:
 
 
 @compiled
-def _largest_part(ways: Bytes, columns: int, queue: Ints) -> NDArray[np.bool_]:
-    either = _roads_back(ways, columns)
-    for node in range(len(ways)):
-        either[node] |= ways[node]
-    best, seen, most = np.zeros(len(ways), np.bool_), np.zeros(len(ways), np.bool_), 0
-    for start in range(len(ways)):
-        if not seen[start]:
-            queue[0], seen[start] = start, True
-            size = _reach(either, columns, queue, 1, seen)
-            if size > most:
-                most = size
-                best = np.zeros(len(ways), np.bool_)
-                for i in range(size):
-                    best[queue[i]] = True
+def _largest_part(gates: Bytes, columns: int) -> Bytes:
+    """What can be reached, and how, from the first place of the part with most places."""
+    size = gates.shape[1]
+    best, seen = np.zeros(size, np.uint8), np.zeros(size, np.bool_)
+    most, left = 0, size
+    for start in range(size):
+        if seen[start]:
+            continue
+        reach = np.zeros(size, np.uint8)
+        reach[start] = ONWARD | HOMEWARD | EITHER
+        _spread(reach, gates, columns)
+        count = 0
+        for node in range(size):
+            is_part = reach[node] != 0
+            seen[node] |= is_part
+            count += is_part
+        if count > most:
+            most, best = count, reach
+        left -= count
+        if left <= most:
+            break
     return best
 
 
 @compiled
-def _open_traps(ways: Bytes, columns: int, inside: NDArray[np.bool_], queue: Ints) -> None:
-    """Later rounds go on from where roads were opened."""
-    root, back = int(np.argmax(inside)), _roads_back(ways, columns)
-    onward, homeward = np.zeros(len(ways), np.bool_), np.zeros(len(ways), np.bool_)
-    onward[root] = homeward[root] = True
-    home_queue = np.empty_like(queue)
-    queue[0] = home_queue[0] = root
-    ahead = behind = 1
-    while ahead or behind:
-        _reach(ways, columns, queue, ahead, onward)
-        _reach(back, columns, home_queue, behind, homeward)
-        ahead = behind = 0
+def _open_traps(ways: Bytes, columns: int, reach: Bytes, gates: Bytes) -> None:
+    """Where one cannot come from or cannot leave, roads to where one can become two-way."""
+    both = np.uint8(ONWARD | HOMEWARD)
+    while True:
+        opened = False
         for node in range(len(ways)):
-            if onward[node] & homeward[node] or not inside[node]:
+            if reach[node] & both == both or not reach[node]:
                 continue
             # Roads between what is in and what is not, both ways: this node is the end that is not.
             for way in range(4):
                 there = node + (1, columns, -1, -columns)[way]
-                mine, theirs = np.uint8(1 << way), np.uint8(1 << ((way + 2) & 3))
-                if not (ways[node] | back[node]) & mine or not onward[there] & homeward[there]:
+                if not gates[way, node] or reach[there] & both != both:
                     continue
-                ways[node] |= mine
-                back[node] |= mine
-                ways[there] |= theirs
-                back[there] |= theirs
-                queue[ahead] = home_queue[behind] = there
-                ahead += 1
-                behind += 1
+                ways[node] |= np.uint8(1 << way)
+                ways[there] |= np.uint8(1 << ((way + 2) & 3))
+                gates[way, node] = gates[(way + 2) & 3, there] = ONWARD | HOMEWARD | EITHER
+                opened = True
+        if not opened:
+            return
+        _spread(reach, gates, columns)
 
 
 @compiled
@@ -525,12 +538,11 @@ def _make_city(
             there = node + (1, columns, -1, -columns)[way]
             if ways[there] & back:
                 ways[there] &= ~back
-    queue = np.empty(5 * size + 1, np.int64)
-    inside = _largest_part(ways, columns, queue)
-    for node in range(size):
-        if not inside[node]:
-            ways[node] = 0
-    _open_traps(ways, columns, inside, queue)
+    gates = _gates_of(ways, columns)
+    reach = _largest_part(gates, columns)
+    inside = reach != 0
+    ways[~inside] = 0
+    _open_traps(ways, columns, reach, gates)
     return xs, ys, ways, inside, area_km2
 
 

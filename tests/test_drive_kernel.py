@@ -52,6 +52,11 @@ KINDS = {
         longest_s=200.0,
         navigation=Navigation(strategy="landmark to landmark"),
     ),
+    "maze": Drive(
+        city=City(dead_end_share=0.2, one_way_share=0.8, smallest_km2=2.0, largest_km2=3.0),
+        landmarks_per_km2=5.0,
+        longest_m=600.0,
+    ),
     "coarse": Drive(
         city=TOWN, car=drive_settings.Car(step_s=0.05, cruise_mps=7.0), longest_m=800.0
     ),
