@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from crosscue.replay.columns import Floats
 from crosscue.replay.mobileye.samples import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.past_settings import Past
-from crosscue.replay.signals import MOBILEYE_SIGNALS, Samples, Signal
+from crosscue.replay.signals import Samples
 
 _BURST, _X = OBSTACLE_COLUMNS.index("burst"), OBSTACLE_COLUMNS.index("x_m")
 _SIDE = LANE_COLUMNS.index("side")
@@ -78,34 +77,3 @@ def _last_lanes(samples: Samples | None) -> Floats | None:
     rows = [int(np.flatnonzero(sides == side)[-1]) for side in np.unique(sides)]
     found: Floats = samples.values[rows]
     return found
-
-
-@dataclass(slots=True)
-class MobileyeMemory:
-    """Samples as they come, window by window, as far back as they may matter."""
-
-    past: Past
-    _kept: dict[Signal, Samples] = field(default_factory=dict)
-
-    def add(self, samples: Mapping[Signal, Samples]) -> None:
-        """Take in a window's samples; those of other signals are left alone."""
-        for signal in MOBILEYE_SIGNALS:
-            fresh = samples.get(signal)
-            if fresh is None or not len(fresh.t_ns):
-                continue
-            before = self._kept.get(signal)
-            if before is not None:
-                t_ns = np.concatenate([before.t_ns, fresh.t_ns])
-                fresh = Samples(signal, t_ns, np.concatenate([before.values, fresh.values]))
-            # A window may be asked about from its start, so what mattered then is kept.
-            keep_ns = round((self.past.most_age_s + 2.0) * 1e9)
-            self._kept[signal] = fresh.take(fresh.t_ns >= fresh.t_ns[-1] - keep_ns)
-
-    def at(self, t_ns: int) -> MobileyeState:
-        """What was known at ``t_ns``, which may lie up to 2 s before the last sample."""
-        return state_at(
-            self._kept.get(Signal.MOBILEYE_OBSTACLES),
-            self._kept.get(Signal.MOBILEYE_LANES),
-            t_ns,
-            self.past,
-        )

@@ -126,11 +126,6 @@ def level_field(
     )
 
 
-def from_bearing(bearing_deg: Floats) -> Floats:
-    """Degrees clockwise from north as radians counter-clockwise from east."""
-    return wrap_all(math.pi / 2 - np.radians(bearing_deg))
-
-
 def course_at(
     at_ns: Int64s,
     course_t_ns: Int64s,

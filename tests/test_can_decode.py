@@ -21,7 +21,7 @@ from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
 from crosscue.replay.can.encode import encode
 from crosscue.replay.can.extract import PRESENT_SUFFIX
-from crosscue.replay.can.layout import Arithmetic, CanMessage, CanSignal
+from crosscue.replay.can.layout import Arithmetic, CanMessage, CanSignal, is_whole
 from crosscue.replay.columns import Block, Table
 from crosscue.replay.ledger import Ledger
 from support.can_layouts import block_of, dbc_text, frames_of, messages
@@ -124,6 +124,10 @@ def test_every_value_equals_cantools(
     assert dtypes == decoder.columns_of("Random")
 
 
+def _is_integral(signal: CanSignal) -> bool:
+    return not signal.is_float and is_whole(signal.scale) and is_whole(signal.offset)
+
+
 def invertible(message: CanMessage) -> CanMessage:
     """The same bits, scaled so that float64 can tell neighbouring values apart."""
     return replace(
@@ -131,7 +135,7 @@ def invertible(message: CanMessage) -> CanMessage:
         signals=tuple(
             replace(s, scale=1, offset=0)
             if s.arithmetic is Arithmetic.BIG
-            or (not s.is_integral and (s.length > 40 or abs(s.offset) > 1000))
+            or (not _is_integral(s) and (s.length > 40 or abs(s.offset) > 1000))
             else s
             for s in message.signals
         ),

@@ -19,7 +19,6 @@ from crosscue.localization.compass import (
     CompassSettings,
     Matrix,
     course_at,
-    from_bearing,
     heading,
     level_field,
 )
@@ -276,12 +275,6 @@ def test_coverage_counts_directions_not_readings() -> None:
     assert coverage_deg(np.full(1000, 0.1)) == 10
     assert coverage_deg(np.array([0.1, 0.1])) == 0
     assert coverage_deg(around(1.0)) == 360
-
-
-def test_a_bearing_of_ninety_is_east() -> None:
-    found = from_bearing(np.array([0.0, 90.0, 180.0, 270.0]))
-
-    np.testing.assert_allclose(np.degrees(found), [90.0, 0.0, -90.0, 180.0], atol=1e-12)
 
 
 def test_a_slow_car_has_no_course() -> None:

@@ -15,7 +15,7 @@ from crosscue.datasets.scenes.camera import Camera
 from crosscue.datasets.scenes.drive import SceneSettings, write_scene
 from crosscue.datasets.truth import load as load_truth
 from crosscue.detectors.cue_names import Cue
-from crosscue.detectors.mobileye_state import MobileyeMemory, MobileyeState, state_at
+from crosscue.detectors.mobileye_state import MobileyeState, state_at
 from crosscue.detectors.past import end_of, past_counts, vehicles_past
 from crosscue.replay.columns import Block, Floats, Topic
 from crosscue.replay.errors import VehicleError
@@ -251,18 +251,23 @@ def test_on_a_simulated_drive_lines_and_vehicles_past_it_are_counted(tmp_path: P
     """L303 has a road ahead with cars on it: both cues come up before the car is there."""
     tiny = SceneSettings(layout="L303", camera=replace(Camera(), width_px=192, height_px=108))
     files = write_scene(tmp_path, tiny)
-    memory = MobileyeMemory(PAST)
     ranges = np.loadtxt(tmp_path / "ranges.csv", delimiter=",", skiprows=1)
     truth = load_truth(files.truth)
     there = [c for c in truth.cues if c.cue == "road_straight" and c.present]
     given: dict[Cue, list[int]] = {Cue.LANES: [], Cue.VEHICLES: []}
-    waiting = ranges[ranges[:, 2] > 0].tolist()
-    for window in windows_of(tmp_path, load(files.vehicle)):
-        memory.add(window.samples)
-        while waiting and waiting[0][0] < window.end_ns:
-            t_ns, _, _, end_m = waiting.pop(0)
-            for cue, count in past_counts(memory.at(int(t_ns)), end_m, PAST).items():
-                given[cue].append(count)
+    seen = [window.samples for window in windows_of(tmp_path, load(files.vehicle))]
+    obstacles, lanes = (
+        Samples(
+            signal,
+            np.concatenate([part[signal].t_ns for part in seen if signal in part]),
+            np.concatenate([part[signal].values for part in seen if signal in part]),
+        )
+        for signal in (Signal.MOBILEYE_OBSTACLES, Signal.MOBILEYE_LANES)
+    )
+    for t_ns, _, _, end_m in ranges[ranges[:, 2] > 0].tolist():
+        state = state_at(obstacles, lanes, int(t_ns), PAST)
+        for cue, count in past_counts(state, end_m, PAST).items():
+            given[cue].append(count)
 
     assert there
     for counts in given.values():

@@ -93,11 +93,6 @@ class CanSignal:
         return 0, (1 << self.length) - 1
 
     @property
-    def is_integral(self) -> bool:
-        """Every physical value is a whole number."""
-        return not self.is_float and is_whole(self.scale) and is_whole(self.offset)
-
-    @property
     def arithmetic(self) -> Arithmetic:
         """How its values are computed, which also decides the column's type."""
         if self.is_float or not is_whole(self.scale):
