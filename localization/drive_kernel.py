@@ -1,7 +1,7 @@
 """A whole simulated drive compiled: city, decisions, car, controllers, sensors and filter.
 
 ``drive_simulator`` is the version to read; this one gives the same results number for number, up
-to rounding, thousands of times as fast, and tests hold the two equal. Four things differ in form:
+to rounding, thousands of times as fast, and tests hold the two equal. Five things differ in form:
 
 * Sixteen drives go on side by side, one step at a time, as vectors of the processor; what does not
   happen at every step is done for each drive alone. No drive depends on its neighbours.
@@ -10,9 +10,28 @@ to rounding, thousands of times as fast, and tests hold the two equal. Four thin
 * Sines and cosines of headings are turned along with the car, by the series of ``ekf.arc``, and
   taken afresh at each decision.
 * A street's four ways are the bits of one byte.
+* What can be reached in a city is found by sweeps over its rows, not by a search with a queue.
+
+Where a rule stands, to read and compiled:
+
+====================================  ====================================  =====================
+what                                  to read                               here
+====================================  ====================================  =====================
+random numbers                        ``random_stream.Stream``              ``_uniform, _normal``
+streets, dead ends, one-way streets   ``city.make_city``                    ``_make_city``
+start, goal, landmarks                ``city.draw_goal, draw_landmarks``    ``_start, _arrive``
+controllers                           ``_Drive._steer, _accelerate``        ``_control``
+bicycle model, wheels, compass        ``_Drive._move, _wheel``              ``_move``
+filter: odometry, compass             ``ekf`` by ``_Drive._estimate``       ``_filter``
+filter: landmarks                     ``_Drive._pass_landmark``             ``_weigh_position``
+lost, at the goal, given up           ``_Drive._has_arrived, run``          ``_look, _attend``
+decisions and their penalties         ``navigation, _Drive._decide``        ``_decide, _remember``
+turns                                 ``_Drive._turn_arcs, _follow_path``   ``_enter, _follow_arcs``
+====================================  ====================================  =====================
 
 Everything compiled stands in this one file: the compiler's cache looks at the file of the function
-called and not at those of the functions that it calls.
+called and not at those of the functions that it calls, and a study keeps what was driven under a
+hash of this file.
 """
 
 from __future__ import annotations
