@@ -55,6 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="measure with so many places looked at; several in turn")  # fmt: skip
     parser.add_argument("--from", dest="start", default="compact", metavar="NETWORK",
                         help="compact, resnet50, resnet50-v2, embedded, or a file")  # fmt: skip
+    parser.add_argument("--backend", default="torch", choices=["torch", "openvino"],
+                        help="measure with the detector's layers run by this one")  # fmt: skip
     parser.add_argument("--classes", nargs="+", default=list(CLASSES), metavar="NAME")
     parser.add_argument("--steps", type=int, default=4000, help="batches altogether")
     parser.add_argument("--batch", type=int, default=8, help="samples in one")
@@ -146,7 +148,8 @@ def _measure(args: argparse.Namespace) -> int:
     from crosscue.detectors.training.annotations import read_coco
     from crosscue.detectors.training.measure import measure
 
-    device = chosen_device(args.device, "train mask-rcnn")
+    asked = args.device if args.backend == "torch" else "cpu"
+    device = chosen_device(asked, "train mask-rcnn")
     checkpoint = checkpoint_named(args.measure)
     classes = [name for name in checkpoint.facts.plan.classes if name]
     whole = read_coco(args.data, args.images, classes)
@@ -156,7 +159,7 @@ def _measure(args: argparse.Namespace) -> int:
         raise UsageError(f"--pictures {args.pictures}: none of {count} pictures; name others")
     told = []
     for proposals in args.proposals:
-        settings = MaskRcnnSettings(proposals=proposals, threads=args.threads)
+        settings = MaskRcnnSettings(proposals=proposals, threads=args.threads, backend=args.backend)
         reached = measure(checkpoint, labelled, settings, device)
         told.append(measured_tree(proposals, reached))
         if not args.quiet and not args.json:
