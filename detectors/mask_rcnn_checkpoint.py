@@ -16,16 +16,16 @@ import torch
 from pydantic import Field, ValidationError
 from torch import Tensor
 
-from crosscue.replay.errors import VehicleError, one_line
+from crosscue.replay.errors import VehicleError
 from crosscue.replay.run_folder import write_whole
 
 from .mask_rcnn_network import Plan, build_network
 from .settings import Settings
+from .weights_file import embedded, packed, unpacked
 
 KEY: Final = "crosscue"
 VERSION: Final = 1
 MOST_BYTES: Final = 2 << 30
-EMBEDDED: Final = "compact_simulated.safetensors"
 _PICKLES: Final = frozenset({".pth", ".pt", ".pkl", ".pickle", ".bin", ".ckpt", ".joblib", ".npy"})
 """Suffixes under which pickles travel."""
 
@@ -87,11 +87,8 @@ def save_checkpoint(path: Path, network: Any, facts: Facts, *, halve: bool = Tru
     Raises:
         OutputError: It cannot be written.
     """
-    from safetensors.torch import save
-
     tensors = {name: _stored(value, halve) for name, value in network.state_dict().items()}
-    header = {KEY: json.dumps(facts.model_dump(mode="json"), sort_keys=True)}
-    content = save(tensors, header)
+    content = packed(tensors, KEY, json.dumps(facts.model_dump(mode="json"), sort_keys=True))
     write_whole(path, lambda place: place.write_bytes(content))
 
 
@@ -102,7 +99,7 @@ def _stored(value: Tensor, halve: bool) -> Tensor:
 
 def embedded_path() -> Path:
     """The checkpoint that comes with crosscue."""
-    return Path(__file__).with_name("checkpoints") / EMBEDDED
+    return embedded("compact_simulated.safetensors")
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
@@ -113,8 +110,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
             not fit each other.
     """
     content = _content(path)
-    header, tensors = _tensors(content, path)
-    facts = _facts(header, path)
+    description, tensors = unpacked(content, KEY, path)
+    facts = _facts(description, path)
     network = build_network(facts.plan)
     fill(network, tensors, path)
     return Checkpoint(facts, network.eval(), hashlib.sha256(content).hexdigest())
@@ -134,28 +131,14 @@ def _content(path: Path) -> bytes:
         raise VehicleError(f"{path}: {error.strerror}; check the network's file name") from None
 
 
-def _tensors(content: bytes, path: Path) -> tuple[Mapping[str, str], dict[str, Tensor]]:
-    from safetensors import SafetensorError
-    from safetensors.torch import load
-
-    try:
-        tensors = load(content)
-        size = int.from_bytes(content[:8], "little")
-        header = json.loads(content[8 : 8 + size]).get("__metadata__", {})
-    except (SafetensorError, ValueError, RecursionError) as error:
-        why = one_line(error, 120)
-        raise VehicleError(f"{path}: no safetensors file ({why}); is it whole?") from None
-    return header, tensors
-
-
-def _facts(header: Mapping[str, str], path: Path) -> Facts:
-    if KEY not in header:
+def _facts(description: str | None, path: Path) -> Facts:
+    if description is None:
         raise VehicleError(
             f"{path}: says nothing of its classes and size; want one that crosscue train mask-rcnn "
             "wrote"
         )
     try:
-        return Facts.model_validate_json(header[KEY])
+        return Facts.model_validate_json(description)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         name = ".".join(str(part) for part in first["loc"])

@@ -42,6 +42,8 @@ def load_coco(name: str) -> Checkpoint:
     weights = getattr(detection, COCO_NETWORKS[name]).DEFAULT
     place = Path(torch.hub.get_dir()) / "checkpoints" / weights.url.rsplit("/", 1)[-1]
     try:
+        if place.exists():
+            _check_whole(place)
         tensors = weights.get_state_dict(progress=False, check_hash=True, weights_only=True)
     except (URLError, TimeoutError, ConnectionError) as error:
         raise VehicleError(
@@ -54,6 +56,20 @@ def load_coco(name: str) -> Checkpoint:
             f"detector mask-rcnn: {name}: {place} is not usable ({why}); delete it and run again"
         ) from None
     return coco_checkpoint(name, weights, tensors)
+
+
+def _check_whole(path: Path) -> None:
+    """What torchvision does with a file that it has just fetched, and not with one it finds.
+
+    Raises:
+        ValueError: Its hash is not the one in its name.
+        OSError: It cannot be read.
+    """
+    wanted = path.stem.rsplit("-", 1)[-1]
+    with path.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if not found.startswith(wanted):
+        raise ValueError(f"damaged: sha256 {found[:8]}, want {wanted}")
 
 
 def coco_checkpoint(name: str, weights: Any, tensors: Mapping[str, Any]) -> Checkpoint:

@@ -16,6 +16,7 @@ from crosscue.replay.run_folder import write_whole
 
 from .road_network import RoadNetwork
 from .settings import Settings
+from .weights_file import packed, unpacked
 
 KEY: Final = "crosscue-road"
 MOST_BYTES: Final = 64 << 20
@@ -52,14 +53,11 @@ def save_road(path: Path, network: RoadNetwork, facts: RoadFacts) -> None:
     Raises:
         OutputError: It cannot be written.
     """
-    from safetensors.torch import save
-
     kept = {
         name: value.detach().cpu().contiguous().half() if value.is_floating_point() else value.cpu()
         for name, value in network.state_dict().items()
     }
-    header = {KEY: json.dumps(facts.model_dump(mode="json"), sort_keys=True)}
-    content = save(kept, header)
+    content = packed(kept, KEY, json.dumps(facts.model_dump(mode="json"), sort_keys=True))
     write_whole(path, lambda place: place.write_bytes(content))
 
 
@@ -69,28 +67,24 @@ def load_road(path: Path) -> RoadCheckpoint:
     Raises:
         VehicleError: Not there, no safetensors, damaged, or not of a road network.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load
-
     if path.suffix != ".safetensors":
         raise VehicleError(f"{path}: want .safetensors; other files can run programs when read")
     try:
         if path.stat().st_size > MOST_BYTES:
             raise VehicleError(f"{path}: more than {MOST_BYTES:,} bytes; want a road network")
         content = path.read_bytes()
-        tensors = load(content)
-        size = int.from_bytes(content[:8], "little")
-        header = json.loads(content[8 : 8 + size])["__metadata__"][KEY]
-        facts = RoadFacts.model_validate_json(header)
     except OSError as error:
         raise VehicleError(f"{path}: {error.strerror}; check the file name") from None
-    except KeyError:
-        raise VehicleError(
-            f"{path}: not what crosscue train road wrote; give such a file"
-        ) from None
-    except (SafetensorError, ValueError, RecursionError, ValidationError) as error:
+    description, tensors = unpacked(content, KEY, path)
+    if description is None:
+        raise VehicleError(f"{path}: not what crosscue train road wrote; give such a file")
+    try:
+        facts = RoadFacts.model_validate_json(description)
+    except ValidationError as error:
         why = one_line(error, 120)
-        raise VehicleError(f"{path}: no whole road network ({why}); train it again") from None
+        raise VehicleError(
+            f"{path}: its description does not fit ({why}); train it again"
+        ) from None
     network = RoadNetwork()
     if not all(bool(value.isfinite().all()) for value in tensors.values()):
         raise VehicleError(f"{path}: holds numbers that are none; train it again")

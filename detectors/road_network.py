@@ -13,6 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from .weights_file import embedded
+
 WIDTHS: Final = (16, 32, 64, 96)
 """Channels at a half, a quarter, an eighth and a sixteenth of the input's size."""
 DILATIONS: Final = (1, 2, 4, 1)
@@ -85,7 +87,7 @@ def _grown(small: Tensor, like: Tensor) -> Tensor:
 
 def embedded_path() -> Path:
     """The checkpoint that comes with crosscue."""
-    return Path(__file__).parent / "checkpoints" / "road.safetensors"
+    return embedded("road.safetensors")
 
 
 def logits_of(network: Any, pictures: Tensor) -> Tensor:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import pickle
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.error import URLError
 
@@ -20,7 +22,7 @@ from torch import Tensor, nn
 from torchvision.models.detection.roi_heads import paste_masks_in_image
 
 from crosscue.datasets.scenes.camera import Camera
-from crosscue.detectors import rle
+from crosscue.detectors import rle, weights_file
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.devices import chosen_device
 from crosscue.detectors.mask_rcnn import (
@@ -47,6 +49,7 @@ from crosscue.detectors.mask_rcnn_network import Plan, build_network, set_limits
 from crosscue.detectors.mask_rcnn_parts import Body, Parts, as_input
 from crosscue.detectors.model_detector import overlaps
 from crosscue.detectors.registry import Choice, make
+from crosscue.detectors.weights_file import SUM
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import CrosscueError, VehicleError
 from support.mask_rcnn import CLASSES, CPU, noise_frame, plan_of, random_checkpoint
@@ -304,6 +307,15 @@ def _file(tmp_path: Path, facts: str | None, tensors: dict[str, Tensor] | None =
     return path
 
 
+@cache
+def _written() -> bytes:
+    plain = random_checkpoint()
+    with TemporaryDirectory() as name:
+        path = Path(name) / "one.safetensors"
+        save_checkpoint(path, plain.network, plain.facts)
+        return path.read_bytes()
+
+
 def _json(**changes: Any) -> str:
     return Facts(plan=plan_of(**changes)).model_dump_json()
 
@@ -384,6 +396,46 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path, content: bytes) -> None
 
     with pytest.raises(VehicleError, match="no safetensors file"):
         build(network=str(path))
+
+
+@given(at=st.floats(0.0, 1.0), bit=st.integers(0, 7))
+@settings(max_examples=60, deadline=None)
+def test_a_flipped_bit_is_never_another_network(at: float, bit: int) -> None:
+    content = bytearray(_written())
+    place = round(at * (len(content) - 1))
+    content[place] ^= 1 << bit
+    with TemporaryDirectory() as name:
+        path = Path(name) / "flipped.safetensors"
+        path.write_bytes(content)
+        # A bit of the sum's own name leaves a file without a sum, as older ones are: whole.
+        if SUM.encode() in content:
+            with pytest.raises(VehicleError, match="flipped"):
+                load_checkpoint(path)
+
+
+def test_the_embedded_networks_are_those_that_were_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = bytearray(embedded_path().read_bytes())
+    content[-1000] ^= 1
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / embedded_path().name).write_bytes(content)
+    monkeypatch.setattr(weights_file, "__file__", str(tmp_path / "weights_file.py"))
+
+    with pytest.raises(VehicleError, match="damaged: want sha256 270a84"):
+        build(network="embedded")
+
+
+def test_coco_weights_that_were_damaged_on_the_disk_are_not_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    folder = tmp_path / "hub" / "checkpoints"
+    folder.mkdir(parents=True)
+    (folder / "maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth").write_bytes(b"half of it")
+
+    with pytest.raises(VehicleError, match=r"damaged: sha256 .*, want bf2d0c1e.*delete it"):
+        build(network="resnet50")
 
 
 def test_a_wrong_name_or_setting_says_what_there_is(tmp_path: Path) -> None:

@@ -109,8 +109,13 @@ def test_files_that_are_no_road_networks_are_refused(tmp_path: Path) -> None:
     other = tmp_path / "other.safetensors"
     save_file({"a": torch.zeros(1)}, other)
 
-    with pytest.raises(VehicleError, match=r"cut.safetensors: no whole road network"):
+    with pytest.raises(VehicleError, match=r"cut.safetensors: no safetensors file"):
         load_road(cut)
+    flipped = tmp_path / "flipped.safetensors"
+    flipped.write_bytes(whole.read_bytes()[:-1] + bytes([whole.read_bytes()[-1] ^ 1]))
+
+    with pytest.raises(VehicleError, match=r"flipped.safetensors: damaged"):
+        load_road(flipped)
     with pytest.raises(VehicleError, match=r"other.safetensors: not what crosscue train road"):
         load_road(other)
     with pytest.raises(VehicleError, match=r"r.pth: want .safetensors"):
