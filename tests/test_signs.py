@@ -169,6 +169,9 @@ def test_fit_signs_chooses_on_some_frames_and_measures_on_others(
     told = capsys.readouterr().out
     assert "least_score = " in told
     assert "precision 1.00 (4 of 4; 95 % interval 0.51 to 1.00)" in told
+    printed = told.split()[2]
+    assert run(["fit", "signs", str(labels), "--label", "one way left", "--score", printed]) == 0
+    assert capsys.readouterr().out == told
 
 
 def coco(folder: Path, seeds: range) -> Path:
@@ -265,7 +268,7 @@ def test_a_given_threshold_is_measured_not_chosen(
     assert run(["fit", "signs", fitted, "--label", "one way left", "--score", "0.99"]) == 0
 
     told = capsys.readouterr().out
-    assert "least_score = 0.990" in told
+    assert "least_score = 0.99\n" in told
     assert "recall    0.00 (0 of 2; " in told
 
 

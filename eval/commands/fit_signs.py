@@ -78,12 +78,17 @@ def run(args: argparse.Namespace) -> int:
         )
     score = args.score
     if score is None:
-        score = threshold_for(together(fitted), args.precision)
+        score = _shown(threshold_for(together(fitted), args.precision))
     if args.json:
         print_json(_as_json(score, fitted, tested))
     elif not args.quiet:
         print(_told(score, fitted, tested, args.precision))
     return 0 if score is not None else 1
+
+
+def _shown(score: float | None) -> float | None:
+    """With as many digits as are printed, rounded down: what is told is told of that number."""
+    return None if score is None else math.floor(score * 1e6) / 1e6
 
 
 def _judged(args: argparse.Namespace) -> tuple[list[Judged], list[Judged]]:
@@ -133,7 +138,7 @@ def _told(
     if score is None:
         signs = sum(part.signs for part in fitted)
         return f"no threshold reaches precision {precision} on {signs} signs"
-    lines = [f"least_score = {score:.3f}"]
+    lines = [f"least_score = {score:g}"]
     for name, parts in (("chosen on", fitted), ("other frames", tested)):
         rates = _rates(parts, score)
         lines.append(f"{name:13} {_share_told('precision', rates.precision)}")
