@@ -148,6 +148,28 @@ def test_simulated_errors_are_as_claimed_and_no_larger_than_the_filters() -> Non
     assert np.median(ends) < 0.2
 
 
+def test_at_the_end_of_hours_without_landmarks_it_knows_what_the_filter_knows() -> None:
+    """Position is held a hundred million times more loosely than each step: seed 5, 24 km."""
+    rng, n = np.random.default_rng(5), 12_000
+    settings = OdometrySettings(
+        track_width_m=TRACK_M, slip_per_sqrt_m=2e-3, wheel_turn_rad_per_sqrt_m=3e-3, max_gap_s=2.0
+    )
+    t_ns = np.arange(n + 1, dtype=np.int64) * 1_000_000_000
+    speeds = 2.0 + np.outer(rng.normal(0.0, 3e-3 * math.sqrt(2.0), n + 1), [-0.5, 0.5]) * TRACK_M
+    made = integrate(WheelSpeeds(t_ns, speeds), settings).increments
+    first = start_belief(0, 0.0, 0.0, 0.0, 2.0, 1.0, 0.09, 1.0)
+    headings = Headings(t_ns[1:], rng.normal(0.0, 0.2, n), np.full(n, 0.04))
+    end = advance(TrackState(first), made, EVERY_READING, headings).poses
+    found = smooth(first, made, headings, at_ns=t_ns[[-1]])
+
+    sd_m = math.sqrt(found.cov[0, 1, 1])
+    assert 20.0 < sd_m < 60.0
+    assert found.xyh[0, 1] == pytest.approx(end.y_m[-1], abs=0.02 * sd_m)
+    # Along the way a filter that linearises at noisy headings falls short by a little.
+    assert found.xyh[0, 0] == pytest.approx(end.x_m[-1], abs=10.0)
+    assert sd_m == pytest.approx(math.sqrt(end.cov_xyh[-1, 3]), rel=0.1)
+
+
 def test_the_camera_ahead_of_the_axle_is_where_the_fix_is() -> None:
     made = straight(4, 0.5)
     start = start_belief(0, 0.0, 0.0, 0.0, 10.0, 10.0, 1e-4, 1.0)
