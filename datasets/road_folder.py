@@ -9,12 +9,11 @@ import numpy as np
 
 from crosscue.datasets.scenes.road_frames import RoadFrames, shrunk
 from crosscue.detectors.base import View
-from crosscue.detectors.pictures import Encoded, decode
+from crosscue.detectors.pictures import decode, read_file
 from crosscue.replay.columns import Bytes
-from crosscue.replay.errors import LogFormatError, LogTooLargeError, UsageError
-from crosscue.replay.limits import DEFAULT
+from crosscue.replay.errors import LogError, UsageError
 
-CODINGS: Final = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".webp": "webp", ".bmp": "bmp"}
+SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 
 
 def load_folder(folder: Path, size_px: tuple[int, int]) -> RoadFrames:
@@ -29,10 +28,10 @@ def load_folder(folder: Path, size_px: tuple[int, int]) -> RoadFrames:
             does not decode.
     """
     images = sorted(
-        path for path in (folder / "images").glob("*") if path.suffix.lower() in CODINGS
+        path for path in (folder / "images").glob("*") if path.suffix.lower() in SUFFIXES
     )
     if not images:
-        raise UsageError(f"{folder / 'images'}: no pictures; want {', '.join(CODINGS)}")
+        raise UsageError(f"{folder / 'images'}: no pictures; want {', '.join(SUFFIXES)}")
     pixels, road = [], []
     for path in images:
         picture = _decoded(path, View())
@@ -49,11 +48,8 @@ def load_folder(folder: Path, size_px: tuple[int, int]) -> RoadFrames:
 
 def _decoded(path: Path, view: View) -> Bytes:
     try:
-        if path.stat().st_size > DEFAULT.message_bytes:
-            raise UsageError(f"{path}: more than {DEFAULT.message_bytes:,} bytes; want a picture")
-        content = path.read_bytes()
-        return decode(Encoded(CODINGS[path.suffix.lower()], memoryview(content)), view)[0]
+        return decode(read_file(path), view)[0]
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}; every picture wants its mask") from None
-    except (LogFormatError, LogTooLargeError) as error:
+    except LogError as error:
         raise UsageError(f"{path}: {error}; mend it or take it out") from None

@@ -7,12 +7,15 @@ is ignored: calibration belongs to the pixels as the sensor gave them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from crosscue.replay.columns import Bytes, Images
+from crosscue.replay.decode.coding import MAGIC_BYTES, coding_of
 from crosscue.replay.errors import LogFormatError, LogTooLargeError
+from crosscue.replay.limits import DEFAULT
 from crosscue.replay.picture_sizes import size_in_header
 from crosscue.replay.readers.picture_bytes import damage_of
 
@@ -47,6 +50,24 @@ def encoded(images: Images, row: int) -> Encoded:
         return Encoded(coding, content)
     width, height, step = (0 if column is None else int(column[row]) for column in columns)
     return Encoded(coding, content, (width, height, step, images.pixel_format[row]))
+
+
+def read_file(path: Path) -> Encoded:
+    """A picture file's bytes; what they code is told by the first of them, not by the name.
+
+    Raises:
+        OSError: It cannot be read.
+        LogFormatError: No picture that is known here.
+        LogTooLargeError: Larger than one encoded picture may be.
+    """
+    with path.open("rb") as file:
+        content = file.read(DEFAULT.message_bytes + 1)
+    if len(content) > DEFAULT.message_bytes:
+        raise LogTooLargeError(f"more than {DEFAULT.message_bytes:,} bytes in one picture")
+    coding = coding_of(content[:MAGIC_BYTES], "")
+    if coding is None:
+        raise LogFormatError("not a JPEG, PNG or WebP picture" if content else "empty picture")
+    return Encoded(coding, memoryview(content))
 
 
 def size_of(picture: Encoded) -> tuple[int, int]:

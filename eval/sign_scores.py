@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from crosscue.detectors.base import Detections, Detector, Frame
-from crosscue.detectors.pictures import Encoded, decode
+from crosscue.detectors.pictures import decode, read_file
 from crosscue.detectors.sign_threshold import Judged, judge, together
 from crosscue.replay.columns import Floats
-from crosscue.replay.decode.coding import MAGIC_BYTES, coding_of
 from crosscue.replay.errors import LogError, UsageError
-from crosscue.replay.limits import DEFAULT
 
 from .sign_drives import drive_pictures
 from .sign_labels import Labelled, read_labels
@@ -64,9 +62,11 @@ def _labelled(path: Path) -> Iterator[Labelled]:
 
 
 def _judged(one: Labelled, detector: Detector, rules: Rules) -> Judged:
-    picture = _read(one.picture) if isinstance(one.picture, Path) else one.picture
     try:
+        picture = read_file(one.picture) if isinstance(one.picture, Path) else one.picture
         pixels, size = decode(picture, detector.view)
+    except OSError as error:
+        raise UsageError(f"{one.name}: {error.strerror}; check the picture column") from None
     except LogError as error:
         raise UsageError(f"{one.name}: {error}; mend the picture or leave it out") from None
     width, height = size
@@ -81,15 +81,3 @@ def _judged(one: Labelled, detector: Detector, rules: Rules) -> Judged:
         which = np.array([name == label for name in found.labels], np.bool_)
         parts.append(judge(found.boxes_px[which], found.scores[which], truth, *rules.of_judge))
     return together(parts)
-
-
-def _read(path: Path) -> Encoded:
-    try:
-        with path.open("rb") as file:
-            content = file.read(DEFAULT.message_bytes)
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}; check the picture column") from None
-    coding = coding_of(content[:MAGIC_BYTES], "")
-    if coding is None:
-        raise UsageError(f"{path}: not a JPEG, PNG or WebP picture")
-    return Encoded(coding, memoryview(content))

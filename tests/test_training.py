@@ -21,7 +21,7 @@ from crosscue.detectors.sign_threshold import Judged
 from crosscue.detectors.training.annotations import LabelledSet, mask_of, read_coco
 from crosscue.detectors.training.calibration import fitted, judged
 from crosscue.detectors.training.loop import Schedule, Training
-from crosscue.detectors.training.samples import Sampler, Window
+from crosscue.detectors.training.samples import Sampler, Window, read_picture
 from crosscue.detectors.training.scores import average_precisions
 from crosscue.eval.cli import run
 from crosscue.replay.errors import CrosscueError, SchemaError
@@ -145,6 +145,17 @@ def test_a_picture_of_another_size_than_annotated_is_refused(tmp_path: Path) -> 
 
     with pytest.raises(SchemaError, match=r"0\.png: want a picture of 130 x 97"):
         [sampler(number) for number in range(20)]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.98])
+def test_a_picture_cut_short_is_not_learnt_from(tmp_path: Path, share: float) -> None:
+    labelled = _bars(tmp_path)
+    path = labelled.pictures[0].path
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+
+    with pytest.raises(SchemaError, match=rf"{path.name}: .*leave it out of the annotations"):
+        read_picture(labelled.pictures[0])
 
 
 def test_all_spellings_of_a_mask_mean_the_same_pixels(tmp_path: Path) -> None:

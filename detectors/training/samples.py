@@ -13,9 +13,11 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from crosscue.detectors.base import View
 from crosscue.detectors.mask_rcnn_network import MEAN, SPREAD, Plan
+from crosscue.detectors.pictures import decode, read_file
 from crosscue.replay.columns import Bytes, Floats
-from crosscue.replay.errors import SchemaError
+from crosscue.replay.errors import LogError, SchemaError
 
 from .annotations import Box, Labelled, LabelledPicture, LabelledSet, mask_of
 
@@ -68,20 +70,23 @@ def read_picture(picture: LabelledPicture) -> Bytes:
     """Pixels, blue green red, (H, W, 3).
 
     Raises:
-        SchemaError: Not a picture, or of another size than annotated.
+        SchemaError: No picture, cut short, or of another size than annotated.
     """
-    import cv2
-
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    content = np.fromfile(picture.path, np.uint8)
-    pixels = cv2.imdecode(content, flags) if len(content) else None
-    if pixels is None or pixels.shape[:2] != picture.size_px[::-1]:
+    try:
+        pixels, size = decode(read_file(picture.path), View())
+    except OSError as error:
+        raise SchemaError(f"{picture.path}: {error.strerror}; check the file") from None
+    except LogError as error:
+        raise SchemaError(
+            f"{picture.path}: {error}; mend the file or leave it out of the annotations"
+        ) from None
+    if size != picture.size_px:
         width, height = picture.size_px
         raise SchemaError(
-            f"{picture.path}: want a picture of {width} x {height}, as its annotations say; "
-            "mend the file or leave it out of the annotations"
+            f"{picture.path}: want a picture of {width} x {height}, as its annotations say, got "
+            f"{size[0]} x {size[1]}; mend the file or leave it out of the annotations"
         )
-    return np.asarray(pixels, np.uint8)
+    return pixels
 
 
 def normalised(pixels: Bytes) -> NDArray[np.float32]:
