@@ -93,6 +93,24 @@ def test_a_detector_of_ones_own_writes_tables(tmp_path: Path) -> None:
     assert set(found["label"].to_pylist()) == {"bright"}
 
 
+def test_a_detector_of_an_installed_package_is_asked_for_by_its_entry_points_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    info = tmp_path / "packages" / "own_pack-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own-pack\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[crosscue.detectors]\nown = support.detecting:build\n")
+    monkeypatch.syspath_prepend(str(info.parent))
+    log = str(_folder(tmp_path))
+
+    args = ["-o", str(tmp_path / "run"), "--no-cache", "-q"]
+    assert run(["detect", log, "--detectors", "own", *args]) == 0
+    assert open_run(tmp_path / "run").table("detections")["detector"].to_pylist() == ["own"] * 5
+
+    assert run(["detect", log, "--detectors", "owm", "--overwrite", *args]) == 2
+    assert "detector 'owm': no such name; did you mean own?" in capsys.readouterr().err
+
+
 def test_a_second_run_takes_all_from_the_cache_and_gives_the_same(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
