@@ -59,9 +59,16 @@ def _told(fitted: CompassFit) -> str:
         f"{fitted.coverage_deg} degrees of the circle",
         f"fitted      {', '.join(fitted.observable) or 'nothing'}",
         *(f"not seen    {name}: {reason}" for name, reason in fitted.not_observable),
-        f"mounting    {math.degrees(turn_deg):.2f} +- "
-        f"{math.degrees(fitted.mounting_yaw_sd_rad):.2f} degrees",
-        f"residual    s.d. {sd_deg:.2f} degrees, persists for {bound}{fitted.persists_s:.1f} s",
+        *(
+            ["residual    not known: there is no reference heading"]
+            if math.isnan(sd_deg)
+            else [
+                f"mounting    {math.degrees(turn_deg):.2f} +- "
+                f"{math.degrees(fitted.mounting_yaw_sd_rad):.2f} degrees",
+                f"residual    s.d. {sd_deg:.2f} degrees, persists for {bound}"
+                f"{fitted.persists_s:.1f} s",
+            ]
+        ),
         "",
         "[compass]",
         *(f"{key} = {value}" for key, value in section_of(fitted).items()),
