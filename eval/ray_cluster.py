@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from typing import Any, Final
 from crosscue.replay.errors import CrosscueError, UsageError, one_line
 
 LOCAL: Final = "local"
+WAIT_S: Final = 5.0
 STORE_BYTES: Final = 96 << 20
 """Results are small; what a local cluster sets aside for them."""
 
@@ -48,6 +50,24 @@ def joined(address: str, workers: int | None = None) -> Iterator[Any]:
             ray.shutdown()
 
 
+def _knock(address: str) -> None:
+    """Refuse an address where nobody listens: Ray itself tries for many minutes.
+
+    Raises:
+        CrosscueError: Nobody listens there.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not (host and port.isdecimal()):
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), WAIT_S).close()
+    except (OSError, OverflowError) as error:
+        raise CrosscueError(
+            f"--ray {address}: nobody listens there ({one_line(error)}); start a cluster with ray "
+            f"start, or give {LOCAL}"
+        ) from None
+
+
 def _connect(ray: Any, address: str, workers: int | None) -> None:
     is_main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGTERM) if is_main else None
@@ -57,6 +77,7 @@ def _connect(ray: Any, address: str, workers: int | None) -> None:
             "num_cpus": workers, "include_dashboard": False,
             "object_store_memory": STORE_BYTES, "_node_ip_address": "127.0.0.1",
         }  # fmt: skip
+    _knock(address)
     try:
         ray.init(address=address, **options)
     except (ConnectionError, RuntimeError, ValueError, OSError) as error:

@@ -1,6 +1,7 @@
 """Joining a Ray cluster takes nothing over and tells nobody."""
 
 import signal
+import socket
 import sys
 from importlib.util import find_spec
 
@@ -41,6 +42,15 @@ def test_a_cluster_that_is_not_there_is_one_line() -> None:
         joined("no_such").__enter__()
 
     assert "\n" not in str(caught.value)
+
+
+@needs_ray
+def test_an_address_where_nobody_listens_is_told_at_once() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    with pytest.raises(CrosscueError, match=f"--ray {address}: nobody listens there"):
+        joined(address).__enter__()
 
 
 def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
