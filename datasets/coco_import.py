@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.limits import MIB
 
@@ -24,9 +25,10 @@ def read_coco(path: Path) -> Annotations:
         SchemaError: Not there, not COCO, or references that lead nowhere.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
             raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split it")
-        tree = json.loads(path.read_text(encoding="utf-8"))
+        tree = json.loads(content)
     except (OSError, ValueError, RecursionError) as error:
         raise SchemaError(f"{path}: not readable as JSON ({error}); give a COCO file") from None
     if not isinstance(tree, dict):

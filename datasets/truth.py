@@ -14,12 +14,15 @@ from typing import Annotated, Any, Final, Literal, Protocol, cast, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import SchemaError, UsageError
+from crosscue.replay.limits import MIB
 from crosscue.replay.misfit import explain
 from crosscue.replay.run_folder import strict_json, write_text
 
 VERSION: Final = 1
 FILE: Final = "truth.json"
+MOST_BYTES: Final = 256 * MIB
 
 CARRIED: Final[dict[str, str]] = {
     "comma2k19": "crosscue.datasets.comma2k19_truth:write",
@@ -173,8 +176,10 @@ def load(path: Path) -> Truth:
     """
     path = path / FILE if path.is_dir() else path
     try:
-        text = path.read_text(encoding="utf-8")
-        tree = json.loads(text, object_pairs_hook=_no_twins)
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
+            raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
+        tree = json.loads(content, object_pairs_hook=_no_twins)
         truth = Truth.model_validate(tree)
     except ValidationError as error:
         raise SchemaError(explain(error, None, str(path), Truth)) from None

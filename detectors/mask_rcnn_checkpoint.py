@@ -16,6 +16,7 @@ import torch
 from pydantic import Field, ValidationError
 from torch import Tensor
 
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.run_folder import write_whole
 
@@ -124,11 +125,12 @@ def _content(path: Path) -> bytes:
             "(convert with safetensors.torch.save_file where you trust the file)"
         )
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise VehicleError(f"{path}: more than {MOST_BYTES:,} bytes; want a checkpoint")
-        return path.read_bytes()
+        content = read_at_most(path, MOST_BYTES)
     except OSError as error:
         raise VehicleError(f"{path}: {error.strerror}; check the network's file name") from None
+    if content is None:
+        raise VehicleError(f"{path}: more than {MOST_BYTES:,} bytes; want a checkpoint")
+    return content
 
 
 def _facts(description: str | None, path: Path) -> Facts:

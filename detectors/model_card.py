@@ -19,10 +19,11 @@ from __future__ import annotations
 import hashlib
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, ValidationError
 
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.limits import MIB
 from crosscue.replay.misfit import explain
@@ -30,8 +31,9 @@ from crosscue.replay.vehicle import tuples
 
 from .settings import Settings, Share
 
-MOST_BYTES = 2048 * MIB
+MOST_BYTES: Final = 2048 * MIB
 """Largest weights read."""
+MOST_CARD_BYTES: Final = 1 * MIB
 Side = Annotated[int, Field(gt=0, le=8192)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Colour = tuple[Finite, Finite, Finite]
@@ -111,7 +113,10 @@ def read_card(path: Path) -> ModelCard:
         VehicleError: Not there, not TOML, or a key or value that does not fit; with the line.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        content = read_at_most(path, MOST_CARD_BYTES)
+        if content is None:
+            raise VehicleError(f"{path}: over {MOST_CARD_BYTES // MIB} MiB; this is no model card")
+        text = content.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise VehicleError(f"{path}: {why}; give a model card") from None
@@ -142,9 +147,9 @@ def read_weights(card: ModelCard, folder: Path) -> Weights:
 
 def _verified(path: Path, want: str, key: str) -> bytes:
     try:
-        if path.stat().st_size > MOST_BYTES:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
             raise VehicleError(f"{path}: over {MOST_BYTES // MIB} MiB; not read")
-        content = path.read_bytes()
     except OSError as error:
         raise VehicleError(f"{path}: {error.strerror}; put the weights next to the card") from None
     found = hashlib.sha256(content).hexdigest()

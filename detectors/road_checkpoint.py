@@ -11,6 +11,7 @@ from typing import Annotated, Final
 import torch
 from pydantic import Field, ValidationError
 
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import VehicleError, one_line
 from crosscue.replay.run_folder import write_whole
 
@@ -70,9 +71,9 @@ def load_road(path: Path) -> RoadCheckpoint:
     if path.suffix != ".safetensors":
         raise VehicleError(f"{path}: want .safetensors; other files can run programs when read")
     try:
-        if path.stat().st_size > MOST_BYTES:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
             raise VehicleError(f"{path}: more than {MOST_BYTES:,} bytes; want a road network")
-        content = path.read_bytes()
     except OSError as error:
         raise VehicleError(f"{path}: {error.strerror}; check the file name") from None
     description, tensors = unpacked(content, KEY, path)

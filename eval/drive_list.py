@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import LogError, UnknownFormatError, UsageError
 from crosscue.replay.limits import MIB
 from crosscue.replay.log import FORMATS, format_of
@@ -146,9 +147,10 @@ def _stem(name: str) -> str:
 
 def _listed(path: Path, *, each: bool) -> Iterator[_Found]:
     try:
-        if path.stat().st_size > LIST_BYTES:
+        content = read_at_most(path, LIST_BYTES)
+        if content is None:
             raise UsageError(f"@{path}: larger than {LIST_BYTES // MIB} MiB; give a list of logs")
-        lines = path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+        lines = content.decode("utf-8", "surrogateescape").splitlines()
     except OSError as error:
         raise UsageError(f"@{path}: {error.strerror}; give a text file") from None
     count = 0

@@ -23,6 +23,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import UsageError
 from crosscue.replay.limits import MIB
 from crosscue.replay.misfit import explain
@@ -93,9 +94,10 @@ def load_gates(path: Path) -> tuple[Gate, ...]:
         UsageError: Not there, not TOML, or not what version 1 says.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
             raise UsageError(f"{path}: over {MOST_BYTES // MIB} MiB; this is no gate file")
-        text = path.read_text(encoding="utf-8")
+        text = content.decode("utf-8")
         tree = tomllib.loads(text)
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise UsageError(f"{path}: not readable as TOML ({error}); mend it") from None

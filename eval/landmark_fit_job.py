@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Iterator
 from functools import lru_cache
@@ -17,11 +18,14 @@ from crosscue.localization.landmark_database import LandmarkDatabase, Nearby
 from crosscue.localization.landmark_features import Features, Matcher
 from crosscue.localization.landmark_fit import ScoredPairs
 from crosscue.localization.landmark_pictures import grey_of, read_picture
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import LogError, SchemaError
+from crosscue.replay.limits import MIB
 
 from .landmark_job import CameraPoses, Frame, place_at
 
 MOST_PAIRS: Final = 1_000_000
+MOST_PAIR_BYTES: Final = 256 * MIB
 SAME_TURN_RAD: Final = math.pi / 4
 """Pictures taken in directions further apart are no pair of either kind when they are near."""
 _LABELS: Final = {"1": True, "0": False, "true": True, "false": False}
@@ -52,7 +56,10 @@ def pairs_of_table(path: Path, matcher: Matcher) -> ScoredPairs:
 
 def _labelled(path: Path) -> Iterator[tuple[str, str, bool]]:
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        content = read_at_most(path, MOST_PAIR_BYTES)
+        if content is None:
+            raise SchemaError(f"{path}: more than {MOST_PAIR_BYTES // MIB} MiB; split it")
+        with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
             table = csv.DictReader(file)
             if not {"query", "known", "same"} <= set(table.fieldnames or ()):
                 raise SchemaError(f"{path}:1: want columns query,known,same; mend the header")

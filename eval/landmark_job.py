@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from crosscue.localization.landmark_pictures import (
     picture_of,
     read_picture,
 )
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.columns import Block, Floats, Images, Int64s
 from crosscue.replay.errors import LogError, SchemaError, UsageError, VehicleError
 from crosscue.replay.ledger import Ledger
@@ -263,9 +265,10 @@ def read_coordinates(path: Path, source: str) -> Iterator[tuple[str, Place]]:
         SchemaError: As there.
     """
     try:
-        if path.stat().st_size > MOST_COORDINATE_BYTES:
+        content = read_at_most(path, MOST_COORDINATE_BYTES)
+        if content is None:
             raise SchemaError(f"{path}: more than {MOST_COORDINATE_BYTES >> 20} MiB; split it")
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file)
             known = set(rows.fieldnames or ())
             missing = _PLACE_COLUMNS - known

@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from crosscue.datasets.truth import FILE, load
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError, UsageError
 from crosscue.replay.limits import MIB
@@ -46,8 +47,6 @@ def pairs_of_table(path: Path) -> RangePairs:
         UsageError: Not there, too large, or without these columns.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise UsageError(f"{path}: over {MOST_BYTES // MIB} MiB; give fewer rows")
         columns = _parquet(path) if path.suffix == ".parquet" else _csv(path, RangePairs._fields)
     except OSError as error:
         raise UsageError(
@@ -140,8 +139,6 @@ def _true_ranges(truth: Path, cue: str) -> tuple[Int64s, Floats]:
         raise SchemaError(f"{truth}: has no ranges; name a file with them as ranges")
     path = _folder(truth) / name
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
         t_ns, range_m = _csv(path, ("t_ns", REFERENCES[cue]))
     except (OSError, UnicodeDecodeError, KeyError, ValueError) as error:
         raise SchemaError(f"{path}: no table of true ranges ({error}); mend it") from None
@@ -155,9 +152,10 @@ def _objects(truth: Path) -> Any:
         raise SchemaError(f"{truth}: has no objects; name a COCO file with them as objects")
     path = _folder(truth) / name
     try:
-        if path.stat().st_size > MOST_BYTES:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
             raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(content)
     except (OSError, ValueError, RecursionError) as error:
         raise SchemaError(f"{path}: not readable as JSON ({error}); mend it") from None
 
@@ -167,7 +165,10 @@ def _folder(truth: Path) -> Path:
 
 
 def _csv(path: Path, names: tuple[str, ...]) -> tuple[Floats, ...]:
-    rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+    content = read_at_most(path, MOST_BYTES)
+    if content is None:
+        raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; give fewer rows")
+    rows = list(csv.DictReader(content.decode("utf-8").splitlines()))
     # Nanoseconds since 1970 are kept to 256 ns, which is near enough to find a picture by.
     return tuple(np.array([float(row[name] or "nan") for row in rows]) for name in names)
 

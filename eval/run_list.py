@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.run_folder import MANIFEST, RunFolder
 
@@ -92,9 +93,10 @@ def _is_merged(folder: Path) -> bool:
 
 def _lines(path: Path) -> list[str]:
     try:
-        if path.stat().st_size > LIST_BYTES:
+        content = read_at_most(path, LIST_BYTES)
+        if content is None:
             raise UsageError(f"@{path}: larger than {LIST_BYTES >> 20} MiB; give a list of runs")
-        lines = path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+        lines = content.decode("utf-8", "surrogateescape").splitlines()
     except OSError as error:
         raise UsageError(f"@{path}: {error.strerror}; give a text file") from None
     named = [line.strip() for line in lines if line.strip() and not line.startswith("#")]

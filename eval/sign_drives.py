@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.detectors.pictures import Encoded, encoded
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.columns import Block, Images
 from crosscue.replay.errors import LogError, SchemaError
 from crosscue.replay.ledger import Ledger
@@ -38,9 +39,10 @@ def drive_pictures(folder: Path) -> Iterator[Labelled]:
 
 def _boxes(path: Path) -> dict[int, Boxes]:
     try:
-        if path.stat().st_size > MOST_BYTES:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
             raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
-        text = path.read_text(encoding="utf-8")
+        text = content.decode("utf-8")
     except OSError as error:
         raise SchemaError(
             f"{path}: {error.strerror}; labels of a drive's signs stand there"

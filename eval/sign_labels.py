@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.detectors.pictures import Encoded
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import UsageError
 from crosscue.replay.limits import MIB
 
@@ -48,9 +49,10 @@ def read_labels(path: Path) -> list[Labelled]:
 
 def _text(path: Path) -> str:
     try:
-        if path.stat().st_size > MOST_BYTES:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
             raise UsageError(f"{path}: over {MOST_BYTES // MIB} MiB; split it")
-        return path.read_text(encoding="utf-8")
+        return content.decode("utf-8")
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}; {_WANTED}") from None
     except UnicodeDecodeError:

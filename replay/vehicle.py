@@ -15,13 +15,16 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, ValidationError, field_validator
 
+from .bounded import read_at_most
 from .errors import VehicleError
 from .fusion_settings import CUES, Fusion, Name, RangeFilter
+from .limits import MIB
 from .misfit import explain
 from .past_settings import Past
 from .settings_section import Finite, NotNegative, Positive, Section
 
 VERSION: Final = 1
+MOST_BYTES: Final = 1 * MIB
 DEGREE: Final = math.pi / 180.0
 
 Vector = tuple[Finite, Finite, Finite]
@@ -296,7 +299,10 @@ def load(path: Path) -> Vehicle:
         VehicleError: Not there, not TOML, or a key or value that does not fit; with the line.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
+            raise VehicleError(f"{path}: over {MOST_BYTES // MIB} MiB; this is no vehicle file")
+        text = content.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise VehicleError(f"{path}: {why}; make one with: crosscue vehicle init LOG") from None

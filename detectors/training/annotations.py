@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors import rle
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import SchemaError
 
@@ -126,9 +127,10 @@ def _why(left_out: Counter[str]) -> str:
 
 def _tree(path: Path) -> Mapping[str, Any]:
     try:
-        if path.stat().st_size > MOST_BYTES:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
             raise SchemaError(f"{path}: more than {MOST_BYTES:,} bytes of annotations; split it")
-        tree = json.loads(path.read_bytes())
+        tree = json.loads(content)
     except OSError as error:
         raise SchemaError(f"{path}: {error.strerror}; want a COCO file") from None
     except (ValueError, RecursionError) as error:

@@ -21,6 +21,7 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from crosscue.localization.drive_settings import City, Drive, Share
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.misfit import explain
 from crosscue.replay.settings_section import Section
@@ -195,11 +196,10 @@ def load_study(path: Path, kind: type[Study]) -> Study:
             with the line.
     """
     try:
-        if path.exists() and not path.is_file():
-            raise StudyFileError(f"{path}: no regular file; give a study file")
-        if path.stat().st_size > LARGEST_FILE:
+        content = read_at_most(path, LARGEST_FILE)
+        if content is None:
             raise StudyFileError(f"{path}: larger than {LARGEST_FILE} bytes; give a study file")
-        text = path.read_text(encoding="utf-8")
+        text = content.decode("utf-8")
         tree = tomllib.loads(text)
     except OSError as error:
         raise StudyFileError(f"{path}: {error.strerror}; check the path") from None
