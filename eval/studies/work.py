@@ -21,7 +21,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crosscue.eval.ray_cluster import joined
-from crosscue.localization import drive_kernel
+from crosscue.localization import (
+    angles,
+    city,
+    drive_kernel,
+    drive_settings,
+    drive_simulator,
+    random_stream,
+)
 from crosscue.localization.drive_kernel import Keys, drive_many
 from crosscue.localization.drive_settings import Drive
 from crosscue.localization.drive_simulator import Result
@@ -38,6 +45,8 @@ if TYPE_CHECKING:
 CHUNK_DRIVES: Final = 100
 CHUNKS: Final = "chunks"
 DRIVES: Final = "drives"
+_COMPILED: Final = (angles, city, drive_kernel, drive_settings, drive_simulator, random_stream)
+"""The kernel and what it takes its constants from."""
 DriveMany = Callable[[Drive, Keys], Floats]
 
 
@@ -183,7 +192,7 @@ def _chunk_schema() -> pa.Schema:
 
 @cache
 def _code() -> bytes:
-    return Path(drive_kernel.__file__).read_bytes()
+    return b"".join(Path(str(module.__file__)).read_bytes() for module in _COMPILED)
 
 
 def _read(kept: RunFolder, chunk: Chunk) -> dict[str, Floats] | None:
