@@ -43,8 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--label", required=True, nargs="+",
                         help="the labels to choose one threshold for")  # fmt: skip
     parser.add_argument(
-        "--kinds", nargs="+", default=list(AMERICAN), choices=KINDS, help="drawings to look for"
-    )
+        "--kinds", nargs="+", default=list(AMERICAN), choices=KINDS, metavar="KIND",
+        help=f"drawings to look for, of: {', '.join(KINDS)}",
+    )  # fmt: skip
     parser.add_argument("--crop-top", type=float, default=0.0, help="share not searched")
     parser.add_argument("--crop-bottom", type=float, default=0.25, help="share not searched")
     parser.add_argument(
