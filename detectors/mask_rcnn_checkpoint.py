@@ -18,7 +18,7 @@ from torch import Tensor
 
 from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import VehicleError
-from crosscue.replay.run_folder import write_whole
+from crosscue.replay.run_folder import write_bytes
 
 from .mask_rcnn_network import Plan, build_network
 from .settings import Settings
@@ -90,7 +90,7 @@ def save_checkpoint(path: Path, network: Any, facts: Facts, *, halve: bool = Tru
     """
     tensors = {name: _stored(value, halve) for name, value in network.state_dict().items()}
     content = packed(tensors, KEY, json.dumps(facts.model_dump(mode="json"), sort_keys=True))
-    write_whole(path, lambda place: place.write_bytes(content))
+    write_bytes(path, content)
 
 
 def _stored(value: Tensor, halve: bool) -> Tensor:

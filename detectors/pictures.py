@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.columns import Bytes, Images
 from crosscue.replay.decode.coding import MAGIC_BYTES, coding_of
 from crosscue.replay.errors import LogFormatError, LogTooLargeError
@@ -52,7 +53,7 @@ def encoded(images: Images, row: int) -> Encoded:
     return Encoded(coding, content, (width, height, step, images.pixel_format[row]))
 
 
-def read_file(path: Path) -> Encoded:
+def read_file(path: Path, most_bytes: int = DEFAULT.message_bytes) -> Encoded:
     """A picture file's bytes; what they code is told by the first of them, not by the name.
 
     Raises:
@@ -60,10 +61,9 @@ def read_file(path: Path) -> Encoded:
         LogFormatError: No picture that is known here.
         LogTooLargeError: Larger than one encoded picture may be.
     """
-    with path.open("rb") as file:
-        content = file.read(DEFAULT.message_bytes + 1)
-    if len(content) > DEFAULT.message_bytes:
-        raise LogTooLargeError(f"more than {DEFAULT.message_bytes:,} bytes in one picture")
+    content = read_at_most(path, most_bytes)
+    if content is None:
+        raise LogTooLargeError(f"more than {most_bytes:,} bytes in one picture")
     coding = coding_of(content[:MAGIC_BYTES], "")
     if coding is None:
         raise LogFormatError("not a JPEG, PNG or WebP picture" if content else "empty picture")

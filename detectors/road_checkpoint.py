@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError
 
 from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import VehicleError, one_line
-from crosscue.replay.run_folder import write_whole
+from crosscue.replay.run_folder import write_bytes
 
 from .road_network import RoadNetwork
 from .settings import Settings
@@ -59,7 +59,7 @@ def save_road(path: Path, network: RoadNetwork, facts: RoadFacts) -> None:
         for name, value in network.state_dict().items()
     }
     content = packed(kept, KEY, json.dumps(facts.model_dump(mode="json"), sort_keys=True))
-    write_whole(path, lambda place: place.write_bytes(content))
+    write_bytes(path, content)
 
 
 def load_road(path: Path) -> RoadCheckpoint:

@@ -21,7 +21,7 @@ from torch.nn import functional
 
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import SchemaError, one_line
-from crosscue.replay.run_folder import write_whole
+from crosscue.replay.run_folder import write_bytes
 
 from .road_network import RoadNetwork, logits_of
 
@@ -122,7 +122,7 @@ class RoadTraining:
                 tensors[f"optimizer.{number}.{name}"] = value.detach().cpu().contiguous().clone()
         header = {STATE_KEY: json.dumps({"done": self.done, "seed": self.schedule.seed})}
         content = save(tensors, header)
-        write_whole(path, lambda place: place.write_bytes(content))
+        write_bytes(path, content)
 
     def resume(self, path: Path) -> None:
         """Go on where ``save`` left off.

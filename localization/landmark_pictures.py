@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.detectors.base import View
-from crosscue.detectors.pictures import Encoded, decode, encoded
+from crosscue.detectors.pictures import Encoded, decode, encoded, read_file
 from crosscue.replay.columns import Bytes, Images
-from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
+from crosscue.replay.errors import LogError
 from crosscue.replay.limits import DEFAULT, Limits
 
 GREY: Final = View(is_grey=True)
@@ -30,20 +30,11 @@ def read_picture(path: Path, limits: Limits = DEFAULT) -> Encoded:
         LogFormatError: No picture that is known here.
     """
     try:
-        if not path.is_file():
-            raise LogError(f"{path}: no such file; give a picture")
-        if path.stat().st_size > limits.message_bytes:
-            raise LogTooLargeError(
-                f"{path}: {path.stat().st_size:,} bytes, more than {limits.message_bytes:,} for "
-                "one picture; make it smaller"
-            )
-        content = path.read_bytes()
+        return read_file(path, limits.message_bytes)
     except OSError as error:
-        raise LogError(f"{path}: {error.strerror}; check the path and its mode") from None
-    coding = _coding_of(content)
-    if coding is None:
-        raise LogFormatError(f"{path}: no picture that is known here; give PNG, JPEG or WebP")
-    return Encoded(coding, memoryview(content))
+        raise LogError(f"{path}: {error.strerror}; give a picture") from None
+    except LogError as error:
+        raise type(error)(f"{path}: {error}; give another") from None
 
 
 def grey_of(picture: Encoded) -> Bytes:
@@ -54,13 +45,3 @@ def grey_of(picture: Encoded) -> Bytes:
         LogTooLargeError: It says it has more pixels than are decoded.
     """
     return decode(picture, GREY)[0]
-
-
-def _coding_of(content: bytes) -> str | None:
-    if content.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "png"
-    if content.startswith(b"\xff\xd8\xff"):
-        return "jpeg"
-    if content.startswith(b"RIFF") and content[8:12] == b"WEBP":
-        return "webp"
-    return None

@@ -138,7 +138,7 @@ def test_pairs_from_a_table_fit_a_threshold_and_write_it(
     [
         ("a,b\n", "want columns query,known,same"),
         ("query,known,same\nx.png,y.png,maybe\n", "pairs.csv:2: same: want 1 or 0"),
-        ("query,known,same\nx.png,y.png,1\n", "x.png: no such file"),
+        ("query,known,same\nx.png,y.png,1\n", "x.png: No such file"),
         ("query,known,same\n", "give more labelled pictures"),
     ],
 )

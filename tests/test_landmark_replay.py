@@ -282,8 +282,8 @@ def test_pictures_with_coordinates_become_landmarks(
         ("image,x_m,y_m,sd_m\n0.png,1,2,-1\n", 1, "at.csv:2: sd_m: want > 0, got -1"),
         ("image,x_m,y_m,sd_m\n0.png,1\n", 1, "at.csv:2: y_m: want a finite number, got None"),
         ("image,x_m,y_m,var_x_m2,cov_xy_m2,var_y_m2\n0.png,1,2,1,2,1\n", 1, "positive definite"),
-        ("image,x_m,y_m,sd_m\nbad.png,1,2,1\n", 4, "bad.png: no picture that is known here"),
-        ("image,x_m,y_m,sd_m\nmissing.png,1,2,1\n", 4, "missing.png: no such file"),
+        ("image,x_m,y_m,sd_m\nbad.png,1,2,1\n", 4, "bad.png: not a JPEG, PNG or WebP picture"),
+        ("image,x_m,y_m,sd_m\nmissing.png,1,2,1\n", 4, "missing.png: No such file"),
         ("image,x_m,y_m,sd_m\n0.png,1,2,1\n0.png,1,2,1\n", 2, "'photos/0.png' is there already"),
     ],
 )

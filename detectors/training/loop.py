@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from crosscue.detectors.mask_rcnn_network import forward_training
 from crosscue.replay.errors import CrosscueError, SchemaError, one_line
-from crosscue.replay.run_folder import write_whole
+from crosscue.replay.run_folder import write_bytes
 
 from .samples import Sample, Sampler
 
@@ -176,7 +176,7 @@ class Training:
         }
         plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
         content = save(plain, header)
-        write_whole(path, lambda place: place.write_bytes(content))
+        write_bytes(path, content)
 
     def resume(self, path: Path) -> Mapping[str, Any]:
         """Go on where ``save`` was called; gives the words kept then.
