@@ -14,7 +14,7 @@ from crosscue.detectors.frame_cues import FrameCues
 from crosscue.detectors.pictures import decode
 from crosscue.detectors.runner import FrameResult
 from crosscue.replay.columns import Bytes
-from crosscue.replay.run_folder import write_whole
+from crosscue.replay.run_folder import write_bytes
 
 GREEN: Final = (80, 220, 60)
 BLUE: Final = (255, 140, 0)
@@ -57,7 +57,7 @@ class Drawer:
         pixels, _ = decode(result.picture, View())
         _, encoded = cv2.imencode(".jpg", draw(pixels, result, cues))
         path = self.folder / f"{result.t_ns}.jpg"
-        write_whole(path, lambda partial: partial.write_bytes(encoded.tobytes()))
+        write_bytes(path, encoded.tobytes())
         self._written.append(path)
 
     def _thin(self) -> None:

@@ -13,7 +13,7 @@ from crosscue.detectors.frame_cues import FrameCues
 from crosscue.detectors.pictures import decode
 from crosscue.detectors.runner import FrameResult
 from crosscue.replay.columns import Bytes, Int64s
-from crosscue.replay.run_folder import RunFolder, write_whole
+from crosscue.replay.run_folder import RunFolder, write_bytes
 
 from .detection_pictures import draw
 from .score_run import RunScored
@@ -51,7 +51,7 @@ def write_sheet(
     tiles += [blank] * (-len(tiles) % columns)
     rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
     _, coded = cv2.imencode(".jpg", np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, quality])
-    write_whole(path, lambda partial: partial.write_bytes(coded.tobytes()))
+    write_bytes(path, coded.tobytes())
 
 
 def _tile(one: RunScored) -> Bytes:

@@ -30,8 +30,7 @@ turns                                 ``_Drive._turn_arcs, _follow_path``   ``_e
 ====================================  ====================================  =====================
 
 Everything compiled stands in this one file: the compiler's cache looks at the file of the function
-called and not at those of the functions that it calls, and a study keeps what was driven under a
-hash of this file.
+called and not at those of the functions that it calls.
 """
 
 from __future__ import annotations

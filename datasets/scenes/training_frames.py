@@ -7,7 +7,7 @@ hundred intersections than from a thousand pictures of one.
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 
 from crosscue.datasets.simulated_drive import START_NS
 from crosscue.replay.columns import Floats
-from crosscue.replay.run_folder import write_whole
+from crosscue.replay.run_folder import write_bytes
 
 from .coco import Objects
 from .drive import SceneSettings, jpeg, world_of
@@ -61,12 +61,8 @@ def frames_of(settings: SceneSettings, count: int, folder: Path) -> Objects:
         objects.add(t_ns, picture, tags, -picture.view.rear_axle[0])
         name = f"{settings.name}-{number:03d}.jpg"
         objects.images[-1]["file_name"] = name
-        write_whole(folder / name, _bytes_writer(jpeg(picture, settings.picture.jpeg_quality)))
+        write_bytes(folder / name, jpeg(picture, settings.picture.jpeg_quality))
     return objects
-
-
-def _bytes_writer(content: bytes) -> Callable[[Path], object]:
-    return lambda path: path.write_bytes(content)
 
 
 def frames(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -69,6 +70,6 @@ def check_place(path: Path) -> None:
     Raises:
         OutputError: It cannot.
     """
-    trial = path.with_suffix(".trial")
+    trial = path.with_name(f".{path.name}.{os.getpid()}.trial")
     write_text(trial, "")
     trial.unlink()

@@ -24,7 +24,7 @@ from crosscue.datasets.scenes.drive import SceneFiles, SceneSettings, write_scen
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.sheet import contact_sheet, sheet_jpeg
 from crosscue.replay.errors import OutputError, UsageError
-from crosscue.replay.run_folder import write_whole
+from crosscue.replay.run_folder import write_bytes
 
 from .common import print_json, with_progress
 
@@ -87,7 +87,7 @@ def _sheet(wanted: list[SceneSettings], args: argparse.Namespace) -> int:
     if args.sheet.exists() and not args.overwrite:
         raise OutputError(f"{args.sheet}: exists; give another name or --overwrite")
     coded = sheet_jpeg(contact_sheet(wanted, columns))
-    write_whole(args.sheet, lambda path: path.write_bytes(coded))
+    write_bytes(args.sheet, coded)
     if args.json:
         print_json({"sheet": str(args.sheet), "drives": [one.name for one in wanted]})
     elif not args.quiet:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import LogTooLargeError, SchemaError
 from crosscue.replay.limits import Limits
 
@@ -92,11 +93,10 @@ def read_text(path: Path, limits: Limits) -> DatabaseText:
     try:
         if not path.is_file():
             raise SchemaError(f"{path}: no such file; give a CAN database")
-        with path.open("rb") as file:
-            stored = file.read(limits.message_bytes + 1)
+        stored = read_at_most(path, limits.message_bytes)
     except OSError as error:
         raise SchemaError(f"{path}: {error.strerror or error}; check the path") from None
-    if len(stored) > limits.message_bytes:
+    if stored is None:
         raise LogTooLargeError(f"{path}: larger than {limits.message_bytes} bytes; not a database")
     text, notices = _decode(path, stored)
     if not text.strip():

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
+from crosscue.replay.bounded import read_at_most
+
 METADATA_BYTES: Final = 1 << 20
 _BRACKETS: Final = 10_000
 
@@ -47,9 +49,8 @@ def read_metadata(path: Path) -> Metadata:
     from ruamel.yaml.error import YAMLError
 
     try:
-        with path.open("rb") as file:
-            raw = file.read(METADATA_BYTES + 1)
-        if len(raw) > METADATA_BYTES or raw.count(b"[") + raw.count(b"{") > _BRACKETS:
+        raw = read_at_most(path, METADATA_BYTES)
+        if raw is None or raw.count(b"[") + raw.count(b"{") > _BRACKETS:
             return Metadata(fault="larger or deeper than any real one")
         said = YAML(typ="base", pure=True).load(raw.decode("utf-8", "backslashreplace"))
     except FileNotFoundError:

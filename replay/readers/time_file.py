@@ -28,6 +28,7 @@ from typing import Final
 
 import numpy as np
 
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import LogFormatError, LogTooLargeError
 from crosscue.replay.limits import Limits
@@ -138,9 +139,8 @@ def read_time_file(path: Path, limits: Limits) -> TimeFile:
 
 def _lines(path: Path, limits: Limits) -> Iterator[tuple[int, str]]:
     """Numbers and text of the lines that say something."""
-    with path.open("rb") as file:
-        raw = file.read(limits.message_bytes + 1)
-    if len(raw) > limits.message_bytes:
+    raw = read_at_most(path, limits.message_bytes)
+    if raw is None:
         raise LogTooLargeError(
             f"{path}: over {limits.message_bytes} bytes; a time file has one line for each picture"
         )
