@@ -24,7 +24,7 @@ def nees_along_the_arc(row: Floats) -> float:
     cov = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
     turn = wrap(heading - at_heading)
     half = 0.5 * turn
-    along = half / math.tan(half)
+    along = half / math.tan(half) if half else 1.0
     dx, dy = x - at_x, y - at_y
     # With the estimate as origin, turn and shift have the covariance of the pose.
     error = np.array([along * dx + half * dy, along * dy - half * dx, turn])
