@@ -33,7 +33,7 @@ def ours(path: Path) -> int:
     with open_log(path) as log:
         count = sum(len(block) for block in log.read(ledger))
     if not ledger.is_whole:
-        raise SystemExit(f"{path}: {[*ledger.losses()][:3]}")
+        raise SystemExit(f"{path}: {[*ledger.drops()][:3]}")
     return count
 
 

@@ -157,7 +157,7 @@ class Segment(Closing):
         """All streams side by side, a second at a time; see ``Log.read``."""
         ledger.integrity = "not checkable: .npy files carry no checksum; lengths were compared"
         for sentence in self._unreadable:
-            ledger.lose("", "array cannot be read", None, sentence)
+            ledger.drop("", "array cannot be read", None, sentence)
         for source in self._sources:
             ledger.declare(source.topic.name, source.topic.declared)
         if any(source.topic.type_name == "crosscue/CanFrames" for source in self._sources):

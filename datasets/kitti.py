@@ -104,7 +104,7 @@ class Drive(Closing):
         notices: Sequence[str],
         limits: Limits,
     ) -> None:
-        """Put a drive together; ``unreadable`` holds arguments for ``Ledger.lose``."""
+        """Put a drive together; ``unreadable`` holds arguments for ``Ledger.drop``."""
         self.path: Final = path
         self._cameras: Final = tuple(cameras)
         self._oxts: Final = oxts
@@ -134,7 +134,7 @@ class Drive(Closing):
         for sentence in self._notices:
             ledger.notice(sentence)
         for loss in self._unreadable:
-            ledger.lose(*loss)
+            ledger.drop(*loss)
         streams = [camera.read(ledger, selection, self._limits) for camera in self._cameras]
         if self._oxts is not None:
             streams.append(_read_oxts(self._oxts, ledger, selection))
@@ -306,7 +306,7 @@ def _read_oxts(oxts: Oxts, ledger: Ledger, selection: Selection) -> Iterator[Blo
                 yield Block(name, packets.t_ns, to_table(packets)).take(wanted)
     missing = oxts.files.missing_ns[is_inside(oxts.files.missing_ns, selection)]
     for name in TOPICS:
-        ledger.lose(name, "a time without its packet", len(missing))
+        ledger.drop(name, "a time without its packet", len(missing))
         if selection.start_ns is None and selection.end_ns is None:
             ledger.settle(name)
 
@@ -331,7 +331,7 @@ def _account(
     for place, t_ns, raw in some:
         why = raw if isinstance(raw, str) else parse(raw)
         if isinstance(why, str):
-            ledger.lose(name, "not an OXTS packet", 1, f"{place}: {why}", t_ns)
+            ledger.drop(name, "not an OXTS packet", 1, f"{place}: {why}", t_ns)
 
 
 def _packets(some: Sequence[Line]) -> Packets:

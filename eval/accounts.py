@@ -69,7 +69,7 @@ def skipped_schema() -> pa.Schema:
             ("reason", pa.string()),
             ("detail", pa.string()),
             ("count", pa.int64()),
-            ("is_loss", pa.bool_()),
+            ("is_dropped", pa.bool_()),
             ("log", pa.string()),
         ]
     )
@@ -84,7 +84,7 @@ def skipped_rows(ledger: Ledger) -> dict[str, object]:
         "reason": [d.reason for d in details],
         "detail": [d.detail for d in details],
         "count": [d.count for d in details],
-        "is_loss": [d.is_loss for d in details],
+        "is_dropped": [d.is_dropped for d in details],
         "log": [ledger.log] * len(details),
     }
 
@@ -107,8 +107,8 @@ def _account(account: TopicAccount) -> dict[str, object]:
         "found": account.found,
         "used": account.used,
         "skipped": dict(sorted(account.skipped.items())),
-        "lost": dict(sorted(account.lost.items())),
-        "lost_unknown": sorted(set(account.lost_unknown)),
+        "dropped": dict(sorted(account.dropped.items())),
+        "dropped_unknown": sorted(set(account.dropped_unknown)),
     }
 
 

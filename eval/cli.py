@@ -65,7 +65,7 @@ exit status:
   0  all done
   1  failed, or a gate failed
   2  wrong usage
-  3  finished, with losses told
+  3  finished, with losses reported
   4  input unreadable
   130, 143  interrupted"""
 

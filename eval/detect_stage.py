@@ -79,7 +79,7 @@ class DetectOutcome:
 
     @property
     def exit_status(self) -> int:
-        """3 when anything was lost, else 0."""
+        """3 when anything was dropped, else 0."""
         return 0 if self.ledger.is_whole else 3
 
 

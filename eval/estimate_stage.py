@@ -86,7 +86,7 @@ class Outcome:
 
     @property
     def exit_status(self) -> int:
-        """3 when anything was lost, else 0."""
+        """3 when anything was dropped, else 0."""
         whole = all(ledger.is_whole for ledger in self.ledgers)
         return 0 if whole and (self.detected is None or self.detected.ledger.is_whole) else 3
 

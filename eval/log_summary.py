@@ -65,8 +65,8 @@ class TopicSummary:
         found: Rows met in the bytes; with ``--quick`` 0, as everything below.
         used: Rows handed on and understood.
         skipped: Rows found and not used, by reason.
-        lost: Rows that were in the file and could not be read, by reason.
-        lost_unknown: Reasons of losses whose extent nobody can know.
+        dropped: Rows that were in the file and could not be read, by reason.
+        dropped_unknown: Reasons of losses whose extent nobody can know.
         rate_hz: Mean rate on the clock that is used, or None.
         clocks: Its clocks, or None where no row was read.
         can_ids: For a CAN bus: its most frequent identifiers.
@@ -81,8 +81,8 @@ class TopicSummary:
     found: int
     used: int
     skipped: Mapping[str, int]
-    lost: Mapping[str, int]
-    lost_unknown: tuple[str, ...]
+    dropped: Mapping[str, int]
+    dropped_unknown: tuple[str, ...]
     rate_hz: float | None
     clocks: ClockReport | None
     can_ids: tuple[CanIdCount, ...]
@@ -97,16 +97,16 @@ class LogSummary:
         path: As the user gave it.
         format: Short name of its format.
         is_quick: Only what the log declares was looked at; its body was not read.
-        is_whole: Nothing is known to be lost; says nothing when quick.
+        is_whole: Nothing is known to be dropped; says nothing when quick.
         integrity: Which checksums were verified, in words.
         start_ns: Lowest log time of all topics, or None without rows.
         end_ns: Highest log time.
         topics: By name.
-        unattributed_lost: Rows lost that no topic can be named for, by reason.
+        unattributed_dropped: Rows dropped that no topic can be named for, by reason.
         unattributed_unknown: The same where their number is not known.
         findings: What is wrong or odd, a sentence each.
         notices: What the reader has to say, a sentence each.
-        losses: The first single losses.
+        drops: The first single drops.
     """
 
     path: str
@@ -117,11 +117,11 @@ class LogSummary:
     start_ns: int | None
     end_ns: int | None
     topics: tuple[TopicSummary, ...]
-    unattributed_lost: Mapping[str, int]
+    unattributed_dropped: Mapping[str, int]
     unattributed_unknown: tuple[str, ...]
     findings: tuple[str, ...]
     notices: tuple[str, ...]
-    losses: tuple[Detail, ...]
+    drops: tuple[Detail, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,8 +263,8 @@ def _summary(
         start_ns=min((c.min_ns for c in log_clocks if c.min_ns is not None), default=None),
         end_ns=max((c.max_ns for c in log_clocks if c.max_ns is not None), default=None),
         topics=topics,
-        unattributed_lost=dict(nameless.lost),
-        unattributed_unknown=tuple(nameless.lost_unknown),
+        unattributed_dropped=dict(nameless.dropped),
+        unattributed_unknown=tuple(nameless.dropped_unknown),
         findings=(
             *_of_nameless(nameless),
             *_of_account(topics, is_quick=is_quick),
@@ -272,7 +272,7 @@ def _summary(
             *_choices(topics),
         ),
         notices=tuple(ledger.notices),
-        losses=tuple(ledger.losses()),
+        drops=tuple(ledger.drops()),
     )
 
 
@@ -293,8 +293,8 @@ def _topic_summary(
         found=account.found,
         used=account.used,
         skipped=dict(account.skipped),
-        lost=dict(account.lost),
-        lost_unknown=tuple(account.lost_unknown),
+        dropped=dict(account.dropped),
+        dropped_unknown=tuple(account.dropped_unknown),
         rate_hz=None if report is None else report.rate_hz,
         clocks=report,
         can_ids=seen.top(0.0 if report is None else report.duration_ns * 1e-9),
@@ -305,18 +305,18 @@ def _topic_summary(
 def _of_nameless(account: TopicAccount) -> Iterator[str]:
     """Losses that no topic can be named for."""
     if not account.is_whole:
-        why = ", ".join(dict.fromkeys([*account.lost, *account.lost_unknown]))
-        at_least = "at least " if account.lost_unknown else ""
-        yield f"{at_least}{account.lost.total()} rows of unknown topics lost: {why}"
+        why = ", ".join(dict.fromkeys([*account.dropped, *account.dropped_unknown]))
+        at_least = "at least " if account.dropped_unknown else ""
+        yield f"{at_least}{account.dropped.total()} rows of unknown topics dropped: {why}"
 
 
 def _of_account(topics: Iterable[TopicSummary], *, is_quick: bool) -> Iterator[str]:
     for topic in topics:
-        lost = sum(topic.lost.values())
-        if lost or topic.lost_unknown:
-            at_least = "at least " if topic.lost_unknown else ""
-            why = ", ".join(dict.fromkeys([*topic.lost, *topic.lost_unknown]))
-            yield f"{topic.name}: {at_least}{lost} of {topic.found + lost} rows lost: {why}"
+        count = sum(topic.dropped.values())
+        if count or topic.dropped_unknown:
+            at_least = "at least " if topic.dropped_unknown else ""
+            why = ", ".join(dict.fromkeys([*topic.dropped, *topic.dropped_unknown]))
+            yield f"{topic.name}: {at_least}{count} of {topic.found + count} rows dropped: {why}"
         if topic.used == 0 and topic.found:
             why = ", ".join(topic.skipped)
             yield f"{topic.name}: none of its {topic.found} rows can be used: {why}"

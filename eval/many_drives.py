@@ -32,7 +32,7 @@ class Result(Protocol):
 
     @property
     def exit_status(self) -> int:
-        """0, or 3 when something was lost."""
+        """0, or 3 when something was dropped."""
         ...
 
 
@@ -196,7 +196,7 @@ def in_turn(jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
 def exit_status_of(results: Iterable[Done[R]]) -> int:
     """One exit status for many drives.
 
-    0 when all are whole; 3 when something was lost or some drives failed; when all failed, the
+    0 when all are whole; 3 when something was dropped or some drives failed; when all failed, the
     status that they share, or 1.
     """
     results = tuple(results)

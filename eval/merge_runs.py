@@ -180,14 +180,14 @@ def _accounts(drives: Sequence[_Drive]) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     for topic, account in (pair for one in drives for pair in _topics(one)):
         total = found.setdefault(
-            topic, {"logs": 0, "in_file": 0, "found": 0, "used": 0, "skipped": {}, "lost": {},
-                    "logs_with_unknown_loss": 0},
+            topic, {"logs": 0, "in_file": 0, "found": 0, "used": 0, "skipped": {}, "dropped": {},
+                    "logs_with_unknown_drops": 0},
         )  # fmt: skip
         total["logs"] += 1
-        total["logs_with_unknown_loss"] += bool(account["lost_unknown"])
+        total["logs_with_unknown_drops"] += bool(account["dropped_unknown"])
         for key in ("in_file", "found", "used"):
             total[key] += account[key] or 0
-        for key in ("skipped", "lost"):
+        for key in ("skipped", "dropped"):
             for reason, count in account[key].items():
                 total[key][reason] = total[key].get(reason, 0) + count
     return found

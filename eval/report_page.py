@@ -113,7 +113,7 @@ def _content(
         "simulated": sum("simulated" in source.lower() for source in sources),
         "failed": metrics["coverage"].get("failed", {}),
         "same_log": metrics["coverage"].get("same_log", ()),
-        "lost": sum(not account["is_whole"] for account in accounts),
+        "dropped": sum(not account["is_whole"] for account in accounts),
         "coverage": metrics["coverage"],
         "settings": metrics["settings"],
         "approaches": metrics["approaches"],

@@ -1,11 +1,11 @@
 """The account of what became of every message of a log.
 
-For every topic: ``in file = used + skipped (by reason) + lost (by reason)``.
+For every topic: ``in file = used + skipped (by reason) + dropped (by reason)``.
 
 * *found*: rows that a reader met in the file's bytes and could tell apart;
 * *skipped*: of those, the ones not handed on or not decodable, each with a reason;
 * *used*: found less skipped;
-* *lost*: rows that must have been in the file (a declared count, a damaged chunk whose index
+* *dropped*: rows that must have been in the file (a declared count, a damaged chunk whose index
   says what it held, a cut record) but could not be read.
 
 A loss whose extent nobody can know (a cut file without statistics) is a ``Loss`` with count None:
@@ -28,7 +28,7 @@ NOT_ASKED_TOPIC: Final = "topic not asked for"
 
 @dataclass(frozen=True, slots=True)
 class Detail:
-    """One thing skipped or lost, for ``skipped.parquet``.
+    """One thing skipped or dropped, for ``skipped.parquet``.
 
     Attributes:
         topic: Topic name, or empty where the damage hides it.
@@ -36,7 +36,7 @@ class Detail:
         detail: Where and why: byte offset, declared against found, the library's words.
         t_ns: Log time where known.
         count: Rows concerned; None if that cannot be known.
-        is_loss: Lost, not merely skipped.
+        is_dropped: Dropped, not merely skipped.
     """
 
     topic: str
@@ -44,7 +44,7 @@ class Detail:
     detail: str
     t_ns: int | None
     count: int | None
-    is_loss: bool
+    is_dropped: bool
 
 
 @dataclass(slots=True)
@@ -54,8 +54,8 @@ class TopicAccount:
     declared: int | None = None
     found: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
-    lost: Counter[str] = field(default_factory=Counter)
-    lost_unknown: list[str] = field(default_factory=list)
+    dropped: Counter[str] = field(default_factory=Counter)
+    dropped_unknown: list[str] = field(default_factory=list)
 
     @property
     def used(self) -> int:
@@ -65,12 +65,12 @@ class TopicAccount:
     @property
     def in_file(self) -> int:
         """Rows that are or must have been in the file."""
-        return self.found + self.lost.total()
+        return self.found + self.dropped.total()
 
     @property
     def is_whole(self) -> bool:
-        """Nothing lost; skips are choices or bad messages, not losses."""
-        return not self.lost.total() and not self.lost_unknown
+        """Nothing dropped; skips are choices or bad messages, not losses."""
+        return not self.dropped.total() and not self.dropped_unknown
 
 
 @dataclass(slots=True)
@@ -118,9 +118,9 @@ class Ledger:
         if count:
             self.topic(topic).skipped[reason] += count
             if reason not in (NOT_ASKED_TIME, NOT_ASKED_TOPIC):
-                self._keep(Detail(topic, reason, detail, t_ns, count, is_loss=False))
+                self._keep(Detail(topic, reason, detail, t_ns, count, is_dropped=False))
 
-    def lose(
+    def drop(
         self,
         topic: str,
         reason: str,
@@ -133,10 +133,10 @@ class Ledger:
             return
         account = self.topic(topic)
         if count is None:
-            account.lost_unknown.append(reason)
+            account.dropped_unknown.append(reason)
         else:
-            account.lost[reason] += count
-        self._keep(Detail(topic, reason, detail, t_ns, count, is_loss=True))
+            account.dropped[reason] += count
+        self._keep(Detail(topic, reason, detail, t_ns, count, is_dropped=True))
 
     def notice(self, sentence: str) -> None:
         """Say something about the log once; a repeated sentence is kept once."""
@@ -146,7 +146,7 @@ class Ledger:
     def settle(self, topic: str, reason: str = "declared by the format, not in its bytes") -> None:
         """Compare with the declared count at the end of a full pass.
 
-        Fewer found than declared: the rest is lost. More: a notice, since the bytes are the truth.
+        Fewer found than declared: the rest is dropped. More: a notice; the bytes are the truth.
         """
         account = self.topic(topic)
         if account.declared is None:
@@ -154,7 +154,7 @@ class Ledger:
         missing = account.declared - account.in_file
         if missing > 0:
             detail = f"declared {account.declared}, found {account.found}"
-            self.lose(topic, reason, missing, detail)
+            self.drop(topic, reason, missing, detail)
         elif missing < 0:
             self.notice(
                 f"{topic}: the file declares {account.declared} messages, holds {account.in_file}"
@@ -162,12 +162,12 @@ class Ledger:
 
     @property
     def is_whole(self) -> bool:
-        """Nothing is known to be lost."""
+        """Nothing is known to be dropped."""
         return all(account.is_whole for account in self.accounts.values())
 
-    def losses(self) -> Iterator[Detail]:
+    def drops(self) -> Iterator[Detail]:
         """The details that are losses."""
-        return (d for d in self.details if d.is_loss)
+        return (d for d in self.details if d.is_dropped)
 
     def _keep(self, detail: Detail) -> None:
         if len(self.details) < DETAILS_KEPT:

@@ -87,7 +87,7 @@ def test_a_cut_log_gives_what_is_there_and_says_so(
     status, out, _ = _info(path, capsys)
 
     assert status == 3
-    assert "lost" in out
+    assert "dropped" in out
 
 
 def test_a_flipped_byte_is_told_and_the_replay_goes_on(
@@ -100,7 +100,7 @@ def test_a_flipped_byte_is_told_and_the_replay_goes_on(
     argv = ["replay", str(path), "--vehicle", str(drive.vehicle), "-o", str(tmp_path / "run")]
 
     assert cli.run(argv) == 3
-    assert "lost" in capsys.readouterr().out
+    assert "dropped" in capsys.readouterr().out
     assert (tmp_path / "run" / "manifest.json").exists()
 
 

@@ -83,8 +83,8 @@ def test_a_line_that_can_be_no_frame_is_lost_and_told(tmp_path: Path, line: str)
     found, ledger = read_back(_log(tmp_path, HEAD + LINE + line + "\n" + LINE))
 
     assert len(found["can/1"]) == 2
-    assert ledger.topic("").lost.total() == 1
-    assert "line 4" in next(ledger.losses()).detail
+    assert ledger.topic("").dropped.total() == 1
+    assert "line 4" in next(ledger.drops()).detail
 
 
 def test_relative_times_add_up_over_all_lines(tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_decimal_logs_are_read_as_decimal(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, text))
 
     assert found["can/1"] == [Sent(_at(0.5), "can/1", 100, b"d\0\xff")]
-    assert ledger.topic("").lost.total() == 1
+    assert ledger.topic("").dropped.total() == 1
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_another_header_in_the_middle_ends_the_reading(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, HEAD + LINE + other + LINE))
 
     assert len(found["can/1"]) == 1
-    assert ledger.topic("").lost_unknown == ["another 'base' line begins inside the file"]
+    assert ledger.topic("").dropped_unknown == ["another 'base' line begins inside the file"]
 
 
 def test_two_logs_in_one_file_keep_their_dates(tmp_path: Path) -> None:

@@ -46,8 +46,8 @@ def test_a_lost_container_costs_its_frames_and_no_more(tmp_path: Path) -> None:
     read = [f for rows in found.values() for f in rows]
     assert set(read) < {f for rows in by_bus(frames).values() for f in rows}
     assert len(read) > 250
-    assert ledger.topic("").lost.total() == len(frames) - len(read)
-    assert "checksum" in next(ledger.losses()).detail
+    assert ledger.topic("").dropped.total() == len(frames) - len(read)
+    assert "checksum" in next(ledger.drops()).detail
 
 
 def test_an_unclosed_log_gives_all_it_holds_and_says_so(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_an_unclosed_log_gives_all_it_holds_and_says_so(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, blf(frames, is_closed=False)))
 
     assert sum(map(len, found.values())) == 200
-    assert ledger.topic("").lost_unknown == ["file was not closed by its writer"]
+    assert ledger.topic("").dropped_unknown == ["file was not closed by its writer"]
     assert any("no start time" in notice for notice in ledger.notices)
 
 
@@ -67,7 +67,7 @@ def test_fewer_objects_than_declared_are_lost(tmp_path: Path) -> None:
 
     _, ledger = read_back(_log(tmp_path, bytes(content)))
 
-    assert ledger.topic("").lost.total() == 10
+    assert ledger.topic("").dropped.total() == 10
 
 
 def test_error_frames_are_kept(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_objects_outside_containers_are_read(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, blf(frames)[:144] + _objects(frames)))
 
     assert found == by_bus(frames)
-    assert ledger.topic("").lost.total() == 0
+    assert ledger.topic("").dropped.total() == 0
 
 
 def test_a_payload_that_looks_like_an_object_is_a_payload(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_an_object_of_impossible_size_does_not_stop_the_reading(
     found, ledger = read_back(_log(tmp_path, content))
 
     assert sum(map(len, found.values())) == 99
-    assert ledger.topic("").lost.total() == 1
+    assert ledger.topic("").dropped.total() == 1
 
 
 @pytest.mark.parametrize("declared", [100, 50_000_000])

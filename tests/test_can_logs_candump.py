@@ -111,23 +111,23 @@ def test_a_line_that_can_be_no_frame_is_lost_and_told(tmp_path: Path, line: str)
     found, ledger = read_back(_log(tmp_path, WHOLE + line + "\n" + WHOLE))
 
     assert len(found["can0"]) == 2
-    assert ledger.topic("").lost.total() == 1
-    assert "line 2" in next(ledger.losses()).detail
+    assert ledger.topic("").dropped.total() == 1
+    assert "line 2" in next(ledger.drops()).detail
 
 
 def test_a_line_broken_in_two_is_not_read_as_a_shorter_frame(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, WHOLE + "(2.0) can0 123#DE\nADBEEF\n" + WHOLE))
 
     assert [f.payload for f in found["can0"]] == [b"\xde\xad\xbe\xef"] * 2
-    assert ledger.topic("can0").lost.total() == 1
-    assert ledger.topic("").lost.total() == 1
+    assert ledger.topic("can0").dropped.total() == 1
+    assert ledger.topic("").dropped.total() == 1
 
 
 def test_a_last_line_without_end_is_not_trusted(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, WHOLE + WHOLE[:-3]))
 
     assert len(found["can0"]) == 1
-    assert ledger.topic("").lost == {"last line has no line end, may be cut": 1}
+    assert ledger.topic("").dropped == {"last line has no line end, may be cut": 1}
 
 
 def test_no_cut_is_silent_and_none_invents_a_frame(tmp_path: Path) -> None:
@@ -205,7 +205,7 @@ def test_many_bus_names_are_damage_not_topics(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, text))
 
     assert len(found) == 256
-    assert ledger.topic("").lost == {"more buses than a log can have": 744}
+    assert ledger.topic("").dropped == {"more buses than a log can have": 744}
 
 
 @pytest.mark.parametrize("size", [64, 100, 1000])

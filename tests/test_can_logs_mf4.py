@@ -214,9 +214,9 @@ def test_a_damaged_compressed_block_costs_its_records_and_no_more(tmp_path: Path
     found, ledger = _tables(path)
 
     used = sum(map(len, found["drive"]))
-    assert used + ledger.topic("drive").lost.total() == 200_000
-    assert 0 < ledger.topic("drive").lost.total() < 200_000
-    assert "compressed block" in next(ledger.losses()).detail
+    assert used + ledger.topic("drive").dropped.total() == 200_000
+    assert 0 < ledger.topic("drive").dropped.total() < 200_000
+    assert "compressed block" in next(ledger.drops()).detail
     (last,) = found["drive"][-1:]
     assert last.rows["torque"][-1] == -199_999
 
@@ -230,7 +230,7 @@ def test_blocks_that_run_in_a_circle_are_found_out(tmp_path: Path) -> None:
 
     _, ledger = _tables(path)
 
-    assert any("circle" in d.detail for d in ledger.losses())
+    assert any("circle" in d.detail for d in ledger.drops())
 
 
 @pytest.mark.parametrize(

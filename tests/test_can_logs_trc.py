@@ -75,8 +75,8 @@ def test_a_line_that_can_be_no_frame_is_lost_and_told(tmp_path: Path, line: str)
     found, ledger = read_back(_log(tmp_path, V1 + LINE_1 + line + "\n" + LINE_1))
 
     assert len(found["can/1"]) == 2
-    assert ledger.topic("").lost.total() == 1
-    assert "line 4" in next(ledger.losses()).detail
+    assert ledger.topic("").dropped.total() == 1
+    assert "line 4" in next(ledger.drops()).detail
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_another_version_in_the_middle_ends_the_reading(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, V1 + LINE_1 + V2 + LINE_2))
 
     assert len(found["can/1"]) == 1
-    assert ledger.topic("").lost_unknown == ["another version begins inside the file"]
+    assert ledger.topic("").dropped_unknown == ["another version begins inside the file"]
 
 
 def test_two_logs_in_one_file_keep_their_start_times(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def test_every_row_of_the_real_segment_is_accounted_for() -> None:
     assert sum(accounts[f"can/{bus}"].used for bus in (0, 1, 128, 129)) == 135_468
     assert rows == sum(account.found for account in accounts.values())
     # One array of the published example is cut; the rest is whole.
-    damaged = {name: a.lost.total() for name, a in accounts.items() if not a.is_whole}
+    damaged = {name: a.dropped.total() for name, a in accounts.items() if not a.is_whole}
     assert damaged == {"imu/magnetometer_uncalibrated": 64}
 
 

@@ -297,7 +297,7 @@ def test_from_to_and_topics_choose(tmp_path: Path, capsys: pytest.CaptureFixture
     assert status == 0
     assert {name: row["messages"] for name, row in said["written"].items()} == {"/imu": 10}
     for account in said["topics"].values():
-        skipped, lost = sum(account["skipped"].values()), sum(account["lost"].values())
+        skipped, lost = sum(account["skipped"].values()), sum(account["dropped"].values())
         assert account["found"] == account["written"] + skipped
         if account["declared"] is not None:
             assert account["declared"] == account["found"] + lost

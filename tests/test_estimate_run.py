@@ -89,7 +89,7 @@ def test_the_manifest_accounts_for_the_camera_and_the_rest(drive: Path) -> None:
 
     topics = manifest["accounts"][0]["topics"]
     for account in topics.values():
-        gone = sum(account["skipped"].values()) + sum(account["lost"].values())
+        gone = sum(account["skipped"].values()) + sum(account["dropped"].values())
         assert account["used"] + gone == account["in_file"] == account["declared"]
     camera = topics["/camera/image/compressed"]
     assert camera["used"] == camera["in_file"] == manifest["scene"]["frames"]

@@ -108,7 +108,7 @@ def test_more_or_fewer_times_than_pictures_are_told(
     _, ledger = read(path)
 
     account = ledger.topic("a")
-    assert sum(account.lost.values()) == lost
+    assert sum(account.dropped.values()) == lost
     assert sum(account.skipped.values()) == skipped
     assert f"{N} pictures and {lines} times (a.txt): paired in order from the first" in (
         ledger.notices

@@ -69,7 +69,7 @@ def test_names_in_the_time_file_decide_and_the_rest_is_told(tmp_path: Path) -> N
     assert shades(blocks) == [(1.5, picture(0)), (0.5, picture(2))]
     account = ledger.topic("front")
     assert account.skipped == {"a picture without its time": 1}
-    assert account.lost == {"a time without its picture": 1}
+    assert account.dropped == {"a time without its picture": 1}
     assert "frame_1.png" in ledger.details[0].detail
 
 
@@ -80,7 +80,7 @@ def test_a_number_left_out_is_a_gap_not_a_shift(tmp_path: Path) -> None:
     blocks, ledger = read(folder)
 
     assert [t for t, _ in shades(blocks)] == [0.5, 1.5, 3.5, 4.5]
-    assert ledger.topic("front").lost == {"a time without its picture": 1}
+    assert ledger.topic("front").dropped == {"a time without its picture": 1}
     assert ledger.details[0].t_ns == 5 * S // 2
     assert ledger.notices == ["front: 1 numbers are missing in the file names; times go by number"]
 
@@ -92,7 +92,7 @@ def test_counts_that_differ_without_a_reason_are_never_zipped_in_silence(tmp_pat
     _, of_fewer = read(fewer)
     _, of_more = read(more)
 
-    assert of_fewer.topic("fewer").lost == {"a time without its picture": 2}
+    assert of_fewer.topic("fewer").dropped == {"a time without its picture": 2}
     assert "paired in order from the first" in of_fewer.notices[0]
     assert of_more.topic("more").skipped == {"a picture without its time": 2}
     assert any("7 files and 5 times" in notice for notice in of_more.notices)
@@ -132,7 +132,7 @@ def test_damaged_cut_and_foreign_files_are_never_given(tmp_path: Path) -> None:
     assert shades(blocks) == [(4.5, picture(4))]
     account = ledger.topic("front")
     assert account.skipped == {"empty file": 1, "not a JPEG, PNG or WebP picture": 1}
-    assert account.lost == {"picture cut short": 1, "picture damaged (checksum)": 1}
+    assert account.dropped == {"picture cut short": 1, "picture damaged (checksum)": 1}
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
@@ -149,7 +149,7 @@ def test_a_picture_cut_anywhere_is_told(tmp_path: Path, suffix: str, share: floa
 
     assert shades(blocks) == [(1.5, picture(1, suffix))]
     account = ledger.topic("front")
-    assert account.skipped.total() + account.lost.total() == 1
+    assert account.skipped.total() + account.dropped.total() == 1
 
 
 @settings(
@@ -265,7 +265,7 @@ def test_a_picture_without_permission_is_lost_and_the_rest_is_read(nobody: Path)
     blocks, ledger = read(folder)
 
     assert len(shades(blocks)) == 1
-    assert "Permission denied" in next(ledger.losses()).detail
+    assert "Permission denied" in next(ledger.drops()).detail
 
 
 def test_suffixes_may_be_in_capitals(tmp_path: Path) -> None:
@@ -299,7 +299,7 @@ def test_a_pipe_in_place_of_a_picture_does_not_hang(tmp_path: Path) -> None:
     blocks, ledger = read(folder)
 
     assert len(shades(blocks)) == 1
-    assert ledger.topic("front").lost == {"picture cannot be opened": 1}
+    assert ledger.topic("front").dropped == {"picture cannot be opened": 1}
 
 
 def test_the_real_dashcam_frames_keep_their_order(tmp_path: Path) -> None:

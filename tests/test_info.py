@@ -36,7 +36,7 @@ class MadeLog:
 
     blocks: tuple[Block, ...]
     topics: tuple[Topic, ...]
-    lost: int = 0
+    dropped: int = 0
     unknown: bool = False
     path: Path = Path("made.mcap")
     format: str = "made"
@@ -46,10 +46,10 @@ class MadeLog:
         for block in self.blocks:
             ledger.find(block.topic, len(block))
             yield block
-        if self.lost:
-            ledger.lose(self.topics[0].name, "chunk CRC", self.lost, "at byte 7", START_NS)
+        if self.dropped:
+            ledger.drop(self.topics[0].name, "chunk CRC", self.dropped, "at byte 7", START_NS)
         if self.unknown:
-            ledger.lose("", "file is cut", None, "at byte 9")
+            ledger.drop("", "file is cut", None, "at byte 9")
         for topic in self.topics:
             ledger.declare(topic.name, topic.declared)
             ledger.settle(topic.name)
@@ -95,7 +95,7 @@ def made(**changes: Any) -> MadeLog:
         can_block("can0", [0x100, 0x100, 0x100, 0x200] * 5, [False, True, False, False] * 5),
     )
     topics = (
-        columns("/imu", "sensor_msgs/msg/Imu", 300 + changes.get("lost", 0)),
+        columns("/imu", "sensor_msgs/msg/Imu", 300 + changes.get("dropped", 0)),
         columns("can0", "crosscue/CanFrames"),
     )
     return replace(MadeLog(blocks, topics), **changes)
@@ -130,25 +130,25 @@ def test_identifiers_are_counted_apart_by_length_and_most_frequent_first() -> No
 
 
 def test_losses_are_told_by_topic_reason_and_place() -> None:
-    summary = summarise(made(lost=31, unknown=True))
+    summary = summarise(made(dropped=31, unknown=True))
     text = "\n".join(lines_of(summary, 100))
 
     assert not summary.is_whole
-    assert "- /imu: 31 of 331 rows lost: chunk CRC" in text
+    assert "- /imu: 31 of 331 rows dropped: chunk CRC" in text
     assert "- 31 of /imu at 0.00 s: chunk CRC (at byte 7)" in text
     assert "- an unknown number of unknown topics: file is cut (at byte 9)" in text
-    assert "- at least 0 rows of unknown topics lost: file is cut" in text
+    assert "- at least 0 rows of unknown topics dropped: file is cut" in text
     assert re.search(r"^\(topic not known\) .*>= 0$", text, re.M)
 
 
-@pytest.mark.parametrize("lost", [0, 1, 40])
-def test_the_account_adds_up(lost: int) -> None:
-    summary = summarise(made(lost=lost))
+@pytest.mark.parametrize("dropped", [0, 1, 40])
+def test_the_account_adds_up(dropped: int) -> None:
+    summary = summarise(made(dropped=dropped))
 
     for topic in summary.topics:
         assert topic.found == topic.used + sum(topic.skipped.values())
         if topic.declared is not None:
-            assert topic.declared == topic.found + sum(topic.lost.values())
+            assert topic.declared == topic.found + sum(topic.dropped.values())
 
 
 def test_what_cannot_be_decoded_is_skipped_with_a_reason_and_still_timed() -> None:
@@ -235,7 +235,7 @@ def test_quick_reads_no_body() -> None:
 def test_nothing_in_a_name_reaches_the_terminal_or_breaks_json() -> None:
     stream = Stream(40, 50 * MS)
     log = MadeLog(
-        (table_of(NASTY, stream.log_ns() * 0),), (Topic(NASTY, NASTY, "columns"),), lost=1,
+        (table_of(NASTY, stream.log_ns() * 0),), (Topic(NASTY, NASTY, "columns"),), dropped=1,
         path=Path(NASTY),
     )  # fmt: skip
 
@@ -281,7 +281,7 @@ def test_eighty_columns_are_enough_for_a_usual_log() -> None:
     log = MadeLog(
         (table_of(long, stream.log_ns(), stream.header_ns()),),
         (columns(long, "sensor_msgs/msg/CompressedImage"),),
-        lost=12,
+        dropped=12,
     )
 
     assert max(cells(line) for line in shown(log, 80).split("\n")) <= 80
@@ -313,7 +313,7 @@ def test_the_command_on_a_real_minute(
     out = capsys.readouterr().out
     assert status == 3
     assert re.search(r"^can/0 +crosscue/CanFrames +CAN bus +53800 ", out, re.M)
-    assert "64 of 592 rows lost: array file is cut" in out
+    assert "64 of 592 rows dropped: array file is cut" in out
     assert max(cells(line) for line in out.split("\n")) <= 80
 
 

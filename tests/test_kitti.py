@@ -190,8 +190,8 @@ def test_a_damaged_packet_is_lost_with_place_and_reason(
     by_topic, ledger = read(drive)
 
     assert len(times(by_topic["oxts/imu"])) == 4
-    assert ledger.topic("oxts/imu").lost == {"not an OXTS packet": 1}
-    assert any(why in loss.detail and "0000000003" in loss.detail for loss in ledger.losses())
+    assert ledger.topic("oxts/imu").dropped == {"not an OXTS packet": 1}
+    assert any(why in loss.detail and "0000000003" in loss.detail for loss in ledger.drops())
 
 
 def test_a_packet_that_is_missing_leaves_a_gap(tmp_path: Path) -> None:
@@ -202,8 +202,8 @@ def test_a_packet_that_is_missing_leaves_a_gap(tmp_path: Path) -> None:
     by_topic, ledger = read(drive)
 
     assert times(by_topic["oxts/imu"]) == [FIRST_NS + 100_000_000 * i for i in (0, 1, 3, 4)]
-    assert ledger.topic("oxts/imu").lost == {"a time without its packet": 1}
-    assert ledger.topic("image_02").lost == {"a time without its picture": 1}
+    assert ledger.topic("oxts/imu").dropped == {"a time without its packet": 1}
+    assert ledger.topic("image_02").dropped == {"a time without its picture": 1}
 
 
 def test_a_stream_without_timestamps_is_lost_and_the_rest_is_read(tmp_path: Path) -> None:
@@ -213,8 +213,8 @@ def test_a_stream_without_timestamps_is_lost_and_the_rest_is_read(tmp_path: Path
     by_topic, ledger = read(drive)
 
     assert set(by_topic) == set(TOPICS)
-    assert ledger.topic("image_02").lost == {"rows without times": 5}
-    assert "image_02/timestamps.txt is missing" in next(ledger.losses()).detail
+    assert ledger.topic("image_02").dropped == {"rows without times": 5}
+    assert "image_02/timestamps.txt is missing" in next(ledger.drops()).detail
     assert run(["info", str(drive)]) == 3
 
 
@@ -225,7 +225,7 @@ def test_oxts_without_timestamps_is_lost_and_carries_no_truth(tmp_path: Path) ->
     by_topic, ledger = read(drive)
 
     assert set(by_topic) == {"image_02"}
-    assert {name: sum(ledger.topic(name).lost.values()) for name in TOPICS} == dict.fromkeys(
+    assert {name: sum(ledger.topic(name).dropped.values()) for name in TOPICS} == dict.fromkeys(
         TOPICS, 5
     )
     with pytest.raises(LogFormatError, match="carries no truth"):

@@ -1,4 +1,4 @@
-"""In file = used + skipped + lost, whatever happens in whatever order."""
+"""In file = used + skipped + dropped, whatever happens in whatever order."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,21 +12,23 @@ _COUNTS = st.integers(0, 1000)
     found=_COUNTS,
     declared=st.none() | _COUNTS,
     skips=st.lists(st.sampled_from("abc")),
-    lost=_COUNTS,
+    dropped=_COUNTS,
 )
-def test_the_identity_holds(found: int, declared: int | None, skips: list[str], lost: int) -> None:
+def test_the_identity_holds(
+    found: int, declared: int | None, skips: list[str], dropped: int
+) -> None:
     ledger = Ledger("log")
     ledger.declare("/t", declared)
     ledger.find("/t", found + len(skips))
     for reason in skips:
         ledger.skip("/t", reason)
-    ledger.lose("/t", "damaged", lost)
+    ledger.drop("/t", "damaged", dropped)
     ledger.settle("/t")
 
     account = ledger.topic("/t")
-    assert account.in_file == account.used + account.skipped.total() + account.lost.total()
+    assert account.in_file == account.used + account.skipped.total() + account.dropped.total()
     assert account.in_file >= (declared or 0)
-    assert ledger.is_whole == (account.lost.total() == 0)
+    assert ledger.is_whole == (account.dropped.total() == 0)
 
 
 def test_fewer_than_declared_is_a_loss_and_more_is_only_said() -> None:
@@ -36,14 +38,14 @@ def test_fewer_than_declared_is_a_loss_and_more_is_only_said() -> None:
         ledger.find(topic, found)
         ledger.settle(topic)
 
-    assert ledger.topic("/few").lost.total() == 2
+    assert ledger.topic("/few").dropped.total() == 2
     assert ledger.topic("/many").is_whole
     assert any("/many" in sentence for sentence in ledger.notices)
 
 
 def test_a_loss_nobody_can_count_still_is_a_loss() -> None:
     ledger = Ledger("log")
-    ledger.lose("", "cut", None)
+    ledger.drop("", "cut", None)
 
     assert not ledger.is_whole
 

@@ -172,7 +172,7 @@ def test_messages_of_an_undeclared_channel_are_told_as_lost(tmp_path: Path) -> N
     reading = read_back(stored(tmp_path / "x.mcap", McapFile([chunk])))
 
     assert reading.count() == 1
-    assert reading.ledger.accounts[""].lost.total() == 2
+    assert reading.ledger.accounts[""].dropped.total() == 2
     assert not reading.ledger.is_whole
 
 
@@ -188,7 +188,7 @@ def test_statistics_that_say_more_than_there_is_are_a_loss(tmp_path: Path) -> No
     reading = read_back(stored(tmp_path / "x.mcap", joined))
 
     assert reading.count() == 2
-    assert reading.ledger.accounts["/a"].lost.total() == 1
+    assert reading.ledger.accounts["/a"].dropped.total() == 1
 
 
 def test_attachments_and_their_checksums_are_looked_at(tmp_path: Path) -> None:

@@ -89,8 +89,8 @@ def test_a_cut_chunk_gives_the_messages_it_begins_with(tmp_path: Path, compressi
     assert 100 < len(given) < 400
     assert [log for log, *_ in given] == list(range(len(given)))
     assert all(sent[i].endswith(payload) for i, (*_, payload) in enumerate(given))
-    assert [loss.reason for loss in reading.ledger.losses()] == ["the file is cut"]
-    assert "no checksum covers" in next(reading.ledger.losses()).detail
+    assert [loss.reason for loss in reading.ledger.drops()] == ["the file is cut"]
+    assert "no checksum covers" in next(reading.ledger.drops()).detail
 
 
 @pytest.mark.parametrize("compression", ["", "lz4", "zstd"])
@@ -106,10 +106,10 @@ def test_a_flipped_byte_costs_its_chunk_and_names_it(tmp_path: Path, compression
 
     reading = read_back(path)
 
-    lost = {name: account.lost.total() for name, account in reading.ledger.accounts.items()}
+    lost = {name: account.dropped.total() for name, account in reading.ledger.accounts.items()}
     assert lost == {"/imu": 9, "/can": 8, "/camera": 8}
     assert reading.count() == 600 - 25
-    for loss in reading.ledger.losses():
+    for loss in reading.ledger.drops():
         assert loss.reason == "damaged chunk"
         assert f"chunk at byte {at}:" in loss.detail
         assert loss.t_ns == 10**9
@@ -273,7 +273,7 @@ def test_a_wrong_section_checksum_keeps_back_only_what_nothing_else_covers(
     reading = read_back(path)
 
     assert reading.count() == 10
-    assert Counter({n: a.lost.total() for n, a in reading.ledger.accounts.items()}) == Counter(
+    assert Counter({n: a.dropped.total() for n, a in reading.ledger.accounts.items()}) == Counter(
         {"/a": 3, "/b": 3}
     )
     assert "wrong" in reading.ledger.integrity
@@ -292,7 +292,7 @@ def test_a_file_that_shrinks_while_open_is_told(tmp_path: Path) -> None:
         given = sum(len(block) for block in log.read(ledger))
 
     assert 200 < given < 400
-    assert sum(a.lost.total() for a in ledger.accounts.values()) == 600 - given
+    assert sum(a.dropped.total() for a in ledger.accounts.values()) == 600 - given
 
 
 def test_an_error_is_never_more_than_a_crosscue_error(tmp_path: Path) -> None:
@@ -324,7 +324,7 @@ def test_without_an_index_reading_goes_on_at_the_next_chunk_that_proves_itself(
     reading = read_back(path)
 
     assert reading.count() == 575
-    assert any(f"bytes {at} to " in loss.detail for loss in reading.ledger.losses())
+    assert any(f"bytes {at} to " in loss.detail for loss in reading.ledger.drops())
 
 
 def test_a_cut_recording_does_not_swallow_the_one_behind_it(tmp_path: Path) -> None:

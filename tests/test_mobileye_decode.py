@@ -89,7 +89,7 @@ def test_parts_of_different_slots_are_never_one_obstacle() -> None:
 
     assert "obstacles" not in tables
     assert skipped(ledger)["obstacle cut: A, B or C is missing"] == 3
-    assert ledger.topic("can1").lost.total() == 3
+    assert ledger.topic("can1").dropped.total() == 3
 
 
 def test_a_triple_across_two_status_frames_is_not_joined() -> None:
@@ -99,8 +99,8 @@ def test_a_triple_across_two_status_frames_is_not_joined() -> None:
 
     assert "obstacles" not in tables
     assert skipped(ledger)["obstacle cut: A, B or C is missing"] == 3
-    assert [d.t_ns for d in ledger.details if not d.is_loss] == [MS, 67 * MS]
-    assert ledger.topic("can1").lost.total() == 3
+    assert [d.t_ns for d in ledger.details if not d.is_dropped] == [MS, 67 * MS]
+    assert ledger.topic("can1").dropped.total() == 3
 
 
 def test_a_cut_burst_keeps_its_whole_obstacles_and_tells_the_rest() -> None:
@@ -110,7 +110,7 @@ def test_a_cut_burst_keeps_its_whole_obstacles_and_tells_the_rest() -> None:
 
     assert tables["obstacles"]["obstacle_id"].tolist() == [7]
     assert skipped(ledger)["obstacle cut: A, B or C is missing"] == 2
-    lost = list(ledger.losses())
+    lost = list(ledger.drops())
     assert [(d.count, d.t_ns, d.detail) for d in lost] == [(4, 0, "burst 0")]
 
 
@@ -425,7 +425,7 @@ def test_how_the_log_is_cut_into_blocks_changes_nothing(seed: int, cuts: list[in
         for column in table.columns:
             np.testing.assert_array_equal(table[column], pieces[name][column])
     assert skipped(ledger) == skipped(ledger_of_pieces)
-    assert ledger.topic("can1").lost == ledger_of_pieces.topic("can1").lost
+    assert ledger.topic("can1").dropped == ledger_of_pieces.topic("can1").dropped
 
 
 @given(seed=st.integers(0, 10_000))
@@ -440,7 +440,7 @@ def test_losing_frames_never_makes_a_row_that_was_not_there(seed: int) -> None:
     assert rows_of(left.get("obstacles")) <= known
     assert rows_of(left.get("lanes")) <= rows_of(whole.get("lanes"))
     if len(rows_of(left.get("obstacles"))) < len(known):
-        assert skipped(ledger) or ledger.topic("can1").lost
+        assert skipped(ledger) or ledger.topic("can1").dropped
 
 
 @given(seed=st.integers(0, 100_000))

@@ -165,14 +165,16 @@ def test_obstacle_messages_that_did_not_come_are_told() -> None:
     _, ledger = from_bag([statuses, obstacles.take(np.arange(8) != 3)])
 
     account = ledger.topic("/parsed_tx/obstacle_data")
-    assert account.lost.total() == 1
-    assert [(d.t_ns, d.detail) for d in ledger.losses()] == [(1066 * MS, "burst 1")]
+    assert account.dropped.total() == 1
+    assert [(d.t_ns, d.detail) for d in ledger.drops()] == [(1066 * MS, "burst 1")]
 
 
 def test_no_obstacle_messages_at_all_are_told_too() -> None:
     statuses, obstacles = obstacle_drive()
     _, ledger = from_bag([statuses, obstacles.take(np.s_[:0])])
-    assert ledger.topic("/parsed_tx/obstacle_data").lost.total() == 6  # the last burst may be cut
+    assert (
+        ledger.topic("/parsed_tx/obstacle_data").dropped.total() == 6
+    )  # the last burst may be cut
 
 
 def test_whole_obstacles_without_their_status_keep_their_own_time() -> None:

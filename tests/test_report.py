@@ -79,7 +79,7 @@ def test_coverage_comes_first_and_losses_are_told(tmp_path: Path) -> None:
              ("Coverage", "Intersections", "Cues", "Belief", "Range", "How")]  # fmt: skip
     assert order == sorted(order)
     assert "<b>50 of 50</b>" in page
-    assert "rows were lost." in page
+    assert "rows were dropped." in page
     assert "Not scored:</b> pose (the truth tells no track (pose: missing))" in page
 
 

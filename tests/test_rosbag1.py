@@ -222,7 +222,9 @@ def test_a_damaged_chunk_is_counted_topic_by_topic(tmp_path: Path, compression: 
     missing = Counter(row.topic for row in rows) - Counter(row.topic for row in reading.rows)
 
     assert missing
-    lost = {name: a.lost.total() for name, a in reading.ledger.accounts.items() if a.lost.total()}
+    lost = {
+        name: a.dropped.total() for name, a in reading.ledger.accounts.items() if a.dropped.total()
+    }
     assert lost == dict(missing)
     for name, account in reading.ledger.accounts.items():
         assert account.in_file == Counter(row.topic for row in rows)[name]
@@ -239,7 +241,7 @@ def test_a_damaged_record_header_costs_one_message(tmp_path: Path) -> None:
     reading = read_rows(path)
 
     assert len(reading.rows) == len(rows) - 1
-    assert sum(a.lost.total() for a in reading.ledger.accounts.values()) == 1
+    assert sum(a.dropped.total() for a in reading.ledger.accounts.values()) == 1
 
 
 def test_a_swapped_connection_number_is_caught_by_the_index(tmp_path: Path) -> None:
@@ -253,7 +255,7 @@ def test_a_swapped_connection_number_is_caught_by_the_index(tmp_path: Path) -> N
 
     assert len(reading.rows) == len(rows) - 1
     assert not Counter(reading.rows) - Counter(rows)
-    assert [d.reason for d in reading.ledger.losses()] == ["record and index disagree"]
+    assert [d.reason for d in reading.ledger.drops()] == ["record and index disagree"]
 
 
 def test_messages_outside_chunks_are_read(tmp_path: Path) -> None:
@@ -314,7 +316,7 @@ def test_messages_without_a_connection_are_lost_with_a_word(tmp_path: Path) -> N
     path = bag(tmp_path / "a.bag", chunk(connection(0, b"/a") + message(9, START_NS, b"x")))
     ledger = read_rows(path).ledger
 
-    assert ledger.topic("").lost == {"message of an unknown connection": 1}
+    assert ledger.topic("").dropped == {"message of an unknown connection": 1}
 
 
 @pytest.mark.parametrize(
@@ -352,7 +354,7 @@ def test_a_chunk_that_declares_gigabytes_is_refused_by_its_word(tmp_path: Path) 
     reading = read_rows(bag(tmp_path / "a.bag", good, bomb, good))
 
     assert len(reading.rows) == 2
-    assert [d.reason for d in reading.ledger.losses()] == ["chunk over the size limit"]
+    assert [d.reason for d in reading.ledger.drops()] == ["chunk over the size limit"]
 
 
 def test_a_chunk_that_grows_beyond_its_word_is_dropped(tmp_path: Path) -> None:

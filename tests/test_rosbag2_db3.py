@@ -331,7 +331,7 @@ def test_a_zeroed_page_costs_its_own_rows_only(tmp_path: Path) -> None:
     content[middle : middle + 4096] = bytes(4096)
     path.write_bytes(content)
     reading = read_rows(path)
-    lost = sum(account.lost.total() for account in reading.ledger.accounts.values())
+    lost = sum(account.dropped.total() for account in reading.ledger.accounts.values())
 
     assert len(rows) - 100 < len(reading.rows) < len(rows)
     assert not Counter(reading.rows) - Counter(rows)
@@ -350,7 +350,7 @@ def test_a_row_whose_time_the_index_disputes_is_not_given(tmp_path: Path) -> Non
 
     assert Counter(rows) - Counter(reading.rows) == Counter([rows[150]])
     assert not Counter(reading.rows) - Counter(rows)
-    assert [d.reason for d in reading.ledger.losses()] == ["row and time index disagree"]
+    assert [d.reason for d in reading.ledger.drops()] == ["row and time index disagree"]
 
 
 @settings(max_examples=25, deadline=None)
@@ -401,7 +401,7 @@ def test_a_damaged_compressed_message_is_lost_alone(tmp_path: Path) -> None:
     reading = read_rows(path)
 
     assert [row.log_ns for row in reading.rows] == [0, 1, 3, 4]
-    assert reading.ledger.topic("/a").lost == {"damaged compressed message": 1}
+    assert reading.ledger.topic("/a").dropped == {"damaged compressed message": 1}
     assert reading.ledger.topic("/a").in_file == 5
 
 
@@ -412,7 +412,7 @@ def test_a_compressed_message_that_grows_without_bound_is_lost(tmp_path: Path) -
     reading = read_rows(make(tmp_path / "a.db3", (1, 5, bomb), (1, 6, b"\0\1\0\0")))
 
     assert [row.log_ns for row in reading.rows] == [6]
-    assert reading.ledger.topic("/a").lost == {"damaged compressed message": 1}
+    assert reading.ledger.topic("/a").dropped == {"damaged compressed message": 1}
 
 
 def test_messages_may_go_back_in_time(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def test_a_listed_file_that_is_missing_is_lost_by_topic(tmp_path: Path) -> None:
     listing(folder, "part_0.db3", "part_1.db3", counts=count_by_topic(rows))
     (folder / "part_1.db3").unlink()
     ledger = read_rows(folder).ledger
-    lost = {name: a.lost["storage file is missing"] for name, a in ledger.accounts.items()}
+    lost = {name: a.dropped["storage file is missing"] for name, a in ledger.accounts.items()}
 
     assert {name: count for name, count in lost.items() if count} == count_by_topic(rows[100:])
     for name, count in count_by_topic(rows).items():
@@ -141,7 +141,7 @@ def test_a_missing_file_without_counts_is_still_told(tmp_path: Path) -> None:
     ledger = read_rows(folder).ledger
 
     assert not ledger.is_whole
-    assert [d.detail for d in ledger.losses()] == ["part_1.db3"]
+    assert [d.detail for d in ledger.drops()] == ["part_1.db3"]
 
 
 def test_a_listed_file_that_does_not_open_is_lost_and_named(tmp_path: Path) -> None:
@@ -152,7 +152,7 @@ def test_a_listed_file_that_does_not_open_is_lost_and_named(tmp_path: Path) -> N
     reading = read_rows(folder)
 
     assert by_topic(reading.rows) == by_topic(rows[:100])
-    lost = sum(account.lost.total() for account in reading.ledger.accounts.values())
+    lost = sum(account.dropped.total() for account in reading.ledger.accounts.values())
     assert lost == 200
     assert any("part_1.db3" in sentence for sentence in reading.ledger.notices)
 
@@ -243,7 +243,7 @@ def test_a_cut_packed_file_gives_its_readable_part(tmp_path: Path, storage: Stor
     assert len(reading.rows) > 1000 or storage == "mcap"
     assert not Counter(reading.rows) - Counter(rows)
     assert not reading.ledger.is_whole
-    lost = sum(a.lost.total() for n, a in reading.ledger.accounts.items())
+    lost = sum(a.dropped.total() for n, a in reading.ledger.accounts.items())
     assert lost == len(rows) - len(reading.rows)
 
 

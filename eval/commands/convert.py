@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     """Convert, read back, print the account.
 
     Returns:
-        0 when every row that was asked for is in the file, 3 when some are lost or skipped.
+        0 when every row that was asked for is in the file, 3 when some are dropped or skipped.
     """
     _check_output(args)
     with open_log(args.log) as log:
@@ -136,7 +136,7 @@ def _refused(account: TopicAccount) -> Mapping[str, int]:
 
 
 def _lost(account: TopicAccount) -> int:
-    return account.lost.total()
+    return account.dropped.total()
 
 
 def _as_json(args: argparse.Namespace, ledger: Ledger, writer: LogWriter) -> object:
@@ -156,8 +156,8 @@ def _as_json(args: argparse.Namespace, ledger: Ledger, writer: LogWriter) -> obj
                 "found": account.found,
                 "written": writer.kept[name],
                 "skipped": dict(account.skipped),
-                "lost": dict(account.lost),
-                "lost_unknown": account.lost_unknown,
+                "dropped": dict(account.dropped),
+                "dropped_unknown": account.dropped_unknown,
             }
             for name, account in ledger.accounts.items()
         },
@@ -169,10 +169,10 @@ def _print(args: argparse.Namespace, ledger: Ledger, writer: LogWriter) -> None:
     width = terminal_width()
     rows = [
         [name, writer.types.get(name, "-"), str(account.found), str(writer.kept[name]),
-         str(account.skipped.total()), str(_lost(account)) + "+" * bool(account.lost_unknown)]
+         str(account.skipped.total()), str(_lost(account)) + "+" * bool(account.dropped_unknown)]
         for name, account in ledger.accounts.items()
     ]  # fmt: skip
-    head = ["topic", "type", "found", "written", "skipped", "lost"]
+    head = ["topic", "type", "found", "written", "skipped", "dropped"]
     print("\n".join(table(head, rows, width, (0, 1))))
     size = args.output.stat().st_size / 1e6
     print(
@@ -181,7 +181,7 @@ def _print(args: argparse.Namespace, ledger: Ledger, writer: LogWriter) -> None:
     for notice in ledger.notices[:SHOWN]:
         print(wrapped(visible(notice), width), file=sys.stderr)
     for detail in ledger.details[:SHOWN]:
-        verb = "lost" if detail.is_loss else "skipped"
+        verb = "dropped" if detail.is_dropped else "skipped"
         count = "?" if detail.count is None else detail.count
         text = f"{detail.topic}: {count} {verb}: {detail.reason}; {detail.detail}".rstrip("; ")
         print(wrapped(visible(text), width), file=sys.stderr)

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Decode; 3 when something was lost."""
+    """Decode; 3 when something was dropped."""
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     with open_logs(args.logs) as logs:
         folder = create(args.output, overwrite=args.overwrite)
@@ -43,8 +43,8 @@ def run(args: argparse.Namespace) -> int:
             for topic, account in sorted(ledger.accounts.items()):
                 for reason, count in sorted(account.skipped.items()):
                     print(f"skipped  {topic}: {count:,} {reason}")
-            for loss in ledger.losses():
-                print(f"lost     {loss.topic or 'the log'}: {loss.count or 'some'} {loss.reason}")
+            for loss in ledger.drops():
+                print(f"dropped  {loss.topic or 'the log'}: {loss.count or 'some'} {loss.reason}")
             for sentence in ledger.notices:
                 print(f"note     {sentence}")
     return 0 if all(ledger.is_whole for ledger in ledgers) else 3

@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Detect; 3 when something was lost."""
+    """Detect; 3 when something was dropped."""
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     if args.draw < 0:
         raise UsageError(f"--draw {args.draw}: want 0 or more")
@@ -72,8 +72,8 @@ def summary(outcome: DetectOutcome) -> str:
     lines += [f"cue      {cue}: in {count:,} frames" for cue, count in outcome.cues.items()]
     for topic, account in sorted(ledger.accounts.items()):
         lines += [f"skipped  {topic}: {n:,} {why}" for why, n in sorted(account.skipped.items())]
-    for loss in ledger.losses():
-        lines.append(f"lost     {loss.topic or 'the log'}: {loss.count or 'some'} {loss.reason}")
+    for loss in ledger.drops():
+        lines.append(f"dropped  {loss.topic or 'the log'}: {loss.count or 'some'} {loss.reason}")
     lines += [f"note     {sentence}" for sentence in (*ledger.notices, *outcome.notices)]
     return "\n".join(visible(line) for line in lines)
 

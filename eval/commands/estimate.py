@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Estimate; 3 when something was lost."""
+    """Estimate; 3 when something was dropped."""
     folder = open_one(args.run)
     vehicle = load(args.vehicle) if args.vehicle else None
     progress = Progress("estimating", not args.quiet and sys.stderr.isatty())

@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     """Look at each log and print what it holds.
 
     Returns:
-        0 when all logs are whole, 3 when something is lost.
+        0 when all logs are whole, 3 when something is dropped.
     """
     with open_logs(args.logs) as logs:
         if args.quick:
@@ -130,15 +130,17 @@ def _account(summary: LogSummary, width: int) -> Iterator[str]:
             str(t.found),
             str(t.used),
             str(sum(t.skipped.values())),
-            ">= " * bool(t.lost_unknown) + str(sum(t.lost.values())),
+            ">= " * bool(t.dropped_unknown) + str(sum(t.dropped.values())),
         )
         for t in summary.topics
     ]
-    if summary.unattributed_lost or summary.unattributed_unknown:
+    if summary.unattributed_dropped or summary.unattributed_unknown:
         unknown = ">= " * bool(summary.unattributed_unknown)
-        lost = f"{unknown}{sum(summary.unattributed_lost.values())}"
-        rows.append(("(topic not known)", "-", "-", "-", "-", lost))
-    yield from table(("topic", "declared", "found", "used", "skipped", "lost"), rows, width, (0,))
+        dropped = f"{unknown}{sum(summary.unattributed_dropped.values())}"
+        rows.append(("(topic not known)", "-", "-", "-", "-", dropped))
+    yield from table(
+        ("topic", "declared", "found", "used", "skipped", "dropped"), rows, width, (0,)
+    )
     for topic in summary.topics:
         for reason, count in sorted(topic.skipped.items()):
             yield wrapped(f"{topic.name}: {count} skipped: {reason}", width, "  ")
@@ -165,14 +167,14 @@ def _ids_in_words(bus: TopicSummary) -> str:
 
 def _losses(summary: LogSummary, width: int) -> Iterator[str]:
     texts = []
-    for loss in summary.losses[:LOSSES_SHOWN]:
+    for loss in summary.drops[:LOSSES_SHOWN]:
         count = "an unknown number" if loss.count is None else str(loss.count)
         begin_ns = summary.start_ns or 0
         at = "" if loss.t_ns is None else f" at {(loss.t_ns - begin_ns) * 1e-9:.2f} s"
         detail = f" ({loss.detail})" if loss.detail else ""
         texts.append(f"{count} of {loss.topic or 'unknown topics'}{at}: {loss.reason}{detail}")
-    if len(summary.losses) > LOSSES_SHOWN:
-        texts.append(f"and {len(summary.losses) - LOSSES_SHOWN} more; --json lists them")
+    if len(summary.drops) > LOSSES_SHOWN:
+        texts.append(f"and {len(summary.drops) - LOSSES_SHOWN} more; --json lists them")
     yield from _bullets("losses", texts, width)
 
 

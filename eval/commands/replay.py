@@ -120,7 +120,7 @@ def cache_of(args: argparse.Namespace) -> Path | None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay; 3 when something was lost."""
+    """Replay; 3 when something was dropped."""
     if args.draw < 0:
         raise UsageError(f"--draw {args.draw}: want 0 or more")
     drives = drives_of(args.logs, each=args.each)
@@ -341,7 +341,7 @@ def summary(outcome: Outcome) -> str:
         lines.append(f"log      {ledger.log}")
         lines.append(f"         {used:,} rows used of {found:,}")
         lines.append(f"         integrity: {ledger.integrity}")
-        lines += [f"  lost   {_loss(d.topic, d.reason, d.count)}" for d in ledger.losses()]
+        lines += [f"  dropped {_loss(d.topic, d.reason, d.count)}" for d in ledger.drops()]
         lines += [f"  note   {sentence}" for sentence in ledger.notices]
     if outcome.rows:
         lines += [

@@ -1,4 +1,4 @@
-"""A page of text beside the pictures: which logs, what was lost, what the colours say."""
+"""A page of text beside the pictures: which logs, what was dropped, what the colours say."""
 
 from __future__ import annotations
 
@@ -26,9 +26,11 @@ def notes(run: RunFolder, more: Sequence[str]) -> rr.TextDocument:
     manifest = run.manifest()
     logs = [f"- {inert(log['path'])}" for log in manifest["logs"]]
     notices = [f"- {inert(sentence)}" for sentence in (*manifest["notices"], *more)]
-    lost = sum(not account["is_whole"] for account in manifest["accounts"])
+    dropped = sum(not account["is_whole"] for account in manifest["accounts"])
     whole = (
-        "nothing is known to be lost" if not lost else f"{lost} log(s) with losses: see manifest"
+        "nothing is known to be dropped"
+        if not dropped
+        else f"{dropped} log(s) with losses: see manifest"
     )
     lines = [
         f"# {inert(run.path.name)}", "", f"Logs ({whole}):", *logs, "", "Notes:",

@@ -141,7 +141,7 @@ class MobileyeDecoder:
                     "of it are not there"
                 )
             else:
-                self._ledger.lose(self._bus, NOT_COME, count, f"burst {number}", log_ns)
+                self._ledger.drop(self._bus, NOT_COME, count, f"burst {number}", log_ns)
         if not len(triples.a):
             return []
         at = status.at(triples.a.burst)

@@ -121,7 +121,7 @@ class RosBursts:
         lacking = np.minimum(self._count[:upto], self._slots) - came
         for k in np.flatnonzero(lacking > 0).tolist() if self._topic else ():
             detail, t_ns = f"burst {int(self._number[k])}", int(self._stamp_ns[k])
-            self._ledger.lose(self._topic, NOT_COME, int(lacking[k]), detail, t_ns)
+            self._ledger.drop(self._topic, NOT_COME, int(lacking[k]), detail, t_ns)
         self._stamp_ns, self._image_ns = self._stamp_ns[upto:], self._image_ns[upto:]
         self._count, self._number = self._count[upto:], self._number[upto:]
 

@@ -193,9 +193,9 @@ class Asc(Dialect):
         if self._is_relative and not ledger.is_whole:
             ledger.notice("times are relative to the line before: each lost line shifts later ones")
         if self._block == _BEGINS:
-            ledger.lose("", "no 'End TriggerBlock': the log may be cut", None)
+            ledger.drop("", "no 'End TriggerBlock': the log may be cut", None)
         elif not self._block and not self._has_events:
-            ledger.lose("", "a header and nothing after it: the log may be cut", None)
+            ledger.drop("", "a header and nothing after it: the log may be cut", None)
 
     def _stretch(self, t_ns: Int64s) -> Int64s:
         self._has_events |= len(t_ns) > 0

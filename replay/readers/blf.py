@@ -185,16 +185,16 @@ class _Pass:
         detail = "; ".join(tally.places)
         missing = header.objects - tally.counted
         if not header.objects and tally.counted:
-            ledger.lose("", "file was not closed by its writer", None, _UNCLOSED)
+            ledger.drop("", "file was not closed by its writer", None, _UNCLOSED)
         if not header.objects and not tally.counted:
             ledger.notice("no objects: nothing was recorded, or the writer was stopped early")
         if header.objects and missing > 0:
             reason = reasons[0] if len(reasons) == 1 else "objects damaged or missing"
             declared = f"declared {header.objects} objects, found {tally.counted}"
-            ledger.lose("", reason, missing, f"{declared}; {detail}" if detail else declared)
+            ledger.drop("", reason, missing, f"{declared}; {detail}" if detail else declared)
         else:
             for reason in reasons:
-                ledger.lose("", reason, None, detail)
+                ledger.drop("", reason, None, detail)
         if header.objects and missing < 0:
             ledger.notice(f"the header declares {header.objects} objects, found {tally.counted}")
 

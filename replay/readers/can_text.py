@@ -192,11 +192,11 @@ class TextCanLog(Closing):
                 if scribe.stopped:
                     break
         except OSError as error:
-            ledger.lose("", "file cannot be read on", None, error.strerror or str(error))
+            ledger.drop("", "file cannot be read on", None, error.strerror or str(error))
         for name in self._names:
             ledger.topic(name)
         if self._path.stat().st_size != size:
-            ledger.lose("", "file changed while it was read", None, f"had {size} bytes before")
+            ledger.drop("", "file changed while it was read", None, f"had {size} bytes before")
         scribe.dialect.finish(ledger)
         ledger.integrity = scribe.dialect.integrity
 
@@ -208,7 +208,7 @@ class TextCanLog(Closing):
             if isinstance(piece, Lines) or found or scribe.knows_it:
                 break
         if not self._names and not scribe.knows_it:
-            why = next((d.detail for d in ledger.losses()), "it is empty")
+            why = next((d.detail for d in ledger.drops()), "it is empty")
             raise LogFormatError(
                 f"{self._path}: no frame of a {dialect.says} in its beginning ({why}); "
                 "check that it is one, and whole"
@@ -231,7 +231,7 @@ class _Scribe:
         if isinstance(piece, Tail):
             return self._tail(piece)
         detail = f"line {piece.number}: at least {piece.byte_count} bytes without a line end"
-        self._ledger.lose("", "stretch without line ends", None, detail)
+        self._ledger.drop("", "stretch without line ends", None, detail)
         return NO_ROWS
 
     def _tail(self, tail: Tail) -> FrameRows:
@@ -243,7 +243,7 @@ class _Scribe:
             outcome = Damage("last line has no line end, may be cut")
         if outcome is None or isinstance(outcome, Frame):
             detail = f"line {tail.number} has no line end"
-            self._ledger.lose("", "file may be cut after its last frame", None, detail)
+            self._ledger.drop("", "file may be cut after its last frame", None, detail)
         self._sort_in(odd, 0, tail.number, tail.text, outcome)
         return self._timed(NO_ROWS, odd)
 
@@ -294,14 +294,14 @@ class _Scribe:
                 odd.marks.append((i, outcome))
                 if outcome.stops:
                     self.stopped = True
-                    self._ledger.lose("", outcome.stops, None, f"from line {number} on")
+                    self._ledger.drop("", outcome.stops, None, f"from line {number} on")
             case None:
                 pass
 
     def _lost(self, topic: str, reason: str, number: int, line: bytes) -> None:
         excerpt = line[:_EXCERPT].decode("ascii", "backslashreplace")
         dots = "..." if len(line) > _EXCERPT else ""
-        self._ledger.lose(topic, reason, 1, f"line {number}: {excerpt!r}{dots}")
+        self._ledger.drop(topic, reason, 1, f"line {number}: {excerpt!r}{dots}")
 
     def _untainted(self, rows: FrameRows, tainted: list[int], lines: Lines) -> FrameRows:
         if not tainted:

@@ -34,14 +34,14 @@ class Giver:
 
     Attributes:
         met: Messages met, by channel number.
-        lost: Messages known to be lost, by channel number.
+        dropped: Messages known to be dropped, by channel number.
     """
 
     def __init__(
         self, ledger: Ledger, selection: Selection, limits: Limits, declarations: Declarations
     ) -> None:
         self.met: Counter[int] = Counter()
-        self.lost: Counter[int] = Counter()
+        self.dropped: Counter[int] = Counter()
         self.declarations = declarations
         self._ledger = ledger
         self._selection = selection
@@ -69,8 +69,8 @@ class Giver:
                 checks.bad_definitions.add(f"in the chunk or record at byte {at}: {error}")
         yield from self._give_part(rows.take(slice(begin, None)) if begin else rows)
 
-    def lose(self, rows: Rows, reason: str, detail: str) -> None:
-        """All messages of ``rows`` are lost."""
+    def drop(self, rows: Rows, reason: str, detail: str) -> None:
+        """All messages of ``rows`` are dropped."""
         channels, counts = np.unique(rows.channel, return_counts=True)
         for channel_id, count in zip(channels.tolist(), counts.tolist(), strict=True):
             self.lose_of_channel(channel_id, reason, count, detail, None)
@@ -78,9 +78,9 @@ class Giver:
     def lose_of_channel(
         self, channel_id: int, reason: str, count: int, detail: str, t_ns: int | None
     ) -> None:
-        """``count`` messages of a channel are lost."""
-        self.lost[channel_id] += count
-        self._ledger.lose(self.declarations.topic(channel_id), reason, count, detail, t_ns)
+        """``count`` messages of a channel are dropped."""
+        self.dropped[channel_id] += count
+        self._ledger.drop(self.declarations.topic(channel_id), reason, count, detail, t_ns)
 
     def wants(self, index: MessageIndex) -> bool:
         """Is any of these messages asked for?"""
@@ -144,7 +144,7 @@ class Giver:
         start, stop = starts[index], rows.stop[index]
         if topic == UNKNOWN:
             named = ", ".join(str(i) for i in np.unique(rows.channel)[:10].tolist())
-            self._ledger.lose(UNKNOWN, UNDECLARED, len(log), f"among the channels {named}")
+            self._ledger.drop(UNKNOWN, UNDECLARED, len(log), f"among the channels {named}")
             return
         kept = self._account(topic, log)
         if kept is not None:

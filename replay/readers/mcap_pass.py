@@ -144,7 +144,7 @@ class SegmentPass:
             else:
                 self._note(item)
         if segment.after:
-            self._ledger.lose("", INCOMPLETE, None, self._where + segment.after)
+            self._ledger.drop("", INCOMPLETE, None, self._where + segment.after)
         self._finish_checks()
 
     def _is_wanted(self, chunk: Chunk) -> bool:
@@ -285,11 +285,11 @@ class SegmentPass:
             if is_before_gap:
                 count = int(np.searchsorted(rows.stop, rows.end - NEAR, side="right"))
                 detail = f"{self._where}up to byte {run.at + rows.end}, where records break off"
-                self._giver.lose(rows.take(slice(count, None)), BEFORE_A_GAP, detail)
+                self._giver.drop(rows.take(slice(count, None)), BEFORE_A_GAP, detail)
                 rows = rows.take(slice(count))
             self._checks.rows_bare += len(rows)
         elif not self._section_is_right():
-            self._giver.lose(rows, DAMAGED_SECTION, f"{self._where}records from byte {run.at} on")
+            self._giver.drop(rows, DAMAGED_SECTION, f"{self._where}records from byte {run.at} on")
             return
         yield from self._giver.give(rows, self._checks, run.at)
 
@@ -360,7 +360,7 @@ class SegmentPass:
             for damage in self._damages:
                 self._tell(damage)
             return None
-        met = self._giver.met + self._giver.lost
+        met = self._giver.met + self._giver.dropped
         if self._summary.counts_channels:
             missing = Counter(statistics.by_channel) - met
         else:
@@ -386,7 +386,7 @@ class SegmentPass:
 
     def _tell(self, damage: Damage) -> None:
         if not damage.counts:
-            self._ledger.lose("", damage.reason, None, damage.detail, damage.t_ns)
+            self._ledger.drop("", damage.reason, None, damage.detail, damage.t_ns)
         for channel_id, count in damage.counts.items():
             self._giver.lose_of_channel(
                 channel_id, damage.reason, count, damage.detail, damage.t_ns

@@ -136,7 +136,7 @@ class Mf4Log(Closing):
             else:
                 yield from self._blocks_of(source, ledger, selection)
         if self._broken:
-            ledger.lose("", "structure damaged", None, self._broken)
+            ledger.drop("", "structure damaged", None, self._broken)
         for name in self._buses:
             ledger.topic(name)
         ledger.integrity = (
@@ -163,7 +163,7 @@ class Mf4Log(Closing):
                 left = (declared if declared is not None else records.lost) - met - lost
                 count = min(records.lost, max(left, 0))
                 lost += count
-                ledger.lose(topic, "damaged data", count or None, records.damage)
+                ledger.drop(topic, "damaged data", count or None, records.damage)
                 continue
             met += len(records.rows)
             if source.can:
@@ -173,7 +173,7 @@ class Mf4Log(Closing):
         if declared is not None and met + lost < declared:
             detail = f"{source.group.name}: declared {declared}, found {met}"
             missing = declared - met - lost
-            ledger.lose(topic, "declared by the format, not in its bytes", missing, detail)
+            ledger.drop(topic, "declared by the format, not in its bytes", missing, detail)
         elif declared is not None and met > declared:
             ledger.notice(f"{source.group.name}: {declared} records declared, {met} in the file")
 
@@ -197,12 +197,12 @@ class Mf4Log(Closing):
     ) -> Iterator[Block]:
         log_ns = self._times(source, records)
         if log_ns is None:
-            ledger.lose("", "time out of range", len(records.rows), source.group.name)
+            ledger.drop("", "time out of range", len(records.rows), source.group.name)
             return
         rows = layout.frames(records, log_ns)
         bad = len(records.rows) - len(rows)
         detail = f"{source.group.name}, from record {records.first} on"
-        ledger.lose("", "record that cannot be a frame", bad, detail)
+        ledger.drop("", "record that cannot be a frame", bad, detail)
         rows = self._named(rows, ledger)
         yield from blocks_by_bus(rows, tuple(self._buses), ledger, selection)
 
@@ -217,7 +217,7 @@ class Mf4Log(Closing):
         is_known = named.bus >= 0
         if not bool(is_known.all()):
             extra = len(rows) - int(np.count_nonzero(is_known))
-            ledger.lose("", "more buses than a log can have", extra)
+            ledger.drop("", "more buses than a log can have", extra)
             return named.take(is_known)
         return named
 
@@ -227,7 +227,7 @@ class Mf4Log(Closing):
         count = len(records.rows)
         log_ns = self._times(source, records)
         if log_ns is None:
-            ledger.lose(source.topic, "time out of range", count, f"from record {records.first} on")
+            ledger.drop(source.topic, "time out of range", count, f"from record {records.first} on")
             return
         ledger.find(source.topic, count)
         inside = in_time(log_ns, selection)

@@ -48,7 +48,7 @@ class PictureFiles:
             yield from self._blocks(ledger, selection, limits)
         missing = self.files.missing_ns[is_inside(self.files.missing_ns, selection)]
         first_ns = int(missing[0]) if len(missing) else None
-        ledger.lose(name, "a time without its picture", len(missing), "", first_ns)
+        ledger.drop(name, "a time without its picture", len(missing), "", first_ns)
         if selection.start_ns is None and selection.end_ns is None:
             ledger.settle(name)
 
@@ -117,7 +117,7 @@ def _read_picture(
             picture = file.read(limits.message_bytes + 1)
     except OSError as error:
         why = error.strerror or str(error)
-        ledger.lose(topic, "picture cannot be opened", 1, f"{path.name}: {why}", t_ns)
+        ledger.drop(topic, "picture cannot be opened", 1, f"{path.name}: {why}", t_ns)
         return None
     coding = coding_of(picture[:MAGIC_BYTES], "")
     reason = None
@@ -132,7 +132,7 @@ def _read_picture(
         ledger.skip(topic, reason or "", 1, f"{path.name}: {len(picture)} bytes", t_ns)
         return None
     if damage := damage_of(picture, coding):
-        ledger.lose(topic, damage, 1, path.name, t_ns)
+        ledger.drop(topic, damage, 1, path.name, t_ns)
         return None
     ledger.find(topic, 1)
     _note_check(ledger, CHECKED[coding])

@@ -67,7 +67,7 @@ class BagLog(Closing):
         for sentence in self._notices:
             ledger.notice(sentence)
         for reason, detail in self._losses:
-            ledger.lose("", reason, None, detail)
+            ledger.drop("", reason, None, detail)
         one = Pass(
             self._file, self._first, self._contents, self._roster, self._limits, ledger, selection
         )

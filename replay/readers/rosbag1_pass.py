@@ -201,7 +201,7 @@ class Pass:
                         yield from self._flush()
                     self._batch.add(*taken)
         except OSError as error:
-            self._ledger.lose("", "file cannot be read on", None, str(error.strerror or error))
+            self._ledger.drop("", "file cannot be read on", None, str(error.strerror or error))
         yield from self._flush()
         for name in [t.name for t in self._roster.topics]:
             self._ledger.settle(name)
@@ -211,7 +211,7 @@ class Pass:
         """Take in a record outside chunks; a message as a chunk of its own."""
         if record.op == MESSAGE:
             if record.size > self._limits.message_bytes:
-                self._ledger.lose(
+                self._ledger.drop(
                     self._roster.topic_of(record.u32(b"conn")),
                     "message over the size limit",
                     1,
@@ -247,7 +247,7 @@ class Pass:
                 self._roster.add(connection)
                 self._ledger.notice(f"{TWO_RECORDS}, the one with a checksum was used: {detail}")
             else:
-                self._ledger.lose(known.topic, TWO_RECORDS, None, detail)
+                self._ledger.drop(known.topic, TWO_RECORDS, None, detail)
 
     def _say_if_renamed(self, connection: Connection) -> None:
         if connection.topic != connection.published:
@@ -268,12 +268,12 @@ class Pass:
             self._ledger.notice(f"the index section is damaged: {where}")
         else:
             reason = CUT if gap.stop == self._file.size else "damaged record"
-            self._ledger.lose("", reason, None, where)
+            self._ledger.drop("", reason, None, where)
 
     def _lose(self, missing: Counter[int], reason: str, detail: str) -> None:
         """Account for a known number of rows by connection; none at all is only a notice."""
         for conn, count in missing.items():
-            self._ledger.lose(self._roster.topic_of(conn), reason, max(count, 0), detail)
+            self._ledger.drop(self._roster.topic_of(conn), reason, max(count, 0), detail)
         if not any(count > 0 for count in missing.values()):
             self._ledger.notice(f"{reason}, no message lost: {detail}")
 
@@ -330,7 +330,7 @@ class Pass:
         if expected:
             self._lose(expected - found, reason, detail)
         else:
-            self._ledger.lose("", reason, None, detail)
+            self._ledger.drop("", reason, None, detail)
 
     def _is_skipped(self, unit: ChunkUnit) -> bool:
         """Leave the chunk compressed if both of its indexes agree that nothing in it is wanted."""
@@ -366,7 +366,7 @@ class Pass:
         for number, count in tally(conn).items():
             name = self._roster.topic_of(number)
             if not self._roster.knows(number):
-                self._ledger.lose("", NO_CONNECTION, count, f"connection {number}")
+                self._ledger.drop("", NO_CONNECTION, count, f"connection {number}")
             elif not self._roster.fits_topic(number):
                 self._ledger.find(name, count)
                 self._ledger.skip(name, OTHER_TYPE, count, f"connection {number}")

@@ -109,7 +109,7 @@ class FolderLog(Closing):
     ) -> Stream:
         log, fault = stack.enter_context(opened(split.path, self._limits))
         if fault:
-            ledger.lose("", "compressed file", None, fault)
+            ledger.drop("", "compressed file", None, fault)
         elif split.path.name.endswith(PACKED):
             ledger.notice("was unpacked to a temporary file")
         names = frozenset(topic.name for topic in split.topics)
@@ -145,13 +145,13 @@ class FolderLog(Closing):
         reason = gone[0][1] if gone else BY_METADATA
         detail = ", ".join(name for name, _ in gone)
         # Rows lost from a known number of nameless ones must not be counted a second time.
-        is_counted = "" in ledger.accounts and ledger.accounts[""].lost.total() > 0
+        is_counted = "" in ledger.accounts and ledger.accounts[""].dropped.total() > 0
         missing: dict[str, int] = {}
         for name, count in metadata.counts.items():
             in_file = ledger.accounts[name].in_file if name in ledger.accounts else 0
             missing[name] = count - in_file
             if missing[name] > 0 and not was_whole and not is_counted:
-                ledger.lose(name, reason, missing[name], detail or "a storage file is damaged")
+                ledger.drop(name, reason, missing[name], detail or "a storage file is damaged")
             elif missing[name]:
                 ledger.notice(
                     f"{name}: metadata.yaml counts {count} messages, the files hold {in_file}"
@@ -159,7 +159,7 @@ class FolderLog(Closing):
         for name, why in gone:
             hint = next((h for h in metadata.splits if h.name == name), None)
             if not any(count > 0 for count in missing.values()):
-                ledger.lose("", why, hint.count if hint is not None else None, name)
+                ledger.drop("", why, hint.count if hint is not None else None, name)
             else:
                 ledger.notice(f"{name}: {why}")
         for split in shut:
@@ -214,7 +214,7 @@ def _unpacked(block: Block, limits: Limits, ledger: Ledger) -> Iterator[Block]:
         stretch = replace(block.take(part), rows=plain)
         for i in damaged:
             ledger.find(block.topic, -1)
-            ledger.lose(
+            ledger.drop(
                 block.topic, DAMAGED, 1, "zstd cannot decompress it", int(stretch.log_ns[i])
             )
         if len(damaged):
@@ -228,8 +228,8 @@ def _absorb(ledger: Ledger, own: Ledger, name: str) -> None:
         total = ledger.topic(topic)
         total.found += account.found
         total.skipped.update(account.skipped)
-        total.lost.update(account.lost)
-        total.lost_unknown.extend(account.lost_unknown)
+        total.dropped.update(account.dropped)
+        total.dropped_unknown.extend(account.dropped_unknown)
     room = max(0, DETAILS_KEPT - len(ledger.details))
     ledger.details.extend(
         replace(detail, detail=f"{name}: {detail.detail}") for detail in own.details[:room]

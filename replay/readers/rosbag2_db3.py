@@ -86,7 +86,7 @@ class Db3Log(Closing):
         one = _Pass(self._database, self._tables, self._limits, ledger, selection)
         yield from one.blocks()
         if _stamp(self._path) != self._stamp:
-            ledger.lose("", "file changed while it was read", None, "read it again")
+            ledger.drop("", "file changed while it was read", None, "read it again")
 
     def close(self) -> None:
         """Release the file and any temporary copy."""
@@ -190,7 +190,7 @@ class _Pass:
             topic, times = place[part].copy(), log_ns[part]
             for i in damaged[topic[damaged] >= 0]:
                 name = self._names[int(topic[i])]
-                self._ledger.lose(name, DAMAGED, 1, "zstd cannot decompress it", int(times[i]))
+                self._ledger.drop(name, DAMAGED, 1, "zstd cannot decompress it", int(times[i]))
             topic[damaged] = -1
             keep = topic >= 0
             start, stop = plain.start[keep], plain.stop[keep]
@@ -238,7 +238,7 @@ class _Pass:
         at = np.minimum(np.searchsorted(listed, ids), len(listed) - 1)
         for i in np.flatnonzero((listed[at] == ids) & (times[at] != log_ns) & (place >= 0)):
             detail = f"row {ids[i]}: row {log_ns[i]}, index {times[at[i]]}"
-            self._ledger.lose(self._names[int(place[i])], INDEX_DIFFERS, 1, detail)
+            self._ledger.drop(self._names[int(place[i])], INDEX_DIFFERS, 1, detail)
             place[i] = -1
 
     def _finish(self, problems: str) -> None:
@@ -250,17 +250,17 @@ class _Pass:
         )
         if is_part and self._in_time_by_index != self._in_time:
             detail = f"index {self._in_time_by_index}, rows {self._in_time}"
-            ledger.lose("", INDEX_DIFFERS, None, detail)
+            ledger.drop("", INDEX_DIFFERS, None, detail)
         if is_part and not scan.holes:
             self._skip_rest()
         for name in self._names:
             ledger.settle(name, DAMAGED_PAGE)
         if scan.disordered and ledger.is_whole:
-            ledger.lose("", DISORDER, scan.disordered)
+            ledger.drop("", DISORDER, scan.disordered)
         if scan.holes and ledger.is_whole:
-            ledger.lose("", DAMAGED_PAGE, self._missing(), "; ".join(scan.holes[:3]))
+            ledger.drop("", DAMAGED_PAGE, self._missing(), "; ".join(scan.holes[:3]))
         if self._database.damage and ledger.is_whole:
-            ledger.lose("", DAMAGED_PAGE, None, self._database.damage)
+            ledger.drop("", DAMAGED_PAGE, None, self._database.damage)
         if is_part:
             ledger.integrity += "; a part was read, the file's structure was not checked"
         elif not problems:
@@ -268,7 +268,7 @@ class _Pass:
         else:
             ledger.integrity += "; SQLite's check finds damage"
             if ledger.is_whole:
-                ledger.lose("", UNSOUND, None, problems)
+                ledger.drop("", UNSOUND, None, problems)
             else:
                 ledger.notice(f"{UNSOUND}: {problems}")
 

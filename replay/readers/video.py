@@ -123,7 +123,7 @@ class Video(Closing):
                 yield from self._packets(index, wanted.tolist(), ledger)
             else:
                 yield from self._decoded(index, wanted.tolist(), ledger)
-        ledger.lose(topic.name, "a time without its picture", index.missing)
+        ledger.drop(topic.name, "a time without its picture", index.missing)
         self._settle(index, ledger)
 
     def close(self) -> None:
@@ -220,7 +220,7 @@ class Video(Closing):
                 try:
                     payload = b"".join(map(bytes, convert.filter(packet) if convert else [packet]))
                 except _failures() as error:
-                    ledger.lose(name, "packet damaged", 1, _words(error), int(index.t_ns[i]))
+                    ledger.drop(name, "packet damaged", 1, _words(error), int(index.t_ns[i]))
                     continue
                 ledger.find(name, 1)
                 if payloads and size + len(payload) > BLOCK_BYTES:
@@ -236,7 +236,7 @@ class Video(Closing):
         """Book a packet that is not to be given."""
         name, t_ns = self.topics[0].name, int(index.t_ns[i])
         if index.is_damaged[i]:
-            ledger.lose(name, "packet damaged", 1, f"packet {i}", t_ns)
+            ledger.drop(name, "packet damaged", 1, f"packet {i}", t_ns)
             return False
         reason = None
         if t_ns == NO_TIME:
@@ -264,7 +264,7 @@ class Video(Closing):
                 if self._usable(index, i, size, wanted[i], ledger):
                     ledger.find(name, 1)
                     yield _raw_block(name, int(index.t_ns[i]), frame)
-        ledger.lose(name, "picture cannot be decoded", len(order) - given)
+        ledger.drop(name, "picture cannot be decoded", len(order) - given)
 
     def _frames(self, container: InputContainer) -> Iterator[VideoFrame]:
         """Pictures that can be decoded."""
@@ -279,14 +279,14 @@ class Video(Closing):
     def _settle(self, index: _Index, ledger: Ledger) -> None:
         (topic,) = self.topics
         if index.stopped:
-            ledger.lose(topic.name, "file is cut or damaged", None, index.stopped)
+            ledger.drop(topic.name, "file is cut or damaged", None, index.stopped)
         elif topic.declared is None and self._times is None and self._duration_s is not None:
             last_s = float(index.t_ns.max(initial=0)) / SECOND_NS
             period_s = last_s / max(len(index.t_ns) - 1, 1)
             # A whole file ends one period after its last picture's time.
             if self._duration_s - last_s > 1.6 * period_s:
                 says = f"the container says {self._duration_s:.2f} s, packets end at {last_s:.2f} s"
-                ledger.lose(topic.name, "file is cut or damaged", None, says)
+                ledger.drop(topic.name, "file is cut or damaged", None, says)
         ledger.settle(topic.name, "declared by the container, not in its bytes")
 
 

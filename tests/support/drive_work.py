@@ -53,8 +53,8 @@ def letters(job: Job) -> Letters:
         write_manifest(run, {
             "accounts": [{"log": str(log), "is_whole": word != "loss", "topics": {
                 "letters": {"found": len(word), "in_file": len(word), "used": len(word) - 1,
-                            "declared": None, "skipped": {"dull": 1}, "lost": {},
-                            "lost_unknown": []},
+                            "declared": None, "skipped": {"dull": 1}, "dropped": {},
+                            "dropped_unknown": []},
             }}],
             "timings": {"seconds": time.monotonic()},
         })  # fmt: skip

@@ -191,7 +191,7 @@ def _check_identity(ledger: Ledger, rows: Sequence[Row]) -> None:
     given = Counter(row.topic for row in rows)
     for name, account in ledger.accounts.items():
         assert account.used == given.get(name, 0), (name, account)
-        assert account.in_file == account.used + account.skipped.total() + account.lost.total()
+        assert account.in_file == account.used + account.skipped.total() + account.dropped.total()
     assert not given.keys() - ledger.accounts.keys()
 
 

@@ -27,7 +27,7 @@ TOPIC: Final = "/camera/[red]<script>alert(1)</script>"
 ACCOUNT: Final[dict[str, Any]] = {
     "log": "drive.mcap", "integrity": "not checkable", "is_whole": False, "notices": [],
     "topics": {TOPIC: {"in_file": FRAMES, "used": FRAMES - 1, "skipped": {},
-                       "lost": {"<b>cut</b>": 1}, "lost_unknown": []}},
+                       "dropped": {"<b>cut</b>": 1}, "dropped_unknown": []}},
 }  # fmt: skip
 
 
