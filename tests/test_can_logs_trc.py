@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import can
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from crosscue.replay.columns import DATA, ERROR, REMOTE
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.log import open_log
-from support.can_files import Sent, read_back, same_as_python_can
+from crosscue.replay.readers.can_lines import CHUNK_BYTES
+from crosscue.replay.readers.can_numbers import GO_BACK, MISFIT, MISSING
+from crosscue.replay.readers.trc import NOT_UNDERSTOOD
+from support.can_files import Sent, made, read_back, same_as_python_can, trc
 from support.data import shared
 
 V1 = ";$FILEVERSION=1.1\n;$STARTTIME=25569.5\n"
@@ -145,9 +151,100 @@ def test_two_logs_in_one_file_keep_their_start_times(tmp_path: Path) -> None:
     assert ledger.is_whole
 
 
-@pytest.mark.parametrize("name", ["happy.trc", "passat-idling.trc", "test_motorola.trc"])
-def test_real_logs_read_as_python_can_reads_them(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "missing"),
+    [
+        ("passat-idling.trc", 0),
+        # Filtered after they were recorded; happy.trc is two such logs in one.
+        ("happy.trc", 11_458),
+        ("test_motorola.trc", 99_976 - 2_863),
+    ],
+)
+def test_real_logs_read_as_python_can_reads_them(name: str, missing: int) -> None:
     path = shared("can", "rusefi_trc", name)
 
     # It rounds the start time to microseconds.
-    same_as_python_can(path, can.TRCReader(path), "can/{}", within_ns=800)
+    same_as_python_can(path, can.TRCReader(path), "can/{}", within_ns=800, missing=missing)
+
+
+@dataclass(frozen=True)
+class Holes:
+    """A log with rows taken out."""
+
+    text: str
+    missing: int
+
+
+def _without(version: str, count: int, deleted: set[int]) -> Holes:
+    """A log of ``count`` rows without those at ``deleted``; the last one left hides later ones."""
+    is_old = version < "1.2"
+    frames = [replace(f, bus="1") if is_old else f for f in made(count, fd=version > "2")]
+    lines = trc(frames, version).decode().splitlines(keepends=True)
+    head, rows = lines[:-count], lines[-count:]
+    kept = [k for k in range(count) if k not in deleted]
+    last = kept[-1] if kept else -1
+    text = "".join([*head, *(rows[k] for k in kept)])
+    return Holes(text, sum(k < last for k in deleted))
+
+
+@pytest.mark.parametrize("version", ["1.0", "1.1", "1.2", "1.3", "2.1"])
+@given(deleted=st.sets(st.integers(0, 59)))
+@settings(max_examples=25, deadline=None)
+def test_each_row_taken_out_is_reported_as_dropped(
+    tmp_path_factory: pytest.TempPathFactory, version: str, deleted: set[int]
+) -> None:
+    holes = _without(version, 60, deleted)
+
+    found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), holes.text))
+
+    assert sum(map(len, found.values())) == 60 - len(deleted)
+    assert ledger.topic("").lost == ({MISSING: holes.missing} if holes.missing else {})
+    assert ledger.is_whole == (not holes.missing)
+
+
+def test_rows_missing_where_chunks_of_the_file_meet_are_reported(tmp_path: Path) -> None:
+    deleted = set(range(100, 40_000, 37))
+    holes = _without("2.1", 40_000, deleted)
+
+    _, ledger = read_back(_log(tmp_path, holes.text))
+
+    assert len(holes.text) > 2 * CHUNK_BYTES
+    assert ledger.topic("").lost == {MISSING: holes.missing}
+    assert "line 105: 101; line 141: 138" in next(ledger.losses()).detail
+
+
+def _numbered(*numbers: int, head: str = V1) -> str:
+    rows = (f"{n:>6}) {k}.5  Rx  0480  2  C2 08\n" for k, n in enumerate(numbers))
+    return head + "".join(rows)
+
+
+@pytest.mark.parametrize(
+    ("text", "lost", "unknown", "rows"),
+    [
+        (_numbered(1, 3, 2, 4), {}, [], 4),
+        (_numbered(0, 1, 2), {}, [], 3),
+        (_numbered(3, 4), {MISSING: 2}, [], 2),
+        (_numbered(1, 2, 2, 3), {}, [GO_BACK], 4),
+        (_numbered(1, 2, 3, 1, 2, 4), {MISSING: 1}, [GO_BACK], 6),
+        (_numbered(1, 2, 5, 6, 2, 3, 4), {MISSING: 2}, [GO_BACK], 7),
+        (_numbered(1, 2, 9, 4, 5), {MISFIT: 1}, [], 4),
+        (_numbered(1, 2, 900_003, 4, 5), {MISFIT: 1}, [], 4),
+        (_numbered(1, 2) + _numbered(1, 3), {MISSING: 1}, [], 4),
+        (_numbered(1) + "gibberish\n" + _numbered(3, head=""), {NOT_UNDERSTOOD: 1}, [], 2),
+        (_numbered(1) + "gibberish\n" + _numbered(4, head=""), {NOT_UNDERSTOOD: 1, MISSING: 1},
+         [], 2),
+        (_numbered(1) + "gibberish\n" + _numbered(2, 4, head=""), {NOT_UNDERSTOOD: 1, MISSING: 1},
+         [], 3),
+        (_numbered(1, 2) + " 5) 9.0 Warng FFFFFFFF 4 00 00 00 08 BUSHEAVY\n", {MISSING: 2}, [], 2),
+        (_numbered(1, 2) + " 5) 9.0 Rx 0480 1 C2", {MISSING: 2},
+         ["file may be cut after its last frame"], 3),
+    ],
+)  # fmt: skip
+def test_numbers_that_do_not_follow_are_reported(
+    tmp_path: Path, text: str, lost: dict[str, int], unknown: list[str], rows: int
+) -> None:
+    found, ledger = read_back(_log(tmp_path, text))
+
+    assert sum(map(len, found.values())) == rows
+    assert ledger.topic("").lost == lost
+    assert ledger.topic("").lost_unknown == unknown

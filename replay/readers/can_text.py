@@ -56,6 +56,8 @@ class Frame(NamedTuple):
     length: int
     payload: bytes = b""
     is_fd: bool = False
+    number: int | None = None
+    """The message number that the writer gave it, in formats that have them."""
 
 
 class Other(NamedTuple):
@@ -64,6 +66,7 @@ class Other(NamedTuple):
     reason: str
     t_ns: int | None = None
     bus: str = ""
+    number: int | None = None
 
 
 class Damage(NamedTuple):
@@ -98,6 +101,29 @@ class Fast:
     names: tuple[str, ...]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Met:
+    """What a chunk came to, for the counters that a format has; lines count from the chunk's first.
+
+    Attributes:
+        rows: Its frames, by line.
+        odd: Frames that ``slow`` found, with their lines.
+        others: Lines that are no frame.
+        damaged: Lines that nobody can read, ascending.
+        marks: Header lines.
+        first_number: Number of the chunk's first line in the file.
+        done: The line after the chunk's last.
+    """
+
+    rows: FrameRows
+    odd: Sequence[tuple[int, int, Frame]]
+    others: Sequence[tuple[int, Other]]
+    damaged: Sequence[int]
+    marks: Sequence[tuple[int, Mark]]
+    first_number: int
+    done: int
+
+
 class Dialect(ABC):
     """One text format; holds what a reading pass must remember, so each pass has its own."""
 
@@ -128,11 +154,22 @@ class Dialect(ABC):
         del place, marks
         return t_ns
 
+    def check(self, met: Met) -> Int64s:
+        """Hold the format's own counters against a chunk.
+
+        Returns:
+            Lines, ascending, whose frames the counters contradict: they are not handed on, and
+            ``finish`` reports them.
+        """
+        del met
+        return _NO_INTS
+
     def finish(self, ledger: Ledger) -> None:
         """Say what the whole file showed, once it is read."""
         del ledger
 
 
+_NO_INTS: Final = np.zeros(0, np.int64)
 NO_FRAMES: Final = CanFrames(
     np.zeros(0, np.uint32),
     np.zeros(0, np.bool_),
@@ -141,7 +178,6 @@ NO_FRAMES: Final = CanFrames(
     np.zeros((0, 8), np.uint8),
     np.zeros(0, np.bool_),
 )
-_NO_INTS: Final = np.zeros(0, np.int64)
 NO_ROWS: Final = FrameRows(_NO_INTS, _NO_INTS, _NO_INTS, NO_FRAMES)
 
 
@@ -245,7 +281,7 @@ class _Scribe:
             detail = f"line {tail.number} has no line end"
             self._ledger.drop("", "file may be cut after its last frame", None, detail)
         self._sort_in(odd, 0, tail.number, tail.text, outcome)
-        return self._timed(NO_ROWS, odd)
+        return self._checked(self._timed(NO_ROWS, odd), odd, tail.number, 1)
 
     def _lines(self, lines: Lines) -> FrameRows:
         fast = self.dialect.fast(lines)
@@ -260,10 +296,18 @@ class _Scribe:
                 break
             self._sort_in(odd, i, lines.first_number + i, line, outcome)
             if self.stopped:
-                return self._timed(rows.take(rows.place < i), odd)
+                rows = self._timed(rows.take(rows.place < i), odd)
+                return self._checked(rows, odd, lines.first_number, i)
         if lines.done < len(lines):
             rows = rows.take(slice(0, int(np.searchsorted(rows.place, lines.done))))
-        return self._untainted(self._timed(rows, odd), odd.tainted, lines)
+        rows = self._checked(self._timed(rows, odd), odd, lines.first_number, lines.done)
+        return self._untainted(rows, odd.tainted, lines)
+
+    def _checked(self, rows: FrameRows, odd: _Odd, first_number: int, done: int) -> FrameRows:
+        """Without the rows that the format's own counters contradict."""
+        met = Met(rows, odd.frames, odd.plain, odd.damaged, odd.marks, first_number, done)
+        refused = self.dialect.check(met)
+        return rows.take(~np.isin(rows.place, refused)) if len(refused) else rows
 
     def _judged(self, line: bytes) -> Outcome:
         if len(line) > LINE_MAX:
@@ -279,15 +323,18 @@ class _Scribe:
             case Frame():
                 code = bus_number(outcome.bus, self._names)
                 if code < 0:
+                    odd.damaged.append(i)
                     self._lost("", "more buses than a log can have", number, line)
                 else:
                     odd.frames.append((i, code, outcome))
             case Other():
                 self.knows_it = True
                 odd.others.setdefault((outcome.bus, outcome.reason), []).append(number)
+                odd.plain.append((i, outcome))
                 if outcome.t_ns is not None:
                     odd.times.append((i, outcome.t_ns))
             case Damage():
+                odd.damaged.append(i)
                 self._lost("", outcome.reason, number, line)
             case Mark():
                 self.knows_it = True
@@ -364,6 +411,8 @@ class _Odd:
         self.times: list[tuple[int, int]] = []
         self.marks: list[tuple[int, Mark]] = []
         self.others: dict[tuple[str, str], list[int]] = {}
+        self.plain: list[tuple[int, Other]] = []
+        self.damaged: list[int] = []
         self.tainted: list[int] = []
 
     def rows(self) -> FrameRows:

@@ -3,7 +3,8 @@
 Times are milliseconds since ``$STARTTIME``, which counts days since 30 December 1899 on a clock
 whose time zone the file does not state; it is taken as UTC, with a notice.
 
-The format has no checksum and no count. A line holds its length, so a cut one is seen.
+The format has no checksum and no count. A line holds its length, so a cut one is seen, and its
+message number, so a missing one is: all but those after the last line.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from crosscue.replay.limits import Limits
 from crosscue.replay.log import Log
 
 from .can_lines import Field, Lines, clean_lines, next_fields, skip_gap
+from .can_numbers import MessageNumbers
 from .can_rows import FD_LENGTHS, IS_FD_LENGTH
 from .can_spaced import NOTHING_FAST, Spaced, is_bus_name, is_way, payload_stop, spaced_frames
 from .can_text import (
@@ -30,6 +32,7 @@ from .can_text import (
     Fast,
     Frame,
     Mark,
+    Met,
     Other,
     Outcome,
     TextCanLog,
@@ -99,7 +102,10 @@ class Trc(Dialect):
 
     format = "trc"
     says = "PEAK TRC log"
-    integrity = "TRC text has no checksums or counts: a changed digit cannot be seen"
+    integrity = (
+        "message numbers followed, so that only rows after the last one could be missing unseen; "
+        "TRC text has no checksums: a changed digit cannot be seen"
+    )
 
     def __init__(self, version: str, columns: str) -> None:
         """Columns are the letters of ``$COLUMNS``, those of old versions put alike."""
@@ -107,11 +113,14 @@ class Trc(Dialect):
         self._is_old = version in _COLUMNS_OF
         self._start_ns = 0
         self._is_dated = False
+        self._numbers = MessageNumbers()
+        self._fast_numbers = NOTHING_FAST.rows.place, NOTHING_FAST.rows.place
 
     def fast(self, lines: Lines) -> Fast:
         """Data frames, CAN FD included."""
         line = clean_lines(lines)
         line = line[lines.buffer[lines.start[line]] != ord(";")]
+        self._fast_numbers = line[:0], line[:0]
         if not len(line):
             return NOTHING_FAST
         limit = lines.stop[line]
@@ -128,7 +137,9 @@ class Trc(Dialect):
             reserved = by["R"]
             ok &= (reserved.size == 1) & (lines.buffer[reserved.start] == ord("-"))
         if "N" in by:
-            ok &= _is_number(lines, by["N"], self._is_old)
+            number, number_ok = _number(lines, by["N"], self._is_old)
+            self._fast_numbers = line, number
+            ok &= number_ok
         payload = skip_gap(lines, fields[-1].stop, limit)
         is_extended = identifier.size == 8
         at = Spaced(line, by.get("B"), identifier, is_extended, length, payload, is_fd)
@@ -152,7 +163,10 @@ class Trc(Dialect):
         if int(found[1]) > SECONDS_MAX:
             return Damage("time out of range")
         t_ns = (int(found[1]) * NANOS + int((found[2] or "").ljust(9, "0"))) // 1000
-        return self._outcome(t_ns, by, values[before:])
+        outcome = self._outcome(t_ns, by, values[before:])
+        if isinstance(outcome, Frame | Other) and "N" in by:
+            return outcome._replace(number=int(by["N"].rstrip(")")))
+        return outcome
 
     def last(self, line: bytes) -> Outcome:
         """Complete when it holds as many bytes as its length says."""
@@ -173,8 +187,51 @@ class Trc(Dialect):
         out[begin:] = t_ns[begin:] + self._start_ns
         return out
 
+    def check(self, met: Met) -> Int64s:
+        """Follow the message numbers, recording by recording."""
+        if "N" not in self._columns:
+            return met.rows.place[:0]
+        place, number = self._numbered(met)
+        at, values = self._fast_numbers
+        k = int(np.searchsorted(at, met.done))
+        following = int(values[k]) if k < len(at) and at[k] == met.done else -1
+        is_misfit = self._numbers.misfits(number, following)
+        for i in np.flatnonzero(is_misfit).tolist():
+            self._numbers.misfit(int(number[i]), met.first_number + int(place[i]))
+        refused = place[is_misfit]
+        damaged = np.union1d(np.array(met.damaged, np.int64), refused)
+        place, number = place[~is_misfit], number[~is_misfit]
+        begin = 0
+        for end in [*(i for i, mark in met.marks if mark.origin_ns is not None), met.done]:
+            here = slice(*np.searchsorted(place, (begin, end)).tolist())
+            bad = damaged[slice(*np.searchsorted(damaged, (begin, end)).tolist())]
+            self._numbers.follow(number[here], place[here], bad, met.first_number)
+            if end != met.done:
+                self._numbers.begin()
+            begin = end
+        self._fast_numbers = place[:0], place[:0]
+        return refused
+
+    def _numbered(self, met: Met) -> tuple[Int64s, Int64s]:
+        """The good lines of a chunk and their message numbers."""
+        odd = [(i, frame.number) for i, _, frame in met.odd]
+        odd += [(i, other.number) for i, other in met.others]
+        at, values = self._fast_numbers
+        known = {i: number for i, number in odd if number is not None}
+        is_fast = ~np.isin(met.rows.place, list(known)) if known else slice(None)
+        fast = met.rows.place[is_fast]
+        if not known:
+            return fast, values[np.searchsorted(at, fast)]
+        place = np.concatenate((fast, np.array(list(known), np.int64)))
+        number = np.concatenate(
+            (values[np.searchsorted(at, fast)], np.array(list(known.values()), np.int64))
+        )
+        order = np.argsort(place, kind="stable")
+        return place[order], number[order]
+
     def finish(self, ledger: Ledger) -> None:
-        """Say what the clock rests on."""
+        """Say what the clock rests on, and which message numbers are missing."""
+        self._numbers.settle(ledger)
         if self._is_dated:
             ledger.notice("the log states no time zone; its start time is read as UTC")
         else:
@@ -233,13 +290,13 @@ class Trc(Dialect):
         return Frame(bus, t_ns, identifier, is_extended, kind, length, payload, is_fd)
 
 
-def _is_number(lines: Lines, word: Field, is_old: bool) -> Bools:
+def _number(lines: Lines, word: Field, is_old: bool) -> tuple[Int64s, Bools]:
     """Digits, and a bracket after them in old versions."""
     stop = word.stop - is_old
-    _, ok = decimal(lines.words, stop, stop - word.start)
+    number, ok = decimal(lines.words, stop, stop - word.start)
     if is_old:
         ok &= lines.buffer[stop] == ord(")")
-    return ok
+    return number, ok
 
 
 def _offsets_ns(lines: Lines, time: Field) -> tuple[Int64s, Bools]:
