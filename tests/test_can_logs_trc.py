@@ -198,7 +198,7 @@ def test_each_row_taken_out_is_reported_as_dropped(
     found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), holes.text))
 
     assert sum(map(len, found.values())) == 60 - len(deleted)
-    assert ledger.topic("").lost == ({MISSING: holes.missing} if holes.missing else {})
+    assert ledger.topic("").dropped == ({MISSING: holes.missing} if holes.missing else {})
     assert ledger.is_whole == (not holes.missing)
 
 
@@ -209,8 +209,8 @@ def test_rows_missing_where_chunks_of_the_file_meet_are_reported(tmp_path: Path)
     _, ledger = read_back(_log(tmp_path, holes.text))
 
     assert len(holes.text) > 2 * CHUNK_BYTES
-    assert ledger.topic("").lost == {MISSING: holes.missing}
-    assert "line 105: 101; line 141: 138" in next(ledger.losses()).detail
+    assert ledger.topic("").dropped == {MISSING: holes.missing}
+    assert "line 105: 101; line 141: 138" in next(ledger.drops()).detail
 
 
 def _numbered(*numbers: int, head: str = V1) -> str:
@@ -246,5 +246,5 @@ def test_numbers_that_do_not_follow_are_reported(
     found, ledger = read_back(_log(tmp_path, text))
 
     assert sum(map(len, found.values())) == rows
-    assert ledger.topic("").lost == lost
-    assert ledger.topic("").lost_unknown == unknown
+    assert ledger.topic("").dropped == lost
+    assert ledger.topic("").dropped_unknown == unknown

@@ -88,12 +88,12 @@ class MessageNumbers:
     def settle(self, ledger: Ledger) -> None:
         """Report what is missing, once everything is read."""
         self._settle_gaps()
-        ledger.lose("", MISFIT, self._misfits, _listed(self._misfit_places, self._misfits))
+        ledger.drop("", MISFIT, self._misfits, _listed(self._misfit_places, self._misfits))
         more = f"first {_PLACES_KEPT} gaps: " if len(self._places) == _PLACES_KEPT else ""
-        ledger.lose("", MISSING, self._missing, more + "; ".join(self._places))
+        ledger.drop("", MISSING, self._missing, more + "; ".join(self._places))
         if self._backward:
             detail = _listed(self._back_places, self._backward)
-            ledger.lose("", GO_BACK, None, f"{self._backward} times: {detail}")
+            ledger.drop("", GO_BACK, None, f"{self._backward} times: {detail}")
 
     def _run(self, first: int, last: int, line: int, damaged: int) -> None:
         """Rows numbered ``first`` to ``last`` without a gap, after ``damaged`` unreadable ones."""

@@ -288,7 +288,7 @@ def same_as_python_can(
     theirs: dict[str, list[can.Message]] = {}
     for message in peer:
         theirs.setdefault(bus.format(message.channel), []).append(message)
-    assert ledger.topic("").lost.total() == missing
+    assert ledger.topic("").dropped.total() == missing
     assert missing or ledger.is_whole
     assert {name: len(frames) for name, frames in found.items()} == {
         name: len(messages) for name, messages in theirs.items()
