@@ -12,6 +12,7 @@ import numpy as np
 
 from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
+from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
@@ -123,7 +124,8 @@ def _decoded(log: Log, vehicle: Vehicle, ledger: Ledger, selection: Selection) -
                 decoders[block.topic] = _decoder(topic, ledger)
             decode = decoders[block.topic]
             if decode is None:
-                ledger.skip(block.topic, "type not understood", len(block))
+                reason = why_not_decoded(topic, "type not understood")
+                ledger.skip(block.topic, reason, len(block))
                 continue
             block = decode(block, ledger)
         if isinstance(block.rows, Table) and len(block):

@@ -222,6 +222,7 @@ def _decoded(log: Log, blocks: Iterable[Block], ledger: Ledger) -> Iterator[Bloc
 def _decoder_of(topic: Topic) -> Decoder:
     """The topic's decoder, or one that skips every row and says why."""
     from crosscue.replay.decode import decoder_for
+    from crosscue.replay.decode.interfaces import why_not_decoded
 
     try:
         decoder = decoder_for(topic)
@@ -230,6 +231,7 @@ def _decoder_of(topic: Topic) -> Decoder:
         decoder, reason, detail = None, "its definition cannot be understood", str(error)
     if decoder is not None:
         return decoder
+    reason = why_not_decoded(topic, reason)
 
     def skip(block: Block, ledger: Ledger, /) -> Block:
         if len(block):

@@ -11,6 +11,7 @@ from typing import Final, Self
 import numpy as np
 
 from .columns import Block, Messages, Topic
+from .decode.interfaces import why_not_decoded
 from .encode import Encoder, Encoders, Outgoing
 from .errors import SchemaError
 from .ledger import Ledger
@@ -69,10 +70,12 @@ class LogWriter:
         if topic.name in self._known:
             return not isinstance(self._known[topic.name], str)
         try:
-            encoder: Encoder | str = self._encoders.encoder_for(topic) or NO_TYPE
+            encoder: Encoder | str = self._encoders.encoder_for(topic) or why_not_decoded(
+                topic, NO_TYPE
+            )
             self._details[topic.name] = f"{topic.type_name} ({topic.encoding})"
         except SchemaError as error:
-            encoder = BAD_SCHEMA
+            encoder = why_not_decoded(topic, BAD_SCHEMA)
             self._details[topic.name] = str(error)
         self._known[topic.name] = encoder
         return not isinstance(encoder, str)

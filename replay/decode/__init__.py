@@ -13,6 +13,8 @@ from typing import Final, Protocol, cast
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.ledger import Ledger
 
+from .interfaces import is_feedback, is_service_event
+
 __all__ = ["Decoder", "decoder_for"]
 
 
@@ -40,10 +42,14 @@ BY_ENCODING: Final[Mapping[str, str]] = {
 def decoder_for(topic: Topic) -> Decoder | None:
     """The decoder of ``topic``, or None if nobody here knows its encoding or type.
 
+    Service events have none; ``interfaces.why_not_decoded`` says why a topic has none.
+
     Raises:
         SchemaError: The log defines the type, but the definition is damaged, too large, or lies.
     """
     maker = BY_ENCODING.get(topic.encoding)
+    if is_service_event(topic) or (is_feedback(topic) and not topic.schema.strip()):
+        maker = None
     if maker is None:
         return None
     module, _, function = maker.partition(":")

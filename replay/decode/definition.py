@@ -70,6 +70,7 @@ class Field:
 Definitions = Mapping[str, tuple[Field, ...]]
 
 _SEPARATOR: Final = re.compile(r"^={40,}[ \t\r]*$", re.MULTILINE)
+_ACTION_PART: Final = re.compile(r"^---[ \t\r]*$", re.MULTILINE)
 _FIELD: Final = re.compile(
     r"(?P<type>[A-Za-z][\w/]*)(?:<=(?P<text>\d{1,10}))?"
     r"(?P<array>\[(?P<most><=)?(?P<size>\d{0,10})\])?"
@@ -104,6 +105,7 @@ def definitions_of(
     except UnicodeDecodeError as error:
         raise SchemaError(f"{type_name}: definition is not UTF-8 text ({error.reason})") from None
     if schema_encoding in ("ros1msg", "ros2msg"):
+        text = _feedback_of_action(type_name, text)
         return _from_msg(ros2_spelling(type_name), text)
     if schema_encoding in ("ros2idl", "omgidl"):
         return _from_idl(type_name, text)
@@ -124,6 +126,19 @@ def _from_msg(type_name: str, text: str) -> Definitions:
         if raw.setdefault(name, fields) != fields:
             raise SchemaError(f"{type_name}: two different definitions of {name}")
     return {name: _resolved(name, fields, raw) for name, fields in raw.items()}
+
+
+def _feedback_of_action(type_name: str, text: str) -> str:
+    """The definition of an action's feedback from that of the action, if that is what is stored."""
+    name = type_name.removesuffix("_FeedbackMessage")
+    separator = _SEPARATOR.search(text)
+    action = text[: separator.start()] if separator else text
+    parts = _ACTION_PART.split(action)
+    if name == type_name or "/action/" not in type_name or len(parts) != 3:
+        return text
+    others = text[separator.start() :] if separator else ""
+    fields = f"unique_identifier_msgs/UUID goal_id\n{name}_Feedback feedback\n"
+    return f"{fields}{'=' * 80}\nMSG: {name}_Feedback\n{parts[2]}\n{others}"
 
 
 def _fields_of(owner: str, body: str) -> Iterator[Field]:

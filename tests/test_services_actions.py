@@ -1,0 +1,170 @@
+"""Service events and actions in bags: recognised, counted, and never called damaged."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Literal
+
+import pyarrow.parquet as pq
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from crosscue.eval import cli
+from crosscue.replay.log import open_log
+
+ROWS = 7
+SERVICE = "/add/_service_event"
+FEEDBACK = "/fibonacci/_action/feedback"
+STATUS = "/fibonacci/_action/status"
+TYPES = {
+    SERVICE: "example_interfaces/srv/AddTwoInts_Event",
+    FEEDBACK: "example_interfaces/action/Fibonacci_FeedbackMessage",
+    STATUS: "action_msgs/msg/GoalStatusArray",
+    "/word": "std_msgs/msg/String",
+}
+END = "=" * 80 + "\n"
+TIME = "int32 sec\nuint32 nanosec\n"
+UUID = f"{END}MSG: unique_identifier_msgs/UUID\nuint8[16] uuid\n"
+STATUS_TEXT = (
+    "action_msgs/GoalStatus[] status_list\n"
+    f"{END}MSG: action_msgs/GoalStatus\nGoalInfo goal_info\nint8 status\n"
+    f"{END}MSG: action_msgs/GoalInfo\nunique_identifier_msgs/UUID goal_id\n"
+    f"builtin_interfaces/Time stamp\n{UUID}{END}MSG: builtin_interfaces/Time\n{TIME}"
+)
+EVENT_TEXT = (
+    "service_msgs/ServiceEventInfo info\n"
+    "example_interfaces/srv/AddTwoInts_Request[<=1] request\n"
+    "example_interfaces/srv/AddTwoInts_Response[<=1] response\n"
+    f"{END}MSG: service_msgs/ServiceEventInfo\nuint8 event_type\nbuiltin_interfaces/Time stamp\n"
+    f"char[16] client_gid\nint64 sequence_number\n{END}MSG: builtin_interfaces/Time\n{TIME}"
+    f"{END}MSG: example_interfaces/srv/AddTwoInts_Request\nint64 a\nint64 b\n"
+    f"{END}MSG: example_interfaces/srv/AddTwoInts_Response\nint64 sum\n"
+)
+FEEDBACK_TEXT = (
+    "unique_identifier_msgs/UUID goal_id\nexample_interfaces/action/Fibonacci_Feedback feedback\n"
+    f"{END}MSG: example_interfaces/action/Fibonacci_Feedback\nint32[] sequence\n{UUID}"
+)
+SERVICE_TEXTS = {
+    "whole": EVENT_TEXT,
+    "that of the service": "int64 a\nint64 b\n---\nint64 sum\n",
+    "types missing": EVENT_TEXT.partition(END)[0],
+    "none": "",
+}
+FEEDBACK_TEXTS = {
+    "whole": FEEDBACK_TEXT,
+    "that of the action": "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n",
+    "types missing": FEEDBACK_TEXT.partition(END)[0],
+    "none": "",
+}
+Storage = Literal["sqlite3", "mcap"]
+
+
+def payload(topic: str, i: int) -> bytes:
+    """One message as a recorder stores it."""
+    head = b"\x00\x01\x00\x00"
+    if topic == SERVICE:  # event, stamp, client, number; one request; no response
+        fixed = struct.pack("<B3xiI16sq", 1, i, 0, bytes(range(16)), i)
+        return head + fixed + struct.pack("<I4xqqI", 1, i, 2 * i, 0)
+    if topic == FEEDBACK:
+        return head + bytes(16) + struct.pack("<I3i", 3, i, i + 1, i + 2)
+    if topic == STATUS:
+        return head + struct.pack("<I16siIb", 1, bytes(16), i, 0, 2)
+    return head + struct.pack("<I", 3) + b"%02d\0" % i
+
+
+def bag(folder: Path, storage: Storage, texts: dict[str, str]) -> Path:
+    """A bag of one service, one action and a topic of its own, as its folder."""
+    with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+        links = {
+            name: writer.add_connection(name, TYPES[name], msgdef=text, rihs01="RIHS01_0")
+            for name, text in texts.items()
+        }
+        for i in range(ROWS):
+            for k, (name, link) in enumerate(links.items()):
+                writer.write(link, 10**18 + i * 10**8 + k, payload(name, i))
+    return folder
+
+
+def texts(service: str, feedback: str) -> dict[str, str]:
+    """A definition for each topic."""
+    return {
+        SERVICE: SERVICE_TEXTS[service],
+        FEEDBACK: FEEDBACK_TEXTS[feedback],
+        STATUS: STATUS_TEXT,
+        "/word": "string data\n",
+    }
+
+
+def opened(folder: Path, as_folder: bool) -> Path:
+    """The folder, or the storage file in it alone."""
+    return folder if as_folder else next(p for p in folder.iterdir() if p.suffix != ".yaml")
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("as_folder", [True, False])
+@pytest.mark.parametrize("service", list(SERVICE_TEXTS))
+def test_service_events_are_skipped_as_what_they_are(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    storage: Storage,
+    service: str,
+    as_folder: bool,
+) -> None:
+    path = opened(bag(tmp_path / "bag", storage, texts(service, "whole")), as_folder)
+
+    status = cli.run(["convert", str(path), "-o", str(tmp_path / "out.mcap"), "--json"])
+    said = capsys.readouterr()
+
+    account = json.loads(said.out)["topics"]
+    assert account[SERVICE]["skipped"] == {"service event": ROWS}
+    assert account[SERVICE]["found"] == ROWS
+    assert not any(topic["skipped"] for name, topic in account.items() if name != SERVICE)
+    assert status == 3
+    assert "damaged" not in said.out + said.err
+
+    cli.run(["info", str(path)])
+    shown = capsys.readouterr()
+    assert "service event" in shown.out
+    assert "damaged" not in shown.out + shown.err
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("feedback", list(FEEDBACK_TEXTS))
+def test_action_feedback_is_read_where_its_definition_is_stored(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], storage: Storage, feedback: str
+) -> None:
+    path = bag(tmp_path / "bag", storage, texts("whole", feedback))
+
+    cli.run(["decode", str(path), "-o", str(tmp_path / "tables"), "--json"])
+    said = capsys.readouterr()
+
+    accounts = json.loads((tmp_path / "tables" / "manifest.json").read_text())["accounts"]
+    topics = accounts[0]["topics"]
+    whole = feedback in ("whole", "that of the action")
+    skipped = {} if whole else {"action feedback without a complete definition": ROWS}
+    assert topics[FEEDBACK]["skipped"] == skipped
+    assert topics[STATUS]["skipped"] == {}
+    assert topics[SERVICE]["skipped"] == {"service event": ROWS}
+    assert "damaged" not in said.out + said.err
+    if whole:
+        table = pq.read_table(tmp_path / "tables" / "fibonacci__action_feedback.parquet")
+        assert table.num_rows == ROWS
+    with open_log(path) as log:
+        assert {topic.name for topic in log.topics} == set(TYPES)
+
+
+def test_a_message_type_that_only_ends_like_an_event_is_data(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        link = writer.add_connection(
+            "/door", "door_msgs/msg/Door_Event", msgdef="string data\n", rihs01="RIHS01_0"
+        )
+        writer.write(link, 10**18, payload("/word", 1))
+
+    status = cli.run(["convert", str(tmp_path / "bag"), "-o", str(tmp_path / "out.mcap"), "--json"])
+
+    assert json.loads(capsys.readouterr().out)["topics"]["/door"]["skipped"] == {}
+    assert status == 0
