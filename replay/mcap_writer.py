@@ -6,7 +6,6 @@ folder; the final name appears when everything is on the disk.
 
 from __future__ import annotations
 
-import os
 import struct
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
@@ -24,7 +23,8 @@ from .checksum import crc32
 from .columns import Int64s
 from .errors import OutputError
 from .mcap_assembly import ChunkRows, Stretch, merged
-from .run_folder import cannot_write, sync
+from .partial_file import PartialFile
+from .run_folder import cannot_write
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = "crosscue"
@@ -126,10 +126,10 @@ class McapWriter:
         self._data_crc = 0
         self._at = 0
         self._ahead: deque[Future[_Packed]] = deque()
-        self._partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self._partial.open("wb")
+            self._partial = PartialFile(path)
+            self._file = self._partial.open()
         except OSError as error:
             raise cannot_write(path, error) from None
         self._pool = ThreadPoolExecutor(THREADS)
@@ -260,11 +260,8 @@ class McapWriter:
         tail = struct.pack("<BQQQ", FOOTER, 20, start, offset_start)
         crc = crc32(tail, crc32(body + offsets))
         self._file.write(body + offsets + tail + struct.pack("<I", crc) + MAGIC)
-        self._file.flush()
-        os.fsync(self._file.fileno())
         self._file.close()
-        self._partial.replace(self.path)
-        sync(self.path.parent)
+        self._partial.keep()
 
     def _summary_section(self, start: int) -> tuple[bytes, bytes]:
         summary = self._summary
@@ -316,7 +313,7 @@ class McapWriter:
         # Bytes that cannot be flushed now belong to a file that is removed anyway.
         with suppress(OSError):
             self._file.close()
-        self._partial.unlink(missing_ok=True)
+        self._partial.drop()
 
     def __enter__(self) -> Self:
         return self

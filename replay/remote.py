@@ -27,7 +27,8 @@ from .columns import Block, Topic
 from .errors import CrosscueError, LogError, LogTooLargeError, OutputError, UsageError, one_line
 from .ledger import Ledger
 from .log import EVERYTHING, Log, Selection
-from .run_folder import cannot_write, is_still
+from .partial_file import is_still
+from .run_folder import cannot_write
 
 URL: Final = re.compile(r"^[a-z][a-z0-9+.-]+://")
 CHUNK_BYTES: Final = 8 << 20

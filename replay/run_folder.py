@@ -8,7 +8,6 @@ checksums, verified when read.
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import json
 import math
@@ -24,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from .errors import OutputError, RunError
 from .parquet_file import opened
+from .partial_file import PartialFile, is_partial, is_still, lock, sweep
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -31,11 +31,8 @@ if TYPE_CHECKING:
 MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
 FORMAT_VERSION: Final = 1
-PARTIAL: Final = ".partial"
 GROUP_ROWS: Final = 8192
 """Rows of a table held back before they are written."""
-WITHOUT_LOCKS: Final = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL})
-"""What file systems answer that cannot lock; the lock file's text must do there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +186,8 @@ def open_run(path: Path) -> RunFolder:
 def _looks_like_run(entries: list[Path]) -> bool:
     ours = {MANIFEST, "score", "view", "pictures"}
     return all(
-        e.name in ours or e.suffix in (".parquet", ".rrd", ".json", PARTIAL) for e in entries
+        e.name in ours or e.suffix in (".parquet", ".rrd", ".json") or is_partial(e.name)
+        for e in entries
     )
 
 
@@ -210,7 +208,7 @@ def locked(run: RunFolder) -> Iterator[None]:
     except OSError as error:
         raise cannot_write(path, error) from None
     try:
-        _sweep(run.path)
+        sweep(run.path, again=True)
         yield
     finally:
         # Gone from the folder before it is free, so that nobody waits for a file without a name.
@@ -218,30 +216,14 @@ def locked(run: RunFolder) -> Iterator[None]:
         os.close(handle)
 
 
-def _sweep(folder: Path) -> None:
-    """Take away what killed processes left half written."""
-    for entry in folder.glob(f".*{PARTIAL}"):
-        pid = entry.name.removesuffix(PARTIAL).rpartition(".")[2]
-        if pid.isdigit() and not Path(f"/proc/{pid}").exists():
-            _drop(entry)
-
-
 def _lock_file(path: Path) -> int:
     """The folder's lock file, open, locked, and with our name in it."""
     while True:
         handle = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
         try:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                is_ours = True
-            except BlockingIOError:
-                is_ours = False
-            except OSError as error:
-                if error.errno not in WITHOUT_LOCKS:
-                    raise
-                is_ours = True
+            is_ours = lock(handle)
             _refuse_if_held(path, os.read(handle, 4096), is_ours=is_ours)
-            if is_ours and is_still(handle, path):
+            if is_still(handle, path):
                 _sign(handle, path)
                 return handle
         except BaseException:
@@ -252,50 +234,46 @@ def _lock_file(path: Path) -> int:
 
 def _sign(handle: int, path: Path) -> None:
     """Write into the lock who holds it; a lock that cannot be written is taken away."""
-    me = f"{os.getpid()} {socket.gethostname()} {_boot_id()}"
+    me = f"{os.getpid()} {socket.gethostname()} {_started(os.getpid())}"
     try:
         os.ftruncate(handle, 0)
         os.pwrite(handle, me.encode(), 0)
     except OSError:
-        _drop(path)
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
         raise
 
 
-def is_still(handle: int, path: Path) -> bool:
-    """Is the open file the one that has this name now?"""
-    try:
-        return os.path.samestat(os.fstat(handle), path.stat())
-    except FileNotFoundError:
-        return False
-
-
-def _refuse_if_held(path: Path, text: bytes, *, is_ours: bool) -> None:
-    """Refuse when the lock's text names a living holder, or the kernel knows of one.
+def _refuse_if_held(path: Path, text: bytes, *, is_ours: bool | None) -> None:
+    """Refuse when the kernel knows of a holder, or, where it cannot, the lock's text names one.
 
     Args:
         path: The lock.
         text: What it says.
-        is_ours: Did the kernel give it to us?
+        is_ours: Did the kernel give it to us? None where it keeps no locks.
     """
     try:
-        pid, host, boot = text.decode().split(" ", 2)
+        pid, host, started = text.decode().split(" ", 2)
     except ValueError:
         # Nobody is named: taken this moment, or its holder died before writing.
-        pid = host = boot = ""
+        pid = host = started = ""
     if host not in ("", socket.gethostname()):
         raise RunError(f"{path}: held by process {pid} on {host}; delete the file if that is over")
     is_other = pid.isdigit() and int(pid) != os.getpid()
-    alive = is_other and boot == _boot_id() and Path(f"/proc/{pid}").exists()
-    if not is_ours or alive:
+    is_alive = is_other and started == _started(int(pid))
+    if is_ours is False or (is_ours is None and is_alive):
         who = f"process {pid} on {host}" if pid else "another process"
         raise RunError(f"{path.parent}: {who} is writing it; wait or stop that")
 
 
-def _boot_id() -> str:
+def _started(pid: int) -> str:
+    """When a process began, boot included: its number alone is used again. Empty if it is gone."""
     try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    except OSError:
-        return "unknown"
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        ticks = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    except (OSError, IndexError):
+        return ""
+    return f"{boot} {ticks}"
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
@@ -304,25 +282,20 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     Raises:
         OutputError: The disk is full or the folder cannot be written; nothing half is left.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}{PARTIAL}")
+    partial: PartialFile | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write(partial)
-        sync(partial)
-        partial.replace(path)
-        sync(path.parent)
+        partial = PartialFile(path)
+        write(partial.path)
+        partial.keep()
     except OSError as error:
-        _drop(partial)
+        if partial is not None:
+            partial.drop()
         raise cannot_write(path, error) from None
     except BaseException:
-        _drop(partial)
+        if partial is not None:
+            partial.drop()
         raise
-
-
-def _drop(partial: Path) -> None:
-    """Take a half-written file away; the error that led here matters more than one of this."""
-    with suppress(OSError):
-        partial.unlink(missing_ok=True)
 
 
 def cannot_write(path: Path, error: OSError) -> OutputError:
@@ -334,19 +307,6 @@ def cannot_write(path: Path, error: OSError) -> OutputError:
             free = 0
         return OutputError(f"{path}: the disk is full ({free} MiB free); make room and run again")
     return OutputError(f"{path}: {error.strerror or error}; choose a place you may write to")
-
-
-def sync(path: Path) -> None:
-    """Have a file's bytes, or the names in a folder, on the disk itself.
-
-    Raises:
-        OSError: Not there, or the disk cannot.
-    """
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -391,12 +351,12 @@ class TableSink:
         import pyarrow.parquet as pq
 
         self._path: Final = run.file(f"{name}.parquet")
-        self._partial: Final = self._path.with_name(f".{name}.{os.getpid()}{PARTIAL}")
         self._schema: Final = schema
         self._held: list[pa.Table] = []
         self._rows = 0
         try:
-            self._file: Final = self._partial.open("wb")
+            self._partial: Final = PartialFile(self._path)
+            self._file: Final = self._partial.open()
         except OSError as error:
             raise cannot_write(self._path, error) from None
         try:
@@ -450,10 +410,8 @@ class TableSink:
         try:
             self._flush()
             self._writer.close()
-            self._file.flush()
-            os.fsync(self._file.fileno())
             self._file.close()
-            self._partial.replace(self._path)
+            self._partial.keep()
         except OSError as error:
             self._give_up()
             raise cannot_write(self._path, error) from None
@@ -462,7 +420,7 @@ class TableSink:
         """Leave nothing half."""
         with suppress(OSError):
             self._file.close()
-        _drop(self._partial)
+        self._partial.drop()
 
 
 def sha256_of(path: Path) -> dict[str, str]:

@@ -68,13 +68,21 @@ def test_the_same_rows_give_the_same_bytes(tmp_path: Path) -> None:
     assert first == second
 
 
-def test_a_second_process_is_refused_and_told_whose_it_is(tmp_path: Path) -> None:
+def test_where_the_kernel_keeps_no_locks_the_text_tells_who_holds_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = create(tmp_path / "run", overwrite=False)
     boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     parent = os.getppid()
-    run.file(".lock").write_text(f"{parent} {socket.gethostname()} {boot}")
+    ticks = Path(f"/proc/{parent}/stat").read_text().rpartition(")")[2].split()[19]
+    monkeypatch.setattr(run_folder, "lock", lambda _: None)
 
+    run.file(".lock").write_text(f"{parent} {socket.gethostname()} {boot} {ticks}")
     with pytest.raises(RunError, match=f"process {parent} "), locked(run):
+        pass
+    # The same number, but begun at another time: used again by another program.
+    run.file(".lock").write_text(f"{parent} {socket.gethostname()} {boot} {int(ticks) + 1}")
+    with locked(run):
         pass
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from crosscue.replay.columns import Topic
 from crosscue.replay.errors import CrosscueError, LogError
 from crosscue.replay.limits import MIB, Limits
 from crosscue.replay.log import Log, open_log
+from crosscue.replay.partial_file import Scratch
 
 from .rosbag2_db3 import Db3Log
 from .rosbag2_metadata import Metadata
@@ -90,8 +90,7 @@ def opened(path: Path, limits: Limits) -> Iterator[tuple[Log, str]]:
         with open_log(path, limits) as log:
             yield log, ""
         return
-    folder = Path(tempfile.mkdtemp(prefix="crosscue-"))
-    try:
+    with Scratch() as folder:
         plain = folder / path.name.removesuffix(PACKED)
         fault = unpack(path, plain, limits)
         try:
@@ -101,8 +100,6 @@ def opened(path: Path, limits: Limits) -> Iterator[tuple[Log, str]]:
             raise LogError(f"{path}: {fault + '; ' if fault else ''}{said}") from None
         with log:
             yield log, fault
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def unpack(packed: Path, plain: Path, limits: Limits) -> str:

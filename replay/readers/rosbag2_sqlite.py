@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -20,6 +19,7 @@ from urllib.parse import quote
 
 from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.limits import MIB, Limits
+from crosscue.replay.partial_file import Scratch
 
 from .rosbag2_wal import check_wal
 
@@ -49,20 +49,20 @@ class Database:
     Attributes:
         connection: Text comes as ``str``, bytes that are no UTF-8 escaped.
         notices: What had to be done to open it, for the ledger.
-        copy: Folder of the temporary copy, or None.
+        copy: Place of the temporary copy, or None.
         damage: What is known to be missing, or empty.
     """
 
     connection: sqlite3.Connection
     notices: list[str] = field(default_factory=list)
-    copy: Path | None = None
+    copy: Scratch | None = None
     damage: str = ""
 
     def close(self) -> None:
         """Close it and remove the temporary copy."""
         self.connection.close()
         if self.copy is not None:
-            shutil.rmtree(self.copy, ignore_errors=True)
+            self.copy.close()
 
 
 def beside(path: Path, suffix: str) -> Path:
@@ -205,12 +205,12 @@ def _repaired_copy(path: Path, limits: Limits) -> Database:
     journal = beside(path, "-journal")
     folder = _room_for_copy(path, path.stat().st_size + journal.stat().st_size)
     try:
-        copy = folder / "copy.db3"
+        copy = folder.path / "copy.db3"
         shutil.copyfile(path, copy)
         shutil.copyfile(journal, beside(copy, "-journal"))
         connection = _connect(copy, "mode=rw", limits)
     except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
+        folder.close()
         raise
     said = (
         "the recorder died while writing: its unfinished transaction was undone in a temporary "
@@ -223,24 +223,24 @@ def _copy_without_torn_page(path: Path, torn: int, missing: int, limits: Limits)
     """A copy that ends with a whole page; SQLite reads the rest of a torn page as zeros."""
     folder = _room_for_copy(path, path.stat().st_size)
     try:
-        copy = folder / "copy.db3"
+        copy = folder.path / "copy.db3"
         shutil.copyfile(path, copy)
         os.truncate(copy, path.stat().st_size - torn)
         connection = _connect(copy, "immutable=1", limits)
     except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
+        folder.close()
         raise
     said = "the file ends within a page: its whole pages were read in a temporary copy"
     return Database(connection, [said], folder, _shortfall(missing))
 
 
-def _room_for_copy(path: Path, size: int) -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="crosscue-"))
-    free = shutil.disk_usage(folder).free
+def _room_for_copy(path: Path, size: int) -> Scratch:
+    folder = Scratch()
+    free = shutil.disk_usage(folder.path).free
     if free < size + 64 * MIB:
-        folder.rmdir()
+        folder.close()
         raise LogError(
-            f"{path}: needs a temporary copy to be repaired in: {size} bytes in {folder.parent}, "
-            f"free are {free}; set TMPDIR to a larger disk"
+            f"{path}: needs a temporary copy to be repaired in: {size} bytes in "
+            f"{folder.path.parent}, free are {free}; set TMPDIR to a larger disk"
         )
     return folder
