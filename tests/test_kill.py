@@ -279,7 +279,7 @@ def test_zone_locale_and_hash_seed_change_no_byte(drive: Drive, tmp_path: Path) 
     commands = [
         subprocess.Popen(
             [sys.executable, "-c", code, *drive.replay(tmp_path / f"run{i}", "-q")],
-            env={**os.environ, "PYTHONPATH": str(Path(__file__).parent), **variant},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **variant},
             stderr=subprocess.PIPE,
         )
         for i, variant in enumerate(variants)

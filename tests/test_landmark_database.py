@@ -346,7 +346,7 @@ def _in_child(
 
     return subprocess.run(
         [sys.executable, "-c", WRITE_MANY, str(path), str(count), *more],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         preexec_fn=limit,
         capture_output=True,
         text=True,

@@ -212,7 +212,7 @@ if __name__ == "__main__":
 def test_a_signal_stops_all_workers(tmp_path: Path, number: signal.Signals, status: int) -> None:
     script = tmp_path / "runner.py"
     script.write_text(RUNNER)
-    here = str(Path(__file__).parent)
+    here = os.pathsep.join(sys.path)
     parent = subprocess.Popen(
         [sys.executable, str(script), str(tmp_path / "drives")],
         env={**os.environ, "PYTHONPATH": here}, stderr=subprocess.PIPE, start_new_session=True,
