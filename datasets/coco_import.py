@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, Final
 from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.limits import MIB
+from crosscue.replay.tree_text import json_tree
 
 from .annotations import Annotations, Picture, Thing
 
@@ -28,8 +28,8 @@ def read_coco(path: Path) -> Annotations:
         content = read_at_most(path, MOST_BYTES)
         if content is None:
             raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split it")
-        tree = json.loads(content)
-    except (OSError, ValueError, RecursionError) as error:
+        tree = json_tree(content)
+    except (OSError, ValueError) as error:
         raise SchemaError(f"{path}: not readable as JSON ({error}); give a COCO file") from None
     if not isinstance(tree, dict):
         raise SchemaError(f"{path}: want an object with images, annotations and categories")

@@ -7,7 +7,6 @@ section may be missing.
 from __future__ import annotations
 
 import difflib
-import json
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Protocol, cast, get_args
@@ -19,6 +18,7 @@ from crosscue.replay.errors import SchemaError, UsageError
 from crosscue.replay.limits import MIB
 from crosscue.replay.misfit import explain
 from crosscue.replay.run_folder import strict_json, write_text
+from crosscue.replay.tree_text import json_tree
 
 VERSION: Final = 1
 FILE: Final = "truth.json"
@@ -179,7 +179,7 @@ def load(path: Path) -> Truth:
         content = read_at_most(path, MOST_BYTES)
         if content is None:
             raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
-        tree = json.loads(content, object_pairs_hook=_no_twins)
+        tree = json_tree(content, object_pairs_hook=_no_twins)
         truth = Truth.model_validate(tree)
     except ValidationError as error:
         raise SchemaError(explain(error, None, str(path), Truth)) from None

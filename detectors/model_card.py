@@ -17,7 +17,6 @@ classes = ["person", "bicycle", "car"]
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -27,6 +26,7 @@ from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.limits import MIB
 from crosscue.replay.misfit import explain
+from crosscue.replay.tree_text import toml_tree
 from crosscue.replay.vehicle import tuples
 
 from .settings import Settings, Share
@@ -121,12 +121,12 @@ def read_card(path: Path) -> ModelCard:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise VehicleError(f"{path}: {why}; give a model card") from None
     try:
-        tree: dict[str, Any] = tuples(tomllib.loads(text))
+        tree: dict[str, Any] = tuples(toml_tree(text))
         return ModelCard.model_validate(tree)
-    except tomllib.TOMLDecodeError as error:
-        raise VehicleError(f"{path}: not TOML: {error}; mend that line") from None
     except ValidationError as error:
         raise VehicleError(explain(error, text, str(path), ModelCard)) from None
+    except ValueError as error:
+        raise VehicleError(f"{path}: not TOML: {error}; mend that line") from None
 
 
 def read_weights(card: ModelCard, folder: Path) -> Weights:

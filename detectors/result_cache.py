@@ -19,6 +19,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from crosscue.replay.errors import OutputError
+from crosscue.replay.tree_text import json_tree
 
 from .base import Detections, Found, RoadMask
 from .pictures import Encoded
@@ -62,7 +63,7 @@ class ResultCache:
         if row is None or zlib.crc32(row[0]) != row[1]:
             return None
         try:
-            return replace(_from_json(json.loads(zlib.decompress(row[0]))), t_ns=t_ns)
+            return replace(_from_json(json_tree(zlib.decompress(row[0]))), t_ns=t_ns)
         except (ValueError, KeyError, TypeError, zlib.error):
             return None
 

@@ -22,6 +22,7 @@ from torch.nn import functional
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import SchemaError, one_line
 from crosscue.replay.run_folder import write_bytes
+from crosscue.replay.tree_text import json_tree
 
 from .road_network import RoadNetwork, logits_of
 
@@ -137,7 +138,7 @@ class RoadTraining:
             content = path.read_bytes()
             tensors = load(content)
             size = int.from_bytes(content[:8], "little")
-            state = json.loads(json.loads(content[8 : 8 + size])["__metadata__"][STATE_KEY])
+            state = json_tree(json_tree(content[8 : 8 + size])["__metadata__"][STATE_KEY])
             done, seed = int(state["done"]), int(state["seed"])
             self._fill(tensors)
         except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:

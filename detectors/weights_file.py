@@ -7,7 +7,6 @@ and weights, and lies in the file's own header; files that came with crosscue ar
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
@@ -15,6 +14,7 @@ from typing import Final
 from torch import Tensor
 
 from crosscue.replay.errors import VehicleError, one_line
+from crosscue.replay.tree_text import json_tree
 
 SUM: Final = "crosscue-sha256"
 EMBEDDED: Final[Mapping[str, str]] = {
@@ -56,8 +56,8 @@ def unpacked(content: bytes, key: str, path: Path) -> tuple[str | None, dict[str
 
     try:
         tensors = load(content)
-        header = json.loads(content[8 : _start(content)]).get("__metadata__", {})
-    except (SafetensorError, ValueError, RecursionError) as error:
+        header = json_tree(content[8 : _start(content)]).get("__metadata__", {})
+    except (SafetensorError, ValueError) as error:
         why = one_line(error, 120)
         raise VehicleError(f"{path}: no safetensors file ({why}); is it whole?") from None
     description: str | None = header.get(key)

@@ -16,11 +16,14 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 from types import FrameType
-from typing import Final, NoReturn, Protocol, cast
+from typing import TYPE_CHECKING, Final, NoReturn, Protocol, cast
 
 from crosscue.replay.errors import CrosscueError, one_line
 
 from .plain_text import visible
+
+if TYPE_CHECKING:
+    from typing_extensions import Buffer
 
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "info": ("info", "topics, counts, clocks, gaps and health of a log"),
@@ -70,6 +73,23 @@ exit status:
   130, 143  interrupted"""
 
 
+class _Parser(argparse.ArgumentParser):
+    """Wrong usage is one line, like every other error."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, with the nearest option to one that does not exist."""
+        import difflib
+
+        hint = f"see {self.prog} --help"
+        if message.startswith("unrecognized arguments: -"):
+            known = [name for action in self._actions for name in action.option_strings]
+            asked = message.partition(": ")[2].split()[0].partition("=")[0]
+            close = difflib.get_close_matches(asked, known, n=1)
+            hint = f"did you mean {close[0]}? {hint}" if close else hint
+        line = one_line(ValueError(f"crosscue: {message}; {hint}"))
+        self.exit(2, f"{visible(line)}\n")
+
+
 class Command(Protocol):
     """What a module in ``commands`` offers."""
 
@@ -84,11 +104,57 @@ class Command(Protocol):
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit status."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            # A topic's name must never stop a command because the terminal cannot show it.
-            stream.reconfigure(errors="backslashreplace")
-    sys.exit(run(sys.argv[1:] if argv is None else argv))
+    _prepare_streams()
+    try:
+        status = run(sys.argv[1:] if argv is None else argv)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        print("crosscue: interrupted", file=sys.stderr)
+        status = 130
+    except BrokenPipeError:
+        status = _without_reader()
+    except OSError as error:
+        print(f"crosscue: standard output: {error.strerror}; write it elsewhere", file=sys.stderr)
+        status = _without_reader()
+    sys.exit(status)
+
+
+class _Messages(io.FileIO):
+    """Standard error: that nobody reads it, or its disk is full, must not stop the work."""
+
+    def write(self, content: Buffer, /) -> int:
+        """Write, or forget what cannot be said."""
+        try:
+            return super().write(content)
+        except OSError:
+            return memoryview(content).nbytes
+
+
+def _prepare_streams() -> None:
+    """Make standard output and error safe to print to, whatever they are connected to."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            # Closed by whoever started us: the next file opened would take its number, and our
+            # output with it.
+            os.open(os.devnull, os.O_RDWR)
+    if sys.stdout is None:
+        sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
+    # A topic's name must never stop a command because the terminal cannot show it.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+    if sys.stderr is None or isinstance(sys.stderr, io.TextIOWrapper):
+        sys.stderr = io.TextIOWrapper(
+            io.BufferedWriter(_Messages(2, "w", closefd=False)),
+            errors="backslashreplace", line_buffering=True,
+        )  # fmt: skip
+
+
+def _without_reader() -> int:
+    """Whoever read our stdout has gone: say nothing more, and let no flush at exit fail."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    return 1
 
 
 def run(argv: Sequence[str]) -> int:
@@ -109,7 +175,7 @@ def run(argv: Sequence[str]) -> int:
     if name is None:
         return _unknown(argv)
     module = cast("Command", import_module(f"crosscue.eval.commands.{COMMANDS[name][0]}"))
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=f"crosscue {name}",
         description=str(cast("object", module).__doc__),
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -142,9 +208,7 @@ def _guarded(module: Command, args: argparse.Namespace) -> int:
         print("crosscue: terminated", file=sys.stderr)
         return 143
     except BrokenPipeError:
-        # Whoever read our stdout has gone; nothing is left to say, and no flush at exit may fail.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        return _without_reader()
     except MemoryError as error:
         return _complain(MemoryError(f"out of memory: {error or 'close other programs'}"), 1, args)
     except OSError as error:
@@ -216,3 +280,7 @@ def _overview() -> str:
             EXIT_STATUS,
         ]
     )
+
+
+if __name__ == "__main__":
+    main()

@@ -7,7 +7,6 @@ scored there are no metrics to judge by; then every difference of a table counts
 from __future__ import annotations
 
 import fnmatch
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,9 +16,11 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
 
+from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.limits import MIB
 from crosscue.replay.run_folder import MANIFEST, RunFolder, open_run
+from crosscue.replay.tree_text import json_tree
 
 from .metric_values import MetricValue, metric_values
 from .score_run import FOLDER, METRICS
@@ -236,12 +237,13 @@ def _leaves(value: object, path: str) -> Iterator[tuple[str, object]]:
 def _metrics_of(run: RunFolder) -> dict[str, MetricValue] | None:
     path = run.file(METRICS) if _is_pooled(run.path) else run.file(FOLDER) / METRICS
     try:
-        if path.stat().st_size > MOST_BYTES:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
             raise RunError(f"{path}: over {MOST_BYTES // MIB} MiB; run crosscue score again")
-        tree = json.loads(path.read_text(encoding="utf-8"))
+        tree = json_tree(content)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise RunError(f"{path}: unreadable ({error}); run crosscue score again") from None
     if not isinstance(tree, dict):
         raise RunError(f"{path}: want an object; run crosscue score again")

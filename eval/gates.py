@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import UsageError
 from crosscue.replay.limits import MIB
 from crosscue.replay.misfit import explain
+from crosscue.replay.tree_text import toml_tree
 
 from .metric_values import MetricValue
 
@@ -98,8 +98,8 @@ def load_gates(path: Path) -> tuple[Gate, ...]:
         if content is None:
             raise UsageError(f"{path}: over {MOST_BYTES // MIB} MiB; this is no gate file")
         text = content.decode("utf-8")
-        tree = tomllib.loads(text)
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        tree = toml_tree(text)
+    except (OSError, ValueError) as error:
         raise UsageError(f"{path}: not readable as TOML ({error}); mend it") from None
     try:
         return GateFile.model_validate(tree).gate

@@ -10,7 +10,6 @@ however the first one ended.
 from __future__ import annotations
 
 import hashlib
-import json
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
@@ -22,6 +21,7 @@ from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 from crosscue.replay.errors import CrosscueError, RunError, UsageError, one_line
 from crosscue.replay.remote import version_of
 from crosscue.replay.run_folder import MANIFEST, RunFolder, strict_json, write_text
+from crosscue.replay.tree_text import json_tree
 
 JOURNAL: Final = ".drives"
 FORMAT_VERSION: Final = 1
@@ -341,7 +341,7 @@ def _write_entry(job: Job, entry: dict[str, object]) -> None:
 def _entry(job: Job) -> dict[str, Any] | None:
     """The journal's entry; None where there is none, or none that can be believed."""
     try:
-        entry = json.loads(_entry_path(job).read_text(encoding="utf-8"))
+        entry = json_tree(_entry_path(job).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     is_ours = isinstance(entry, dict) and entry.get("format_version") == FORMAT_VERSION

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -16,6 +15,7 @@ from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError, UsageError
 from crosscue.replay.limits import MIB
 from crosscue.replay.parquet_file import opened
+from crosscue.replay.tree_text import json_tree
 
 MOST_BYTES: Final = 256 * MIB
 LABELS: Final[Mapping[str, str]] = {"stop_sign": "stop sign", "traffic_light": "traffic light"}
@@ -155,8 +155,8 @@ def _objects(truth: Path) -> Any:
         content = read_at_most(path, MOST_BYTES)
         if content is None:
             raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
-        return json.loads(content)
-    except (OSError, ValueError, RecursionError) as error:
+        return json_tree(content)
+    except (OSError, ValueError) as error:
         raise SchemaError(f"{path}: not readable as JSON ({error}); mend it") from None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from crosscue.detectors.pictures import Encoded
 from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import UsageError
 from crosscue.replay.limits import MIB
+from crosscue.replay.tree_text import json_tree
 
 COLUMNS: Final = ("picture", "label", "x0", "y0", "x1", "y1")
 MOST_BYTES: Final = 64 * MIB
@@ -79,7 +79,7 @@ def coco_boxes(text: str, path: Path) -> list[tuple[dict[str, Any], Boxes]]:
         UsageError: It is none, holds no image, or a box is none.
     """
     try:
-        tree = json.loads(text)
+        tree = json_tree(text)
         names = {one["id"]: str(one["name"]) for one in tree["categories"]}
         found: dict[int, tuple[dict[str, Any], Boxes]] = {
             image["id"]: (image, {}) for image in tree["images"]
@@ -90,7 +90,7 @@ def coco_boxes(text: str, path: Path) -> list[tuple[dict[str, Any], Boxes]]:
             if not all(map(math.isfinite, box)) or wide <= 0.0 or high <= 0.0:
                 raise UsageError(f"{path}: annotation {one['id']}: box {box}: want a real one")
             found[one["image_id"]][1].setdefault(names[one["category_id"]], []).append(box)
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{path}: no COCO file ({error!r}); mend it") from None
     if not found:
         raise UsageError(f"{path}: no picture in it; add some")

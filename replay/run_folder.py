@@ -21,9 +21,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
+from .bounded import read_at_most
 from .errors import OutputError, RunError
 from .parquet_file import opened
 from .partial_file import PartialFile, is_partial, is_still, lock, sweep
+from .tree_text import json_tree
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
 FORMAT_VERSION: Final = 1
+MAX_MANIFEST_BYTES: Final = 256 << 20
 GROUP_ROWS: Final = 8192
 """Rows of a table held back before they are written."""
 
@@ -53,7 +56,10 @@ class RunFolder:
         """
         path = self.file(MANIFEST)
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
+            content = read_at_most(path, MAX_MANIFEST_BYTES)
+            if content is None:
+                raise ValueError(f"over {MAX_MANIFEST_BYTES >> 20} MiB")
+            found = json_tree(content)
         except FileNotFoundError:
             raise RunError(
                 f"{self.path}: no {MANIFEST}: not a run folder, or its run was cut short; "

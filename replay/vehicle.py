@@ -8,7 +8,6 @@ REP-103: x forward, y left, heading counter-clockwise. Every default is written 
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -22,6 +21,7 @@ from .limits import MIB
 from .misfit import explain
 from .past_settings import Past
 from .settings_section import Finite, NotNegative, Positive, Section
+from .tree_text import toml_tree
 
 VERSION: Final = 1
 MOST_BYTES: Final = 1 * MIB
@@ -326,8 +326,8 @@ def parse(text: str, where: str) -> Vehicle:
         VehicleError: As in ``load``.
     """
     try:
-        tree = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        tree = toml_tree(text)
+    except ValueError as error:
         raise VehicleError(f"{where}: not TOML: {error}; mend that line") from None
     try:
         return Vehicle.model_validate(tuples(tree))

@@ -428,3 +428,15 @@ def test_a_disk_that_fills_up_at_any_place_leaves_no_half_file(
         assert "the disk is full" in line
         assert line.count("\n") == 1
     assert calls == fails_at - 1 >= 8
+
+
+def test_one_run_is_written_to_the_folder_asked_for_as_well(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, out = _one(tmp_path), tmp_path / "scored"
+
+    assert cli.run(["score", str(run), "-o", str(out)]) == 0
+    assert f"written to {out}" in capsys.readouterr().out.replace("\n", " ")
+    for name in ("metrics.json", "curves.parquet", "cue_frames.parquet"):
+        assert (out / name).read_bytes() == (run / "score" / name).read_bytes()
+    assert (out / "report.html").exists()

@@ -7,7 +7,6 @@ its mask is not one of that picture's size; a box that sticks out is cut off at 
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -22,6 +21,7 @@ from crosscue.detectors import rle
 from crosscue.replay.bounded import read_at_most
 from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import SchemaError
+from crosscue.replay.tree_text import json_tree
 
 MOST_BYTES: Final = 2 << 30
 """Largest file read."""
@@ -130,10 +130,10 @@ def _tree(path: Path) -> Mapping[str, Any]:
         content = read_at_most(path, MOST_BYTES)
         if content is None:
             raise SchemaError(f"{path}: more than {MOST_BYTES:,} bytes of annotations; split it")
-        tree = json.loads(content)
+        tree = json_tree(content)
     except OSError as error:
         raise SchemaError(f"{path}: {error.strerror}; want a COCO file") from None
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise SchemaError(f"{path}: no JSON ({error}); want a COCO file") from None
     if not isinstance(tree, dict):
         raise SchemaError(f"{path}: want a COCO file: images, annotations and categories")

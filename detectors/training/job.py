@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -29,6 +28,7 @@ from crosscue.detectors.mask_rcnn_network import Plan, build_network
 from crosscue.detectors.sign_threshold import Judged
 from crosscue.replay.errors import OutputError
 from crosscue.replay.run_folder import strict_json, write_text
+from crosscue.replay.tree_text import json_tree
 
 from .annotations import LabelledSet
 from .calibration import fitted, judged
@@ -223,4 +223,4 @@ def told_rates(name: str, rows: Judged, by: Calibration) -> dict[str, float | No
 
 def read_curve(path: Path) -> list[Point]:
     """The points of a curve file."""
-    return [Point(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
+    return [Point(**row) for row in json_tree(path.read_text(encoding="utf-8"))]

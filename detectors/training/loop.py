@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from crosscue.detectors.mask_rcnn_network import forward_training
 from crosscue.replay.errors import CrosscueError, SchemaError, one_line
 from crosscue.replay.run_folder import write_bytes
+from crosscue.replay.tree_text import json_tree
 
 from .samples import Sample, Sampler
 
@@ -188,7 +189,7 @@ class Training:
 
         try:
             with safe_open(path, "pt", device=str(self.device)) as file:
-                kept = json.loads((file.metadata() or {}).get(STATE_KEY, "{}"))
+                kept = json_tree((file.metadata() or {}).get(STATE_KEY, "{}"))
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         except (SafetensorError, OSError, ValueError) as error:
             raise SchemaError(

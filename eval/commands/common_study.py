@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from crosscue.replay.errors import UsageError
+from crosscue.replay.tree_text import json_tree
 
 from .common import print_json, with_progress
 
@@ -92,9 +93,7 @@ def run_study(
         done[0] = share
     made = finish(study, args.output)
     if args.json:
-        import json
-
-        print_json(json.loads((args.output / SUMMARY).read_text(encoding="utf-8")))
+        print_json(json_tree((args.output / SUMMARY).read_text(encoding="utf-8")))
     elif not args.quiet:
         print("\n\n".join(table.as_text() for table in made.tables))
         print("\n" + "\n".join(made.notes))

@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "-o", "--output", type=Path, metavar="DIR",
-        help="folder for the pooled metrics and junit.xml of several runs",
+        help="folder for metrics, report and junit.xml, pooled over all runs",
     )  # fmt: skip
     parser.add_argument("--gate", type=Path, metavar="G.toml", help="bounds on metrics")
     parser.add_argument(
@@ -145,10 +145,14 @@ def _tell_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) 
     one = found.one
     scores = scores_of([one], settings)
     worth = _attribution([found], found.metrics, settings, args)
+    report = found.report
     if worth:
         with locked(one.run):
             write_scores(one.run.file(FOLDER), [one], found.metrics)
             write_report(one.run.file(FOLDER), [one], scores, found.metrics)
+    if args.output is not None:
+        write_scores(args.output, [one], found.metrics)
+        report = write_report(args.output, [one], scores, found.metrics)
     if args.json or args.quiet:
         return found.metrics
     print(f"run        {visible(str(one.run.path))}")
@@ -157,7 +161,7 @@ def _tell_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) 
         print("\n" + pose_summary(one.pose))
     if found.smoothed is not None:
         print(told(found.smoothed))
-    print(f"written to {visible(str(found.report))}")
+    print(f"written to {visible(str(report))}")
     return found.metrics
 
 

@@ -8,7 +8,6 @@ navigator on board knew them.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -22,6 +21,7 @@ import numpy as np
 from crosscue.localization.random_stream import key_of
 from crosscue.replay.errors import RunError
 from crosscue.replay.run_folder import RunFolder, locked, strict_json, write_text
+from crosscue.replay.tree_text import json_tree
 
 from .intervals import mean_of, share_of
 from .page import Table, write_page
@@ -126,7 +126,7 @@ def _claim(study: FieldStudy, folder: Path, *, overwrite: bool) -> None:
     wanted = study.model_dump(mode="json")
     if path.exists() and not overwrite:
         try:
-            before = json.loads(path.read_text(encoding="utf-8"))
+            before = json_tree(path.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             before = None
         if before != wanted:
@@ -145,7 +145,7 @@ def _run(job: _Job) -> FieldRun:
     kept = folder / "field_run.json"
     if kept.exists():
         try:
-            return FieldRun(**json.loads(kept.read_text(encoding="utf-8")))
+            return FieldRun(**json_tree(kept.read_text(encoding="utf-8")))
         except (ValueError, TypeError):
             kept.unlink()
     settings = job.study.settings(has_landmarks=job.has_landmarks)

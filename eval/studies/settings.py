@@ -12,7 +12,6 @@ A study file names its ``kind`` and whatever differs from the published study of
 
 from __future__ import annotations
 
-import tomllib
 from itertools import product
 from pathlib import Path
 from typing import Annotated, ClassVar, Final, Literal, NamedTuple, Self, TypeVar
@@ -25,6 +24,7 @@ from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.misfit import explain
 from crosscue.replay.settings_section import Section
+from crosscue.replay.tree_text import toml_tree
 from crosscue.replay.vehicle import tuples
 
 VERSION: Final = 1
@@ -200,12 +200,12 @@ def load_study(path: Path, kind: type[Study]) -> Study:
         if content is None:
             raise StudyFileError(f"{path}: larger than {LARGEST_FILE} bytes; give a study file")
         text = content.decode("utf-8")
-        tree = tomllib.loads(text)
+        tree = toml_tree(text)
     except OSError as error:
         raise StudyFileError(f"{path}: {error.strerror}; check the path") from None
     except UnicodeDecodeError:
         raise StudyFileError(f"{path}: not UTF-8 text; give a study file") from None
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise StudyFileError(f"{path}: not TOML: {error}; mend that line") from None
     wanted = kind.model_fields["kind"].default
     if tree.get("kind") != wanted:

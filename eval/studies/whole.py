@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -12,6 +11,7 @@ from typing import Final
 from crosscue.localization.drive_simulator import Result
 from crosscue.replay.errors import RunError
 from crosscue.replay.run_folder import RunFolder, locked, strict_json, write_text
+from crosscue.replay.tree_text import json_tree
 
 from . import landmark_figure, landmark_study, range_figure, range_study
 from .page import Table, write_page
@@ -149,7 +149,7 @@ def _refuse_another(study: RangeStudy | LandmarkStudy, folder: Path, *, overwrit
     if overwrite or not path.exists():
         return
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))["study"]
+        before = json_tree(path.read_text(encoding="utf-8"))["study"]
     except (OSError, ValueError, KeyError, TypeError):
         before = None
     if before != study.model_dump(mode="json"):

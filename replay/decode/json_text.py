@@ -5,7 +5,6 @@ JSON that names a key twice, or holds NaN or Infinity (which JSON does not have)
 
 from __future__ import annotations
 
-import json
 from base64 import b64decode
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from crosscue.replay.columns import Block, Messages, Table, Topic
 from crosscue.replay.errors import SchemaError, one_line
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT
+from crosscue.replay.tree_text import json_tree
 
 from .coding import MAGIC_BYTES
 from .foxglove import PICTURES, TABLES, Picture, Source
@@ -52,7 +52,7 @@ def json_decoder(topic: Topic) -> Callable[[Block, Ledger], Block]:
 
 
 def _object(text: bytes) -> dict[str, Any]:
-    value = json.loads(text.decode("utf-8"), parse_constant=_refuse, object_pairs_hook=_once)
+    value = json_tree(text.decode("utf-8"), parse_constant=_refuse, object_pairs_hook=_once)
     if not isinstance(value, dict):
         raise ValueError(f"want an object, got {type(value).__name__}")
     return value

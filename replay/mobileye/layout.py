@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -11,6 +10,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 from crosscue.replay.errors import SchemaError
+from crosscue.replay.tree_text import toml_tree
 
 Kind: TypeAlias = Literal["real", "code", "flag"]
 Beyond: TypeAlias = Literal["refuse", "clip", "drop"]
@@ -192,7 +192,7 @@ def layout() -> Layout:
     text = files(__package__).joinpath("layout.toml").read_text(encoding="utf-8")
     try:
         return parse(text)
-    except (tomllib.TOMLDecodeError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise SchemaError(f"layout.toml: {error}; install crosscue again") from None
 
 
@@ -204,7 +204,7 @@ def parse(text: str) -> Layout:
         KeyError: A message lacks a key.
         TypeError: A key that no message or field has.
     """
-    entries: list[dict[str, Any]] = tomllib.loads(text)["message"]
+    entries: list[dict[str, Any]] = toml_tree(text)["message"]
     messages: dict[str, Message] = {}
     for entry in entries:
         messages[entry["name"]] = _message(dict(entry), messages)

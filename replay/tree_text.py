@@ -1,0 +1,77 @@
+"""JSON and TOML text as plain values, nested no deeper than any file of ours has a reason to be.
+
+The parsers recurse, and so does most of what is done with their result. One place with one limit
+turns a hostile file into one clear line, whatever command reads it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+
+MAX_DEPTH: Final = 64
+"""Objects and arrays within each other; a manifest has about ten."""
+_STRING: Final = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
+"""Also one that the text ends in, so that no text makes this go over it twice."""
+_OPEN: Final = b"[{"
+_NO_BRACKET: Final = bytes(set(range(256)) - set(b"[]{}"))
+_TOO_DEEP: Final = f"nested over {MAX_DEPTH} levels deep"
+
+
+def json_tree(
+    text: str | bytes,
+    object_pairs_hook: Callable[[list[tuple[str, Any]]], Any] | None = None,
+    parse_constant: Callable[[str], Any] | None = None,
+) -> Any:
+    """What a JSON text holds; arguments are those of ``json.loads``.
+
+    Raises:
+        ValueError: No JSON, or nested too deep; one line.
+    """
+    if _depth(text) > MAX_DEPTH:
+        raise ValueError(_TOO_DEEP)
+    try:
+        return json.loads(text, object_pairs_hook=object_pairs_hook, parse_constant=parse_constant)
+    except RecursionError:
+        raise ValueError(_TOO_DEEP) from None
+
+
+def toml_tree(text: str) -> dict[str, Any]:
+    """What a TOML text holds.
+
+    Raises:
+        ValueError: No TOML, or nested too deep; one line.
+    """
+    try:
+        tree = tomllib.loads(text)
+    except RecursionError:
+        raise ValueError(_TOO_DEEP) from None
+    level: list[Any] = [tree]
+    for _ in range(MAX_DEPTH):
+        level = [branch for one in level for branch in _branches(one)]
+    if level:
+        raise ValueError(_TOO_DEEP)
+    return tree
+
+
+def _branches(value: Any) -> list[Any]:
+    below = value.values() if isinstance(value, dict) else value
+    return [one for one in below if isinstance(one, dict | list)]
+
+
+def _depth(text: str | bytes) -> int:
+    """How deep the brackets outside strings nest; of what is no JSON, some number."""
+    content = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
+    if content.count(b"[") + content.count(b"{") <= MAX_DEPTH:
+        return 0
+    brackets = _STRING.sub(b"", content).translate(None, _NO_BRACKET)
+    if not brackets:
+        return 0
+    codes = np.frombuffer(brackets, np.uint8)
+    steps = np.where(np.isin(codes, np.frombuffer(_OPEN, np.uint8)), 1, -1)
+    return int(np.cumsum(steps).max())
