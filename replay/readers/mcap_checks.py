@@ -34,6 +34,7 @@ class Checks:
     sections_unread: int = 0
     summaries_right: int = 0
     attachments: int = 0
+    attachments_unread: int = 0
     attachments_right: int = 0
     bad_attachments: Tally = field(default_factory=Tally)
     bad_indexes: Tally = field(default_factory=Tally)
@@ -60,25 +61,34 @@ class Checks:
 
     def _integrity(self) -> str:
         right: list[str] = []
-        if self.chunks:
+        read = self.chunks - self.chunks_unread
+        if read and not self.chunks_unread:
             right.append(f"{self.chunks_right} of {self.chunks} chunks")
+        elif self.chunks_right != read:
+            right.append(_many(self.chunks_right, "chunk"))
         if self.sections_right:
             right.append("the data section")
         if self.summaries_right:
             right.append("the summary")
-        if self.attachments:
+        if self.attachments > self.attachments_unread:
             right.append(f"{self.attachments_right} of {self.attachments} attachments")
         has_any = self.chunks_right + self.sections_right + self.summaries_right
-        parts = [f"CRC-32 verified: {', '.join(right)}"] if has_any else []
+        parts = [f"CRC-32 verified: {', '.join(right)}"] if has_any and right else []
         if self.chunks_bare or self.rows_bare:
             what = [_many(self.chunks_bare, "chunk")] if self.chunks_bare else []
             bare = _many(self.rows_bare, "message")
             what += [f"{bare} outside whole chunks"] if self.rows_bare else []
             parts.append(f"no checksum covers {' and '.join(what)}")
         if self.chunks_unread:
-            parts.append(f"{_many(self.chunks_unread, 'chunk')} not asked for and not read")
+            verb = "was" if read == 1 else "were"
+            verified = " and verified" if read and read == self.chunks_right else ""
+            parts.append(
+                f"of {_many(self.chunks, 'chunk')} {read} {verb} read{verified}; the rest was not"
+            )
+        if self.attachments_unread:
+            parts.append(f"{_many(self.attachments_unread, 'attachment')} not read")
         if self.sections_unread:
-            parts.append("the data section's checksum was not needed")
+            parts.append("the data section's checksum was not compared, which takes every byte")
         if self.sections_wrong:
             parts.append("the data section's checksum is wrong")
         return "; ".join(parts) or "the file carries no checksums"

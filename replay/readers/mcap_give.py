@@ -94,6 +94,14 @@ class Giver:
         self.met[index.channel_id] += count
         self._account(self.declarations.topic(index.channel_id), index.entries["log"])
 
+    def pass_over_counted(self, channel_id: int, count: int) -> None:
+        """Account for messages in chunks that nobody looked into, as the statistics count them."""
+        topic = self.declarations.topic(channel_id)
+        self.met[channel_id] += count
+        self._ledger.find(topic, count)
+        is_wanted = self._selection.wants(topic)
+        self._ledger.skip(topic, NOT_ASKED_TIME if is_wanted else NOT_ASKED_TOPIC, count)
+
     def pass_over_large(self, channel_id: int, log: int, size: int, at: int) -> None:
         """Account for a message outside chunks that is too large to be read."""
         self.met[channel_id] += 1

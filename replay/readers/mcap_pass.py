@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
 from typing import Final
 
@@ -26,6 +26,7 @@ from .mcap_scan import Scanner
 from .mcap_segments import Segment, Summary
 from .mcap_topics import TopicBook
 from .mcap_walk import Attachment, Chunk, End, Gap, How, Ignored, Item, Oversized, Run, Stray, Walk
+from .mcap_window import Window, find_window
 
 DAMAGED_CHUNK: Final = "damaged chunk"
 DAMAGED_RECORD: Final = "damaged record"
@@ -110,7 +111,10 @@ class SegmentPass:
         self._summary = segment.summary or Summary()
         self._limits = limits
         self._ledger = ledger
+        self._selection = selection
         self._may_skip = selection != EVERYTHING
+        self._inside: Window | None = None
+        self._doubt = ""
         self._checks = checks
         self._scanner = scanner
         self._loader = loader
@@ -130,12 +134,55 @@ class SegmentPass:
         if segment.has_end and segment.summary is None:
             self._notice("it has no summary that can be used; topics were found by reading")
         self._checks.summaries_right += self._summary.is_verified
-        if segment.data_crc and not self._may_skip:
-            self._section = self._loader.section_crc(segment)
-        walk = Walk(
-            self._file, segment.begin, segment.end, segment.rail, self._limits, self._scanner
-        )
-        items = self._loader.ahead(iter(walk), self._is_wanted)
+        window = self._window()
+        if window is not None:
+            yield from self._windowed(window)
+        else:
+            if segment.data_crc and not self._may_skip:
+                self._section = self._loader.section_crc(segment)
+            rail = segment.rail(self._file)
+            walk = Walk(self._file, segment.begin, segment.end, rail, self._limits, self._scanner)
+            yield from self._walked(iter(walk))
+        if segment.after:
+            self._ledger.drop("", INCOMPLETE, None, self._where + segment.after)
+        self._finish_checks()
+
+    def _window(self) -> Window | None:
+        """Where what was asked for lies, if the index can be trusted; else the reason is told."""
+        if not self._may_skip or not self._segment.has_end:
+            return None
+        found = find_window(self._segment, self._declarations, self._selection)
+        if isinstance(found, Window):
+            return found
+        self._notice(f"the part asked for was found by walking through the file: {found}")
+        return None
+
+    def _windowed(self, window: Window) -> Iterator[Block]:
+        """Blocks of the chunks that the index names, and of whatever lies outside chunks."""
+        if self._segment.data_crc:
+            # Only all bytes together have this checksum.
+            self._checks.sections_unread += 1
+            self._segment = replace(self._segment, data_crc=0)
+        self._inside = window
+        yield from self._walked(window.items(self._file, self._limits, self._scanner))
+        self._inside = None
+        held = self._giver.met + self._giver.dropped
+        doubt = self._doubt or ("it has damage" if self._damages else "")
+        rest = window.rest(self._summary, held)
+        if doubt or rest is None:
+            doubt = doubt or "it does not add up with the statistics"
+            self._notice(
+                f"the index was not trusted after all ({doubt}); every chunk was looked at"
+            )
+            yield from self._walked(window.others(self._file, self._limits, self._scanner))
+            return
+        self._checks.chunks += window.left
+        self._checks.chunks_unread += window.left
+        for channel_id, count in rest.items():
+            self._giver.pass_over_counted(channel_id, count)
+
+    def _walked(self, walk: Iterator[Item]) -> Iterator[Block]:
+        items = self._loader.ahead(walk, self._is_wanted)
         for (item, load), (following, _) in pairwise(chain(items, [(None, None)])):
             if isinstance(item, Chunk):
                 yield from self._chunk(item, load)
@@ -143,9 +190,6 @@ class SegmentPass:
                 yield from self._run(item, isinstance(following, Gap))
             else:
                 self._note(item)
-        if segment.after:
-            self._ledger.drop("", INCOMPLETE, None, self._where + segment.after)
-        self._finish_checks()
 
     def _is_wanted(self, chunk: Chunk) -> bool:
         """Must the chunk be read? Only a chunk whose indexes all agree may be passed over."""
@@ -166,6 +210,8 @@ class SegmentPass:
 
     def _chunk(self, chunk: Chunk, load: Load | None) -> Iterator[Block]:
         self._checks.chunks += 1
+        if self._inside is not None and not _is_as_indexed(chunk):
+            self._doubt = self._doubt or f"it does not fit the chunk at byte {chunk.at}"
         if load is None and not any(self._giver.wants(m) for m in chunk.messages):
             self._checks.chunks_unread += 1
             for index in chunk.messages:
@@ -302,6 +348,9 @@ class SegmentPass:
     def _note(self, item: Item | None) -> None:
         """Account for what holds no messages that could be given."""
         match item:
+            case Attachment() if self._inside is not None:
+                self._checks.attachments += 1
+                self._checks.attachments_unread += 1
             case Gap(at, to, why):
                 self._damages.append(
                     Damage(DAMAGED_RECORD, f"{self._where}bytes {at} to {to}: {why}")
@@ -394,3 +443,12 @@ class SegmentPass:
 
     def _notice(self, sentence: str) -> None:
         self._ledger.notice(self._where + sentence)
+
+
+def _is_as_indexed(chunk: Chunk) -> bool:
+    """Does the summary say of the chunk what the chunk and its message indexes say?"""
+    index = chunk.index
+    if index is None or chunk.fault or chunk.differs:
+        return False
+    held = {m.channel_id for m in chunk.messages if len(m.entries)}
+    return held <= index.channels or not index.channels

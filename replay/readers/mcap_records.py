@@ -226,22 +226,6 @@ def read_message_index(content: bytes | memoryview) -> MessageIndex:
     return MessageIndex(channel_id, np.frombuffer(content, INDEX_ENTRY, count, _INDEX_HEAD.size))
 
 
-def read_chunk_index(content: bytes | memoryview, base: int = 0) -> ChunkIndex:
-    """A ChunkIndex record; ``base`` is where its file begins within a concatenated one."""
-    fields = Fields(content)
-    start, end, at, length = (fields.number(8) for _ in range(4))
-    size = fields.number(4)
-    if size % 10:
-        raise BrokenRecordError(f"a map of {size} bytes is no whole number of entries")
-    pairs = np.frombuffer(fields.take(size), dtype=np.dtype([("id", "<u2"), ("at", "<u8")]))
-    channels = frozenset(pairs["id"].tolist())
-    index_length, compression = fields.number(8), fields.text()
-    body_size, size = fields.number(8), fields.number(8)
-    return ChunkIndex(
-        start, end, base + at, length, channels, index_length, compression, body_size, size
-    )
-
-
 def read_statistics(content: bytes | memoryview) -> Statistics:
     """A Statistics record."""
     fields = Fields(content)

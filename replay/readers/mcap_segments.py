@@ -11,17 +11,19 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from crosscue.replay.checksum import crc32
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.limits import Limits
 
 from .mcap_bytes import PIECE, ByteFile
+from .mcap_chunk_table import ChunkTable, run_of, table_of
 from .mcap_find import find_bytes
 from .mcap_inflate import inflate, inflate_prefix
 from .mcap_records import (
     CHANNEL,
     CHUNK,
-    CHUNK_FIXED,
     CHUNK_INDEX,
     DATA_END,
     DATA_END_SIZE,
@@ -38,7 +40,6 @@ from .mcap_records import (
     Schema,
     Statistics,
     read_channel,
-    read_chunk_index,
     read_footer,
     read_schema,
     read_statistics,
@@ -48,8 +49,8 @@ from .mcap_scan import Scanner
 from .mcap_topics import Declarations, TopicBook
 from .mcap_walk import Chunk, End, How, Run, Walk
 
-SMALLEST_CHUNK: Final = PREFIX.size + CHUNK_FIXED
 HEADER_MOST: Final = 1 << 16
+NO_CHUNKS: Final = table_of(b"", (), (), 0)
 DATA_END_PREFIX: Final = PREFIX.pack(DATA_END, DATA_END_SIZE - PREFIX.size)
 
 
@@ -61,14 +62,14 @@ class Summary:
         schemas: By number.
         channels: By number.
         statistics: Counts, or None.
-        chunks: By offset from the beginning of the whole file.
+        chunks: By offset from the beginning of the whole file, as the index says.
         is_verified: Its checksum is there and right.
     """
 
     schemas: Mapping[int, Schema] = field(default_factory=dict)
     channels: Mapping[int, Channel] = field(default_factory=dict)
     statistics: Statistics | None = None
-    chunks: Mapping[int, ChunkIndex] = field(default_factory=dict)
+    chunks: ChunkTable = field(default_factory=lambda: NO_CHUNKS)
     is_verified: bool = False
 
     @property
@@ -80,7 +81,7 @@ class Summary:
     @property
     def mentioned(self) -> frozenset[int]:
         """Channels that its counts or indexes mention."""
-        found = frozenset[int]().union(*(chunk.channels for chunk in self.chunks.values()))
+        found = frozenset(np.unique(self.chunks.channel).tolist())
         return found if self.statistics is None else found | self.statistics.by_channel.keys()
 
     @property
@@ -126,12 +127,14 @@ class Segment:
         """What was known before reading."""
         return Declarations(book, self.schemas, self.channels)
 
-    @property
-    def rail(self) -> Mapping[int, ChunkIndex] | None:
+    def rail(self, file: ByteFile) -> Mapping[int, ChunkIndex] | None:
         """The chunks known, for a walk; None where not even the end is known."""
         if not self.has_end:
             return None
-        return self.summary.chunks if self.summary is not None else {}
+        if self.summary is None:
+            return {}
+        is_sure = self.summary.is_verified
+        return self.summary.chunks if is_sure else _confirmed(file, self.summary.chunks)
 
 
 def find_segments(
@@ -227,14 +230,14 @@ def _read_summary(
     if crc and crc32(checked) != crc:
         raise BrokenRecordError("the summary does not match its checksum")
     summary = _parse_summary(records, base)
-    chunks = summary.chunks if crc else _confirmed(file, summary.chunks)
-    return replace(summary, chunks=chunks, is_verified=bool(crc))
+    return replace(summary, is_verified=bool(crc))
 
 
 def _parse_summary(records: bytes, base: int) -> Summary:
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
-    chunks: dict[int, ChunkIndex] = {}
+    begins: list[int] = []
+    sizes: list[int] = []
     statistics: Statistics | None = None
     view, at = memoryview(records), 0
     while at < len(records):
@@ -253,11 +256,14 @@ def _parse_summary(records: bytes, base: int) -> Summary:
         elif opcode == STATISTICS:
             statistics = read_statistics(content)
         elif opcode == CHUNK_INDEX:
-            index = read_chunk_index(content, base)
-            if index.length >= SMALLEST_CHUNK:
-                chunks[index.at] = index
+            size = PREFIX.size + length
+            run = run_of(records, at, size)
+            begins += range(at + PREFIX.size, at + run * size, size)
+            sizes += [length] * run
+            at += (run - 1) * size
         at += PREFIX.size + length
-    return Summary(schemas, channels, statistics, dict(sorted(chunks.items())))
+    chunks = table_of(records, begins, sizes, base)
+    return Summary(schemas, channels, statistics, chunks)
 
 
 def _confirmed(file: ByteFile, chunks: Mapping[int, ChunkIndex]) -> dict[int, ChunkIndex]:
@@ -284,7 +290,7 @@ def _enter(segment: Segment, declarations: Declarations) -> Segment:
 def _survey_named(file: ByteFile, segment: Segment, book: TopicBook, limits: Limits) -> Segment:
     """A segment whose summary does not name all channels: find them in its data section."""
     scanner = Scanner()
-    walk = Walk(file, segment.begin, segment.end, segment.rail, limits, scanner)
+    walk = Walk(file, segment.begin, segment.end, segment.rail(file), limits, scanner)
     declarations = Declarations(book, *_declared(segment.summary or Summary()))
     _collect(file, walk, declarations, limits, scanner)
     return _enter(segment, declarations)
