@@ -34,6 +34,8 @@ from crosscue.replay.log import EVERYTHING, Selection
 from .npy import Column, read_column
 
 STEP_NS: Final = 1_000_000_000
+LATEST_NS: Final = 1 << 62
+NO_TIME: Final = -(1 << 63)
 MICROTESLA: Final = 1e-6
 FLIP: Final = np.array([1.0, -1.0, -1.0])
 """[forward, right, down] to [forward, left, up]."""
@@ -164,10 +166,14 @@ class Segment(Closing):
             ledger.notice("CAN frame lengths are not kept by comma2k19; payloads are zero-padded")
         filled = [source for source in self._sources if len(source.t_ns)]
         if filled:
-            edge_ns = min(int(source.t_ns[0]) for source in filled)
             cursors = [0] * len(filled)
-            while any(at < len(s.t_ns) for at, s in zip(cursors, filled, strict=True)):
-                edge_ns += STEP_NS
+            while waiting := [
+                int(s.reach_ns[at])
+                for at, s in zip(cursors, filled, strict=True)
+                if at < len(s.t_ns)
+            ]:
+                # From the earliest row, not from the last edge: damaged times lie years apart.
+                edge_ns = min(waiting) + STEP_NS
                 for i, source in enumerate(filled):
                     stop = int(np.searchsorted(source.reach_ns, edge_ns))
                     if stop > cursors[i]:
@@ -266,12 +272,14 @@ def _block(source: _Source, part: slice, ledger: Ledger, selection: Selection) -
         ledger.skip(name, NOT_ASKED_TOPIC, count)
         return
     block = Block(name, source.t_ns[part], source.rows(part))
-    wanted = np.ones(count, np.bool_)
+    wanted = block.log_ns != NO_TIME
+    timeless = int(count - wanted.sum())
+    ledger.skip(name, "a row without a possible time", timeless)
     if selection.start_ns is not None:
         wanted &= block.log_ns >= selection.start_ns
     if selection.end_ns is not None:
         wanted &= block.log_ns < selection.end_ns
-    ledger.skip(name, NOT_ASKED_TIME, int(count - wanted.sum()))
+    ledger.skip(name, NOT_ASKED_TIME, int(count - timeless - wanted.sum()))
     if wanted.all():
         yield block
     elif wanted.any():
@@ -279,7 +287,11 @@ def _block(source: _Source, part: slice, ledger: Ledger, selection: Selection) -
 
 
 def _to_ns(seconds: Values) -> Int64s:
-    return np.rint(np.asarray(seconds, np.float64) * 1e9).astype(np.int64)
+    """Nanoseconds, ``NO_TIME`` where damage has made a number that is no time."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        t_ns = np.rint(np.asarray(seconds, np.float64) * 1e9)
+        is_time = np.abs(t_ns) < LATEST_NS
+    return np.where(is_time, t_ns, NO_TIME).astype(np.int64)
 
 
 def open_segment(path: Path, limits: Limits) -> Segment:

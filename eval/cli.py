@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "info": ("info", "topics, counts, clocks, gaps and health of a log"),
     "convert": ("convert", "any log or data set to MCAP with ROS 2 types"),
+    "seal": ("seal", "a hash of each MiB beside a log, or check a log against it"),
     "vehicle init": ("vehicle_init", "write a first vehicle file from what a log holds"),
     "decode": ("decode", "every stream as columns: a Parquet file for each topic or CAN message"),
     "detect": ("detect", "run detectors over the camera: detections, road, cues"),

@@ -25,6 +25,7 @@ from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Detail, Ledger, TopicAccount
 from crosscue.replay.log import Log
 from crosscue.replay.roles import Role, role_of
+from crosscue.replay.sealed_log import sealed_sentence
 
 if TYPE_CHECKING:
     from crosscue.replay.decode import Decoder
@@ -99,6 +100,7 @@ class LogSummary:
         is_quick: Only what the log declares was looked at; its body was not read.
         is_whole: Nothing is known to be dropped; says nothing when quick.
         integrity: Which checksums were verified, in words.
+        seal: Whether it is sealed, when and with which hash.
         start_ns: Lowest log time of all topics, or None without rows.
         end_ns: Highest log time.
         topics: By name.
@@ -114,6 +116,7 @@ class LogSummary:
     is_quick: bool
     is_whole: bool
     integrity: str
+    seal: str
     start_ns: int | None
     end_ns: int | None
     topics: tuple[TopicSummary, ...]
@@ -262,6 +265,7 @@ def _summary(
         is_quick=is_quick,
         is_whole=ledger.is_whole,
         integrity="not looked at" if is_quick else ledger.integrity,
+        seal=sealed_sentence(log),
         start_ns=min((c.min_ns for c in log_clocks if c.min_ns is not None), default=None),
         end_ns=max((c.max_ns for c in log_clocks if c.max_ns is not None), default=None),
         topics=topics,

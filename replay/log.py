@@ -72,7 +72,8 @@ class Log(Protocol):
         reading them, and the declared counts then say how many were skipped. Once exhausted,
         declared counts have been settled and ``ledger.integrity`` is set. Damage never raises here
         after the log was opened: what is readable is given, the rest is ``ledger.lose``-d. A row
-        whose bytes are known to be damaged is never given.
+        whose bytes are known to be damaged is never given. (A seal knows of damage by the MiB, not
+        by the row, see ``sealed_log``.)
         """
         ...
 
@@ -159,7 +160,8 @@ FORMATS: Final[dict[str, Format]] = {
 def open_log(path: Path | str, limits: Limits = DEFAULT) -> Log:
     """Open any recording by its suffix or, for a folder, by what lies in it.
 
-    A text with ``://`` is a URL: it is fetched first, see ``remote``.
+    A text with ``://`` is a URL: it is fetched first, see ``remote``. Of a log with a seal beside
+    it, what is read is held against the seal, see ``sealed_log``.
 
     Raises:
         UnknownFormatError: No format fits; the message lists those there are.
@@ -170,7 +172,14 @@ def open_log(path: Path | str, limits: Limits = DEFAULT) -> Log:
         from .remote import open_remote
 
         return open_remote(path, lambda fetched: open_log(fetched, limits))
-    path = Path(path)
+    from .sealed_log import with_seal
+
+    place = Path(path)
+    return with_seal(place, lambda: open_unsealed(place, limits))
+
+
+def open_unsealed(path: Path, limits: Limits = DEFAULT) -> Log:
+    """As ``open_log`` of a file or folder, without looking at its seal."""
     name = format_of(path)
     module, _, function = FORMATS[name].opener.partition(":")
     opener = cast("Callable[[Path, Limits], Log]", getattr(import_module(module), function))

@@ -121,3 +121,23 @@ def test_rows_outside_the_wanted_span_are_counted() -> None:
     assert ((times >= start_ns) & (times < start_ns + 10**10)).all()
     assert account.used == len(times)
     assert account.found == account.used + account.skipped["outside --from/--to"] == 4974
+
+
+@pytest.mark.parametrize("damaged", [np.nan, np.inf, -1e300, 5e8, -5e8])
+def test_a_time_that_damage_made_impossible_or_far_costs_its_row_alone(
+    tmp_path: Path, damaged: float
+) -> None:
+    times = np.arange(50) * 0.01
+    times[0] = damaged
+    folder = tmp_path / "processed_log" / "IMU" / "gyro"
+    _save(folder / "t", times)
+    _save(folder / "value", np.ones((50, 3)))
+
+    with open_log(tmp_path) as log:
+        ledger = Ledger("")
+        rows = sum(len(block) for block in log.read(ledger))
+
+    is_time = abs(damaged) < 1e9
+    assert rows == ledger.accounts["imu/gyro"].used == (50 if is_time else 49)
+    skipped = ledger.accounts["imu/gyro"].skipped
+    assert skipped == ({} if is_time else {"a row without a possible time": 1})

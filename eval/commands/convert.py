@@ -24,6 +24,7 @@ from crosscue.replay.columns import Topic
 from crosscue.replay.errors import LogError, OutputError, UsageError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger, TopicAccount
 from crosscue.replay.log import Log, Selection, open_log
+from crosscue.replay.seal import seal_path
 from crosscue.replay.writing import LogWriter
 
 from .common import add_part_arguments, print_json, selection_of, with_progress
@@ -75,6 +76,10 @@ def _check_output(args: argparse.Namespace) -> None:
         raise UsageError(f"{args.output}: want a name that ends in .mcap")
     if args.output.exists() and args.log.exists() and args.output.samefile(args.log):
         raise UsageError(f"{args.output}: is the log itself; give another name")
+    if seal_path(args.output).exists():
+        raise OutputError(
+            f"{seal_path(args.output)}: seals what was there before; delete it, or give another -o"
+        )
 
 
 def _copy(

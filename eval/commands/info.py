@@ -85,6 +85,7 @@ def lines_of(summary: LogSummary, width: int) -> Iterator[str]:
     if not summary.is_quick:
         yield wrapped(span_sentence(summary.start_ns, summary.end_ns), width, "  time       ")
         yield wrapped(summary.integrity, width, "  integrity  ")
+    yield wrapped(summary.seal, width, "  seal       ")
     yield ""
     yield from _topics(summary, width)
     if not summary.is_quick:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Final
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import CrosscueError, LogError
 from crosscue.replay.limits import MIB, Limits
-from crosscue.replay.log import Log, open_log
+from crosscue.replay.log import Log, open_log, open_unsealed
 from crosscue.replay.partial_file import Scratch
 
 from .rosbag2_db3 import Db3Log
@@ -76,7 +76,7 @@ def look_into(path: Path, metadata: Metadata, limits: Limits) -> Split:
     """Open a storage file for a moment to learn what it holds."""
     hint = next((hint for hint in metadata.splits if hint.name == path.name), None)
     try:
-        with opened(path, limits) as (log, _):
+        with opened(path, limits, open_unsealed) as (log, _):
             range_ns = log.time_range_ns if isinstance(log, Db3Log) else None
             return Split(path, log.topics, range_ns or (hint.range_ns if hint else None))
     except (CrosscueError, OSError) as error:
@@ -84,10 +84,12 @@ def look_into(path: Path, metadata: Metadata, limits: Limits) -> Split:
 
 
 @contextmanager
-def opened(path: Path, limits: Limits) -> Iterator[tuple[Log, str]]:
+def opened(
+    path: Path, limits: Limits, open_one: Callable[[Path, Limits], Log] = open_log
+) -> Iterator[tuple[Log, str]]:
     """The log in a storage file, and what went wrong when it was unpacked (or nothing)."""
     if not path.name.endswith(PACKED):
-        with open_log(path, limits) as log:
+        with open_one(path, limits) as log:
             yield log, ""
         return
     with Scratch() as folder:

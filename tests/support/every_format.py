@@ -1,0 +1,85 @@
+"""One small log of every format that ``open_log`` knows, made on the spot."""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+import can
+import numpy as np
+
+from support.can_files import Sent, asc, blf, candump, made, trc
+from support.kitti_drive import raw_drive
+from support.pictures import picture_folder
+from support.rosbag_files import rows_of, write_bag, write_folder
+from support.videos import video
+
+FRAMES: Final = 300
+
+
+def _bytes(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+def _mcap(folder: Path) -> Path:
+    whole = write_folder(folder / "whole", rows_of(400), "mcap")
+    return Path(shutil.move(str(next(whole.glob("*.mcap"))), folder / "log.mcap"))
+
+
+def _db3(folder: Path) -> Path:
+    whole = write_folder(folder / "whole", rows_of(400))
+    return Path(shutil.move(str(next(whole.glob("*.db3"))), folder / "log.db3"))
+
+
+def _mf4(path: Path, frames: Sequence[Sent]) -> Path:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        writer = can.MF4Writer(path)
+        for f in frames:
+            writer(
+                can.Message(
+                    timestamp=f.t_ns * 1e-9, arbitration_id=f.arbitration_id,
+                    is_extended_id=f.is_extended, is_remote_frame=f.kind == 1, is_fd=f.is_fd,
+                    data=f.payload, channel=int(f.bus),
+                )
+            )  # fmt: skip
+        writer.stop()
+    return path
+
+
+def _comma2k19(folder: Path) -> Path:
+    rng = np.random.default_rng(5)
+    place = folder / "processed_log" / "IMU" / "gyro"
+    place.mkdir(parents=True)
+    for name, rows in (("t", np.arange(500) * 0.01), ("value", rng.normal(size=(500, 3)))):
+        with (place / name).open("wb") as file:
+            np.save(file, rows)
+    return folder
+
+
+def _video(folder: Path) -> Path:
+    path = video(folder / "front.mp4")
+    (folder / "front.txt").write_text("".join(f"{0.05 * i:.2f}\n" for i in range(24)))
+    return path
+
+
+EVERY_FORMAT: Final[dict[str, Callable[[Path], Path]]] = {
+    "mcap": _mcap,
+    "rosbag1": lambda folder: write_bag(folder / "log.bag", rows_of(400)),
+    "rosbag2-sqlite3": _db3,
+    "rosbag2": lambda folder: write_folder(folder / "bag", rows_of(400)),
+    "candump": lambda folder: _bytes(folder / "can.log", candump(made(FRAMES))),
+    "asc": lambda folder: _bytes(folder / "can.asc", asc(made(FRAMES))),
+    "blf": lambda folder: _bytes(folder / "can.blf", blf(made(FRAMES))),
+    "trc": lambda folder: _bytes(folder / "can.trc", trc(made(FRAMES))),
+    "mf4": lambda folder: _mf4(folder / "can.mf4", made(FRAMES)),
+    "comma2k19": lambda folder: _comma2k19(folder / "segment"),
+    "kitti-raw": lambda folder: raw_drive(folder / "drive"),
+    "video": _video,
+    "images": lambda folder: picture_folder(folder / "front", 12, "rate_hz: 10\n"),
+}
+"""By the names in ``FORMATS``: writes a log into an empty folder and returns it."""
