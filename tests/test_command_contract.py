@@ -41,6 +41,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "truth check": ("gone.json --log gone.mcap", RUN),
     "train road": ("--data gone -o x.safetensors", SETTINGS),
     "train mask-rcnn": ("--data gone.json --images gone -o x.safetensors", RUN),
+    "seal": ("gone.mcap", RECORDING),
     "study intersections": ("-o out --vehicle gone.toml", SETTINGS),
     "study range": ("-o out --settings gone.toml", SETTINGS),
     "study landmarks": ("-o out --settings gone.toml", SETTINGS),
