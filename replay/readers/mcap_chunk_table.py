@@ -84,13 +84,12 @@ class ChunkTable(Mapping[int, ChunkIndex]):
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Self:
         """Some of the chunks."""
         picked = np.arange(len(self))[rows]
-        counts = np.diff(self.edges)[picked]
-        parts = [self.channel[self.edges[i] : self.edges[i + 1]] for i in picked.tolist()]
+        edges = np.concatenate(([0], np.cumsum(np.diff(self.edges)[picked]))).astype(np.int64)
+        pairs = np.repeat(self.edges[picked] - edges[:-1], np.diff(edges)) + np.arange(edges[-1])
         return type(self)(
             self.at[rows], self.length[rows], self.index_length[rows], self.start[rows],
             self.end[rows], self.sizes[rows], self.compression[rows],
-            np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-            np.concatenate(parts) if parts else self.channel[:0],
+            edges, self.channel[pairs],
         )  # fmt: skip
 
     def __len__(self) -> int:

@@ -1,0 +1,66 @@
+"""One topic over a span of time: the rows that a whole reading gives there, and no others."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from crosscue.replay.columns import Messages, Table
+from crosscue.replay.errors import UsageError
+from crosscue.replay.log import open_log
+from crosscue.replay.topic_part import read_topic
+
+
+def stored(path: Path) -> Path:
+    """200 vectors on /speed (20 of them a chunk), and as many messages of no known type."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=1200)
+        writer.start(profile="ros2")
+        schema = writer.register_schema(
+            "geometry_msgs/msg/Vector3", "ros2msg", b"float64 x\nfloat64 y\nfloat64 z"
+        )
+        speed = writer.register_channel("/speed", "cdr", schema)
+        other = writer.register_channel("/other", "secret", 0)
+        for i in range(200):
+            head = b"\x00\x01\x00\x00"
+            writer.add_message(speed, i, head + np.array([i, 0, 0], "<f8").tobytes(), i)
+            writer.add_message(other, i, b"%d" % i, i)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def test_rows_of_the_span_come_as_columns(tmp_path: Path) -> None:
+    with open_log(stored(tmp_path / "x.mcap")) as log:
+        part = read_topic(log, "/speed", 50, 75)
+
+    values: list[float] = []
+    for block in part.blocks:
+        assert isinstance(block.rows, Table)
+        values += block.rows["x"].tolist()
+    assert values == list(range(50, 75))
+    assert len(part) == 25
+    assert part.ledger.is_whole
+    assert part.ledger.accounts["/speed"].skipped == {"outside --from/--to": 175}
+    assert part.ledger.accounts["/other"].skipped == {"topic not asked for": 200}
+
+
+def test_a_type_that_nobody_knows_comes_as_messages(tmp_path: Path) -> None:
+    with open_log(stored(tmp_path / "x.mcap")) as log:
+        part = read_topic(log, "/other", end_ns=3)
+
+    found = [
+        bytes(block.rows.payload(i))
+        for block in part.blocks
+        if isinstance(block.rows, Messages)
+        for i in range(len(block))
+    ]
+    assert found == [b"0", b"1", b"2"]
+
+
+def test_a_topic_that_is_missing_lists_those_there_are(tmp_path: Path) -> None:
+    with (
+        open_log(stored(tmp_path / "x.mcap")) as log,
+        pytest.raises(UsageError, match=r"no topic '/spede'; there are: /speed, /other"),
+    ):
+        read_topic(log, "/spede")
