@@ -69,7 +69,14 @@ class BagLog(Closing):
         for reason, detail in self._losses:
             ledger.drop("", reason, None, detail)
         one = Pass(
-            self._file, self._first, self._contents, self._roster, self._limits, ledger, selection
+            self._file,
+            self._first,
+            self._contents,
+            self._roster,
+            self._limits,
+            ledger,
+            selection,
+            self._chunk_count,
         )
         yield from one.blocks(self._index_at)
 
@@ -100,6 +107,7 @@ class BagLog(Closing):
         return record.end, record
 
     def _learn(self, header: Record | None) -> Contents:
+        self._chunk_count = header.u32(b"chunk_count") if header is not None else -1
         self._index_at = header.u64(b"index_pos") if header is not None else 0
         largest = self._limits.schema_bytes
         if self._first <= self._index_at <= self._file.size:

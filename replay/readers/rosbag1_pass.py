@@ -12,7 +12,7 @@ import numpy as np
 from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Block, Bytes, Int64s, Topic
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
-from crosscue.replay.log import Selection
+from crosscue.replay.log import EVERYTHING, Selection
 
 from .mixed import MixedRows, blocks_of
 from .rosbag1_chunk import CUT, TOO_LARGE, ChunkRows, Inflated, inflate, read_chunk
@@ -22,11 +22,13 @@ from .rosbag1_records import (
     CONNECTION,
     MESSAGE,
     BagFile,
+    ChunkInfo,
     Connection,
     Record,
     connection_of,
     tally,
 )
+from .rosbag1_window import BagWindow, find_bag_window
 
 BATCH_BYTES: Final = BLOCK_BYTES // 2
 """Chunks are copied into buffers of this size, unless one is larger.
@@ -105,6 +107,7 @@ class _Checked:
     bz2: int = 0
     lz4: int = 0
     unchecked: int = 0
+    left: int = 0
 
     def words(self) -> str:
         """The sentence for ``Ledger.integrity``."""
@@ -117,6 +120,13 @@ class _Checked:
             said.append(
                 f"{self.unchecked} chunks carry no checksum: a changed payload byte in them cannot "
                 "be seen"
+            )
+        if self.left:
+            read = self.bz2 + self.lz4 + self.unchecked
+            verb = "was" if read == 1 else "were"
+            verified = " and verified" if read and not self.unchecked else ""
+            said.append(
+                f"of {read + self.left} chunks {read} {verb} read{verified}; the rest was not"
             )
         return "; ".join(said) or "no chunk read, nothing to check"
 
@@ -165,7 +175,11 @@ class Pass:
         limits: Limits,
         ledger: Ledger,
         selection: Selection,
+        chunk_count: int,
     ) -> None:
+        self._chunk_count = chunk_count
+        self._inside: BagWindow | None = None
+        self._doubt = ""
         self._file = file
         self._first = first
         self._contents = contents
@@ -186,26 +200,72 @@ class Pass:
             self._ledger.declare(topic.name, topic.declared)
         for connection in self._contents.connections.values():
             self._say_if_renamed(connection)
-        known = sorted(self._contents.infos)
         try:
-            for unit in units(self._file, self._first, known, self._limits):
-                taken = None
-                if isinstance(unit, ChunkUnit):
-                    taken = self._chunk(unit)
-                elif isinstance(unit, Gap):
-                    self._gap(unit, index_at)
-                else:
-                    taken = self._record(unit)
-                if taken is not None:
-                    if not self._batch.has_room(taken[0]):
-                        yield from self._flush()
-                    self._batch.add(*taken)
+            window = self._window(index_at)
+            if window is None:
+                known = sorted(self._contents.infos)
+                yield from self._taken(
+                    units(self._file, self._first, known, self._limits), index_at
+                )
+            else:
+                yield from self._windowed(window, index_at)
         except OSError as error:
             self._ledger.drop("", "file cannot be read on", None, str(error.strerror or error))
         yield from self._flush()
         for name in [t.name for t in self._roster.topics]:
             self._ledger.settle(name)
         self._ledger.integrity = self._checked.words()
+
+    def _window(self, index_at: int) -> BagWindow | None:
+        """Where what was asked for lies, if the index can be trusted; else the reason is told."""
+        if self._selection == EVERYTHING:
+            return None
+        found = find_bag_window(
+            self._contents, self._first, index_at, self._chunk_count, self._selection
+        )
+        if isinstance(found, BagWindow):
+            return found
+        self._ledger.notice(f"the part asked for was found by walking through the bag: {found}")
+        return None
+
+    def _windowed(self, window: BagWindow, index_at: int) -> Iterator[Block]:
+        """Blocks of the chunks that the index names; the others are looked at if it is wrong."""
+        self._inside = window
+        yield from self._taken(window.units(self._file, self._limits), index_at)
+        self._inside = None
+        if self._doubt:
+            self._ledger.notice(
+                f"the index was not trusted after all ({self._doubt}); every chunk was looked at"
+            )
+            others = window.units(self._file, self._limits, is_read=False)
+            yield from self._taken(others, index_at)
+            return
+        for info in window.left:
+            self._checked.left += 1
+            self._pass_over(info, self._selection)
+
+    def _taken(self, found: Iterator[ChunkUnit | Record | Gap], index_at: int) -> Iterator[Block]:
+        for unit in found:
+            taken = None
+            if isinstance(unit, ChunkUnit):
+                taken = self._chunk(unit)
+            elif isinstance(unit, Gap):
+                self._doubt = self._doubt or f"bytes {unit.at} to {unit.stop} are damaged"
+                self._gap(unit, index_at)
+            else:
+                taken = self._record(unit)
+            if taken is not None:
+                if not self._batch.has_room(taken[0]):
+                    yield from self._flush()
+                self._batch.add(*taken)
+
+    def _pass_over(self, info: ChunkInfo, asked: Selection) -> None:
+        """Account for a chunk's messages, none of which is asked for, without reading them."""
+        for conn, count in info.counts.items():
+            name = self._roster.topic_of(conn)
+            self._ledger.find(name, count)
+            reason = NOT_ASKED_TIME if asked.wants(name) else NOT_ASKED_TOPIC
+            self._ledger.skip(name, reason, count)
 
     def _record(self, record: Record) -> tuple[bytes, ChunkRows] | None:
         """Take in a record outside chunks; a message as a chunk of its own."""
@@ -279,6 +339,8 @@ class Pass:
 
     def _chunk(self, unit: ChunkUnit) -> tuple[bytes, ChunkRows] | None:
         """The records of a chunk and the messages in them, accounted for."""
+        if self._inside is not None and not self._is_as_indexed(unit):
+            self._doubt = self._doubt or f"it does not fit the chunk at byte {unit.record.at}"
         if self._is_skipped(unit):
             return None
         size = unit.record.u32(b"size")
@@ -332,28 +394,30 @@ class Pass:
         else:
             self._ledger.drop("", reason, None, detail)
 
+    def _is_as_indexed(self, unit: ChunkUnit) -> bool:
+        """Do the index section and the index records behind the chunk say the same of it?"""
+        info, entries = self._contents.infos.get(unit.record.at), unit.entries
+        if info is None or entries is None or not len(entries) or not unit.is_framed:
+            return False
+        span = int(entries.log_ns.min()), int(entries.log_ns.max())
+        return (*span, entries.counts()) == (info.start_ns, info.end_ns, info.counts)
+
     def _is_skipped(self, unit: ChunkUnit) -> bool:
         """Leave the chunk compressed if both of its indexes agree that nothing in it is wanted."""
         asked = self._selection
         info = self._contents.infos.get(unit.record.at)
-        entries = unit.entries
-        if info is None or entries is None or not len(entries) or not unit.is_framed:
-            return False
-        first, last = int(entries.log_ns.min()), int(entries.log_ns.max())
-        if (first, last, entries.counts()) != (info.start_ns, info.end_ns, info.counts):
+        if info is None or not self._is_as_indexed(unit):
             return False
         if not all(self._roster.knows(conn) for conn in info.counts):
             return False
-        is_outside = (asked.start_ns is not None and last < asked.start_ns) or (
-            asked.end_ns is not None and first >= asked.end_ns
+        is_outside = (asked.start_ns is not None and info.end_ns < asked.start_ns) or (
+            asked.end_ns is not None and info.start_ns >= asked.end_ns
         )
         names = {conn: self._roster.topic_of(conn) for conn in info.counts}
         if not is_outside and any(asked.wants(name) for name in names.values()):
             return False
-        for conn, count in info.counts.items():
-            reason = NOT_ASKED_TIME if asked.wants(names[conn]) else NOT_ASKED_TOPIC
-            self._ledger.find(names[conn], count)
-            self._ledger.skip(names[conn], reason, count)
+        self._checked.left += 1
+        self._pass_over(info, asked)
         return True
 
     def _flush(self) -> Iterator[Block]:
