@@ -106,6 +106,8 @@ class CanFrames:
             or ``LENGTH_UNKNOWN``.
         data: Shape (N, W), uint8, W = 8 or 64; bytes from ``length`` on are zero.
         is_fd: Shape (N,), bool: CAN FD frame.
+        is_tx: Shape (N,), bool: sent by the logger itself, not received; None where the log or its
+            reader does not keep the direction.
     """
 
     arbitration_id: NDArray[np.uint32]
@@ -114,6 +116,7 @@ class CanFrames:
     length: NDArray[np.uint8]
     data: Bytes
     is_fd: NDArray[np.bool_]
+    is_tx: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         """Refuse columns that do not line up."""
@@ -122,6 +125,8 @@ class CanFrames:
             shape = getattr(self, name).shape
             if shape != (n,):
                 raise ValueError(f"{name}: want ({n},), got {shape}")
+        if self.is_tx is not None and self.is_tx.shape != (n,):
+            raise ValueError(f"is_tx: want ({n},), got {self.is_tx.shape}")
         if self.data.ndim != 2 or self.data.shape[0] != n or self.data.shape[1] not in (8, 64):
             raise ValueError(f"data: want ({n}, 8) or ({n}, 64), got {self.data.shape}")
 
@@ -137,6 +142,7 @@ class CanFrames:
             self.length[index],
             self.data[index],
             self.is_fd[index],
+            None if self.is_tx is None else self.is_tx[index],
         )
 
 

@@ -75,29 +75,91 @@ class FrameRows:
         )
 
 
+_NONE: Final = np.zeros(0, np.int64)
+_NO_FLAGS: Final = np.zeros(0, np.bool_)
+_NO_BYTES: Final = np.zeros(0, np.uint8)
+NO_ROWS: Final = FrameRows(
+    _NONE,
+    _NONE,
+    _NONE,
+    CanFrames(
+        np.zeros(0, np.uint32),
+        _NO_FLAGS,
+        _NO_BYTES,
+        _NO_BYTES,
+        np.zeros((0, 8), np.uint8),
+        _NO_FLAGS,
+    ),
+)
+
+
 def joined(first: FrameRows, second: FrameRows) -> FrameRows:
     """Both, by place."""
-    if not len(second):
-        return first
-    if not len(first):
-        return second
-    a, b = first.frames, second.frames
-    width = max(a.data.shape[1], b.data.shape[1])
+    return merged((first, second))
+
+
+def merged(all_rows: Sequence[FrameRows]) -> FrameRows:
+    """All of them, one sequence at least, by place."""
+    some = [rows for rows in all_rows if len(rows)] or [all_rows[0]]
+    if len(some) == 1:
+        return some[0]
+    parts = [rows.frames for rows in some]
+    width = max(one.data.shape[1] for one in parts)
+    is_tx = [one.is_tx for one in parts if one.is_tx is not None]
     frames = CanFrames(
-        np.concatenate((a.arbitration_id, b.arbitration_id)),
-        np.concatenate((a.is_extended, b.is_extended)),
-        np.concatenate((a.kind, b.kind)),
-        np.concatenate((a.length, b.length)),
-        np.concatenate((widened(a.data, width), widened(b.data, width))),
-        np.concatenate((a.is_fd, b.is_fd)),
+        np.concatenate([one.arbitration_id for one in parts]),
+        np.concatenate([one.is_extended for one in parts]),
+        np.concatenate([one.kind for one in parts]),
+        np.concatenate([one.length for one in parts]),
+        np.concatenate([widened(one.data, width) for one in parts]),
+        np.concatenate([one.is_fd for one in parts]),
+        np.concatenate(is_tx) if len(is_tx) == len(parts) else None,
     )
     rows = FrameRows(
-        np.concatenate((first.place, second.place)),
-        np.concatenate((first.bus, second.bus)),
-        np.concatenate((first.log_ns, second.log_ns)),
+        np.concatenate([rows.place for rows in some]),
+        np.concatenate([rows.bus for rows in some]),
+        np.concatenate([rows.log_ns for rows in some]),
         frames,
     )
     return rows.take(np.argsort(rows.place, kind="stable"))
+
+
+def merged_by_time(streams: Sequence[Iterator[FrameRows]]) -> Iterator[FrameRows]:
+    """All rows of several groups in time order, each group's own order kept.
+
+    Holds what each group's next rows are, and no more. A group whose clock was set back comes in
+    its own order all the same.
+    """
+    held = [_next_by_time(stream) for stream in streams]
+    if len(streams) == 1:
+        while (rows := held[0]) is not None:
+            yield rows
+            held[0] = _next_by_time(streams[0], rows)
+        return
+    while any(rows is not None for rows in held):
+        horizon = min(int(rows.place[-1]) for rows in held if rows is not None)
+        ready = []
+        for k, rows in enumerate(held):
+            if rows is None:
+                continue
+            count = int(np.searchsorted(rows.place, horizon, side="right"))
+            if count:
+                ready.append(rows.take(slice(0, count)))
+            held[k] = rows.take(slice(count, None))
+            if count == len(rows):
+                held[k] = _next_by_time(streams[k], rows)
+        yield merged(ready)
+
+
+def _next_by_time(stream: Iterator[FrameRows], before: FrameRows | None = None) -> FrameRows | None:
+    """The stream's next rows, placed by time, after those before; None at its end."""
+    for rows in stream:
+        if len(rows):
+            place = np.maximum.accumulate(rows.log_ns)
+            if before is not None:
+                place = np.maximum(place, before.place[-1])
+            return FrameRows(place, rows.bus, rows.log_ns, rows.frames)
+    return None
 
 
 def widened(payload: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
@@ -150,4 +212,5 @@ def narrowed(frames: CanFrames) -> CanFrames:
         frames.length,
         np.ascontiguousarray(frames.data[:, :8]),
         frames.is_fd,
+        frames.is_tx,
     )

@@ -7,7 +7,7 @@ Attachments are never opened. Compressed blocks carry a checksum, which is verif
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -16,23 +16,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.closing import Closing
-from crosscue.replay.columns import (
-    Block,
-    Bytes,
-    Int64s,
-    Table,
-    Topic,
-)
+from crosscue.replay.columns import BLOCK_ROWS, Block, Int64s, Table, Topic
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, Log, Selection
 
-from .can_rows import FrameRows, blocks_by_bus, bus_number, bus_topic, in_time
+from .can_rows import (
+    NO_ROWS,
+    FrameRows,
+    blocks_by_bus,
+    bus_number,
+    bus_topic,
+    in_time,
+    merged,
+    merged_by_time,
+)
 from .mf4_blocks import (
+    CYCLE_COUNTERS,
     MASTER,
     REMOTE_MASTER,
     TIME,
+    VARIABLE_OFFSETS,
     VIRTUAL_MASTER,
     VLSD_GROUP,
     Blocks,
@@ -40,27 +45,57 @@ from .mf4_blocks import (
     Channel,
     DataGroup,
     Group,
-    Header,
 )
 from .mf4_frames import CanLayout, can_layout
-from .mf4_records import Records, records_of
-from .mf4_values import invalid, is_applied, is_numeric, physical, raw, times_ns
+from .mf4_records import LAST_CUT, Records, UnsortedData, Walked, sorted_records
+from .mf4_stream import Stream
+from .mf4_values import Words, invalid, is_applied, is_numeric, physical, raw, times_ns
+from .mf4_variable import GroupValues, StoredValues, VariableValues
 
-_NAMES_TOLD: Final = 5
-_LAST_LENGTH_MISSING: Final = 4
-_VLSD_OFFSETS_MISSING: Final = 64
+_NAMES_SHOWN: Final = 5
+_PEEK_ROWS: Final = 4096
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Source:
-    """One channel group that can be read, or the reason why not."""
+    """One channel group that can be read, or the reason why not.
 
-    data: DataGroup
+    Attributes:
+        index: Its place among the groups of its data.
+        declared: Records that the file says it has, or None where nobody wrote that.
+    """
+
+    index: int
     group: Group
     master: Channel | None
     can: CanLayout | None
     topic: str
     refusal: str
+    declared: int | None
+
+
+@dataclass(slots=True, eq=False)
+class _Account:
+    """What became of one group's records so far."""
+
+    met: int = 0
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stored:
+    """Groups that share one stream of data.
+
+    Attributes:
+        unsorted: The records of all of them, where they are mixed.
+        sources: The groups, those left out that hold nothing but values of others.
+        values: Where the payloads of a source lie, by its index, if not in its records.
+    """
+
+    stream: Stream
+    unsorted: UnsortedData | None
+    sources: tuple[_Source, ...]
+    values: Mapping[int, VariableValues]
 
 
 def open_mf4(path: Path, limits: Limits) -> Log:
@@ -88,8 +123,8 @@ class Mf4Log(Closing):
         self._broken = ""
         try:
             self._header = self._blocks.header(str(path))
-            self._sources = tuple(self._found())
-            if self._broken and not self._sources:
+            self._stored = tuple(self._found())
+            if self._broken and not self._stored:
                 raise LogFormatError(f"{path}: no channel group can be read: {self._broken}")
             self._peek()
         except BaseException:
@@ -110,9 +145,9 @@ class Mf4Log(Closing):
     def topics(self) -> tuple[Topic, ...]:
         """Tables, and the buses seen so far: those of first records, after a pass all of them."""
         tables = tuple(
-            Topic(s.topic, "crosscue/Table", "columns", declared=self._declared(s.group))
-            for s in self._sources
-            if s.topic and not s.refusal
+            Topic(s.topic, "crosscue/Table", "columns", declared=s.declared)
+            for s in self._sources()
+            if s.topic
         )
         return tuple(bus_topic(name) for name in self._buses) + tables
 
@@ -125,16 +160,31 @@ class Mf4Log(Closing):
         for topic in self.topics:
             ledger.declare(topic.name, topic.declared)
         self._say(ledger)
-        for source in self._sources:
-            if source.refusal:
-                count = source.group.records
-                ledger.find("", count)
-                ledger.skip("", source.refusal, count, source.group.name)
-            elif source.can is None and not selection.wants(source.topic):
-                ledger.find(source.topic, source.group.records)
-                ledger.skip(source.topic, NOT_ASKED_TOPIC, source.group.records)
-            else:
-                yield from self._blocks_of(source, ledger, selection)
+        accounts = {source: _Account() for source in self._sources()}
+        for stored in self._stored:
+            if stored.unsorted:
+                yield from self._mixed(stored, stored.unsorted, accounts, ledger, selection)
+        yield from self._by_time(accounts, ledger, selection)
+        for stored in self._stored:
+            for source in () if stored.unsorted else stored.sources:
+                if source.can is None or source.refusal:
+                    yield from self._alone(stored, source, accounts[source], ledger, selection)
+        for source, account in accounts.items():
+            _settle(source, account, ledger)
+        self._close_account(sum(account.met for account in accounts.values()), ledger)
+
+    def _sources(self) -> Iterator[_Source]:
+        return (source for stored in self._stored for source in stored.sources)
+
+    def _say(self, ledger: Ledger) -> None:
+        if self._header.is_local:
+            ledger.notice("the log states no time zone; its start time is read as UTC")
+
+    def _close_account(self, met: int, ledger: Ledger) -> None:
+        if not self._header.is_finalized:
+            ledger.notice(
+                f"not finalized by the logger; {met} records recovered from the data block"
+            )
         if self._broken:
             ledger.drop("", "structure damaged", None, self._broken)
         for name in self._buses:
@@ -143,77 +193,178 @@ class Mf4Log(Closing):
             "checksums of compressed blocks verified; MDF has none for the rest of the file"
         )
 
-    def _say(self, ledger: Ledger) -> None:
-        if self._header.is_local:
-            ledger.notice("the log states no time zone; its start time is read as UTC")
-        if not self._header.is_finalized:
-            ledger.notice(
-                "the recorder never finalized the file, so nothing declares how much it must hold"
-            )
-
-    def _declared(self, group: Group) -> int | None:
-        return group.records if self._header.is_finalized else None
-
-    def _blocks_of(self, source: _Source, ledger: Ledger, selection: Selection) -> Iterator[Block]:
-        met = lost = 0
-        topic = "" if source.can else source.topic
-        declared = self._declared(source.group)
-        for records in self._records(source):
-            if records.damage:
-                left = (declared if declared is not None else records.lost) - met - lost
-                count = min(records.lost, max(left, 0))
-                lost += count
-                ledger.drop(topic, "damaged data", count or None, records.damage)
-                continue
-            met += len(records.rows)
-            if source.can:
-                yield from self._frames(source, source.can, records, ledger, selection)
-            else:
-                yield from self._table(source, records, ledger, selection)
-        if declared is not None and met + lost < declared:
-            detail = f"{source.group.name}: declared {declared}, found {met}"
-            missing = declared - met - lost
-            ledger.drop(topic, "declared by the format, not in its bytes", missing, detail)
-        elif declared is not None and met > declared:
-            ledger.notice(f"{source.group.name}: {declared} records declared, {met} in the file")
-
-    def _records(self, source: _Source) -> Iterator[Records]:
-        is_open_ended = bool(self._header.unfinished & _LAST_LENGTH_MISSING)
-        return records_of(self._blocks, source.data, source.group, is_open_ended)
-
-    def _times(self, source: _Source, records: Records) -> Int64s | None:
-        assert source.master is not None
-        values = raw(source.master, records.rows, records.first)
-        since = times_ns(source.master, values)
-        return None if since is None else since + self._header.start_ns
-
-    def _frames(
+    def _mixed(
         self,
-        source: _Source,
-        layout: CanLayout,
-        records: Records,
+        stored: _Stored,
+        data: UnsortedData,
+        accounts: Mapping[_Source, _Account],
         ledger: Ledger,
         selection: Selection,
     ) -> Iterator[Block]:
-        log_ns = self._times(source, records)
-        if log_ns is None:
-            ledger.drop("", "time out of range", len(records.rows), source.group.name)
+        """The records of unsorted data: all groups piece by piece, frames in stored order."""
+        last = None
+        for k, piece in data.pieces():
+            last = piece
+            present = np.bincount(piece.group, minlength=len(data.data.groups))
+            frames = []
+            for source in stored.sources:
+                if not present[source.index]:
+                    continue
+                accounts[source].met += int(present[source.index])
+                if source.refusal or not source.can:
+                    records = data.rows(k, source.index)
+                    yield from self._other(source, records, ledger, selection)
+                else:
+                    frames.append(self._frames(stored, source, data.rows(k, source.index), ledger))
+            if frames:
+                yield from self._handed_on(merged(frames), ledger, selection)
+        if last is not None and last.damage:
+            self._drop_rest(stored, last, accounts, ledger)
+
+    def _drop_rest(
+        self,
+        stored: _Stored,
+        last: Walked,
+        accounts: Mapping[_Source, _Account],
+        ledger: Ledger,
+    ) -> None:
+        """Account for what a damaged end of unsorted data held."""
+        if all(source.declared is not None for source in stored.sources):
+            for source in stored.sources:
+                missing = max((source.declared or 0) - accounts[source].met, 0)
+                accounts[source].dropped += missing
+                ledger.drop(source.topic, "damaged data", missing, last.damage)
+        elif last.cut < 0:
+            is_cut = last.damage == LAST_CUT
+            ledger.drop("", "damaged data", 1 if is_cut else None, last.damage)
+        elif not self._is_missed(stored, last.cut):
+            ledger.drop("", "damaged data", 1, last.damage)
+
+    def _is_missed(self, stored: _Stored, group: int) -> bool:
+        """Was a frame dropped already because its payload is the value that the end cuts?"""
+        return any(
+            isinstance(one, GroupValues) and one.group == group and one.first_missed is not None
+            for one in stored.values.values()
+        )
+
+    def _by_time(
+        self, accounts: Mapping[_Source, _Account], ledger: Ledger, selection: Selection
+    ) -> Iterator[Block]:
+        """The frames of all groups that have their data to themselves, merged by time."""
+        streams = [
+            self._alone_frames(stored, source, accounts[source], ledger, selection)
+            for stored in self._stored
+            if not stored.unsorted
+            for source in stored.sources
+            if source.can and not source.refusal
+        ]
+        for rows in merged_by_time(streams):
+            yield from self._handed_on(rows, ledger, selection)
+
+    def _alone_frames(
+        self,
+        stored: _Stored,
+        source: _Source,
+        account: _Account,
+        ledger: Ledger,
+        selection: Selection,
+    ) -> Iterator[FrameRows]:
+        for records in self._records(stored, source, account, ledger, selection):
+            yield self._frames(stored, source, records, ledger)
+
+    def _alone(
+        self,
+        stored: _Stored,
+        source: _Source,
+        account: _Account,
+        ledger: Ledger,
+        selection: Selection,
+    ) -> Iterator[Block]:
+        """The rows of a group that has its data to itself and holds no frames."""
+        if source.refusal or not selection.wants(source.topic):
+            size = source.group.record_bytes
+            there = stored.stream.size // size if size else 0
+            count = there if source.declared is None else source.declared
+            account.met += count
+            self._leave_out(source, count, ledger)
             return
-        rows = layout.frames(records, log_ns)
-        bad = len(records.rows) - len(rows)
+        for records in self._records(stored, source, account, ledger, selection):
+            yield from self._table(source, records, ledger, selection)
+
+    def _other(
+        self, source: _Source, records: Records, ledger: Ledger, selection: Selection
+    ) -> Iterator[Block]:
+        if source.refusal or not selection.wants(source.topic):
+            self._leave_out(source, len(records.rows), ledger)
+        else:
+            yield from self._table(source, records, ledger, selection)
+
+    def _leave_out(self, source: _Source, count: int, ledger: Ledger) -> None:
+        """Account for rows that are not read: of a kind that is not, or not asked for."""
+        if source.refusal and source.can and source.can.is_needed:
+            ledger.drop("", source.refusal, count, source.group.name)
+            return
+        ledger.find(source.topic, count)
+        reason = source.refusal or NOT_ASKED_TOPIC
+        ledger.skip(source.topic, reason, count, source.group.name)
+
+    def _records(
+        self,
+        stored: _Stored,
+        source: _Source,
+        account: _Account,
+        ledger: Ledger,
+        selection: Selection,
+    ) -> Iterator[Records]:
+        """Records of sorted data; those that cannot be read are accounted for here."""
+        for records in sorted_records(stored.stream, source.group):
+            if not records.damage:
+                account.met += len(records.rows)
+                yield records
+                continue
+            count = records.dropped
+            if source.declared is not None:
+                count = min(count, max(source.declared - account.met - account.dropped, 0))
+            account.dropped += count
+            if count or records.dropped == 0:
+                ledger.drop(source.topic, "damaged data", count or None, records.damage)
+
+    def _times(self, source: _Source, words: Words) -> Int64s | None:
+        assert source.master is not None
+        since = times_ns(source.master, raw(source.master, words))
+        return None if since is None else since + self._header.start_ns
+
+    def _frames(
+        self, stored: _Stored, source: _Source, records: Records, ledger: Ledger
+    ) -> FrameRows:
+        assert source.can is not None
+        words = Words(records.rows, records.first)
+        log_ns = self._times(source, words)
+        if log_ns is None:
+            ledger.drop("", "time out of range", len(words), source.group.name)
+            return NO_ROWS
+        found = source.can.frames(records, words, log_ns, stored.values.get(source.index))
         detail = f"{source.group.name}, from record {records.first} on"
-        ledger.drop("", "record that cannot be a frame", bad, detail)
-        rows = self._named(rows, ledger)
+        ledger.drop("", "record that cannot be a frame", found.impossible, detail)
+        ledger.drop("", "payload cut or damaged", found.unreadable, detail)
+        ledger.find("", found.invalid)
+        ledger.skip("", "marked as invalid by the logger", found.invalid, detail)
+        return self._named(found.rows, ledger)
+
+    def _handed_on(self, rows: FrameRows, ledger: Ledger, selection: Selection) -> Iterator[Block]:
         yield from blocks_by_bus(rows, tuple(self._buses), ledger, selection)
 
     def _named(self, rows: FrameRows, ledger: Ledger) -> FrameRows:
-        channels, codes = np.unique(rows.bus, return_inverse=True)
-        bus = np.array(
-            [bus_number(str(channel), self._buses) for channel in channels.tolist()], np.int64
-        )
-        named = FrameRows(
-            rows.place, bus[codes] if len(bus) else rows.bus, rows.log_ns, rows.frames
-        )
+        """With places among the names of buses instead of channel numbers."""
+        if not len(rows):
+            return rows
+        channels = [int(rows.bus[0])]
+        if bool((rows.bus != channels[0]).any()):
+            channels = np.unique(rows.bus).tolist()
+        bus = np.full(len(rows), -1, np.int64)
+        for channel in channels:
+            bus[rows.bus == channel] = bus_number(str(channel), self._buses)
+        named = FrameRows(rows.place, bus, rows.log_ns, rows.frames)
         is_known = named.bus >= 0
         if not bool(is_known.all()):
             extra = len(rows) - int(np.count_nonzero(is_known))
@@ -225,7 +376,7 @@ class Mf4Log(Closing):
         self, source: _Source, records: Records, ledger: Ledger, selection: Selection
     ) -> Iterator[Block]:
         count = len(records.rows)
-        log_ns = self._times(source, records)
+        log_ns = self._times(source, Words(records.rows, records.first))
         if log_ns is None:
             ledger.drop(source.topic, "time out of range", count, f"from record {records.first} on")
             return
@@ -234,11 +385,16 @@ class Mf4Log(Closing):
         rows = records.rows
         if inside is not None:
             ledger.skip(source.topic, NOT_ASKED_TIME, count - int(np.count_nonzero(inside)))
-            log_ns, rows = log_ns[inside], rows[inside]
-        if len(rows):
-            yield Block(source.topic, log_ns, self._columns(source, rows, ledger))
+            if not bool(inside.any()):
+                return
+        table = self._columns(source, Words(rows, records.first), ledger)
+        if inside is not None:
+            log_ns, table = log_ns[inside], table.take(inside)
+        for k in range(0, len(log_ns), BLOCK_ROWS):
+            part = slice(k, k + BLOCK_ROWS)
+            yield Block(source.topic, log_ns[part], table.take(part))
 
-    def _columns(self, source: _Source, rows: Bytes, ledger: Ledger) -> Table:
+    def _columns(self, source: _Source, words: Words, ledger: Ledger) -> Table:
         columns: dict[str, NDArray[np.generic]] = {}
         units: dict[str, str] = {}
         left_out, unconverted = [], []
@@ -249,8 +405,8 @@ class Mf4Log(Closing):
                 left_out.append(channel.name)
                 continue
             name = _free(channel.name or "channel", columns)
-            values = physical(channel.conversion, raw(channel, rows, 0))
-            bad = invalid(channel, rows, source.group.value_bytes)
+            values = physical(channel.conversion, raw(channel, words))
+            bad = invalid(channel, words.records, source.group.value_bytes)
             if bad is not None:
                 values = np.where(bad, np.nan, values.astype(np.float64))
             columns[name] = values
@@ -263,51 +419,94 @@ class Mf4Log(Closing):
             (unconverted, "have a conversion that is not evaluated; raw values are given"),
         ):
             if names:
-                some = ", ".join(names[:_NAMES_TOLD]) + (", ..." if len(names) > 5 else "")
+                some = ", ".join(names[:_NAMES_SHOWN]) + (
+                    ", ..." if len(names) > _NAMES_SHOWN else ""
+                )
                 ledger.notice(f"{source.topic}: {len(names)} channels {what}: {some}")
         return Table(columns, units)
 
     def _peek(self) -> None:
-        scratch = Ledger(str(self._path))
-        for source in self._sources:
-            if source.can and not source.refusal:
-                for records in self._records(source):
-                    if not records.damage:
-                        for _ in self._frames(source, source.can, records, scratch, EVERYTHING):
-                            pass
-                        break
+        for stored in self._stored:
+            for source in stored.sources:
+                if source.can is None or source.refusal:
+                    continue
+                if stored.unsorted:
+                    piece = stored.unsorted.piece(0)
+                    some = stored.unsorted.rows(0, source.index) if piece else None
+                else:
+                    records = sorted_records(stored.stream, source.group, 0, _PEEK_ROWS)
+                    some = next(records, None)
+                if some is not None:
+                    for channel in np.unique(source.can.buses(some)).tolist():
+                        bus_number(str(channel), self._buses)
 
-    def _found(self) -> Iterator[_Source]:
+    def _found(self) -> Iterator[_Stored]:
         names: dict[str, NDArray[np.generic]] = {}
         try:
             for data in self._blocks.data_groups(self._header.first_group):
-                for group in data.groups:
-                    if group.flags & VLSD_GROUP or not (group.records or self._may_hold(data)):
-                        continue
-                    yield self._source(data, group, names)
+                stream = Stream(self._blocks, data.data, self._header.unfinished)
+                unsorted = None
+                if data.id_bytes:
+                    unsorted = UnsortedData(stream, data, self._limits.message_bytes)
+                sources = tuple(self._sources_of(data, stream, names))
+                values = {
+                    source.index: self._values(source.can.variable, data, unsorted)
+                    for source in sources
+                    if source.can and source.can.variable
+                }
+                yield _Stored(stream, unsorted, sources, values)
         except BrokenBlockError as broken:
             self._broken = str(broken)
 
-    def _may_hold(self, data: DataGroup) -> bool:
-        return not self._header.is_finalized and bool(data.data)
+    def _values(
+        self, channel: Channel, data: DataGroup, unsorted: UnsortedData | None
+    ) -> VariableValues:
+        for k, group in enumerate(data.groups):
+            if unsorted and group.flags & VLSD_GROUP and group.at == channel.data:
+                by_order = bool(self._header.unfinished & VARIABLE_OFFSETS)
+                return GroupValues(unsorted, k, by_order)
+        return StoredValues(Stream(self._blocks, channel.data, self._header.unfinished))
+
+    def _sources_of(
+        self, data: DataGroup, stream: Stream, names: dict[str, NDArray[np.generic]]
+    ) -> Iterator[_Source]:
+        for k, group in enumerate(data.groups):
+            is_empty = stream.size < group.record_bytes + data.id_bytes and not stream.broken
+            if not group.flags & VLSD_GROUP and (self._declared(group) or not is_empty):
+                yield self._source(k, data, group, names)
+
+    def _declared(self, group: Group) -> int | None:
+        return None if self._header.unfinished & CYCLE_COUNTERS else group.records
 
     def _source(
-        self, data: DataGroup, group: Group, names: dict[str, NDArray[np.generic]]
+        self, index: int, data: DataGroup, group: Group, names: dict[str, NDArray[np.generic]]
     ) -> _Source:
         masters = [c for c in group.channels if c.type in (MASTER, VIRTUAL_MASTER)]
         master = next((c for c in masters if c.sync == TIME), None)
-        can = can_layout(self._blocks, group)
-        refusal = _refusal(data, group, master, can, self._header)
+        can = can_layout(group)
+        refusal = _refusal(group, master, can)
         topic = ""
+        # A group of mixed data that declares nothing may still turn out to hold something.
         if can is None and not refusal:
             topic = _free(group.name or "group", names)
             names[topic] = np.zeros(0)
-        return _Source(data, group, master, can, topic, refusal)
+        return _Source(index, group, master, can, topic, refusal, self._declared(group))
 
 
-def _refusal(
-    data: DataGroup, group: Group, master: Channel | None, can: CanLayout | None, header: Header
-) -> str:
+def _settle(source: _Source, account: _Account, ledger: Ledger) -> None:
+    """Compare what was met with what the file declares."""
+    if source.declared is None:
+        return
+    missing = source.declared - account.met - account.dropped
+    name = source.group.name
+    if missing > 0:
+        detail = f"{name}: declared {source.declared}, found {account.met}"
+        ledger.drop(source.topic, "declared by the format, not in its bytes", missing, detail)
+    elif account.met > source.declared:
+        ledger.notice(f"{name}: {source.declared} records declared, {account.met} in the file")
+
+
+def _refusal(group: Group, master: Channel | None, can: CanLayout | None) -> str:
     """Why a group cannot be read; empty when it can."""
     if group.flags & REMOTE_MASTER:
         return "column-oriented storage, not supported"
@@ -321,8 +520,6 @@ def _refusal(
             return "bus that is no CAN"
         has_numbers = any(_is_column(c, group) for c in group.channels if c is not master)
         return "" if has_numbers else "group without numbers"
-    if can.is_variable and (data.id_bytes or header.unfinished & _VLSD_OFFSETS_MISSING):
-        return "variable-length payloads in unsorted data, not supported; finalize the file first"
     return can.refusal
 
 

@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import re
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BufferedReader
 from typing import Final
-
-import numpy as np
 
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.limits import Limits
@@ -27,13 +24,20 @@ _TEXT_MAX: Final = 1 << 16
 _CHAIN_MAX: Final = 200_000
 """Most blocks in one chain of links; a longer one runs in a circle."""
 _TX: Final = re.compile(rb"<TX[^>]*>(.*?)</TX>", re.DOTALL)
-PIECE_BYTES: Final = 1 << 20
+_DATA: Final = (b"##DT", b"##SD", b"##RD")
 
-MASTER, VIRTUAL_MASTER = 2, 3
-FIXED, VARIABLE, MAX_LENGTH = 0, 1, 5
+VARIABLE, MASTER, VIRTUAL_MASTER, VIRTUAL, VARIABLE_COMPACT = 1, 2, 3, 6, 7
 TIME: Final = 1
 VLSD_GROUP: Final = 1
 REMOTE_MASTER: Final = 8
+
+CYCLE_COUNTERS: Final = 0x01
+LAST_DATA_LENGTH: Final = 0x04
+LAST_REDUCED_LENGTH: Final = 0x08
+LAST_DATA_LIST: Final = 0x10
+VARIABLE_BYTES: Final = 0x20
+VARIABLE_OFFSETS: Final = 0x40
+"""What the logger of an unfinalized file did not come to write."""
 
 
 class BrokenBlockError(Exception):
@@ -53,7 +57,8 @@ class Conversion:
     """How raw values become physical ones.
 
     Attributes:
-        type: 0 none, 1 linear, 2 rational, 4 table with interpolation; others are not applied.
+        type: 0 none, 1 linear, 2 rational, 4 table with interpolation, 5 table, 6 table of ranges;
+            others are not applied.
         values: Its parameters.
         unit: Of the physical value.
     """
@@ -94,6 +99,7 @@ class Group:
         value_bytes: Of each record.
         invalid_bytes: Bytes with invalidation bits after the values.
         channels: All channels, those of structures included.
+        at: Where its block lies, which links to it name.
     """
 
     name: str
@@ -103,6 +109,7 @@ class Group:
     value_bytes: int
     invalid_bytes: int
     channels: tuple[Channel, ...]
+    at: int = 0
 
     @property
     def record_bytes(self) -> int:
@@ -120,11 +127,25 @@ class DataGroup:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
-    """One stored stretch of data: ``content`` None when it cannot be read."""
+class Stretch:
+    """One stored stretch of data.
 
-    content: bytes | None
-    byte_count: int
+    Attributes:
+        start: Where it begins in the stream that all stretches behind one link make up.
+        size: Bytes of the stream.
+        at: Where its content begins in the file.
+        stored: Bytes of it there.
+        method: Of compression, as stored; -1 for none.
+        parameter: Of that method: columns of transposed records.
+        damage: Why it cannot be read.
+    """
+
+    start: int
+    size: int
+    at: int
+    stored: int
+    method: int = -1
+    parameter: int = 0
     damage: str = ""
 
 
@@ -154,6 +175,7 @@ class Blocks:
 
     def __init__(self, file: BufferedReader, size: int, limits: Limits) -> None:
         self._file, self.size, self._limits = file, size, limits
+        self._linked: set[int] = set()
 
     def header(self, path: str) -> Header:
         """Read identification and header.
@@ -177,9 +199,13 @@ class Blocks:
         start_ns, _, _, time_flags = struct.unpack_from("<QhhB", block.body)
         if start_ns >= 1 << 62:
             raise LogFormatError(f"{path}: MDF header damaged: start time {start_ns}")
-        unfinished = struct.unpack_from("<H", head, 60)[0] if name == b"UnFinMF " else 0
+        is_finalized = name == b"MDF     "
+        unfinished, custom = (0, 0) if is_finalized else struct.unpack_from("<HH", head, 60)
+        if custom:
+            # What a maker's own flags stand for is unknown: no counter is to be trusted.
+            unfinished |= CYCLE_COUNTERS | LAST_DATA_LENGTH
         is_local = bool(time_flags & 1)
-        return Header(version, name == b"MDF     ", unfinished, start_ns, is_local, block.links[0])
+        return Header(version, is_finalized, unfinished, start_ns, is_local, block.links[0])
 
     def block(self, at: int, kind: bytes, links: int, body: int) -> RawBlock:
         """The block at ``at``.
@@ -200,7 +226,9 @@ class Blocks:
         if not is_sound or length > _BLOCK_MAX or at + length > self.size:
             raise BrokenBlockError(f"{kind.decode()} at byte {at} has impossible sizes")
         raw = self._file.read(length - HEAD_BYTES)
-        return RawBlock(struct.unpack_from(f"<{count}Q", raw), raw[8 * count :])
+        found_links: tuple[int, ...] = struct.unpack_from(f"<{count}Q", raw)
+        self._linked.update(found_links)
+        return RawBlock(found_links, raw[8 * count :])
 
     def data_groups(self, first: int) -> Iterator[DataGroup]:
         """All data groups.
@@ -214,19 +242,39 @@ class Blocks:
             )
             yield DataGroup(block.body[0], block.links[2], groups)
 
-    def pieces(self, at: int, is_open_ended: bool) -> Iterator[Piece]:
-        """The stored stretches behind a data link, in order, each at most a container large.
+    def stretches(self, link: int, unfinished: int) -> Iterator[Stretch]:
+        """The stored stretches behind a data link, in order; their heads are read, no content.
 
         Args:
-            at: Link to a data block or a list of them.
-            is_open_ended: The last block's length was never written: it reaches to the end.
-        """
-        try:
-            yield from self._pieces(at, is_open_ended)
-        except BrokenBlockError as broken:
-            yield Piece(None, 0, str(broken))
+            link: To a data block or a list of them.
+            unfinished: The file's flags for what its logger never wrote.
 
-    def _pieces(self, at: int, is_open_ended: bool) -> Iterator[Piece]:
+        Raises:
+            BrokenBlockError: The chain of blocks is damaged from here on.
+        """
+        start, addresses = 0, iter(self._data_blocks(link, unfinished))
+        at = next(addresses, None)
+        while at is not None:
+            # The blocks before a broken link come out before its error does.
+            try:
+                after, error = next(addresses, None), None
+            except BrokenBlockError as broken:
+                after, error = None, broken
+            is_last = after is None and error is None
+            is_open = is_last and bool(unfinished & (LAST_DATA_LENGTH | LAST_REDUCED_LENGTH))
+            for stretch in self._stretch(at, start, is_open):
+                yield stretch
+                start = stretch.start + stretch.size
+            if error is not None:
+                raise error
+            at = after
+
+    def read(self, at: int, count: int) -> bytes:
+        """Bytes of the file."""
+        self._file.seek(at)
+        return self._file.read(count)
+
+    def _data_blocks(self, at: int, unfinished: int) -> Iterator[int]:
         if not at:
             return
         kind, _, _ = self._head(at)
@@ -236,35 +284,45 @@ class Blocks:
                 return
             kind, _, _ = self._head(at)
         if kind != b"##DL":
-            yield from self._stored(at, is_open_ended)
+            yield at
             return
-        for block in self._chain(at, b"##DL", 1, 0):
-            for link in block.links[1:]:
-                if link:
-                    yield from self._stored(link, is_open_ended)
+        for place, block in self._chain_at(at, b"##DL", 1, 0):
+            found = [link for link in block.links[1:] if link]
+            yield from found
+            if not block.links[0] and unfinished & LAST_DATA_LIST:
+                missing = len(block.links) - 1 - len(found)
+                yield from self._unlinked(found[-1] if found else place, missing)
 
-    def _stored(self, at: int, is_open_ended: bool) -> Iterator[Piece]:
+    def _unlinked(self, at: int, count: int) -> Iterator[int]:
+        """Data blocks that follow the one at ``at`` and that their list was never told of."""
+        for _ in range(count):
+            at = -(-(at + self._head(at)[1]) // 8) * 8
+            if at + HEAD_BYTES > self.size or self._head(at)[0] not in (*_DATA, b"##DZ"):
+                return
+            yield at
+
+    def _stretch(self, at: int, start: int, is_open: bool) -> Iterator[Stretch]:
         kind, length, count = self._head(at)
         if kind == b"##DZ":
-            yield self._deflated(at, length)
+            yield self._compressed(at, start)
             return
-        if kind not in (b"##DT", b"##SD", b"##RD") or length < HEAD_BYTES or count:
+        if kind not in _DATA or length < HEAD_BYTES or count:
             raise BrokenBlockError(f"no data block at byte {at}: {kind!r}")
-        end = at + length
-        if is_open_ended and (end >= self.size or length == HEAD_BYTES):
-            end = self.size
-        position = at + HEAD_BYTES
-        while position < min(end, self.size):
-            self._file.seek(position)
-            content = self._file.read(min(PIECE_BYTES, end - position))
-            if not content:
-                break
-            yield Piece(content, len(content))
-            position += len(content)
-        if position < end:
-            yield Piece(None, end - position, f"data block at byte {at} is cut by the file's end")
+        content = at + HEAD_BYTES
+        end = self._following(at) if is_open else at + length
+        there = max(min(end, self.size) - content, 0)
+        if there:
+            yield Stretch(start, there, content, there)
+        if content + there < end:
+            damage = f"data block at byte {at} is cut by the file's end"
+            yield Stretch(start + there, end - content - there, content, 0, damage=damage)
 
-    def _deflated(self, at: int, length: int) -> Piece:
+    def _following(self, at: int) -> int:
+        """Where the next block begins that anything links to; the file's end without one."""
+        return min((link for link in self._linked if link > at), default=self.size)
+
+    def _compressed(self, at: int, start: int) -> Stretch:
+        _, length, _ = self._head(at)
         head = self._file.read(24)
         if len(head) < 24:
             raise BrokenBlockError(f"compressed block at byte {at} is cut by the file's end")
@@ -272,18 +330,7 @@ class Blocks:
         limit = self._limits.chunk_bytes
         if original > limit or stored > limit or length < HEAD_BYTES + 24 + stored:
             raise BrokenBlockError(f"compressed block at byte {at} has impossible sizes")
-        inflater = zlib.decompressobj()
-        try:
-            content = inflater.decompress(self._file.read(stored), original + 1)
-        except zlib.error:
-            return Piece(None, original, f"compressed block at byte {at} fails its checksum")
-        if not inflater.eof or len(content) != original:
-            return Piece(None, original, f"compressed block at byte {at} is cut or damaged")
-        if method not in (0, 1):
-            return Piece(None, original, f"compressed block at byte {at}: unknown method {method}")
-        if method == 1:
-            content = _transposed(content, parameter)
-        return Piece(content, original)
+        return Stretch(start, original, at + HEAD_BYTES + 24, stored, method, parameter)
 
     def _head(self, at: int) -> tuple[bytes, int, int]:
         if at % 2 or at + HEAD_BYTES > self.size:
@@ -316,7 +363,7 @@ class Blocks:
             raise BrokenBlockError(f"##CG at byte {at} declares records of {value_bytes} bytes")
         name = self._text(block.links[2]) or self._source(block.links[3])
         channels = tuple(self._channels(block.links[1], depth=0))
-        return Group(name, record_id, records, flags, value_bytes, invalid_bytes, channels)
+        return Group(name, record_id, records, flags, value_bytes, invalid_bytes, channels, at)
 
     def _channels(self, first: int, depth: int) -> Iterator[Channel]:
         for block in self._chain(first, b"##CN", 8, 24):
@@ -372,12 +419,3 @@ class Blocks:
             found = _TX.search(raw)
             raw = found[1] if found else b""
         return raw.decode("utf-8", "replace").strip()
-
-
-def _transposed(content: bytes, columns: int) -> bytes:
-    """Undo the column-wise order in which compressed records may be stored."""
-    if columns < 2 or columns > len(content):
-        return content
-    rows = len(content) // columns
-    whole = np.frombuffer(content, np.uint8, rows * columns).reshape(columns, rows)
-    return whole.T.tobytes() + content[rows * columns :]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -10,192 +12,215 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import DATA, ERROR, REMOTE, Bytes, CanFrames, Int64s
 
-from .can_rows import IS_FD_LENGTH, FrameRows
-from .mf4_blocks import VARIABLE, Blocks, Channel, Group, Piece
+from .can_rows import FD_LENGTHS, IS_FD_LENGTH, FrameRows
+from .mf4_blocks import VARIABLE, VARIABLE_COMPACT, Channel, Group
 from .mf4_records import Records
-from .mf4_values import is_numeric, raw
+from .mf4_values import Words, invalid, is_applied, is_numeric, physical, raw
+from .mf4_variable import VariableValues
 
-_KINDS: Final = {"CAN_DataFrame": DATA, "CAN_RemoteFrame": REMOTE, "CAN_ErrorFrame": ERROR}
-_SPAN_MAX: Final = 16 << 20
-_PAYLOAD_MAX: Final = 64
-_RESTARTS_MAX: Final = 64
-"""How often values may be stored in another order than their records."""
+_KINDS: Final = {
+    "CAN_DataFrame": DATA,
+    "CAN_RemoteFrame": REMOTE,
+    "CAN_ErrorFrame": ERROR,
+    "CAN_OverloadFrame": -1,
+}
+_CLASSIC, _FD = 8, 64
+_MASK: Final = np.array([(1 << 8 * k) - 1 for k in range(9)], np.uint64)
+_VALID_PARTS: Final = ("", "ID", "DataBytes", "DataLength")
+_NUMBER: Final = re.compile(r"CAN[ _-]*(\d+)", re.IGNORECASE)
 
 
-def can_layout(blocks: Blocks, group: Group) -> CanLayout | None:
+def can_layout(group: Group) -> CanLayout | None:
     """How ``group`` holds CAN frames; None when it holds something else."""
-    for channel in group.channels:
-        if channel.name in _KINDS:
-            prefix = channel.name + "."
-            parts = {
-                one.name.removeprefix(prefix): one
-                for one in group.channels
-                if one.name.startswith(prefix)
-            }
-            return CanLayout(blocks, group, _KINDS[channel.name], parts)
+    for name, kind in _KINDS.items():
+        parts = {
+            one.name.removeprefix(name).removeprefix("."): one
+            for one in group.channels
+            if one.name == name or one.name.startswith(name + ".")
+        }
+        if parts:
+            return CanLayout(group, kind, parts)
     return None
 
 
-class CanLayout:
-    """Where the fields of one kind of frame lie in its records."""
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Frames of some records, and how many of those gave none.
 
-    def __init__(
-        self, blocks: Blocks, group: Group, kind: int, parts: Mapping[str, Channel]
-    ) -> None:
+    Attributes:
+        rows: The frames; ``bus`` holds channel numbers.
+        impossible: Records that no frame can look like.
+        unreadable: Records whose payload is missing, cut or damaged.
+        invalid: Records that the logger itself marked as invalid.
+    """
+
+    rows: FrameRows
+    impossible: int
+    unreadable: int
+    invalid: int
+
+
+class CanLayout:
+    """Where the fields of one kind of frame lie in its records.
+
+    Attributes:
+        variable: Its payloads' channel, where they have variable length.
+    """
+
+    def __init__(self, group: Group, kind: int, parts: Mapping[str, Channel]) -> None:
         self._group, self._kind, self._parts = group, kind, parts
+        self._numbers = {
+            name: one for name, one in parts.items() if is_numeric(one, group.value_bytes)
+        }
         payload = parts.get("DataBytes")
-        self.is_variable = payload is not None and payload.type == VARIABLE
-        self._store = _Store(blocks, payload.data) if payload and self.is_variable else None
+        is_variable = kind == DATA and payload is not None and payload.type == VARIABLE
+        self.variable = payload if is_variable else None
+        # Whatever type the values have, what the record holds is an offset.
+        self._key = replace(payload, data_type=0) if payload and is_variable else None
+        named = _NUMBER.search(group.name)
+        self._bus = int(named[1][:3]) if named else 1
+
+    @property
+    def is_needed(self) -> bool:
+        """Would somebody miss these records? Overload frames carry nothing."""
+        return self._kind >= 0
 
     @property
     def refusal(self) -> str:
         """Why these frames cannot be read; empty when they can."""
+        if self._kind < 0:
+            return "overload frames, which carry nothing"
         if self._kind == ERROR:
             return ""
-        numeric = [name for name in ("ID", "DataLength") if self._number(name) is None]
-        if "ID" in numeric:
+        if "ID" not in self._numbers:
             return "bus group without identifiers"
-        if self._kind == DATA and ("DataBytes" not in self._parts or "DataLength" in numeric):
+        payload = self._parts.get("DataBytes")
+        if self._kind == DATA and payload is None:
             return "bus group without payloads"
+        if payload is not None and payload.type == VARIABLE_COMPACT:
+            return "payloads stored as compact variable-length values (VLSC), not supported"
+        if self._key is not None and not is_numeric(self._key, self._group.value_bytes):
+            return "bus group whose payloads cannot be found"
         return ""
 
-    def frames(self, records: Records, log_ns: Int64s) -> FrameRows:
-        """The records that can be frames; ``bus`` holds channel numbers."""
-        rows = records.rows
-        count = len(rows)
-        identifier = self._values("ID", rows, 0)
-        marked = (identifier >> 31) & 1
-        is_extended = self._values("IDE", rows, marked) != 0
+    def buses(self, records: Records) -> Int64s:
+        """Shape (N,): channel numbers."""
+        return self._values("BusChannel", Words(records.rows, records.first), self._bus)
+
+    def frames(
+        self, records: Records, words: Words, log_ns: Int64s, values: VariableValues | None
+    ) -> Found:
+        """The records that can be frames."""
+        identifier = self._values("ID", words, 0)
         number = identifier & 0x1FFFFFFF
-        is_fd = self._values("EDL", rows, 0) != 0
-        length = np.zeros(count, np.int64)
-        ok = np.ones(count, np.bool_)
-        payload = np.zeros((count, _PAYLOAD_MAX), np.uint8)
+        marked = ((identifier >> 31) & 1 != 0) | (number > 0x7FF)
+        is_extended = self._flags("IDE", words, marked)
+        ok = is_extended | (number <= 0x7FF) | np.bool_(self._kind == ERROR)
+        count = len(words)
+        length, is_fd = np.zeros(count, np.int64), np.zeros(count, np.bool_)
+        payload, whole = np.zeros((count, _CLASSIC), np.uint8), np.ones(count, np.bool_)
         if self._kind == DATA:
-            length = self._values("DataLength", rows, 0)
-            payload, ok = self._payloads(rows, length)
-            ok &= is_extended | (number <= 0x7FF)
-            ok &= np.where(is_fd, IS_FD_LENGTH[np.clip(length, 0, 64)], length <= 8)
-            ok &= length <= _PAYLOAD_MAX
-        width = _PAYLOAD_MAX if bool(is_fd.any()) else 8
+            length, is_fd = self._lengths(words)
+            possible = np.where(is_fd, IS_FD_LENGTH[np.clip(length, 0, _FD)], length <= _CLASSIC)
+            ok &= possible & (length >= 0) & (length <= _FD)
+            length = np.where(ok, length, 0)
+            payload, whole = self._payloads(words, length, values, bool(is_fd.any()))
         frames = CanFrames(
             number.astype(np.uint32),
             is_extended,
             np.full(count, self._kind, np.uint8),
-            np.minimum(length, width).astype(np.uint8),
-            np.ascontiguousarray(payload[:, :width]),
+            length.astype(np.uint8),
+            payload,
             is_fd,
+            self._flags("Dir", words, None) if "Dir" in self._numbers else None,
         )
-        bus = self._values("BusChannel", rows, 1)
-        place = np.arange(records.first, records.first + count)
-        found = FrameRows(place, bus, log_ns, frames)
-        return found if bool(ok.all()) else found.take(ok)
+        rows = FrameRows(
+            records.place, self._values("BusChannel", words, self._bus), log_ns, frames
+        )
+        return self._sound(rows, ok, whole, self._marked(words))
 
-    def _number(self, name: str) -> Channel | None:
-        channel = self._parts.get(name)
-        if channel is None or not is_numeric(channel, self._group.value_bytes):
-            return None
-        return channel
+    def _sound(
+        self,
+        rows: FrameRows,
+        ok: NDArray[np.bool_],
+        whole: NDArray[np.bool_],
+        marked: NDArray[np.bool_] | None,
+    ) -> Found:
+        is_valid = ok & whole if marked is None else ok & whole & ~marked
+        if bool(is_valid.all()):
+            return Found(rows, 0, 0, 0)
+        invalid_count = 0 if marked is None else int(np.count_nonzero(marked))
+        if marked is not None:
+            ok, whole = ok | marked, whole | marked
+        unreadable = int(np.count_nonzero(ok & ~whole))
+        return Found(rows.take(is_valid), int(np.count_nonzero(~ok)), unreadable, invalid_count)
 
-    def _values(self, name: str, rows: Bytes, missing: int | Int64s) -> Int64s:
-        channel = self._number(name)
+    def _marked(self, words: Words) -> NDArray[np.bool_] | None:
+        """Which records the logger marked as invalid; None for none."""
+        marked: NDArray[np.bool_] | None = None
+        for name in _VALID_PARTS:
+            if name in self._parts:
+                one = invalid(self._parts[name], words.records, self._group.value_bytes)
+                if one is not None:
+                    marked = one if marked is None else marked | one
+        return marked
+
+    def _lengths(self, words: Words) -> tuple[Int64s, NDArray[np.bool_]]:
+        """Payload bytes, and which frames are CAN FD."""
+        code = self._values("DLC", words, -1)
+        by_code = FD_LENGTHS[np.clip(code, 0, 15)]
+        length = self._values("DataLength", words, by_code)
+        stored = self._parts["DataBytes"].bit_count // 8
+        can_be_fd = self.variable is not None or stored > _CLASSIC
+        is_fd = self._flags("EDL", words, (length > _CLASSIC) & can_be_fd)
+        # A classic frame may have the codes 9 to 15 for eight bytes.
+        is_long = ~is_fd & (length > _CLASSIC) & (code > _CLASSIC)
+        if bool(is_long.any()):
+            length = np.where(is_long, _CLASSIC, length)
+        return length, is_fd
+
+    def _flags(
+        self, name: str, words: Words, missing: NDArray[np.bool_] | None
+    ) -> NDArray[np.bool_]:
+        if missing is not None and name not in self._numbers:
+            return missing
+        is_set: NDArray[np.bool_] = self._values(name, words, 0) != 0
+        return is_set
+
+    def _values(self, name: str, words: Words, missing: int | Int64s) -> Int64s:
+        channel = self._numbers.get(name)
         if channel is None:
-            return np.zeros(len(rows), np.int64) + missing
-        return raw(channel, rows, 0).astype(np.int64)
+            return np.broadcast_to(np.asarray(missing, np.int64), (len(words),))
+        values = raw(channel, words)
+        if channel.conversion.type and is_applied(channel.conversion):
+            values = physical(channel.conversion, values)
+        if values.dtype.kind == "f":
+            values = np.rint(np.nan_to_num(values, nan=-1.0, posinf=-1.0, neginf=-1.0))
+        return values.astype(np.int64)
 
-    def _payloads(self, rows: Bytes, length: Int64s) -> tuple[Bytes, NDArray[np.bool_]]:
-        """Payloads of shape (N, 64), zero from ``length`` on, and which of them are whole."""
-        channel = self._parts["DataBytes"]
-        inside = np.arange(_PAYLOAD_MAX) < length[:, None]
-        if self._store is None:
-            stored = min(channel.bit_count // 8, _PAYLOAD_MAX)
+    def _payloads(
+        self, words: Words, length: Int64s, values: VariableValues | None, is_any_fd: bool
+    ) -> tuple[Bytes, NDArray[np.bool_]]:
+        """Payloads of 8 or 64 columns, zero from ``length`` on, and which of them are whole."""
+        width = _FD if is_any_fd else _CLASSIC
+        channel, rows = self._parts["DataBytes"], words.records
+        if values is None or self._key is None:
+            stored = min(channel.bit_count // 8, width)
             part = rows[:, channel.byte_offset : channel.byte_offset + stored]
-            payload = np.zeros((len(rows), _PAYLOAD_MAX), np.uint8)
+            payload = np.zeros((len(rows), width), np.uint8)
             payload[:, : part.shape[1]] = part
-            return np.where(inside, payload, np.uint8(0)), length <= part.shape[1]
-        offsets = rows[:, channel.byte_offset : channel.byte_offset + 8]
-        if offsets.shape[1] < 8:
-            return np.zeros((len(rows), _PAYLOAD_MAX), np.uint8), np.zeros(len(rows), np.bool_)
-        at = np.ascontiguousarray(offsets).view("<u8")[:, 0]
-        payload, stored_length = self._store.fetch(at)
-        return np.where(inside, payload, np.uint8(0)), stored_length == length
+            return _cut(payload, length), length <= part.shape[1]
+        key = raw(self._key, words).astype(np.int64)
+        payload, stored_length = values.fetch(key, words.first, width)
+        return _cut(payload, length), stored_length >= length
 
 
-class _Store:
-    """Variable-length values of one channel, read along with the records that point at them."""
-
-    def __init__(self, blocks: Blocks, link: int) -> None:
-        self._blocks, self._link = blocks, link
-        self._pieces: Iterator[Piece] = iter(())
-        self._held, self._base, self._end, self._restarts = b"", 0, 0, 0
-        self._damaged: list[tuple[int, int]] = []
-        self._rewind()
-
-    def fetch(self, at: NDArray[np.uint64]) -> tuple[Bytes, Int64s]:
-        """The values at these offsets.
-
-        Returns:
-            Shape (N, 64): their first bytes; shape (N,): their lengths, -1 for unreadable ones.
-        """
-        payload = np.zeros((len(at), _PAYLOAD_MAX), np.uint8)
-        length = np.full(len(at), -1, np.int64)
-        if not len(at):
-            return payload, length
-        first = int(at.min())
-        near = at - np.uint64(first) < _SPAN_MAX
-        last = int(at[near].max()) + 4 + _PAYLOAD_MAX
-        window = self._window(first, last)
-        if self._base != first:
-            return payload, length
-        place = np.where(near, at - np.uint64(first), 0).astype(np.int64)
-        room = len(window) - 4 - _PAYLOAD_MAX
-        is_inside = near & (place < room)
-        place = np.where(is_inside, place, 0)
-        numbers: NDArray[np.uint32] = np.ndarray(
-            (len(window) - 3,), np.dtype("<u4"), window.data, strides=(1,)
-        )
-        found = numbers[place].astype(np.int64)
-        is_good = is_inside & (found <= _PAYLOAD_MAX) & ~self._is_damaged(first + place, found)
-        # The window ends in padding, which no value may reach into.
-        is_good &= first + place + 4 + found <= self._end
-        view = np.lib.stride_tricks.sliding_window_view(window, _PAYLOAD_MAX)
-        payload[is_good] = view[place[is_good] + 4]
-        length[is_good] = found[is_good]
-        return payload, length
-
-    def _is_damaged(self, start: Int64s, length: Int64s) -> NDArray[np.bool_]:
-        bad = np.zeros(len(start), np.bool_)
-        for begin, end in self._damaged:
-            bad |= (start < end) & (start + 4 + length > begin)
-        return bad
-
-    def _window(self, first: int, last: int) -> Bytes:
-        """Bytes from ``first`` on, padded so that every value in it can be looked at."""
-        if first < self._base and self._restarts < _RESTARTS_MAX:
-            self._restarts += 1
-            self._rewind()
-        while self._end < last:
-            piece = next(self._pieces, None)
-            if piece is None:
-                break
-            content = piece.content
-            if content is None:
-                self._damaged.append((self._end, self._end + piece.byte_count))
-                if not 0 < piece.byte_count <= _SPAN_MAX:
-                    self._pieces = iter(())
-                    break
-                content = bytes(piece.byte_count)
-            self._held += content
-            self._end += len(content)
-            self._drop(first)
-        self._drop(first)
-        return np.frombuffer(self._held + bytes(2 * _PAYLOAD_MAX + 8), np.uint8)
-
-    def _drop(self, first: int) -> None:
-        count = min(max(first - self._base, 0), len(self._held))
-        self._held, self._base = self._held[count:], self._base + count
-
-    def _rewind(self) -> None:
-        self._pieces = self._blocks.pieces(self._link, is_open_ended=False)
-        self._held, self._base, self._end = b"", 0, 0
-        self._damaged = []
+def _cut(payload: Bytes, length: Int64s) -> Bytes:
+    """``payload`` with zeros from ``length`` on."""
+    width = payload.shape[1]
+    if bool((length == width).all()):
+        return payload
+    if width == _CLASSIC:
+        words = payload.view(np.uint64)[:, 0] & _MASK[length].astype(np.uint64)
+        return words.view(np.uint8).reshape(-1, _CLASSIC)
+    return np.where(np.arange(width) < length[:, None], payload, np.uint8(0))

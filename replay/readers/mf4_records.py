@@ -1,138 +1,373 @@
-"""Records of one MDF 4 channel group, in chunks, out of sorted or unsorted data."""
+"""Records of MDF 4 channel groups, in chunks, out of sorted or unsorted data.
+
+Sorted data are records of one group, all of one size. Unsorted data are records of several groups
+one after the other, each behind its group's identifier; some are values of variable length that
+belong to a record of another group.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import struct
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import BLOCK_ROWS, Bytes
+from crosscue.replay.columns import BLOCK_ROWS, Bytes, Int64s
 
-from .mf4_blocks import VLSD_GROUP, Blocks, DataGroup, Group
+from .mf4_blocks import VLSD_GROUP, DataGroup, Group
+from .mf4_stream import Stream
+
+_WALK_BYTES: Final = 1 << 20
+_KEPT: Final = 3
+"""Walked pieces that are kept: values lie near the records that they belong to."""
+PATIENCE: Final = 300_000
+"""Records that the plain loop may take before Numba is worth its import."""
+PADDING: Final = 64
+"""Bytes after those of a piece, so that every value in it can be looked at with that width."""
+LAST_CUT: Final = "last record is cut"
+_LENGTH: Final = struct.Struct("<L")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Records:
-    """Consecutive records, or a stretch that cannot be read.
+    """Consecutive records of one group, or a stretch that cannot be read.
 
     Attributes:
         rows: Shape (N, record bytes).
         first: Index of the first one in its group.
+        place: Shape (N,): ascending, comparable among the groups of one data group.
         damage: What is wrong, where nothing can be read.
-        lost: Records that are known to be lost by it.
+        dropped: Records that are known to be dropped by it.
     """
 
     rows: Bytes
     first: int
+    place: Int64s
     damage: str = ""
-    lost: int = 0
+    dropped: int = 0
 
 
-_NONE = np.zeros((0, 0), np.uint8)
+_NO_ROWS: Final = np.zeros((0, 0), np.uint8)
+_NO_PLACE: Final = np.zeros(0, np.int64)
 
 
-def records_of(
-    blocks: Blocks, data: DataGroup, group: Group, is_open_ended: bool
+def sorted_records(
+    stream: Stream, group: Group, first: int = 0, stop: int | None = None
 ) -> Iterator[Records]:
-    """The records of ``group`` in stored order, at most ``BLOCK_ROWS`` at a time."""
-    if not group.record_bytes and not data.id_bytes:
-        return
-    if data.id_bytes:
-        found = _unsorted(blocks, data, group, is_open_ended)
-    else:
-        found = _sorted(blocks, data, group, is_open_ended)
-    for records in found:
-        if records.damage:
-            yield records
-        for k in range(0, len(records.rows), BLOCK_ROWS):
-            yield Records(records.rows[k : k + BLOCK_ROWS], records.first + k)
-
-
-def _sorted(
-    blocks: Blocks, data: DataGroup, group: Group, is_open_ended: bool
-) -> Iterator[Records]:
+    """Records ``first`` to ``stop`` of a group that has its data to itself."""
     size = group.record_bytes
-    done, position, tail, gap = 0, 0, b"", 0
-    for piece in blocks.pieces(data.data, is_open_ended):
-        position += piece.byte_count
-        if piece.content is None:
-            # The next record that begins after the stretch is the first one to be whole again.
-            following = -(-position // size)
-            lost = following - done if piece.byte_count else 0
-            yield Records(_NONE, done, piece.damage, lost)
-            done, tail, gap = following, b"", following * size - position
-            continue
-        content = tail + piece.content[gap:]
-        gap = max(gap - piece.byte_count, 0)
+    if not size:
+        return
+    end = stream.size if stop is None else min(stream.size, stop * size)
+    done = first
+    while done * size < end:
+        at = done * size
+        content = stream.read(at, min(BLOCK_ROWS * size, end - at))
         count = len(content) // size
         if count:
             rows = np.frombuffer(content, np.uint8, count * size).reshape(count, size)
-            yield Records(rows, done)
-        done += count
-        tail = content[count * size :]
-    if tail:
-        yield Records(_NONE, done, f"{group.name}: last record is cut", 1)
-
-
-def _unsorted(
-    blocks: Blocks, data: DataGroup, group: Group, is_open_ended: bool
-) -> Iterator[Records]:
-    sizes = {g.record_id: _size(g) for g in data.groups}
-    done, tail, base = 0, b"", 0
-    for piece in blocks.pieces(data.data, is_open_ended):
-        if piece.content is None:
-            yield Records(_NONE, done, f"{piece.damage}; unsorted records after it cannot be found")
-            return
-        content = tail + piece.content
-        start, stop = _starts(content, data.id_bytes, sizes, group.record_id)
-        rows = _gathered(content, start, group.record_bytes)
-        if len(rows):
-            yield Records(rows, done)
-        done += len(rows)
-        if stop < 0:
-            yield Records(_NONE, done, f"unknown record identifier after byte {base} of the data")
-            return
-        base += stop
-        tail = content[stop:]
-    if tail:
-        yield Records(_NONE, done, "last record is cut")
-
-
-def _size(group: Group) -> int:
-    return -1 if group.flags & VLSD_GROUP else group.record_bytes
-
-
-def _starts(
-    content: bytes, id_bytes: int, sizes: dict[int, int], wanted: int
-) -> tuple[NDArray[np.int64], int]:
-    """Where the wanted group's whole records begin, and where the first incomplete one does.
-
-    The second value is -1 when an identifier is unknown.
-    """
-    found: list[int] = []
-    position, end = 0, len(content)
-    while position + id_bytes <= end:
-        identifier = int.from_bytes(content[position : position + id_bytes], "little")
-        size = sizes.get(identifier)
-        if size is None:
-            return np.array(found, np.int64), -1
-        start = position + id_bytes
-        if size < 0:
-            if start + 4 > end:
-                break
-            size = 4 + int.from_bytes(content[start : start + 4], "little")
-        if start + size > end:
+            yield Records(rows, done, np.arange(done, done + count))
+            done += count
+            continue
+        hole = stream.hole(at, at + size)
+        if hole is None:
+            yield _damaged(done, f"{group.name}: {LAST_CUT}", 1)
             break
-        if identifier == wanted:
-            found.append(start)
-        position = start + size
-    return np.array(found, np.int64), position
+        # The next record that begins after the stretch is the first one to be whole again.
+        following = -(-hole.stop // size)
+        yield _damaged(done, hole.damage, following - done)
+        done = following
+    if stream.broken and stop is None:
+        yield _damaged(done, stream.broken, 0)
 
 
-def _gathered(content: bytes, start: NDArray[np.int64], size: int) -> Bytes:
+def _damaged(first: int, damage: str, dropped: int) -> Records:
+    return Records(_NO_ROWS, first, _NO_PLACE, damage, dropped)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walked:
+    """Whole records of unsorted data, one after the other.
+
+    Attributes:
+        content: Their bytes and ``PADDING`` more, shape (B,).
+        base: Where those begin in the stream.
+        group: Shape (N,): index of each record's group.
+        start: Shape (N,): where its values begin in ``content``.
+        damage: Why nothing can be read after them; empty where all ends as it should.
+        cut: Index of the group of a record that the end cuts, -1 for none or an unknown one.
+    """
+
+    content: Bytes
+    base: int
+    group: Int64s
+    start: Int64s
+    damage: str
+    cut: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """What came before a piece: its place, and each group's records and value bytes."""
+
+    at: int
+    records: Int64s
+    value_bytes: Int64s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Values:
+    """Variable-length values of one group in one piece.
+
+    Attributes:
+        offset: Shape (N,), ascending: where each begins among all of its group, as the records
+            that it belongs to spell it.
+        end: Where the first one after them begins.
+        first: Index of the first one in its group.
+        start: Shape (N,): where it begins in ``content``.
+        length: Shape (N,).
+        content: Shape (B,).
+    """
+
+    offset: Int64s
+    end: int
+    first: int
+    start: Int64s
+    length: Int64s
+    content: Bytes
+
+
+class UnsortedData:
+    """Records of several groups in one stream, found piece by piece.
+
+    Where a piece begins is kept once it is known, so that values of variable length can be looked
+    for away from the records that point at them, in bounded memory.
+    """
+
+    def __init__(self, stream: Stream, data: DataGroup, max_record: int) -> None:
+        """Nothing is read yet.
+
+        Args:
+            stream: The data.
+            data: The groups in it.
+            max_record: Bytes above which a record's size is damage.
+        """
+        self.stream, self.data, self._max = stream, data, max_record
+        self._finder = _Finder(data)
+        none = np.zeros(len(data.groups), np.int64)
+        self._states = [_State(0, none, none)]
+        self._is_complete = False
+        self._kept: dict[int, Walked] = {}
+
+    def pieces(self) -> Iterator[tuple[int, Walked]]:
+        """All of it, in order, numbered."""
+        k = 0
+        while (piece := self.piece(k)) is not None:
+            yield k, piece
+            k += 1
+
+    def piece(self, k: int) -> Walked | None:
+        """Piece ``k``, or None after the last one."""
+        while k >= len(self._states) and not self._is_complete:
+            self.piece(len(self._states) - 1)
+        if k >= len(self._states):
+            return None
+        if k not in self._kept:
+            while len(self._kept) >= _KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[k] = self._walk(k)
+        return self._kept[k]
+
+    def rows(self, k: int, group: int) -> Records:
+        """The records of one group in piece ``k``."""
+        piece = self._known(k)
+        start = piece.start[piece.group == group]
+        rows = _gathered(piece.content, start, self.data.groups[group].record_bytes)
+        return Records(rows, int(self._states[k].records[group]), start + piece.base)
+
+    def values(self, k: int, group: int) -> Values:
+        """The variable-length values of one group in piece ``k``."""
+        piece, before = self._known(k), self._states[k]
+        start = piece.start[piece.group == group]
+        length = _lengths(piece.content, start)
+        after = before.value_bytes[group] + np.cumsum(length + 4)
+        end = int(after[-1] if len(after) else before.value_bytes[group])
+        first = int(before.records[group])
+        return Values(after - (length + 4), end, first, start, length, piece.content)
+
+    def piece_of(self, group: int, key: int, by_order: bool) -> int:
+        """The piece that holds a value if any does, by offset or by index; -1 for none."""
+        while True:
+            low, high = 0, len(self._states)
+            while low < high:
+                middle = (low + high) // 2
+                state = self._states[middle]
+                before = state.records[group] if by_order else state.value_bytes[group]
+                low, high = (middle + 1, high) if before <= key else (low, middle)
+            is_last = low == len(self._states)
+            if not is_last or self._is_complete:
+                return low - 1
+            self.piece(low - 1)
+            if self._is_complete:
+                return low - 1
+
+    def _known(self, k: int) -> Walked:
+        piece = self.piece(k)
+        assert piece is not None
+        return piece
+
+    def _walk(self, k: int) -> Walked:
+        before, size = self._states[k], _WALK_BYTES
+        while True:
+            content = self.stream.read(before.at, size)
+            is_end = len(content) < size
+            group, start, stop, unknown = self._finder(content)
+            if len(start) or is_end or unknown >= 0:
+                break
+            if size > self._max:
+                unknown = -2
+                break
+            size *= 2
+        damage, cut = "", -1
+        if is_end or unknown != -1:
+            damage, cut = self._end(before.at + stop, content[stop:], unknown)
+        buffer = np.frombuffer(content + bytes(PADDING), np.uint8)
+        piece = Walked(buffer, before.at, group, start, damage, cut)
+        if k == len(self._states) - 1 and not self._is_complete:
+            self._advance(before, piece, stop, is_end or unknown != -1)
+        return piece
+
+    def _advance(self, before: _State, piece: Walked, stop: int, is_last: bool) -> None:
+        if is_last:
+            self._is_complete = True
+            return
+        count = len(self.data.groups)
+        records = before.records + np.bincount(piece.group, minlength=count)
+        value_bytes = before.value_bytes.copy()
+        for g in np.flatnonzero(self._finder.sizes < 0):
+            start = piece.start[piece.group == g]
+            value_bytes[g] += int((_lengths(piece.content, start) + 4).sum())
+        self._states.append(_State(before.at + stop, records, value_bytes))
+
+    def _end(self, at: int, rest: bytes, unknown: int) -> tuple[str, int]:
+        left = self.stream.size - at
+        where = f"byte {at} of the data, {left} bytes before its end"
+        if unknown == -2:
+            return f"a record of over {self._max} bytes at {where}", -1
+        if unknown >= 0:
+            return f"unknown record identifier {unknown} at {where}", -1
+        hole = self.stream.hole(at, self.stream.size)
+        if hole is not None:
+            return f"{hole.damage}; unsorted records after it cannot be found", -1
+        if not rest:
+            return self.stream.broken, -1
+        return LAST_CUT, self._finder.group_of(rest)
+
+
+class _Finder:
+    """Finds records in a buffer; remembers how much the plain loop has done."""
+
+    def __init__(self, data: DataGroup) -> None:
+        self._id_bytes = data.id_bytes
+        self._index = {group.record_id: k for k, group in enumerate(data.groups)}
+        self.sizes = np.array(
+            [-1 if g.flags & VLSD_GROUP else g.record_bytes for g in data.groups], np.int64
+        )
+        order = sorted(self._index)
+        self._ids = np.array(order, np.uint64)
+        self._order = np.array([self._index[one] for one in order], np.int64)
+        self._done = 0
+
+    def group_of(self, content: bytes) -> int:
+        """The group whose record begins here, -1 where that is unknown."""
+        if len(content) < self._id_bytes:
+            return -1
+        return self._index.get(int.from_bytes(content[: self._id_bytes], "little"), -1)
+
+    def __call__(self, content: bytes) -> tuple[Int64s, Int64s, int, int]:
+        """Groups and value starts of the whole records.
+
+        Returns:
+            Groups, starts, where the first record begins that is not whole, and its identifier
+            where that belongs to no group, else -1.
+        """
+        if "numba" in sys.modules or self._done + len(content) // 20 > PATIENCE:
+            return self._compiled(content)
+        found = self._plainly(content)
+        self._done += len(found[0])
+        return found
+
+    def _plainly(self, content: bytes) -> tuple[Int64s, Int64s, int, int]:
+        id_bytes, index, sizes = self._id_bytes, self._index, self.sizes.tolist()
+        groups: list[int] = []
+        starts: list[int] = []
+        at, end, unknown = 0, len(content), -1
+        while at + id_bytes <= end:
+            start = at + id_bytes
+            identifier = content[at] if id_bytes == 1 else _number(content, at, start)
+            group = index.get(identifier)
+            if group is None:
+                unknown = identifier
+                break
+            size = sizes[group]
+            if size < 0:
+                if start + 4 > end:
+                    break
+                size = _LENGTH.unpack_from(content, start)[0]
+                start += 4
+            if start + size > end:
+                break
+            groups.append(group)
+            starts.append(start)
+            at = start + size
+        return np.array(groups, np.int64), np.array(starts, np.int64), at, unknown
+
+    def _compiled(self, content: bytes) -> tuple[Int64s, Int64s, int, int]:
+        known = self.sizes[self.sizes >= 0]
+        smallest = self._id_bytes + int(min(known.min(initial=4), 4))
+        room = len(content) // smallest + 1
+        groups, starts = np.empty(room, np.int64), np.empty(room, np.int64)
+        buffer = np.frombuffer(content, np.uint8)
+        count, at, is_unknown = _walker()(
+            buffer, self._id_bytes, self._ids, self._order, self.sizes, groups, starts
+        )
+        unknown = _number(content, at, at + self._id_bytes) if is_unknown else -1
+        return groups[:count].copy(), starts[:count].copy(), at, unknown
+
+
+def _number(content: bytes, start: int, stop: int) -> int:
+    return int.from_bytes(content[start:stop], "little")
+
+
+_Walker = Callable[
+    [Bytes, int, NDArray[np.uint64], Int64s, Int64s, Int64s, Int64s], tuple[int, int, bool]
+]
+_walk: _Walker | None = None
+
+
+def _walker() -> _Walker:
+    global _walk
+    if _walk is None:
+        from .mf4_records_numba import walk
+
+        _walk = cast("_Walker", walk)
+    return _walk
+
+
+def _lengths(content: Bytes, start: Int64s) -> Int64s:
+    """The lengths in front of variable-length values."""
     if not len(start):
-        return np.zeros((0, size), np.uint8)
-    buffer = np.frombuffer(content, np.uint8)
-    return np.lib.stride_tricks.sliding_window_view(buffer, size)[start]
+        return np.zeros(0, np.int64)
+    shape = (len(content) - 3,)
+    numbers = np.ndarray(shape, np.dtype("<u4"), content.data, strides=(1,))
+    return numbers[start - 4].astype(np.int64)
+
+
+def _gathered(content: Bytes, start: Int64s, size: int) -> Bytes:
+    if not len(start) or not size:
+        return np.zeros((len(start), size), np.uint8)
+    return np.lib.stride_tricks.sliding_window_view(content, size)[start]

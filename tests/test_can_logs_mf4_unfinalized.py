@@ -1,0 +1,279 @@
+"""MDF 4 logs as loggers leave them: unfinalized, unsorted, with virtual channels, cut anywhere."""
+
+from __future__ import annotations
+
+import random
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from crosscue.replay.columns import CanFrames
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import open_log
+from support.can_files import Sent, by_bus, made, read_back
+from support.data import shared
+from support.mf4_files import unsorted
+
+asammdf = pytest.importorskip("asammdf")
+
+Key = tuple[int, int, bool, bool]
+Frames = dict[Key, list[tuple[float, int, bytes]]]
+"""By bus, identifier, kind of identifier and direction: seconds, data length, payload."""
+
+REAL = [
+    (("css_unfinalized", "00000000_00000048_00000001.MF4"), {1: 1_026}),
+    (("css_unfinalized", "17BD1DB7_00000006_00000170.MF4"), {1: 2_010}),
+    (("css_unfinalized", "94C49784_00000005_00000002.MF4"), {1: 9_600}),
+    (("css_unfinalized", "FCBF0606_00002058_00000001-5FAB8E54.mf4"), {1: 17_674}),
+    (("css_unfinalized", "00000014.MF4"), {1: 14_360, 2: 14_361}),
+    (("css_unfinalized", "00000014_fin.MF4"), {1: 14_360, 2: 14_361}),
+    (("css_unfinalized", "asammdf-basics_00000001.MF4"), {1: 139_136, 9: 11_275}),
+    (("css_unfinalized", "7512BE4D_00000427_00000001.MF4"), {1: 15_302, 9: 56_707}),
+    (("css_canedge", "3BA199E2", "00000164", "00000001-60FE3F04.MF4"), {1: 7_692, 2: 57_604}),
+]
+
+
+def _peer(path: Path) -> Frames:
+    """Data frames as asammdf gives them after finalizing the file."""
+    found: Frames = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with asammdf.MDF(path) as mdf:
+            for k, group in enumerate(mdf.groups):
+                names = {channel.name for channel in group.channels}
+                if "CAN_DataFrame.ID" in names and group.channel_group.cycles_nr:
+                    _add_group(mdf, k, names, found)
+    return found
+
+
+def _add_group(mdf: Any, group: int, names: set[str], found: Frames) -> None:
+    part = {
+        name: mdf.get(f"CAN_DataFrame.{name}", group=group)
+        for name in ("BusChannel", "ID", "IDE", "Dir", "DataLength", "DataBytes")
+        if f"CAN_DataFrame.{name}" in names
+    }
+    length = part["DataLength"].samples.astype(int).tolist()
+    seconds = part["ID"].timestamps.tolist()
+    columns = [part[n].samples.astype(int).tolist() for n in ("BusChannel", "ID", "IDE", "Dir")]
+    for k, (bus, number, ide, direction) in enumerate(zip(*columns, strict=True)):
+        payload = part["DataBytes"].samples[k].tobytes()[: length[k]]
+        key = (bus, number & 0x1FFFFFFF, bool(ide), bool(direction))
+        found.setdefault(key, []).append((seconds[k], length[k], payload))
+
+
+def _ours(path: Path, start_ns: int) -> tuple[Frames, Ledger]:
+    ledger = Ledger(str(path))
+    found: Frames = {}
+    with open_log(path) as log:
+        for block in log.read(ledger):
+            rows = block.rows
+            assert isinstance(rows, CanFrames)
+            assert rows.is_tx is not None
+            bus = int(block.topic.removeprefix("can/"))
+            columns = zip(
+                rows.arbitration_id.tolist(), rows.is_extended.tolist(), rows.is_tx.tolist(),
+                rows.length.tolist(), ((block.log_ns - start_ns) * 1e-9).tolist(), strict=True,
+            )  # fmt: skip
+            for k, (number, ide, is_tx, length, seconds) in enumerate(columns):
+                payload = rows.data[k].tobytes()[:length]
+                found.setdefault((bus, number, ide, is_tx), []).append((seconds, length, payload))
+    return found, ledger
+
+
+def _same(ours: Frames, theirs: Frames) -> None:
+    assert {key: len(rows) for key, rows in ours.items()} == {
+        key: len(rows) for key, rows in theirs.items()
+    }
+    for key, rows in ours.items():
+        assert [row[1:] for row in rows] == [row[1:] for row in theirs[key]], key
+        ours_s, theirs_s = np.array([r[0] for r in rows]), np.array([r[0] for r in theirs[key]])
+        np.testing.assert_allclose(ours_s, theirs_s, rtol=0, atol=1e-6)
+
+
+def _start_ns(path: Path) -> int:
+    return int.from_bytes(path.read_bytes()[64 + 24 + 48 :][:8], "little")
+
+
+@pytest.mark.parametrize(("where", "expected"), REAL, ids=[where[-1] for where, _ in REAL])
+def test_every_frame_of_a_real_log_is_as_asammdf_returns_it_after_finalizing(
+    where: tuple[str, ...], expected: dict[int, int]
+) -> None:
+    path = shared("can", *where)
+
+    ours, ledger = _ours(path, _start_ns(path))
+
+    by_number: dict[int, int] = {}
+    for (bus, *_), rows in ours.items():
+        by_number[bus] = by_number.get(bus, 0) + len(rows)
+    assert by_number == expected
+    assert ledger.is_whole
+    _same(ours, _peer(path))
+
+
+def test_the_summary_says_that_the_logger_never_finalized_the_file() -> None:
+    path = shared("can", "css_unfinalized", "00000014.MF4")
+
+    _, ledger = read_back(path)
+
+    said = "not finalized by the logger; 28721 records recovered from the data block"
+    assert said in ledger.notices
+    assert {name: one.used for name, one in ledger.accounts.items() if name} == {
+        "can/1": 14_360,
+        "can/2": 14_361,
+    }
+
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "one group": {"virtual": False},
+    "virtual": {"virtual": True},
+    "identifiers of 2 bytes": {"virtual": True, "id_bytes": 2},
+    "identifiers of 4 bytes": {"virtual": False, "id_bytes": 4},
+    "identifiers of 8 bytes": {"virtual": True, "id_bytes": 8},
+    "values before their records": {"virtual": False, "order": "before"},
+    "values after all records": {"virtual": False, "order": "last"},
+    "values of some groups after all records": {"virtual": True, "order": "last"},
+    "offsets never written": {"virtual": False, "flags": 0x65},
+    "list of blocks": {"virtual": True, "stretch": 999, "flags": 0x21},
+    "list with its last blocks missing": {"virtual": False, "stretch": 999, "flags": 0x35},
+    "deflated": {"virtual": False, "stretch": 999, "coding": 0, "flags": 0x21},
+    "transposed": {"virtual": True, "stretch": 999, "coding": 1, "flags": 0x21},
+    "deflated, last blocks missing": {
+        "virtual": True, "stretch": 999, "coding": 0, "flags": 0x31,
+    },
+    "finalized": {"virtual": True, "is_finalized": True},
+    "finalized, one group": {"virtual": False, "is_finalized": True},
+}  # fmt: skip
+
+
+def _frames(count: int, seed: int = 1, *, virtual: bool) -> list[Sent]:
+    """The older layout holds data frames only."""
+    return [f for f in made(count, seed) if virtual or f.kind == 0]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_virtual_and_variable_length_channel_groups_keep_every_frame(
+    tmp_path: Path, variant: str
+) -> None:
+    options = VARIANTS[variant]
+    frames = _frames(1_500, virtual=options["virtual"])
+    path = tmp_path / "x.mf4"
+    path.write_bytes(unsorted(frames, **options).content)
+
+    found, ledger = read_back(path)
+
+    assert found == by_bus(frames, "can/{}")
+    assert ledger.is_whole
+    said = f"not finalized by the logger; {len(frames)} records recovered from the data block"
+    assert (said in ledger.notices) != options.get("is_finalized", False)
+
+
+@pytest.mark.parametrize("variant", ["one group", "virtual", "identifiers of 2 bytes", "finalized"])
+def test_made_logs_read_as_asammdf_reads_them(tmp_path: Path, variant: str) -> None:
+    options = VARIANTS[variant]
+    frames = [f for f in _frames(400, virtual=options["virtual"]) if f.kind == 0]
+    path = tmp_path / "x.mf4"
+    path.write_bytes(unsorted(frames, **options).content)
+
+    ours, _ = _ours(path, _start_ns(path))
+
+    _same(ours, _peer(path))
+
+
+@pytest.mark.parametrize("order", ["after", "before", "last"])
+@pytest.mark.parametrize("virtual", [False, True])
+def test_a_cut_end_costs_the_frames_it_cuts_and_no_other(
+    tmp_path: Path, virtual: bool, order: str
+) -> None:
+    frames = _frames(120, seed=3, virtual=virtual)
+    whole = unsorted(frames, virtual=virtual, order=order)
+    path = tmp_path / "x.mf4"
+    chance = random.Random(7)
+    for cut in sorted(chance.sample(range(whole.data_at, len(whole.content)), 120)):
+        path.write_bytes(whole.content[:cut])
+        inside = [f for f, end in zip(frames, whole.ends, strict=True) if end <= cut]
+
+        found, ledger = read_back(path)
+
+        assert found == by_bus(inside, "can/{}"), f"cut at {cut}"
+        if cut not in whole.starts:
+            assert not ledger.is_whole, f"cut at {cut}: nothing said"
+        known = sum(account.dropped.total() for account in ledger.accounts.values())
+        assert known <= len(frames) - len(inside) + 1
+
+
+def test_an_end_in_the_middle_of_a_payload_costs_one_frame(tmp_path: Path) -> None:
+    frames = _frames(50, virtual=False)
+    whole = unsorted(frames, virtual=False)
+    path = tmp_path / "x.mf4"
+    path.write_bytes(whole.content[: whole.ends[-1] - 1])
+
+    found, ledger = read_back(path)
+
+    assert sum(map(len, found.values())) == len(frames) - 1
+    assert sum(account.dropped.total() for account in ledger.accounts.values()) == 1
+
+
+@pytest.mark.parametrize("virtual", [False, True])
+def test_records_of_an_unknown_identifier_are_reported_and_no_frame_invented(
+    tmp_path: Path, virtual: bool
+) -> None:
+    frames = _frames(100, virtual=virtual)
+    whole = unsorted(frames, virtual=virtual)
+    path = tmp_path / "x.mf4"
+    for k in (0, 17, 60):
+        content = bytearray(whole.content)
+        content[whole.starts[k]] = 0xEE
+        path.write_bytes(content)
+
+        found, ledger = read_back(path)
+
+        inside = [f for f, e in zip(frames, whole.ends, strict=True) if e <= whole.starts[k]]
+        assert found == by_bus(inside, "can/{}")
+        assert not ledger.is_whole
+        assert any("unknown record identifier 238" in drop.detail for drop in ledger.drops())
+
+
+def test_bytes_after_the_last_declared_record_cost_nothing(tmp_path: Path) -> None:
+    frames = _frames(100, virtual=True)
+    whole = unsorted(frames, virtual=True, is_finalized=True)
+    path = tmp_path / "x.mf4"
+    content = bytearray(whole.content) + b"\xee" * 16
+    at = whole.data_at - 24 + 8
+    content[at : at + 8] = (int.from_bytes(content[at : at + 8], "little") + 16).to_bytes(
+        8, "little"
+    )
+    path.write_bytes(content)
+
+    found, ledger = read_back(path)
+
+    assert sum(map(len, found.values())) == len(frames)
+    assert ledger.is_whole
+
+
+def test_frames_of_several_groups_come_in_the_order_of_the_log(tmp_path: Path) -> None:
+    frames: Sequence[Sent] = _frames(2_000, virtual=True)
+    path = tmp_path / "x.mf4"
+    path.write_bytes(unsorted(frames, virtual=True).content)
+
+    with open_log(path) as log:
+        for block in log.read(Ledger("x")):
+            assert bool((np.diff(block.log_ns) >= 0).all())
+
+
+def test_sorted_groups_of_one_bus_come_in_time_order(tmp_path: Path) -> None:
+    frames = [f for f in _frames(3_000, virtual=True) if f.kind == 0 and not f.is_fd]
+    mixed, path = tmp_path / "mixed.mf4", tmp_path / "sorted.mf4"
+    mixed.write_bytes(unsorted(frames, virtual=True).content)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with asammdf.MDF(mixed) as mdf:
+            mdf.save(path, overwrite=True)
+
+    found, ledger = read_back(path)
+
+    assert ledger.is_whole
+    assert found == by_bus(frames, "can/{}")
