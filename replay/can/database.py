@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Final
 from crosscue.replay.errors import LogTooLargeError, SchemaError, one_line
 from crosscue.replay.limits import DEFAULT, Limits
 
+from .dbc_text import read_dbc
 from .layout import CanMessage, CanSignal, layout_problem, overlaps
+from .layout_cache import LayoutEntry, cache_folder
 from .sources import DatabaseText, doubts, read_text, refuse_bombs
 
 if TYPE_CHECKING:
@@ -176,16 +178,27 @@ def _load_file(path: Path, limits: Limits) -> tuple[list[CanMessage], list[str]]
         known = " ".join(f".{suffix}" for suffix in FORMATS)
         raise SchemaError(f"{path}: no CAN database; expected a file ending in one of {known}")
     source = read_text(path, limits)
+    entry = LayoutEntry(source, form, cache_folder())
+    kept = entry.read()
+    if kept is not None:
+        return kept
+    messages, notices = _read_layout(source, form)
+    entry.write(messages, notices)
+    return messages, notices
+
+
+def _read_layout(source: DatabaseText, form: str) -> tuple[list[CanMessage], list[str]]:
+    """Messages, and notices about what is doubtful in them."""
+    path = source.path
     refuse_bombs(source, form)
-    parsed = _parse(source, form)
     lines = source.lines_of_messages(form)
     marked = source.multiplexed_signals() if form == "dbc" else {}
     messages = []
-    for one in parsed.messages:
-        stored = str(one.frame_id | (_EXTENDED_FLAG if one.is_extended_frame else 0))
-        line = lines.get(stored if form == "dbc" else one.name)
+    for one in _defined(source, form):
+        line = lines.get(one.source)
         where = f"{path.name}:{line}" if line else path.name
-        messages.append(_message(one, where, _says_fd(parsed, form), marked.get(stored, [])))
+        problem = one.problem or _problem(one, marked.get(one.source, []))
+        messages.append(replace(one, source=where, problem=problem))
     if not messages:
         raise SchemaError(f"{path}: defines no message; check that the file is whole")
     notices = [*source.notices, *doubts(source, form, [m.name for m in messages])]
@@ -195,6 +208,16 @@ def _load_file(path: Path, limits: Limits) -> tuple[list[CanMessage], list[str]]
     if empty:
         notices.append(f"{path.name}: {empty} of {len(messages)} messages have no signals")
     return messages, notices
+
+
+def _defined(source: DatabaseText, form: str) -> list[CanMessage]:
+    """The messages of a file; their ``source`` is what ``lines_of_messages`` calls them."""
+    quick = read_dbc(source.text) if form == "dbc" else None
+    if quick is not None:
+        return quick
+    parsed = _parse(source, form)
+    says_fd = _says_fd(parsed, form)
+    return [_message(one, form, says_fd) for one in parsed.messages]
 
 
 def _parse(source: DatabaseText, form: str) -> InternalDatabase:
@@ -225,22 +248,25 @@ def _says_fd(parsed: InternalDatabase, form: str) -> bool:
     return form == "arxml"
 
 
-def _message(parsed: Message, where: str, says_fd: bool, marked: list[str]) -> CanMessage:
-    message = CanMessage(
+def _message(parsed: Message, form: str, says_fd: bool) -> CanMessage:
+    stored = str(parsed.frame_id | (_EXTENDED_FLAG if parsed.is_extended_frame else 0))
+    return CanMessage(
         name=parsed.name,
         arbitration_id=parsed.frame_id,
         is_extended=parsed.is_extended_frame,
         length=parsed.length,
         signals=tuple(_signal(s) for s in parsed.signals),
         is_fd=parsed.is_fd if says_fd else None,
-        source=where,
+        problem="container message, not supported" if parsed.is_container else "",
+        source=stored if form == "dbc" else parsed.name,
     )
-    if parsed.is_container:
-        return replace(message, problem="container message, not supported")
+
+
+def _problem(message: CanMessage, marked: list[str]) -> str:
     lost = [s.name for s in message.signals if s.name in marked and s.multiplexer is None]
     if lost:
-        return replace(message, problem=f"nothing says which multiplexer brings {lost[0]}")
-    return replace(message, problem=layout_problem(message))
+        return f"nothing says which multiplexer brings {lost[0]}"
+    return layout_problem(message)
 
 
 def _signal(parsed: Signal) -> CanSignal:

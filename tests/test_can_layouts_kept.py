@@ -1,0 +1,283 @@
+"""Layouts of CAN databases: read straight from the text, kept for the next start."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.can import database
+from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.can.dbc_text import read_dbc
+from crosscue.replay.can.layout import CanMessage
+from crosscue.replay.can.layout_cache import VARIABLE, cache_folder
+from crosscue.replay.can.sources import DatabaseText, read_text
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.limits import DEFAULT
+from support.can_layouts import dbc_text, messages
+from support.data import shared
+
+EXTENDED = """VERSION ""
+BU_: ECU Vector__XXX
+BO_ 2147484000 Wide: 8 ECU
+ SG_ kind M : 0|4@1+ (1,0) [0|0] "" ECU,Vector__XXX
+ SG_ inner m1M : 4|4@1+ (1,0) [0|15] "" ECU
+ SG_ deep m3 : 8|16@1- (0.5,-40) [-40|100] "\u00b0C" ECU
+ SG_ whole m2 : 8|16@1+ (2.0,1.0) [0|1] "" ECU
+ SG_ other : 63|8@0+ (1.0,0) [0|0] "" ECU
+BO_ 100 Fd: 64 ECU
+ SG_ real : 0|32@1- (1,0) [0|0] "" ECU
+CM_ SG_ 100 real "a \\" quote
+and a second line";
+BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","StandardCAN_FD";
+BA_DEF_DEF_ "VFrameFormat" "ExtendedCAN";
+BA_ "VFrameFormat" BO_ 100 2;
+VAL_ 2147484000 other 1 "one" 2 "two" ;
+SIG_VALTYPE_ 100 real : 1;
+SG_MUL_VAL_ 2147484000 inner kind 1-1;
+SG_MUL_VAL_ 2147484000 deep inner 3-3, 7-9;
+SG_MUL_VAL_ 2147484000 whole kind 2-2;
+"""
+
+
+def _by_cantools(source: DatabaseText) -> list[CanMessage]:
+    parsed = database._parse(source, "dbc")
+    says_fd = database._says_fd(parsed, "dbc")
+    return [database._message(one, "dbc", says_fd) for one in parsed.messages]
+
+
+def _spelled(messages: list[CanMessage]) -> list[str]:
+    """With types, since 1 and 1.0 decode to other columns; sets have no order."""
+    return [
+        repr(replace(m, signals=()))
+        + "".join(repr((replace(s, branches=frozenset()), sorted(s.branches))) for s in m.signals)
+        for m in messages
+    ]
+
+
+def _all_shared() -> list[Path]:
+    return sorted(shared().rglob("*.dbc"))
+
+
+def test_every_real_file_reads_as_cantools_reads_it() -> None:
+    files = _all_shared()
+
+    assert len(files) >= 11
+    for path in files:
+        source = read_text(path, DEFAULT)
+        quick = read_dbc(source.text)
+        assert quick is not None, path
+        assert _spelled(quick) == _spelled(_by_cantools(source)), path
+
+
+@given(message=st.one_of(messages(), messages(multiplexed=True)))
+@settings(max_examples=100, deadline=None)
+def test_every_layout_reads_as_cantools_reads_it(message: CanMessage) -> None:
+    source = DatabaseText(Path("x.dbc"), dbc_text([message]))
+
+    quick = read_dbc(source.text)
+
+    assert quick is not None
+    assert _spelled(quick) == _spelled(_by_cantools(source))
+
+
+def test_multiplexers_of_multiplexers_floats_and_can_fd_read_as_cantools_reads_them() -> None:
+    source = DatabaseText(Path("x.dbc"), EXTENDED)
+
+    quick = read_dbc(source.text)
+
+    assert quick is not None
+    assert _spelled(quick) == _spelled(_by_cantools(source))
+    wide, fd = quick
+    assert {s.name: (s.multiplexer, set(s.branches)) for s in wide.signals} == {
+        "kind": (None, set()),
+        "inner": ("kind", {1}),
+        "deep": ("inner", {3, 7, 8, 9}),
+        "whole": ("kind", {2}),
+        "other": (None, set()),
+    }
+    assert fd.is_fd
+    assert not wide.is_fd
+    assert fd.signals[0].is_float
+
+
+@pytest.mark.parametrize("text", [EXTENDED, "savvycan/bms.dbc", "savvycan/LeafPowertrainBus.dbc"])
+def test_no_damage_makes_the_two_readers_differ(text: str) -> None:
+    whole = text if "\n" in text else shared("can", *text.split("/")).read_text()
+    chance = random.Random(7)
+    compared = 0
+    for _ in range(150):
+        at, count = chance.randrange(len(whole)), chance.randrange(1, 9)
+        patch = chance.choice(["", whole[at : at + count] * 2, chance.choice(' ;:"|@M0-_\n\\')])
+        source = DatabaseText(Path("x.dbc"), whole[:at] + patch + whole[at + count :])
+        quick = read_dbc(source.text)
+        if quick is None:
+            continue
+        try:
+            theirs = _by_cantools(source)
+        except SchemaError:
+            continue  # a statement is broken that decoding has no use for
+        assert _spelled(quick) == _spelled(theirs), source.text
+        compared += 1
+    assert compared > 20
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("SG_ other :", "SG_ real : 0|8@1+ (1,0) [0|0] \"\" ECU\n SG_ real :"),
+        ("BO_ 100 Fd", "BO_ 2147484000 Fd"),
+        ("BO_ 100 Fd", "BO_ 4000 Fd"),
+        ("VAL_ 2147484000 other", "VAL_ 2147484000 nobody"),
+        ("SIG_VALTYPE_ 100 real", "SIG_VALTYPE_ 100 nobody"),
+        ("deep inner 3-3", "inner inner 3-3"),
+        ("0|32@1-", "0|0@1-"),
+        ("(2.0,1.0)", "(.5,1.0)"),
+        ("Fd: 64", "Fd: 064"),
+        ("\"VFrameFormat\" BO_ 100 2", "\"SystemMessageLongSymbol\" BO_ 100 \"Long\""),
+        ("\"VFrameFormat\" BO_ 100 2", "\"VFrameFormat\" BO_ 100 20"),
+        ("\nVAL_ 2147484000", "\nBOGUS_ 2147484000"),
+        ("7-9;\n", "7-9\n"),
+    ],
+)  # fmt: skip
+def test_what_is_unusual_is_left_to_cantools(old: str, new: str) -> None:
+    assert EXTENDED.count(old) == 1
+
+    assert read_dbc(EXTENDED.replace(old, new)) is None
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache of its own."""
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def _file(tmp_path: Path, text: str = EXTENDED, name: str = "x.dbc") -> Path:
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def _parses(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Fills up with the names of the files that are parsed from now on."""
+    parsed: list[str] = []
+    read = database._read_layout
+
+    def counted(source: DatabaseText, form: str) -> tuple[list[CanMessage], list[str]]:
+        parsed.append(source.path.name)
+        return read(source, form)
+
+    monkeypatch.setattr(database, "_read_layout", counted)
+    return parsed
+
+
+def _same(a: CanDatabase, b: CanDatabase) -> bool:
+    return _spelled(list(a.messages)) == _spelled(list(b.messages)) and a.notices == b.notices
+
+
+def test_a_second_start_parses_nothing(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [*_all_shared(), _file(tmp_path)]
+    parsed = _parses(monkeypatch)
+    first = [CanDatabase.load([path], keep_first=True) for path in files]
+    assert len(parsed) == len(files) == len(list(folder.iterdir()))
+
+    second = [CanDatabase.load([path], keep_first=True) for path in files]
+
+    assert len(parsed) == len(files)
+    assert all(_same(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_another_text_or_name_or_code_is_another_entry(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parsed = _parses(monkeypatch)
+    CanDatabase.load([_file(tmp_path)])
+    CanDatabase.load([_file(tmp_path, EXTENDED.replace("-40|100", "-40|101"))])
+    CanDatabase.load([_file(tmp_path, name="y.dbc")])
+    monkeypatch.setattr("crosscue.replay.can.layout_cache._made_by", lambda: "other code")
+    CanDatabase.load([_file(tmp_path)])
+
+    assert parsed == ["x.dbc", "x.dbc", "y.dbc", "x.dbc"]
+    assert len(list(folder.iterdir())) == 4
+
+
+def test_a_damaged_entry_is_parsed_again(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = _file(tmp_path)
+    whole = CanDatabase.load([path])
+    (entry,) = folder.iterdir()
+    stored = entry.read_bytes()
+    parsed = _parses(monkeypatch)
+    chance = random.Random(3)
+    copies = [b"", stored[:-1], stored[:20], b"null", b"\n{}"]
+    for _ in range(40):
+        at = chance.randrange(len(stored))
+        copies.append(
+            stored[:at] + bytes([stored[at] ^ 1 << chance.randrange(8)]) + stored[at + 1 :]
+        )
+    for copy in copies:
+        entry.write_bytes(copy)
+        assert _same(CanDatabase.load([path]), whole)
+        assert entry.read_bytes() == stored
+
+    assert len(parsed) == len(copies)
+
+
+@pytest.mark.parametrize("value", ["off", "", "/dev/null/nowhere", "/proc/nowhere"])
+def test_without_a_place_for_it_files_are_just_parsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: str
+) -> None:
+    monkeypatch.setenv(VARIABLE, value)
+    parsed = _parses(monkeypatch)
+    path = _file(tmp_path)
+
+    assert _same(CanDatabase.load([path]), CanDatabase.load([path]))
+    assert len(parsed) == 2
+
+
+def test_the_cache_lies_where_the_environment_says() -> None:
+    assert cache_folder({VARIABLE: "/a"}) == Path("/a")
+    assert cache_folder({VARIABLE: "off"}) is None
+    assert cache_folder({"XDG_CACHE_HOME": "/b"}) == Path("/b/crosscue/can_layouts")
+    home = Path.home() / ".cache/crosscue/can_layouts"
+    assert cache_folder({}) == home
+    assert cache_folder({"XDG_CACHE_HOME": "relative"}) == home
+
+
+_LOAD_OFTEN = """
+import sys
+from pathlib import Path
+from crosscue.replay.can.database import CanDatabase
+path, folder = sys.argv[1:]
+first = CanDatabase.load([path])
+for _ in range(20):
+    for entry in Path(folder).glob("*.json"):
+        entry.unlink(missing_ok=True)
+    assert CanDatabase.load([path]) == first
+"""
+
+
+def test_concurrent_starts_do_not_disturb_each_other(tmp_path: Path, folder: Path) -> None:
+    path = _file(tmp_path)
+    command = [sys.executable, "-c", _LOAD_OFTEN, str(path), str(folder)]
+    running = [subprocess.Popen(command) for _ in range(3)]
+
+    assert [one.wait(timeout=60) for one in running] == [0, 0, 0]
+    assert not list(folder.glob(".*"))
+
+
+def test_old_entries_leave(tmp_path: Path, folder: Path) -> None:
+    for k in range(70):
+        CanDatabase.load([_file(tmp_path, name=f"{k}.dbc")])
+
+    assert len(list(folder.iterdir())) == 64
