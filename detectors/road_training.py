@@ -25,6 +25,7 @@ from crosscue.replay.run_folder import write_bytes
 from crosscue.replay.tree_text import json_tree
 
 from .road_network import RoadNetwork, logits_of
+from .weights_file import serialised
 
 STATE_KEY: Final = "crosscue_road_training"
 EDGE_WEIGHT: Final = 6.0
@@ -114,16 +115,13 @@ class RoadTraining:
         Raises:
             OutputError: It cannot be written.
         """
-        from safetensors.torch import save
-
         tensors = {f"network.{k}": v.detach().cpu().contiguous().clone()
                    for k, v in self.network.state_dict().items()}  # fmt: skip
         for number, slot in self._optimizer.state_dict()["state"].items():
             for name, value in slot.items():
                 tensors[f"optimizer.{number}.{name}"] = value.detach().cpu().contiguous().clone()
         header = {STATE_KEY: json.dumps({"done": self.done, "seed": self.schedule.seed})}
-        content = save(tensors, header)
-        write_bytes(path, content)
+        write_bytes(path, serialised(tensors, header))
 
     def resume(self, path: Path) -> None:
         """Go on where ``save`` left off.

@@ -7,6 +7,7 @@ and weights, and lies in the file's own header; files that came with crosscue ar
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
@@ -42,7 +43,23 @@ def packed(tensors: Mapping[str, Tensor], key: str, description: str) -> bytes:
     from safetensors.torch import save
 
     whole = dict(tensors)
-    return save(whole, {key: description, SUM: _sum(description, save(whole))})
+    return serialised(whole, {key: description, SUM: _sum(description, save(whole))})
+
+
+def serialised(tensors: Mapping[str, Tensor], words: Mapping[str, str]) -> bytes:
+    """Tensors and words as a safetensors file; the same ones are the same bytes.
+
+    The library writes the words in an order that differs from process to process.
+    """
+    from safetensors.torch import save
+
+    content = save(dict(tensors), dict(words))
+    start = _start(content)
+    header = json.loads(content[8:start])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)
+    return b"".join((len(text).to_bytes(8, "little"), text, memoryview(content)[start:]))
 
 
 def unpacked(content: bytes, key: str, path: Path) -> tuple[str | None, dict[str, Tensor]]:

@@ -34,6 +34,7 @@ from .annotations import LabelledSet
 from .calibration import fitted, judged
 from .loop import Schedule, Training
 from .measure import rates_by_score, raw_detections
+from .reproducible import decides_bits, reproducible
 from .samples import Sampler, Window
 from .scores import average_precisions
 
@@ -112,6 +113,14 @@ def run_job(
         _check_place(job, overwrite)
     device = chosen_device(job.device, "train mask-rcnn")
     torch.set_num_threads(job.threads)
+    with reproducible(device):
+        return _run(job, train, held_out, device, resume=resume, tell=tell)
+
+
+def _run(
+    job: Job, train: LabelledSet, held_out: LabelledSet, device: torch.device, *, resume: bool,
+    tell: Callable[[Point], None],
+) -> Facts:  # fmt: skip
     training = Training(lambda: starting_network(job), job.schedule, device)
     points: list[Point] = []
     if resume and job.state_path.exists():
@@ -206,7 +215,7 @@ def finished_facts(job: Job, network: Any, held_out: LabelledSet, device: torch.
         measured |= told_rates(name, rows, by[name])
     recipe = {**job.recipe, "start": Path(job.start).name,
               **{f"schedule.{k}": v for k, v in asdict(job.schedule).items()},
-              "held_out_pictures": len(held_out.pictures)}  # fmt: skip
+              "held_out_pictures": len(held_out.pictures), **decides_bits(device)}  # fmt: skip
     return Facts(plan=job.plan, calibration=by, recipe=recipe, measured=measured)
 
 

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from crosscue.detectors.mask_rcnn_network import forward_training
+from crosscue.detectors.weights_file import serialised
 from crosscue.replay.errors import CrosscueError, SchemaError, one_line
 from crosscue.replay.run_folder import write_bytes
 from crosscue.replay.tree_text import json_tree
@@ -164,8 +165,6 @@ class Training:
         Raises:
             OutputError: It cannot be written.
         """
-        from safetensors.torch import save
-
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         tensors |= {f"averaged.{k}": v for k, v in self.averaged.state_dict().items()}
         for i, state in self._optimizer.state_dict()["state"].items():
@@ -176,8 +175,7 @@ class Training:
             )
         }
         plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-        content = save(plain, header)
-        write_bytes(path, content)
+        write_bytes(path, serialised(plain, header))
 
     def resume(self, path: Path) -> Mapping[str, Any]:
         """Go on where ``save`` was called; gives the words kept then.

@@ -77,6 +77,7 @@ def run(args: argparse.Namespace) -> int:
     from crosscue.detectors.devices import chosen_device
     from crosscue.detectors.road_checkpoint import RoadFacts, load_road, save_road
     from crosscue.detectors.road_training import RoadSchedule, RoadTraining
+    from crosscue.detectors.training.reproducible import decides_bits, reproducible
 
     if args.threads:
         torch.set_num_threads(args.threads)
@@ -84,15 +85,18 @@ def run(args: argparse.Namespace) -> int:
     size = _size(args)
     learn, held = _frames(args)
     schedule = RoadSchedule(args.steps, args.batch, seed=args.seed)
-    training = RoadTraining(schedule, chosen_device(args.device, "train road"))
-    if args.start is not None:
-        training.network.load_state_dict(load_road(args.start).network.state_dict())
-    loss = _trained(training, learn, args)
+    device = chosen_device(args.device, "train road")
+    with reproducible(device):
+        training = RoadTraining(schedule, device)
+        if args.start is not None:
+            training.network.load_state_dict(load_road(args.start).network.state_dict())
+        loss = _trained(training, learn, args)
     recipe: dict[str, str | int | float] = {
         "layouts": " ".join(args.layouts or []), "pictures": len(learn), "steps": args.steps,
         "stopped_at": training.done, "batch": args.batch, "seed": args.seed, "loss": round(loss, 5),
         **_measured(training.network, training.device, "held_out", held),
         **_measured(training.network, training.device, "scored", _scored(args, size)),
+        **decides_bits(device),
     }  # fmt: skip
     facts = RoadFacts(width_px=size[0], height_px=size[1], recipe=recipe)
     save_road(args.output, training.network, facts)
