@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from crosscue.replay.clocks import Clock
 from crosscue.replay.ledger import Ledger, TopicAccount
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.remote import RemoteLog
+from crosscue.replay.remote import RangedLog, RemoteLog
 from crosscue.replay.run_folder import RunFolder, TableSink, sha256_of
 from crosscue.replay.signals import Extractor
 
@@ -127,7 +127,7 @@ def _log_row(log: Log) -> dict[str, object]:
     row: dict[str, object] = {
         "path": str(log.path), "format": log.format, "sha256": sha256_of(log.path),
     }  # fmt: skip
-    return row | {"url": log.url} if isinstance(log, RemoteLog) else row
+    return row | {"url": log.url} if isinstance(log, RemoteLog | RangedLog) else row
 
 
 def write_skipped(run: RunFolder, ledgers: Sequence[Ledger], kept: pa.Table | None = None) -> None:

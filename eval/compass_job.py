@@ -12,6 +12,7 @@ from crosscue.localization.compass_fit import CompassFit, fit_compass
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.remote import name_of
 from crosscue.replay.signals import Extractor, Samples, Signal, plan
 from crosscue.replay.vehicle import Vehicle
 from crosscue.replay.windows import windows
@@ -33,7 +34,7 @@ def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassF
     wanted = {source.topic.name for source in (magnetometer, course) if source is not None}
     narrowed = Selection(frozenset(wanted), selection.start_ns, selection.end_ns)
     extractors = [
-        Extractor(planned, vehicle, i, Ledger(str(log.path))) for i, log in enumerate(logs)
+        Extractor(planned, vehicle, i, Ledger(name_of(log))) for i, log in enumerate(logs)
     ]
     found: dict[Signal, list[Samples]] = {Signal.MAGNETIC_FIELD: [], Signal.COURSE: []}
     for window in windows(logs, extractors, [narrowed] * len(logs), planned):

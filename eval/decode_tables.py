@@ -20,6 +20,7 @@ from crosscue.replay.mobileye.admit import all_ids
 from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.ros import RosMobileye
 from crosscue.replay.mobileye.samples import settings_of
+from crosscue.replay.remote import name_of
 from crosscue.replay.roles import Role, role_of
 from crosscue.replay.run_folder import RunFolder, TableSink, clear, locked, write_manifest
 from crosscue.replay.vehicle import Vehicle
@@ -87,7 +88,7 @@ def decode_tables(
         SchemaError: A DBC file cannot be read.
         OutputError: The disk is full.
     """
-    ledgers = tuple(Ledger(str(log.path)) for log in logs)
+    ledgers = tuple(Ledger(name_of(log)) for log in logs)
     tables: dict[str, _Table] = {}
     with locked(run):
         clear(run)

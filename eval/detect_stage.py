@@ -22,6 +22,7 @@ from crosscue.replay.columns import Block
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.remote import name_of
 from crosscue.replay.run_folder import (
     RunFolder,
     TableSink,
@@ -147,7 +148,7 @@ def detect_into(
         raise VehicleError(f"{logs[0].path}: no camera in the logs; name its topic under [topics]")
     named = [Named(choice.name, make(choice)) for choice in choices]
     log, topic = logs[camera[0]], camera[1]
-    ledger = Ledger(str(log.path))
+    ledger = Ledger(name_of(log))
     planned = Plan((Source(camera[0], topic, ()),), {})
     narrowed = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
     probe = Extractor(planned, vehicle, camera[0], Ledger(""))

@@ -24,6 +24,7 @@ from crosscue.replay.columns import Block, CanFrames, Messages, Topic
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Detail, Ledger, TopicAccount
 from crosscue.replay.log import Log
+from crosscue.replay.remote import name_of
 from crosscue.replay.roles import Role, role_of
 from crosscue.replay.sealed_log import sealed_sentence
 
@@ -170,7 +171,7 @@ Progress = Callable[[Iterable[Block], Callable[[], float]], Iterable[Block]]
 
 def quick_summary(log: Log) -> LogSummary:
     """What a log says of itself; its body is not read."""
-    ledger = Ledger(str(log.path))
+    ledger = Ledger(name_of(log))
     for topic in log.topics:
         ledger.declare(topic.name, topic.declared)
     return _summary(log, ledger, ClockWatch(), {}, is_quick=True)
@@ -178,7 +179,7 @@ def quick_summary(log: Log) -> LogSummary:
 
 def summarise(log: Log, progress: Progress | None = None) -> LogSummary:
     """Read a whole log once, in bounded memory, and say what is in it."""
-    ledger, clocks, can_ids = Ledger(str(log.path)), ClockWatch(), dict[str, _CanIds]()
+    ledger, clocks, can_ids = Ledger(name_of(log)), ClockWatch(), dict[str, _CanIds]()
     blocks: Iterable[Block] = log.read(ledger)
     if progress is not None:
         blocks = progress(blocks, lambda: _share_done(log, ledger))

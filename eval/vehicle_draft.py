@@ -15,6 +15,7 @@ from crosscue.replay.columns import CanFrames
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.remote import name_of
 from crosscue.replay.roles import Role, role_of
 from crosscue.replay.signals import ANGLE_UNITS, SPEED_UNITS
 
@@ -116,7 +117,7 @@ def _buses(logs: Sequence[Log], database: CanDatabase | None) -> list[Bus]:
 
 def _ids(log: Log, name: str) -> Iterator[tuple[int, bool]]:
     """Identifiers among a bus's first frames."""
-    ledger, seen = Ledger(str(log.path)), 0
+    ledger, seen = Ledger(name_of(log)), 0
     topic = next(topic for topic in log.topics if topic.name == name)
     decode = decoder_for(topic) if topic.encoding != "columns" else None
     for block in log.read(ledger, Selection(frozenset({name}))):

@@ -160,7 +160,7 @@ FORMATS: Final[dict[str, Format]] = {
 def open_log(path: Path | str, limits: Limits = DEFAULT) -> Log:
     """Open any recording by its suffix or, for a folder, by what lies in it.
 
-    A text with ``://`` is a URL: it is fetched first, see ``remote``. Of a log with a seal beside
+    A text with ``://`` is a URL: see ``remote``. Of a log with a seal beside
     it, what is read is held against the seal, see ``sealed_log``.
 
     Raises:
@@ -171,7 +171,7 @@ def open_log(path: Path | str, limits: Limits = DEFAULT) -> Log:
     if isinstance(path, str) and "://" in path:
         from .remote import open_remote
 
-        return open_remote(path, lambda fetched: open_log(fetched, limits))
+        return open_remote(path, lambda fetched: open_log(fetched, limits), limits)
     from .sealed_log import with_seal
 
     place = Path(path)

@@ -1,10 +1,11 @@
-"""Logs on object stores: fetched whole into a bounded store on this machine.
+"""Logs on object stores: a part is read by ranges, a whole is fetched into a bounded store.
 
-A log is read to its end at least once (checksums and accounts need every byte), often twice, and
-some readers need a real file (SQLite, memory maps), so one download beats many ranged reads. What
-was fetched is kept under a name made of its address and version, so a changed object is fetched
-again; the least recently used go when the store grows over its limit, never one that is open.
-Protocols and credentials are fsspec's.
+Of an MCAP file or ROS 1 bag whose index leads to the part asked for, only the index and that part
+are fetched (``RangedLog``). A log that is read to its end is often read twice, and some readers
+need a real file (SQLite, videos), so one download beats many ranged reads there. What was fetched
+is kept under a name made of its address and version, so a changed object is fetched again; the
+least recently used go when the store grows over its limit, never one that is open. Protocols and
+credentials are fsspec's.
 """
 
 from __future__ import annotations
@@ -26,15 +27,17 @@ from .closing import Closing
 from .columns import Block, Topic
 from .errors import CrosscueError, LogError, LogTooLargeError, OutputError, UsageError, one_line
 from .ledger import Ledger
-from .log import EVERYTHING, Log, Selection
+from .limits import Limits
+from .log import EVERYTHING, FORMATS, Log, Selection
 from .partial_file import is_still
+from .remote_ranges import RangedFile
 from .run_folder import cannot_write
 
 URL: Final = re.compile(r"^[a-z][a-z0-9+.-]+://")
 CHUNK_BYTES: Final = 8 << 20
 VERSION_KEYS: Final = (
-    "ETag", "etag", "version_id", "generation", "md5Hash", "LastModified", "last_modified",
-    "mtime", "updated", "created",
+    "ETag", "etag", "version_id", "generation", "md5Hash", "LastModified", "Last-Modified",
+    "last_modified", "mtime", "updated", "created",
 )  # fmt: skip
 """What stores call the version of an object; the first that is there is taken."""
 LOCK: Final = ".lock"
@@ -61,7 +64,7 @@ class _System(Protocol):
     def ls(self, path: str, *, detail: bool) -> list[dict[str, Any]]: ...
     def find(self, path: str, *, detail: bool) -> dict[str, dict[str, Any]]: ...
     def glob(self, path: str) -> list[str]: ...
-    def open(self, path: str, mode: str) -> BinaryIO: ...
+    def open(self, path: str, mode: str, **how: str) -> BinaryIO: ...
     def invalidate_cache(self) -> None: ...
 
 
@@ -113,6 +116,11 @@ class Fetched(Closing):
         """Take over the open and locked file ``hold``, if there is one."""
         self.path: Final = path
         self._hold: int | None = hold
+
+    @property
+    def is_in_place(self) -> bool:
+        """Is it a file of this machine, which did not have to be fetched?"""
+        return self._hold is None
 
     def close(self) -> None:
         """Let it go; it stays in the store until the room is needed."""
@@ -206,8 +214,11 @@ def matches(pattern: str) -> tuple[str, ...]:
 class RemoteLog:
     """A log that was fetched; closing it lets go of the fetched file."""
 
-    def __init__(self, url: str, log: Log, fetched: Fetched) -> None:
-        """Stand for ``log``."""
+    def __init__(
+        self, url: str, log: Log, fetched: Fetched, why: str = "its format needs a local file"
+    ) -> None:
+        """Stand for ``log``, which was fetched whole for a reason."""
+        self._why: Final = why
         self.url: Final = url
         self._log: Final = log
         self._fetched: Final = fetched
@@ -229,6 +240,8 @@ class RemoteLog:
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """As of the log."""
+        if not self._fetched.is_in_place:
+            ledger.notice(f"fetched whole: {self._why}")
         return self._log.read(ledger, selection)
 
     def close(self) -> None:
@@ -250,18 +263,162 @@ class RemoteLog:
         self.close()
 
 
-def open_remote(url: str, opener: Callable[[Path], Log], store: Store | None = None) -> RemoteLog:
-    """Fetch a log and open it with ``opener``.
+class _Partial(Protocol):
+    """A log that can tell whether a part of it can be read alone."""
+
+    @property
+    def format(self) -> str: ...
+    @property
+    def topics(self) -> tuple[Topic, ...]: ...
+    @property
+    def beginning(self) -> Selection: ...
+    def needs_whole(self, selection: Selection) -> str: ...
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]: ...
+    def close(self) -> None: ...
+
+
+RANGED: Final = {
+    ".mcap": "crosscue.replay.readers.mcap:open_ranged",
+    ".bag": "crosscue.replay.readers.rosbag1:open_ranged",
+}
+"""Formats of which a part can be read by ranges."""
+
+
+class RangedLog:
+    """A remote log of which only what is asked for is fetched; all of it once all is asked for."""
+
+    def __init__(
+        self, url: str, log: _Partial, ranged: RangedFile, whole: Callable[[str], RemoteLog]
+    ) -> None:
+        """Stand for ``log``, read by ranges, or for what ``whole`` fetches."""
+        self.url: Final = url
+        self.ranged: Final = ranged
+        self._log: Final = log
+        self._fetch: Final = whole
+        self._whole: RemoteLog | None = None
+
+    @property
+    def path(self) -> Path:
+        """Where it lies on this machine: all of it is fetched for this."""
+        return self._fetched("its file was asked for").path
+
+    @property
+    def format(self) -> str:
+        """As of the log."""
+        return self._log.format
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """As of the log."""
+        return self._log.topics if self._whole is None else self._whole.topics
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """As of the log; the object must be the same at the end as when it was opened.
+
+        Raises:
+            LogError: It has changed meanwhile, or cannot be reached.
+        """
+        why = self._log.needs_whole(selection)
+        if why or self._whole is not None:
+            yield from self._fetched(why).read(ledger, selection)
+            return
+        before = self.ranged.transferred
+        yield from self._log.read(ledger, selection)
+        self.ranged.verify()
+        took = self.ranged.transferred - before
+        ledger.notice(f"{took} of {self.ranged.size} bytes were fetched")
+
+    def first_blocks(self, ledger: Ledger) -> Iterator[Block]:
+        """What the first chunk holds, for whoever looks at the beginning only."""
+        return self.read(ledger, self._log.beginning)
+
+    def close(self) -> None:
+        """Release the connection, and what was fetched."""
+        try:
+            self._log.close()
+            self.ranged.close()
+        finally:
+            if self._whole is not None:
+                self._whole.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _fetched(self, why: str) -> RemoteLog:
+        if self._whole is None:
+            self._whole = self._fetch(why)
+        return self._whole
+
+
+def name_of(log: Log) -> str:
+    """What a log is called in accounts: its URL, else its path."""
+    return log.url if isinstance(log, RemoteLog | RangedLog) else str(log.path)
+
+
+def open_remote(
+    url: str, opener: Callable[[Path], Log], limits: Limits, store: Store | None = None
+) -> RemoteLog | RangedLog:
+    """Open a log by ranges where its format and index allow it; else fetch it, then ``opener``.
 
     Raises:
         CrosscueError: As ``fetch`` and ``opener``.
     """
-    fetched = fetch(url, store)
+
+    def whole(why: str) -> RemoteLog:
+        fetched = fetch(url, store)
+        try:
+            return RemoteLog(url, opener(fetched.path), fetched, why)
+        except BaseException:
+            fetched.close()
+            raise
+
+    system, address = _opened(url)
+    suffix = PurePosixPath(address).suffix.lower()
+    if _is_local(system) or suffix not in RANGED:
+        return whole("its format is read from a local file")
+    ranged = _ranged(url, system, address)
+    if ranged is None:
+        return whole("its store gives no ranges")
+    module, _, function = RANGED[suffix].partition(":")
+    open_ranged = cast(
+        "Callable[[Path, RangedFile, Limits], _Partial | None]",
+        getattr(import_module(module), function),
+    )
     try:
-        return RemoteLog(url, opener(fetched.path), fetched)
+        log = open_ranged(Path(PurePosixPath(address).name), ranged, limits)
     except BaseException:
-        fetched.close()
+        ranged.close()
         raise
+    if log is None:
+        ranged.close()
+        return whole("it has no index that can be used")
+    return RangedLog(url, log, ranged, whole)
+
+
+def _ranged(url: str, system: _System, address: str) -> RangedFile | None:
+    """The object by ranges; None if it is no single object of known size."""
+    info = _guarded(url, lambda: system.info(address))
+    if info.get("type") == "directory" or not info.get("size") or info.get("partial") is False:
+        return None
+    name = PurePosixPath(address.rstrip("/")).name
+    told = _object(name, info)
+
+    def changed() -> bool:
+        system.invalidate_cache()
+        return _object(name, system.info(address)) != told
+
+    def opened() -> BinaryIO:
+        return system.open(address, "rb", cache_type="none")
+
+    return RangedFile(url, told.size, opened, changed)
 
 
 def _opened(url: str) -> tuple[_System, str]:
@@ -301,16 +458,35 @@ def _objects(system: _System, address: str) -> list[_Object]:
     """All objects of a log: of a folder all below it, of a file those that share its stem."""
     address = address.rstrip("/")
     name = PurePosixPath(address).name
-    if system.isdir(address):
+    if _is_folder(system, address):
         found = system.find(address, detail=True).values()
         start = len(address) + 1
         named = [(f"{name}/{str(info['name'])[start:]}", info) for info in found]
     else:
-        system.info(address)
-        around = system.ls(address[: len(address) - len(name)] or address, detail=True)
+        alone = system.info(address)
+        try:
+            around = system.ls(address[: len(address) - len(name)] or address, detail=True)
+        except (OSError, ValueError):  # a plain web server need not list anything
+            around = [alone | {"name": address}]
+        around = [one for one in around if _belongs(PurePosixPath(str(one["name"])).name, name)]
+        # A web server's list says no sizes.
+        around = [
+            one if one.get("size") is not None else system.info(str(one["name"])) for one in around
+        ] or [alone | {"name": address}]
         named = [(PurePosixPath(str(info["name"])).name, info) for info in around]
         named = [(other, info) for other, info in named if _belongs(other, name)]
     return sorted((_object(other, info) for other, info in named), key=lambda one: one.name)
+
+
+def _is_folder(system: _System, address: str) -> bool:
+    """Is it a folder? To a web server every address is both, and asking costs the whole file."""
+    suffix = PurePosixPath(address).suffix.lower()
+    if any(suffix in known.suffixes for known in FORMATS.values()):
+        try:
+            return system.info(address).get("type") == "directory"
+        except FileNotFoundError:
+            return system.isdir(address)
+    return system.isdir(address)
 
 
 def _belongs(other: str, name: str) -> bool:

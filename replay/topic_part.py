@@ -12,6 +12,7 @@ from .decode import decoder_for
 from .errors import UsageError
 from .ledger import Ledger
 from .log import Log, Selection
+from .remote import name_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,8 +51,8 @@ def read_topic(
     topic = next((one for one in log.topics if one.name == name), None)
     if topic is None:
         known = ", ".join(one.name for one in log.topics)
-        raise UsageError(f"{log.path}: no topic {name!r}; there are: {known}")
-    ledger, decode = Ledger(str(log.path)), decoder_for(topic)
+        raise UsageError(f"{name_of(log)}: no topic {name!r}; there are: {known}")
+    ledger, decode = Ledger(name_of(log)), decoder_for(topic)
     blocks = log.read(ledger, Selection(frozenset({name}), start_ns, end_ns))
     if decode is None:
         return TopicPart(topic, tuple(blocks), ledger)

@@ -13,6 +13,7 @@ from typing import TypeVar
 from crosscue.replay.errors import UsageError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.remote import RangedLog, name_of
 from crosscue.replay.run_folder import strict_json
 
 T = TypeVar("T")
@@ -99,7 +100,8 @@ def first_ns(logs: Sequence[Log]) -> int:
     """
     starts: list[int] = []
     for log in logs:
-        for block in log.read(Ledger(str(log.path))):
+        blocks = log.first_blocks if isinstance(log, RangedLog) else log.read
+        for block in blocks(Ledger(name_of(log))):
             if len(block):
                 starts.append(int(block.log_ns.min()))
                 break

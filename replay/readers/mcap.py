@@ -15,24 +15,36 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 from crosscue.replay.closing import Closing
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.remote_ranges import RangedFile
 
-from .mcap_bytes import ByteFile
+from .mcap_bytes import ByteFile, RangedByteFile
 from .mcap_pass import read_segments
-from .mcap_segments import Segment, find_segments
+from .mcap_segments import Segment, find_segments, has_whole_summary
 from .mcap_topics import TopicBook
+from .mcap_window import find_window
+
+HEADER_GUESS: Final = 64
+SUMMARY_GUESS: Final = 64 << 10
+"""Bytes at the end of a remote file that are fetched at once."""
 
 
 class McapLog(Closing):
     """An open MCAP file; see ``crosscue.replay.log.Log``."""
 
-    def __init__(self, path: Path, limits: Limits) -> None:
+    def __init__(self, path: Path, limits: Limits, file: ByteFile | None = None) -> None:
         """Find the topics.
+
+        Args:
+            path: Where it lies.
+            limits: Sizes above which nothing is read.
+            file: Its bytes, if they do not come from ``path``.
 
         Raises:
             LogFormatError: Not MCAP, or no readable record in it.
@@ -41,7 +53,7 @@ class McapLog(Closing):
         self._path = path
         self._limits = limits
         self._book = TopicBook(limits)
-        self._file = ByteFile(path)
+        self._file = ByteFile(path) if file is None else file
         try:
             self._segments = find_segments(self._file, path, self._book, limits)
         except BaseException:
@@ -75,6 +87,24 @@ class McapLog(Closing):
             self._file, self._segments, self._book, self._limits, ledger, selection
         )
 
+    @property
+    def beginning(self) -> Selection:
+        """The times of the first chunk."""
+        summary = self._segments[0].summary
+        if summary is None or not len(summary.chunks):
+            return EVERYTHING
+        return Selection(None, int(summary.chunks.start[0]), int(summary.chunks.end[0]) + 1)
+
+    def needs_whole(self, selection: Selection) -> str:
+        """Why reading this part takes all bytes of the file; empty if the index leads to it."""
+        segment = self._segments[0]
+        if selection == EVERYTHING:
+            return "all of it was asked for"
+        if len(self._segments) > 1 or not segment.has_end:
+            return "it has no summary that can be used"
+        found = find_window(segment, segment.declarations(self._book), selection)
+        return found if isinstance(found, str) else ""
+
     def close(self) -> None:
         """Release the file."""
         self._file.close()
@@ -100,3 +130,17 @@ def open_mcap(path: Path, limits: Limits) -> McapLog:
         OSError: It cannot be opened.
     """
     return McapLog(path, limits)
+
+
+def open_ranged(name: Path, ranged: RangedFile, limits: Limits) -> McapLog | None:
+    """Open a remote MCAP file by its summary; None if its summary is not enough to know it.
+
+    Args:
+        name: What it is called.
+        ranged: Its bytes.
+        limits: Sizes above which nothing is read.
+    """
+    file = RangedByteFile(ranged)
+    file.window(0, HEADER_GUESS)
+    file.window(max(0, file.size - SUMMARY_GUESS), SUMMARY_GUESS)
+    return McapLog(name, limits, file) if has_whole_summary(file, limits) else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from sys import getrefcount
 from threading import Event, Lock
@@ -12,6 +13,7 @@ import numpy as np
 
 from crosscue.replay.checksum import crc32
 from crosscue.replay.columns import Bytes
+from crosscue.replay.remote_ranges import RangedFile
 
 from .mcap_records import BrokenRecordError
 
@@ -120,6 +122,9 @@ class ByteFile:
             value, at = crc32(piece, value), at + len(piece)
         return value
 
+    def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
+        """These ranges, sorted, are going to be read: nothing to do for a file on a disk."""
+
     def close(self) -> None:
         """Release the file; later reads raise ValueError."""
         self._file.close()
@@ -131,3 +136,33 @@ class ByteFile:
             return os.pread(self._file.fileno(), size, at)
         except OSError as error:
             raise BrokenRecordError(f"the disk says: {error.strerror}") from None
+
+
+class RangedByteFile(ByteFile):
+    """The same of a remote object, of which only what is read is fetched."""
+
+    def __init__(self, ranged: RangedFile) -> None:
+        self._ranged = ranged
+        self.size = ranged.size
+        self.buffers = Buffers()
+
+    def window(self, at: int, least: int) -> memoryview:
+        """What is at hand from ``at`` on: at least ``least`` bytes, less only at the end."""
+        return self._ranged.at_least(at, least)
+
+    def read_into(self, at: int, array: Bytes) -> Bytes:
+        """The bytes at ``at``, written into ``array``; fewer than it has at the end."""
+        found = self._ranged.at_least(at, len(array))[: len(array)]
+        array[: len(found)] = np.frombuffer(found, dtype=np.uint8)
+        return array[: len(found)]
+
+    def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
+        """These ranges, sorted, are going to be read, and may be fetched in larger pieces."""
+        self._ranged.expect(ranges)
+
+    def close(self) -> None:
+        """Release the connection."""
+        self._ranged.close()
+
+    def _pread(self, at: int, size: int) -> bytes:
+        return bytes(self._ranged.at_least(at, size)[:size])

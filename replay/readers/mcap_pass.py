@@ -164,6 +164,7 @@ class SegmentPass:
             self._checks.sections_unread += 1
             self._segment = replace(self._segment, data_crc=0)
         self._inside = window
+        self._file.expect(window.ranges())
         yield from self._walked(window.items(self._file, self._limits, self._scanner))
         self._inside = None
         held = self._giver.met + self._giver.dropped

@@ -166,6 +166,12 @@ def find_segments(
     return segments
 
 
+def has_whole_summary(file: ByteFile, limits: Limits) -> bool:
+    """Does the file end in a summary that names every channel there is?"""
+    segment = _by_footer(file, limits) if file.size else None
+    return segment is not None and segment.summary is not None and segment.summary.names_all
+
+
 def _by_footer(file: ByteFile, limits: Limits) -> Segment | None:
     """The only segment, if the footer and the summary before it are as they should be."""
     footer_at = file.size - FOOTER_SIZE - len(MAGIC)

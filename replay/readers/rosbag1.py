@@ -17,17 +17,24 @@ from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.remote_ranges import RangedFile
 
 from .rosbag1_index import Contents, read_index, walk
 from .rosbag1_pass import Pass, Roster
-from .rosbag1_records import BAG_HEADER, MAGIC, BagFile, Record
+from .rosbag1_records import BAG_HEADER, MAGIC, BagFile, RangedBagFile, Record
+from .rosbag1_window import find_bag_window
 
 
 class BagLog(Closing):
     """An open ROS 1 bag; see ``crosscue.replay.log.Log``."""
 
-    def __init__(self, path: Path, limits: Limits) -> None:
+    def __init__(self, path: Path, limits: Limits, file: BagFile | None = None) -> None:
         """Open the bag and learn its topics.
+
+        Args:
+            path: Where it lies.
+            limits: Sizes above which nothing is read.
+            file: Its bytes, if they do not come from ``path``.
 
         Raises:
             LogFormatError: No ROS 1 bag of format 2.0, or encrypted, or nothing readable in it.
@@ -37,9 +44,9 @@ class BagLog(Closing):
         self._limits = limits
         self._notices: list[str] = []
         self._losses: list[tuple[str, str]] = []
-        self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC) if file is None else -1
         try:
-            self._file = BagFile(self._fd, os.fstat(self._fd).st_size)
+            self._file = file or BagFile(self._fd, os.fstat(self._fd).st_size)
             self._first, header = self._bag_header()
             self._contents = self._learn(header)
         except BaseException:
@@ -79,6 +86,21 @@ class BagLog(Closing):
             self._chunk_count,
         )
         yield from one.blocks(self._index_at)
+
+    @property
+    def beginning(self) -> Selection:
+        """The times of the first chunk."""
+        first = self._contents.infos.get(min(self._contents.infos, default=-1))
+        return EVERYTHING if first is None else Selection(None, first.start_ns, first.end_ns + 1)
+
+    def needs_whole(self, selection: Selection) -> str:
+        """Why reading this part takes all bytes of the file; empty if the index leads to it."""
+        if selection == EVERYTHING:
+            return "all of it was asked for"
+        found = find_bag_window(
+            self._contents, self._first, self._index_at, self._chunk_count, selection
+        )
+        return found if isinstance(found, str) else ""
 
     def close(self) -> None:
         """Release the file."""
@@ -159,3 +181,21 @@ def open_bag(path: Path, limits: Limits = DEFAULT) -> BagLog:
         OSError: It cannot be opened.
     """
     return BagLog(path, limits)
+
+
+def open_ranged(name: Path, ranged: RangedFile, limits: Limits) -> BagLog | None:
+    """Open a remote bag by its index section; None if it has none that can be used.
+
+    Args:
+        name: What it is called.
+        ranged: Its bytes.
+        limits: Sizes above which nothing is read.
+    """
+    file = RangedBagFile(-1, ranged.size, ranged)
+    header = file.whole_record(len(MAGIC))
+    index_at = header.u64(b"index_pos") if header is not None and header.op == BAG_HEADER else 0
+    if not 0 < index_at < file.size:
+        return None
+    file.expect([(index_at, file.size)])
+    contents = read_index(file, index_at, limits.schema_bytes)
+    return BagLog(name, limits, file) if contents is not None and contents.connections else None

@@ -231,6 +231,7 @@ class Pass:
     def _windowed(self, window: BagWindow, index_at: int) -> Iterator[Block]:
         """Blocks of the chunks that the index names; the others are looked at if it is wrong."""
         self._inside = window
+        self._file.expect(window.ranges())
         yield from self._taken(window.units(self._file, self._limits), index_at)
         self._inside = None
         if self._doubt:

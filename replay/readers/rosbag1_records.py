@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Int64s
+from crosscue.replay.remote_ranges import RangedFile
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 MESSAGE: Final = 2
@@ -153,6 +155,9 @@ class BagFile:
             start += len(part)
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
+    def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
+        """These ranges, sorted, are going to be read: nothing to do for a file on a disk."""
+
     def record(self, at: int) -> Record | None:
         """The record at byte ``at``; None if there is none or it does not fit into the file."""
         look = self.bytes_at(at, at + _FIRST_LOOK)
@@ -166,6 +171,22 @@ class BagFile:
         """The record at byte ``at`` if all of its body is in the file."""
         record = self.record(at)
         return record if record is not None and record.end <= self.size else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangedBagFile(BagFile):
+    """The same of a remote object, of which only what is read is fetched."""
+
+    ranged: RangedFile
+
+    def bytes_at(self, start: int, stop: int) -> bytes:
+        """Bytes of the object from ``start`` to ``stop``, fewer at its end."""
+        size = max(0, stop - start)
+        return bytes(self.ranged.at_least(start, size)[:size])
+
+    def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
+        """These ranges, sorted, are going to be read, and may be fetched in larger pieces."""
+        self.ranged.expect(ranges)
 
 
 @dataclass(frozen=True, slots=True)

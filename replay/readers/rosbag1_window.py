@@ -27,16 +27,23 @@ class BagWindow:
         infos: All chunks, in the order of the file.
         is_read: For each, whether it may hold messages of that span.
         index_at: Where the chunks end.
+        is_asked: For each, whether the index says so; the others that are read are neighbors.
     """
 
     infos: tuple[ChunkInfo, ...]
     is_read: tuple[bool, ...]
     index_at: int
+    is_asked: tuple[bool, ...]
 
     @property
     def left(self) -> tuple[ChunkInfo, ...]:
         """The chunks that are not read."""
         return self._those(is_read=False)
+
+    def ranges(self) -> list[tuple[int, int]]:
+        """Where the chunks asked for and their index records are."""
+        edges = pairwise([*(info.at for info in self.infos), self.index_at])
+        return [edge for edge, asked in zip(edges, self.is_asked, strict=True) if asked]
 
     def units(
         self, file: BagFile, limits: Limits, *, is_read: bool = True
@@ -87,9 +94,10 @@ def find_bag_window(
         and (selection.end_ns is None or info.start_ns < selection.end_ns)
         for info in infos
     ]
+    is_asked = tuple(asked)
     if not any(asked):  # between two chunks, or beyond the bag's ends
         begins = selection.start_ns if selection.start_ns is not None else infos[0].start_ns
         place = sum(info.end_ns < begins for info in infos)
         asked[min(place, len(infos) - 1)] = True
     around = zip([False, *asked], asked, [*asked[1:], False], strict=False)
-    return BagWindow(infos, tuple(any(three) for three in around), index_at)
+    return BagWindow(infos, tuple(any(three) for three in around), index_at, is_asked)

@@ -1,0 +1,90 @@
+"""A plain web server on loopback that gives ranges of files, counts bytes and can misbehave."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+
+
+@dataclass(slots=True)
+class Served:
+    """What the server holds and has done.
+
+    Attributes:
+        base: Its URL.
+        files: Contents by name.
+        sent: Bytes of bodies sent.
+        gets: Ranges asked for, as in the requests.
+        failing: How many more GETs to cut off in the middle.
+    """
+
+    base: str = ""
+    files: dict[str, bytes] = field(default_factory=dict)
+    sent: int = 0
+    gets: list[str] = field(default_factory=list)
+    failing: int = 0
+
+
+@contextmanager
+def serving() -> Iterator[Served]:
+    """A server of ``Served.files`` as long as the ``with`` block lasts."""
+    served = Served()
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_HEAD(self) -> None:
+            self._answer(with_body=False)
+
+        def do_GET(self) -> None:
+            self._answer(with_body=True)
+
+        def log_message(self, *args: object) -> None:
+            """Nothing: the tests look at ``Served``."""
+
+        def _answer(self, *, with_body: bool) -> None:
+            content = served.files.get(self.path.lstrip("/"))
+            if content is None:
+                self.send_response(404)
+                self.send_header("Content-Length", "0")
+                self.end_headers()
+                return
+            asked = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
+            begin, end = (int(asked[1]), int(asked[2]) + 1) if asked else (0, len(content))
+            body = content[begin:end]
+            self.send_response(206 if asked else 200)
+            self.send_header("Accept-Ranges", "bytes")
+            self.send_header("Content-Length", str(len(body)))
+            self.send_header("Content-Type", "application/octet-stream")
+            self.send_header("ETag", f'"{hashlib.sha256(content).hexdigest()[:16]}"')
+            if asked:
+                whole = f"bytes {begin}-{begin + len(body) - 1}/{len(content)}"
+                self.send_header("Content-Range", whole)
+            self.end_headers()
+            if not with_body:
+                return
+            served.gets.append(self.headers.get("Range", "all"))
+            if served.failing:
+                served.failing -= 1
+                self.wfile.write(body[: len(body) // 2])
+                self.close_connection = True
+                return
+            self.wfile.write(body)
+            served.sent += len(body)
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    thread = Thread(target=server.serve_forever, args=(0.05,), daemon=True)
+    thread.start()
+    served.base = f"http://127.0.0.1:{server.server_address[1]}"
+    try:
+        yield served
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
