@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import platform
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,6 +19,8 @@ from crosscue.replay.signals import Extractor
 if TYPE_CHECKING:
     import pyarrow as pa
 
+UNATTRIBUTED: Final = ""
+"""The topic of what no topic can be named for."""
 PROBE_NS: Final = 10_000_000_000
 """Log time looked at before a clock is chosen for each topic."""
 
@@ -75,18 +79,9 @@ def skipped_schema() -> pa.Schema:
     )
 
 
-def skipped_rows(ledger: Ledger) -> dict[str, object]:
-    """Rows of ``skipped.parquet``: single skips and losses of one log."""
-    details = ledger.details
-    return {
-        "t_ns": [d.t_ns for d in details],
-        "topic": [d.topic for d in details],
-        "reason": [d.reason for d in details],
-        "detail": [d.detail for d in details],
-        "count": [d.count for d in details],
-        "is_dropped": [d.is_dropped for d in details],
-        "log": [ledger.log] * len(details),
-    }
+def _skipped_rows(ledger: Ledger) -> list[dict[str, Any]]:
+    """Single skips and drops of one log."""
+    return [asdict(detail) | {"log": ledger.log} for detail in ledger.details]
 
 
 def account_of(ledger: Ledger) -> dict[str, object]:
@@ -103,7 +98,7 @@ def account_of(ledger: Ledger) -> dict[str, object]:
 def _account(account: TopicAccount) -> dict[str, object]:
     return {
         "declared": account.declared,
-        "in_file": account.in_file,
+        "in": account.in_file,
         "found": account.found,
         "used": account.used,
         "skipped": dict(sorted(account.skipped.items())),
@@ -130,19 +125,58 @@ def _log_row(log: Log) -> dict[str, object]:
     return row | {"url": log.url} if isinstance(log, RemoteLog | RangedLog) else row
 
 
-def write_skipped(run: RunFolder, ledgers: Sequence[Ledger], kept: pa.Table | None = None) -> None:
-    """Write ``skipped.parquet``.
+def write_skipped(
+    run: RunFolder,
+    ledgers: Sequence[Ledger],
+    reading: Sequence[Mapping[str, Any]],
+    kept: pa.Table | None = None,
+) -> None:
+    """Write ``skipped.parquet``; its counts are those of the account, reason by reason.
 
     Args:
         run: The run.
         ledgers: Of all logs.
-        kept: Rows of an earlier stage that stay.
+        reading: The account's part on them, as it goes into the manifest.
+        kept: Rows of an earlier stage; those of topics that it alone has read stay.
     """
+    rows = [row for ledger in ledgers for row in _skipped_rows(ledger)]
+    earlier = [] if kept is None else kept.to_pylist()
     with TableSink(run, "skipped", skipped_schema()) as sink:
-        if kept is not None:
-            sink.write({name: kept[name] for name in kept.column_names})
-        for ledger in ledgers:
-            sink.write(skipped_rows(ledger))
+        for log in reading:
+            for topic, account in log["topics"].items():
+                # What both stages have met stands in either's rows, a camera's in the first's.
+                for rest in (rows, earlier) if topic == UNATTRIBUTED else (earlier, rows):
+                    mine = [r for r in rest if (r["log"], r["topic"]) == (log["log"], topic)]
+                    if mine:
+                        break
+                mine += _in_bulk(mine, log["log"], topic, account)
+                if mine:
+                    names = skipped_schema().names
+                    sink.write({name: [row[name] for row in mine] for name in names})
+
+
+def _in_bulk(
+    single: Sequence[Mapping[str, Any]], log: str, topic: str, account: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """A row for each reason of which the single rows tell less than the account."""
+    rows = []
+    for key, is_dropped in (("skipped", False), ("dropped", True)):
+        listed: Counter[str] = Counter()
+        for row in single:
+            if row["is_dropped"] is is_dropped:
+                listed[row["reason"]] += row["count"] or 0
+        counts: list[tuple[str, int | None]] = [
+            (why, n - listed[why]) for why, n in account[key].items() if n != listed[why]
+        ]
+        if is_dropped:
+            known = {row["reason"] for row in single if row["count"] is None}
+            counts += [(why, None) for why in account["dropped_unknown"] if why not in known]
+        rows += [
+            {"t_ns": None, "topic": topic, "reason": why, "detail": "not listed one by one",
+             "count": count, "is_dropped": is_dropped, "log": log}
+            for why, count in counts
+        ]  # fmt: skip
+    return rows
 
 
 def joined_accounts(
@@ -156,6 +190,8 @@ def joined_accounts(
         before = logs.get(account["log"])
         if before is not None and topic in before["topics"]:
             one["topics"] = {**account["topics"], topic: before["topics"][topic]}
+            if UNATTRIBUTED not in account["topics"] and UNATTRIBUTED in before["topics"]:
+                one["topics"][UNATTRIBUTED] = before["topics"][UNATTRIBUTED]
             one["is_whole"] = account["is_whole"] and before["is_whole"]
             one["notices"] = list(dict.fromkeys([*before["notices"], *account["notices"]]))
         joined.append(one)

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from crosscue.replay.run_folder import MANIFEST, RunFolder, open_run
 from crosscue.replay.tree_text import json_tree
 
 from .metric_values import MetricValue, metric_values
+from .run_account import is_whole
 from .score_run import FOLDER, METRICS
 
 if TYPE_CHECKING:
@@ -212,6 +213,14 @@ def open_scored(path: Path) -> RunFolder:
     return RunFolder(path) if _is_pooled(path) else open_run(path)
 
 
+def is_whole_run(run: RunFolder) -> bool:
+    """Was nothing dropped in the run, or in any of those that were scored together?"""
+    if not _is_pooled(run.path):
+        return is_whole(run.manifest())
+    account = _tree_of(run.file(METRICS)).get("account")
+    return isinstance(account, dict) and bool(account.get("is_whole"))
+
+
 def _is_pooled(path: Path) -> bool:
     return not (path / MANIFEST).exists() and (path / METRICS).exists()
 
@@ -236,19 +245,24 @@ def _leaves(value: object, path: str) -> Iterator[tuple[str, object]]:
 
 def _metrics_of(run: RunFolder) -> dict[str, MetricValue] | None:
     path = run.file(METRICS) if _is_pooled(run.path) else run.file(FOLDER) / METRICS
+    if not path.exists():
+        return None
+    left_out = ("truth", "settings", "format", "account")
+    judged = {name: branch for name, branch in _tree_of(path).items() if name not in left_out}
+    return metric_values(judged, parts=False)
+
+
+def _tree_of(path: Path) -> dict[str, Any]:
     try:
         content = read_at_most(path, MOST_BYTES)
         if content is None:
             raise RunError(f"{path}: over {MOST_BYTES // MIB} MiB; run crosscue score again")
         tree = json_tree(content)
-    except FileNotFoundError:
-        return None
     except (OSError, ValueError) as error:
         raise RunError(f"{path}: unreadable ({error}); run crosscue score again") from None
     if not isinstance(tree, dict):
         raise RunError(f"{path}: want an object; run crosscue score again")
-    judged = {name: tree[name] for name in tree if name not in ("truth", "settings", "format")}
-    return metric_values(judged, parts=False)
+    return tree
 
 
 def compare_metrics(

@@ -25,7 +25,8 @@ from crosscue.replay.roles import Role, role_of
 from crosscue.replay.run_folder import RunFolder, TableSink, clear, locked, write_manifest
 from crosscue.replay.vehicle import Vehicle
 
-from .accounts import account_of, versions
+from .accounts import versions
+from .run_account import Account, account, reading_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -72,7 +73,7 @@ class _Table:
 
 def decode_tables(
     logs: Sequence[Log], vehicle: Vehicle, run: RunFolder, selection: Selection
-) -> tuple[dict[str, int], tuple[Ledger, ...]]:
+) -> tuple[dict[str, int], Account]:
     """Write all streams of a drive as tables.
 
     Args:
@@ -82,7 +83,7 @@ def decode_tables(
         selection: What part.
 
     Returns:
-        Rows for each file written, and one account for each log.
+        Rows for each file written, and the account.
 
     Raises:
         SchemaError: A DBC file cannot be read.
@@ -102,15 +103,16 @@ def decode_tables(
             for table in tables.values():
                 table.write()
         rows = {f"{table.name}.parquet": table.rows for table in tables.values()}
+        made = account(reading_of(ledgers))
         content = {
             "versions": versions(),
             "tables": {topic: f"{table.name}.parquet" for topic, table in tables.items()},
             "rows": rows,
             "settings": vehicle.model_dump(mode="json"),
-            "accounts": [account_of(ledger) for ledger in ledgers],
+            "account": made,
         }
         write_manifest(run, content)
-    return rows, ledgers
+    return rows, made
 
 
 def _decoded(log: Log, vehicle: Vehicle, ledger: Ledger, selection: Selection) -> Iterator[Block]:
@@ -118,7 +120,7 @@ def _decoded(log: Log, vehicle: Vehicle, ledger: Ledger, selection: Selection) -
     mobileye = _ros_mobileye(log, vehicle, ledger)
     decoders: dict[str, Decoder | None] = {}
     buses: dict[str, tuple[list[_BlockDecoder], list[MobileyeDecoder]]] = {}
-    for block in log.read(ledger, selection):
+    for block in ledger.handing_on(log.read(ledger, selection)):
         topic = topics.get(block.topic) or _late_topic(log, block.topic)
         if isinstance(block.rows, Messages):
             if block.topic not in decoders:

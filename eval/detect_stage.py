@@ -34,7 +34,6 @@ from crosscue.replay.signals import Extractor, Plan, Source, camera_of
 from crosscue.replay.vehicle import Vehicle
 
 from .accounts import (
-    account_of,
     clock_rows,
     log_rows,
     probe_clocks,
@@ -43,6 +42,7 @@ from .accounts import (
     write_skipped,
 )
 from .detection_pictures import Drawer
+from .run_account import Account, account, detecting_of, reading_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -68,6 +68,7 @@ class DetectOutcome:
         cues: Frames in which each cue was positive.
         notices: Plain sentences.
         seconds: Wall time.
+        account: What became of every row and frame.
     """
 
     run: RunFolder
@@ -77,11 +78,12 @@ class DetectOutcome:
     cues: dict[str, int]
     notices: tuple[str, ...]
     seconds: float
+    account: Account
 
     @property
     def exit_status(self) -> int:
         """3 when anything was dropped, else 0."""
-        return 0 if self.ledger.is_whole else 3
+        return 0 if self.account["is_whole"] else 3
 
 
 def choices_of(vehicle: Vehicle) -> dict[str, Choice]:
@@ -158,7 +160,7 @@ def detect_into(
     with ResultCache(cache) as results:
         runner = Runner(
             named, results, topic.name, vehicle.camera.depth_bits,
-            lambda t_ns, reason, why: ledger.skip(topic.name, reason, 1, why, t_ns),
+            lambda t_ns, reason, why: ledger.spoil(topic.name, reason, 1, why, t_ns),
         )  # fmt: skip
         drawer = Drawer(run.path / "pictures", draw)
         tables = _Tables(run, topic.name, vehicle, named, drawer, CuePass(vehicle), is_sign)
@@ -171,12 +173,13 @@ def detect_into(
             extractor.on_pictures = lambda block: _through(
                 runner, block, tables, lambda: on_frames(runner.counts.frames, declared())
             )
-            for block in log.read(ledger, narrowed):
+            for block in ledger.handing_on(log.read(ledger, narrowed)):
                 for _ in extractor(block):
                     pass
             for _ in extractor.finish():
                 pass
-        write_skipped(run, [ledger])
+        made = account(reading_of([ledger]), detecting_of(topic.name, ledger, runner.counts.frames))
+        write_skipped(run, [ledger], made["reading"])
         seconds = time.monotonic() - began
         notices = tuple(tables.notices)
         write_manifest(run, {
@@ -192,7 +195,7 @@ def detect_into(
                 for one, choice in zip(named, choices, strict=True)
             ],
             "clocks": [clock_rows(extractor)],
-            "accounts": [account_of(ledger)],
+            "account": made,
             "counts": {
                 "frames": runner.counts.frames, "decoded": runner.counts.decoded,
                 "ran": runner.counts.ran, "from_cache": runner.counts.from_cache,
@@ -202,7 +205,7 @@ def detect_into(
             "timings": {"seconds": seconds},
         })  # fmt: skip
     return DetectOutcome(
-        run, ledger, runner.counts, tables.objects, tables.cue_frames, notices, seconds
+        run, ledger, runner.counts, tables.objects, tables.cue_frames, notices, seconds, made
     )
 
 

@@ -30,7 +30,7 @@ from crosscue.replay.windows import windows
 
 from . import measurements
 from .accounts import (
-    account_of,
+    UNATTRIBUTED,
     clock_changes,
     clock_rows,
     joined_accounts,
@@ -45,6 +45,7 @@ from .landmark_stage import looking
 from .mobileye_tables import MobileyeSink, StoredMobileye
 from .pose_stage import PoseStage, turn_signal_of
 from .pose_tables import PoseTally, pose_rows, pose_schema
+from .run_account import Account, account, estimating_of, reading_of
 from .scene_stage import SceneOutcome, estimate_scene, features_of, schemas
 
 if TYPE_CHECKING:
@@ -68,6 +69,7 @@ class Outcome:
         seconds: Wall time, detection included where it ran.
         drive_seconds: Log time from first to last pose row.
         landmark_counts: What became of camera frames; empty where no landmarks were given.
+        account: What became of every row, frame and reading.
         detected: What the detect stage did, where it ran just now.
         scene: Cues, ranges and beliefs, where detectors have run.
     """
@@ -81,14 +83,14 @@ class Outcome:
     seconds: float
     drive_seconds: float
     landmark_counts: dict[str, int]
+    account: Account
     detected: DetectOutcome | None = None
     scene: SceneOutcome | None = None
 
     @property
     def exit_status(self) -> int:
         """3 when anything was dropped, else 0."""
-        whole = all(ledger.is_whole for ledger in self.ledgers)
-        return 0 if whole and (self.detected is None or self.detected.ledger.is_whole) else 3
+        return 0 if self.account["is_whole"] else 3
 
 
 def detected_part(manifest: Mapping[str, Any]) -> Mapping[str, Any] | None:
@@ -140,7 +142,15 @@ def estimate_into(
         _begin_again(run, found)
     tally = _pose(reading, stage, run, on_time)
     scene = None if found is None else _scene(run, vehicle, found)
-    write_skipped(run, reading.ledgers, kept)
+    accounts = reading_of(reading.ledgers)
+    if found is not None:
+        accounts = joined_accounts(accounts, found["account"]["reading"], found["camera"])
+    frames = None if scene is None or found is None else (found["counts"]["frames"], scene.frames)
+    made = account(
+        accounts, {} if found is None else found["account"]["detecting"],
+        estimating_of(stage, frames),
+    )  # fmt: skip
+    write_skipped(run, reading.ledgers, made["reading"], kept)
     before = 0.0 if detected is None else detected.seconds
     seconds = time.monotonic() - began
     notices = (
@@ -153,9 +163,6 @@ def estimate_into(
         *stage.doubts(),
         *clock_changes(reading.extractors),
     )
-    accounts: list[dict[str, Any]] = [account_of(ledger) for ledger in reading.ledgers]
-    if found is not None:
-        accounts = joined_accounts(accounts, found["accounts"], found["camera"])
     write_manifest(run, {
         "stage": "estimate",
         "versions": versions(),
@@ -164,7 +171,7 @@ def estimate_into(
         "settings": vehicle.model_dump(mode="json"),
         "sources": _sources(reading.planned, logs),
         "clocks": [clock_rows(extractor) for extractor in reading.extractors],
-        "accounts": accounts,
+        "account": made,
         "counts": stage.counts(),
         "landmarks": None if landmarks is None else {
             "database": str(landmarks.path), "landmarks": len(landmarks),
@@ -181,7 +188,7 @@ def estimate_into(
     })  # fmt: skip
     return Outcome(
         run, reading.ledgers, tally.rows, tally.travelled_m, tally.major_axis_m, notices,
-        seconds + before, tally.seconds, stage.landmarks.counts(), detected, scene,
+        seconds + before, tally.seconds, stage.landmarks.counts(), made, detected, scene,
     )  # fmt: skip
 
 
@@ -283,7 +290,8 @@ def _camera_skips(run: RunFolder, camera: str) -> pa.Table:
     import pyarrow.compute as pc
 
     table = run.table("skipped")
-    return table.filter(pc.equal(table["topic"], camera))
+    ours = pc.or_(pc.equal(table["topic"], camera), pc.equal(table["topic"], UNATTRIBUTED))
+    return table.filter(ours)
 
 
 def _sources(planned: Plan, logs: Sequence[Log]) -> dict[str, str | None]:

@@ -162,7 +162,7 @@ class LandmarkStage:
         try:
             return self.search.matcher.describe(grey_of(frame.picture))
         except LogError as error:
-            self.ledger.skip(frame.topic, UNDECODABLE, 1, str(error), frame.t_ns)
+            self.ledger.spoil(frame.topic, UNDECODABLE, 1, str(error), frame.t_ns)
             return None
 
 

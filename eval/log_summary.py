@@ -180,13 +180,14 @@ def quick_summary(log: Log) -> LogSummary:
 def summarise(log: Log, progress: Progress | None = None) -> LogSummary:
     """Read a whole log once, in bounded memory, and say what is in it."""
     ledger, clocks, can_ids = Ledger(name_of(log)), ClockWatch(), dict[str, _CanIds]()
-    blocks: Iterable[Block] = log.read(ledger)
+    blocks: Iterable[Block] = ledger.handing_on(log.read(ledger))
     if progress is not None:
         blocks = progress(blocks, lambda: _share_done(log, ledger))
     for block in _decoded(log, blocks, ledger):
         clocks.see(block)
         if isinstance(block.rows, CanFrames):
             can_ids.setdefault(block.topic, _CanIds()).see(block.rows)
+    ledger.check()
     return _summary(log, ledger, clocks, can_ids, is_quick=False)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -23,6 +23,8 @@ from crosscue.replay.run_folder import (
     open_run,
     write_manifest,
 )
+
+from .run_account import is_whole, summed
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -149,7 +151,7 @@ def _manifest(
                 "name": one.name,
                 "run": str(one.run.path),
                 "logs": [log["path"] for log in one.manifest.get("logs", [])],
-                "is_whole": all(log["is_whole"] for log in one.manifest.get("accounts", [])),
+                "is_whole": is_whole(one.manifest),
                 "rows": one.rows,
                 "seconds": one.seconds,
                 "tables_sha256": _fingerprint(one),
@@ -157,7 +159,7 @@ def _manifest(
             for one in drives
         ],
         "failures": dict(sorted(failures.items())),
-        "accounts": _accounts(drives),
+        "account": summed(one.manifest["account"] for one in drives),
         "notices": dict(Counter(text for one in drives for text in _notices(one)).most_common()),
         "versions": _versions(drives),
         "timings": {
@@ -173,29 +175,6 @@ def _fingerprint(one: _Drive) -> str:
         with one.run.file(f"{kind}.parquet").open("rb") as file:
             digest.update(kind.encode() + b"\0" + hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
-
-
-def _accounts(drives: Sequence[_Drive]) -> dict[str, dict[str, Any]]:
-    """Every topic's account, added up over all logs of all drives."""
-    found: dict[str, dict[str, Any]] = {}
-    for topic, account in (pair for one in drives for pair in _topics(one)):
-        total = found.setdefault(
-            topic, {"logs": 0, "in_file": 0, "found": 0, "used": 0, "skipped": {}, "dropped": {},
-                    "logs_with_unknown_drops": 0},
-        )  # fmt: skip
-        total["logs"] += 1
-        total["logs_with_unknown_drops"] += bool(account["dropped_unknown"])
-        for key in ("in_file", "found", "used"):
-            total[key] += account[key] or 0
-        for key in ("skipped", "dropped"):
-            for reason, count in account[key].items():
-                total[key][reason] = total[key].get(reason, 0) + count
-    return found
-
-
-def _topics(one: _Drive) -> Iterator[tuple[str, dict[str, Any]]]:
-    for log in one.manifest.get("accounts", []):
-        yield from log["topics"].items()
 
 
 def _notices(one: _Drive) -> set[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Final
@@ -71,6 +72,9 @@ class PoseStage:
         odometry_counts: What became of wheel rows.
         track_counts: What became of headings and intervals.
         landmarks: What looks for landmarks meanwhile.
+        received: Samples that arrived, by signal.
+        started_with: Headings that the first belief was made of.
+        turn_early: Turn samples that came before the first wheel speeds.
     """
 
     vehicle: Vehicle
@@ -79,6 +83,9 @@ class PoseStage:
     notices: list[str] = field(default_factory=list)
     odometry_counts: odometry.OdometryCounts = field(default_factory=odometry.OdometryCounts)
     track_counts: TrackCounts = field(default_factory=TrackCounts)
+    received: Counter[Signal] = field(default_factory=Counter)
+    started_with: int = 0
+    turn_early: int = 0
     _pending: Pending = field(default_factory=Pending)
     _state: TrackState | None = None
     _last_ns: int | None = None
@@ -86,6 +93,7 @@ class PoseStage:
 
     def __call__(self, window: Window) -> Iterator[PoseColumns]:
         """Rows that this window completes."""
+        self.received.update({signal: len(of.t_ns) for signal, of in window.samples.items()})
         yield from self._advance(window, window.end_ns)
 
     def finish(self) -> Iterator[PoseColumns]:
@@ -121,12 +129,18 @@ class PoseStage:
             "landmarks": self.landmarks.counts(),
         }
 
+    @property
+    def waiting(self) -> int:
+        """Headings that wait for wheel speeds."""
+        return 0 if self._state is None else len(self._state.waiting)
+
     def _advance(self, window: Window, until_ns: int | None) -> Iterator[PoseColumns]:
         wheels = window.samples.get(Signal.WHEEL_SPEEDS)
         headings = self._headings(window)
         if self._state is None:
             if wheels is None:
                 self._missed(headings)
+                self.turn_early += 0 if (turn := self._turn(window)) is None else len(turn)
                 self.landmarks.let_go(window.end_ns)
                 return
             headings = self._start(int(wheels.t_ns[0]), headings)
@@ -164,6 +178,7 @@ class PoseStage:
                 f"start heading {np.rad2deg(heading_rad):.1f} deg from the first "
                 f"{len(headings)} compass readings"
             )
+            self.started_with = len(headings)
             headings = NO_HEADINGS
         elif heading_rad is None:
             heading_rad, sd_rad = 0.0, OWN_FRAME_SD_RAD

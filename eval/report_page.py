@@ -105,7 +105,7 @@ def _content(
     cues = [_cue(name, one) for name, one in metrics["cues"].items()]
     pose = metrics["pose"]
     is_alone = len(scored) == 1
-    accounts = [account for run in runs for account in run.manifest["accounts"]]
+    accounts = [account for run in runs for account in run.manifest["account"]["reading"]]
     return {
         "title": runs[0].name if is_alone else f"{len(runs)} drives",
         "runs": runs,

@@ -15,6 +15,7 @@ from crosscue.replay.errors import RunError, SchemaError, UsageError
 from crosscue.replay.run_folder import RunFolder, strict_json, write_text, write_whole
 
 from . import intervals, merge_runs, score_pose, score_truth
+from .run_account import Account, check, scoring_of, summed
 from .score_approaches import FEATURES
 from .score_drives import DEFAULTS, DriveJudged, Scores, ScoreSettings, as_metrics, judge, score
 from .score_pose import PoseScore
@@ -161,6 +162,7 @@ def metrics_of(scored: Sequence[RunScored], scores: Scores) -> dict[str, Any]:
     A single run's pose is given whole; of several, means over drives and each one by itself.
     """
     tree = as_metrics(scores)
+    tree["account"] = _account_of(scored)
     poses = {str(one.run.path): one.pose for one in scored if one.pose is not None}
     if not poses:
         tree["coverage"]["not_scored"]["pose"] = scored[0].why_no_pose
@@ -172,6 +174,16 @@ def metrics_of(scored: Sequence[RunScored], scores: Scores) -> dict[str, Any]:
         tree["coverage"]["same_log"] = same_logs(scored)
         tree["pose"] = _poses(poses)
     return tree
+
+
+def _account_of(scored: Sequence[RunScored]) -> Account:
+    """The account of one run, or of all added up, with the scoring as its last stage."""
+    if len(scored) == 1:
+        (only,) = scored
+        found: Account = only.run.manifest()["account"] | {"scoring": scoring_of(only)}
+        check(found)
+        return found
+    return summed(_account_of([one]) for one in scored)
 
 
 def same_logs(scored: Sequence[RunScored]) -> list[tuple[str, str]]:

@@ -10,6 +10,8 @@
     * VehicleError           the vehicle file is wrong or lacks a role
     * RunError               a run folder is missing, locked, damaged or of another version
     * OutputError            a result cannot be written (disk full, no permission)
+    * EmptyResultError       nothing of what was asked for is in the logs
+    * AccountError           rows in are not rows used, skipped and dropped: a bug of ours
 
 A wrong argument from the caller's own code stays a ``ValueError``.
 """
@@ -65,6 +67,14 @@ class RunError(CrosscueError):
 
 class OutputError(CrosscueError):
     """A result cannot be written."""
+
+
+class EmptyResultError(CrosscueError):
+    """Nothing of what was asked for is in the logs."""
+
+
+class AccountError(CrosscueError):
+    """An account does not add up, so no result can be relied on; always a bug of ours."""
 
 
 def one_line(error: BaseException, most: int | None = None) -> str:

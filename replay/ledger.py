@@ -15,15 +15,31 @@ the log is then not whole, and the summary says "at least".
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol, TypeVar
+
+from .errors import AccountError
 
 DETAILS_KEPT: Final = 1000
 """Single skips and losses kept with time and text; counts are exact beyond it."""
 
 NOT_ASKED_TIME: Final = "outside --from/--to"
 NOT_ASKED_TOPIC: Final = "topic not asked for"
+
+
+class RowsOfTopic(Protocol):
+    """What a reader hands on: rows of one topic."""
+
+    @property
+    def topic(self) -> str:
+        """Topic name."""
+        ...
+
+    def __len__(self) -> int: ...
+
+
+B = TypeVar("B", bound=RowsOfTopic)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +65,20 @@ class Detail:
 
 @dataclass(slots=True)
 class TopicAccount:
-    """Counts of one topic; see the module's text for the terms."""
+    """Counts of one topic; see the module's text for the terms.
+
+    Two counts are kept apart from the others, so that they can be held against them: the rows that
+    the reader really handed on (``Ledger.handing_on``), and those that were skipped or spoiled
+    after that.
+    """
 
     declared: int | None = None
     found: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
     dropped_unknown: list[str] = field(default_factory=list)
+    handed_on: int = 0
+    refused: int = 0
 
     @property
     def used(self) -> int:
@@ -90,6 +113,7 @@ class Ledger:
     accounts: dict[str, TopicAccount] = field(default_factory=dict)
     details: list[Detail] = field(default_factory=list)
     notices: list[str] = field(default_factory=list)
+    _is_reading: bool = True
 
     def topic(self, name: str) -> TopicAccount:
         """The account of ``name``, opened when first asked for."""
@@ -116,9 +140,14 @@ class Ledger:
             t_ns: Log time of the first one.
         """
         if count:
-            self.topic(topic).skipped[reason] += count
+            self.skip_more(topic, reason, count)
             if reason not in (NOT_ASKED_TIME, NOT_ASKED_TOPIC):
                 self._keep(Detail(topic, reason, detail, t_ns, count, is_dropped=False))
+
+    def skip_more(self, topic: str, reason: str, count: int) -> None:
+        """Count more rows skipped for a reason that has been told with its detail already."""
+        self.topic(topic).skipped[reason] += count
+        self._refuse(topic, count)
 
     def drop(
         self,
@@ -137,6 +166,54 @@ class Ledger:
         else:
             account.dropped[reason] += count
         self._keep(Detail(topic, reason, detail, t_ns, count, is_dropped=True))
+
+    def spoil(
+        self, topic: str, reason: str, count: int = 1, detail: str = "", t_ns: int | None = None
+    ) -> None:
+        """Of the rows found, ``count`` turn out to be damaged: they are dropped, not skipped."""
+        self.find(topic, -count)
+        self._refuse(topic, count)
+        self.drop(topic, reason, count, detail, t_ns)
+
+    def handing_on(self, blocks: Iterable[B]) -> Iterator[B]:
+        """A reader's blocks, their rows counted as they leave it, for ``check``."""
+        rest = iter(blocks)
+        while True:
+            self._is_reading = True
+            block = next(rest, None)
+            self._is_reading = False
+            if block is None:
+                return
+            self.topic(block.topic).handed_on += len(block)
+            yield block
+
+    def check(self, used: Mapping[str, int] | None = None) -> None:
+        """Hold the account against what was counted apart from it; at the end of a whole pass.
+
+        Args:
+            used: By topic, rows that whoever was handed them has used, by its own count.
+
+        Raises:
+            AccountError: Rows have come from nowhere or gone without a word.
+        """
+        for name, account in self.accounts.items():
+            left = account.handed_on - account.refused
+            if account.used != left or left < 0 or account.found < 0:
+                raise AccountError(
+                    f"{self.log}: {name or 'rows of unknown topics'}: {account.found} rows found, "
+                    f"{account.skipped.total()} skipped, {left} used: this does not add up; it is "
+                    "a bug in crosscue, please report it"
+                )
+        for name, count in (used or {}).items():
+            if self.topic(name).used != count:
+                raise AccountError(
+                    f"{self.log}: {name}: {self.topic(name).used} rows used by the account, "
+                    f"{count} by what used them; it is a bug in crosscue, please report it"
+                )
+
+    def _refuse(self, topic: str, count: int) -> None:
+        if not self._is_reading:
+            self.topic(topic).refused += count
 
     def notice(self, sentence: str) -> None:
         """Say something about the log once; a repeated sentence is kept once."""

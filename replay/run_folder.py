@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
-FORMAT_VERSION: Final = 1
+FORMAT_VERSION: Final = 2
 MAX_MANIFEST_BYTES: Final = 256 << 20
 GROUP_ROWS: Final = 8192
 """Rows of a table held back before they are written."""

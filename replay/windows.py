@@ -75,7 +75,8 @@ def windows(
         width_ns: Length of a window.
     """
     streams = [
-        log.read(e.ledger, s) for log, e, s in zip(logs, extractors, selections, strict=True)
+        e.ledger.handing_on(log.read(e.ledger, s))
+        for log, e, s in zip(logs, extractors, selections, strict=True)
     ]
     topics = [planned.topics_of(i) for i in range(len(logs))]
     progress = [_Progress() for _ in logs]

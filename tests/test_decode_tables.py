@@ -56,13 +56,14 @@ def test_what_is_not_understood_is_counted_not_dropped(tmp_path: Path) -> None:
     blocks = [block, wheel_block([3], [1.0]), *_mobileye_drive()]
     log = MemoryLog((odd, wheels, EYE), blocks, path=Path(__file__))
 
-    rows_of, (ledger,) = decode_tables(
+    rows_of, account = decode_tables(
         [log], Vehicle(version=1), create(tmp_path / "out", overwrite=False), EVERYTHING
     )
 
     assert rows_of == {"wheels.parquet": 1}
-    assert ledger.topic("odd").skipped == {"type not understood": 2}
-    assert ledger.topic("eye").used == 0
+    topics = account["reading"][0]["topics"]
+    assert topics["odd"]["skipped"] == {"type not understood": 2}
+    assert topics["eye"]["used"] == 0
 
 
 def test_two_topics_never_share_a_file_and_none_leaves_the_folder() -> None:

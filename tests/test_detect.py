@@ -141,13 +141,14 @@ def test_broken_empty_and_huge_pictures_are_skipped_and_told(tmp_path: Path) -> 
 
     status = run(["detect", str(log), "-o", str(out), "--detectors", BRIGHT, "--no-cache", "-q"])
 
-    assert status == 0
+    assert status == 3
     assert len(open_run(out).table("detections")) == 3
     reasons = open_run(out).table("skipped")["reason"].to_pylist()
     assert sorted(reasons) == ["empty file", "picture not decoded"]
-    account = open_run(out).manifest()["accounts"][0]["topics"]["cam"]
+    account = open_run(out).manifest()["account"]["reading"][0]["topics"]["cam"]
     assert account["used"] == 3
-    assert account["found"] == 5
+    assert account["in"] == 5
+    assert account["dropped"]["picture not decoded"] == 1
 
 
 def test_a_camera_that_changes_size_is_followed_and_told(tmp_path: Path) -> None:

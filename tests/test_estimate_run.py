@@ -87,12 +87,12 @@ def test_every_frame_has_every_cue_that_was_looked_for(drive: Path) -> None:
 def test_the_manifest_accounts_for_the_camera_and_the_rest(drive: Path) -> None:
     manifest = _manifest(drive / "run")
 
-    topics = manifest["accounts"][0]["topics"]
+    topics = manifest["account"]["reading"][0]["topics"]
     for account in topics.values():
         gone = sum(account["skipped"].values()) + sum(account["dropped"].values())
-        assert account["used"] + gone == account["in_file"] == account["declared"]
+        assert account["used"] + gone == account["in"] == account["declared"]
     camera = topics["/camera/image/compressed"]
-    assert camera["used"] == camera["in_file"] == manifest["scene"]["frames"]
+    assert camera["used"] == camera["in"] == manifest["scene"]["frames"]
     assert topics["/can/car"]["used"] > 0
     assert manifest["detect"]["camera"] == "/camera/image/compressed"
     assert manifest["scene"]["frames"] == manifest["detect"]["counts"]["frames"]

@@ -144,7 +144,7 @@ def test_rows_name_the_landmark_and_the_manifest_accounts_for_every_frame(
 
     assert len(named) == counts["accepted"]
     assert all(name.startswith("survey/") for name in named)
-    camera = manifest["accounts"][1]["topics"]["camera"]
+    camera = manifest["account"]["reading"][1]["topics"]["camera"]
     assert counts["frames"] == camera["used"] == len(list(town.camera.glob("*.png")))
     with LandmarkDatabase(town.database) as database:
         assert manifest["landmarks"]["landmarks"] == len(database)
@@ -324,7 +324,7 @@ def belief_at(t_ns: int) -> PoseBelief:
     return PoseBelief(t_ns, np.zeros(4), np.eye(4))
 
 
-def test_a_picture_that_does_not_decode_is_skipped_in_the_account(tmp_path: Path) -> None:
+def test_a_picture_that_does_not_decode_is_dropped_in_the_account(tmp_path: Path) -> None:
     ledger = Ledger("cam")
     stage = stage_at(database_of(tmp_path / "lm.sqlite", np.zeros((1, 2))), ledger)
     ledger.find("cam", 2)
@@ -333,7 +333,7 @@ def test_a_picture_that_does_not_decode_is_skipped_in_the_account(tmp_path: Path
     assert list(stage.times_ns()) == [0, 500_000_000]
     assert stage.weigh(belief_at(0), 0.0) is None
     assert stage.weigh(belief_at(500_000_000), 5.0) is None
-    assert ledger.accounts["cam"].skipped == {"picture does not decode": 1}
+    assert ledger.accounts["cam"].dropped == {"picture does not decode": 1}
     assert ledger.accounts["cam"].used == 1
     assert stage.counts()["undecodable"] == 1
     assert stage.counts()["candidates"] == 1

@@ -1,8 +1,13 @@
 """In file = used + skipped + dropped, whatever happens in whatever order."""
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from crosscue.replay.errors import AccountError
 from crosscue.replay.ledger import DETAILS_KEPT, Ledger
 
 _COUNTS = st.integers(0, 1000)
@@ -58,3 +63,61 @@ def test_counts_go_on_when_details_stop() -> None:
 
     assert len(ledger.details) == DETAILS_KEPT
     assert ledger.topic("/t").used == 0
+
+
+@dataclass
+class _Rows:
+    topic: str
+    rows: int
+
+    def __len__(self) -> int:
+        return self.rows
+
+
+def _read(ledger: Ledger, found: int, handed: int, skipped: int) -> None:
+    def blocks() -> Iterator[_Rows]:
+        ledger.find("/t", found)
+        ledger.skip("/t", "not wanted", skipped)
+        yield _Rows("/t", handed)
+
+    for _ in ledger.handing_on(blocks()):
+        ledger.skip("/t", "not understood", 1)
+        ledger.skip_more("/t", "not understood", 1)
+        ledger.spoil("/t", "damaged", 1)
+
+
+def test_what_a_reader_hands_on_is_held_against_its_account() -> None:
+    ledger = Ledger("log")
+    _read(ledger, found=10, handed=7, skipped=3)
+
+    ledger.check({"/t": 4})
+
+    account = ledger.topic("/t")
+    assert (account.in_file, account.used) == (10, 4)
+    assert account.skipped == {"not wanted": 3, "not understood": 2}
+    assert account.dropped == {"damaged": 1}
+    with pytest.raises(AccountError, match="please report"):
+        ledger.check({"/t": 5})
+
+
+@pytest.mark.parametrize(("found", "handed", "skipped"), [(11, 7, 3), (10, 8, 3), (10, 7, 2)])
+def test_one_row_too_many_or_too_few_is_a_bug_and_loud(
+    found: int, handed: int, skipped: int
+) -> None:
+    ledger = Ledger("log")
+    _read(ledger, found, handed, skipped)
+
+    with pytest.raises(AccountError, match="does not add up"):
+        ledger.check()
+
+
+def test_as_many_as_declared_is_neither_a_loss_nor_worth_a_word() -> None:
+    for declared, missing, notices in ((5, 0, 0), (6, 1, 0), (4, 0, 1)):
+        ledger = Ledger("log")
+        ledger.declare("/t", declared)
+        ledger.find("/t", 5)
+        ledger.settle("/t")
+
+        assert ledger.topic("/t").dropped.total() == missing
+        assert len(ledger.details) == missing
+        assert len(ledger.notices) == notices

@@ -8,6 +8,7 @@ import pytest
 from crosscue.eval import cli
 from crosscue.eval.many_drives import in_turn, run_many
 from crosscue.eval.merge_runs import is_merged, merge_runs
+from crosscue.eval.run_account import account
 from crosscue.replay.errors import RunError
 from crosscue.replay.run_folder import RunFolder, TableSink, create, open_run, write_manifest
 from support.drive_work import letters, made_jobs
@@ -27,7 +28,7 @@ def _run(path: Path, **columns: "pa.Array") -> RunFolder:
     table = pa.table(columns)
     with TableSink(run, "belief", table.schema) as sink:
         sink.write({name: table[name] for name in table.column_names})
-    write_manifest(run, {"stage": "estimate"})
+    write_manifest(run, {"stage": "estimate", "account": account([])})
     return run
 
 
@@ -45,10 +46,10 @@ def test_the_manifest_names_failures_and_adds_up_accounts(tmp_path: Path) -> Non
 
     assert manifest["failures"].keys() == {"drive1"}
     assert "cut; copy it again" in manifest["failures"]["drive1"]
-    account = manifest["accounts"]["letters"]
-    assert (account["logs"], account["in_file"], account["used"]) == (2, 5, 3)
-    assert account["skipped"] == {"dull": 2}
-    assert account["in_file"] == account["used"] + sum(account["skipped"].values())
+    letters = manifest["account"]["reading"]["letters"]
+    assert (letters["runs"], letters["in"], letters["used"]) == (2, 5, 3)
+    assert letters["skipped"] == {"dull": 2}
+    assert letters["in"] == letters["used"] + sum(letters["skipped"].values())
     assert [one["rows"] for one in manifest["drives"]] == [{"letters": 3}, {"letters": 2}]
 
 

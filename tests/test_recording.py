@@ -158,7 +158,7 @@ def test_view_takes_truth_without_a_track(
     truth = truth_folder(tmp_path / "truth")
     out = tmp_path / "out.rrd"
 
-    assert cli.run(["view", str(run.path), "--save", str(out), "--truth", str(truth)]) == 0
+    assert cli.run(["view", str(run.path), "--save", str(out), "--truth", str(truth)]) == 3
     assert capsys.readouterr().out == f"{out}\n"
     rows = _rows(out)
     assert rows["/plots/range/true_start"] == rows["/plots/range/true_end"] == 40

@@ -93,8 +93,8 @@ def test_rows_that_are_not_numbers_are_counted_and_left_out(tmp_path: Path) -> N
 def test_the_manifest_accounts_for_every_row_and_setting(tmp_path: Path) -> None:
     manifest = _replay(tmp_path / "run", _drive(0.0)).run.manifest()
 
-    topics = manifest["accounts"][0]["topics"]
-    assert topics["wheels"]["used"] == topics["wheels"]["in_file"] == 200
+    topics = manifest["account"]["reading"][0]["topics"]
+    assert topics["wheels"]["used"] == topics["wheels"]["in"] == 200
     assert manifest["settings"]["odometry"]["track_width_m"] == 1.55
     assert manifest["sources"]["yaw_rate"].endswith("gyro")
     assert manifest["versions"]["crosscue"]
@@ -140,6 +140,6 @@ def test_the_real_minute_from_the_command_line(
     status = cli.run(["replay", str(segment), "--vehicle", str(car), "-o", str(run)])
 
     assert status == 3
-    assert "imu/magnetometer_uncalibrated: 64 rows" in capsys.readouterr().out
+    assert "dropped 64 of reading imu/magnetometer_uncalibrated" in capsys.readouterr().out
     assert cli.run(["replay", str(segment), "--vehicle", str(car), "-o", str(run)]) == 1
     assert "--overwrite" in capsys.readouterr().err

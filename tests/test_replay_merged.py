@@ -40,10 +40,10 @@ def test_a_broken_vehicle_file_costs_its_own_drive_and_an_edited_dbc_is_seen(
     merged = open_run(tmp_path / "runs" / "merged")
     assert set(merged.table("pose")["drive"].to_pylist()) == {"monday"}
     assert list(merged.manifest()["failures"]) == ["tuesday"]
-    accounts = merged.manifest()["accounts"].values()
+    accounts = merged.manifest()["account"]["reading"].values()
     assert sum(one["used"] for one in accounts) > 1000
     for one in accounts:
-        assert one["in_file"] == one["used"] + sum(one["skipped"].values())
+        assert one["in"] == one["used"] + sum(one["skipped"].values())
 
     (dbc,) = drives.joinpath("monday").glob("*.dbc")
     dbc.write_text(dbc.read_text() + "\n")

@@ -198,10 +198,10 @@ def test_score_writes_the_page_and_names_it(
 ) -> None:
     runs = [str(_scored(tmp_path / name, name).run.path) for name in ("one", "two")]
 
-    assert cli.run(["score", runs[0]]) == 0
+    assert cli.run(["score", runs[0]]) == 3
     told = capsys.readouterr().out
     assert f"written to {Path(runs[0]) / FOLDER / 'report.html'}" in told
-    assert cli.run(["score", *runs, "-o", str(tmp_path / "all"), "-q"]) == 0
+    assert cli.run(["score", *runs, "-o", str(tmp_path / "all"), "-q"]) == 3
     assert "<h1>2 drives</h1>" in (tmp_path / "all" / "report.html").read_text()
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from crosscue.eval.run_list import runs_of
 from crosscue.replay.errors import CrosscueError
+from crosscue.replay.run_folder import FORMAT_VERSION
 
 
 @pytest.fixture
@@ -15,7 +16,7 @@ def runs(tmp_path: Path) -> Path:
                         ("merged", "merged")):  # fmt: skip
         folder = tmp_path / "runs" / name
         folder.mkdir(parents=True)
-        text = json.dumps({"format_version": 1, "stage": stage})
+        text = json.dumps({"format_version": FORMAT_VERSION, "stage": stage})
         folder.joinpath("manifest.json").write_text(text)
     (tmp_path / "runs" / "empty").mkdir()
     (tmp_path / "runs" / ".drives").mkdir()

@@ -292,7 +292,7 @@ def test_runs_that_cannot_be_scored_are_named(
     manifest = run / "manifest.json"
     whole = manifest.read_text()
 
-    manifest.write_text(whole.replace('"format_version": 1', '"format_version": 99'))
+    manifest.write_text(whole.replace('"format_version": 2', '"format_version": 99'))
     assert "format 99" in _fails(capsys, "score", run)
     manifest.write_text(whole[:50])
     assert "manifest.json: unreadable" in _fails(capsys, "score", run)

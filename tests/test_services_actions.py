@@ -140,7 +140,7 @@ def test_action_feedback_is_read_where_its_definition_is_stored(
     cli.run(["decode", str(path), "-o", str(tmp_path / "tables"), "--json"])
     said = capsys.readouterr()
 
-    accounts = json.loads((tmp_path / "tables" / "manifest.json").read_text())["accounts"]
+    accounts = json.loads((tmp_path / "tables" / "manifest.json").read_text())["account"]["reading"]
     topics = accounts[0]["topics"]
     whole = feedback in ("whole", "that of the action")
     skipped = {} if whole else {"action feedback without a complete definition": ROWS}

@@ -25,6 +25,7 @@ from crosscue.eval.compare_runs import (
     MetricChange,
     TableChange,
     compare_runs,
+    is_whole_run,
     open_scored,
     read_tolerance,
 )
@@ -48,14 +49,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare, tell, and give 1 when the second run is worse."""
+    """Compare, tell, and give 1 when the second run is worse, 3 when either has drops."""
     tolerances = [read_tolerance(text) for text in args.tolerance]
-    found = compare_runs(open_scored(args.first), open_scored(args.second), tolerances)
+    runs = [open_scored(args.first), open_scored(args.second)]
+    found = compare_runs(runs[0], runs[1], tolerances)
     if args.json:
         print_json(asdict(found) | {"worse": found.worse})
     elif not args.quiet:
         print("\n".join(_told(found)))
-    return 1 if found.worse else 0
+    return 1 if found.worse else 0 if all(map(is_whole_run, runs)) else 3
 
 
 def _told(found: Comparison) -> Iterator[str]:

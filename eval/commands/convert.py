@@ -92,7 +92,8 @@ def _copy(
     def share() -> float:
         return done / declared if declared else 0.0
 
-    for block in with_progress(log.read(ledger, selection), share, args, "converting"):
+    blocks = ledger.handing_on(log.read(ledger, selection))
+    for block in with_progress(blocks, share, args, "converting"):
         done += len(block)
         # A topic may come to light only while a damaged log is read.
         for topic in log.topics:
@@ -104,12 +105,7 @@ def _copy(
 
 def _check_identity(ledger: Ledger, writer: LogWriter) -> None:
     """Found = written + skipped, for every topic."""
-    for name, account in ledger.accounts.items():
-        if account.used != writer.kept[name]:
-            raise OutputError(
-                f"{visible(name)}: {account.used} rows to write, {writer.kept[name]} written; "
-                "nothing is kept; report this as a bug"
-            )
+    ledger.check({name: writer.kept[name] for name in ledger.accounts})
 
 
 def _read_back(path: Path, writer: LogWriter) -> None:

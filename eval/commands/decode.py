@@ -9,8 +9,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.eval.accounts import account_of
 from crosscue.eval.decode_tables import decode_tables
+from crosscue.eval.plain_text import visible
+from crosscue.eval.run_account import account_lines
 from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import create
 from crosscue.replay.vehicle import Vehicle, load
@@ -32,19 +33,16 @@ def run(args: argparse.Namespace) -> int:
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     with open_logs(args.logs) as logs:
         folder = create(args.output, overwrite=args.overwrite)
-        rows, ledgers = decode_tables(logs, vehicle, folder, selection_of(args, logs))
+        rows, account = decode_tables(logs, vehicle, folder, selection_of(args, logs))
     if args.json:
-        print_json({"tables": rows, "logs": [account_of(ledger) for ledger in ledgers]})
+        print_json({"tables": rows, "account": account})
     elif not args.quiet:
         width = max(map(len, rows), default=0)
         for name, count in rows.items():
             print(f"{name:{width}}  {count:>10,} rows")
-        for ledger in ledgers:
-            for topic, account in sorted(ledger.accounts.items()):
-                for reason, count in sorted(account.skipped.items()):
-                    print(f"skipped  {topic}: {count:,} {reason}")
-            for loss in ledger.drops():
-                print(f"dropped  {loss.topic or 'the log'}: {loss.count or 'some'} {loss.reason}")
-            for sentence in ledger.notices:
-                print(f"note     {sentence}")
-    return 0 if all(ledger.is_whole for ledger in ledgers) else 3
+        for line in account_lines(account):
+            print(visible(line))
+        for log in account["reading"]:
+            for sentence in log["notices"]:
+                print(f"note     {visible(sentence)}")
+    return 0 if account["is_whole"] else 3

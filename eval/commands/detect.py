@@ -14,9 +14,9 @@ import sys
 from pathlib import Path
 
 from crosscue.detectors.registry import known
-from crosscue.eval.accounts import account_of
 from crosscue.eval.detect_stage import DetectOutcome, detect_drive
 from crosscue.eval.plain_text import visible
+from crosscue.eval.run_account import account_lines
 from crosscue.replay.errors import UsageError
 from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import create
@@ -70,10 +70,7 @@ def summary(outcome: DetectOutcome) -> str:
         lines.append(f"  {name}: ran on {ran:,}, {counts.from_cache[name]:,} from the cache")
     lines += [f"found    {what}: {count:,}" for what, count in sorted(outcome.objects.items())]
     lines += [f"cue      {cue}: in {count:,} frames" for cue, count in outcome.cues.items()]
-    for topic, account in sorted(ledger.accounts.items()):
-        lines += [f"skipped  {topic}: {n:,} {why}" for why, n in sorted(account.skipped.items())]
-    for loss in ledger.drops():
-        lines.append(f"dropped  {loss.topic or 'the log'}: {loss.count or 'some'} {loss.reason}")
+    lines += account_lines(outcome.account)
     lines += [f"note     {sentence}" for sentence in (*ledger.notices, *outcome.notices)]
     return "\n".join(visible(line) for line in lines)
 
@@ -81,7 +78,7 @@ def summary(outcome: DetectOutcome) -> str:
 def _as_json(outcome: DetectOutcome) -> dict[str, object]:
     return {
         "run": str(outcome.run.path),
-        "logs": [account_of(outcome.ledger)],
+        "account": outcome.account,
         "frames": outcome.counts.frames,
         "ran": outcome.counts.ran,
         "from_cache": outcome.counts.from_cache,

@@ -25,7 +25,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from crosscue.detectors.registry import Choice, chosen
-from crosscue.eval.accounts import account_of, versions
+from crosscue.eval.accounts import versions
 from crosscue.eval.detect_stage import choices_of
 from crosscue.eval.drive_list import DriveInput, DriveList, drives_of
 from crosscue.eval.estimate_stage import Outcome
@@ -43,10 +43,10 @@ from crosscue.eval.many_drives import Progress as DrivesDone
 from crosscue.eval.merge_runs import FOLDER, merge_runs
 from crosscue.eval.plain_text import terminal_width, visible, wrapped
 from crosscue.eval.replay_drive import Detecting, replay_drive
+from crosscue.eval.run_account import account_lines
 from crosscue.eval.scene_stage import ApproachSummary, SceneOutcome
 from crosscue.eval.worker_pool import Processes
 from crosscue.replay.errors import CrosscueError, UsageError
-from crosscue.replay.ledger import NOT_ASKED_TOPIC
 from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import create, open_run
 from crosscue.replay.vehicle import Vehicle, load
@@ -335,14 +335,11 @@ class Progress:
 def summary(outcome: Outcome) -> str:
     """What happened, for a person, in 80 columns."""
     lines = [f"run      {outcome.run.path}"]
-    for ledger in outcome.ledgers:
-        used = sum(a.used for a in ledger.accounts.values())
-        found = sum(a.in_file for a in ledger.accounts.values())
-        lines.append(f"log      {ledger.log}")
-        lines.append(f"         {used:,} rows used of {found:,}")
-        lines.append(f"         integrity: {ledger.integrity}")
-        lines += [f"  dropped {_loss(d.topic, d.reason, d.count)}" for d in ledger.drops()]
-        lines += [f"  note   {sentence}" for sentence in ledger.notices]
+    for log in outcome.account["reading"]:
+        lines.append(f"log      {log['log']}")
+        lines.append(f"         integrity: {log['integrity']}")
+        lines += [f"  note   {sentence}" for sentence in log["notices"]]
+    lines += account_lines(outcome.account)
     if outcome.rows:
         lines += [
             f"pose     {outcome.rows:,} rows over {outcome.travelled_m:.0f} m in "
@@ -374,12 +371,6 @@ def _detected(outcome: Outcome) -> list[str]:
     lines = [f"frames   {counts.frames:,} looked at"]
     for name, ran in counts.ran.items():
         lines.append(f"         {name}: ran on {ran:,}, {counts.from_cache[name]:,} from the cache")
-    for topic, account in sorted(outcome.detected.ledger.accounts.items()):
-        lines += [
-            f"  skip   {topic}: {n:,} {why}"
-            for why, n in sorted(account.skipped.items())
-            if why != NOT_ASKED_TOPIC
-        ]
     return lines
 
 
@@ -409,16 +400,11 @@ def _landmarks(counts: dict[str, int]) -> str:
     )
 
 
-def _loss(topic: str, reason: str, count: int | None) -> str:
-    many = "an unknown number" if count is None else f"{count:,}"
-    return f"{topic or 'the log'}: {many} rows: {reason}"
-
-
 def as_json(outcome: Outcome) -> dict[str, object]:
     """The result for other programs."""
     return {
         "run": str(outcome.run.path),
-        "logs": [account_of(ledger) for ledger in outcome.ledgers],
+        "account": outcome.account,
         "pose": {
             "rows": outcome.rows,
             "travelled_m": outcome.travelled_m,

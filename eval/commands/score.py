@@ -38,6 +38,7 @@ from crosscue.eval.junit import write_junit
 from crosscue.eval.metric_values import metric_values
 from crosscue.eval.plain_text import visible
 from crosscue.eval.report_page import REPORT, write_report
+from crosscue.eval.run_account import account_lines
 from crosscue.eval.run_list import runs_of
 from crosscue.eval.score_drives import DEFAULTS, Scores, ScoreSettings
 from crosscue.eval.score_many import Failed, Scored, ScoreWork, score_runs
@@ -89,7 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Score every run, then all together; 1 for a failed gate, 3 when some runs failed."""
+    """Score every run, then all together; 1 for a failed gate, 3 when anything was dropped."""
     paths = runs_of(args.runs)
     if args.gate is not None and len(paths) > 1 and args.output is None:
         raise UsageError("score: several runs and --gate: say with -o DIR where junit.xml goes")
@@ -112,7 +113,9 @@ def run(args: argparse.Namespace) -> int:
                     "runs": {str(one.one.run.path): one.metrics for one in scored}})  # fmt: skip
     elif results and not args.quiet:
         print(gate_lines(results))
-    return 1 if any(one.failure for one in results) else 3 if failed else 0
+    if any(one.failure for one in results):
+        return 1
+    return 3 if failed or not tree["account"]["is_whole"] else 0
 
 
 def _score_all(
@@ -156,6 +159,7 @@ def _tell_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) 
     if args.json or args.quiet:
         return found.metrics
     print(f"run        {visible(str(one.run.path))}")
+    print("\n".join(map(visible, account_lines(found.metrics["account"]))) + "\n")
     _print_scores(scores, one.why_no_pose, worth)
     if one.pose is not None:
         print("\n" + pose_summary(one.pose))
@@ -206,6 +210,7 @@ def _pool(
     for first, second in tree["coverage"].get("same_log", ()):
         names = f"{visible(first)} and {visible(second)}"
         print(told_line("twice", f"{names} are runs of one log, which therefore counts twice"))
+    print("\n".join(map(visible, account_lines(tree["account"]))) + "\n")
     why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
     _print_scores(scores, why, worth)
     if args.output is not None:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from crosscue.eval.merge_runs import open_one
 from crosscue.eval.recording import TruthTrack, save
+from crosscue.eval.run_account import is_whole
 from crosscue.eval.score_pose import truth_track
 from crosscue.eval.score_truth import TrueRanges, load
 from crosscue.replay.errors import CrosscueError, UsageError
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write drive.rrd into the run, or where asked, and open it."""
+    """Write drive.rrd into the run, or where asked, and open it; 3 when the run has drops."""
     if args.save is not None and args.save.suffix != ".rrd":
         raise UsageError(f"{args.save}: want a name that ends in .rrd")
     folder = open_one(args.run)
@@ -46,8 +47,9 @@ def run(args: argparse.Namespace) -> int:
     if args.save is not None:
         if not args.quiet:
             print(path)
-        return 0
-    return _open(path, args.web)
+    else:
+        _open(path, args.web)
+    return 0 if is_whole(folder.manifest()) else 3
 
 
 def _truth(
@@ -61,7 +63,7 @@ def _truth(
     return truth_track(args.truth, folder) if has_track else None, told.ranges
 
 
-def _open(path: Path, web: bool) -> int:
+def _open(path: Path, web: bool) -> None:
     # Rerun's Python calls listen on every address; only its command can be bound to this machine.
     command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(path)]
     if web:
@@ -80,4 +82,3 @@ def _open(path: Path, web: bool) -> int:
         viewer.wait()
     if status:
         raise CrosscueError(f"rerun: ended with status {status}; open {path} with another viewer")
-    return 0

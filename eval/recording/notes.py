@@ -26,7 +26,7 @@ def notes(run: RunFolder, more: Sequence[str]) -> rr.TextDocument:
     manifest = run.manifest()
     logs = [f"- {inert(log['path'])}" for log in manifest["logs"]]
     notices = [f"- {inert(sentence)}" for sentence in (*manifest["notices"], *more)]
-    dropped = sum(not account["is_whole"] for account in manifest["accounts"])
+    dropped = sum(not account["is_whole"] for account in manifest["account"]["reading"])
     whole = (
         "nothing is known to be dropped"
         if not dropped

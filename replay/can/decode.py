@@ -245,7 +245,7 @@ class BusDecoder:
         if key not in self.counts:
             return False
         self.counts[key] += count
-        self._ledger.accounts[self._bus].skipped[key[2]] += count
+        self._ledger.skip_more(self._bus, key[2], count)
         return True
 
     def _tell(self, key: CountKey, count: int, log_ns: Int64s, rows: NDArray[np.bool_]) -> None:

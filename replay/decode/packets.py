@@ -69,7 +69,7 @@ class PacketDecoder:
                 self._taken += 1
             except av.FFmpegError as error:
                 why = one_line(error, 100)
-                self._ledger.skip(self._topic, NOT_DECODED, 1, why, t_ns)
+                self._ledger.spoil(self._topic, NOT_DECODED, 1, why, t_ns)
             yield from self._full()
 
     def flush(self) -> Iterator[Block]:

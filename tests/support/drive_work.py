@@ -12,6 +12,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from crosscue.eval.many_drives import Job
+from crosscue.eval.run_account import account, line
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.run_folder import TableSink, clear, create, locked, write_manifest
 
@@ -51,11 +52,9 @@ def letters(job: Job) -> Letters:
             sink.write({"t_ns": range(len(word)), "letter": list(word)})
             _obey(word, log)
         write_manifest(run, {
-            "accounts": [{"log": str(log), "is_whole": word != "loss", "topics": {
-                "letters": {"found": len(word), "in_file": len(word), "used": len(word) - 1,
-                            "declared": None, "skipped": {"dull": 1}, "dropped": {},
-                            "dropped_unknown": []},
-            }}],
+            "account": account([{"log": str(log), "is_whole": word != "loss", "topics": {
+                "letters": line(len(word), len(word) - 1, {"dull": 1}),
+            }}]),
             "timings": {"seconds": time.monotonic()},
         })  # fmt: skip
     status = 3 if word == "loss" else 0

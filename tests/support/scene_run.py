@@ -26,7 +26,7 @@ LABEL: Final = "<img src=x onerror=alert(1)>"
 TOPIC: Final = "/camera/[red]<script>alert(1)</script>"
 ACCOUNT: Final[dict[str, Any]] = {
     "log": "drive.mcap", "integrity": "not checkable", "is_whole": False, "notices": [],
-    "topics": {TOPIC: {"in_file": FRAMES, "used": FRAMES - 1, "skipped": {},
+    "topics": {TOPIC: {"in": FRAMES, "used": FRAMES - 1, "skipped": {},
                        "dropped": {"<b>cut</b>": 1}, "dropped_unknown": []}},
 }  # fmt: skip
 
@@ -118,7 +118,8 @@ def scene_run(folder: Path, *, without: frozenset[str] = frozenset()) -> RunFold
     return run_folder(
         folder / "run",
         {name: table for name, table in tables.items() if name not in without},
-        stage="estimate", detect=detect, accounts=[ACCOUNT],
+        stage="estimate", detect=detect,
+        account={"reading": [ACCOUNT], "is_whole": False},
         settings=Vehicle(version=1).model_dump(mode="json"),
         selection={"start_ns": None, "end_ns": None, "topics": None},
         notices=["[here](http://example.org) ![x](http://example.org/x.png) </td><script>"],

@@ -174,7 +174,8 @@ def run_folder(
         "stage": "replay", "versions": {"crosscue": "0"}, "settings": {}, "notices": [],
         "logs": [{"path": str(path.parent / "drive.mcap"), "format": "mcap",
                   "sha256": {"drive.mcap": "00"}}],
-        "accounts": [], "clocks": [], "counts": {}, "timings": {"seconds": 1.0},
+        "account": {"reading": [], "is_whole": True},
+        "clocks": [], "counts": {}, "timings": {"seconds": 1.0},
     }  # fmt: skip
     write_manifest(run, content | manifest)
     return run
