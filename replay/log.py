@@ -72,8 +72,9 @@ class Log(Protocol):
         reading them, and the declared counts then say how many were skipped. Once exhausted,
         declared counts have been settled and ``ledger.integrity`` is set. Damage never raises here
         after the log was opened: what is readable is given, the rest is ``ledger.lose``-d. A row
-        whose bytes are known to be damaged is never given. (A seal knows of damage by the MiB, not
-        by the row, see ``sealed_log``.)
+        whose bytes are known to be damaged is never given; where a checksum only says that one of
+        many rows is damaged, all that are structurally sound are given and the log is not whole.
+        (A seal knows of damage by the MiB, not by the row, see ``sealed_log``.)
         """
         ...
 

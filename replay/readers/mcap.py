@@ -2,9 +2,12 @@
 
 The file's own records are the truth and its indexes only hints: the data section is walked record
 by record, each chunk is decompressed to at most the size it declares and verified, and only then
-are its messages given, as ranges of the chunk's bytes. Nothing is made per message. A checksum
-covers a whole chunk (or, outside chunks, the whole data section), so that is also the unit of loss:
-where a checksum is wrong, nothing that only it vouches for is given.
+are its messages given, as ranges of the chunk's bytes. Nothing is made per message. A chunk's
+checksum is also the unit of loss: where it is wrong, nothing of the chunk is given. Where only the
+data section's checksum covers messages and is wrong, one of them may hold changed bytes and nobody
+can know which: those that are structurally sound are given, and the account is not whole. Behind
+damaged bytes reading goes on at the next chunk that proves itself, or at the next records that are
+plausible in a row.
 
 Channels become topics as ``mcap_topics`` says. A publish time that is no int64 counts as not
 available and becomes the log time, as the format writes it.

@@ -1,8 +1,8 @@
 """Where a recording goes on after a place where its records cannot be followed.
 
 A chunk is taken for one only if it proves itself: its lengths agree with each other and its records
-match their checksum. Chunks within another recording's bytes are not taken: the search ends where
-another recording begins.
+match their checksum or, without one, fill it and lie in the time that it declares. Chunks within
+another recording's bytes are not taken: the search ends where another recording begins.
 """
 
 from __future__ import annotations
@@ -24,8 +24,11 @@ from .mcap_records import (
     MAGIC,
     PREFIX,
     BrokenRecordError,
+    ChunkHead,
     read_chunk_head,
 )
+from .mcap_rows import NEVER_IN_A_CHUNK, rows_by_scan
+from .mcap_scan import Scanner
 
 HEAD_MOST: Final = PREFIX.size + CHUNK_FIXED + 32
 FIRST_PIECE: Final = 4 << 10
@@ -46,7 +49,7 @@ def find_bytes(file: ByteFile, at: int, end: int, wanted: bytes) -> int | None:
 
 
 def find_chunk(
-    file: ByteFile, since: int, at: int, end: int, limits: Limits
+    file: ByteFile, since: int, at: int, until: int, end: int, limits: Limits
 ) -> tuple[int, bool] | None:
     """The next place from which to go on.
 
@@ -55,24 +58,25 @@ def find_chunk(
         since: Where another recording may begin at the earliest; before ``at`` if the record before
             the damaged place may have swallowed its beginning.
         at: Where a chunk may begin at the earliest.
-        end: Where to give up.
+        until: Where to give up.
+        end: Where a chunk must end.
         limits: Chunks over these are not tried.
 
     Returns:
         The place, and whether it is a chunk (else another recording); None if there is neither.
     """
     begins = MAGIC + bytes([HEADER])
-    other = find_bytes(file, since, min(at + len(begins), end), begins)
+    other = find_bytes(file, since, min(at + len(begins), until), begins)
     tries, piece = 0, FIRST_PIECE
-    while other is None and at < end:
-        behind = min(at + piece, end)
+    while other is None and at < until:
+        behind = min(at + piece, until)
         other = find_bytes(file, at, min(behind + len(begins), end), begins)
         stop = end if other is None else other
         window = file.read(at, min(piece + HEAD_MOST, stop - at))
-        for offset in _candidates(window, piece):
+        for offset in _candidates(window, min(piece, behind - at)):
             if tries < TRIES and _agrees(file, at + offset, end, limits):
                 tries += 1
-                if _proves_itself(file, at + offset):
+                if _proves_itself(file, at + offset, limits):
                     return at + offset, True
         at, piece = behind, min(2 * piece, PIECE)
     return None if other is None else (other, False)
@@ -99,19 +103,28 @@ def _agrees(file: ByteFile, at: int, end: int, limits: Limits) -> bool:
     except BrokenRecordError:
         return False
     return (
-        bool(head.crc)
-        and head.compression in COMPRESSIONS
+        head.compression in COMPRESSIONS
+        and bool(head.size)
         and length == head.body_at + head.body_size
         and at + PREFIX.size + length <= end
         and max(head.size, head.body_size) <= limits.chunk_bytes
     )
 
 
-def _proves_itself(file: ByteFile, at: int) -> bool:
+def _proves_itself(file: ByteFile, at: int, limits: Limits) -> bool:
     head = read_chunk_head(file.peek(at, HEAD_MOST)[PREFIX.size :])
     body_at = at + PREFIX.size + head.body_at
     try:
-        inflate(file.read(body_at, head.body_size), head, file.buffers.take(head.size + 1))
+        room = file.buffers.take(head.size + 1)
+        records = inflate(file.read(body_at, head.body_size), head, room)
+        return bool(head.crc) or _is_filled(records, head, limits)
     except BrokenRecordError:
         return False
-    return True
+
+
+def _is_filled(records: Bytes, head: ChunkHead, limits: Limits) -> bool:
+    """Without a checksum: do records fill the chunk, with messages of the time it declares?"""
+    rows = rows_by_scan(records, Scanner(), NEVER_IN_A_CHUNK, limits.records_per_chunk)
+    if rows.end != len(records) or not len(rows):
+        return False
+    return bool(rows.log.min() == head.start and rows.log.max() == head.end)

@@ -21,22 +21,34 @@ from .mcap_checks import Checks
 from .mcap_give import Giver
 from .mcap_load import Load, Loader, Stretch
 from .mcap_records import PREFIX, BrokenRecordError
+from .mcap_resync import Plausible, Resync
 from .mcap_rows import NEVER_IN_A_CHUNK, Rows, contradicts, join, rows_by_index, rows_by_scan
 from .mcap_scan import Scanner
 from .mcap_segments import Segment, Summary
 from .mcap_topics import TopicBook
-from .mcap_walk import Attachment, Chunk, End, Gap, How, Ignored, Item, Oversized, Run, Stray, Walk
+from .mcap_walk import (
+    STOPS_A_RUN,
+    Attachment,
+    Chunk,
+    End,
+    Gap,
+    How,
+    Ignored,
+    Item,
+    Oversized,
+    Run,
+    Stray,
+    Walk,
+)
 from .mcap_window import Window, find_window
 
 DAMAGED_CHUNK: Final = "damaged chunk"
 DAMAGED_RECORD: Final = "damaged record"
-DAMAGED_SECTION: Final = "only the data section's checksum covers it, which is wrong"
+DAMAGED_SECTION: Final = "the data section does not match its checksum"
 MISSING: Final = "declared by the format, not in its bytes"
 INCOMPLETE: Final = "the file does not end as it should"
 CUT: Final = "the file is cut"
-BEFORE_A_GAP: Final = "right before damaged bytes, and no checksum covers it"
-NEAR: Final = 64
-"""Bytes before a damaged place that are not trusted unless a checksum vouches for them."""
+BEFORE_A_GAP: Final = "leads into damaged bytes"
 DETAILS_JOINED: Final = 10
 
 
@@ -120,11 +132,14 @@ class SegmentPass:
         self._loader = loader
         self._where = where
         self._damages: list[Damage] = []
+        self._rows_doubted = 0
+        self._is_short: bool | None = None
         self._section: Future[int | None] | None = None
         self._attachments: list[tuple[int, int, Future[int | None]]] = []
         self._waiting: list[tuple[Stretch, Rows]] = []
         self._declarations = segment.declarations(book)
         self._giver = Giver(ledger, selection, limits, self._declarations)
+        self._search = Resync(file, segment.end, segment.has_end, (), self._plausible())
 
     def blocks(self) -> Iterator[Block]:
         """Its blocks."""
@@ -140,9 +155,7 @@ class SegmentPass:
         else:
             if segment.data_crc and not self._may_skip:
                 self._section = self._loader.section_crc(segment)
-            rail = segment.rail(self._file)
-            walk = Walk(self._file, segment.begin, segment.end, rail, self._limits, self._scanner)
-            yield from self._walked(iter(walk))
+            yield from self._walked(iter(self._walk()))
         if segment.after:
             self._ledger.drop("", INCOMPLETE, None, self._where + segment.after)
         self._finish_checks()
@@ -188,9 +201,30 @@ class SegmentPass:
             if isinstance(item, Chunk):
                 yield from self._chunk(item, load)
             elif isinstance(item, Run):
-                yield from self._run(item, isinstance(following, Gap))
+                yield from self._run(item, following if isinstance(following, Gap) else None)
             else:
                 self._note(item)
+
+    def _walk(self) -> Walk:
+        segment = self._segment
+        rail = segment.rail(self._file)
+        return Walk(
+            self._file,
+            segment.begin,
+            segment.end,
+            rail,
+            self._limits,
+            self._scanner,
+            self._plausible(),
+        )
+
+    def _plausible(self) -> Plausible:
+        """What messages must look like to be believed behind damaged bytes."""
+        statistics = self._summary.statistics
+        channels = [channel.id for channel in self._segment.channels]
+        if statistics is None or not statistics.message_count:
+            return Plausible(channels)
+        return Plausible(channels, (statistics.start, statistics.end))
 
     def _is_wanted(self, chunk: Chunk) -> bool:
         """Must the chunk be read? Only a chunk whose indexes all agree may be passed over."""
@@ -289,7 +323,7 @@ class SegmentPass:
                 self._checks.bad_heads.add(f"the chunk at byte {chunk.at}: {doubt}")
             return
         if self._segment.data_crc:
-            raise BrokenRecordError(DAMAGED_SECTION)
+            self._rows_doubted += len(rows)
         self._checks.chunks_bare += 1 if head.size else 0
         self._checks.chunks_right += 0 if head.size else 1
         if doubt or contradicts(rows, chunk.messages):
@@ -325,20 +359,84 @@ class SegmentPass:
         if not counts or chunk.index_fault or not held <= counts.keys():
             self._damages.append(Damage(reason, detail, t_ns))
 
-    def _run(self, run: Run, is_before_gap: bool) -> Iterator[Block]:
-        """Messages, schemas and channels outside chunks."""
+    def _run(self, run: Run, gap: Gap | None) -> Iterator[Block]:
+        """Messages, schemas and channels outside chunks, up to a gap that may reach into them."""
         rows = run.rows
-        if not self._segment.data_crc:
-            if is_before_gap:
-                count = int(np.searchsorted(rows.stop, rows.end - NEAR, side="right"))
-                detail = f"{self._where}up to byte {run.at + rows.end}, where records break off"
-                self._giver.drop(rows.take(slice(count, None)), BEFORE_A_GAP, detail)
-                rows = rows.take(slice(count))
-            self._checks.rows_bare += len(rows)
-        elif not self._section_is_right():
-            self._giver.drop(rows, DAMAGED_SECTION, f"{self._where}records from byte {run.at} on")
+        if gap is not None:
+            rows = self._before_gap(run, gap)
+        if self._segment.data_crc and self._section_is_right():
+            yield from self._giver.give(rows, self._checks, run.at)
             return
-        yield from self._giver.give(rows, self._checks, run.at)
+        for at, part in self._parts(run.at, rows):
+            sound = self._plausible_rows(part, at)
+            if self._segment.data_crc:
+                self._rows_doubted += len(sound)
+            else:
+                self._checks.rows_bare += len(sound)
+            yield from self._giver.give(sound, self._checks, at)
+
+    def _parts(self, at: int, rows: Rows) -> Iterator[tuple[int, Rows]]:
+        """A run in parts, without messages whose damaged lengths take in those behind them."""
+        self._search.plausible.learn(rows)
+        while (found := self._search.swallowed(at, rows)) is not None:
+            i, begin = found
+            place = f"{self._where}bytes {at + int(rows.offset[i])} to {at + begin}"
+            if not self._is_some_missing():
+                self._report_suspicion(place)
+                break
+            detail = f"{place}: its length takes in the records behind it"
+            self._giver.drop(rows.take(slice(i, i + 1)), DAMAGED_RECORD, detail)
+            definitions = [one for one in rows.definitions if one.at < begin]
+            yield at, replace(rows.take(slice(i)), definitions=definitions)
+            at, buffer = at + begin, rows.buffer[begin : rows.end]
+            rows = rows_by_scan(buffer, self._scanner, STOPS_A_RUN, len(buffer))
+        yield at, rows
+
+    def _is_some_missing(self) -> bool:
+        """Are fewer messages outside chunks than there must be? Walks once more to know."""
+        statistics = self._summary.statistics
+        if statistics is None:
+            return bool(self._segment.data_crc)  # which is wrong: something is damaged
+        if self._is_short is None:
+            count, has_chunks = 0, False
+            for item in self._walk():
+                has_chunks |= isinstance(item, Chunk)
+                count += len(item.rows) if isinstance(item, Run) else 0
+            self._is_short = count < statistics.message_count and not has_chunks
+        return self._is_short
+
+    def _report_suspicion(self, place: str) -> None:
+        if self._summary.statistics is None and not self._segment.data_crc:
+            detail = f"{place}: it ends in what look like other records of this recording"
+            self._damages.append(Damage(DAMAGED_RECORD, detail))
+
+    def _plausible_rows(self, rows: Rows, at: int) -> Rows:
+        """Of messages that no right checksum covers, those that agree with the statistics.
+
+        Statistics that do not fit most of them are wrong themselves.
+        """
+        plausible = self._plausible()
+        if not plausible.is_declared:
+            return rows
+        good = plausible.messages(rows)
+        if 2 * np.count_nonzero(good) < len(good):
+            return rows
+        for i in np.flatnonzero(~good).tolist():
+            detail = (
+                f"{self._where}bytes {at + int(rows.offset[i])} to {at + int(rows.stop[i])}: log "
+                f"time {int(rows.log[i])} or channel {int(rows.channel[i])} contradicts the summary"
+            )
+            self._giver.drop(rows.take(slice(i, i + 1)), DAMAGED_RECORD, detail)
+        return rows if good.all() else rows.take(np.flatnonzero(good))
+
+    def _before_gap(self, run: Run, gap: Gap) -> Rows:
+        """The messages of a run that lie before a gap; the others are dropped."""
+        end = min(gap.at - run.at, run.rows.end)
+        count = int(np.searchsorted(run.rows.offset, end))
+        detail = f"{self._where}bytes {gap.at} to {gap.to}: {gap.why}"
+        self._giver.drop(run.rows.take(slice(count, None)), BEFORE_A_GAP, detail)
+        definitions = [found for found in run.rows.definitions if found.at < end]
+        return replace(run.rows.take(slice(count)), definitions=definitions, end=end)
 
     def _section_is_right(self) -> bool:
         """Does the data section match its checksum? Waits until that is known."""
@@ -398,10 +496,23 @@ class SegmentPass:
             self._checks.sections_right += 1
         else:
             self._checks.sections_wrong += 1
+            self._report_doubt()
+
+    def _report_doubt(self) -> None:
+        """The data section is damaged, and its checksum cannot say where."""
+        segment = self._segment
+        if not self._rows_doubted:
             self._notice(
-                "its data section does not match its checksum; what chunks with a checksum of "
-                "their own hold was given, the rest was not"
+                "its data section does not match its checksum; all messages in it are in chunks "
+                "that match theirs"
             )
+            return
+        detail = (
+            f"{self._where}bytes {segment.base} to {segment.end} do not match their checksum; "
+            f"{self._rows_doubted} messages there are covered by no other and were read, and which "
+            "of them hold changed bytes cannot be known"
+        )
+        self._ledger.drop("", DAMAGED_SECTION, None, detail)
 
     def settle(self) -> Counter[str] | None:
         """Compare with the statistics, and tell what is lost; declared counts by topic."""

@@ -164,11 +164,16 @@ class MessageIndex:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Counts of a whole file; ``by_channel`` is empty where the writer did not count."""
+    """Counts of a whole file; ``by_channel`` is empty where the writer did not count.
+
+    ``start`` and ``end`` are its first and last log time, 0 where there is no message.
+    """
 
     message_count: int
     chunk_count: int
     by_channel: Mapping[int, int]
+    start: int = 0
+    end: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,13 +237,13 @@ def read_statistics(content: bytes | memoryview) -> Statistics:
     message_count = fields.number(8)
     fields.take(2 + 4 + 4 + 4)
     chunk_count = fields.number(4)
-    fields.take(8 + 8)
+    start, end = fields.number(8), fields.number(8)
     size = fields.number(4)
     if size % 10:
         raise BrokenRecordError(f"a map of {size} bytes is no whole number of entries")
     pairs = np.frombuffer(fields.take(size), dtype=np.dtype([("id", "<u2"), ("n", "<u8")]))
     by_channel = dict(zip(pairs["id"].tolist(), pairs["n"].tolist(), strict=True))
-    return Statistics(message_count, chunk_count, by_channel)
+    return Statistics(message_count, chunk_count, by_channel, start, end)
 
 
 def read_footer(content: bytes | memoryview) -> Footer:

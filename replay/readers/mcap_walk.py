@@ -2,14 +2,15 @@
 
 The bytes lead; a chunk index from the summary serves as a rail: where a record's length cannot be
 right, the walk goes on at the next chunk that the summary knows; without a rail, at the next chunk
-that proves itself by its checksum (``mcap_find``).
+that proves itself by its checksum (``mcap_find``). Where records stand outside chunks, it goes on
+at the next of them that are plausible in a row (``mcap_resync``).
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final, TypeAlias
 
@@ -48,6 +49,7 @@ from .mcap_records import (
     read_chunk_head,
     read_message_index,
 )
+from .mcap_resync import Plausible, Resync, is_exact
 from .mcap_rows import Rows, opcodes, rows_by_scan
 from .mcap_scan import Scanner
 
@@ -130,7 +132,10 @@ class Stray:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Bytes from ``at`` to ``to`` that cannot be read as records."""
+    """Bytes from ``at`` to ``to`` that cannot be read as records.
+
+    A run before it may reach beyond ``at``: what of it begins there or later is not to be believed.
+    """
 
     at: int
     to: int
@@ -169,6 +174,7 @@ class Walk:
         chunks: Mapping[int, ChunkIndex] | None,
         limits: Limits,
         scanner: Scanner,
+        plausible: Plausible | None = None,
     ) -> None:
         """A walk from ``begin``.
 
@@ -180,6 +186,7 @@ class Walk:
             chunks: By offset, what a trusted summary says; None where no end is known.
             limits: Sizes above which nothing is read.
             scanner: Does the stepping within runs.
+            plausible: What is known of messages outside chunks before the walk.
         """
         self._file = file
         self._at = begin
@@ -192,6 +199,9 @@ class Walk:
         self._run_bytes = 0
         self._is_over = False
         self._last_at = begin
+        self._resync = Resync(file, end, self._has_end, self._known, plausible or Plausible())
+        self._before: Run | None = None
+        self._has_bare = not self._known
 
     def __iter__(self) -> Iterator[Item]:
         """The items in the order of the file."""
@@ -206,7 +216,8 @@ class Walk:
                 yield item
             if isinstance(item, End):
                 return
-            assert self._at > before or self._is_over, "a walk must go forward"
+            since = item.at if isinstance(item, Gap) else before
+            assert self._at > since or self._is_over, "a walk must go forward"
         how = How.DATA_END if self._has_end else How.TOLD if self._is_over else How.BARE
         yield End(self._end, how)
 
@@ -243,15 +254,35 @@ class Walk:
 
     def _gap(self, why: str) -> Item:
         """What begins here is no record; go on where something is known to begin."""
-        at, self._at = self._at, self._bound(self._at)
-        if self._at == self._end:
-            found = find_chunk(self._file, self._last_at + 1, at + 1, self._end, self._limits)
-            place, is_chunk = found if found is not None else (self._end, False)
-            if is_chunk:
-                self._at = place
-            elif not self._has_end:
-                self._at, self._end, self._is_over = max(place, at), place, True
-        return Gap(at, self._at, why)
+        at, bound = self._at, self._bound(self._at)
+        since, record = self._next_record(at, bound)
+        if bound < self._end:
+            self._at = bound if record is None else record
+            return Gap(since, self._at, why)
+        self._at = self._end if record is None else record
+        after = min(self._last_at, since) + 1
+        found = find_chunk(self._file, after, since + 1, self._at, self._end, self._limits)
+        place, is_chunk = found if found is not None else (self._at, record is not None)
+        if is_chunk:
+            self._at = place
+        elif not self._has_end:
+            self._at, self._end, self._is_over = max(place, since), place, True
+        return Gap(since, self._at, why)
+
+    def _next_record(self, at: int, bound: int) -> tuple[int, int | None]:
+        """From where on records outside chunks are not to be believed, and where they are again."""
+        if not self._has_bare:
+            return at, None
+        since = at
+        if self._before is not None and self._before.at + self._before.rows.end == at:
+            since = self._before.at + self._resync.last_trusted(self._before.rows)
+        head = self._file.peek(at, PREFIX.size)
+        if len(head) == PREFIX.size:
+            # Only its kind may be damaged: then its own length leads on.
+            after = at + PREFIX.size + PREFIX.unpack(head)[1]
+            if after < bound and self._resync.continues(after):
+                return since, after
+        return since, self._resync.find(since + 1, bound)
 
     def _cut(self, what: str) -> Item:
         if self._has_end or self._bound(self._at) != self._end:
@@ -259,7 +290,8 @@ class Walk:
         return End(self._at, How.CUT)
 
     def _overlong(self, opcode: int, length: int, bound: int) -> Item:
-        if self._has_end or bound != self._end or opcode not in _KINDS:
+        is_cut = not self._has_end and bound == self._end and opcode in _KINDS
+        if not is_cut or self._next_record(self._at, bound)[1] is not None:
             return self._gap(f"a record (kind {opcode:#04x}) of {length} bytes does not fit")
         return End(self._at, How.CUT)
 
@@ -280,9 +312,17 @@ class Walk:
         elif (hidden := self._hidden_chunk(opcode, length)) is not None:
             return hidden
         else:
+            if self._has_bare and not self._is_unknown_kind(at, length):
+                raise BrokenRecordError(f"a record of the unknown kind {opcode:#04x}")
             item = Ignored(at, opcode)
         self._at = after
         return item
+
+    def _is_unknown_kind(self, at: int, length: int) -> bool:
+        """Is a record of an unknown kind really one, and not a damaged message or its content?"""
+        if self._resync.is_message(at, length):
+            return False
+        return self._before is None or self._resync.continues(at + PREFIX.size + length, 1)
 
     def _whole(self, length: int) -> memoryview:
         if length > self._limits.records_per_chunk * INDEX_ENTRY.itemsize:
@@ -324,10 +364,30 @@ class Walk:
         rows = rows_by_scan(buffer, self._scanner, STOPS_A_RUN, len(buffer))
         if not rows.end:
             raise BrokenRecordError("the file became shorter while being read")
+        rows = self._without_hidden(at, rows)
         is_stopped = rows.end < len(buffer) and STOPS_A_RUN[buffer[rows.end]]
         self._run_bytes = 0 if is_stopped else min(2 * len(buffer), RUN_BYTES)
         self._at = at + rows.end
-        return Run(at, rows)
+        self._has_bare = True
+        self._before = Run(at, rows)
+        self._resync.plausible.learn(rows)
+        return self._before
+
+    def _without_hidden(self, at: int, rows: Rows) -> Rows:
+        """A run up to the first message in it whose kind was damaged to that of a definition.
+
+        Raises:
+            BrokenRecordError: It begins with one.
+        """
+        for found in rows.definitions:
+            if not self._resync.is_message(at + found.at, len(found.content)) or is_exact(found):
+                continue
+            if not found.at:
+                raise BrokenRecordError(f"a record of kind {found.opcode:#04x} cannot be read")
+            kept = rows.take(np.flatnonzero(rows.offset < found.at))
+            earlier = [one for one in rows.definitions if one.at < found.at]
+            return replace(kept, definitions=earlier, end=found.at)
+        return rows
 
     def _run_buffer(self, at: int, size: int, bound: int) -> Bytes:
         if self._run_bytes > size:
@@ -376,6 +436,8 @@ class Walk:
         if inner_end > end and not fault:
             fault = f"declares {head.body_size} bytes of records, has {max(0, end - body_at)}"
         messages, index_fault = self._message_indexes(end, index)
+        # Records found by searching behind damage would be those of an uncompressed chunk.
+        self._has_bare &= self._before is not None
         return Chunk(at, body_at, head, index, fault, differs, False, messages, index_fault)
 
     def _chunk_without_head(
