@@ -315,7 +315,7 @@ def test_one_flipped_byte_outside_chunks_costs_two_messages_at_most(
     rng = np.random.default_rng(3)
     begin = coded.index(records[4])  # behind the schema and the channels
     end = begin + sum(map(len, records[4:]))
-    for at in rng.integers(begin, end, 150).tolist():
+    for at in rng.integers(begin, end, 40).tolist():
         damaged = bytearray(coded)
         damaged[at] ^= int(rng.integers(1, 256))
         path.write_bytes(damaged)

@@ -46,6 +46,7 @@ LINKS: Final = 3
 DAY_NS: Final = 86_400 * 10**9
 """How far from the messages before it a log time may lie, where no statistics bound it."""
 LATEST: Final = (1 << 63) - 1
+MOST: Final = (1 << 64) - 1
 PIECE_MIN: Final = 4 << 10
 PIECE_MAX: Final = 1 << 20
 DEFINITION_MOST: Final = 1 << 20
@@ -75,7 +76,7 @@ class Plausible:
         if len(rows) and self._declared is None:
             middle = int(np.sort(rows.log)[len(rows) // 2])
             near = rows.log[_within(rows.log, middle - DAY_NS, middle + DAY_NS)]
-            self._met = int(near.min()), int(near.max())
+            self._met = (int(near.min()), int(near.max())) if len(near) else None
         if len(rows):
             apart = rows.log.astype(np.float64) - rows.publish.astype(np.float64)
             self._is_close = bool(2 * np.count_nonzero(np.abs(apart) <= DAY_NS) > len(rows))
@@ -91,7 +92,7 @@ class Plausible:
             return self._declared
         if self._met is None:
             return 0, LATEST
-        return self._met[0] - DAY_NS, self._met[1] + DAY_NS
+        return self._met[0] - DAY_NS, min(self._met[1] + DAY_NS, LATEST)
 
     def messages(self, heads: Heads | Rows) -> NDArray[np.bool_]:
         """Shape (N,): which messages are plausible.
@@ -109,7 +110,7 @@ class Plausible:
 
 def _within(log: NDArray[np.uint64], first: int, last: int) -> NDArray[np.bool_]:
     """Which times lie between two, both included."""
-    low, high = np.uint64(max(first, 0)), np.uint64(min(max(last, 0), LATEST))
+    low, high = np.uint64(max(first, 0)), np.uint64(min(max(last, 0), MOST))
     is_in: NDArray[np.bool_] = (log >= low) & (log <= high)
     return is_in
 
