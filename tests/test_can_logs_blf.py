@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import can
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from crosscue.replay.columns import ERROR
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.ledger import NOT_ASKED_TIME, Ledger
 from crosscue.replay.limits import Limits
-from crosscue.replay.log import open_log
-from support.can_files import Sent, blf, by_bus, made, read_back, same_as_python_can
+from crosscue.replay.log import Selection, open_log
+from support.can_files import START_NS, Sent, blf, by_bus, made, read_back, same_as_python_can
 from support.data import shared
 
 
@@ -196,3 +200,84 @@ def test_python_can_writes_what_we_read(tmp_path: Path) -> None:
 def test_the_real_log_reads_as_python_can_reads_it() -> None:
     path = shared("can", "python_can", "issue_1905.blf")
     same_as_python_can(path, _peer(path), "can/{}")
+
+
+MINUTE = [replace(f, t_ns=START_NS + k * 10_000_000) for k, f in enumerate(made(6_000))]
+WHOLE = blf(MINUTE, container=4_000)
+
+
+@given(
+    window=st.tuples(st.integers(-5, 65), st.integers(-5, 65)),
+    ends=st.sampled_from(["both", "from", "to"]),
+    stored=st.booleans(),
+)
+@settings(max_examples=20, deadline=None)
+def test_a_window_costs_the_containers_in_it_and_its_account_is_exact(
+    tmp_path_factory: pytest.TempPathFactory, window: tuple[int, int], ends: str, stored: bool
+) -> None:
+    start_ns, end_ns = (START_NS + s * 10**9 for s in sorted(window))
+    asked = Selection(
+        start_ns=None if ends == "to" else start_ns, end_ns=None if ends == "from" else end_ns
+    )
+    content = blf(MINUTE, container=4_000, stored=stored) if stored else WHOLE
+
+    found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), content), asked)
+
+    wanted = [
+        f
+        for f in MINUTE
+        if (asked.start_ns or 0) <= f.t_ns and (asked.end_ns is None or f.t_ns < asked.end_ns)
+    ]
+    assert found == by_bus(wanted)
+    accounts = ledger.accounts.values()
+    assert sum(one.in_file for one in accounts) == len(MINUTE)
+    assert sum(one.used for one in accounts) == len(wanted)
+    assert {reason for one in accounts for reason in one.skipped} <= {NOT_ASKED_TIME}
+    assert ledger.is_whole
+
+
+def test_what_a_window_leaves_unread_is_said(tmp_path: Path) -> None:
+    window = Selection(start_ns=START_NS + 50 * 10**9, end_ns=START_NS + 52 * 10**9)
+
+    found, ledger = read_back(_log(tmp_path, WHOLE), window)
+
+    assert found == by_bus(MINUTE[5_000:5_200])
+    assert "bytes outside --from/--to not read" in ledger.integrity
+    unread = int(re.findall(r"(\d+) bytes outside", ledger.integrity)[0])
+    assert unread > 0.85 * len(WHOLE)
+    assert sum(one.found for name, one in ledger.accounts.items() if name) < 700
+
+
+def test_a_log_whose_clock_goes_back_is_read_wherever_the_window_may_be(tmp_path: Path) -> None:
+    again = [replace(f, t_ns=f.t_ns - 59 * 10**9) for f in MINUTE[5_900:]]
+    frames = [*MINUTE[:3_000], *again, *MINUTE[3_000:]]
+    window = Selection(start_ns=START_NS, end_ns=START_NS + 10**9)
+
+    found, ledger = read_back(_log(tmp_path, blf(frames, container=4_000)), window)
+
+    assert found == by_bus([f for f in frames if START_NS <= f.t_ns < START_NS + 10**9])
+    assert sum(one.in_file for one in ledger.accounts.values()) == len(frames)
+
+
+def test_damage_inside_the_window_is_reported(tmp_path: Path) -> None:
+    content = bytearray(WHOLE)
+    content[content.find(b"LOBJ", len(content) * 51 // 60) + 1_500] ^= 0xFF
+    window = Selection(start_ns=START_NS + 45 * 10**9, end_ns=START_NS + 58 * 10**9)
+
+    found, ledger = read_back(_log(tmp_path, bytes(content)), window)
+
+    assert sum(map(len, found.values())) < 1_300
+    assert "container does not match its checksum" in ledger.topic("").dropped_unknown
+
+
+@pytest.mark.parametrize("step", range(500, 548))
+def test_stretches_may_end_anywhere_in_an_object(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    monkeypatch.setattr("crosscue.replay.readers.blf.STREAM_BYTES", step)
+    frames = made(100)
+
+    found, ledger = read_back(_log(tmp_path, blf(frames, container=4_000)))
+
+    assert found == by_bus(frames)
+    assert ledger.is_whole

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from io import BufferedReader
@@ -21,7 +21,7 @@ import numpy as np
 from crosscue.replay.closing import Closing
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.ledger import NOT_ASKED_TIME, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, Log, Selection
 
@@ -35,6 +35,7 @@ from .blf_objects import (
     chain_of,
     rows_of,
 )
+from .blf_windows import unwanted
 from .can_rows import FrameRows, blocks_by_bus, bus_number, bus_topic, keep_memory
 from .digits import NANOS, within_range
 
@@ -51,6 +52,7 @@ _SCAN_BYTES: Final = 1 << 20
 _PIECE_BYTES: Final = 1 << 16
 _WASTE: Final = 8
 """How many times the file's size may be read from containers that turn out damaged."""
+_NOT_READ: Final = "outside the window"
 _UNCLOSED: Final = "the writer never closed the file: what it had not yet written is missing"
 
 
@@ -120,7 +122,7 @@ class BlfLog(Closing):
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """All frames, a stretch of containers at a time; see ``Log.read``."""
         keep_memory()
-        reading = _Pass(self._path, self._header, self._limits, self._names)
+        reading = _Pass(self._path, self._header, self._limits, self._names, selection)
         try:
             for rows in reading.rows():
                 yield from blocks_by_bus(rows, tuple(self._names), ledger, selection)
@@ -135,13 +137,21 @@ class _Pass:
     """One reading pass: containers in, rows out, and the account at the end."""
 
     def __init__(
-        self, path: Path, header: FileHeader, limits: Limits, names: dict[str, int]
+        self,
+        path: Path,
+        header: FileHeader,
+        limits: Limits,
+        names: dict[str, int],
+        selection: Selection = EVERYTHING,
     ) -> None:
         self.tally = Tally()
         self._path, self._header, self._limits, self._names = path, header, limits, names
         self._tail = b""
         self._is_resumed = self._has_loose = False
         self._deflated = self._stored = self._wasted = 0
+        self._selection = selection
+        self._skips: Mapping[int, int] = {}
+        self._skipped_bytes = 0
 
     def rows(self) -> Iterator[FrameRows]:
         """The file's frames, a stretch at a time."""
@@ -150,9 +160,11 @@ class _Pass:
         with self._path.open("rb") as file:
             for content, where in self._contents(file):
                 if content is None:
+                    # Where nothing is missing, only not read, an object may end in what follows.
+                    is_end = where != _NOT_READ
                     if parts or self._tail:
-                        yield self._rows(b"".join(parts), place, is_end=True)
-                    parts, held, self._is_resumed = [], 0, True
+                        yield self._rows(b"".join(parts), place, is_end=is_end)
+                    parts, held, self._is_resumed, self._tail = [], 0, True, b""
                     continue
                 place = place if parts else where
                 parts.append(content)
@@ -171,9 +183,10 @@ class _Pass:
         self._settle_losses(ledger)
         self._say(ledger)
         plain = f"; {self._stored} stored without one" if self._stored else ""
+        unread = f"; {self._skipped_bytes} bytes outside --from/--to not read"
         ledger.integrity = (
-            f"checksums of {self._deflated} compressed containers verified{plain}; "
-            "BLF headers have none"
+            f"checksums of {self._deflated} compressed containers verified{plain}"
+            f"{unread if self._skips else ''}; BLF headers have none"
         )
         size = self._path.stat().st_size
         if header.objects and size != header.file_bytes:
@@ -188,6 +201,10 @@ class _Pass:
             ledger.drop("", "file was not closed by its writer", None, _UNCLOSED)
         if not header.objects and not tally.counted:
             ledger.notice("no objects: nothing was recorded, or the writer was stopped early")
+        if self._skips and missing > 0:
+            ledger.find("", missing)
+            ledger.skip("", NOT_ASKED_TIME, missing)
+            missing = 0
         if header.objects and missing > 0:
             reason = reasons[0] if len(reasons) == 1 else "objects damaged or missing"
             declared = f"declared {header.objects} objects, found {tally.counted}"
@@ -252,7 +269,15 @@ class _Pass:
         position = self._header.size
         if size < position:
             self.tally.damage("file is cut", "inside its header")
+        if self._header.objects:  # otherwise nothing says how many objects are not read
+            start_ns = self._header.start_ns or 0
+            self._skips = unwanted(file, position, size, start_ns, self._selection)
         while position < size:
+            if position in self._skips:
+                self._skipped_bytes += self._skips[position] - position
+                position = self._skips[position]
+                yield None, _NOT_READ
+                continue
             file.seek(position)
             head = file.read(BASE_BYTES)
             place = f"byte {position}"

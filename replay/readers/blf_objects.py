@@ -30,6 +30,8 @@ RESTORE_POINT: Final = 115
 """Not counted by the file header."""
 TYPE_MAX: Final = 255
 """No type known is above 150."""
+_UNSEEN_MAX: Final = BASE_BYTES + PADDING_MAX
+"""Bytes after an object in which no other can be seen yet."""
 _PLACES_KEPT: Final = 5
 _SIGNATURE: Final = int.from_bytes(MAGIC, "little")
 _EXTENDED: Final = 0x80000000
@@ -121,9 +123,12 @@ def chain_of(
             rest = len(stream)
         elif rest < len(stream):
             break
-    # Padding of the last whole object may still be to come.
-    whole = at[keep & (at < rest)]
-    return Chain(whole, rest)
+    is_whole = keep & (at < rest)
+    last = int(end[is_whole][-1]) if bool(is_whole.any()) else rest
+    if not is_end and rest == len(stream) and last < rest <= last + _UNSEEN_MAX:
+        # Padding, or the next object's header, of which the rest is still to come.
+        rest = last
+    return Chain(at[is_whole], rest)
 
 
 def _mend(
@@ -147,6 +152,9 @@ def _mend(
         near = at[following] if following < len(at) else length
         if near - end[k] < PADDING_MAX:
             keep[k + 1 : following] = False
+            return length
+        if not is_end and following == len(at) and length - end[k] < _UNSEEN_MAX:
+            keep[k + 1 :] = False
             return length
     if is_sound[k] and end[k] > length and not is_end:
         keep[k:] = False
@@ -222,6 +230,7 @@ _KINDS: Final = (
     ((2,), _ERROR_PLAIN),
     ((104,), _ERROR_FD64),
 )
+FRAME_TYPES: Final = frozenset(type_ for types, _ in _KINDS for type_ in types)
 
 
 def rows_of(stream: Bytes, start: Int64s, start_ns: int, tally: Tally, place: str) -> FrameRows:
