@@ -8,10 +8,12 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 from crosscue.replay.errors import UsageError
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.remote import RangedLog, name_of
 from crosscue.replay.run_folder import strict_json
@@ -35,6 +37,31 @@ def add_part_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--to", dest="end", metavar="T", help="end before this time")
     parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="only these topics")
+    add_limit_arguments(parser)
+
+
+def add_limit_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--max-chunk``."""
+    parser.add_argument(
+        "--max-chunk", type=_mebibytes, default=DEFAULT.chunk_bytes, metavar="MIB",
+        help="the largest chunk, container or page that is decompressed "
+        f"(default: {DEFAULT.chunk_bytes >> 20})",
+    )  # fmt: skip
+
+
+def limits_of(args: argparse.Namespace) -> Limits:
+    """The limits that a log is read with."""
+    return replace(DEFAULT, chunk_bytes=args.max_chunk)
+
+
+def _mebibytes(text: str) -> int:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and 0.0 < value <= 1 << 20):
+        raise argparse.ArgumentTypeError(f"{text!r}: want MiB, above 0 and up to {1 << 20}")
+    return max(int(value * (1 << 20)), 1)
 
 
 def metres(text: str) -> float:

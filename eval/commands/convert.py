@@ -4,12 +4,15 @@ examples:
   crosscue convert drive.bag -o drive.mcap
   crosscue convert can0.log -o can0.mcap --from 10 --to 70
   crosscue convert segment/ -o segment.mcap --topics wheels compass --compression lz4
+  crosscue convert damaged.mcap -o rescued.mcap --salvage
 
 ROS 2 messages are copied byte for byte and ROS 1 messages transcribed. CAN frames become
 can_msgs/msg/Frame (CAN FD: crosscue_msgs/msg/CanFdFrame on TOPIC/fd), pictures
 sensor_msgs/msg/CompressedImage, Image or foxglove_msgs/msg/CompressedVideo, tables the standard
 type that holds all their columns, or else crosscue_msgs/msg/TOPIC with one field a column.
 The written file is read back and its messages counted before the command says that it is done.
+What can be read of a damaged log is written, and the exit status is 3; --salvage prints every
+damaged place, with its bytes where the format has them.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ from crosscue.replay.log import Log, Selection, open_log
 from crosscue.replay.seal import seal_path
 from crosscue.replay.writing import LogWriter
 
-from .common import add_part_arguments, print_json, selection_of, with_progress
+from .common import add_part_arguments, limits_of, print_json, selection_of, with_progress
 
 NOT_ASKED = frozenset({NOT_ASKED_TIME, NOT_ASKED_TOPIC})
 SHOWN = 20
@@ -44,6 +47,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--compression", choices=("zstd", "lz4", "none"), default="zstd", help="of the chunks"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace OUT.mcap if it is there")
+    parser.add_argument(
+        "--salvage", action="store_true",
+        help="the log is damaged: list every place where something was dropped",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the account as JSON")
 
 
@@ -54,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         0 when every row that was asked for is in the file, 3 when some are dropped or skipped.
     """
     _check_output(args)
-    with open_log(args.log) as log:
+    with open_log(args.log, limits_of(args)) as log:
         selection = selection_of(args, [log])
         ledger = Ledger(str(args.log))
         writer = LogWriter(
@@ -163,6 +170,17 @@ def _as_json(args: argparse.Namespace, ledger: Ledger, writer: LogWriter) -> obj
             for name, account in ledger.accounts.items()
         },
         "notices": [visible(notice) for notice in ledger.notices],
+        "details": [
+            {
+                "topic": visible(detail.topic),
+                "reason": detail.reason,
+                "detail": visible(detail.detail),
+                "count": detail.count,
+                "t_ns": detail.t_ns,
+                "is_dropped": detail.is_dropped,
+            }
+            for detail in (ledger.details if args.salvage else ())
+        ],
     }
 
 
@@ -181,8 +199,17 @@ def _print(args: argparse.Namespace, ledger: Ledger, writer: LogWriter) -> None:
     )
     for notice in ledger.notices[:SHOWN]:
         print(wrapped(visible(notice), width), file=sys.stderr)
-    for detail in ledger.details[:SHOWN]:
+    shown = ledger.details if args.salvage else ledger.details[:SHOWN]
+    for detail in shown:
         verb = "dropped" if detail.is_dropped else "skipped"
         count = "?" if detail.count is None else detail.count
         text = f"{detail.topic}: {count} {verb}: {detail.reason}; {detail.detail}".rstrip("; ")
         print(wrapped(visible(text), width), file=sys.stderr)
+    if len(shown) < len(ledger.details):
+        print(f"and {len(ledger.details) - len(shown)} more places", file=sys.stderr)
+    if not ledger.is_whole and not args.salvage:
+        print(
+            "the log is damaged; what could be read was written; crosscue convert --salvage lists "
+            "every damaged place",
+            file=sys.stderr,
+        )

@@ -16,7 +16,7 @@ from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import create
 from crosscue.replay.vehicle import Vehicle, load
 
-from .common import add_log_arguments, print_json, selection_of
+from .common import add_log_arguments, limits_of, print_json, selection_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Decode; 3 when something was dropped."""
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
-    with open_logs(args.logs) as logs:
+    with open_logs(args.logs, limits_of(args)) as logs:
         folder = create(args.output, overwrite=args.overwrite)
         rows, account = decode_tables(logs, vehicle, folder, selection_of(args, logs))
     if args.json:

@@ -22,7 +22,7 @@ from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import create
 from crosscue.replay.vehicle import Vehicle, load
 
-from .common import add_log_arguments, print_json, selection_of
+from .common import add_log_arguments, limits_of, print_json, selection_of
 from .replay import Progress, add_detector_arguments, cache_of, detectors_of
 
 
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     choices = detectors_of(args, vehicle)
     if not choices:
         raise UsageError(f"--detectors: none named; there are: {', '.join(known({}))}")
-    with open_logs(args.logs) as logs:
+    with open_logs(args.logs, limits_of(args)) as logs:
         selection = selection_of(args, logs)
         folder = create(args.output, overwrite=args.overwrite)
         progress = Progress("detecting", not args.quiet and sys.stderr.isatty())

@@ -20,7 +20,7 @@ from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import write_text
 from crosscue.replay.vehicle import Vehicle, load, parse
 
-from .common import add_log_arguments, print_json, selection_of
+from .common import add_log_arguments, limits_of, print_json, selection_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     if args.write and args.vehicle is None:
         raise UsageError("--write: give the file to write into with --vehicle V.toml")
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
-    with open_logs(args.logs) as logs:
+    with open_logs(args.logs, limits_of(args)) as logs:
         fitted = fit(logs, vehicle, selection_of(args, logs))
     if args.write:
         text = with_section(args.vehicle.read_text(encoding="utf-8"), fitted)

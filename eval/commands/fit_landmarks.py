@@ -27,7 +27,7 @@ from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import write_text
 from crosscue.replay.vehicle import Vehicle, load, parse
 
-from .common import add_part_arguments, metres, print_json, selection_of
+from .common import add_part_arguments, limits_of, metres, print_json, selection_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -101,7 +101,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _pairs_of_logs(args: argparse.Namespace, vehicle: Vehicle, matcher: Matcher) -> ScoredPairs:
     poses = read_poses(args.poses, vehicle)
-    with open_for(args.database, matcher) as database, open_logs(args.logs) as logs:
+    with (
+        open_for(args.database, matcher) as database,
+        open_logs(args.logs, limits_of(args)) as logs,
+    ):
         ledgers = [Ledger(str(log.path)) for log in logs]
         frames = camera_frames(logs, vehicle, selection_of(args, logs), ledgers)
         return pairs_of_drive(

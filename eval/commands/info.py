@@ -29,7 +29,7 @@ from crosscue.eval.plain_text import table, terminal_width, visible, wrapped
 from crosscue.replay.columns import Block
 from crosscue.replay.log import open_logs
 
-from .common import print_json, with_progress
+from .common import add_limit_arguments, limits_of, print_json, with_progress
 
 LOSSES_SHOWN = 10
 
@@ -37,6 +37,7 @@ LOSSES_SHOWN = 10
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("logs", nargs="+", metavar="LOG", help="recordings to look at")
+    add_limit_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     parser.add_argument(
         "--quick", action="store_true", help="only what the log declares; do not read its body"
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     Returns:
         0 when all logs are whole, 3 when something is dropped.
     """
-    with open_logs(args.logs) as logs:
+    with open_logs(args.logs, limits_of(args)) as logs:
         if args.quick:
             summaries = [quick_summary(log) for log in logs]
         else:
@@ -176,6 +177,8 @@ def _losses(summary: LogSummary, width: int) -> Iterator[str]:
         texts.append(f"{count} of {loss.topic or 'unknown topics'}{at}: {loss.reason}{detail}")
     if len(summary.drops) > LOSSES_SHOWN:
         texts.append(f"and {len(summary.drops) - LOSSES_SHOWN} more; --json lists them")
+    if summary.drops:
+        texts.append("to write what can be read: crosscue convert LOG -o OUT.mcap --salvage")
     yield from _bullets("losses", texts, width)
 
 

@@ -31,7 +31,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import open_logs
 from crosscue.replay.vehicle import Vehicle, load
 
-from .common import add_part_arguments, metres, print_json, selection_of
+from .common import add_part_arguments, limits_of, metres, print_json, selection_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -90,7 +90,7 @@ def _add_logs(
     args: argparse.Namespace, vehicle: Vehicle, matcher: Matcher
 ) -> tuple[AddCounts, bool]:
     poses = read_poses(args.poses, vehicle)
-    with open_logs(args.logs) as logs:
+    with open_logs(args.logs, limits_of(args)) as logs:
         ledgers = [Ledger(str(log.path)) for log in logs]
         frames = camera_frames(logs, vehicle, selection_of(args, logs), ledgers)
         source = visible(args.source or args.logs[0].resolve().stem)

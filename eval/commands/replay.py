@@ -51,7 +51,7 @@ from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import create, open_run
 from crosscue.replay.vehicle import Vehicle, load
 
-from .common import add_part_arguments, first_ns, print_json, selection_of
+from .common import add_part_arguments, first_ns, limits_of, print_json, selection_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -151,7 +151,7 @@ def _replay(
         detectors_of(args, vehicle), cache_of(args), args.draw, args.resume, progress.at_frame
     )
     with ExitStack() as stack:
-        logs = stack.enter_context(open_logs(drive.logs))
+        logs = stack.enter_context(open_logs(drive.logs, limits_of(args)))
         selection = selection_of(args, logs)
         landmarks = None
         if args.landmarks:

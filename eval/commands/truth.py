@@ -13,12 +13,13 @@ from crosscue.datasets.truth import json_schema, write_carried
 from crosscue.replay.errors import UsageError
 from crosscue.replay.log import open_log
 
-from .common import print_json
+from .common import add_limit_arguments, limits_of, print_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("log", nargs="?", type=Path, metavar="LOG", help="a data set's folder")
+    add_limit_arguments(parser)
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="where to write it")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     parser.add_argument("--schema", action="store_true", help="print truth.json's JSON Schema")
@@ -31,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     if args.log is None or args.output is None:
         raise UsageError("truth: give a LOG and -o DIR, or --schema")
-    with open_log(args.log) as log:
+    with open_log(args.log, limits_of(args)) as log:
         written = write_carried(log.format, args.log, args.output)
     if args.json:
         print_json({"truth": str(written)})

@@ -15,7 +15,7 @@ from crosscue.replay.log import open_logs
 from crosscue.replay.run_folder import write_text
 from crosscue.replay.vehicle import parse
 
-from .common import print_json
+from .common import add_limit_arguments, limits_of, print_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recordings of one drive")
     parser.add_argument("--dbc", nargs="+", type=Path, default=[], metavar="FILE",
                         help="DBC, KCD, ARXML or SYM files of its buses")  # fmt: skip
+    add_limit_arguments(parser)
     parser.add_argument("-o", "--output", type=Path, metavar="V.toml", help="default: print it")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
@@ -33,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output is not None and args.output.exists() and not args.overwrite:
         raise UsageError(f"{args.output}: exists; give another name or --overwrite")
     folder = args.output.parent if args.output is not None else Path.cwd()
-    with open_logs(args.logs) as logs:
+    with open_logs(args.logs, limits_of(args)) as logs:
         text = draft(logs, args.dbc, folder)
     parse(text, "the draft")
     if args.output is not None:

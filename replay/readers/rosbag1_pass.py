@@ -349,7 +349,7 @@ class Pass:
         if max(size, unit.stored_stop - unit.record.body) > self._limits.chunk_bytes and (
             unit.is_framed or size > self._limits.chunk_bytes
         ):
-            detail = f"{where}: {size} bytes, limit {self._limits.chunk_bytes}"
+            detail = f"{where}: {size} bytes, limit {self._limits.chunk_bytes} (--max-chunk)"
             self._short(unit, Counter(), TOO_LARGE, detail)
             return None
         stop = min(unit.stored_stop, unit.record.body + self._limits.chunk_bytes)

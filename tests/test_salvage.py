@@ -1,0 +1,114 @@
+"""``convert --salvage``, and what plain ``convert`` and ``info`` say of a damaged log."""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from pathlib import Path
+
+import pytest
+
+from crosscue.eval.cli import run as crosscue
+from support.mcap_damage import sound_parts
+from support.mcap_files import McapFile, channel, message, read_back, schema
+from support.rosbag_files import read_rows, rows_of, write_bag
+
+
+def cdr(i: int) -> bytes:
+    """A message that fits the definition ``int32 x``."""
+    return b"\x00\x01\x00\x00" + struct.pack("<i", i)
+
+
+@pytest.fixture
+def damaged(tmp_path: Path) -> tuple[Path, int]:
+    """A recording without chunks, one of whose 600 records begins with zeros now; and where."""
+    records = [schema(1), channel(1, 1, "/a")]
+    records += [message(1, 10**18 + i * 10**6, cdr(i)) for i in range(600)]
+    coded = bytearray(McapFile(records, data_crc=True).coded())
+    at = coded.index(records[300])
+    coded[at : at + 30] = bytes(30)
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(coded)
+    return path, at
+
+
+@pytest.mark.parametrize("flags", [[], ["--salvage"]])
+def test_convert_writes_what_can_be_read_and_exits_3(
+    damaged: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str]
+) -> None:
+    path, at = damaged
+
+    status = crosscue(["convert", str(path), "-o", str(tmp_path / "out.mcap"), *flags])
+
+    said = capsys.readouterr()
+    assert status == 3
+    spans = re.findall(r"bytes (\d+) to (\d+)", " ".join(said.err.split()))
+    assert any(at - 39 <= int(a) <= at and int(b) == at + 39 for a, b in spans)
+    assert ("--salvage" in said.err) == (not flags)
+    read = read_back(path)
+    assert read_back(tmp_path / "out.mcap").messages == read.messages
+    assert read.count() == 598
+
+
+def test_salvage_lists_every_damaged_place(
+    damaged: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, _ = damaged
+
+    crosscue(["convert", str(path), "-o", str(tmp_path / "out.mcap"), "--salvage", "--json"])
+
+    account = json.loads(capsys.readouterr().out)
+    assert not account["is_whole"]
+    assert any(re.search(r"bytes \d+ to \d+", one["detail"]) for one in account["details"])
+    assert account["written"]["/a"]["messages"] == 598
+
+
+def test_a_damaged_bag_is_salvaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_bag(tmp_path / "a.bag", rows_of(600), "bz2")
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 40] = bytes(40)
+    path.write_bytes(content)
+    readable = len(read_rows(path).rows)
+
+    status = crosscue(
+        ["convert", str(path), "-o", str(tmp_path / "out.mcap"), "--salvage", "--json"]
+    )
+
+    account = json.loads(capsys.readouterr().out)
+    assert status == 3
+    assert 0 < readable < 600
+    assert sum(one["found"] for one in account["topics"].values()) == readable
+
+
+def test_info_of_a_damaged_log_names_salvage(
+    damaged: tuple[Path, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert crosscue(["info", str(damaged[0])]) == 3
+    assert "convert LOG -o OUT.mcap --salvage" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("command", ["info", "convert"])
+def test_a_chunk_over_max_chunk_is_refused_with_both_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(McapFile(sound_parts("zstd", is_chunked=True)).coded())
+    out = {
+        "info": [],
+        "convert": ["-o", str(tmp_path / "o.mcap")],
+        "decode": ["-o", str(tmp_path / "t")],
+    }
+
+    status = crosscue([command, str(path), "--max-chunk", "0.001", *out[command]])
+
+    said = capsys.readouterr()
+    text = " ".join((said.out + said.err).split())
+    assert status == 3
+    assert "the limit is 1048" in text
+
+
+def test_max_chunk_wants_a_size(capsys: pytest.CaptureFixture[str]) -> None:
+    assert crosscue(["info", "x.mcap", "--max-chunk", "-1"]) == 2
+    assert "want MiB" in capsys.readouterr().err
