@@ -15,6 +15,9 @@ from crosscue.replay.log import Log, Selection
 from crosscue.replay.remote import RangedLog, RemoteLog
 from crosscue.replay.run_folder import RunFolder, TableSink, sha256_of
 from crosscue.replay.signals import Extractor
+from crosscue.replay.time_segments import ONE_SEGMENT, Timeline
+
+from .labelled import labelled
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -130,6 +133,7 @@ def write_skipped(
     ledgers: Sequence[Ledger],
     reading: Sequence[Mapping[str, Any]],
     kept: pa.Table | None = None,
+    timeline: Timeline = ONE_SEGMENT,
 ) -> None:
     """Write ``skipped.parquet``; its counts are those of the account, reason by reason.
 
@@ -138,10 +142,11 @@ def write_skipped(
         ledgers: Of all logs.
         reading: The account's part on them, as it goes into the manifest.
         kept: Rows of an earlier stage; those of topics that it alone has read stay.
+        timeline: The drive's time segments; stamps here are as recorded.
     """
     rows = [row for ledger in ledgers for row in _skipped_rows(ledger)]
     earlier = [] if kept is None else kept.to_pylist()
-    with TableSink(run, "skipped", skipped_schema()) as sink:
+    with TableSink(run, "skipped", labelled(skipped_schema())) as sink:
         for log in reading:
             for topic, account in log["topics"].items():
                 # What both stages have met stands in either's rows, a camera's in the first's.
@@ -152,7 +157,10 @@ def write_skipped(
                 mine += _in_bulk(mine, log["log"], topic, account)
                 if mine:
                     names = skipped_schema().names
-                    sink.write({name: [row[name] for row in mine] for name in names})
+                    times = [row["t_ns"] for row in mine]
+                    numbers = [timeline.number_of_stamp(t_ns) for t_ns in times]
+                    columns = {name: [row[name] for row in mine] for name in names}
+                    sink.write({**columns, "segment": numbers, "log_t_ns": times})
 
 
 def _in_bulk(

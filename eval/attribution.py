@@ -16,7 +16,9 @@ import numpy as np
 from crosscue.replay.run_folder import RunFolder
 from crosscue.replay.vehicle import Vehicle
 
+from .drive_time import timeline_in
 from .intervals import Mean, mean
+from .log_time import table_in_log_time
 from .metric_values import metric_values
 from .scene_variants import GROUPS, scene_tables
 from .score_approaches import ApproachResult
@@ -104,9 +106,12 @@ def estimate_of(run: RunFolder, vehicle: Vehicle | None = None) -> EstimateWitho
     """
 
     def estimate(cues: frozenset[str], /) -> RunTables:
+        timeline = timeline_in(run.manifest())
         tables = scene_tables(run, vehicle, cues)
-        columns = {f"{name}_table": table for name, table in tables.items()}
-        return run_tables(str(run.path), frames_table=run.table("frames", ["t_ns"]), **columns)
+        columns = {f"{name}_table": table_in_log_time(t, timeline) for name, t in tables.items()}
+        frames = run.table("frames", ["t_ns", "segment", "log_t_ns"])
+        frames = table_in_log_time(frames, timeline)
+        return run_tables(str(run.path), frames_table=frames, **columns)
 
     return estimate
 

@@ -25,12 +25,12 @@ from crosscue.replay.log import Log, Selection
 from crosscue.replay.remote import name_of
 from crosscue.replay.run_folder import (
     RunFolder,
-    TableSink,
     clear,
     locked,
     write_manifest,
 )
 from crosscue.replay.signals import Extractor, Plan, Source, camera_of
+from crosscue.replay.time_segments import LogClock, TimedLog, Timeline, gaps_told, shift_of
 from crosscue.replay.vehicle import Vehicle
 
 from .accounts import (
@@ -42,6 +42,8 @@ from .accounts import (
     write_skipped,
 )
 from .detection_pictures import Drawer
+from .drive_time import camera_timeline, time_told
+from .labelled import LabelledSink
 from .run_account import Account, account, detecting_of, reading_of
 
 if TYPE_CHECKING:
@@ -69,6 +71,7 @@ class DetectOutcome:
         notices: Plain sentences.
         seconds: Wall time.
         account: What became of every row and frame.
+        has_gaps: The drive has more than one time segment.
     """
 
     run: RunFolder
@@ -79,11 +82,12 @@ class DetectOutcome:
     notices: tuple[str, ...]
     seconds: float
     account: Account
+    has_gaps: bool = False
 
     @property
     def exit_status(self) -> int:
-        """3 when anything was dropped, else 0."""
-        return 0 if self.account["is_whole"] else 3
+        """3 when anything was dropped or the drive has gaps, else 0."""
+        return 0 if self.account["is_whole"] and not self.has_gaps else 3
 
 
 def choices_of(vehicle: Vehicle) -> dict[str, Choice]:
@@ -126,6 +130,7 @@ def detect_into(
     cache: Path | None = None,
     draw: int = 0,
     on_frames: OnFrames = unwatched,
+    timeline: Timeline | None = None,
 ) -> DetectOutcome:
     """Run detectors over the one camera of a drive, into a run folder that is locked.
 
@@ -138,6 +143,7 @@ def detect_into(
         cache: File with results of earlier runs, or None for none.
         draw: How many pictures to write at most, with detections drawn, spread over the drive.
         on_frames: Told how many frames are done, and of how many where the log declares it.
+        timeline: The drive's time segments, if they have been found already.
 
     Raises:
         VehicleError: No camera or several; a card, weights or settings that do not fit.
@@ -155,15 +161,23 @@ def detect_into(
     narrowed = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
     probe = Extractor(planned, vehicle, camera[0], Ledger(""))
     clocks = probe_clocks(log, probe, narrowed)
-    extractor = Extractor(planned, vehicle, camera[0], ledger, clocks)
+    timeline = timeline or camera_timeline(logs, vehicle, selection, camera)
+    clock = timeline.clock(camera[0])
+    extractor = Extractor(
+        planned, vehicle, camera[0], ledger, clocks, shift_at=shift_of(timeline, camera[0])
+    )
     is_sign = [choice.kind == "signs" for choice in choices]
     with ResultCache(cache) as results:
         runner = Runner(
             named, results, topic.name, vehicle.camera.depth_bits,
-            lambda t_ns, reason, why: ledger.spoil(topic.name, reason, 1, why, t_ns),
+            lambda t_ns, reason, why: ledger.spoil(
+                topic.name, reason, 1, why, int(clock.log_times(np.array([t_ns]))[0])
+            ),
         )  # fmt: skip
         drawer = Drawer(run.path / "pictures", draw)
-        tables = _Tables(run, topic.name, vehicle, named, drawer, CuePass(vehicle), is_sign)
+        tables = _Tables(
+            run, topic.name, vehicle, named, drawer, CuePass(vehicle), is_sign, timeline, clock
+        )
 
         def declared() -> int | None:
             is_whole = selection.start_ns is None and selection.end_ns is None
@@ -173,15 +187,15 @@ def detect_into(
             extractor.on_pictures = lambda block: _through(
                 runner, block, tables, lambda: on_frames(runner.counts.frames, declared())
             )
-            for block in ledger.handing_on(log.read(ledger, narrowed)):
+            for block in ledger.handing_on(TimedLog(log, clock).read(ledger, narrowed)):
                 for _ in extractor(block):
                     pass
             for _ in extractor.finish():
                 pass
         made = account(reading_of([ledger]), detecting_of(topic.name, ledger, runner.counts.frames))
-        write_skipped(run, [ledger], made["reading"])
+        write_skipped(run, [ledger], made["reading"], timeline=timeline)
         seconds = time.monotonic() - began
-        notices = tuple(tables.notices)
+        notices = (*gaps_told(timeline.segments), *tables.notices)
         write_manifest(run, {
             "stage": "detect",
             "versions": versions(),
@@ -189,6 +203,8 @@ def detect_into(
             "selection": selection_told(selection),
             "settings": vehicle.model_dump(mode="json"),
             "camera": topic.name,
+            "camera_log": camera[0],
+            "time": time_told(timeline),
             "detectors": [
                 {"name": one.name, "identity": one.detector.identity, "kind": choice.kind,
                  "role": tables.roles.get(one.name), "settings": dict(choice.settings)}
@@ -205,8 +221,9 @@ def detect_into(
             "timings": {"seconds": seconds},
         })  # fmt: skip
     return DetectOutcome(
-        run, ledger, runner.counts, tables.objects, tables.cue_frames, notices, seconds, made
-    )
+        run, ledger, runner.counts, tables.objects, tables.cue_frames, notices, seconds, made,
+        timeline.has_gaps,
+    )  # fmt: skip
 
 
 def _through(runner: Runner, block: Block, tables: _Tables, on_frame: Callable[[], None]) -> None:
@@ -226,10 +243,12 @@ class _Tables:
     drawer: Drawer
     cues: CuePass
     is_for_signs: Sequence[bool]
+    timeline: Timeline
+    clock: LogClock
     notices: list[str] = field(default_factory=list)
     objects: dict[str, int] = field(default_factory=dict)
     cue_frames: dict[str, int] = field(default_factory=dict)
-    _sinks: dict[str, TableSink] = field(default_factory=dict)
+    _sinks: dict[str, LabelledSink] = field(default_factory=dict)
     _open: ExitStack = field(default_factory=ExitStack)
     roles: dict[str, Role] = field(default_factory=dict)
     _held: dict[str, list[dict[str, object]]] = field(default_factory=dict)
@@ -239,7 +258,8 @@ class _Tables:
     def __enter__(self) -> _Tables:
         with ExitStack() as stack:
             for name, schema in schemas().items():
-                self._sinks[name] = stack.enter_context(TableSink(self.run, name, schema))
+                sink = LabelledSink(self.run, name, schema, self.timeline, self.clock)
+                self._sinks[name] = stack.enter_context(sink)
                 self._held[name] = []
             self._open = stack.pop_all()
         return self

@@ -25,6 +25,15 @@ from crosscue.replay.run_folder import (
     write_manifest,
 )
 from crosscue.replay.signals import Extractor, Plan, Signal, camera_of, plan, with_pictures
+from crosscue.replay.time_segments import (
+    ONE_SEGMENT,
+    LogClock,
+    Segment,
+    TimedLog,
+    Timeline,
+    gaps_told,
+    shift_of,
+)
 from crosscue.replay.vehicle import Vehicle
 from crosscue.replay.windows import windows
 
@@ -41,6 +50,8 @@ from .accounts import (
     write_skipped,
 )
 from .detect_stage import DetectOutcome
+from .drive_time import drive_timeline, selections_of, time_told, timeline_in
+from .labelled import LabelledSink
 from .landmark_stage import looking
 from .mobileye_tables import MobileyeSink, StoredMobileye
 from .pose_stage import PoseStage, turn_signal_of
@@ -72,6 +83,7 @@ class Outcome:
         account: What became of every row, frame and reading.
         detected: What the detect stage did, where it ran just now.
         scene: Cues, ranges and beliefs, where detectors have run.
+        segments: Time segments of the drive.
     """
 
     run: RunFolder
@@ -86,11 +98,12 @@ class Outcome:
     account: Account
     detected: DetectOutcome | None = None
     scene: SceneOutcome | None = None
+    segments: tuple[Segment, ...] = ONE_SEGMENT.segments
 
     @property
     def exit_status(self) -> int:
-        """3 when anything was dropped, else 0."""
-        return 0 if self.account["is_whole"] else 3
+        """3 when anything was dropped or the drive has gaps, else 0."""
+        return 0 if self.account["is_whole"] and len(self.segments) == 1 else 3
 
 
 def detected_part(manifest: Mapping[str, Any]) -> Mapping[str, Any] | None:
@@ -111,6 +124,7 @@ def estimate_into(
     detected: DetectOutcome | None = None,
     earlier: Mapping[str, Any] | None = None,
     told: Sequence[Mapping[str, object]] | None = None,
+    timeline: Timeline | None = None,
 ) -> Outcome:
     """Write pose, cues, ranges, beliefs and the manifest into a run folder that is locked.
 
@@ -124,6 +138,7 @@ def estimate_into(
         detected: The detect stage, if it ran just now.
         earlier: The manifest's part on the detect stage, if it ran earlier.
         told: ``log_rows(logs)``, if they have been hashed already.
+        timeline: The drive's time segments, if they have been found already.
 
     Raises:
         VehicleError: The vehicle file does not fit the logs.
@@ -132,8 +147,9 @@ def estimate_into(
     began = time.monotonic()
     found = earlier if detected is None else detected_part(run.manifest())
     kept = None if found is None else _camera_skips(run, found["camera"])
-    reading = _Reading(logs, vehicle, selection, landmarks)
-    stage = PoseStage(vehicle, turn_signal_of(reading.planned, vehicle))
+    reading = _Reading(logs, vehicle, selection, landmarks, timeline, found)
+    timeline = reading.timeline
+    stage = PoseStage(vehicle, turn_signal_of(reading.planned, vehicle), timeline=timeline)
     if reading.camera is not None and landmarks is not None:
         at = reading.camera[0]
         stage.landmarks = looking(landmarks, vehicle, reading.ledgers[at])
@@ -141,7 +157,7 @@ def estimate_into(
     if detected is None:
         _begin_again(run, found)
     tally = _pose(reading, stage, run, on_time)
-    scene = None if found is None else _scene(run, vehicle, found)
+    scene = None if found is None else _scene(run, vehicle, found, reading)
     accounts = reading_of(reading.ledgers)
     if found is not None:
         accounts = joined_accounts(accounts, found["account"]["reading"], found["camera"])
@@ -150,15 +166,16 @@ def estimate_into(
         accounts, {} if found is None else found["account"]["detecting"],
         estimating_of(stage, frames),
     )  # fmt: skip
-    write_skipped(run, reading.ledgers, made["reading"], kept)
+    write_skipped(run, reading.ledgers, made["reading"], kept, timeline)
     before = 0.0 if detected is None else detected.seconds
     seconds = time.monotonic() - began
     notices = (
+        *gaps_told(timeline.segments),
         *_missing(reading.planned),
         *_no_camera(landmarks, reading.camera),
         *_no_mobileye(found, reading.planned),
         *_no_scene(found, reading),
-        *([] if found is None else found["notices"]),
+        *_of_detecting(found),
         *stage.notices,
         *stage.doubts(),
         *clock_changes(reading.extractors),
@@ -173,6 +190,7 @@ def estimate_into(
         "clocks": [clock_rows(extractor) for extractor in reading.extractors],
         "account": made,
         "counts": stage.counts(),
+        "time": time_told(timeline),
         "landmarks": None if landmarks is None else {
             "database": str(landmarks.path), "landmarks": len(landmarks),
             "sha256": sha256_of(landmarks.path),
@@ -188,8 +206,24 @@ def estimate_into(
     })  # fmt: skip
     return Outcome(
         run, reading.ledgers, tally.rows, tally.travelled_m, tally.major_axis_m, notices,
-        seconds + before, tally.seconds, stage.landmarks.counts(), made, detected, scene,
+        seconds + before, _driven_s(timeline, tally), stage.landmarks.counts(), made, detected,
+        scene, timeline.segments,
     )  # fmt: skip
+
+
+def _of_detecting(found: Mapping[str, Any] | None) -> list[str]:
+    """What the detect stage had to say, but for the gaps: those are said of the whole run."""
+    if found is None:
+        return []
+    return [one for one in found["notices"] if one not in found["time"]["notices"]]
+
+
+def _driven_s(timeline: Timeline, tally: PoseTally) -> float:
+    """From the first row to the last, gaps left out."""
+    later = timeline.segments[1:]
+    pairs = zip(timeline.segments, later, strict=False)
+    gaps_ns = sum(b.start_ns - a.end_ns for a, b in pairs if b.breaks_odometry)
+    return tally.seconds - gaps_ns * 1e-9
 
 
 def _hashed(logs: Sequence[Log], found: Mapping[str, Any] | None) -> Sequence[Mapping[str, object]]:
@@ -211,7 +245,8 @@ class _Reading:
 
     def __init__(
         self, logs: Sequence[Log], vehicle: Vehicle, selection: Selection,
-        landmarks: LandmarkDatabase | None,
+        landmarks: LandmarkDatabase | None, timeline: Timeline | None,
+        found: Mapping[str, Any] | None,
     ) -> None:  # fmt: skip
         topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
         self.logs = logs
@@ -221,30 +256,43 @@ class _Reading:
         if self.camera is not None:
             self.planned = with_pictures(self.planned, self.camera)
         self.ledgers = tuple(Ledger(str(log.path)) for log in logs)
-        self.selections = [
-            _narrowed(selection, self.planned.topics_of(i)) for i in range(len(logs))
-        ]
+        self.selections = selections_of(logs, self.planned, selection)
+        if timeline is None:
+            known = None if found is None else timeline_in(found)
+            timeline = drive_timeline(logs, vehicle, selection, self.camera, known)
+        self.timeline = timeline
         clocks = [
             probe_clocks(log, Extractor(self.planned, vehicle, i, Ledger("")), self.selections[i])
             for i, log in enumerate(logs)
         ]
         self.extractors = [
-            Extractor(self.planned, vehicle, i, ledger, clocks[i])
+            Extractor(self.planned, vehicle, i, ledger, clocks[i], shift_at=shift_of(timeline, i))
             for i, ledger in enumerate(self.ledgers)
         ]
+
+    @property
+    def timed(self) -> list[TimedLog]:
+        """The logs in drive time."""
+        return [TimedLog(log, self.timeline.clock(i)) for i, log in enumerate(self.logs)]
+
+    def clock_of(self, signal: Signal) -> LogClock:
+        """The clock of the log that a signal comes from."""
+        source = self.planned.source_of(signal)
+        return self.timeline.clock(0 if source is None else source.log)
 
 
 def _pose(
     reading: _Reading, stage: PoseStage, run: RunFolder, on_time: Callable[[int], None]
 ) -> PoseTally:
     tally = PoseTally()
+    timeline, clock = reading.timeline, reading.clock_of(Signal.WHEEL_SPEEDS)
     with (
-        TableSink(run, "pose", pose_schema()) as sink,
-        TableSink(run, measurements.TABLE, measurements.schema()) as measured,
-        MobileyeSink(run) as mobileye,
+        LabelledSink(run, "pose", pose_schema(), timeline, clock) as sink,
+        LabelledSink(run, measurements.TABLE, measurements.schema(), timeline, clock) as measured,
+        MobileyeSink(run, timeline, reading.clock_of(Signal.MOBILEYE_OBSTACLES)) as mobileye,
     ):
         for window in windows(
-            reading.logs, reading.extractors, reading.selections, reading.planned
+            reading.timed, reading.extractors, reading.selections, reading.planned
         ):
             for poses in stage(window):
                 sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
@@ -265,14 +313,20 @@ def _write_all(sink: TableSink, parts: Sequence[Mapping[str, object]]) -> None:
             sink.write(columns)
 
 
-def _scene(run: RunFolder, vehicle: Vehicle, found: Mapping[str, Any]) -> SceneOutcome:
+def _scene(
+    run: RunFolder, vehicle: Vehicle, found: Mapping[str, Any], reading: _Reading
+) -> SceneOutcome:
+    timeline, clock = reading.timeline, reading.timeline.clock(found["camera_log"])
     with ExitStack() as stack:
         sinks = {
-            name: stack.enter_context(TableSink(run, name, schema))
+            name: stack.enter_context(LabelledSink(run, name, schema, timeline, clock))
             for name, schema in schemas(features_of(vehicle)).items()
         }
-        past = StoredMobileye(run, vehicle.past).cues
-        return estimate_scene(run, vehicle, found, lambda name, rows: sinks[name].write(rows), past)
+        past = StoredMobileye(run, vehicle.past)
+        return estimate_scene(
+            run, vehicle, found, lambda name, rows: sinks[name].write(rows), past.cues,
+            timeline=timeline, on_restart=past.forget_before,
+        )  # fmt: skip
 
 
 def _scene_told(scene: SceneOutcome) -> dict[str, object]:
@@ -323,11 +377,6 @@ def _no_camera(landmarks: LandmarkDatabase | None, camera: tuple[int, Topic] | N
     if landmarks is None or camera is not None:
         return []
     return ["landmarks were given, but the logs have no camera: none is looked for"]
-
-
-def _narrowed(selection: Selection, planned: frozenset[str]) -> Selection:
-    topics = planned if selection.topics is None else planned & selection.topics
-    return Selection(topics, selection.start_ns, selection.end_ns)
 
 
 def _no_mobileye(found: Mapping[str, Any] | None, planned: Plan) -> list[str]:

@@ -1,8 +1,9 @@
 """What the pose filter was given, as a table: the smoother's input, written beside the pose.
 
 ``measurements.parquet`` has one row a measurement and nulls where a column does not apply:
-``start`` (the first belief), ``odometry`` (from ``start_ns`` to ``t_ns``), ``heading`` (those that
-counted), ``landmark`` (those weighed in).
+``start`` (the first belief), ``odometry`` (from ``start_ns`` to ``t_ns``), ``gap`` (likewise: what
+was assumed between two time segments), ``heading`` (those that counted), ``landmark`` (those
+weighed in).
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from crosscue.localization.ekf import PoseBelief
+from crosscue.localization.gap import Crossed
 from crosscue.localization.landmark_update import Sighting
-from crosscue.localization.odometry import Increments
+from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
 from crosscue.localization.pose_track import ACCEPTED, HeadingColumns, Headings
 from crosscue.localization.smoother import Fixes
 from crosscue.replay.columns import Floats
@@ -86,6 +88,20 @@ def odometry_rows(made: Increments) -> dict[str, object]:
     return _rows("odometry", made.stop_ns, columns | {"start_ns": made.start_ns})
 
 
+def gap_rows(start_ns: int, crossed: Crossed) -> dict[str, object]:
+    """A gap as a row."""
+    _, _, _, speed_mps = crossed.belief.mean.tolist()
+    return _rows(
+        "gap",
+        np.array([crossed.belief.t_ns]),
+        {
+            "start_ns": [start_ns], "distance_m": [crossed.distance_m], "turn_rad": [0.0],
+            "distance_var_m2": [crossed.distance_var_m2], "turn_var_rad2": [crossed.turn_var_rad2],
+            "speed_mps": [speed_mps], "speed_var_m2ps2": [crossed.belief.cov[3, 3]],
+        },
+    )  # fmt: skip
+
+
 def heading_rows(used: HeadingColumns) -> dict[str, object]:
     """Headings that counted as rows."""
     good = used.outcome == ACCEPTED
@@ -123,19 +139,23 @@ def read_measured(run: RunFolder) -> Measured:
     Raises:
         RunError: The table is missing (a run of an older crosscue), damaged, or empty.
     """
+    import pyarrow as pa
     import pyarrow.compute as pc
 
     table = run.table(TABLE)
 
-    def of(kind: str) -> dict[str, Floats]:
-        part = table.filter(pc.equal(table["kind"].cast("string"), kind))
+    def of(*kinds: str) -> dict[str, Floats]:
+        part = table.filter(pc.is_in(table["kind"].cast("string"), pa.array(kinds)))
         names = ("start_ns", "t_ns", *_NUMBERS)
         return {name: part[name].to_numpy() for name in names}
 
-    start, odometry, heading, landmark = map(of, ("start", "odometry", "heading", "landmark"))
+    start, heading, landmark = map(of, ("start", "heading", "landmark"))
+    odometry, gaps = of("odometry", "gap"), of("gap")
+    is_gap = np.isin(odometry["t_ns"], gaps["t_ns"]) & np.isin(
+        odometry["start_ns"], gaps["start_ns"]
+    )
     if len(start["t_ns"]) != 1 or not len(odometry["t_ns"]):
         raise RunError(f"{run.path}: no odometry in it, so there is nothing to smooth")
-    n = len(odometry["t_ns"])
     cov = np.zeros((4, 4))
     cov[:2, :2] = _matrices(start)[0]
     cov[2, 2], cov[3, 3] = start["heading_var_rad2"][0], start["speed_var_m2ps2"][0]
@@ -151,8 +171,8 @@ def read_measured(run: RunFolder) -> Measured:
             turn_var_rad2=odometry["turn_var_rad2"],
             speed_mps=odometry["speed_mps"],
             speed_var_m2ps2=odometry["speed_var_m2ps2"],
-            turn_source=np.zeros(n, np.uint8),
-            is_gap=np.zeros(n, np.bool_),
+            turn_source=np.where(is_gap, BY_NOTHING, BY_YAW_RATE).astype(np.uint8),
+            is_gap=is_gap,
         ),
         Headings(
             heading["t_ns"].astype(np.int64), heading["heading_rad"], heading["heading_var_rad2"]

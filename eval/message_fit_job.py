@@ -25,6 +25,7 @@ from crosscue.replay.run_folder import RunFolder
 from crosscue.replay.vehicle import Vehicle, of_manifest
 
 from .intervals import Interval, resampled, wilson
+from .log_time import refuse_set_back
 from .score_truth import CROSSING_NS
 from .travelled import odometer_of
 
@@ -70,6 +71,7 @@ def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) ->
     Raises:
         RunError: A table is missing or damaged, or nothing of the run lies in the truth's time.
     """
+    refuse_set_back(run, "fit messages")
     belief = run.table("belief", ["t_ns", "approach", "established"])
     t_ns = _whole(belief["t_ns"])
     number, established = _whole(belief["approach"]), np.asarray(belief["established"])

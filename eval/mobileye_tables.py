@@ -20,8 +20,11 @@ from crosscue.fusion.approaches import PastCues
 from crosscue.fusion.intersection_range import RangeBelief, Reference
 from crosscue.replay.mobileye.samples import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.past_settings import Past
-from crosscue.replay.run_folder import RunFolder, TableSink
+from crosscue.replay.run_folder import RunFolder
 from crosscue.replay.signals import MOBILEYE_SIGNALS, Samples, Signal
+from crosscue.replay.time_segments import BEGINNING, LogClock, Timeline
+
+from .labelled import LabelledSink
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -42,10 +45,11 @@ def schema(signal: Signal) -> pa.Schema:
 class MobileyeSink:
     """Writes both tables, a window at a time; a context manager."""
 
-    def __init__(self, run: RunFolder) -> None:
+    def __init__(self, run: RunFolder, timeline: Timeline, clock: LogClock) -> None:
         self._stack: Final = ExitStack()
         self._sinks: Final = {
-            signal: TableSink(run, name, schema(signal)) for signal, (name, _) in TABLES.items()
+            signal: LabelledSink(run, name, schema(signal), timeline, clock)
+            for signal, (name, _) in TABLES.items()
         }
 
     def write(self, samples: Mapping[Signal, Samples]) -> None:
@@ -75,6 +79,7 @@ class StoredMobileye:
 
     def __init__(self, run: RunFolder, past: Past) -> None:
         self._past: Final = past
+        self._since_ns = BEGINNING
         self._readers: Final = {signal: _Reader(signal, _parts(run, signal)) for signal in TABLES}
 
     def at(self, t_ns: int) -> MobileyeState:
@@ -83,7 +88,16 @@ class StoredMobileye:
         obstacles, lanes = (
             self._readers[signal].around(t_ns, keep_ns) for signal in MOBILEYE_SIGNALS
         )
-        return state_at(obstacles, lanes, t_ns, self._past)
+        return state_at(self._fresh(obstacles), self._fresh(lanes), t_ns, self._past)
+
+    def forget_before(self, t_ns: int) -> None:
+        """Nothing told before ``t_ns`` counts any more."""
+        self._since_ns = t_ns
+
+    def _fresh(self, held: Samples | None) -> Samples | None:
+        if held is None or held.t_ns[0] >= self._since_ns:
+            return held
+        return held.take(held.t_ns >= self._since_ns)
 
     def cues(self, t_ns: int) -> PastCues:
         """The cues past the intersection at ``t_ns``, once a range is known."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
 from crosscue.localization import compass, odometry, pose_track
+from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.odometry import OdometrySettings, Pending, TurnSignal, WheelSpeeds
 from crosscue.localization.pose_track import (
     NO_HEADINGS,
@@ -21,11 +22,12 @@ from crosscue.localization.pose_track import (
 )
 from crosscue.replay.columns import Floats
 from crosscue.replay.signals import Plan, Samples, Signal
+from crosscue.replay.time_segments import ONE_SEGMENT, Cause, Segment, Timeline
 from crosscue.replay.vehicle import Vehicle
 from crosscue.replay.windows import Window
 
 from .landmark_stage import LandmarkStage, NoLandmarks
-from .measurements import heading_rows, landmark_rows, odometry_rows, start_rows
+from .measurements import gap_rows, heading_rows, landmark_rows, odometry_rows, start_rows
 
 REJECTED_SHARE: Final = 0.1
 """An honest filter refuses one reading in a thousand; above this something is wrong."""
@@ -61,9 +63,15 @@ def track_settings(vehicle: Vehicle) -> TrackSettings:
     )
 
 
+def gap_settings(vehicle: Vehicle) -> GapSettings:
+    """What the vehicle file says a car can do in a gap."""
+    fields = vehicle.time.model_dump(exclude={"max_silence_s", "unknown_gap_s"})
+    return GapSettings(**fields)
+
+
 @dataclass(slots=True)
 class PoseStage:
-    """Carries belief and pending rows from window to window.
+    """Carries belief and pending rows from window to window, and the belief across gaps.
 
     Attributes:
         vehicle: The vehicle file.
@@ -75,6 +83,7 @@ class PoseStage:
         received: Samples that arrived, by signal.
         started_with: Headings that the first belief was made of.
         turn_early: Turn samples that came before the first wheel speeds.
+        timeline: Where the drive has gaps.
     """
 
     vehicle: Vehicle
@@ -86,21 +95,64 @@ class PoseStage:
     received: Counter[Signal] = field(default_factory=Counter)
     started_with: int = 0
     turn_early: int = 0
+    timeline: Timeline = ONE_SEGMENT
     _pending: Pending = field(default_factory=Pending)
     _state: TrackState | None = None
     _last_ns: int | None = None
     _measured: list[dict[str, object]] = field(default_factory=list)
+    _gap: Segment | None = None
+    _segment: int = 0
 
     def __call__(self, window: Window) -> Iterator[PoseColumns]:
         """Rows that this window completes."""
         self.received.update({signal: len(of.t_ns) for signal, of in window.samples.items()})
+        while (following := self._following(window.end_ns)) is not None:
+            if following.begins_ns > window.start_ns:
+                before, window = _split(window, following.begins_ns)
+                yield from self._advance(before, before.end_ns)
+            if following.breaks_odometry:
+                yield from self._end_segment(following)
         yield from self._advance(window, window.end_ns)
+
+    def _following(self, until_ns: int) -> Segment | None:
+        """The next segment, if it begins before ``until_ns``."""
+        segments = self.timeline.segments
+        if self._segment + 1 >= len(segments):
+            return None
+        following = segments[self._segment + 1]
+        if following.begins_ns >= until_ns:
+            return None
+        self._segment += 1
+        return following
 
     def finish(self) -> Iterator[PoseColumns]:
         """Rows that waited for more odometry."""
+        yield from self._close()
+        self.landmarks.let_go(FOREVER_NS)
+
+    def _close(self) -> Iterator[PoseColumns]:
+        """Rows that waited for odometry that does not come."""
         if self._state is not None and self._last_ns is not None:
             yield from self._advance(Window(self._last_ns, self._last_ns, {}), None)
-        self.landmarks.let_go(FOREVER_NS)
+
+    def _end_segment(self, following: Segment) -> Iterator[PoseColumns]:
+        """Close a segment; what follows is another drive that begins about here."""
+        yield from self._close()
+        self._pending = Pending()
+        if self._state is not None:
+            self._gap = following
+
+    def _cross(self, segment: Segment, until_ns: int) -> None:
+        """Carry the belief over the gap before ``segment``, to its first wheel speed."""
+        assert self._state is not None
+        restarts = segment.cause is Cause.SET_BACK
+        before_ns = self._state.belief.t_ns
+        crossed = cross_gap(
+            self._state.belief, until_ns, gap_settings(self.vehicle), restarts=restarts
+        )
+        self._state = replace(self._state, belief=crossed.belief, counted_ns=None)
+        self._measured.append(gap_rows(before_ns, crossed))
+        self._gap = None
 
     def take_measured(self) -> list[dict[str, object]]:
         """What the filter was given since the last call, as rows of ``measurements.parquet``."""
@@ -146,6 +198,13 @@ class PoseStage:
             headings = self._start(int(wheels.t_ns[0]), headings)
         assert self._state is not None
         self._last_ns = window.end_ns
+        if self._gap is not None:
+            if wheels is None:
+                self._missed(headings)
+                self.turn_early += 0 if (turn := self._turn(window)) is None else len(turn)
+                self.landmarks.let_go(window.end_ns)
+                return
+            self._cross(self._gap, int(wheels.t_ns[0]))
         step = odometry.integrate(
             _wheels(wheels), odometry_settings(self.vehicle), self._turn(window), self._pending,
             until_ns,
@@ -215,6 +274,19 @@ class PoseStage:
             return NO_HEADINGS
         heading_rad = compass.heading(found.values, compass_settings(self.vehicle))
         return Headings(found.t_ns, heading_rad, np.full(len(found.t_ns), variance))
+
+
+def _split(window: Window, at_ns: int) -> tuple[Window, Window]:
+    """A window's part before a time, and the rest."""
+    before: dict[Signal, Samples] = {}
+    after: dict[Signal, Samples] = {}
+    for signal, samples in window.samples.items():
+        is_before = samples.t_ns < at_ns
+        if is_before.any():
+            before[signal] = samples.take(is_before)
+        if not is_before.all():
+            after[signal] = samples.take(~is_before)
+    return Window(window.start_ns, at_ns, before), Window(at_ns, window.end_ns, after)
 
 
 def compass_settings(vehicle: Vehicle) -> compass.CompassSettings:

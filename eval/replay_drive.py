@@ -9,14 +9,17 @@ from typing import Any, Final
 
 from crosscue.detectors.registry import Choice, make
 from crosscue.localization.landmark_database import LandmarkDatabase
+from crosscue.replay.columns import Topic
 from crosscue.replay.errors import RunError
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.run_folder import RunFolder, clear, locked
 from crosscue.replay.signals import camera_of
+from crosscue.replay.time_segments import Timeline
 from crosscue.replay.vehicle import Vehicle
 
 from .accounts import log_rows, selection_told
 from .detect_stage import DetectOutcome, OnFrames, detect_into, unwatched
+from .drive_time import drive_timeline
 from .estimate_stage import Outcome, detected_part, estimate_into
 
 TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
@@ -70,25 +73,40 @@ def replay_drive(
         OutputError: The disk is full.
     """
     with locked(run):
+        timeline = drive_timeline(
+            logs, vehicle, selection, _camera(logs, vehicle, detecting, landmarks)
+        )
         earlier = _kept(logs, vehicle, run, selection, detecting) if detecting.resume else None
         if earlier is None:
             clear(run)
-            found = _detect(logs, vehicle, run, selection, detecting)
+            found = _detect(logs, vehicle, run, selection, detecting, timeline)
         else:
             found = None
-        return estimate_into(logs, vehicle, run, selection, on_time, landmarks, found, earlier)
+        return estimate_into(
+            logs, vehicle, run, selection, on_time, landmarks, found, earlier, timeline=timeline
+        )
+
+
+def _camera(
+    logs: Sequence[Log], vehicle: Vehicle, detecting: Detecting,
+    landmarks: LandmarkDatabase | None,
+) -> tuple[int, Topic] | None:  # fmt: skip
+    """The camera, where anything will look at it."""
+    if not detecting.choices and landmarks is None:
+        return None
+    return camera_of([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
 
 
 def _detect(
     logs: Sequence[Log], vehicle: Vehicle, run: RunFolder, selection: Selection,
-    detecting: Detecting,
+    detecting: Detecting, timeline: Timeline,
 ) -> DetectOutcome | None:  # fmt: skip
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
     if not detecting.choices or camera_of(topics, vehicle) is None:
         return None
     return detect_into(
         logs, vehicle, run, selection, detecting.choices, detecting.cache, detecting.draw,
-        detecting.on_frames,
+        detecting.on_frames, timeline,
     )  # fmt: skip
 
 
@@ -111,6 +129,7 @@ def _kept(
         "camera": camera[1].name,
         "identities": [make(choice).identity for choice in detecting.choices],
         "depth_bits": vehicle.camera.depth_bits,
+        "time": vehicle.time.model_dump(mode="json"),
     }
     there = {
         "logs": earlier["logs"],
@@ -118,5 +137,6 @@ def _kept(
         "camera": earlier["camera"],
         "identities": [detector["identity"] for detector in earlier["detectors"]],
         "depth_bits": earlier["settings"]["camera"]["depth_bits"],
+        "time": earlier["settings"]["time"],
     }
     return earlier if wanted == there else None

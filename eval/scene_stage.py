@@ -18,6 +18,7 @@ from crosscue.fusion.approaches import Approaches, FrameEvidence, PastCues, Sign
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.run_folder import RunFolder
+from crosscue.replay.time_segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle import Vehicle
 
 from .sign_ranges import sign_ranges
@@ -90,6 +91,8 @@ def estimate_scene(
     past: Callable[[int], PastCues | None] = nothing_past,
     without: frozenset[str] = frozenset(),
     on_time: Callable[[int], None] = lambda _: None,
+    timeline: Timeline = ONE_SEGMENT,
+    on_restart: Callable[[int], None] = lambda _: None,
 ) -> SceneOutcome:
     """Run cues, range filter and belief over a run's stored frames.
 
@@ -101,6 +104,8 @@ def estimate_scene(
         past: From a time to the Mobileye's cues past the intersection then.
         without: Cues to leave out as if nothing had looked for them, with the ranges they give.
         on_time: Told the log time reached.
+        timeline: Where the drive has gaps; beyond a long one everything starts anew.
+        on_restart: Told the drive time from which on a new start counts.
 
     Raises:
         RunError: A table is missing or damaged.
@@ -113,8 +118,13 @@ def estimate_scene(
         odometer_of(run),
         _Rows(sink, features_of(vehicle)),
     )
+    restarts = _Restarts(vehicle, timeline)
     fresh_regions = detected["settings"]["regions"] != vehicle.model_dump(mode="json")["regions"]
     for frame in stored_frames(run, detected["detectors"], with_road_masks=fresh_regions):
+        fresh_ns = restarts.before(frame.seen.t_ns)
+        if fresh_ns is not None:
+            scene.restart(fresh_ns)
+            on_restart(fresh_ns)
         scene.step(frame, past(frame.seen.t_ns), without)
         on_time(frame.seen.t_ns)
     scene.rows.flush()
@@ -123,6 +133,28 @@ def estimate_scene(
         scene.frames, dict(sorted(scene.positive.items())), tuple(scene.summaries.values()),
         scene.approaches.counts, scene.without_odometry,
     )  # fmt: skip
+
+
+@dataclass(slots=True)
+class _Restarts:
+    """Follows the segments along the frames."""
+
+    vehicle: Vehicle
+    timeline: Timeline
+    _number: int = 0
+
+    def before(self, t_ns: int) -> int | None:
+        """Where the new segment begins if a frame at ``t_ns`` is the first after a long gap."""
+        segments, found = self.timeline.segments, None
+        limit_ns = round(self.vehicle.time.restart_after_s * 1e9)
+        while self._number + 1 < len(segments):
+            following = segments[self._number + 1]
+            if following.begins_ns > t_ns:
+                break
+            self._number += 1
+            if following.gap_ns is None or following.gap_ns > limit_ns:
+                found = following.begins_ns
+        return found
 
 
 @dataclass(slots=True)
@@ -157,6 +189,13 @@ class _Scene:
         self.positive.update(cue for cue, count in step.counts.items() if count)
         self.rows.add(step)
         self._sum_up(step)
+
+    def restart(self, t_ns: int) -> None:
+        """Know nothing of what was before ``t_ns``."""
+        self.approaches.restart()
+        self.odometer.skip_to(t_ns)
+        self.cues = CuePass(self.vehicle)
+        self._last_ns = None
 
     def _evidence(
         self, t_ns: int, counts: Mapping[str, int], signs: tuple[SignRange, ...]

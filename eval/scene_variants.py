@@ -9,7 +9,9 @@ from crosscue.replay.errors import RunError
 from crosscue.replay.run_folder import RunFolder
 from crosscue.replay.vehicle import Vehicle, of_manifest
 
+from .drive_time import timeline_in
 from .estimate_stage import detected_part
+from .labelled import with_labels
 from .mobileye_tables import StoredMobileye
 from .scene_stage import estimate_scene, features_of, schemas
 
@@ -58,6 +60,13 @@ def scene_tables(
     def keep(name: str, rows: dict[str, list[Any]]) -> None:
         parts[name].append(pa.table(rows, schema=wanted[name]))
 
-    past = StoredMobileye(run, settings.past).cues
-    estimate_scene(run, settings, detected, keep, past, without)
-    return {name: pa.concat_tables(some) for name, some in parts.items()}
+    timeline = timeline_in(manifest)
+    past = StoredMobileye(run, settings.past)
+    estimate_scene(
+        run, settings, detected, keep, past.cues, without,
+        timeline=timeline, on_restart=past.forget_before,
+    )  # fmt: skip
+    clock = timeline.clock(detected["camera_log"])
+    return {
+        name: with_labels(pa.concat_tables(some), timeline, clock) for name, some in parts.items()
+    }

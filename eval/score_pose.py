@@ -25,6 +25,7 @@ from crosscue.replay.errors import SchemaError
 from crosscue.replay.run_folder import RunFolder, strict_json, write_text
 from crosscue.replay.vehicle import Vehicle, of_manifest
 
+from .log_time import pose_in_log_time
 from .pose_figures import ScoredPoses, draw_all
 from .pose_metrics import (
     Alignment,
@@ -105,7 +106,7 @@ def truth_track(path: Path, run: RunFolder) -> TruthTrack:
         SchemaError: The truth does not fit the run.
     """
     _, track = load_truth(path)
-    table = run.table("pose", ["t_ns"])
+    table = pose_in_log_time(run)
     inside = _inside(track, table, path)
     return TruthTrack(track.t_ns[inside], track.xyz_m[inside, 0], track.xyz_m[inside, 1])
 
@@ -132,7 +133,7 @@ def score(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.
 def measure(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.0)) -> PoseScore:
     """As ``score``, with tracks and figures written but no metrics."""
     truth, track = load_truth(truth_path)
-    table = run.table("pose")
+    table = pose_in_log_time(run)
     vehicle = of_manifest(run.manifest()["settings"])
     inside = _inside(track, table, truth_path)
     estimate, cov = _estimate(table, vehicle, truth)

@@ -13,6 +13,9 @@ from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import RunError
 from crosscue.replay.run_folder import RunFolder
 
+from .drive_time import timeline_in
+from .log_time import LABELS, table_in_log_time
+
 if TYPE_CHECKING:
     import pyarrow as pa
 
@@ -100,8 +103,12 @@ def tables_of(run: RunFolder) -> RunTables:
     Raises:
         RunError: A table is damaged or has other columns.
     """
+    timeline = timeline_in(run.manifest())
     found = {
-        name: run.table(name) if run.file(f"{name}.parquet").exists() else None for name in NAMES
+        name: table_in_log_time(run.table(name), timeline)
+        if run.file(f"{name}.parquet").exists()
+        else None
+        for name in NAMES
     }
     return run_tables(str(run.path), **{f"{name}_table": table for name, table in found.items()})
 
@@ -163,7 +170,7 @@ def _ranges(table: pa.Table, where: str) -> RangeRows:
 def _belief(table: pa.Table, where: str) -> BeliefRows:
     features: dict[str, Floats] = {}
     for name in table.column_names:
-        if name in ("t_ns", "approach", "established"):
+        if name in ("t_ns", "approach", "established", *LABELS):
             continue
         values = _numbers(table, name, where)
         # NaN compares false: it is left out later, and counted.

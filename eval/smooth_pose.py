@@ -17,6 +17,7 @@ from crosscue.replay.errors import SchemaError
 from crosscue.replay.run_folder import RunFolder, strict_json, write_text
 from crosscue.replay.vehicle import of_manifest
 
+from .log_time import refuse_set_back
 from .measurements import read_measured
 from .pose_metrics import NeesSummary, nees, pair, summarise_nees
 from .score_pose import COVARIANCES, MAX_DIFFERENCE_NS, at_truths_point, load_truth
@@ -61,6 +62,7 @@ def score_smoother(run: RunFolder, truth_path: Path) -> SmootherScore:
         SchemaError: The truth does not fit the run.
     """
     truth, track = load_truth(truth_path)
+    refuse_set_back(run, "the smoother")
     measured = read_measured(run)
     vehicle = of_manifest(run.manifest()["settings"])
     first_ns, last_ns = measured.start.t_ns, int(measured.increments.stop_ns[-1])

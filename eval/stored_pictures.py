@@ -19,7 +19,10 @@ from crosscue.replay.log import Selection, open_log
 from crosscue.replay.roles import Role, role_of
 from crosscue.replay.run_folder import RunFolder
 from crosscue.replay.signals import Extractor, Plan, Source
+from crosscue.replay.time_segments import UNSHIFTED, LogClock, TimedLog
 from crosscue.replay.vehicle import Vehicle
+
+from .drive_time import timeline_in
 
 AROUND_NS: Final = 2_000_000_000
 """A picture's own clock and the log's may differ by this much."""
@@ -34,12 +37,14 @@ class StoredCamera:
         topic: In it.
         clock: Whose times the run's tables have.
         selection: What part of the log the run looked at.
+        time: The log's clock against the times of the run's tables.
     """
 
     log: Path
     topic: Topic
     clock: Clock
     selection: Selection
+    time: LogClock = UNSHIFTED
 
 
 def camera_of(run: RunFolder) -> StoredCamera | None:
@@ -53,9 +58,12 @@ def camera_of(run: RunFolder) -> StoredCamera | None:
     named = None if detected is None else detected["camera"]
     if detected is None:
         named = manifest["settings"].get("topics", {}).get("camera")
+    timeline = timeline_in(manifest)
     found: list[tuple[Path, Topic]] = []
-    for entry in manifest["logs"]:
+    clocks: dict[Path, LogClock] = {}
+    for number, entry in enumerate(manifest["logs"]):
         path = Path(entry["path"])
+        clocks[path] = timeline.clock(number)
         # The log may have gone since it was replayed; the rest of the run can still be seen.
         with suppress(LogError), open_log(path) as log:
             found += [(path, topic) for topic in log.topics if role_of(topic) is Role.CAMERA]
@@ -66,7 +74,7 @@ def camera_of(run: RunFolder) -> StoredCamera | None:
     path, topic = found[0]
     part = manifest.get("selection", {})
     selection = Selection(frozenset({topic.name}), part.get("start_ns"), part.get("end_ns"))
-    return StoredCamera(path, topic, _clock(detected, topic.name), selection)
+    return StoredCamera(path, topic, _clock(detected, topic.name), selection, clocks[path])
 
 
 def _clock(detected: Mapping[str, Any] | None, topic: str) -> Clock:
@@ -109,12 +117,14 @@ def read_pictures(
     extractor = Extractor(
         Plan((Source(0, camera.topic, ()),), {}), Vehicle(version=1), 0, ledger,
         {camera.topic.name: camera.clock}, on_pictures=on_pictures,
+        shift_at=camera.time.shift_at if len(camera.time.epochs) > 1 else None,
     )  # fmt: skip
     selection = camera.selection
-    if around_ns is not None:
+    # Rows are told apart by counting where stamps alone do not do.
+    if around_ns is not None and camera.topic.name not in camera.time.topics:
         begin, end = around_ns - AROUND_NS, around_ns + AROUND_NS
         selection = Selection(selection.topics, begin, end)
     with open_log(camera.log) as log:
-        for block in log.read(ledger, selection):
+        for block in TimedLog(log, camera.time).read(ledger, selection):
             for _ in extractor(block):
                 pass

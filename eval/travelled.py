@@ -76,6 +76,10 @@ class Odometer:
         self.at_ns = t_ns
         return Way(distance, var, turn, covered)
 
+    def skip_to(self, t_ns: int) -> None:
+        """Leave out all odometry before ``t_ns``."""
+        self.until(t_ns)
+
     def _peek(self) -> tuple[int, int, float, float, float] | None:
         while self._next == len(self._rows):
             part = next(self.parts, None)

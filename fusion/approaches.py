@@ -177,6 +177,13 @@ class Approaches:
             self._open.since_evidence_m = 0.0
         return self._step(self._open, evidence, signs, past, moved)
 
+    def restart(self) -> None:
+        """Begin anew after a gap in time: what was believed is about another place."""
+        if self._open is not None:
+            self._close("a gap in time")
+        self._last_ns = None
+        self._rest_m = 0.0
+
     def finish(self) -> None:
         """Say that the drive is over; an approach still open is counted as such."""
         if self._open is not None:

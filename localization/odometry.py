@@ -28,6 +28,8 @@ TurnKind: TypeAlias = Literal["yaw rate", "steering"]
 BY_YAW_RATE: Final = 0
 BY_STEERING: Final = 1
 BY_WHEELS: Final = 2
+BY_NOTHING: Final = 3
+"""No odometry: a gap between two time segments."""
 
 _POSITIVE: Final = (
     "track_width_m",
@@ -211,7 +213,8 @@ class Increments:
         turn_var_rad2: Shape (N,).
         speed_mps: Shape (N,): of the rear axle at the end.
         speed_var_m2ps2: Shape (N,).
-        turn_source: Shape (N,), uint8: ``BY_YAW_RATE``, ``BY_STEERING`` or ``BY_WHEELS``.
+        turn_source: Shape (N,), uint8: ``BY_YAW_RATE``, ``BY_STEERING``, ``BY_WHEELS``; or
+            ``BY_NOTHING``, where what was assumed in a gap stands in for odometry.
         is_gap: Shape (N,), bool: longer than the settings allow.
     """
 

@@ -20,7 +20,7 @@ from crosscue.replay.errors import UsageError
 
 from .angles import wrap
 from .ekf import PoseBelief
-from .odometry import Increments
+from .odometry import BY_NOTHING, Increments
 from .packed_state import PackedState, driven
 from .pose_track import Headings
 
@@ -165,22 +165,25 @@ def _steps(times: Int64s, increments: Increments) -> list[tuple[Floats, Floats]]
         increments.distance_var_m2,
         increments.turn_var_rad2,
     )
+    is_blind = increments.turn_source == BY_NOTHING
     starts, stops = increments.start_ns.tolist(), increments.stop_ns.tolist()
     rows = list(zip(*(column.tolist() for column in columns), strict=True))
     i = int(np.searchsorted(increments.stop_ns, times[0], side="right"))
     steps: list[tuple[Floats, Floats]] = []
     now = int(times[0])
     for until in times[1:].tolist():
-        state = _AT_REST
+        state, aside_var = _AT_REST, 0.0
         while now < until:
             to = min(until, stops[i])
             share = (to - now) / (stops[i] - starts[i])
             distance, turn, distance_var, turn_var = (share * value for value in rows[i])
             state = driven(state, distance, turn, distance_var, turn_var, 0.0)
+            aside_var += distance_var if is_blind[i] else 0.0
             now = to
             i += now == stops[i]
         x, y, heading, _, xx, xy, xh, _, yy, yh, _, hh, _, _ = state
-        cov = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
+        # In a gap the car may have gone aside as far as ahead.
+        cov = np.array([[xx, xy, xh], [xy, yy + aside_var, yh], [xh, yh, hh]])
         steps.append((np.array([x, y, heading]), cov))
     return steps
 

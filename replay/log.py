@@ -42,6 +42,14 @@ class Selection:
 EVERYTHING: Final = Selection()
 
 
+class Readable(Protocol):
+    """What gives blocks: a log, or one that is read on another time."""
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """As ``Log.read``."""
+        ...
+
+
 class Log(Protocol):
     """An open recording. Use it as a context manager."""
 

@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from .bounded import read_at_most
 from .errors import OutputError, RunError
@@ -398,7 +398,7 @@ class TableSink:
         if held:
             self._writer.write_table(pa.concat_tables(held).combine_chunks())
 
-    def __enter__(self) -> TableSink:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from .clocks import Clock, ClockWatch, times_of
+from .clocks import MAX_OFFSET_NS, Clock, ClockWatch, times_of
 from .columns import Block, Floats, Images, Int64s, Table, Topic
 from .decode import Decoder, decoder_for
 from .errors import VehicleError
@@ -299,6 +299,8 @@ class Extractor:
         clocks: From a topic to the clock whose times its samples carry; the log's where none is.
         watch: Sees every block, decoded.
         on_pictures: Given every block of ``Images``, its ``log_ns`` on the clock chosen.
+        shift_at: From drive time to how far it lies from the log's own, where blocks come in drive
+            time; sensors' stamps are shifted alike.
     """
 
     planned: Plan
@@ -308,6 +310,7 @@ class Extractor:
     clocks: Mapping[str, Clock] = field(default_factory=dict)
     watch: ClockWatch = field(default_factory=ClockWatch)
     on_pictures: Callable[[Block], None] = _no_pictures
+    shift_at: Callable[[Int64s], Int64s] | None = None
     _decoders: dict[str, Decoder | None] = field(default_factory=dict)
     _buses: dict[str, BusDecoder] = field(default_factory=dict)
     _mobileye: MobileyeStream | None = None
@@ -331,6 +334,8 @@ class Extractor:
             block = decode(block, self.ledger)
         if not len(block):
             return
+        if self.shift_at is not None and block.header_ns is not None:
+            block = replace(block, header_ns=self._shifted(block.header_ns, block.log_ns))
         self.watch.see(block)
         clock = self.clocks.get(block.topic, Clock.LOG)
         block = replace(block, log_ns=times_of(block, clock))
@@ -345,6 +350,13 @@ class Extractor:
         for signal in source.signals:
             if signal not in MOBILEYE_SIGNALS:
                 yield from _FROM_TABLE[signal](block, self.ledger)
+
+    def _shifted(self, header_ns: Int64s, log_ns: Int64s) -> Int64s:
+        """Sensors' stamps in drive time; 0, for none, where they did not follow the log's clock."""
+        assert self.shift_at is not None
+        shifted = header_ns + self.shift_at(log_ns)
+        follows = (header_ns > 0) & (np.abs(shifted - log_ns) <= MAX_OFFSET_NS)
+        return np.where(follows, shifted, 0)
 
     def finish(self) -> Iterator[tuple[str, Samples]]:
         """What was held back until it was known to be whole, with its topic; at the log's end.

@@ -21,6 +21,7 @@ from .limits import MIB
 from .misfit import explain
 from .past_settings import Past
 from .settings_section import Finite, NotNegative, Positive, Section
+from .time_settings import Time
 from .tree_text import toml_tree
 
 VERSION: Final = 1
@@ -276,6 +277,7 @@ class Vehicle(Section):
     can: Can = Can()
     mobileye: Mobileye = Mobileye()
     odometry: Odometry = Odometry()
+    time: Time = Time()
     compass: Compass = Compass()
     start: Start = Start()
     camera: Camera = Camera()

@@ -15,7 +15,7 @@ import numpy as np
 
 from .columns import Block
 from .ledger import Ledger
-from .log import Log, Selection
+from .log import Readable, Selection
 from .signals import Extractor, Plan, Samples, Signal
 
 WIDTH_NS: Final = 1_000_000_000
@@ -59,7 +59,7 @@ class _Progress:
 
 
 def windows(
-    logs: Sequence[Log],
+    logs: Sequence[Readable],
     extractors: Sequence[Extractor],
     selections: Sequence[Selection],
     planned: Plan,

@@ -13,6 +13,7 @@ from crosscue.replay.columns import Block
 from crosscue.replay.errors import RunError, VehicleError
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.run_folder import create
+from crosscue.replay.time_settings import Time
 from crosscue.replay.vehicle import Start, Vehicle, parse
 from support.data import shared
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
@@ -82,7 +83,9 @@ def test_rows_that_are_not_numbers_are_counted_and_left_out(tmp_path: Path) -> N
     blocks = _drive(0.0)
     blocks[5] = wheel_block([2 * SECOND + 1], [math.nan])
 
-    outcome = _replay(tmp_path / "run", blocks)
+    vehicle = Vehicle(version=1, start=Start(heading_rad=0.0), time=Time(max_silence_s=1.5))
+
+    outcome = _replay(tmp_path / "run", blocks, vehicle)
 
     counts = outcome.run.manifest()["counts"]["odometry"]
     assert counts["not_finite"] == 1

@@ -11,6 +11,7 @@ import pyarrow.compute as pc
 import rerun as rr
 from numpy.typing import NDArray
 
+from crosscue.eval.log_time import LABELS
 from crosscue.eval.score_truth import TrueRanges
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle import Vehicle
@@ -31,7 +32,7 @@ POSE: Final[Mapping[str, str]] = {
     "ellipse": "2-sigma ellipse, full major axis (m)",
 }
 """Plots of the pose and their titles."""
-NOT_IN_BELIEF: Final = ("t_ns", "approach", "established")
+NOT_IN_BELIEF: Final = ("t_ns", "approach", "established", *LABELS)
 
 
 def log_pose_series(
