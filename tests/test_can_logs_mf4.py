@@ -18,6 +18,7 @@ from crosscue.replay.errors import CrosscueError, LogFormatError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, Selection, open_log
+from crosscue.replay.readers.mf4_blocks import Blocks
 from support.can_files import Sent, made, read_back, same_as_python_can
 from support.data import shared
 
@@ -253,3 +254,62 @@ def test_what_is_no_mdf_4_log_is_refused_in_one_line(
         open_log(path)
 
     assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+@pytest.mark.parametrize("compression", [0, 2])
+def test_a_span_of_time_reads_the_blocks_that_overlap_and_no_other(
+    tmp_path: Path, compression: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(3)
+    count = 400_000
+    times = np.arange(count) * 1e-3
+    samples = [rng.integers(0, 1 << 60, count) for _ in range(3)]
+    path = tmp_path / "x.mf4"
+    with asammdf.MDF(version="4.10") as mdf:
+        mdf.configure(write_fragment_size=1 << 18)
+        signals = [asammdf.Signal(s, times, name=f"s{k}") for k, s in enumerate(samples)]
+        mdf.append(signals, acq_name="drive")
+        mdf.save(path, compression=compression)
+    read: list[int] = []
+    plain = Blocks.read
+
+    def counted(self: Blocks, at: int, size: int) -> bytes:
+        read.append(size)
+        return plain(self, at, size)
+
+    monkeypatch.setattr(Blocks, "read", counted)
+    with open_log(path) as log:
+        ledger = Ledger(str(path))
+        first_ns = next(log.read(ledger)).log_ns[0]
+        read.clear()
+        span = Selection(None, int(first_ns) + 200 * 10**9, int(first_ns) + 202 * 10**9)
+        ledger = Ledger(str(path))
+        blocks = list(log.read(ledger, span))
+
+    (block,) = blocks
+    assert isinstance(block.rows, Table)
+    np.testing.assert_array_equal(block.rows["s1"], samples[1][200_000:202_000])
+    assert sum(read) < path.stat().st_size / (4 if compression else 30)
+    account = ledger.topic("drive")
+    assert account.declared == account.found == count
+    assert account.skipped.total() == count - 2_000
+    assert ledger.is_whole
+    assert "of other times, were not read" in ledger.integrity
+
+
+def test_a_span_of_time_of_a_bus_gives_what_a_whole_pass_gives() -> None:
+    path = shared(*REAL)
+    whole, _ = read_back(path)
+    times = sorted(f.t_ns for frames in whole.values() for f in frames)
+    for begin, end in ((0.5, 0.51), (0.0, 0.1), (0.98, 1.0), (0.3, 0.3)):
+        start_ns, end_ns = times[int(begin * len(times))], times[int(end * (len(times) - 1))]
+
+        part, ledger = read_back(path, Selection(None, start_ns, end_ns))
+
+        expected = {
+            name: [f for f in frames if start_ns <= f.t_ns < end_ns]
+            for name, frames in whole.items()
+        }
+        assert part == {name: frames for name, frames in expected.items() if frames}
+        assert ledger.is_whole
+        assert sum(account.found for account in ledger.accounts.values()) == len(times)

@@ -70,6 +70,8 @@ class FrameRows:
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> FrameRows:
         """The rows picked by ``index``."""
+        if isinstance(index, np.ndarray) and index.dtype == np.bool_:
+            index = np.flatnonzero(index)
         return FrameRows(
             self.place[index], self.bus[index], self.log_ns[index], self.frames.take(index)
         )

@@ -7,8 +7,9 @@ Attachments are never opened. Compressed blocks carry a checksum, which is verif
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -23,12 +24,14 @@ from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, Log, Selection
 
 from .can_rows import (
+    BUSES_MAX,
     NO_ROWS,
     FrameRows,
     blocks_by_bus,
     bus_number,
     bus_topic,
     in_time,
+    keep_memory,
     merged,
     merged_by_time,
 )
@@ -54,6 +57,10 @@ from .mf4_variable import GroupValues, StoredValues, VariableValues
 
 _NAMES_SHOWN: Final = 5
 _PEEK_ROWS: Final = 4096
+_CHUNK_BYTES: Final = 1 << 16
+"""Bytes of records that are read or left out together when a span of time is asked for."""
+_BUFFER_BYTES: Final = 1 << 16
+"""Loggers write the blocks that describe a file close together; they are read at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +87,11 @@ class _Account:
 
     met: int = 0
     dropped: int = 0
+    unread: int = 0
+
+
+class _UnreadableError(Exception):
+    """A record's time cannot be read."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +129,8 @@ class Mf4Log(Closing):
             LogFormatError: It is no MDF 4 file, or its header or all of its groups are damaged.
         """
         self._path, self._limits = path, limits
-        self._file = path.open("rb")
+        keep_memory()
+        self._file = path.open("rb", buffering=_BUFFER_BYTES)
         self._blocks = Blocks(self._file, path.stat().st_size, limits)
         self._buses: dict[str, int] = {}
         self._broken = ""
@@ -171,7 +184,7 @@ class Mf4Log(Closing):
                     yield from self._alone(stored, source, accounts[source], ledger, selection)
         for source, account in accounts.items():
             _settle(source, account, ledger)
-        self._close_account(sum(account.met for account in accounts.values()), ledger)
+        self._close_account(accounts.values(), ledger)
 
     def _sources(self) -> Iterator[_Source]:
         return (source for stored in self._stored for source in stored.sources)
@@ -180,7 +193,8 @@ class Mf4Log(Closing):
         if self._header.is_local:
             ledger.notice("the log states no time zone; its start time is read as UTC")
 
-    def _close_account(self, met: int, ledger: Ledger) -> None:
+    def _close_account(self, accounts: Collection[_Account], ledger: Ledger) -> None:
+        met = sum(account.met for account in accounts)
         if not self._header.is_finalized:
             ledger.notice(
                 f"not finalized by the logger; {met} records recovered from the data block"
@@ -192,6 +206,8 @@ class Mf4Log(Closing):
         ledger.integrity = (
             "checksums of compressed blocks verified; MDF has none for the rest of the file"
         )
+        if unread := sum(account.unread for account in accounts):
+            ledger.integrity += f"; {unread} of {met} records, of other times, were not read"
 
     def _mixed(
         self,
@@ -317,7 +333,14 @@ class Mf4Log(Closing):
         selection: Selection,
     ) -> Iterator[Records]:
         """Records of sorted data; those that cannot be read are accounted for here."""
-        for records in sorted_records(stored.stream, source.group):
+        first, stop = self._span(stored, source, selection)
+        if stop is not None:
+            unread = stored.stream.size // source.group.record_bytes - (stop - first)
+            account.met += unread
+            account.unread += unread
+            ledger.find(source.topic, unread)
+            ledger.skip(source.topic, NOT_ASKED_TIME, unread)
+        for records in sorted_records(stored.stream, source.group, first, stop):
             if not records.damage:
                 account.met += len(records.rows)
                 yield records
@@ -328,6 +351,40 @@ class Mf4Log(Closing):
             account.dropped += count
             if count or records.dropped == 0:
                 ledger.drop(source.topic, "damaged data", count or None, records.damage)
+
+    def _span(
+        self, stored: _Stored, source: _Source, selection: Selection
+    ) -> tuple[int, int | None]:
+        """The records that may lie in the span of time asked for; all of them without a stop.
+
+        The first records of chunks are looked at by bisection: MDF demands that times ascend.
+        """
+        size, start_ns, end_ns = source.group.record_bytes, selection.start_ns, selection.end_ns
+        if not size or (start_ns is None and end_ns is None) or stored.stream.broken:
+            return 0, None
+        total = stored.stream.size // size
+        rows = max(_CHUNK_BYTES // size, 1)
+
+        @cache
+        def time_ns(chunk: int) -> int:
+            content = stored.stream.read(chunk * rows * size, size)
+            if len(content) < size:
+                raise _UnreadableError
+            record = np.frombuffer(content, np.uint8).reshape(1, size)
+            times = self._times(source, Words(record, chunk * rows))
+            if times is None:
+                raise _UnreadableError
+            return int(times[0])
+
+        count = -(-total // rows)
+        try:
+            if count < 2 or time_ns(count - 1) < time_ns(0):
+                return 0, None
+            first = 0 if start_ns is None else max(_first_from(start_ns, count, time_ns) - 1, 0)
+            stop = count if end_ns is None else _first_from(end_ns, count, time_ns)
+        except _UnreadableError:
+            return 0, None
+        return first * rows, max(min(stop * rows, total), first * rows)
 
     def _times(self, source: _Source, words: Words) -> Int64s | None:
         assert source.master is not None
@@ -358,15 +415,20 @@ class Mf4Log(Closing):
         """With places among the names of buses instead of channel numbers."""
         if not len(rows):
             return rows
-        channels = [int(rows.bus[0])]
-        if bool((rows.bus != channels[0]).any()):
-            channels = np.unique(rows.bus).tolist()
-        bus = np.full(len(rows), -1, np.int64)
-        for channel in channels:
-            bus[rows.bus == channel] = bus_number(str(channel), self._buses)
+        if rows.bus.min() >= 0 and rows.bus.max() < BUSES_MAX:
+            channels, codes = np.flatnonzero(np.bincount(rows.bus)), None
+        else:
+            channels, codes = np.unique(rows.bus, return_inverse=True)
+        numbers = np.array([bus_number(str(c), self._buses) for c in channels.tolist()], np.int64)
+        if codes is None:
+            table = np.zeros(BUSES_MAX, np.int64)
+            table[channels] = numbers
+            bus = table[rows.bus]
+        else:
+            bus = numbers[codes]
         named = FrameRows(rows.place, bus, rows.log_ns, rows.frames)
-        is_known = named.bus >= 0
-        if not bool(is_known.all()):
+        if numbers.min() < 0:
+            is_known = named.bus >= 0
             extra = len(rows) - int(np.count_nonzero(is_known))
             ledger.drop("", "more buses than a log can have", extra)
             return named.take(is_known)
@@ -491,6 +553,32 @@ class Mf4Log(Closing):
             topic = _free(group.name or "group", names)
             names[topic] = np.zeros(0)
         return _Source(index, group, master, can, topic, refusal, self._declared(group))
+
+
+def _first_from(t_ns: int, count: int, time_ns: Callable[[int], int]) -> int:
+    """The first of ``count`` chunks that begins at ``t_ns`` or later.
+
+    Guesses by interpolation, since a look into a chunk may cost to inflate it; every other step
+    halves what is left, so that a log with pauses costs no more than twice a bisection.
+    """
+    low, high = 0, count - 1
+    if time_ns(low) >= t_ns:
+        return low
+    if time_ns(high) < t_ns:
+        return count
+    is_guess = True
+    while high - low > 1:
+        middle = (low + high) // 2
+        if is_guess:
+            fraction = (t_ns - time_ns(low)) / max(time_ns(high) - time_ns(low), 1)
+            middle = low + round(fraction * (high - low))
+            middle = min(max(middle, low + 1), high - 1)
+        is_guess = not is_guess
+        if time_ns(middle) < t_ns:
+            low = middle
+        else:
+            high = middle
+    return high
 
 
 def _settle(source: _Source, account: _Account, ledger: Ledger) -> None:

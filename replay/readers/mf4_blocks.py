@@ -10,8 +10,7 @@ import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from io import BufferedReader
-from typing import Final
+from typing import BinaryIO, Final
 
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.limits import Limits
@@ -173,7 +172,7 @@ class Header:
 class Blocks:
     """Blocks of an open file."""
 
-    def __init__(self, file: BufferedReader, size: int, limits: Limits) -> None:
+    def __init__(self, file: BinaryIO, size: int, limits: Limits) -> None:
         self._file, self.size, self._limits = file, size, limits
         self._linked: set[int] = set()
 

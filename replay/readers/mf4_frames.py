@@ -15,7 +15,7 @@ from crosscue.replay.columns import DATA, ERROR, REMOTE, Bytes, CanFrames, Int64
 from .can_rows import FD_LENGTHS, IS_FD_LENGTH, FrameRows
 from .mf4_blocks import VARIABLE, VARIABLE_COMPACT, Channel, Group
 from .mf4_records import Records
-from .mf4_values import Words, invalid, is_applied, is_numeric, physical, raw
+from .mf4_values import Words, invalid, is_applied, is_numeric, is_plain, physical, raw
 from .mf4_variable import VariableValues
 
 _KINDS: Final = {
@@ -113,17 +113,22 @@ class CanLayout:
         """The records that can be frames."""
         identifier = self._values("ID", words, 0)
         number = identifier & 0x1FFFFFFF
-        marked = ((identifier >> 31) & 1 != 0) | (number > 0x7FF)
-        is_extended = self._flags("IDE", words, marked)
-        ok = is_extended | (number <= 0x7FF) | np.bool_(self._kind == ERROR)
+        is_long = number > 0x7FF
+        if "IDE" in self._numbers:
+            is_extended = self._flags("IDE", words)
+        else:
+            is_extended = ((identifier >> 31) & 1 != 0) | is_long
+        ok = is_extended | ~is_long | np.bool_(self._kind == ERROR)
         count = len(words)
         length, is_fd = np.zeros(count, np.int64), np.zeros(count, np.bool_)
         payload, whole = np.zeros((count, _CLASSIC), np.uint8), np.ones(count, np.bool_)
         if self._kind == DATA:
             length, is_fd = self._lengths(words)
-            possible = np.where(is_fd, IS_FD_LENGTH[np.clip(length, 0, _FD)], length <= _CLASSIC)
-            ok &= possible & (length >= 0) & (length <= _FD)
-            length = np.where(ok, length, 0)
+            if count and (length.min() < 0 or length.max() > _CLASSIC):
+                is_fd_length = IS_FD_LENGTH[np.clip(length, 0, _FD)]
+                possible = np.where(is_fd, is_fd_length, length <= _CLASSIC)
+                ok = ok & possible & (length >= 0) & (length <= _FD)
+                length = np.where(ok, length, 0)
             payload, whole = self._payloads(words, length, values, bool(is_fd.any()))
         frames = CanFrames(
             number.astype(np.uint32),
@@ -132,7 +137,7 @@ class CanLayout:
             length.astype(np.uint8),
             payload,
             is_fd,
-            self._flags("Dir", words, None) if "Dir" in self._numbers else None,
+            self._flags("Dir", words) if "Dir" in self._numbers else None,
         )
         rows = FrameRows(
             records.place, self._values("BusChannel", words, self._bus), log_ns, frames
@@ -167,30 +172,32 @@ class CanLayout:
 
     def _lengths(self, words: Words) -> tuple[Int64s, NDArray[np.bool_]]:
         """Payload bytes, and which frames are CAN FD."""
-        code = self._values("DLC", words, -1)
-        by_code = FD_LENGTHS[np.clip(code, 0, 15)]
-        length = self._values("DataLength", words, by_code)
+        length = self._values("DataLength", words, -1)
+        if "DataLength" not in self._numbers and "DLC" in self._numbers:
+            length = FD_LENGTHS[np.clip(self._values("DLC", words, 0), 0, 15)]
+        is_long = length > _CLASSIC
         stored = self._parts["DataBytes"].bit_count // 8
         can_be_fd = self.variable is not None or stored > _CLASSIC
-        is_fd = self._flags("EDL", words, (length > _CLASSIC) & can_be_fd)
-        # A classic frame may have the codes 9 to 15 for eight bytes.
-        is_long = ~is_fd & (length > _CLASSIC) & (code > _CLASSIC)
+        is_fd = is_long & can_be_fd
+        if "EDL" in self._numbers:
+            is_fd = self._flags("EDL", words)
         if bool(is_long.any()):
+            # A classic frame may have the codes 9 to 15 for eight bytes.
+            is_long &= ~is_fd & (self._values("DLC", words, 0) > _CLASSIC)
             length = np.where(is_long, _CLASSIC, length)
         return length, is_fd
 
-    def _flags(
-        self, name: str, words: Words, missing: NDArray[np.bool_] | None
-    ) -> NDArray[np.bool_]:
-        if missing is not None and name not in self._numbers:
-            return missing
+    def _flags(self, name: str, words: Words) -> NDArray[np.bool_]:
         is_set: NDArray[np.bool_] = self._values(name, words, 0) != 0
         return is_set
 
-    def _values(self, name: str, words: Words, missing: int | Int64s) -> Int64s:
+    def _values(self, name: str, words: Words, missing: int) -> Int64s:
         channel = self._numbers.get(name)
         if channel is None:
-            return np.broadcast_to(np.asarray(missing, np.int64), (len(words),))
+            return np.full(len(words), missing, np.int64)
+        if is_plain(channel) and channel.bit_count < 64:
+            bits = words.bits(channel.byte_offset, channel.bit_offset, channel.bit_count)
+            return bits.view(np.int64)
         values = raw(channel, words)
         if channel.conversion.type and is_applied(channel.conversion):
             values = physical(channel.conversion, values)

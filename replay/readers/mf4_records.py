@@ -24,7 +24,7 @@ from .mf4_stream import Stream
 _WALK_BYTES: Final = 1 << 20
 _KEPT: Final = 3
 """Walked pieces that are kept: values lie near the records that they belong to."""
-PATIENCE: Final = 300_000
+PATIENCE: Final = 3_000_000
 """Records that the plain loop may take before Numba is worth its import."""
 PADDING: Final = 64
 """Bytes after those of a piece, so that every value in it can be looked at with that width."""

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import zlib
 from bisect import bisect_right
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
+from isal import isal_zlib
 
 from .mf4_blocks import Blocks, BrokenBlockError, Stretch
 
-_KEPT: Final = 2
+_DAMAGED: Final = cast("type[Exception]", isal_zlib.error)
+_KEPT: Final = 3
 """Inflated blocks that are kept; a record may begin in one and end in the next."""
 
 
@@ -100,10 +101,10 @@ def _inflated(one: Stretch, stored: bytes) -> tuple[bytes, str]:
     """Content of a compressed block, or what is wrong with it."""
     if one.method not in (0, 1):
         return b"", f"has the unknown method {one.method}"
-    inflater = zlib.decompressobj()
+    inflater = isal_zlib.decompressobj()
     try:
         content = inflater.decompress(stored, one.size + 1)
-    except zlib.error:
+    except _DAMAGED:
         return b"", "fails its checksum"
     if not inflater.eof or len(content) != one.size:
         return b"", "is cut or damaged"

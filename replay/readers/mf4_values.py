@@ -25,6 +25,12 @@ def is_numeric(channel: Channel, value_bytes: int) -> bool:
     return channel.data_type <= 3 and channel.bit_count > 0 and fits
 
 
+def is_plain(channel: Channel) -> bool:
+    """Is its value an unsigned little-endian number in the record and nothing else?"""
+    is_stored = channel.type not in (VIRTUAL_MASTER, VIRTUAL)
+    return is_stored and channel.data_type == 0 and channel.conversion.type == 0
+
+
 class Words:
     """Records as 64-bit words: what several channels take their bits from is loaded once."""
 
@@ -50,8 +56,10 @@ class Words:
         at = max(min(at, size - 8), 0)
         if at not in self._loaded:
             self._loaded[at] = self._word(at, size)
-        word: NDArray[np.uint64] = self._loaded[at] >> np.uint64(8 * (byte - at) + bit)
-        return word if count == 64 else word & np.uint64((1 << count) - 1)
+        word, shift = self._loaded[at], 8 * (byte - at) + bit
+        if shift:
+            word = word >> np.uint64(shift)
+        return word if shift + count == 64 else word & np.uint64((1 << count) - 1)
 
     def _word(self, at: int, size: int) -> NDArray[np.uint64]:
         if size < 8:
@@ -63,7 +71,7 @@ class Words:
         view: NDArray[np.uint64] = np.ndarray(
             (len(self.records),), np.dtype("<u8"), self.records.data, at, (size,)
         )
-        return view.astype(np.uint64)
+        return view.astype(np.uint64)  # copied: the words are aligned from here on
 
 
 def raw(channel: Channel, words: Words) -> NDArray[np.generic]:
@@ -78,7 +86,7 @@ def raw(channel: Channel, words: Words) -> NDArray[np.generic]:
     else:
         value = words.bits(channel.byte_offset, channel.bit_offset, channel.bit_count)
     if channel.data_type in (4, 5):
-        number = value.astype(f"<u{channel.bit_count // 8}")
+        number = value.astype(f"<u{channel.bit_count // 8}", copy=False)
         floats: NDArray[np.generic] = number.view(_FLOATS[channel.bit_count])
         return floats
     if channel.data_type in (0, 1):
@@ -176,9 +184,10 @@ def times_ns(channel: Channel, values: NDArray[np.generic]) -> NDArray[np.int64]
             return None
         return values.astype(np.int64) * whole
     with np.errstate(over="ignore", invalid="ignore"):
-        seconds = values.astype(np.float64)
+        seconds = values.astype(np.float64, copy=False)
         # One product where it can be exact: counts of nanoseconds stored as floating point.
         nanos = np.rint(seconds * step if offset == 0.0 else (seconds * factor + offset) * 1e9)
-        if not bool((np.abs(nanos) < float(1 << 62)).all()):
+        # Comparisons with what is no number are false.
+        if len(nanos) and not (nanos.max() < float(1 << 62) and nanos.min() > -float(1 << 62)):
             return None
     return nanos.astype(np.int64)

@@ -46,8 +46,9 @@ class StoredValues:
         """As ``VariableValues`` says."""
         payload, length = _nothing(len(key), width)
         for begin, end, rows in _windows(key):
+            near = key if len(rows) == len(key) else key[rows]
             for base, content in self._readable(begin, end + 4 + width):
-                _take(content, key[rows] - base, rows, payload, length)
+                _take(content, near - base, rows, payload, length)
         return payload, length
 
     def _readable(self, begin: int, end: int) -> Iterator[tuple[int, bytes]]:
@@ -94,7 +95,7 @@ class GroupValues:
             is_here = known[at] == mine if len(known) else np.zeros(len(mine), np.bool_)
             rows, at = left[is_here], at[is_here]
             start, found = values.start[at], values.length[at]
-            payload[rows] = _windowed(values.content, width)[start]
+            payload[rows] = windowed(values.content, width, start)
             length[rows] = found
             # What this piece should hold and does not is nowhere.
             left = left[~is_here & (mine >= end)]
@@ -140,10 +141,18 @@ def _take(
     is_whole = place + 4 + found <= size
     if not bool(is_whole.all()):
         place, rows, found = place[is_whole], rows[is_whole], found[is_whole]
-    payload[rows] = _windowed(buffer, width)[place + 4]
+    if len(rows) == len(length):
+        np.copyto(payload, windowed(buffer, width, place + 4))
+        np.copyto(length, found)
+        return
+    payload[rows] = windowed(buffer, width, place + 4)
     length[rows] = found
 
 
-def _windowed(buffer: Bytes, width: int) -> Bytes:
-    """Shape (B, width): the bytes from each place on."""
-    return np.lib.stride_tricks.sliding_window_view(buffer, width)
+def windowed(buffer: Bytes, width: int, place: Int64s) -> Bytes:
+    """Shape (N, width): the ``width`` bytes, 8 or 64, from each place on."""
+    if width == 8:
+        shape = (len(buffer) - 7,)
+        words: NDArray[np.uint64] = np.ndarray(shape, np.dtype("<u8"), buffer.data, strides=(1,))
+        return words[place].view(np.uint8).reshape(-1, 8)
+    return np.lib.stride_tricks.sliding_window_view(buffer, width)[place]

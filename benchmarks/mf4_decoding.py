@@ -1,0 +1,218 @@
+"""Signals out of MF4 bus logs: ours beside asammdf, DBC parsed before and from a cold start.
+
+    python benchmarks/mf4_decoding.py [rounds]
+
+Three logs: a CANedge one with its DBC; the Ford candump, many times over, with a DBC of 0.8 MB, as
+a logger leaves it on its card, unfinalized and unsorted; and the same log as asammdf finalizes and
+sorts it. asammdf extracts with ``extract_bus_logging``; ours reads and decodes the same bus or
+buses, looks every frame up and accounts for it. All values are compared before anything is timed.
+Warm: one process, DBC parsed before by each, in rotation, CPU seconds of the process; ratios are
+taken round by round. Cold: a process for each pass, imports and DBC included, CPU seconds of the
+child; the first start fills whatever is cached, the second one finds it.
+The recordings are looked for in $CROSSCUE_DATA or ../shared/data.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+DATA = Path(os.environ.get("CROSSCUE_DATA", Path(__file__).parents[2] / "shared" / "data"))
+CANEDGE = DATA / "can/css_canedge"
+FORD = DATA / "can/ford_fusion_2017"
+REPEAT = 12
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+
+def ours(log: Path, database: Any) -> dict[str, list[Any]]:
+    """Blocks of signals by message."""
+    from crosscue.replay.can.decode import BusDecoder, DecodeSettings
+    from crosscue.replay.ledger import Ledger
+    from crosscue.replay.log import open_log
+
+    ledger = Ledger(str(log))
+    found: dict[str, list[Any]] = {}
+    decoders: dict[str, BusDecoder] = {}
+    settings = DecodeSettings(allow_longer=True, engine="numpy")
+    with open_log(log) as opened:
+        for block in opened.read(ledger):
+            if block.topic not in decoders:
+                decoders[block.topic] = BusDecoder(database, block.topic, ledger, None, settings)
+            for one in decoders[block.topic](block):
+                found.setdefault(one.topic, []).append(one)
+    return found
+
+
+def our_database(dbc: Path) -> Any:
+    from crosscue.replay.can.database import CanDatabase
+
+    return CanDatabase.load([dbc])
+
+
+def theirs(log: Path, database: Any) -> Any:
+    """What asammdf extracts, as an MDF object in memory."""
+    import asammdf
+
+    with asammdf.MDF(log) as mdf:
+        return mdf.extract_bus_logging({"CAN": [(database, 0)]})
+
+
+def their_database(dbc: Path) -> Any:
+    from asammdf.blocks.utils import load_can_database
+
+    return load_can_database(dbc)
+
+
+def compared(log: Path, dbc: Path) -> int:
+    """Values that both give, all of them equal; ends the program at the first that is not."""
+    mine = ours(log, our_database(dbc))
+    totals: dict[str, list[float]] = {}
+    for topic, blocks in mine.items():
+        message = topic.rsplit("/", 1)[1]
+        for name in blocks[0].rows.columns:
+            columns = [np.asarray(b.rows[name], np.float64) for b in blocks]
+            totals.setdefault(f"{message}.{name}", []).extend(np.concatenate(columns).tolist())
+    extracted, count = theirs(log, their_database(dbc)), 0
+    seen: dict[str, list[float]] = {}
+    for signal in extracted.iter_channels():
+        message = signal.source.path.rsplit(".", 1)[-1] if signal.source else ""
+        message = message.split(" ")[-1]
+        if signal.samples.dtype.kind in "iufb":
+            valid = signal.samples
+            if signal.invalidation_bits is not None:
+                valid = valid[~np.asarray(signal.invalidation_bits, bool)]
+            seen.setdefault(signal.name, []).extend(valid.astype(np.float64).tolist())
+    by_name: dict[str, list[float]] = {}
+    for key, values in totals.items():
+        by_name.setdefault(key.split(".", 1)[1], []).extend(values)
+    for name in sorted(by_name.keys() & seen.keys()):
+        a, b = np.sort(by_name[name]), np.sort(seen[name])
+        if len(a) == len(b):
+            if not np.allclose(a, b, rtol=1e-6, atol=1e-9, equal_nan=True):
+                raise SystemExit(f"{log.name}: {name} differs")
+            count += len(a)
+    return count
+
+
+def ford_logs(folder: Path) -> list[Path]:
+    """The Ford frames many times over: as they lie on a logger's card, and finalized."""
+    import asammdf
+    import can
+
+    from support.can_files import START_NS, Sent
+    from support.mf4_files import unsorted
+
+    source = folder / "ford.log"
+    candump = FORD / "acc_on_speed_changing_from_30km_to_80km_per_hour.candump"
+    source.write_bytes(candump.read_bytes())
+    once = [m for m in can.LogReader(source) if not m.is_error_frame and not m.is_remote_frame]
+    first, span = once[0].timestamp, once[-1].timestamp - once[0].timestamp + 0.001
+    frames = [
+        Sent(
+            START_NS + round((m.timestamp - first + k * span) * 1e6) * 1000,
+            "1",
+            m.arbitration_id,
+            bytes(m.data),
+            m.is_extended_id,
+        )
+        for k in range(REPEAT)
+        for m in once
+    ]
+    card, finalized = folder / "ford_on_card.mf4", folder / "ford_finalized.mf4"
+    card.write_bytes(unsorted(frames, virtual=True).content)
+    with asammdf.MDF(card) as mdf:
+        mdf.save(finalized, compression=0)
+    return [finalized, card]
+
+
+def cpu_s(run: Callable[[], object]) -> float:
+    began = time.process_time()
+    run()
+    return time.process_time() - began
+
+
+def cold_s(which: str, log: Path, dbc: Path, cache: Path) -> float:
+    """CPU seconds of a process that does one pass and nothing else."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    environment = os.environ | {"XDG_CACHE_HOME": str(cache)}
+    command = [sys.executable, __file__, "--once", which, str(log), str(dbc)]
+    subprocess.run(command, check=True, env=environment, stdout=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def once(which: str, log: Path, dbc: Path) -> None:
+    """One pass in a process of its own."""
+    warnings.simplefilter("ignore")
+    if which == "ours":
+        ours(log, our_database(dbc))
+    else:
+        theirs(log, their_database(dbc))
+
+
+def warm(log: Path, dbc: Path, rounds: int) -> None:
+    mine, peer = our_database(dbc), their_database(dbc)
+    times = [
+        (cpu_s(lambda: ours(log, mine)), cpu_s(lambda: theirs(log, peer)))
+        for _ in range(rounds + 1)
+    ][1:]
+    report("DBC parsed before", times)
+
+
+def cold(log: Path, dbc: Path, rounds: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        cache = Path(folder)
+        first = [(cold_s("ours", log, dbc, cache), cold_s("asammdf", log, dbc, cache))]
+        later = [
+            (cold_s("ours", log, dbc, cache), cold_s("asammdf", log, dbc, cache))
+            for _ in range(min(rounds, 3))
+        ]
+    report("cold, first start", first)
+    report("cold, after the first", later)
+
+
+def report(title: str, times: list[tuple[float, float]]) -> None:
+    mine, peer = (statistics.median(column) * 1e3 for column in zip(*times, strict=True))
+    ratios = [b / a for a, b in times]
+    spread = f"[{min(ratios):.1f} to {max(ratios):.1f}]"
+    print(
+        f"  {title:22} ours {mine:8.1f} ms   asammdf {peer:8.1f} ms"
+        f"   x{statistics.median(ratios):.1f} {spread}"
+    )
+
+
+def main(rounds: int) -> None:
+    warnings.simplefilter("ignore")
+    canedge = CANEDGE / "3BA199E2/00000164/00000001-60FE3F04.MF4"
+    with tempfile.TemporaryDirectory() as folder:
+        logs = [(canedge, CANEDGE / "canmod-gps.dbc")]
+        logs += [(log, FORD / "ford_lincoln_base_pt.dbc") for log in ford_logs(Path(folder))]
+        for log, dbc in logs:
+            frames = sum(len(b) for blocks in ours(log, our_database(dbc)).values() for b in blocks)
+            print(
+                f"{log.name}: {log.stat().st_size / 1e6:.1f} MB, {frames:,} frames decoded with"
+                f" {dbc.name}; {compared(log, dbc):,} values compared, all equal"
+            )
+            warm(log, dbc, rounds)
+            cold(log, dbc, rounds)
+
+
+if __name__ == "__main__":
+    if not DATA.is_dir():
+        raise SystemExit(f"{DATA}: no recordings there; set CROSSCUE_DATA")
+    if sys.argv[1:2] == ["--once"]:
+        once(sys.argv[2], Path(sys.argv[3]), Path(sys.argv[4]))
+    else:
+        main(int(sys.argv[1]) if len(sys.argv) > 1 else 7)
