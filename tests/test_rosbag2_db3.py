@@ -18,6 +18,7 @@ from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.log import Selection, open_log
 from crosscue.replay.readers.rosbag2_db3 import open_db3
+from crosscue.replay.readers.rosbag2_tables import Tables
 from crosscue.replay.readers.rosbag2_wal import check_wal
 from support.data import shared
 from support.rosbag_files import (
@@ -89,7 +90,9 @@ def test_a_real_database_reads_as_rosbags_reads_it() -> None:
         theirs = [Row(c.topic, t, bytes(raw)) for c, t, raw in reader.messages()]
 
     assert Counter(reading.rows) == Counter(theirs)
-    assert {t.name: t.declared for t in reading.log.topics} == {"/tf_static": 1, "/tf": 517}
+    assert {name: a.found for name, a in reading.ledger.accounts.items()} == {
+        "/tf_static": 1, "/tf": 517,
+    }  # fmt: skip
     assert all(t.schema_encoding == "ros2msg" and t.schema for t in reading.log.topics)
     assert reading.ledger.is_whole
     assert "no checksums" in reading.ledger.integrity
@@ -228,7 +231,7 @@ def test_rows_of_wrong_types_are_skipped_by_reason(tmp_path: Path) -> None:
         "payload is not a blob": 2,
     }
     assert ledger.topic("").skipped == {"message without a topic": 2}
-    assert ledger.topic("/a").in_file == ledger.topic("/a").declared == 6
+    assert ledger.topic("/a").in_file == 6
 
 
 def test_two_types_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
@@ -436,3 +439,31 @@ def test_no_damage_goes_unseen(tmp_path: Path, compression: str) -> None:
             silent.append((how, verdict))
 
     assert not silent
+
+
+def test_a_sound_file_is_gone_through_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = make(tmp_path / "a.db3", *[(1, i, b"x" * i) for i in range(50)])
+
+    def counted(*_: object) -> None:
+        raise AssertionError("the table was gone through again")
+
+    monkeypatch.setattr(Tables, "counts", counted)
+    reading = read_rows(path)
+
+    assert reading.ledger.is_whole
+    assert len(reading.rows) == 50
+
+
+def test_payloads_of_topics_not_asked_for_are_not_fetched(tmp_path: Path) -> None:
+    path = make(
+        tmp_path / "a.db3",
+        (1, 1, b"wanted"), (2, 2, "no blob"), (2, 3, b"y"), (77, 4, b"orphan"),
+        tables=TABLES + "INSERT INTO topics VALUES(2, '/b', 'std_msgs/msg/String', 'cdr');",
+    )  # fmt: skip
+    reading = read_rows(path, Selection(frozenset({"/a"})))
+
+    assert reading.rows == (Row("/a", 1, b"wanted"),)
+    accounts = reading.ledger.accounts
+    # That one of them is no blob is not looked at.
+    assert accounts["/b"].skipped == {"topic not asked for": 2}
+    assert accounts[""].skipped == {"message without a topic": 1}

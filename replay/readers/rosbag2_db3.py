@@ -6,7 +6,7 @@ time index against the rows, the types and the order of the rows, the file's len
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -18,9 +18,10 @@ from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import EVERYTHING, Selection
 
+from .can_rows import keep_memory
 from .mixed import MixedRows, blocks_of
 from .rosbag2_inflate import DAMAGED, inflated
-from .rosbag2_rows import FIRST_ROWID, LAST_ROWID, Row, RowScan, index_times
+from .rosbag2_rows import FIRST_ROWID, LAST_ROWID, Row, RowColumns, RowScan, index_times
 from .rosbag2_sqlite import FAULTS, Database, open_database
 from .rosbag2_tables import Tables, fetched, read_tables
 from .timed_files import is_inside
@@ -32,6 +33,7 @@ NO_TOPIC: Final = "message without a topic"
 NOT_A_TIME: Final = "timestamp is not an integer"
 NOT_BYTES: Final = "payload is not a blob"
 OTHER_TYPE: Final = "another message type on the same topic"
+_SMALL: Final = 1 << 16
 INDEX_DIFFERS: Final = "row and time index disagree"
 
 
@@ -68,7 +70,7 @@ class Db3Log(Closing):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """Topics by their number in the file, with rows counted by SQLite."""
+        """Topics by their number in the file; the format declares no counts."""
         return tuple(self._tables.topics.values())
 
     @property
@@ -111,14 +113,26 @@ class _Pass:
         self._selection = selection
         self._names = list(tables.topics)
         self._place = tables.places()
-        self._scan = RowScan(database, FIRST_ROWID, LAST_ROWID)
+        self._places = _place_table(self._place)
+        self._fetched = self._numbers_asked()
+        self._scan = RowScan(database, FIRST_ROWID, LAST_ROWID, self._fetched)
+        self._counts: dict[str, int] | None = None
         self._indexed: tuple[Int64s, Int64s] | None = None
         self._in_time_by_index: int | None = None
         self._in_time = 0
         self._met = 0
 
+    def _numbers_asked(self) -> frozenset[int] | None:
+        """Numbers of the topics asked for, or None for all."""
+        if self._selection.topics is None:
+            return None
+        return frozenset(
+            n for n, at in self._place.items() if self._selection.wants(self._names[at])
+        )
+
     def blocks(self) -> Iterator[Block]:
         """Everything asked for, and the account of it."""
+        keep_memory()
         for sentence in (*self._database.notices, *self._tables.notices):
             self._ledger.notice(sentence)
         for topic in self._tables.topics.values():
@@ -131,8 +145,11 @@ class _Pass:
 
     def _narrow(self) -> None:
         """Scan only the row ids between which the times asked for lie, if the index is complete."""
-        asked, index, counts = self._selection, self._tables.index, self._tables.counts
-        if index is None or counts is None or (asked.start_ns is None and asked.end_ns is None):
+        asked, index = self._selection, self._tables.index
+        if index is None or (asked.start_ns is None and asked.end_ns is None):
+            return
+        counts = self._tables.counts(self._database)
+        if counts is None:
             return
         start = FIRST_ROWID if asked.start_ns is None else asked.start_ns
         end = LAST_ROWID if asked.end_ns is None else asked.end_ns
@@ -146,9 +163,9 @@ class _Pass:
         except FAULTS:
             return
         if total[0][0] == sum(counts.values()):
-            self._in_time_by_index = count
+            self._in_time_by_index, self._counts = count, counts
             first, last = (0, -1) if first is None else (first, last)
-            self._scan = RowScan(self._database, first, last)
+            self._scan = RowScan(self._database, first, last, self._fetched)
 
     def _problems(self) -> str:
         """What SQLite's integrity check says against the file; empty if nothing."""
@@ -162,28 +179,20 @@ class _Pass:
             self._indexed = index_times(self._database, self._tables.index)
         return "; ".join(said).replace("\n", " ")
 
-    def _blocks_of(self, rows: list[Row]) -> Iterator[Block]:
+    def _blocks_of(self, rows: RowColumns) -> Iterator[Block]:
         self._met += len(rows)
-        ids, topics, times, payloads = zip(*rows, strict=True)
-        if not (
-            set(map(type, topics)) == {int}
-            and set(map(type, times)) == {int}
-            and set(map(type, payloads)) == {bytes}
-        ):
-            rows = [row for row in rows if self._is_sound(row)]
-            if not rows:
-                return
-            ids, topics, times, payloads = zip(*rows, strict=True)
-        length = np.fromiter(map(len, payloads), dtype=np.int64, count=len(rows))
-        stop = np.cumsum(length)
-        messages = Messages(np.frombuffer(b"".join(payloads), dtype=np.uint8), stop - length, stop)
-        log_ns = np.fromiter(times, dtype=np.int64, count=len(rows))
-        place = self._placed(np.fromiter(topics, dtype=np.int64, count=len(rows)))
+        for row in rows.odd:
+            self._skip_odd(row)
+        if not len(rows.ids):
+            return
+        stop = np.cumsum(rows.length)
+        messages = Messages(np.frombuffer(rows.payloads, np.uint8), stop - rows.length, stop)
+        place = self._placed(rows.topics)
         if self._indexed is not None:
-            self._drop_disputed(np.fromiter(ids, dtype=np.int64, count=len(rows)), log_ns, place)
+            self._drop_disputed(rows.ids, rows.times, place)
         if self._in_time_by_index is not None:
-            self._in_time += int(is_inside(log_ns, self._selection).sum())
-        yield from self._grouped(messages, place, log_ns)
+            self._in_time += int(is_inside(rows.times, self._selection).sum())
+        yield from self._grouped(messages, place, rows.times)
 
     def _grouped(self, messages: Messages, place: Int64s, log_ns: Int64s) -> Iterator[Block]:
         for part, plain, damaged in inflated(messages, self._limits):
@@ -197,17 +206,15 @@ class _Pass:
             rows = MixedRows(plain.buffer, topic[keep], times[keep], start, stop)
             yield from blocks_of(rows, self._names, self._selection, self._limits, self._ledger)
 
-    def _is_sound(self, row: Row) -> bool:
-        """Has the row the types it must have? One that has not is skipped by reason."""
+    def _skip_odd(self, row: Row) -> None:
+        """Skip a row that has not the types it must have, by reason."""
         number, topic, time, payload = row
         if not isinstance(topic, int):
             reason = NO_TOPIC
         elif not isinstance(time, int):
             reason = NOT_A_TIME
-        elif not isinstance(payload, bytes):
-            reason = NOT_BYTES
         else:
-            return True
+            reason = NOT_BYTES
         place = self._place.get(topic, -1) if isinstance(topic, int) else -1
         name = self._names[place] if place >= 0 else ""
         detail = (
@@ -216,10 +223,13 @@ class _Pass:
         )
         self._ledger.find(name, 1)
         self._ledger.skip(name, reason, 1, detail)
-        return False
 
     def _placed(self, numbers: Int64s) -> Int64s:
         """Place of each row's topic among the names; -1 for rows not to be handed on."""
+        if numbers.min() >= 0 and numbers.max() < len(self._places):
+            known = self._places[numbers]
+            if known.min() >= 0:
+                return known
         distinct, which, counts = np.unique(numbers, return_inverse=True, return_counts=True)
         place = np.array([self._place.get(int(n), -1) for n in distinct], dtype=np.int64)
         for i in np.flatnonzero(place < 0):
@@ -248,6 +258,7 @@ class _Pass:
         ledger.integrity = (
             "SQLite has no checksums: a changed payload byte, length or topic number cannot be seen"
         )
+        self._declare(is_doubtful=bool(problems or scan.holes or scan.disordered))
         if is_part and self._in_time_by_index != self._in_time:
             detail = f"index {self._in_time_by_index}, rows {self._in_time}"
             ledger.drop("", INDEX_DIFFERS, None, detail)
@@ -278,14 +289,43 @@ class _Pass:
             return None
         return len(self._indexed[0]) - self._met
 
+    def _declare(self, *, is_doubtful: bool) -> None:
+        """Say how many rows SQLite counts where that can differ from those met.
+
+        Counting by topic goes through the whole table again, so that after a full pass it is only
+        done if something is wrong, or if the time index has another number of rows.
+        """
+        if self._counts is None and (is_doubtful or self._total() != self._met):
+            self._counts = self._tables.counts(self._database)
+        for name, count in (self._counts or {}).items():
+            if name:
+                self._ledger.declare(name, count)
+
+    def _total(self) -> int | None:
+        """Rows that SQLite counts, in the smallest index there is."""
+        try:
+            return int(fetched(self._database, "SELECT COUNT(*) FROM messages")[0][0])
+        except FAULTS:
+            return None
+
     def _skip_rest(self) -> None:
         """Count the rows outside the scan, never fetched, as skipped."""
-        for name, topic in self._tables.topics.items():
-            rest = (topic.declared or 0) - self._ledger.topic(name).in_file
+        for name, declared in (self._counts or {}).items():
+            if not name:
+                continue
+            rest = declared - self._ledger.topic(name).in_file
             if rest > 0:
                 reason = NOT_ASKED_TIME if self._selection.wants(name) else NOT_ASKED_TOPIC
                 self._ledger.find(name, rest)
                 self._ledger.skip(name, reason, rest)
+
+
+def _place_table(places: Mapping[int, int]) -> Int64s:
+    """Places by topic number, -1 where there is none; for small numbers, as recorders give them."""
+    small = {number: at for number, at in places.items() if 0 <= number < _SMALL}
+    table = np.full(max(small, default=-1) + 1, -1, dtype=np.int64)
+    table[list(small)] = list(small.values())
+    return table
 
 
 def _stamp(path: Path) -> tuple[int, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -38,15 +38,12 @@ class Tables:
     Attributes:
         stored: Lines of the topics table.
         topics: By name; the first line of a name decides its type.
-        counts: Rows by topic number, numbers of no topic included; None if a damaged page hides
-            some.
         index: Quoted name of an index that begins with the timestamp, or None.
         notices: What is odd about them.
     """
 
     stored: tuple[Stored, ...]
     topics: dict[str, Topic]
-    counts: dict[Any, int] | None
     index: str | None
     notices: tuple[str, ...]
 
@@ -58,6 +55,23 @@ class Tables:
             for one in self.stored
             if self.topics[one.name].type_name == one.type_name
         }
+
+    def counts(self, database: Database) -> dict[str, int] | None:
+        """Rows by topic name, "" for those of no topic; None if a damaged page hides some.
+
+        SQLite goes through all rows for it, but not through their payloads.
+        """
+        query = "SELECT topic_id, COUNT(*) FROM messages NOT INDEXED GROUP BY topic_id"
+        try:
+            by_number = fetched(database, query)
+        except FAULTS:
+            return None
+        names = {one.number: one.name for one in self.stored}
+        counts = dict.fromkeys(self.topics, 0)
+        for number, count in by_number:
+            name = names.get(number, "")
+            counts[name] = counts.get(name, 0) + int(count)
+        return counts
 
 
 def read_tables(database: Database, path: Path, limits: Limits) -> Tables:
@@ -71,13 +85,13 @@ def read_tables(database: Database, path: Path, limits: Limits) -> Tables:
         _require(database, kinds, path)
         notices: list[str] = []
         stored = _stored(database, notices)
-        counts = _counted(database)
+        is_empty = not fetched(database, "SELECT 1 FROM messages LIMIT 1")
         definitions = _definitions(database, kinds, limits)
-        topics = _topics(stored, counts, definitions, notices)
+        topics = _topics(stored, 0 if is_empty else None, definitions, notices)
         index = _time_index(database)
     except FAULTS as error:
         raise LogFormatError(f"{path}: {explained(error)}") from None
-    return Tables(tuple(stored), topics, counts, index, tuple(notices))
+    return Tables(tuple(stored), topics, index, tuple(notices))
 
 
 def fetched(database: Database, query: str, values: Sequence[int] = ()) -> list[Any]:
@@ -122,14 +136,6 @@ def _stored(database: Database, notices: list[str]) -> list[Stored]:
     return stored
 
 
-def _counted(database: Database) -> dict[Any, int] | None:
-    query = "SELECT topic_id, COUNT(*) FROM messages NOT INDEXED GROUP BY topic_id"
-    try:
-        return dict(fetched(database, query))
-    except FAULTS:
-        return None
-
-
 def _time_index(database: Database) -> str | None:
     for _, name, _, _, is_partial in fetched(database, "PRAGMA index_list(messages)"):
         quoted = '"' + str(name).replace('"', '""') + '"'
@@ -160,17 +166,13 @@ def _definitions(
 
 def _topics(
     stored: list[Stored],
-    counts: dict[Any, int] | None,
+    count: int | None,
     definitions: dict[str, tuple[str, bytes]],
     notices: list[str],
 ) -> dict[str, Topic]:
     topics: dict[str, Topic] = {}
     for one in stored:
-        count = None if counts is None else counts.get(one.number, 0)
-        first = topics.get(one.name)
-        if first is not None:
-            total = None if count is None else (first.declared or 0) + count
-            topics[one.name] = replace(first, declared=total)
+        if one.name in topics:
             continue
         coding, text = definitions.get(one.type_name, ("", b""))
         if not text and (text := known_definition(one.type_name)):
