@@ -26,6 +26,7 @@ from crosscue.replay.run_folder import RunFolder, TableSink, clear, locked, writ
 from crosscue.replay.vehicle import Vehicle
 
 from .accounts import versions
+from .empty_result import empty_result, nothing_left
 from .run_account import Account, account, reading_of
 
 if TYPE_CHECKING:
@@ -87,11 +88,12 @@ def decode_tables(
 
     Raises:
         SchemaError: A DBC file cannot be read.
+        EmptyResultError: Not one row in the part asked for; the folder is empty again.
         OutputError: The disk is full.
     """
     ledgers = tuple(Ledger(name_of(log)) for log in logs)
     tables: dict[str, _Table] = {}
-    with locked(run):
+    with locked(run), nothing_left(run):
         clear(run)
         with ExitStack() as stack:
             for log, ledger in zip(logs, ledgers, strict=True):
@@ -103,6 +105,8 @@ def decode_tables(
             for table in tables.values():
                 table.write()
         rows = {f"{table.name}.parquet": table.rows for table in tables.values()}
+        if not any(rows.values()):
+            raise empty_result("no topic gave a row for a table", logs, selection)
         made = account(reading_of(ledgers))
         content = {
             "versions": versions(),

@@ -43,6 +43,7 @@ from .accounts import (
 )
 from .detection_pictures import Drawer
 from .drive_time import camera_timeline, time_told
+from .empty_result import empty_result, nothing_left
 from .labelled import LabelledSink
 from .run_account import Account, account, detecting_of, reading_of
 
@@ -116,7 +117,7 @@ def detect_drive(
 
     The folder is locked while this works, and cleared first; otherwise as ``detect_into``.
     """
-    with locked(run):
+    with locked(run), nothing_left(run):
         clear(run)
         return detect_into(logs, vehicle, run, selection, choices, cache, draw, on_frames)
 
@@ -147,6 +148,7 @@ def detect_into(
 
     Raises:
         VehicleError: No camera or several; a card, weights or settings that do not fit.
+        EmptyResultError: Not one frame in the part asked for.
         OutputError: The disk is full.
     """
     began = time.monotonic()
@@ -192,6 +194,11 @@ def detect_into(
                     pass
             for _ in extractor.finish():
                 pass
+        if not runner.counts.frames:
+            gone = ledger.topic(topic.name).dropped.total()
+            dropped = f" ({gone:,} are damaged)" if gone else ""
+            what = f"the camera, planned from {topic.name}, found no frames{dropped}"
+            raise empty_result(what, logs, selection)
         made = account(reading_of([ledger]), detecting_of(topic.name, ledger, runner.counts.frames))
         write_skipped(run, [ledger], made["reading"], timeline=timeline)
         seconds = time.monotonic() - began

@@ -51,6 +51,7 @@ from .accounts import (
 )
 from .detect_stage import DetectOutcome
 from .drive_time import drive_timeline, selections_of, time_told, timeline_in
+from .empty_result import empty_result, silent_roles
 from .labelled import LabelledSink
 from .landmark_stage import looking
 from .mobileye_tables import MobileyeSink, StoredMobileye
@@ -142,6 +143,7 @@ def estimate_into(
 
     Raises:
         VehicleError: The vehicle file does not fit the logs.
+        EmptyResultError: The part asked for holds nothing to estimate from.
         OutputError: The disk is full.
     """
     began = time.monotonic()
@@ -157,6 +159,13 @@ def estimate_into(
     if detected is None:
         _begin_again(run, found)
     tally = _pose(reading, stage, run, on_time)
+    silent = silent_roles(reading.planned, stage.received)
+    if Signal.WHEEL_SPEEDS in silent:
+        raise empty_result(silent[Signal.WHEEL_SPEEDS], logs, selection)
+    if not tally.rows and found is None and landmarks is None:
+        why = reading.planned.missing.get(Signal.WHEEL_SPEEDS, "they gave no pose")
+        what = f"no detector has run over a camera, and of the wheel speeds: {why}"
+        raise empty_result(what, logs, selection)
     scene = None if found is None else _scene(run, vehicle, found, reading)
     accounts = reading_of(reading.ledgers)
     if found is not None:
@@ -172,6 +181,7 @@ def estimate_into(
     notices = (
         *gaps_told(timeline.segments),
         *_missing(reading.planned),
+        *silent.values(),
         *_no_camera(landmarks, reading.camera),
         *_no_mobileye(found, reading.planned),
         *_no_scene(found, reading),

@@ -20,6 +20,7 @@ from crosscue.replay.vehicle import Vehicle
 from .accounts import log_rows, selection_told
 from .detect_stage import DetectOutcome, OnFrames, detect_into, unwatched
 from .drive_time import drive_timeline
+from .empty_result import nothing_left
 from .estimate_stage import Outcome, detected_part, estimate_into
 
 TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
@@ -70,6 +71,7 @@ def replay_drive(
 
     Raises:
         VehicleError: The vehicle file does not fit the logs.
+        EmptyResultError: Nothing came of it; the folder is empty again.
         OutputError: The disk is full.
     """
     with locked(run):
@@ -77,14 +79,15 @@ def replay_drive(
             logs, vehicle, selection, _camera(logs, vehicle, detecting, landmarks)
         )
         earlier = _kept(logs, vehicle, run, selection, detecting) if detecting.resume else None
-        if earlier is None:
-            clear(run)
-            found = _detect(logs, vehicle, run, selection, detecting, timeline)
-        else:
-            found = None
-        return estimate_into(
-            logs, vehicle, run, selection, on_time, landmarks, found, earlier, timeline=timeline
-        )
+        with nothing_left(run):
+            if earlier is None:
+                clear(run)
+                found = _detect(logs, vehicle, run, selection, detecting, timeline)
+            else:
+                found = None
+            return estimate_into(
+                logs, vehicle, run, selection, on_time, landmarks, found, earlier, timeline=timeline
+            )
 
 
 def _camera(

@@ -8,6 +8,7 @@
         * UnknownFormatError no reader knows this file or folder
     * SchemaError            a message type, DBC or truth file cannot be understood
     * VehicleError           the vehicle file is wrong or lacks a role
+        * MissingTopicError  a topic that it or a flag names is not in the logs
     * RunError               a run folder is missing, locked, damaged or of another version
     * OutputError            a result cannot be written (disk full, no permission)
     * EmptyResultError       nothing of what was asked for is in the logs
@@ -59,6 +60,10 @@ class VehicleError(CrosscueError):
     """The vehicle file is wrong or lacks a role."""
 
     exit_status = 2
+
+
+class MissingTopicError(VehicleError, UsageError):
+    """A topic that the vehicle file or a flag names is not in the logs, or a log has no row."""
 
 
 class RunError(CrosscueError):

@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Final, Protocol, Self, cast
 
 from .columns import Block, Topic
-from .errors import LogError, UnknownFormatError
+from .errors import LogError, MissingTopicError, UnknownFormatError
 from .ledger import Ledger
 from .limits import DEFAULT, Limits
 
@@ -245,4 +245,26 @@ def _holds(folder: Path, marker: str) -> bool:
 def open_logs(paths: Sequence[Path | str], limits: Limits = DEFAULT) -> Iterator[tuple[Log, ...]]:
     """Several logs of one drive, open as long as the ``with`` block lasts; as ``open_log``."""
     with ExitStack() as stack:
-        yield tuple(stack.enter_context(open_log(path, limits)) for path in paths)
+        logs = tuple(stack.enter_context(open_log(path, limits)) for path in paths)
+        with unless_damaged(logs):
+            yield logs
+
+
+@contextmanager
+def unless_damaged(logs: Sequence[Log]) -> Iterator[None]:
+    """Blame the log, not who names its topics, where what is missing may be in the damaged part.
+
+    Raises:
+        LogError: Instead of a ``MissingTopicError``, when a log turns out to be damaged.
+    """
+    try:
+        yield
+    except MissingTopicError as error:
+        for log in logs:
+            ledger = Ledger(str(log.path))
+            for _ in log.read(ledger):
+                pass
+            for loss in ledger.drops():
+                detail = f" ({loss.detail})" if loss.detail else ""
+                raise LogError(f"{log.path}: {loss.reason}{detail}; so {error}") from None
+        raise

@@ -18,7 +18,7 @@ import numpy as np
 from .clocks import MAX_OFFSET_NS, Clock, ClockWatch, times_of
 from .columns import Block, Floats, Images, Int64s, Table, Topic
 from .decode import Decoder, decoder_for
-from .errors import VehicleError
+from .errors import MissingTopicError, VehicleError
 from .ledger import Ledger
 from .roles import Role, role_of
 from .vehicle import AngleSignal, Vehicle
@@ -122,7 +122,7 @@ class _Planner:
             found = [(log, topic) for log, topic in self.topics if topic.name == named]
             if not found:
                 names = ", ".join(sorted(topic.name for _, topic in self.topics))
-                raise VehicleError(f"{key} = {named!r}: no such topic; there are: {names}")
+                raise MissingTopicError(f"{key} = {named!r}: no such topic; there are: {names}")
             return found[0]
         found = [(log, topic) for log, topic in self.topics if role_of(topic) is role]
         if len(found) > 1:

@@ -10,7 +10,7 @@ from crosscue.eval import cli
 from crosscue.eval.estimate_stage import Outcome
 from crosscue.eval.replay_drive import replay_drive
 from crosscue.replay.columns import Block
-from crosscue.replay.errors import RunError, VehicleError
+from crosscue.replay.errors import EmptyResultError, RunError, VehicleError
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.run_folder import create
 from crosscue.replay.time_settings import Time
@@ -103,15 +103,13 @@ def test_the_manifest_accounts_for_every_row_and_setting(tmp_path: Path) -> None
     assert manifest["versions"]["crosscue"]
 
 
-def test_without_wheels_the_run_goes_on_and_says_so(tmp_path: Path) -> None:
+def test_without_wheels_and_camera_there_is_no_run(tmp_path: Path) -> None:
     log = MemoryLog((GYRO,), [gyro_block([1, 2], [0.0, 0.0])], path=Path(__file__))
+    run = create(tmp_path / "run", overwrite=False)
 
-    outcome = replay_drive(
-        [log], Vehicle(version=1), create(tmp_path / "run", overwrite=False), EVERYTHING
-    )
-
-    assert outcome.rows == 0
-    assert any("no wheel speeds, so no pose" in sentence for sentence in outcome.notices)
+    with pytest.raises(EmptyResultError, match=r"no wheel speeds: name the bus.*gyro \(2 rows\)"):
+        replay_drive([log], Vehicle(version=1), run, EVERYTHING)
+    assert not list(run.path.iterdir())
 
 
 def test_signals_without_a_dbc_are_refused(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import MissingTopicError, UsageError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import Log, Selection
@@ -90,7 +90,7 @@ def selection_of(args: argparse.Namespace, logs: Sequence[Log]) -> Selection:
         known = {topic.name for log in logs for topic in log.topics}
         for name in args.topics:
             if name not in known:
-                raise UsageError(
+                raise MissingTopicError(
                     f"--topics {name}: no such topic; there are: {', '.join(sorted(known))}"
                 )
         topics = frozenset(args.topics)
@@ -133,7 +133,9 @@ def first_ns(logs: Sequence[Log]) -> int:
                 starts.append(int(block.log_ns.min()))
                 break
     if not starts:
-        raise UsageError("--from, --to: the log holds no row, so it has no start; leave them out")
+        raise MissingTopicError(
+            "--from, --to: the log holds no row, so it has no start; leave them out"
+        )
     return min(starts)
 
 

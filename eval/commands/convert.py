@@ -22,11 +22,12 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+from crosscue.eval.empty_result import empty_result
 from crosscue.eval.plain_text import table, terminal_width, visible, wrapped
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import LogError, OutputError, UsageError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger, TopicAccount
-from crosscue.replay.log import Log, Selection, open_log
+from crosscue.replay.log import Log, Selection, open_log, unless_damaged
 from crosscue.replay.seal import seal_path
 from crosscue.replay.writing import LogWriter
 
@@ -61,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
         0 when every row that was asked for is in the file, 3 when some are dropped or skipped.
     """
     _check_output(args)
-    with open_log(args.log, limits_of(args)) as log:
+    with open_log(args.log, limits_of(args)) as log, unless_damaged([log]):
         selection = selection_of(args, [log])
         ledger = Ledger(str(args.log))
         writer = LogWriter(
@@ -70,6 +71,8 @@ def run(args: argparse.Namespace) -> int:
         with writer:
             _copy(log, selection, ledger, writer, args)
             _check_identity(ledger, writer)
+            if not writer.written and _is_whole(ledger):
+                raise empty_result("no row to write", [log], selection)
     _read_back(args.output, writer)
     if args.json:
         print_json(_as_json(args, ledger, writer))
