@@ -277,3 +277,34 @@ def test_sorted_groups_of_one_bus_come_in_time_order(tmp_path: Path) -> None:
 
     assert ledger.is_whole
     assert found == by_bus(frames, "can/{}")
+
+
+@pytest.mark.parametrize("virtual", [False, True])
+def test_long_runs_of_equal_frames_and_what_interrupts_them_keep_every_frame(
+    tmp_path: Path, virtual: bool
+) -> None:
+    frames = []
+    for k, one in enumerate(_frames(6_000, virtual=False)):
+        payload = k.to_bytes(2, "little") * 4
+        length = 3 if k in (900, 901, 2_500, 4_999) else 8
+        bus = "2" if 3_000 < k < 3_003 else "1"
+        is_fd = k == 4_000
+        frames.append(Sent(one.t_ns, bus, k % 2048, payload[:length], False, 0, is_fd))
+    path = tmp_path / "x.mf4"
+    whole = unsorted(frames, virtual=virtual)
+
+    path.write_bytes(whole.content)
+    found, ledger = read_back(path)
+    assert found == by_bus(frames, "can/{}")
+    assert ledger.is_whole
+
+    k = len(whole.starts) * 2 // 3
+    for content in (
+        whole.content[: whole.starts[k] + 5],
+        whole.content[: whole.starts[k]] + b"\xee" + whole.content[whole.starts[k] + 1 :],
+    ):
+        path.write_bytes(content)
+        found, ledger = read_back(path)
+        inside = [f for f, e in zip(frames, whole.ends, strict=True) if e <= whole.starts[k]]
+        assert found == by_bus(inside, "can/{}")
+        assert not ledger.is_whole

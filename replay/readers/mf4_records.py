@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, cast
 
@@ -29,6 +29,10 @@ PATIENCE: Final = 3_000_000
 PADDING: Final = 64
 """Bytes after those of a piece, so that every value in it can be looked at with that width."""
 LAST_CUT: Final = "last record is cut"
+_FEW: Final = 16
+"""Records that make a run."""
+_MANY: Final = 500
+"""Records in a run after which the next one is looked for at once."""
 _LENGTH: Final = struct.Struct("<L")
 
 
@@ -305,7 +309,8 @@ class _Finder:
         id_bytes, index, sizes = self._id_bytes, self._index, self.sizes.tolist()
         groups: list[int] = []
         starts: list[int] = []
-        at, end, unknown = 0, len(content), -1
+        before: list[tuple[Int64s, Int64s]] = []
+        at, end, unknown, patience = 0, len(content), -1, _FEW
         while at + id_bytes <= end:
             start = at + id_bytes
             identifier = content[at] if id_bytes == 1 else _number(content, at, start)
@@ -324,7 +329,45 @@ class _Finder:
             groups.append(group)
             starts.append(start)
             at = start + size
-        return np.array(groups, np.int64), np.array(starts, np.int64), at, unknown
+            if len(groups) > patience:
+                run = self._run(content, groups, starts, at)
+                # Looking for a run costs as much as some hundred records of this loop.
+                is_worth_it = run is not None and len(run[0]) > _MANY
+                patience = _FEW if is_worth_it else min(2 * patience, PATIENCE)
+                if run:
+                    before += [(np.array(groups, np.int64), np.array(starts, np.int64)), run[:2]]
+                    groups, starts, at = [], [], run[2]
+        before.append((np.array(groups, np.int64), np.array(starts, np.int64)))
+        found = [np.concatenate(column) for column in zip(*before, strict=True)]
+        return found[0], found[1], at, unknown
+
+    def _run(
+        self, content: bytes, groups: Sequence[int], starts: Sequence[int], at: int
+    ) -> tuple[Int64s, Int64s, int] | None:
+        """The records from ``at`` on that repeat the last one or the last two.
+
+        Loggers write long runs of frames of one kind, each perhaps with a payload of one length:
+        there all identifiers and lengths are compared at once.
+        """
+        for period in (1, 2):
+            kinds = np.array(groups[-period:], np.int64)
+            start = np.array(starts[-period:], np.int64)
+            head = start - self._id_bytes - np.where(self.sizes[kinds] < 0, 4, 0)
+            first = int(head[0])
+            stride = at - first
+            columns = np.concatenate([np.arange(*pair) for pair in zip(head, start, strict=True)])
+            for most in (_FEW, (len(content) - at) // stride):
+                count = min((len(content) - at) // stride, most)
+                bytes_ = np.frombuffer(content, np.uint8, (count + 1) * stride, first)
+                table = bytes_.reshape(count + 1, stride)[:, columns - first]
+                differs = (table != table[0]).any(axis=1)
+                count = int(np.argmax(differs)) - 1 if bool(differs.any()) else count
+                if count < _FEW:
+                    break
+            if count >= _FEW:
+                begins = at + stride * np.arange(count)[:, None] + (start - first)
+                return np.tile(kinds, count), begins.ravel(), at + count * stride
+        return None
 
     def _compiled(self, content: bytes) -> tuple[Int64s, Int64s, int, int]:
         known = self.sizes[self.sizes >= 0]
