@@ -55,11 +55,13 @@ class Inflated:
         raw: The records.
         is_checked: A checksum over all of ``raw`` was verified.
         fault: Why ``raw`` is not the whole chunk, or empty.
+        sizes: What was declared and what came out, where they differ; else empty.
     """
 
     raw: bytes
     is_checked: bool
     fault: str = ""
+    sizes: str = ""
 
 
 def inflate(compression: bytes, stored: bytes, size: int, is_framed: bool) -> Inflated:
@@ -103,7 +105,9 @@ def _ended(raw: bytes, size: int, is_at_end: bool, is_checked: bool) -> Inflated
     if is_at_end and len(raw) == size:
         return Inflated(raw, is_checked)
     if is_at_end or len(raw) > size:
-        return Inflated(b"", is_checked=False, fault=INFLATE)
+        produced = "more" if len(raw) > size else f"{len(raw)} bytes"
+        sizes = f"inflates to {produced}, declares {size} bytes"
+        return Inflated(b"", is_checked=False, fault=INFLATE, sizes=sizes)
     return Inflated(raw, is_checked=False, fault=CUT)
 
 

@@ -375,7 +375,8 @@ class Pass:
         found = Counter(rows.counts())
         if rows.fault:
             inside = f", byte {rows.fault_at} of it" if rows.fault_at >= 0 else ""
-            self._short(unit, found, rows.fault, where + inside)
+            sizes = f": {inflated.sizes}" if inflated.sizes else ""
+            self._short(unit, found, rows.fault, where + inside + sizes)
             return
         if unit.entries is not None and unit.entries.counts() != found:
             self._ledger.notice(f"the index behind the {where} is damaged; it was not used")

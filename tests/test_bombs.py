@@ -1,0 +1,102 @@
+"""Compressed bombs: what declares or produces too much is refused, within bounded memory."""
+
+from __future__ import annotations
+
+import bz2
+import os
+import re
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import lz4.frame
+import pytest
+import zstandard
+
+from crosscue.replay.limits import DEFAULT
+from support.mcap_files import MAGIC, ChunkOf, channel, header, message, record, schema, text
+from support.rosbag_files import header_field
+from support.rosbag_files import record as bag_record
+
+BOMB_BYTES = 1 << 30
+MOST_MB = 200
+"""What a process that refuses a bomb may take in all, Python and its libraries included."""
+PIECE = bytes(1 << 20)
+
+
+def with_zstd() -> bytes:
+    packer = zstandard.ZstdCompressor(write_content_size=False).compressobj()
+    return b"".join(packer.compress(PIECE) for _ in range(BOMB_BYTES >> 20)) + packer.flush()
+
+
+def with_lz4() -> bytes:
+    context = lz4.frame.create_compression_context()
+    parts = [lz4.frame.compress_begin(context)]
+    parts += [lz4.frame.compress_chunk(context, PIECE) for _ in range(BOMB_BYTES >> 20)]
+    return b"".join([*parts, lz4.frame.compress_flush(context)])
+
+
+def with_bz2() -> bytes:
+    packer = bz2.BZ2Compressor()
+    return b"".join(packer.compress(PIECE) for _ in range(64)) + packer.flush()
+
+
+def mcap(body: bytes, compression: str, declared: int) -> bytes:
+    """A recording of one sound chunk and a bomb."""
+    sound = ChunkOf([schema(1), channel(1, 1, "/a"), message(1, 1, b"\0\1\0\0\1\0\0\0")])
+    head = struct.pack("<QQQI", 1, 1, declared, 0) + text(compression)
+    return MAGIC + header() + sound.coded() + record(6, head + struct.pack("<Q", len(body)) + body)
+
+
+def bag(body: bytes, compression: str, declared: int) -> bytes:
+    """A ROS 1 bag of one bomb and a connection."""
+    names = {b"topic": b"/a", b"type": b"std_msgs/String", b"md5sum": b"x",
+             b"message_definition": b"string data\n"}  # fmt: skip
+    about = b"".join(header_field(*pair) for pair in names.items())
+    return (
+        b"#ROSBAG V2.0\n"
+        + bag_record(
+            b" " * 4027, op=b"\3", index_pos=bytes(8), conn_count=bytes(4), chunk_count=bytes(4)
+        )
+        + bag_record(about, op=b"\7", conn=bytes(4), topic=b"/a")
+        + bag_record(
+            body, op=b"\5", compression=compression.encode(), size=struct.pack("<I", declared)
+        )
+    )
+
+
+CASES: dict[str, tuple[str, str, Callable[[], bytes], int]] = {
+    "mcap zstd over the limit": (".mcap", "zstd", with_zstd, BOMB_BYTES),
+    "mcap zstd more than declared": (".mcap", "zstd", with_zstd, 1000),
+    "mcap lz4 over the limit": (".mcap", "lz4", with_lz4, BOMB_BYTES),
+    "mcap lz4 more than declared": (".mcap", "lz4", with_lz4, 1000),
+    "bag bz2 over the limit": (".bag", "bz2", with_bz2, BOMB_BYTES),
+    "bag bz2 more than declared": (".bag", "bz2", with_bz2, 1000),
+    "bag lz4 over the limit": (".bag", "lz4", with_lz4, BOMB_BYTES),
+    "bag lz4 more than declared": (".bag", "lz4", with_lz4, 1000),
+}
+
+
+@pytest.mark.parametrize("case", list(CASES), ids=lambda name: name.replace(" ", "-"))
+def test_a_bomb_is_refused_with_both_numbers_in_bounded_memory(tmp_path: Path, case: str) -> None:
+    suffix, compression, body, declared = CASES[case]
+    path = tmp_path / f"bomb{suffix}"
+    path.write_bytes((mcap if suffix == ".mcap" else bag)(body(), compression, declared))
+
+    child = subprocess.Popen(
+        [sys.executable, "-m", "crosscue.eval.cli", "info", str(path)],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert child.stdout is not None
+    said = " ".join(child.stdout.read().split())
+    _, status, used = os.wait4(child.pid, 0)
+    child.stdout.close()
+    child.returncode = os.waitstatus_to_exitcode(status)
+
+    assert child.returncode == 3
+    assert used.ru_maxrss / 1024 < MOST_MB
+    assert str(declared) in said
+    other = str(DEFAULT.chunk_bytes) if "limit" in case else "more"
+    assert re.search(rf"\b{other}\b", said)
