@@ -30,7 +30,7 @@ MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = "crosscue"
 CHUNK_BYTES: Final = 4 << 20
 """Uncompressed bytes that a chunk aims at."""
-WINDOW_BYTES: Final = 16 << 20
+WINDOW_BYTES: Final = 8 << 20
 """Bytes that wait to be merged by time before they are cut into chunks."""
 CHUNKS_AHEAD: Final = 3
 """Chunks being compressed while others are written."""
