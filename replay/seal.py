@@ -23,7 +23,6 @@ import xxhash
 from .bounded import read_at_most
 from .errors import LogError, OutputError, one_line
 from .limits import MIB
-from .run_folder import strict_json, write_text
 
 SUFFIX: Final = ".seal"
 KIND: Final = "crosscue seal"
@@ -236,11 +235,15 @@ def write_seal(log: Path, seal: Seal, *, overwrite: bool) -> bool:
             f"{path}: the log differs from its seal of {kept.sealed_at}; see "
             f"'crosscue seal --check {log}', and give --overwrite only if the log is right"
         )
+    from .run_folder import write_text  # every log that is opened imports this module
+
     write_text(path, _as_text(seal))
     return True
 
 
 def _as_text(seal: Seal) -> str:
+    from .run_folder import strict_json
+
     tree = {
         "kind": KIND,
         "version": VERSION,

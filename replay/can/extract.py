@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import groupby
 from typing import Any, Final, TypeAlias
 
@@ -246,8 +247,7 @@ class Extractor:
         self.message = message
         self.signals = tuple(s for s in message.signals if s.name in names)
         self.is_multiplexed = any(switches_on(message, s) for s in message.signals)
-        needed = [s for s in message.signals if s.name in names or s.is_multiplexer]
-        self._root = _node(message, [s for s in needed if s.multiplexer is None], needed)
+        self._needed = [s for s in message.signals if s.name in names or s.is_multiplexer]
 
     def __call__(self, words: Words) -> tuple[dict[str, Column], NDArray[np.bool_] | None]:
         """Decode N payloads.
@@ -271,6 +271,12 @@ class Extractor:
             if column.present is not None:
                 columns[name + PRESENT_SUFFIX] = column.present
         return columns, strange if strange.any() else None
+
+    @cached_property
+    def _root(self) -> _Node:
+        """Made when the first frame comes: a bus carries few of a large database's messages."""
+        here = [s for s in self._needed if s.multiplexer is None]
+        return _node(self.message, here, self._needed)
 
 
 class _Filled:

@@ -12,12 +12,11 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from hashlib import blake2b
-from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -97,6 +96,8 @@ class LayoutEntry:
 
 def _replace(path: Path, content: bytes) -> None:
     """Write a file whole: another process sees the old one or this one."""
+    import tempfile
+
     number, name = tempfile.mkstemp(prefix=".", suffix=".partial", dir=path.parent)
     try:
         with os.fdopen(number, "wb") as file:
@@ -125,9 +126,20 @@ def _made_by() -> str | None:
     try:
         for name in _MADE_BY:
             code.update(Path(__file__).with_name(name).read_bytes())
-        return f"{code.hexdigest()} {version('cantools')}"
-    except (OSError, PackageNotFoundError):
+        return f"{code.hexdigest()} {_version_of_cantools()}"
+    except (OSError, ImportError, ValueError):
         return None
+
+
+def _version_of_cantools() -> str:
+    """Its version as installed, told without importing it or all that reads package metadata."""
+    spec = find_spec("cantools")
+    if spec is None or spec.origin is None:
+        raise ImportError("cantools is not installed as files")
+    package = Path(spec.origin)
+    stamp = package.stat()
+    installed = sorted(one.name for one in package.parents[1].glob("cantools-*.dist-info"))
+    return f"{' '.join(installed)} {stamp.st_size} {stamp.st_mtime_ns}"
 
 
 def _row(message: CanMessage) -> list[Any]:
