@@ -244,6 +244,24 @@ def test_a_damaged_record_header_costs_one_message(tmp_path: Path) -> None:
     assert sum(a.dropped.total() for a in reading.ledger.accounts.values()) == 1
 
 
+@pytest.mark.parametrize("damage", [b"\xff\xff\xff\xff", b"\0\0\0\0"])
+@pytest.mark.parametrize("of_body", [False, True])
+def test_without_an_index_a_damaged_length_costs_two_messages(
+    tmp_path: Path, damage: bytes, of_body: bool
+) -> None:
+    payloads = [b"%03d" % i * (3 + i % 5) for i in range(80)]
+    body = b"".join(message(0, START_NS + i, payload) for i, payload in enumerate(payloads))
+    content = bytearray(chunk(connection(0, b"/a") + body))
+    at = content.index(message(0, START_NS + 40, payloads[40])) + (42 if of_body else 0)
+    content[at : at + 4] = damage
+    reading = read_rows(bag(tmp_path / "a.bag", bytes(content)))
+
+    given = [row.payload for row in reading.rows]
+    assert not set(given) - set(payloads)
+    assert len(given) >= 78
+    assert not reading.ledger.is_whole
+
+
 def test_a_swapped_connection_number_is_caught_by_the_index(tmp_path: Path) -> None:
     rows = rows_of(200)
     path = write_bag(tmp_path / "a.bag", rows)

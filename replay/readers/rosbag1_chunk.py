@@ -44,6 +44,9 @@ _HEADER: Final = 38
 _HEAD: Final = 4 + _HEADER + 4
 _U32 = struct.Struct("<I")
 _FIRST_RUN: Final = 16
+_IN_A_ROW: Final = 3
+"""Plausible messages in a row that are believed behind damaged bytes without an index."""
+_DAY_NS: Final = 86_400 * 10**9
 _LONGEST_RUN: Final = 65_536
 
 
@@ -301,8 +304,9 @@ def _by_steps(
         if after is not None:
             at = after
             continue
-        is_tail_of_cut = inflated.fault == CUT
-        onward = _next_confirmed(raw, at, entries)
+        onward = _next_plausible(raw, at, steps) if entries is None else None
+        onward = onward or _next_confirmed(raw, at, entries)
+        is_tail_of_cut = inflated.fault == CUT and onward is None
         if fault_at < 0:
             fault, fault_at = fault or DAMAGED_BYTES, at
         if not is_tail_of_cut and (entries is None or at not in entries.offset):
@@ -395,6 +399,41 @@ def _next_confirmed(raw: bytes, at: int, entries: Entries | None) -> int | None:
         if _is_confirmed(raw, entries, i) is not None:
             return int(entries.offset[i])
     return None
+
+
+def _next_plausible(raw: bytes, at: int, steps: _Steps) -> int | None:
+    """Without an index: the next offset at which messages stand in a row.
+
+    The message that led to ``at`` may have a damaged length, so the search begins within it.
+    """
+    begin = at + 1
+    if steps.stop and len(steps.stop[-1]) and steps.stop[-1][-1] == at:
+        begin = int(steps.at[-1][-1]) + 1
+    known = {int(conn) for part in steps.conn for conn in np.unique(part)}
+    last_ns = next((int(part[-1]) for part in reversed(steps.log_ns) if len(part)), None)
+    found = raw.find(_U32.pack(_HEADER), begin)
+    while found >= 0:
+        if _stands_in_a_row(raw, found, known, last_ns):
+            return found
+        found = raw.find(_U32.pack(_HEADER), found + 1)
+    return None
+
+
+def _stands_in_a_row(raw: bytes, at: int, known: set[int], near_ns: int | None) -> bool:
+    """Do ``_IN_A_ROW`` messages of known connections and near times follow, or fewer to the end?"""
+    for _ in range(_IN_A_ROW):
+        if at == len(raw):
+            return True
+        record = record_at(memoryview(raw)[at : at + _HEAD], 0, at)
+        if record is None or record.op != MESSAGE or record.end > len(raw):
+            return False
+        if known and record.u32(b"conn") not in known:
+            return False
+        near_ns = record.time_ns(b"time") if near_ns is None else near_ns
+        if abs(record.time_ns(b"time") - near_ns) > _DAY_NS:
+            return False
+        at = record.end
+    return True
 
 
 def _is_confirmed(raw: bytes, entries: Entries, i: int) -> Record | None:
