@@ -281,3 +281,19 @@ def test_stretches_may_end_anywhere_in_an_object(
 
     assert found == by_bus(frames)
     assert ledger.is_whole
+
+
+@given(deleted=st.sets(st.integers(0, 79)))
+@settings(max_examples=25, deadline=None)
+def test_each_object_taken_out_is_reported_as_dropped(
+    tmp_path_factory: pytest.TempPathFactory, deleted: set[int]
+) -> None:
+    frames = made(80)
+    kept = [frame for k, frame in enumerate(frames) if k not in deleted]
+    content = blf(kept)[:32] + struct.pack("<L", len(frames)) + blf(kept)[36:]
+
+    found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), content))
+
+    assert found == by_bus(kept)
+    assert ledger.topic("").dropped.total() == len(deleted)
+    assert ledger.is_whole == (not deleted)
