@@ -103,6 +103,9 @@ class SealedLog(Closing):
                 _exhaust(check.everything())
             else:
                 yield from self._checked(self._touched, check, ledger, selection)
+                if selection == EVERYTHING:
+                    # What no reader needs, such as indexes, belongs to the log, too.
+                    _exhaust(check.everything())
         finally:
             _report(check, ledger)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from support.accounted import read
 from support.can_files import candump, made
 from support.every_format import EVERY_FORMAT
 from support.pictures import picture_folder
+from support.rosbag_files import rows_of, write_bag, write_folder
 
 
 def _sealed(folder: Path, kind: str) -> Path:
@@ -141,7 +143,8 @@ def test_every_command_that_reads_a_sealed_log_reports(
 
     assert run(["convert", str(long_log), "-o", str(out)]) == 3
     assert f"can.log: bytes {MIB} to {2 * MIB}" in " ".join(capsys.readouterr().err.split())
-    assert run(["decode", str(long_log), "-o", str(long_log.with_name("tables"))]) == 3
+    assert run(["info", str(long_log)]) == 3
+    assert f"can.log: bytes {MIB} to {2 * MIB}" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("is_cut", [True, False])
@@ -340,12 +343,33 @@ def test_hidden_files_and_links_in_a_circle(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def test_a_window_checks_what_it_reads_and_says_so(tmp_path: Path) -> None:
-    log = EVERY_FORMAT["mcap"](tmp_path)
+@pytest.mark.parametrize("kind", ["mcap", "rosbag1"])
+def test_a_window_of_an_indexed_log_checks_its_own_blocks_alone(tmp_path: Path, kind: str) -> None:
+    rows = rows_of(40_000)
+    if kind == "mcap":
+        log = next(write_folder(tmp_path / "bag", rows, "mcap").glob("*.mcap"))
+    else:
+        log = write_bag(tmp_path / "log.bag", rows, chunk_bytes=300_000)
+    assert log.stat().st_size > 3 * MIB
     assert run(["seal", str(log)]) == 0
-    ledger = Ledger(str(log))
-    with open_log(log) as opened:
-        for _ in opened.read(ledger, Selection(end_ns=0)):
-            pass
+    total = read_seal(seal_path(log)).blocks
+    early = Selection(end_ns=rows[200].log_ns)
 
-    assert "1 of 1 blocks" in ledger.integrity or "all 1 blocks" in ledger.integrity
+    def losses(selection: Selection) -> list[str]:
+        ledger = Ledger(str(log))
+        with open_log(log) as opened:
+            for _ in opened.read(ledger, selection):
+                pass
+        (checked,) = re.findall(r"(\d+) of \d+ blocks|$", ledger.integrity)[:1]
+        assert selection != early or 0 < int(checked) < total, ledger.integrity
+        return [drop.detail for drop in ledger.drops() if drop.reason == DIFFERS]
+
+    assert losses(early) == losses(Selection()) == []
+    middle = total // 2
+    _flip(log, middle * MIB + 77)
+    assert losses(early) == []
+    assert losses(Selection()) == [f"{log.name}: bytes {middle * MIB} to {(middle + 1) * MIB}"]
+    _flip(log, middle * MIB + 77)
+    at = rows[10].payload[4:20]
+    _flip(log, log.read_bytes().index(at)) if at in log.read_bytes() else _flip(log, 5000)
+    assert losses(early) == [f"{log.name}: bytes 0 to {MIB}"]

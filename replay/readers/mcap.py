@@ -26,6 +26,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, Selection
 from crosscue.replay.remote_ranges import RangedFile
+from crosscue.replay.touched import Touched
 
 from .mcap_bytes import ByteFile, RangedByteFile
 from .mcap_pass import read_segments
@@ -83,6 +84,11 @@ class McapLog(Closing):
             )
             for t in self._book.topics
         )
+
+    @property
+    def touched(self) -> Touched:
+        """Which bytes were read, for a seal."""
+        return self._file.touched
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """Its messages in stored order: a block per topic and a few chunks; see ``Log.read``."""

@@ -14,6 +14,7 @@ import numpy as np
 from crosscue.replay.checksum import crc32
 from crosscue.replay.columns import Bytes
 from crosscue.replay.remote_ranges import RangedFile
+from crosscue.replay.touched import Touched
 
 from .mcap_records import BrokenRecordError
 
@@ -60,7 +61,9 @@ class ByteFile:
     """An open file. ``peek`` is for one thread; ``read`` and ``crc`` are for any."""
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._file = path.open("rb", buffering=0)
+        self.touched = Touched()
         self.size = os.fstat(self._file.fileno()).st_size
         self._window = b""
         self._window_at = 0
@@ -105,6 +108,7 @@ class ByteFile:
             if not step:
                 break
             done += step
+        self.touched.add(self._path, at, done)
         return array[:done]
 
     def crc(self, begin: int, end: int, stop: Event | None = None) -> int | None:
@@ -133,9 +137,11 @@ class ByteFile:
         if at >= self.size:  # also where a damaged length leads, beyond what a file can hold
             return b""
         try:
-            return os.pread(self._file.fileno(), size, at)
+            found = os.pread(self._file.fileno(), size, at)
         except OSError as error:
             raise BrokenRecordError(f"the disk says: {error.strerror}") from None
+        self.touched.add(self._path, at, len(found))
+        return found
 
 
 class RangedByteFile(ByteFile):
@@ -143,6 +149,7 @@ class RangedByteFile(ByteFile):
 
     def __init__(self, ranged: RangedFile) -> None:
         self._ranged = ranged
+        self.touched = Touched()
         self.size = ranged.size
         self.buffers = Buffers()
 

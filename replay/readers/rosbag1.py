@@ -18,6 +18,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import EVERYTHING, Selection
 from crosscue.replay.remote_ranges import RangedFile
+from crosscue.replay.touched import Touched
 
 from .rosbag1_index import Contents, read_index, walk
 from .rosbag1_pass import Pass, Roster
@@ -46,7 +47,7 @@ class BagLog(Closing):
         self._losses: list[tuple[str, str]] = []
         self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC) if file is None else -1
         try:
-            self._file = file or BagFile(self._fd, os.fstat(self._fd).st_size)
+            self._file = file or BagFile(self._fd, os.fstat(self._fd).st_size, path=path)
             self._first, header = self._bag_header()
             self._contents = self._learn(header)
         except BaseException:
@@ -68,6 +69,11 @@ class BagLog(Closing):
     def topics(self) -> tuple[Topic, ...]:
         """Topics by connection number; those of a bag without index are found in its chunks."""
         return self._roster.topics
+
+    @property
+    def touched(self) -> Touched:
+        """Which bytes were read, for a seal."""
+        return self._file.touched
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """Blocks of ROS 1 messages, a few chunks at a time; see ``Log.read``."""

@@ -10,7 +10,8 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import Int64s
 from crosscue.replay.remote_ranges import RangedFile
+from crosscue.replay.touched import Touched
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 MESSAGE: Final = 2
@@ -142,16 +144,21 @@ class BagFile:
     Attributes:
         fd: Open file descriptor.
         size: File size in bytes when it was opened.
+        path: What it is called in ``touched``.
+        touched: Takes note of what is read, for a seal.
     """
 
     fd: int
     size: int
+    path: Path = field(default=Path(), kw_only=True)
+    touched: Touched = field(default_factory=Touched, kw_only=True)
 
     def bytes_at(self, start: int, stop: int) -> bytes:
         """Bytes of the file from ``start`` to ``stop``, fewer at its end."""
         parts: list[bytes] = []
         while start < stop and (part := os.pread(self.fd, stop - start, start)):
             parts.append(part)
+            self.touched.add(self.path, start, len(part))
             start += len(part)
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
