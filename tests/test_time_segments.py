@@ -96,7 +96,7 @@ def test_a_clock_that_is_set_makes_no_distance_and_loses_none(tmp_path: Path, by
 
 
 @settings(
-    max_examples=20,
+    max_examples=10,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
     phases=[Phase.explicit, Phase.reuse, Phase.generate],
