@@ -195,15 +195,20 @@ class CanLayout:
         channel = self._numbers.get(name)
         if channel is None:
             return np.full(len(words), missing, np.int64)
+        conversion = channel.conversion
+        if conversion.type == 1 and conversion.values[1:2] == (0.0,):
+            only = _whole(np.array(conversion.values[:1]))[0]
+            return np.full(len(words), only, np.int64)
         if is_plain(channel) and channel.bit_count < 64:
             bits = words.bits(channel.byte_offset, channel.bit_offset, channel.bit_count)
-            return bits.view(np.int64)
+            if not conversion.type or not is_applied(conversion):
+                return bits.view(np.int64)
+            if channel.bit_count <= 8:
+                # Few values are possible: each is converted once.
+                table = _whole(physical(conversion, np.arange(1 << channel.bit_count)))
+                return table[bits]
         values = raw(channel, words)
-        if channel.conversion.type and is_applied(channel.conversion):
-            values = physical(channel.conversion, values)
-        if values.dtype.kind == "f":
-            values = np.rint(np.nan_to_num(values, nan=-1.0, posinf=-1.0, neginf=-1.0))
-        return values.astype(np.int64)
+        return _whole(physical(conversion, values) if is_applied(conversion) else values)
 
     def _payloads(
         self, words: Words, length: Int64s, values: VariableValues | None, is_any_fd: bool
@@ -220,6 +225,13 @@ class CanLayout:
         key = raw(self._key, words).astype(np.int64)
         payload, stored_length = values.fetch(key, words.first, width)
         return _cut(payload, length), stored_length >= length
+
+
+def _whole(values: NDArray[np.generic]) -> Int64s:
+    """As whole numbers; -1 for what is none."""
+    if values.dtype.kind == "f":
+        values = np.rint(np.nan_to_num(values, nan=-1.0, posinf=-1.0, neginf=-1.0))
+    return values.astype(np.int64)
 
 
 def _cut(payload: Bytes, length: Int64s) -> Bytes:

@@ -26,9 +26,8 @@ def is_numeric(channel: Channel, value_bytes: int) -> bool:
 
 
 def is_plain(channel: Channel) -> bool:
-    """Is its value an unsigned little-endian number in the record and nothing else?"""
-    is_stored = channel.type not in (VIRTUAL_MASTER, VIRTUAL)
-    return is_stored and channel.data_type == 0 and channel.conversion.type == 0
+    """Is its raw value an unsigned little-endian number in the record?"""
+    return channel.type not in (VIRTUAL_MASTER, VIRTUAL) and channel.data_type == 0
 
 
 class Words:
