@@ -90,7 +90,7 @@ def test_a_cut_log_gives_what_is_there_and_says_so(
     assert "dropped" in out
 
 
-def test_a_flipped_byte_is_told_and_the_replay_goes_on(
+def test_a_flipped_byte_in_the_only_chunk_leaves_nothing_and_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], drive: DriveFiles
 ) -> None:
     damaged = bytearray(drive.log.read_bytes())
@@ -99,9 +99,11 @@ def test_a_flipped_byte_is_told_and_the_replay_goes_on(
     path.write_bytes(damaged)
     argv = ["replay", str(path), "--vehicle", str(drive.vehicle), "-o", str(tmp_path / "run")]
 
-    assert cli.run(argv) == 3
-    assert "dropped" in capsys.readouterr().out
-    assert (tmp_path / "run" / "manifest.json").exists()
+    assert cli.run(argv) == 4
+    said = capsys.readouterr().err
+    assert "damaged chunk" in said
+    assert "not one row is left" in said
+    assert not (tmp_path / "run" / "manifest.json").exists()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")

@@ -80,6 +80,7 @@ def test_coverage_comes_first_and_losses_are_told(tmp_path: Path) -> None:
     assert order == sorted(order)
     assert "<b>50 of 50</b>" in page
     assert "rows were dropped." in page
+    assert "1 &lt;b&gt;not decoded&lt;/b&gt;" in page
     assert "Not scored:</b> pose (the truth tells no track (pose: missing))" in page
 
 

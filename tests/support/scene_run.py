@@ -12,6 +12,7 @@ import pyarrow as pa
 from crosscue.detectors import rle
 from crosscue.eval.detect_stage import schemas
 from crosscue.eval.pose_tables import pose_schema
+from crosscue.eval.run_account import line
 from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.run_folder import RunFolder
@@ -119,7 +120,10 @@ def scene_run(folder: Path, *, without: frozenset[str] = frozenset()) -> RunFold
         folder / "run",
         {name: table for name, table in tables.items() if name not in without},
         stage="estimate", detect=detect,
-        account={"reading": [ACCOUNT], "is_whole": False},
+        account={
+            "reading": [ACCOUNT], "is_whole": False, "estimating": {},
+            "detecting": {TOPIC: line(FRAMES, FRAMES - 1, {}, {"<b>not decoded</b>": 1})},
+        },
         settings=Vehicle(version=1).model_dump(mode="json"),
         selection={"start_ns": None, "end_ns": None, "topics": None},
         notices=["[here](http://example.org) ![x](http://example.org/x.png) </td><script>"],

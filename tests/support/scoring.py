@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from crosscue.datasets.truth import Approach, CueTruth, Features, Truth, save
+from crosscue.eval.run_account import account
 from crosscue.eval.score_tables import RunTables, run_tables
 from crosscue.eval.score_truth import DriveTruth, TrueRanges
 from crosscue.replay.run_folder import RunFolder, create, write_manifest, write_text
@@ -174,7 +175,7 @@ def run_folder(
         "stage": "replay", "versions": {"crosscue": "0"}, "settings": {}, "notices": [],
         "logs": [{"path": str(path.parent / "drive.mcap"), "format": "mcap",
                   "sha256": {"drive.mcap": "00"}}],
-        "account": {"reading": [], "is_whole": True},
+        "account": account([]),
         "clocks": [], "counts": {}, "timings": {"seconds": 1.0},
     }  # fmt: skip
     write_manifest(run, content | manifest)
