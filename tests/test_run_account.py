@@ -12,7 +12,7 @@ import pytest
 from crosscue.datasets.simulated_drive import DriveSettings
 from crosscue.datasets.simulated_log import write_drive
 from crosscue.eval import cli
-from crosscue.eval.accounts import write_skipped
+from crosscue.eval.accounts import account_of, write_skipped
 from crosscue.eval.run_account import account, account_lines, check, line, lines, summed
 from crosscue.replay.errors import AccountError
 from crosscue.replay.ledger import DETAILS_KEPT, Ledger
@@ -110,8 +110,6 @@ def test_single_rows_beyond_those_kept_are_added_up(tmp_path: Path) -> None:
     ledger.drop("/t", "cut", 3)
     ledger.drop("", "who knows", None)
     run = create(tmp_path / "run", overwrite=False)
-    from crosscue.eval.accounts import account_of
-
     write_skipped(run, [ledger], [account_of(ledger)])
 
     rows = run.table("skipped").to_pylist()
@@ -160,3 +158,38 @@ def test_a_person_reads_every_stage_and_every_reason_once() -> None:
                   "skipped 3 of estimating headings: refused by the gate"):  # fmt: skip
         assert text.count(words) == 1
     assert np.all([len(part) <= 100 for part in text.splitlines()])
+
+
+def test_one_row_beyond_those_kept_and_one_of_unknown_number_are_not_lost(tmp_path: Path) -> None:
+    ledger = Ledger("log")
+    ledger.find("/t", 3 * DETAILS_KEPT)
+    ledger.drop("/t", "cut", 3)
+    ledger.drop("/t", "cut", None)
+    for _ in range(DETAILS_KEPT - 1):
+        ledger.skip("/t", "bad")
+    run = create(tmp_path / "run", overwrite=False)
+
+    write_skipped(run, [ledger], [account_of(ledger)])
+
+    rows = run.table("skipped").to_pylist()
+    assert sum(row["count"] for row in rows if row["reason"] == "bad") == DETAILS_KEPT - 1
+    assert [row["count"] for row in rows if row["reason"] == "cut"] == [3, None]
+
+
+def test_headings_that_the_first_belief_is_made_of_are_used(
+    damaged: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, log, vehicle = damaged
+    text = "\n".join(row for row in vehicle.read_text().splitlines() if "heading_rad" not in row)
+    for dbc in vehicle.parent.glob("*.dbc"):
+        (tmp_path / dbc.name).write_bytes(dbc.read_bytes())
+    (tmp_path / "car.toml").write_text(text)
+    run = tmp_path / "run"
+
+    assert cli.run(["replay", str(log), "--vehicle", str(tmp_path / "car.toml"), "-o", str(run),
+                    "--json"]) == 3  # fmt: skip
+
+    printed = json.loads(capsys.readouterr().out)
+    assert any("start heading" in sentence for sentence in printed["notices"])
+    headings = _agrees(run, printed)["estimating"]["headings"]
+    assert headings["in"] == headings["used"] + sum(headings["skipped"].values())
