@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from crosscue.replay.clocks import Clock
 from crosscue.replay.ledger import Ledger, TopicAccount
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.remote import RangedLog, RemoteLog
-from crosscue.replay.run_folder import RunFolder, TableSink, sha256_of
+from crosscue.replay.run_folder import RunFolder, TableSink
 from crosscue.replay.signals import Extractor
 from crosscue.replay.time_segments import ONE_SEGMENT, Timeline
 
@@ -114,18 +113,6 @@ def versions() -> dict[str, str]:
     """Of crosscue, Python and the libraries that results depend on."""
     libraries = ("crosscue", "numpy", "numba", "cantools", "rosbags", "mcap", "pyarrow")
     return {"python": platform.python_version(), **{name: version(name) for name in libraries}}
-
-
-def log_rows(logs: Sequence[Log]) -> list[dict[str, object]]:
-    """Path, format and hash of every log, for the manifest; of a fetched one its URL, too."""
-    return [_log_row(log) for log in logs]
-
-
-def _log_row(log: Log) -> dict[str, object]:
-    row: dict[str, object] = {
-        "path": str(log.path), "format": log.format, "sha256": sha256_of(log.path),
-    }  # fmt: skip
-    return row | {"url": log.url} if isinstance(log, RemoteLog | RangedLog) else row
 
 
 def write_skipped(

@@ -36,6 +36,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "replay": ("replay", "the main job: from a log to a run folder"),
     "score": ("score", "runs against truth: metrics, figures, report, gates"),
     "compare": ("compare", "what changed between two runs, with tolerances"),
+    "merge": ("merge", "the runs of batches as one folder of tables"),
     "view": ("view", "a run in Rerun"),
     "fit compass": ("fit_compass", "compass mounting, hard and soft iron from a drive"),
     "fit signs": ("fit_signs", "the sign threshold for a wanted precision"),

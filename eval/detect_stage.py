@@ -22,7 +22,6 @@ from crosscue.replay.columns import Block
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.remote import name_of
 from crosscue.replay.run_folder import (
     RunFolder,
     clear,
@@ -35,7 +34,6 @@ from crosscue.replay.vehicle import Vehicle
 
 from .accounts import (
     clock_rows,
-    log_rows,
     probe_clocks,
     selection_told,
     versions,
@@ -46,6 +44,8 @@ from .drive_time import camera_timeline, time_told
 from .empty_result import empty_result, nothing_left
 from .labelled import LabelledSink
 from .run_account import Account, account, detecting_of, reading_of
+from .run_input import input_of
+from .run_logs import log_names, log_rows
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -118,7 +118,7 @@ def detect_drive(
     The folder is locked while this works, and cleared first; otherwise as ``detect_into``.
     """
     with locked(run), nothing_left(run):
-        clear(run)
+        clear(run, input_of(logs, vehicle, selection, choices, draw, None))
         return detect_into(logs, vehicle, run, selection, choices, cache, draw, on_frames)
 
 
@@ -158,7 +158,7 @@ def detect_into(
         raise VehicleError(f"{logs[0].path}: no camera in the logs; name its topic under [topics]")
     named = [Named(choice.name, make(choice)) for choice in choices]
     log, topic = logs[camera[0]], camera[1]
-    ledger = Ledger(name_of(log))
+    ledger = Ledger(log_names(logs)[camera[0]])
     planned = Plan((Source(camera[0], topic, ()),), {})
     narrowed = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
     probe = Extractor(planned, vehicle, camera[0], Ledger(""))
@@ -206,7 +206,7 @@ def detect_into(
         write_manifest(run, {
             "stage": "detect",
             "versions": versions(),
-            "logs": log_rows(logs),
+            "logs": log_rows(logs, run),
             "selection": selection_told(selection),
             "settings": vehicle.model_dump(mode="json"),
             "camera": topic.name,

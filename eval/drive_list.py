@@ -8,7 +8,7 @@ Logs named one by one are the logs of one drive, merged by time. Many drives are
 * ``@drives.txt``: a line for each drive, its logs as words, relative to the list's folder;
 * ``each``: every argument is a drive, or a folder of drives.
 
-One of these makes drives of its neighbours, too. A folder with ``vehicle.toml`` or ``truth.json``
+One of these makes drives of its neighbors, too. A folder with ``vehicle.toml`` or ``truth.json``
 beside its recordings, as ``crosscue simulate`` writes, is one drive, and brings those files along.
 """
 
@@ -18,7 +18,6 @@ import glob
 import hashlib
 import re
 import shlex
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from typing import Final
 
 from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import LogError, UnknownFormatError, UsageError
+from crosscue.replay.identity import SHORT, identity_of, identity_of_all
 from crosscue.replay.limits import MIB
 from crosscue.replay.log import FORMATS, format_of
 from crosscue.replay.remote import is_remote, matches
@@ -37,6 +37,11 @@ LIST_BYTES: Final = 64 * MIB
 DEPTH: Final = 8
 """Of folders within folders of drives."""
 NAME_LENGTH: Final = 150
+SAYS_NOTHING: Final = frozenset({
+    "bag", "camera", "can", "can0", "can1", "data", "drive", "images", "log", "logs", "record",
+    "recording", "rosbag", "rosbag2", "video",
+})  # fmt: skip
+"""Names of logs that tell no drive from another."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +49,9 @@ class DriveInput:
     """One drive that a command line means.
 
     Attributes:
-        name: Unique among the drives; letters, digits and ``._+=@-`` only.
-        logs: Paths or URLs, as given.
+        name: A readable stem and 8 hex digits of the logs' identity, whatever else is in the
+            batch; letters, digits and ``._+=@-`` only.
+        logs: Paths or URLs, as given, sorted by name: their order changes nothing.
         vehicle: The vehicle file that lies beside its logs, if any.
         truth: The truth that lies beside its logs, if any.
     """
@@ -74,16 +80,12 @@ class _Found:
     """A drive before it has a name.
 
     Attributes:
-        logs: As in ``DriveInput``.
+        logs: As in ``DriveInput``, in the order met.
         beside: The folder that may hold its vehicle file and truth, or None.
-        parts: Of its absolute place; the last ones make its name.
-        shown: How many of them make it at least.
     """
 
     logs: tuple[str, ...]
     beside: Path | None
-    parts: tuple[str, ...]
-    shown: int
 
 
 def drives_of(arguments: Sequence[str], *, each: bool = False) -> DriveList:
@@ -96,8 +98,7 @@ def drives_of(arguments: Sequence[str], *, each: bool = False) -> DriveList:
     """
     is_many = each or any(_is_plural(text) for text in arguments)
     if not is_many and len(arguments) > 1:
-        first = _plain(arguments[0])
-        return DriveList((_named([replace(first, logs=tuple(arguments), beside=None)])[0],), False)
+        return DriveList(tuple(_named([_Found(tuple(arguments), None)])), False)
     found = [one for text in arguments for one in _expanded(text, each=each)]
     if not is_many and not Path(arguments[0]).is_dir():
         found = [replace(found[0], beside=None)]
@@ -129,13 +130,8 @@ def _expanded(text: str, *, each: bool) -> Iterator[_Found]:
         yield from _in_folder(Path(text), each=each)
 
 
-def _plain(text: str, shown: int = 1) -> _Found:
-    if is_remote(text):
-        parts = [part for part in re.split(r"[:/]+", text) if part]
-        return _Found((text,), None, (*parts[:-1], _stem(parts[-1])), shown)
-    place = Path(text)
-    parts = list(place.absolute().parts)
-    return _Found((text,), place.parent, (*parts[:-1], _stem(parts[-1])), shown)
+def _plain(text: str) -> _Found:
+    return _Found((text,), None if is_remote(text) else Path(text).parent)
 
 
 def _stem(name: str) -> str:
@@ -176,29 +172,20 @@ def _matched(pattern: str) -> Iterator[_Found]:
         found = tuple(sorted(glob.glob(pattern, recursive=True)))  # noqa: PTH207 (keeps ** and relative names)
     if not found:
         raise UsageError(f"{pattern}: nothing matches; check the pattern")
-    fixed = len([part for part in re.split(r"[:/]+", _fixed(pattern)) if part])
     for text in found:
-        whole = len([part for part in re.split(r"[:/]+", text) if part])
-        shown = max(1, whole - fixed)
         if is_remote(text) or Path(text).is_file():
-            yield _plain(text, shown)
+            yield _plain(text)
         else:
-            yield from _in_folder(Path(text), each=False, shown=shown)
+            yield from _in_folder(Path(text), each=False)
 
 
-def _fixed(pattern: str) -> str:
-    """The folder that a pattern looks in."""
-    parts = pattern.split("/")
-    return "/".join(parts[: next(i for i, part in enumerate(parts) if glob.has_magic(part))])
-
-
-def _in_folder(folder: Path, *, each: bool, shown: int = 1) -> Iterator[_Found]:
+def _in_folder(folder: Path, *, each: bool) -> Iterator[_Found]:
     """The folder as a drive, or the drives in it."""
     is_split = _format(folder) == "rosbag2" and not folder.joinpath("metadata.yaml").exists()
     if _is_drive(folder):
-        yield _drive_folder(folder, shown)
+        yield _drive_folder(folder)
     elif _format(folder) and not (each and is_split):
-        yield _Found((str(folder),), folder.parent, _parts(folder), shown)
+        yield _Found((str(folder),), folder.parent)
     else:
         found = list(_walk(folder, 1))
         if not found:
@@ -217,19 +204,18 @@ def _walk(folder: Path, depth: int) -> Iterator[_Found]:
         )
     for entry in _entries(folder):
         if entry.is_file() and entry in recordings:
-            yield _plain(str(entry), depth)
+            yield _plain(str(entry))
         elif entry.is_dir() and not entry.joinpath(MANIFEST).exists():
             if _is_drive(entry):
-                yield _drive_folder(entry, depth)
+                yield _drive_folder(entry)
             elif _format(entry):
-                yield _Found((str(entry),), entry.parent, _parts(entry), depth)
+                yield _Found((str(entry),), entry.parent)
             elif depth < DEPTH and not entry.is_symlink():
                 yield from _walk(entry, depth + 1)
 
 
-def _drive_folder(folder: Path, shown: int) -> _Found:
-    logs = tuple(str(one) for one in _recordings(folder))
-    return _Found(logs, folder, _parts(folder), shown)
+def _drive_folder(folder: Path) -> _Found:
+    return _Found(tuple(str(one) for one in _recordings(folder)), folder)
 
 
 def _is_drive(folder: Path) -> bool:
@@ -265,44 +251,65 @@ def _format(place: Path) -> str:
         return ""
 
 
-def _parts(folder: Path) -> tuple[str, ...]:
-    return folder.absolute().parts
-
-
 def _named(found: Sequence[_Found]) -> list[DriveInput]:
-    """Names from the ends of places, as long as it takes to tell all drives apart."""
-    twice = [logs for logs, count in Counter(one.logs for one in found).items() if count > 1]
-    if twice:
-        raise UsageError(f"{' '.join(twice[0])}: named twice; name each drive once")
-    shown = [min(one.shown, len(one.parts)) for one in found]
-    while True:
-        names = [_name(one, count) for one, count in zip(found, shown, strict=True)]
-        clashing = {name for name, count in Counter(names).items() if count > 1}
-        longer = [
-            min(count + (name in clashing), len(one.parts))
-            for one, count, name in zip(found, shown, names, strict=True)
-        ]
-        if longer == shown:
-            break
-        shown = longer
-    names = [
-        f"{name}-{_digest(one)}" if name in clashing else name
-        for one, name in zip(found, names, strict=True)
-    ]
-    return [
-        DriveInput(name, one.logs, _file(one.beside, VEHICLE), _file(one.beside, TRUTH))
-        for one, name in zip(found, names, strict=True)
-    ]
+    """Each drive with a name that its own logs alone decide.
+
+    Raises:
+        UsageError: One drive is named twice, perhaps as a copy.
+    """
+    drives: dict[str, DriveInput] = {}
+    for one in found:
+        logs = tuple(sorted(one.logs, key=lambda log: (_parts(log)[-1], log)))
+        name = _name(logs)
+        if name in drives:
+            first, second = " ".join(drives[name].logs), " ".join(logs)
+            also = "named twice" if first == second else f"the same recording as {first}"
+            raise UsageError(f"{second}: {also}; name each drive once")
+        vehicle, truth = _file(one.beside, VEHICLE), _file(one.beside, TRUTH)
+        drives[name] = DriveInput(name, logs, vehicle, truth)
+    return list(drives.values())
 
 
-def _name(one: _Found, count: int) -> str:
-    text = "__".join(part for part in one.parts[-count:] if part != "/")
-    text = re.sub(r"[^A-Za-z0-9._+=@-]", "_", text).lstrip(".") or "drive"
-    return text if len(text) <= NAME_LENGTH else f"{text[:NAME_LENGTH]}-{_digest(one)}"
+def _name(logs: tuple[str, ...]) -> str:
+    text = re.sub(r"[^A-Za-z0-9._+=@-]", "_", _readable(logs)).lstrip(".") or "drive"
+    return f"{text[:NAME_LENGTH]}-{_identity(logs)}"
 
 
-def _digest(one: _Found) -> str:
-    return hashlib.sha256("\0".join(one.logs).encode(errors="surrogateescape")).hexdigest()[:8]
+def _readable(logs: tuple[str, ...]) -> str:
+    """What a person calls the drive: its folder if that is one drive's, else its first log.
+
+    A log of a name that says nothing (``drive``, ``40``) is called by its folder.
+    """
+    parts = [part for part in _parts(logs[0]) if part != "/"]
+    if len(logs) > 1 and all(_parts(log)[:-1] == _parts(logs[0])[:-1] for log in logs):
+        folder = Path(logs[0]).parent
+        if not is_remote(logs[0]) and any((folder / mark).is_file() for mark in (VEHICLE, TRUTH)):
+            return parts[-2]
+    stem, above = parts[-1], parts[:-1]
+    while above and stem.lower() in SAYS_NOTHING:
+        stem = above.pop()
+    while above and not any(letter.isalpha() for letter in stem):
+        stem = f"{above.pop()}__{stem}"
+    return stem
+
+
+def _parts(log: str) -> tuple[str, ...]:
+    """Of a log's absolute place, the last one without its suffix."""
+    if is_remote(log):
+        parts = tuple(part for part in re.split(r"[:/]+", log) if part)
+    else:
+        parts = Path(log).absolute().parts
+    return (*parts[:-1], _stem(parts[-1]))
+
+
+def _identity(logs: tuple[str, ...]) -> str:
+    """Of the logs; of a log that cannot be read, of its place: it will fail, but by this name."""
+    try:
+        return identity_of_all([identity_of(log) for log in logs]).short
+    except LogError:
+        places = [log if is_remote(log) else str(Path(log).absolute()) for log in logs]
+        text = "\0".join(places).encode(errors="surrogateescape")
+        return hashlib.sha256(text).hexdigest()[:SHORT]
 
 
 def _file(folder: Path | None, name: str) -> Path | None:

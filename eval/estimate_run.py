@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from crosscue.replay.errors import RunError
-from crosscue.replay.log import Log, Selection, open_log
-from crosscue.replay.run_folder import MANIFEST, RunFolder, locked
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.run_folder import MANIFEST, RunFolder, locked, sha256_of, write_input
 from crosscue.replay.vehicle import Vehicle, of_manifest
 
-from .accounts import log_rows
 from .estimate_stage import Outcome, detected_part, estimate_into
+from .run_input import settings_changed
+from .run_logs import reopened
 
 
 def selection_used(manifest: Mapping[str, Any]) -> Selection:
@@ -51,6 +52,9 @@ def estimate_run(
         logs = [stack.enter_context(_reopened(run, said)) for said in manifest["logs"]]
         stack.enter_context(locked(run))
         settings = vehicle or of_manifest(manifest["settings"])
+        changed = None if vehicle is None else settings_changed(run, vehicle)
+        if changed is not None:
+            write_input(run, changed)
         return estimate_into(
             logs, settings, run, selection_used(manifest), on_time,
             earlier=detected_part(manifest), told=manifest["logs"],
@@ -58,14 +62,10 @@ def estimate_run(
 
 
 def _reopened(run: RunFolder, said: Mapping[str, Any]) -> Log:
-    path = Path(said["path"])
-    if not path.exists() and "url" not in said:
-        raise RunError(f"{run.path}: its log {path} is gone; put it back, or replay again")
-    # What was fetched may have had to make room for others.
-    log = open_log(said.get("url", path))
-    if not _is_older(log.path, run) and log_rows([log])[0]["sha256"] != said["sha256"]:
+    log = reopened(run, said)
+    if not _is_older(log.path, run) and sha256_of(log.path) != said["sha256"]:
         log.close()
-        raise RunError(f"{run.path}: its log {path} has changed since; replay again")
+        raise RunError(f"{run.path}: its log {log.path} has changed since; replay again")
     return log
 
 

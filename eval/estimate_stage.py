@@ -43,7 +43,6 @@ from .accounts import (
     clock_changes,
     clock_rows,
     joined_accounts,
-    log_rows,
     probe_clocks,
     selection_told,
     versions,
@@ -58,6 +57,7 @@ from .mobileye_tables import MobileyeSink, StoredMobileye
 from .pose_stage import PoseStage, turn_signal_of
 from .pose_tables import PoseTally, pose_rows, pose_schema
 from .run_account import Account, account, estimating_of, reading_of
+from .run_logs import log_names, log_rows, relative
 from .scene_stage import SceneOutcome, estimate_scene, features_of, schemas
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def estimate_into(
         landmarks: Camera frames are compared with these, where given.
         detected: The detect stage, if it ran just now.
         earlier: The manifest's part on the detect stage, if it ran earlier.
-        told: ``log_rows(logs)``, if they have been hashed already.
+        told: ``log_rows(logs, run)``, if they have been hashed already.
         timeline: The drive's time segments, if they have been found already.
 
     Raises:
@@ -193,7 +193,7 @@ def estimate_into(
     write_manifest(run, {
         "stage": "estimate",
         "versions": versions(),
-        "logs": _hashed(logs, found) if told is None else list(told),
+        "logs": _hashed(logs, run, found) if told is None else list(told),
         "selection": selection_told(selection),
         "settings": vehicle.model_dump(mode="json"),
         "sources": _sources(reading.planned, logs),
@@ -202,7 +202,7 @@ def estimate_into(
         "counts": stage.counts(),
         "time": time_told(timeline),
         "landmarks": None if landmarks is None else {
-            "database": str(landmarks.path), "landmarks": len(landmarks),
+            "database": relative(landmarks.path, run), "landmarks": len(landmarks),
             "sha256": sha256_of(landmarks.path),
         },
         "notices": list(notices),
@@ -236,9 +236,11 @@ def _driven_s(timeline: Timeline, tally: PoseTally) -> float:
     return tally.seconds - gaps_ns * 1e-9
 
 
-def _hashed(logs: Sequence[Log], found: Mapping[str, Any] | None) -> Sequence[Mapping[str, object]]:
+def _hashed(
+    logs: Sequence[Log], run: RunFolder, found: Mapping[str, Any] | None
+) -> Sequence[Mapping[str, object]]:
     """Paths and hashes of the logs; the detect stage of this very run has taken them already."""
-    told: Sequence[Mapping[str, object]] = log_rows(logs) if found is None else found["logs"]
+    told: Sequence[Mapping[str, object]] = log_rows(logs, run) if found is None else found["logs"]
     return told
 
 
@@ -265,7 +267,7 @@ class _Reading:
         self.camera = None if landmarks is None else camera_of(topics, vehicle)
         if self.camera is not None:
             self.planned = with_pictures(self.planned, self.camera)
-        self.ledgers = tuple(Ledger(str(log.path)) for log in logs)
+        self.ledgers = tuple(Ledger(name) for name in log_names(logs))
         self.selections = selections_of(logs, self.planned, selection)
         if timeline is None:
             known = None if found is None else timeline_in(found)
@@ -360,11 +362,10 @@ def _camera_skips(run: RunFolder, camera: str) -> pa.Table:
 
 def _sources(planned: Plan, logs: Sequence[Log]) -> dict[str, str | None]:
     """From a signal to the log and topic that gave it."""
+    names = log_names(logs)
     found = {signal: planned.source_of(signal) for signal in Signal}
     return {
-        signal.name.lower(): None
-        if source is None
-        else f"{logs[source.log].path}: {source.topic.name}"
+        signal.name.lower(): None if source is None else f"{names[source.log]}: {source.topic.name}"
         for signal, source in found.items()
     }
 

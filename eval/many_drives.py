@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
 from crosscue.replay.errors import CrosscueError, RunError, UsageError, one_line
+from crosscue.replay.identity import as_row, identity_of, identity_of_all
 from crosscue.replay.remote import version_of
 from crosscue.replay.run_folder import MANIFEST, RunFolder, strict_json, write_text
 from crosscue.replay.tree_text import json_tree
 
 JOURNAL: Final = ".drives"
-FORMAT_VERSION: Final = 1
+FORMAT_VERSION: Final = 2
 
 
 class Result(Protocol):
@@ -317,8 +318,9 @@ def _earlier(job: Job, overwrite: bool) -> Done[R] | None:
 
 
 def _inputs(job: Job) -> dict[str, object]:
-    """What decides the result, without reading a log: places, sizes, times, settings."""
-    return {"fingerprint": job.fingerprint, "logs": [[log, version_of(log)] for log in job.logs]}
+    """What decides the result: the logs' identity and the settings."""
+    identity = identity_of_all([identity_of(log) for log in job.logs])
+    return {"fingerprint": job.fingerprint, "identity": as_row(identity)}
 
 
 def _manifest_hash(job: Job) -> str:

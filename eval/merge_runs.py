@@ -1,7 +1,9 @@
 """The runs of many drives as one folder of tables, each row with its drive's name.
 
 Tables are streamed, so memory does not grow with the number of drives. The merged manifest tells
-which drives are in it, which failed and why, and adds up every topic's account.
+which drives are in it, which failed and why, and adds up every topic's account. Merging is a set
+union: the order does not matter, a run that is met twice counts once, and what comes out is the
+same bytes however the drives were spread over batches.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.replay.errors import RunError, one_line
+from crosscue.replay.errors import RunError, UsageError, one_line
 from crosscue.replay.run_folder import (
     MANIFEST,
     RunFolder,
@@ -21,6 +23,7 @@ from crosscue.replay.run_folder import (
     clear,
     locked,
     open_run,
+    strict_json,
     write_manifest,
 )
 
@@ -75,7 +78,7 @@ def merge_runs(
     """Write one table of each kind with a ``drive`` column, and a manifest.
 
     Args:
-        runs: By name, in the order that rows are to have.
+        runs: By name; rows come in the order of names.
         out: Where to; cleared first.
         failures: By name of the drive, why there is no run of it.
 
@@ -83,7 +86,7 @@ def merge_runs(
         RunError: A run is damaged, or two have columns of one name and different types.
         OutputError: The disk is full.
     """
-    drives = [_Drive(name, run, run.manifest()) for name, run in runs.items()]
+    drives = [_Drive(name, run, run.manifest()) for name, run in sorted(runs.items())]
     kinds = sorted({path.stem for one in drives for path in one.run.path.glob("*.parquet")})
     with locked(out):
         clear(out)
@@ -149,12 +152,15 @@ def _manifest(
         "drives": [
             {
                 "name": one.name,
-                "run": str(one.run.path),
-                "logs": [log["path"] for log in one.manifest.get("logs", [])],
+                "logs": [
+                    {"name": log["name"], "identity": log["identity"]}
+                    for log in one.manifest.get("logs", [])
+                ],
+                "settings_sha256": _settings_hash(one.manifest),
                 "is_whole": is_whole(one.manifest),
                 "rows": one.rows,
                 "seconds": one.seconds,
-                "tables_sha256": _fingerprint(one),
+                "tables_sha256": _tables_hash(one.run),
             }
             for one in drives
         ],
@@ -162,19 +168,80 @@ def _manifest(
         "account": summed(one.manifest["account"] for one in drives),
         "notices": dict(Counter(text for one in drives for text in _notices(one)).most_common()),
         "versions": _versions(drives),
-        "timings": {
-            "seconds": sum(one.manifest.get("timings", {}).get("seconds", 0.0) for one in drives)
-        },
     }
 
 
-def _fingerprint(one: _Drive) -> str:
-    """Of the drive's tables as they were merged."""
+def _settings_hash(manifest: Mapping[str, Any]) -> str:
+    """Of the settings and detectors that a run was made with."""
+    detected = manifest.get("detect") or {}
+    made_with = [manifest.get("settings"), detected.get("detectors"), manifest.get("selection")]
+    return hashlib.sha256(strict_json(made_with).encode()).hexdigest()
+
+
+def _tables_hash(run: RunFolder) -> str:
+    """Of a run's tables."""
     digest = hashlib.sha256()
-    for kind in sorted(one.rows):
-        with one.run.file(f"{kind}.parquet").open("rb") as file:
-            digest.update(kind.encode() + b"\0" + hashlib.file_digest(file, "sha256").digest())
+    for path in sorted(run.path.glob("*.parquet")):
+        with path.open("rb") as file:
+            digest.update(path.stem.encode() + b"\0")
+            digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
+
+
+def gathered(
+    folders: Sequence[Path],
+) -> tuple[dict[str, RunFolder], dict[str, str]]:
+    """All runs of batches, and the failures of drives that none of them has a run of.
+
+    Args:
+        folders: Run folders, or folders of them, as ``replay`` of many drives writes.
+
+    Returns:
+        Runs by name, and by name of a drive why there is no run of it.
+
+    Raises:
+        UsageError: Two different runs have one name.
+        RunError: A run is damaged or of another version.
+    """
+    runs: dict[str, RunFolder] = {}
+    failures: dict[str, str] = {}
+    for folder in folders:
+        for path in _finished(folder):
+            run = open_run(path)
+            first = runs.setdefault(path.resolve().name, run)
+            if first is not run and _content(first) != _content(run):
+                raise UsageError(
+                    f"{first.path} and {path}: two different runs of one name; merging would "
+                    "drop one: rename it, or replay it as the other was"
+                )
+        merged = RunFolder(folder / FOLDER)
+        if is_merged(merged):
+            for name, why in merged.manifest()["failures"].items():
+                failures.setdefault(name, why)
+    return runs, {name: why for name, why in failures.items() if name not in runs}
+
+
+def _finished(folder: Path) -> list[Path]:
+    """Runs of single drives in a folder, which may be one itself."""
+    if folder.joinpath(MANIFEST).exists():
+        if is_merged(RunFolder(folder)):
+            raise UsageError(
+                f"{folder}: tables that were merged before; give the folder that holds the runs"
+            )
+        return [folder]
+    try:
+        inside = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    except OSError as error:
+        raise RunError(f"{folder}: {error.strerror}; give a folder of runs") from None
+    holding = [entry for entry in inside if entry.joinpath(MANIFEST).exists()]
+    return [entry for entry in holding if not is_merged(RunFolder(entry))]
+
+
+def _content(run: RunFolder) -> tuple[str, ...]:
+    """What makes two runs the same: logs, settings and every table."""
+    manifest = run.manifest()
+    logs = sorted(str(log["identity"]["digest"]) for log in manifest.get("logs", []))
+    return (*logs, _settings_hash(manifest), _tables_hash(run))
 
 
 def _notices(one: _Drive) -> set[str]:
@@ -190,13 +257,13 @@ def _versions(drives: Sequence[_Drive]) -> dict[str, list[str]]:
     return {library: sorted(used) for library, used in sorted(found.items())}
 
 
-def open_one(path: Path) -> RunFolder:
-    """The run of one drive.
+def open_one(path: Path, logs: Path | None = None, *, without_pictures: bool = False) -> RunFolder:
+    """The run of one drive; arguments as of ``open_run``.
 
     Raises:
         RunError: It holds many drives; else as ``open_run``.
     """
-    run = open_run(path)
+    run = open_run(path, logs, without_pictures=without_pictures)
     if is_merged(run):
         raise RunError(f"{path}: holds the tables of many drives; give one of the runs beside it")
     return run

@@ -17,11 +17,13 @@ from crosscue.replay.signals import camera_of
 from crosscue.replay.time_segments import Timeline
 from crosscue.replay.vehicle import Vehicle
 
-from .accounts import log_rows, selection_told
+from .accounts import selection_told
 from .detect_stage import DetectOutcome, OnFrames, detect_into, unwatched
 from .drive_time import drive_timeline
 from .empty_result import nothing_left
 from .estimate_stage import Outcome, detected_part, estimate_into
+from .run_input import input_of, refuse_another
+from .run_logs import log_rows
 
 TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
 """What the second stage reads of the first."""
@@ -57,6 +59,8 @@ def replay_drive(
     on_time: Callable[[int], None] = lambda _: None,
     landmarks: LandmarkDatabase | None = None,
     detecting: Detecting = NO_DETECTORS,
+    *,
+    overwrite: bool = False,
 ) -> Outcome:
     """Replay one drive into an empty or to be overwritten run folder.
 
@@ -68,20 +72,28 @@ def replay_drive(
         on_time: Told the log time that has been reached, for progress.
         landmarks: Camera frames are compared with these, where given.
         detecting: Detectors to run over the camera; without any, the run has pose alone.
+        overwrite: Replace a run of other logs or settings, though ``detecting`` says to resume.
 
     Raises:
+        UsageError: It is to be resumed, and the folder holds a run of other logs or settings.
         VehicleError: The vehicle file does not fit the logs.
         EmptyResultError: Nothing came of it; the folder is empty again.
         OutputError: The disk is full.
     """
+    mine = input_of(
+        logs, vehicle, selection, detecting.choices, detecting.draw,
+        None if landmarks is None else landmarks.path,
+    )  # fmt: skip
     with locked(run):
+        if detecting.resume and not overwrite:
+            refuse_another(run, mine)
         timeline = drive_timeline(
             logs, vehicle, selection, _camera(logs, vehicle, detecting, landmarks)
         )
         earlier = _kept(logs, vehicle, run, selection, detecting) if detecting.resume else None
         with nothing_left(run):
             if earlier is None:
-                clear(run)
+                clear(run, mine)
                 found = _detect(logs, vehicle, run, selection, detecting, timeline)
             else:
                 found = None
@@ -127,7 +139,7 @@ def _kept(
     if earlier is None or camera is None or not all(run.file(name).exists() for name in TABLES):
         return None
     wanted = {
-        "logs": log_rows(logs),
+        "logs": log_rows(logs, run),
         "selection": selection_told(selection),
         "camera": camera[1].name,
         "identities": [make(choice).identity for choice in detecting.choices],

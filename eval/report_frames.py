@@ -136,16 +136,16 @@ def _scores(run: RunFolder, times: set[int]) -> dict[int, list[dict[str, Any]]]:
 
 
 def _with_picture(one: WorstFrame, run: RunFolder) -> WorstFrame:
-    camera = camera_of(run)
-    if camera is None:
-        return one
     labels = _labels(one.cue, of_manifest(run.manifest()["settings"]))
     rows = [row for row in _scores(run, {one.t_ns}).get(one.t_ns, []) if row["label"] in labels]
     try:
+        camera = camera_of(run)
+        if camera is None:
+            return one
         picture = picture_at(camera, one.t_ns)
         return one if picture is None else _drawn(picture, one, rows)
     except CrosscueError:
-        # The report is about the run; a picture that has gone or cannot be read is left out.
+        # The page is about the run: it says that a picture has gone or cannot be read.
         return one
 
 

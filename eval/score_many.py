@@ -66,6 +66,7 @@ class ScoreWork:
         rpe_m: Distances of the relative pose error.
         has_smoother: Run the batch smoother as well?
         any_log: Take truth that names the hash of another file?
+        logs: Where the runs' logs have moved to, if they have.
     """
 
     truth: Path | None
@@ -73,6 +74,7 @@ class ScoreWork:
     rpe_m: tuple[float, ...]
     has_smoother: bool = False
     any_log: bool = False
+    logs: Path | None = None
 
     def __call__(self, path: Path) -> Scored:
         """Score one run and write its files.
@@ -80,7 +82,7 @@ class ScoreWork:
         Raises:
             CrosscueError: It cannot be scored.
         """
-        folder = open_run(path)
+        folder = open_run(path, self.logs)
         truth_path = find_truth(folder, self.truth)
         with locked(folder):
             one = judge_run(folder, truth_path, self.settings, self.rpe_m, any_log=self.any_log)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,10 +13,12 @@ import numpy as np
 
 from crosscue.datasets.truth import FILE, Truth
 from crosscue.replay.errors import RunError, SchemaError, UsageError
+from crosscue.replay.remote import is_remote
 from crosscue.replay.run_folder import RunFolder, strict_json, write_text, write_whole
 
 from . import intervals, merge_runs, score_pose, score_truth
 from .run_account import Account, check, scoring_of, summed
+from .run_logs import place_of
 from .score_approaches import FEATURES
 from .score_drives import DEFAULTS, DriveJudged, Scores, ScoreSettings, as_metrics, judge, score
 from .score_pose import PoseScore
@@ -65,12 +68,22 @@ def find_truth(run: RunFolder, given: Path | None) -> Path:
         return given
     looked: list[str] = []
     for log in run.manifest().get("logs", []):
-        path = Path(log["path"])
+        if is_remote(log["path"]):
+            continue
+        path = _place(run, log)
         for folder in (path, path.parent):
             if (folder / FILE).is_file():
                 return folder / FILE
             looked.append(str(folder))
     raise UsageError(f"{run.path}: no {FILE} beside its logs ({', '.join(looked)}); give --truth")
+
+
+def _place(run: RunFolder, log: Mapping[str, Any]) -> Path:
+    """Where a log lies or lay; its truth may still be there."""
+    try:
+        return Path(place_of(run, log))
+    except RunError:
+        return Path(os.path.normpath(run.path.resolve() / log["path"]))
 
 
 def judge_run(
@@ -118,7 +131,7 @@ def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
     logs = run.manifest().get("logs", [])
     found = {digest for log in logs for digest in log.get("sha256", {}).values()}
     if told and found and not told & found:
-        names = ", ".join(log["path"] for log in logs)
+        names = ", ".join(log["name"] for log in logs)
         raise SchemaError(
             f"{path}: by its hash it belongs to another {truth.log or 'log'}, not to {names}; "
             "give the truth of that log, or --any-log for the same drive in another file"

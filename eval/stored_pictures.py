@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -13,16 +12,15 @@ import numpy as np
 from crosscue.detectors.pictures import Encoded, encoded
 from crosscue.replay.clocks import Clock
 from crosscue.replay.columns import Block, Images, Topic
-from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Selection, open_log
-from crosscue.replay.roles import Role, role_of
 from crosscue.replay.run_folder import RunFolder
 from crosscue.replay.signals import Extractor, Plan, Source
 from crosscue.replay.time_segments import UNSHIFTED, LogClock, TimedLog
 from crosscue.replay.vehicle import Vehicle
 
 from .drive_time import timeline_in
+from .run_logs import place_of
 
 AROUND_NS: Final = 2_000_000_000
 """A picture's own clock and the log's may differ by this much."""
@@ -33,14 +31,14 @@ class StoredCamera:
     """Where a run's pictures lie.
 
     Attributes:
-        log: Path.
+        log: Path or URL.
         topic: In it.
         clock: Whose times the run's tables have.
         selection: What part of the log the run looked at.
         time: The log's clock against the times of the run's tables.
     """
 
-    log: Path
+    log: Path | str
     topic: Topic
     clock: Clock
     selection: Selection
@@ -48,33 +46,35 @@ class StoredCamera:
 
 
 def camera_of(run: RunFolder) -> StoredCamera | None:
-    """The camera, where its log is still at hand and no choice is left.
+    """The camera; None where the run's logs have none, or several and no line says which.
 
     Raises:
-        RunError: The manifest cannot be read.
+        RunError: The manifest cannot be read; its log is gone, or another lies in its place.
+        LogError: The log cannot be opened.
     """
+    if run.without_pictures:
+        return None
     manifest = run.manifest()
     detected = manifest if manifest.get("stage") == "detect" else manifest.get("detect")
     named = None if detected is None else detected["camera"]
     if detected is None:
         named = manifest["settings"].get("topics", {}).get("camera")
-    timeline = timeline_in(manifest)
-    found: list[tuple[Path, Topic]] = []
-    clocks: dict[Path, LogClock] = {}
-    for number, entry in enumerate(manifest["logs"]):
-        path = Path(entry["path"])
-        clocks[path] = timeline.clock(number)
-        # The log may have gone since it was replayed; the rest of the run can still be seen.
-        with suppress(LogError), open_log(path) as log:
-            found += [(path, topic) for topic in log.topics if role_of(topic) is Role.CAMERA]
-    if named is not None:
-        found = [(path, topic) for path, topic in found if topic.name == named]
-    if len(found) != 1:
+    cameras = [
+        (number, entry, name)
+        for number, entry in enumerate(manifest["logs"])
+        for name in entry["cameras"]
+        if named in (None, name)
+    ]
+    if len(cameras) != 1:
         return None
-    path, topic = found[0]
+    number, entry, name = cameras[0]
+    place = place_of(run, entry)
+    with open_log(place) as log:
+        topic = next(one for one in log.topics if one.name == name)
     part = manifest.get("selection", {})
     selection = Selection(frozenset({topic.name}), part.get("start_ns"), part.get("end_ns"))
-    return StoredCamera(path, topic, _clock(detected, topic.name), selection, clocks[path])
+    clock = timeline_in(manifest).clock(number)
+    return StoredCamera(place, topic, _clock(detected, topic.name), selection, clock)
 
 
 def _clock(detected: Mapping[str, Any] | None, topic: str) -> Clock:

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
+INPUT: Final = "input.json"
+"""What a run is made of, written before anything else: a run cut short has no manifest."""
 FORMAT_VERSION: Final = 2
 MAX_MANIFEST_BYTES: Final = 256 << 20
 GROUP_ROWS: Final = 8192
@@ -40,9 +42,17 @@ GROUP_ROWS: Final = 8192
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """A run's folder; make one with ``create`` or ``open_run``."""
+    """A run's folder; make one with ``create`` or ``open_run``.
+
+    Attributes:
+        path: Where it is.
+        logs: A folder that its logs have moved to, or None where they are as the manifest says.
+        without_pictures: Is it to be shown without the pictures in its logs?
+    """
 
     path: Path
+    logs: Path | None = None
+    without_pictures: bool = False
 
     def file(self, name: str) -> Path:
         """Path of one of its files."""
@@ -70,7 +80,7 @@ class RunFolder:
         version = found.get("format_version") if isinstance(found, dict) else None
         if version != FORMAT_VERSION:
             raise RunError(
-                f"{path}: format {version!r}, this crosscue reads {FORMAT_VERSION}; replay again"
+                f"{path}: format {version!r}, this crosscue reads {FORMAT_VERSION}: replay again"
             )
         return dict(found)
 
@@ -156,18 +166,24 @@ def create(path: Path, *, overwrite: bool) -> RunFolder:
     return RunFolder(path)
 
 
-def clear(run: RunFolder) -> None:
+def clear(run: RunFolder, content: Mapping[str, object] | None = None) -> None:
     """Delete an earlier run's files; the lock stays. Call it while holding the lock.
 
     The manifest goes first: a folder that has one is a whole run, even if this is cut short.
+
+    Args:
+        run: The folder.
+        content: Of ``input.json``, which says from now on what is being made here.
 
     Raises:
         OutputError: One cannot be deleted.
     """
     try:
         run.file(MANIFEST).unlink(missing_ok=True)
+        if content is not None:
+            write_input(run, content)
         for entry in run.path.iterdir():
-            if entry.name == LOCK:
+            if entry.name == LOCK or (entry.name == INPUT and content is not None):
                 continue
             if entry.is_dir() and not entry.is_symlink():
                 shutil.rmtree(entry)
@@ -178,13 +194,18 @@ def clear(run: RunFolder) -> None:
         raise cannot_write(place, error) from None
 
 
-def open_run(path: Path) -> RunFolder:
+def open_run(path: Path, logs: Path | None = None, *, without_pictures: bool = False) -> RunFolder:
     """An existing run folder, its manifest checked.
+
+    Args:
+        path: The folder.
+        logs: Where its logs have moved to, if they have.
+        without_pictures: Show it without the pictures in its logs.
 
     Raises:
         RunError: As ``RunFolder.manifest``.
     """
-    run = RunFolder(path)
+    run = RunFolder(path, logs, without_pictures)
     run.manifest()
     return run
 
@@ -329,6 +350,12 @@ def write_manifest(run: RunFolder, content: Mapping[str, object]) -> None:
     """Write the manifest, last of all: a folder that has one is a finished run."""
     whole = {"format_version": FORMAT_VERSION, **content}
     write_text(run.file(MANIFEST), strict_json(whole) + "\n")
+
+
+def write_input(run: RunFolder, content: Mapping[str, object]) -> None:
+    """Write what the run is made of."""
+    whole = {"format_version": FORMAT_VERSION, **content}
+    write_text(run.file(INPUT), strict_json(whole) + "\n")
 
 
 def strict_json(value: object) -> str:

@@ -27,6 +27,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "replay": ("gone.mcap -o out", RECORDING),
     "score": ("gone", RUN),
     "compare": ("gone gone2", RUN),
+    "merge": ("gone -o out", RUN),
     "view": ("gone --save x.rrd", RUN),
     "fit compass": ("gone.mcap --vehicle gone.toml", SETTINGS),
     "fit signs": ("gone.json --label a", SETTINGS),

@@ -1,5 +1,6 @@
 """Which drives a command line means."""
 
+import re
 import uuid
 from importlib import import_module
 from pathlib import Path
@@ -16,7 +17,7 @@ def _touch(folder: Path, *names: str) -> Path:
     for name in names:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
+        path.write_text(str(path))
     return folder
 
 
@@ -28,24 +29,29 @@ def _simulated(folder: Path, *names: str) -> Path:
 
 
 def _names(drives: tuple[DriveInput, ...]) -> list[str]:
-    return [one.name for one in drives]
+    """What a person reads of the names."""
+    assert all(re.fullmatch(r".*-[0-9a-f]{8}", one.name, re.DOTALL) for one in drives)
+    return [one.name[:-9] for one in drives]
 
 
 def test_logs_named_one_by_one_are_one_drive(tmp_path: Path) -> None:
-    _touch(tmp_path, "camera.mcap", "can.blf", "vehicle.toml")
-    logs = (str(tmp_path / "camera.mcap"), str(tmp_path / "can.blf"))
+    _touch(tmp_path, "monday.mcap", "tuesday.blf", "vehicle.toml")
+    logs = (str(tmp_path / "monday.mcap"), str(tmp_path / "tuesday.blf"))
 
     found = drives_of(logs)
 
     assert not found.is_many
-    assert found.drives == (DriveInput("camera", logs),)
+    assert found.drives == (DriveInput(found.drives[0].name, logs),)
+    assert drives_of(logs[::-1]) == found
 
 
 def test_one_log_is_one_drive(tmp_path: Path) -> None:
     _touch(tmp_path, "a.b.mcap")
     log = str(tmp_path / "a.b.mcap")
 
-    assert drives_of([log]).drives == (DriveInput("a.b", (log,)),)
+    assert _names(drives_of([log]).drives) == ["a.b"]
+    assert drives_of([log]).drives[0].logs == (log,)
+    assert drives_of([log], each=True).drives == drives_of([log]).drives
     assert not drives_of([log]).is_many
     assert drives_of([log], each=True).is_many
 
@@ -56,10 +62,10 @@ def test_a_drive_folder_brings_its_vehicle_and_truth(tmp_path: Path) -> None:
     found = drives_of([str(folder)])
 
     assert not found.is_many
-    assert found.drives == (
-        DriveInput("A-01", (str(folder / "drive.mcap"),), folder / "vehicle.toml",
-                   folder / "truth.json"),
-    )  # fmt: skip
+    (one,) = found.drives
+    assert _names(found.drives) == ["A-01"]
+    assert one.logs == (str(folder / "drive.mcap"),)
+    assert (one.vehicle, one.truth) == (folder / "vehicle.toml", folder / "truth.json")
 
 
 def test_a_folder_of_drives_is_many(tmp_path: Path) -> None:
@@ -113,7 +119,8 @@ def test_a_pattern_that_the_shell_left_alone(tmp_path: Path) -> None:
     deep = drives_of([f"{tmp_path}/**/drive.mcap"])
 
     assert files.is_many
-    assert _names(files.drives) == ["A-01__drive", "A-02__drive"]
+    assert _names(files.drives) == ["A-01", "A-02"]
+    assert [one.name for one in files.drives] == [one.name for one in folders.drives]
     assert files.drives[0].truth == tmp_path / "A-01" / "truth.json"
     assert _names(folders.drives) == ["A-01", "A-02"]
     assert [one.logs for one in folders.drives] == [one.logs for one in files.drives]
@@ -123,7 +130,7 @@ def test_a_pattern_that_the_shell_left_alone(tmp_path: Path) -> None:
 def test_a_list_names_drives_line_by_line(tmp_path: Path) -> None:
     _touch(tmp_path, "a b.mcap", "can.blf", "c.bag")
     _simulated(tmp_path / "sim", "A-01", "A-02")
-    text = "# day one\n'a b.mcap' can.blf\n\nc.bag  # alone\nsim\ns3://bucket/x.mcap\n"
+    text = "# day one\n'a b.mcap' can.blf\n\nc.bag  # alone\nsim\nmemory://bucket/x.mcap\n"
     (tmp_path / "drives.txt").write_text(text)
 
     found = drives_of([f"@{tmp_path / 'drives.txt'}"])
@@ -131,7 +138,7 @@ def test_a_list_names_drives_line_by_line(tmp_path: Path) -> None:
     assert found.is_many
     assert _names(found.drives) == ["a_b", "c", "A-01", "A-02", "x"]
     assert found.drives[0].logs == (str(tmp_path / "a b.mcap"), str(tmp_path / "can.blf"))
-    assert found.drives[4].logs == ("s3://bucket/x.mcap",)
+    assert found.drives[4].logs == ("memory://bucket/x.mcap",)
 
 
 def test_each_makes_every_argument_a_drive_and_names_differ(tmp_path: Path) -> None:
@@ -140,9 +147,8 @@ def test_each_makes_every_argument_a_drive_and_names_differ(tmp_path: Path) -> N
 
     names = _names(drives_of(logs, each=True).drives)
 
-    assert names[1] == "y__drive"
-    assert names[2] == "z__x__drive"
-    assert len(set(names)) == 3
+    assert names == ["x", "y", "x"]
+    assert len({one.name for one in drives_of(logs, each=True).drives}) == 3
 
 
 def test_remote_patterns(tmp_path: Path) -> None:
@@ -154,9 +160,32 @@ def test_remote_patterns(tmp_path: Path) -> None:
     found = drives_of([f"memory://{bucket}/*/drive.mcap"])
     system.rm(f"/{bucket}", recursive=True)
 
-    assert _names(found.drives) == ["a__drive", "b__drive"]
+    assert _names(found.drives) == ["a", "b"]
     assert found.drives[0].logs == (f"memory://{bucket}/a/drive.mcap",)
     assert not drives_of([f"memory://{bucket}/a/drive.mcap"]).is_many
+
+
+def test_a_name_depends_on_the_logs_alone(tmp_path: Path) -> None:
+    _touch(tmp_path, "x/drive.mcap", "y/drive.mcap", "route/40/drive.mcap", "mon.bag", "tue.bag")
+    logs = [str(path) for path in sorted(tmp_path.rglob("*.*"))]
+    together = {one.logs: one.name for one in drives_of(logs, each=True).drives}
+
+    assert len(together) == len(logs)
+    for log in logs:
+        (alone,) = drives_of([log]).drives
+        assert together[alone.logs] == alone.name
+    before = drives_of([logs[0]]).drives[0].name
+    Path(logs[0]).write_text("recorded anew")
+    assert drives_of([logs[0]]).drives[0].name != before
+
+
+def test_a_copy_of_a_drive_is_not_taken_for_another(tmp_path: Path) -> None:
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "monday.bag").write_text("the same")
+
+    with pytest.raises(UsageError, match="the same recording as"):
+        drives_of([str(tmp_path)])
 
 
 @pytest.mark.parametrize(
@@ -192,11 +221,11 @@ def test_a_link_that_leads_back_is_not_followed_for_ever(tmp_path: Path) -> None
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.text(min_size=1, max_size=300), min_size=1, max_size=6, unique=True))
 def test_names_are_safe_and_apart_whatever_the_logs_are_called(texts: list[str]) -> None:
-    logs = [f"s3://bucket/{text.replace('*', '').replace('?', '').replace('[', '')}.mcap"
+    logs = [f"memory://bucket/{text.replace('*', '').replace('?', '').replace('[', '')}.mcap"
             for text in texts]  # fmt: skip
     logs = list(dict.fromkeys(logs))
 
-    names = _names(drives_of(logs, each=True).drives)
+    names = [one.name for one in drives_of(logs, each=True).drives]
 
     assert len(set(names)) == len(logs)
     for name in names:

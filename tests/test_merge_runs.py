@@ -69,8 +69,8 @@ def test_a_column_that_only_some_drives_have_is_null_in_the_others(tmp_path: Pat
 
     table = merge_runs(runs, create(tmp_path / "out", overwrite=False), {}).run.table("belief")
 
-    assert table["roundabout"].to_pylist() == [None, 0.5]
-    assert table["drive"].to_pylist() == ["plain", "own"]
+    assert table["drive"].to_pylist() == ["own", "plain"]
+    assert table["roundabout"].to_pylist() == [0.5, None]
 
 
 def test_columns_that_do_not_fit_are_told(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from crosscue.eval.report_page import write_report
 from crosscue.eval.score_pose import PoseScore, load_truth, score, truth_track
 from crosscue.eval.score_run import FOLDER, judge_run, metrics_of, scores_of
 from crosscue.replay.columns import Block, Images, Messages, Topic
-from crosscue.replay.errors import SchemaError
+from crosscue.replay.errors import RunError, SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import EVERYTHING, open_log
 from crosscue.replay.run_folder import RunFolder, create
@@ -162,7 +163,7 @@ def _reported(run: RunFolder, path: Path) -> Path:
 def test_the_report_needs_no_network_and_hostile_names_stay_text(tmp_path: Path) -> None:
     run, path, _ = _scored(tmp_path)
     manifest = json.loads(run.file("manifest.json").read_text())
-    manifest["logs"][0]["path"] = "</td><script>alert(1)</script>"
+    manifest["logs"][0]["name"] = "</td><script>alert(1)</script>"
     manifest["notices"] = ["{{ 7 * 7 }} <img src=x onerror=alert(1)>"]
     run.file("manifest.json").write_text(json.dumps(manifest))
 
@@ -234,7 +235,9 @@ def test_pictures_pass_into_the_recording_as_stored(tmp_path: Path) -> None:
 
     save_recording(run, tmp_path / "drive.rrd")
     log.unlink()
-    save_recording(run, tmp_path / "without.rrd")
+    with pytest.raises(RunError, match="is gone; say where it is with --logs DIR"):
+        save_recording(run, tmp_path / "without.rrd")
+    save_recording(replace(run, without_pictures=True), tmp_path / "without.rrd")
 
     sizes = [(tmp_path / f"{name}.rrd").stat().st_size for name in ("drive", "without")]
     assert edges[-1] <= sizes[0] - sizes[1] < 1.02 * edges[-1] + 20_000

@@ -19,6 +19,7 @@ from crosscue.eval.gates import Gate, check_gates, load_gates
 from crosscue.eval.junit import junit_text
 from crosscue.eval.metric_values import MetricValue, metric_values
 from crosscue.replay.errors import UsageError
+from crosscue.replay.run_folder import RunFolder
 from support.scoring import (
     BELIEF,
     CUES,
@@ -27,6 +28,7 @@ from support.scoring import (
     belief_table,
     cue_table,
     frame_table,
+    log_row,
     range_table,
     run_folder,
     truth,
@@ -359,9 +361,8 @@ def test_merged_drives_are_not_scored_as_one(
     assert "many drives merged" in _fails(capsys, "score", run.path)
 
 
-def _log_of(folder: Path) -> list[dict[str, Any]]:
-    digest = {"drive.mcap": folder.name}
-    return [{"path": str(folder / "drive.mcap"), "format": "mcap", "sha256": digest}]
+def _log_of(folder: Path, run: Path) -> list[dict[str, Any]]:
+    return [log_row(folder / "drive.mcap", RunFolder(run), folder.name)]
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])
@@ -370,7 +371,8 @@ def test_a_run_that_cannot_be_scored_does_not_stop_the_rest(
 ) -> None:
     for name in ("a", "b", "c"):
         truth_folder(tmp_path / "drives" / name)
-        run_folder(tmp_path / "runs" / name, logs=_log_of(tmp_path / "drives" / name))
+        run = tmp_path / "runs" / name
+        run_folder(run, logs=_log_of(tmp_path / "drives" / name, run))
     (tmp_path / "runs" / "b" / "manifest.json").unlink()
     argv = ["score", str(tmp_path / "runs"), "-o", str(tmp_path / "all"), "--workers", workers]
 

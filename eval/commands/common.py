@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TypeVar
 
 from crosscue.replay.errors import MissingTopicError, UsageError
@@ -62,6 +63,23 @@ def _mebibytes(text: str) -> int:
     if not (math.isfinite(value) and 0.0 < value <= 1 << 20):
         raise argparse.ArgumentTypeError(f"{text!r}: want MiB, above 0 and up to {1 << 20}")
     return max(int(value * (1 << 20)), 1)
+
+
+def add_logs_argument(parser: argparse.ArgumentParser) -> None:
+    """``--logs``."""
+    parser.add_argument(
+        "--logs", type=Path, metavar="DIR",
+        help="the run's logs have moved to this folder; each is known by its content",
+    )  # fmt: skip
+
+
+def add_logs_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--logs`` and ``--without-pictures``."""
+    add_logs_argument(parser)
+    parser.add_argument(
+        "--without-pictures", action="store_true",
+        help="leave out the pictures in the run's logs, which may be gone",
+    )  # fmt: skip
 
 
 def metres(text: str) -> float:

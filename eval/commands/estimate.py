@@ -16,7 +16,7 @@ from crosscue.eval.estimate_run import estimate_run
 from crosscue.eval.merge_runs import open_one
 from crosscue.replay.vehicle import load
 
-from .common import print_json
+from .common import add_logs_argument, print_json
 from .replay import Progress, as_json, summary
 
 
@@ -26,12 +26,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--vehicle", type=Path, metavar="V.toml", help="other settings; the run's, if left out"
     )
+    add_logs_argument(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Estimate; 3 when something was dropped."""
-    folder = open_one(args.run)
+    folder = open_one(args.run, args.logs)
     vehicle = load(args.vehicle) if args.vehicle else None
     progress = Progress("estimating", not args.quiet and sys.stderr.isatty())
     outcome = estimate_run(folder, vehicle, progress.at_time)

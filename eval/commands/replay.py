@@ -40,7 +40,7 @@ from crosscue.eval.many_drives import (
     run_many,
 )
 from crosscue.eval.many_drives import Progress as DrivesDone
-from crosscue.eval.merge_runs import FOLDER, merge_runs
+from crosscue.eval.merge_runs import FOLDER, gathered, merge_runs
 from crosscue.eval.plain_text import terminal_width, visible, wrapped
 from crosscue.eval.replay_drive import Detecting, replay_drive
 from crosscue.eval.run_account import account_lines
@@ -48,7 +48,7 @@ from crosscue.eval.scene_stage import ApproachSummary, SceneOutcome
 from crosscue.eval.worker_pool import Processes
 from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.log import open_logs
-from crosscue.replay.run_folder import create, open_run
+from crosscue.replay.run_folder import create
 from crosscue.replay.vehicle import Vehicle, load
 
 from .common import add_part_arguments, first_ns, limits_of, print_json, selection_of
@@ -160,7 +160,14 @@ def _replay(
         if progress.is_shown:
             progress.start_ns = first_ns(logs)
         return replay_drive(
-            logs, vehicle, run_folder, selection, progress.at_time, landmarks, detecting
+            logs,
+            vehicle,
+            run_folder,
+            selection,
+            progress.at_time,
+            landmarks,
+            detecting,
+            overwrite=args.overwrite,
         )
 
 
@@ -191,7 +198,7 @@ def _run_many(args: argparse.Namespace, drives: DriveList) -> int:
     status = exit_status_of(done)
     where, why = str(args.output / FOLDER), None
     try:
-        _merge(done, args.output / FOLDER)
+        _merge(done, args.output)
     except CrosscueError as error:
         # The drives are done, and that must be told, whatever became of their common table.
         status, why = status or 3, str(error)
@@ -204,28 +211,29 @@ def _run_many(args: argparse.Namespace, drives: DriveList) -> int:
     return status
 
 
-def _merge(done: Sequence[Done[Outcome]], folder: Path) -> None:
-    merge_runs(
-        {one.job.name: open_run(one.job.run) for one in done if one.error is None},
-        create(folder, overwrite=True),
-        {one.job.name: one.error for one in done if one.error is not None},
-    )
+def _merge(done: Sequence[Done[Outcome]], output: Path) -> None:
+    """One table of all runs in the folder, those of earlier batches too."""
+    runs, failures = gathered([output])
+    ended = {one.job.name: one.error for one in done}
+    # A drive that failed now has no run, though an earlier start may have left one that was cut.
+    runs = {name: run for name, run in runs.items() if ended.get(name) is None}
+    failed = {name: why for name, why in ended.items() if why is not None}
+    merge_runs(runs, create(output / FOLDER, overwrite=True), {**failures, **failed})
 
 
 def _fingerprint(args: argparse.Namespace, drive: DriveInput) -> str:
     """Of everything that decides a drive's run besides its logs."""
     flags = {
         name: None if getattr(args, name) is None else str(getattr(args, name))
-        for name in ("detectors", "draw", "start", "end", "topics", "landmarks")
+        for name in ("detectors", "draw", "start", "end", "topics")
     }
+    flags["landmarks"] = None if args.landmarks is None else str(args.landmarks.resolve())
     try:
         settings: object = _vehicle(args.vehicle, drive.vehicle).model_dump(mode="json")
     except CrosscueError as error:
         # This drive's own attempt tells it; the others must not suffer.
         settings = str(error)
-    return fingerprint_of(
-        settings, flags, versions(), files_named_in([settings, str(args.landmarks)])
-    )
+    return fingerprint_of(settings, flags, versions(), files_named_in([settings, flags]))
 
 
 def engine_of(workers: int | None, ray: str | None) -> Engine:

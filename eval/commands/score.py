@@ -49,7 +49,7 @@ from crosscue.eval.smooth_pose import told
 from crosscue.replay.errors import UsageError, one_line
 from crosscue.replay.run_folder import locked
 
-from .common import metres, print_json, with_progress
+from .common import add_logs_argument, metres, print_json, with_progress
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,6 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--any-log", action="store_true",
         help="take truth that names the hash of another file: the same drive, converted",
     )  # fmt: skip
+    add_logs_argument(parser)
     parser.add_argument(
         "-o", "--output", type=Path, metavar="DIR",
         help="folder for metrics, report and junit.xml, pooled over all runs",
@@ -101,7 +102,10 @@ def run(args: argparse.Namespace) -> int:
     except ValueError as error:
         raise UsageError(f"--threshold: {error}") from None
     gates = () if args.gate is None else load_gates(args.gate)
-    work = ScoreWork(args.truth, settings, tuple(args.rpe), args.smoother is not None, args.any_log)
+    work = ScoreWork(
+        args.truth, settings, tuple(args.rpe), args.smoother is not None, args.any_log,
+        args.logs,
+    )  # fmt: skip
     scored, failed = _score_all(paths, work, args)
     if len(paths) == 1:
         tree = _tell_one(scored[0], settings, args)

@@ -24,6 +24,8 @@ from crosscue.eval.score_truth import TrueRanges, load
 from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.run_folder import RunFolder
 
+from .common import add_logs_arguments
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
@@ -31,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--save", type=Path, metavar="X.rrd", help="write the recording only")
     how.add_argument("--web", action="store_true", help="serve it on 127.0.0.1 for a browser")
+    add_logs_arguments(parser)
     parser.add_argument(
         "--truth", type=Path, metavar="T.json", help="draw the true track and ranges too"
     )
@@ -40,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     """Write drive.rrd into the run, or where asked, and open it; 3 when the run has drops."""
     if args.save is not None and args.save.suffix != ".rrd":
         raise UsageError(f"{args.save}: want a name that ends in .rrd")
-    folder = open_one(args.run)
+    folder = open_one(args.run, args.logs, without_pictures=args.without_pictures)
     path = args.save or folder.file("drive.rrd")
     track, ranges = _truth(args, folder)
     save(folder, path, track, ranges)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crosscue.eval.score_truth import TrueRanges
-from crosscue.eval.stored_pictures import camera_of
+from crosscue.eval.stored_pictures import StoredCamera, camera_of
 from crosscue.replay.columns import Floats
 from crosscue.replay.run_folder import RunFolder, write_whole
 from crosscue.replay.vehicle import of_manifest
@@ -43,7 +43,7 @@ def save(
         true_ranges: Drawn beside the estimated ones.
 
     Raises:
-        RunError: The run's tables are damaged.
+        RunError: The run's tables are damaged, or the log with its pictures is not found.
         OutputError: It cannot be written.
     """
     import rerun as rr
@@ -63,7 +63,7 @@ def save(
     def write(partial: Path) -> None:
         recording = rr.RecordingStream("crosscue", recording_id=str(run.path.resolve().name))
         recording.save(partial, default_blueprint=blueprint(shown))
-        _log_all(recording, time, run, pose, truth, true_ranges)
+        _log_all(recording, time, run, pose, truth, true_ranges, camera)
         recording.flush()
         recording.disconnect()
 
@@ -73,6 +73,7 @@ def save(
 def _log_all(
     recording: rr.RecordingStream, time: DriveTime, run: RunFolder,
     pose: Mapping[str, Floats] | None, truth: TruthTrack | None, true_ranges: TrueRanges | None,
+    stored: StoredCamera | None,
 ) -> None:  # fmt: skip
     from . import ahead, camera, plan, series
     from .notes import notes
@@ -95,7 +96,6 @@ def _log_all(
         series.log_ranges(recording, time, scene, true_ranges)
         series.log_cues(recording, time, scene)
         _log_marks(recording, time, run, manifest)
-    stored = camera_of(run)
     if stored is not None:
         left_out = camera.log_pictures(recording, stored, time)
         if left_out:

@@ -19,7 +19,17 @@ from crosscue.replay.run_folder import RunFolder
 from crosscue.replay.vehicle import Vehicle
 from crosscue.replay.writing import LogWriter
 
-from .scoring import BELIEF, CUES, at, belief_table, cue_table, frame_table, range_table, run_folder
+from .scoring import (
+    BELIEF,
+    CUES,
+    at,
+    belief_table,
+    cue_table,
+    frame_table,
+    log_row,
+    range_table,
+    run_folder,
+)
 
 FRAMES: Final = 50
 SIZE: Final = (160, 90)
@@ -125,6 +135,7 @@ def scene_run(folder: Path, *, without: frozenset[str] = frozenset()) -> RunFold
             "detecting": {TOPIC: line(FRAMES, FRAMES - 1, {}, {"<b>not decoded</b>": 1})},
         },
         settings=Vehicle(version=1).model_dump(mode="json"),
+        logs=[log_row(folder / "drive.mcap", RunFolder(folder / "run"), "00", TOPIC)],
         selection={"start_ns": None, "end_ns": None, "topics": None},
         notices=["[here](http://example.org) ![x](http://example.org/x.png) </td><script>"],
     )  # fmt: skip

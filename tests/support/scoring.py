@@ -12,8 +12,10 @@ import pyarrow.parquet as pq
 
 from crosscue.datasets.truth import Approach, CueTruth, Features, Truth, save
 from crosscue.eval.run_account import account
+from crosscue.eval.run_logs import relative
 from crosscue.eval.score_tables import RunTables, run_tables
 from crosscue.eval.score_truth import DriveTruth, TrueRanges
+from crosscue.replay.identity import Identity, as_row, identity_of
 from crosscue.replay.run_folder import RunFolder, create, write_manifest, write_text
 
 STEP_NS: Final = 100_000_000
@@ -161,6 +163,15 @@ def good_truth(drive: str = "made up") -> DriveTruth:
     )  # fmt: skip
 
 
+def log_row(log: Path, run: RunFolder, sha256: str = "00", *cameras: str) -> dict[str, Any]:
+    """A log as a manifest tells of it; of one that is not there, with a made-up identity."""
+    found = identity_of(log) if log.exists() else Identity(log.name, 0, "0" * 64)
+    return {
+        "name": log.name, "path": relative(log, run), "format": "mcap", "cameras": list(cameras),
+        "identity": as_row(found), "sha256": {log.name: sha256},
+    }  # fmt: skip
+
+
 def run_folder(
     path: Path, found: Mapping[str, pa.Table] | None = None, **manifest: Any
 ) -> RunFolder:
@@ -173,8 +184,7 @@ def run_folder(
         pq.write_table(table, run.file(f"{name}.parquet"), write_page_checksum=True)
     content: dict[str, Any] = {
         "stage": "replay", "versions": {"crosscue": "0"}, "settings": {}, "notices": [],
-        "logs": [{"path": str(path.parent / "drive.mcap"), "format": "mcap",
-                  "sha256": {"drive.mcap": "00"}}],
+        "logs": [log_row(path.parent / "drive.mcap", run)],
         "account": account([]),
         "clocks": [], "counts": {}, "timings": {"seconds": 1.0},
     }  # fmt: skip

@@ -1,0 +1,50 @@
+"""Merge the runs of batches into one folder of tables, each row with its drive's name.
+
+The result is a set union: the order does not matter, and a run that is in two batches counts once.
+Two different runs of one name are refused. It is the same, byte for byte, as that of one batch over
+all the drives.
+
+example:
+  crosscue merge shards/1 shards/2 -o all
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from crosscue.eval.merge_runs import gathered, merge_runs
+from crosscue.eval.plain_text import visible
+from crosscue.replay.errors import RunError
+from crosscue.replay.run_folder import create
+
+from .common import print_json
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument(
+        "folders", nargs="+", type=Path, metavar="RUNS", help="folders of runs, or run folders"
+    )
+    parser.add_argument(
+        "-o", "--output", required=True, type=Path, metavar="ALL", help="folder for the tables"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace earlier tables")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Merge; 3 when a drive of a batch has failed."""
+    runs, failures = gathered(args.folders)
+    if not runs:
+        raise RunError(f"{args.folders[0]}: no finished run in it; replay first")
+    merged = merge_runs(runs, create(args.output, overwrite=args.overwrite), failures)
+    if args.json:
+        print_json({"merged": str(merged.run.path), "drives": sorted(runs), "failures": failures,
+                    "rows": merged.rows})  # fmt: skip
+    elif not args.quiet:
+        failed = [f"failed   {name}: {why}" for name, why in sorted(failures.items())]
+        lines = [*failed, f"drives   {merged.drives}, {len(failures)} failed",
+                 f"tables   {merged.run.path}"]  # fmt: skip
+        print("\n".join(visible(line) for line in lines))
+    return 3 if failures else 0
