@@ -86,7 +86,7 @@ def draw(pixels: Bytes, result: FrameResult, cues: FrameCues, enlarge: float = 1
     positive = [f"{cue} {count}" for cue, count in cues.counts.items() if count]
     text = "  ".join(positive) or "no cue"
     scale = _fitting(text, canvas.shape[1] - 2 * MARGIN_PX, 0.6 * enlarge)
-    _write(canvas, text, (MARGIN_PX, canvas.shape[0] - 14), (255, 255, 255), scale)
+    write_label(canvas, text, (MARGIN_PX, canvas.shape[0] - 14), (255, 255, 255), scale)
     return canvas
 
 
@@ -96,7 +96,7 @@ def _fitting(text: str, width_px: int, scale: float) -> float:
 
     # Strokes are whole pixels, so a text at half the scale is not half as wide: look again.
     for _ in range(4):
-        (wide, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, _thickness(scale) + 2)
+        (wide, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, _thickness(scale))
         scale *= min(1.0, width_px / wide)
     return scale
 
@@ -117,16 +117,20 @@ def _boxes(canvas: Bytes, found: Detections, enlarge: float) -> None:
         x0, y0, x1, y1 = (round(float(side)) for side in box)
         cv2.rectangle(canvas, (x0, y0), (x1, y1), GREEN, round(2 * enlarge))
         place = (x0, max(y0 - 4, round(12 * enlarge)))
-        _write(canvas, f"{label} {score:.2f}", place, GREEN, 0.5 * enlarge)
+        write_label(canvas, f"{label} {score:.2f}", place, GREEN, 0.5 * enlarge)
 
 
-def _write(
+def write_label(
     canvas: Bytes, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float
 ) -> None:
+    """Write on a dark box; ``at`` is the left end of the line that letters stand on."""
     import cv2
 
+    # On a box: an outline of thicker letters has other widths from OpenCV 5 on, and covers them.
     thick = _thickness(scale)
-    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), thick + 2)
+    (wide, high), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thick)
+    corners = (at[0] - 1, at[1] - high - 2), (at[0] + wide + 1, at[1] + below)
+    cv2.rectangle(canvas, *corners, (0, 0, 0), -1)
     cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thick)
 
 

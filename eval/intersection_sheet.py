@@ -15,7 +15,7 @@ from crosscue.detectors.runner import FrameResult
 from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.run_folder import RunFolder, write_bytes
 
-from .detection_pictures import draw
+from .detection_pictures import draw, write_label
 from .score_run import RunScored
 from .stored_frames import StoredFrame, stored_frames
 from .stored_pictures import StoredCamera, camera_of, picture_at
@@ -64,9 +64,8 @@ def _tile(one: RunScored) -> Bytes:
         picture = np.zeros((TILE_PX[1], TILE_PX[0], 3), np.uint8)
     tile = cv2.resize(picture, TILE_PX, interpolation=cv2.INTER_AREA)
     name = one.run.path.name
-    cv2.putText(tile, name, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 4)
-    cv2.putText(tile, name, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1)
     found: Bytes = np.asarray(tile, np.uint8)
+    write_label(found, name, (8, 20), (255, 255, 255), 0.6)
     return found
 
 
