@@ -12,7 +12,7 @@ from crosscue.replay.log import Log, Selection
 from crosscue.replay.run_folder import MANIFEST, RunFolder, locked, sha256_of, write_input
 from crosscue.replay.vehicle import Vehicle, of_manifest
 
-from .estimate_stage import Outcome, detected_part, estimate_into
+from .estimate_stage import Outcome, begin_again, detected_part, estimate_into
 from .run_input import settings_changed
 from .run_logs import reopened
 
@@ -54,6 +54,8 @@ def estimate_run(
         settings = vehicle or of_manifest(manifest["settings"])
         changed = None if vehicle is None else settings_changed(run, vehicle)
         if changed is not None:
+            # In this order a run cut short between them does not pass for a whole one.
+            begin_again(run, detected_part(manifest))
             write_input(run, changed)
         return estimate_into(
             logs, settings, run, selection_used(manifest), on_time,

@@ -157,7 +157,7 @@ def estimate_into(
         stage.landmarks = looking(landmarks, vehicle, reading.ledgers[at])
         reading.extractors[at].on_pictures = stage.landmarks.see
     if detected is None:
-        _begin_again(run, found)
+        begin_again(run, found)
     tally = _pose(reading, stage, run, on_time)
     silent = silent_roles(reading.planned, stage.received)
     if Signal.WHEEL_SPEEDS in silent:
@@ -244,7 +244,7 @@ def _hashed(
     return told
 
 
-def _begin_again(run: RunFolder, found: Mapping[str, Any] | None) -> None:
+def begin_again(run: RunFolder, found: Mapping[str, Any] | None) -> None:
     """Make the run what the detect stage left: cut short, it must not pass for a whole one."""
     if found is None:
         run.file(MANIFEST).unlink(missing_ok=True)

@@ -311,7 +311,8 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """
     partial: PartialFile | None = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.parent.is_dir():
+            path.parent.mkdir(parents=True, exist_ok=True)
         partial = PartialFile(path)
         write(partial.path)
         partial.keep()

@@ -136,7 +136,7 @@ def test_an_estimate_killed_midway_is_never_taken_for_whole(drive: Drive, tmp_pa
     shutil.copytree(drive.folder / "whole", run)
     text = drive.vehicle.read_text().replace("x_m = 1.7", "x_m = 1.2")
     other.write_text(text.replace('"simulated_car.dbc"', f'"{drive.folder}/simulated_car.dbc"'))
-    argv = ["estimate", str(run), "--vehicle", str(other)]
+    argv = ["estimate", str(run), "--vehicle", str(other), "--logs", str(drive.folder)]
     count = len(faults.operations(run, faults.CHANGES, argv))
     replaced = tree(run)
     assert replaced != drive.whole

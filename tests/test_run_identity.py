@@ -113,6 +113,8 @@ def test_a_run_is_the_same_bytes_from_wherever_it_is_made(
     assert _replay("D-0/drive.mcap", Path("../out/run"), "--vehicle", "D-0/vehicle.toml") == 0
 
     assert tree(drives.parent / "out") == first
+    again = _manifest(drives.parent / "out" / "run")
+    assert {**again, "timings": 0} == {**json.loads(text), "timings": 0}
     assert json.loads(text)["logs"][0]["path"] == "../../drives/D-0/drive.mcap"
     shutil.rmtree(drives.parent / "out")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def tree(folder: Path) -> dict[str, str]:
-    """From relative name to a hash of the bytes; of a manifest without its timings."""
+    """From relative name to a hash of the bytes; of a manifest without timings and logs' places."""
     return {
         path.relative_to(folder).as_posix(): _hash(path)
         for path in sorted(folder.rglob("*"))
@@ -25,5 +25,5 @@ def _hash(path: Path) -> str:
 
 def _without_timings(value: object) -> object:
     if isinstance(value, dict):
-        return {k: _without_timings(v) for k, v in value.items() if k != "timings"}
+        return {k: _without_timings(v) for k, v in value.items() if k not in ("timings", "path")}
     return [_without_timings(one) for one in value] if isinstance(value, list) else value
