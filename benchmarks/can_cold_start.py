@@ -31,7 +31,7 @@ from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import open_log
-import crosscue.replay.readers.candump, crosscue.replay.sealed_log
+import crosscue.replay.readers.can_text.candump, crosscue.replay.seal.log
 began = time.process_time()
 database = CanDatabase.load([dbc])
 ledger = Ledger(log)

@@ -17,13 +17,19 @@ from typing import Any
 
 import numpy as np
 
-from crosscue.datasets.truth import Truth, load
-from crosscue.detectors.cars import CarShapes, car_shapes, cross_traffic, pair_cars, parked_cars
-from crosscue.eval.estimate_stage import detected_part
-from crosscue.eval.score_truth import cue_at
-from crosscue.eval.stored_frames import stored_frames
-from crosscue.replay.run_folder import RunFolder, open_run
-from crosscue.replay.vehicle import Vehicle, of_manifest
+from crosscue.datasets.truth.truth import Truth, load
+from crosscue.detectors.cues.cars import (
+    CarShapes,
+    car_shapes,
+    cross_traffic,
+    pair_cars,
+    parked_cars,
+)
+from crosscue.eval.pipeline.estimate import detected_part
+from crosscue.eval.pipeline.stored_frames import stored_frames
+from crosscue.eval.scoring.truth import cue_at
+from crosscue.replay.files.run_folder import RunFolder, open_run
+from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
 
 LEAST_NEAR = 0.5
 """A true car counts where its middle is so near, in lengths of its box."""

@@ -19,16 +19,16 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from crosscue.datasets.scenes.drive import SceneSettings, jpeg, world_of
-from crosscue.datasets.scenes.render import Renderer
+from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, View
-from crosscue.detectors.frame_cues import CuePass, Seen
-from crosscue.detectors.pictures import Encoded, decode
+from crosscue.detectors.cues.frame import CuePass, Seen
+from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.registry import chosen
-from crosscue.eval.detect_stage import detect_drive
+from crosscue.eval.pipeline.detect import detect_drive
+from crosscue.replay.files.run_folder import create
 from crosscue.replay.log import Selection, open_log
-from crosscue.replay.run_folder import create
-from crosscue.replay.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 ROUNDS = 5
 FRAMES = 1000

@@ -18,19 +18,19 @@ from statistics import median
 
 import numpy as np
 
-from crosscue.datasets.simulated_drive import DriveSettings, drive, sense, vehicle_text
-from crosscue.datasets.simulated_log import BUS, GYRO, MAGNETOMETER, sensor_blocks
+from crosscue.datasets.simulated.drive import DriveSettings, drive, sense, vehicle_text
+from crosscue.datasets.simulated.log_files import BUS, GYRO, MAGNETOMETER, sensor_blocks
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Found, Frame, View
 from crosscue.detectors.registry import Choice
-from crosscue.eval.detect_stage import detect_drive
-from crosscue.eval.estimate_run import estimate_run
+from crosscue.eval.pipeline.detect import detect_drive
+from crosscue.eval.pipeline.reestimate import estimate_run
 from crosscue.replay.columns import Block, Images, Messages, Topic
+from crosscue.replay.files.run_folder import create, open_run
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import EVERYTHING, open_log
-from crosscue.replay.run_folder import create, open_run
-from crosscue.replay.vehicle import parse
-from crosscue.replay.writing import LogWriter
+from crosscue.replay.vehicle.vehicle import parse
+from crosscue.replay.write.convert import LogWriter
 
 ROUNDS = 5
 PICTURE_BYTES = 150_000
@@ -127,7 +127,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         seconds = write_log(folder / "drive.mcap", settings)
-        dbc = Path(__file__).parent.parent / "datasets" / "simulated_car.dbc"
+        dbc = Path(__file__).parent.parent / "datasets" / "simulated" / "simulated_car.dbc"
         vehicle = parse(vehicle_text(settings, str(dbc)) + RANGES, "benchmark")
         choice = Choice("busy", f"{__name__}:build")
         run = create(folder / "run", overwrite=False)

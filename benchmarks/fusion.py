@@ -18,12 +18,12 @@ import gtsam
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from crosscue.detectors.cue_names import Cue
+from crosscue.detectors.cues.names import Cue
 from crosscue.fusion.approaches import Approaches, FrameEvidence, SignRange
 from crosscue.fusion.belief import Situation, begin, multiply, probabilities, source_speaker
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import RangeBelief, Reference, predict, update
-from crosscue.replay.fusion_settings import Calibrated, Fusion, RangeFilter, Rates
+from crosscue.replay.vehicle.fusion import Calibrated, Fusion, RangeFilter, Rates
 
 ROUNDS: Final = 7
 FRAMES: Final = 6000

@@ -24,12 +24,12 @@ from statistics import median
 
 import numpy as np
 
-from crosscue.datasets.scenes.camera import Camera
 from crosscue.datasets.scenes.drive import SceneSettings, write_scene
+from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.detectors.base import Detections, Found, Frame, View
 from crosscue.eval import cli
 from crosscue.replay.errors import RunError
-from crosscue.replay.run_folder import open_run
+from crosscue.replay.files.run_folder import open_run
 
 LEAST_S = 0.001
 

@@ -27,11 +27,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from crosscue.localization.landmark_database import LandmarkDatabase, LandmarkWriter, Place
-from crosscue.localization.landmark_features import Features
-from crosscue.localization.landmark_matcher import OrbMatcher, OrbSettings
-from crosscue.localization.landmark_pictures import grey_of, read_picture
-from crosscue.localization.landmark_update import best_of
+from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
+from crosscue.localization.landmarks.features import Features
+from crosscue.localization.landmarks.images import grey_of, read_picture
+from crosscue.localization.landmarks.matcher import OrbMatcher, OrbSettings
+from crosscue.localization.landmarks.update import best_of
 from crosscue.replay.columns import Floats
 from support.landmark_files import seen_from, some_features, wall
 

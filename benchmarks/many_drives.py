@@ -28,12 +28,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from crosscue.datasets.simulated_drive import DriveSettings, vehicle_text
+from crosscue.datasets.simulated.drive import DriveSettings, vehicle_text
 from crosscue.eval import cli
-from crosscue.eval.many_drives import Job, in_turn, run_many
-from crosscue.eval.merge_runs import merge_runs
-from crosscue.eval.worker_pool import Processes
-from crosscue.replay.run_folder import (
+from crosscue.eval.batch.jobs import Job, in_turn, run_many
+from crosscue.eval.batch.merge import merge_runs
+from crosscue.eval.batch.processes import Processes
+from crosscue.replay.files.run_folder import (
     RunFolder,
     TableSink,
     clear,
@@ -126,7 +126,7 @@ def engines(folder: Path, rounds: int) -> None:
 
 def town_drives(folder: Path, count: int, minutes: float) -> float:
     """Drive folders; seconds of log in all."""
-    dbc = Path(__file__).parent.parent / "datasets" / "simulated_car.dbc"
+    dbc = Path(__file__).parent.parent / "datasets" / "simulated" / "simulated_car.dbc"
     seconds = 0.0
     for seed in range(count):
         blocks = max(4, round(minutes * 60.0 / estimate.SECONDS_PER_BLOCK))

@@ -30,9 +30,10 @@ from torch import Tensor, nn
 from torchvision.models.detection.transform import GeneralizedRCNNTransform
 
 from crosscue.datasets.scenes.drive import SceneSettings, world_of
-from crosscue.datasets.scenes.render import Renderer
+from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.detectors.base import Detections, Frame
-from crosscue.detectors.mask_rcnn import (
+from crosscue.detectors.networks.mask_rcnn.checkpoint import Calibration, Checkpoint, Facts
+from crosscue.detectors.networks.mask_rcnn.detector import (
     MaskRcnnDetector,
     MaskRcnnSettings,
     checkpoint_named,
@@ -40,9 +41,14 @@ from crosscue.detectors.mask_rcnn import (
     place,
     raw_score,
 )
-from crosscue.detectors.mask_rcnn_checkpoint import Calibration, Checkpoint, Facts
-from crosscue.detectors.mask_rcnn_network import MEAN, SPREAD, Plan, build_network, set_limits
-from crosscue.detectors.model_detector import overlaps
+from crosscue.detectors.networks.mask_rcnn.network import (
+    MEAN,
+    SPREAD,
+    Plan,
+    build_network,
+    set_limits,
+)
+from crosscue.detectors.networks.model_detector import overlaps
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import VehicleError
 

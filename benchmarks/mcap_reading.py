@@ -34,12 +34,12 @@ from rosbags.highlevel import AnyReader
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT
-from crosscue.replay.readers.mcap import open_mcap
-from crosscue.replay.readers.mcap_bytes import ByteFile
-from crosscue.replay.readers.mcap_scan import Scanner
-from crosscue.replay.readers.mcap_segments import find_segments
-from crosscue.replay.readers.mcap_topics import TopicBook
-from crosscue.replay.readers.mcap_walk import Chunk, Walk
+from crosscue.replay.readers.mcap.bytes import ByteFile
+from crosscue.replay.readers.mcap.channels import TopicBook
+from crosscue.replay.readers.mcap.reader import open_mcap
+from crosscue.replay.readers.mcap.scan import Scanner
+from crosscue.replay.readers.mcap.segments import find_segments
+from crosscue.replay.readers.mcap.walk import Chunk, Walk
 
 DATA = Path(os.environ.get("CROSSCUE_DATA", Path(__file__).parents[2] / "shared" / "data"))
 RAW_CAN = (
@@ -300,7 +300,7 @@ import sys
 from pathlib import Path
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import open_log
-import crosscue.replay.readers.mcap
+import crosscue.replay.readers.mcap.reader
 
 def peak():
     status = Path("/proc/self/status").read_text()

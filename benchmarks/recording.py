@@ -28,18 +28,18 @@ from estimate import (  # type: ignore[import-not-found]  # a script beside this
     write_log,
 )
 
-from crosscue.datasets.simulated_drive import DriveSettings, vehicle_text
+from crosscue.datasets.simulated.drive import DriveSettings, vehicle_text
 from crosscue.detectors import rle
 from crosscue.detectors.registry import Choice
-from crosscue.eval.detect_stage import detect_drive
-from crosscue.eval.estimate_run import estimate_run
+from crosscue.eval.pipeline.detect import detect_drive
+from crosscue.eval.pipeline.reestimate import estimate_run
+from crosscue.eval.pipeline.stored_frames import stored_frames
+from crosscue.eval.pipeline.stored_images import camera_of, read_pictures
 from crosscue.eval.recording import save
-from crosscue.eval.stored_frames import stored_frames
-from crosscue.eval.stored_pictures import camera_of, read_pictures
 from crosscue.replay.columns import Block, Images
+from crosscue.replay.files.run_folder import RunFolder, create, open_run
 from crosscue.replay.log import EVERYTHING, open_log
-from crosscue.replay.run_folder import RunFolder, create, open_run
-from crosscue.replay.vehicle import parse
+from crosscue.replay.vehicle.vehicle import parse
 
 ROUNDS = 5
 CLASSES = {"car": 1, "stop sign": 2, "traffic light": 3}
@@ -47,7 +47,7 @@ MEMORY = """
 import sys
 from pathlib import Path
 from crosscue.eval.recording import save
-from crosscue.replay.run_folder import open_run
+from crosscue.replay.files.run_folder import open_run
 save(open_run(Path(sys.argv[1])), Path(sys.argv[2]))
 status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
 print(int(status["VmHWM"].split()[0]) // 1024)
@@ -59,7 +59,7 @@ def make_run(folder: Path, minutes: float) -> tuple[RunFolder, float]:
     settings = DriveSettings(blocks=max(4, round(minutes * 60.0 / SECONDS_PER_BLOCK)))
     folder.mkdir()
     seconds = write_log(folder / "drive.mcap", settings)
-    dbc = Path(__file__).parent.parent / "datasets" / "simulated_car.dbc"
+    dbc = Path(__file__).parent.parent / "datasets" / "simulated" / "simulated_car.dbc"
     vehicle = parse(vehicle_text(settings, str(dbc)) + RANGES, "benchmark")
     run = create(folder / "run", overwrite=False)
     with open_log(folder / "drive.mcap") as log:

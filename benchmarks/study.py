@@ -32,10 +32,10 @@ from typing import NamedTuple
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from crosscue.localization import drive_simulator
 from crosscue.localization.angles import wrap
-from crosscue.localization.city import HEADINGS_RAD
-from crosscue.localization.drive_kernel import (
+from crosscue.localization.town import simulator as drive_simulator
+from crosscue.localization.town.city import HEADINGS_RAD
+from crosscue.localization.town.kernel import (
     LANES,
     Traced,
     drive_many,
@@ -43,9 +43,9 @@ from crosscue.localization.drive_kernel import (
     filter_rows,
     numbers_of,
 )
-from crosscue.localization.drive_settings import City, Drive
-from crosscue.localization.drive_simulator import SENSOR_STREAM, drive
-from crosscue.localization.random_stream import Stream, key_of
+from crosscue.localization.town.random_stream import Stream, key_of
+from crosscue.localization.town.settings import City, Drive
+from crosscue.localization.town.simulator import SENSOR_STREAM, drive
 from crosscue.replay.columns import Floats
 
 SETTINGS = Drive()

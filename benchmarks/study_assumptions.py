@@ -16,18 +16,18 @@ import argparse
 
 import numpy as np
 
-from crosscue.eval.chi_square import mean_band
-from crosscue.eval.studies.consistency import nees_along_the_arc
+from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.studies.intervals import mean_of
-from crosscue.eval.studies.landmark_study import comparisons_of
-from crosscue.eval.studies.range_study import law_m
-from crosscue.eval.studies.settings import UNTIL_LOST, FieldStudy, LandmarkStudy
+from crosscue.eval.studies.town.consistency import nees_along_the_arc
+from crosscue.eval.studies.town.landmark_study import comparisons_of
+from crosscue.eval.studies.town.range_study import law_m
+from crosscue.eval.studies.town.settings import UNTIL_LOST, FieldStudy, LandmarkStudy
+from crosscue.eval.studies.town.work import chunks_of
 from crosscue.eval.studies.words import km, percent
-from crosscue.eval.studies.work import chunks_of
-from crosscue.localization.drive_kernel import Keys, drive_many, drive_traced
-from crosscue.localization.drive_settings import City, Drive, Navigation, Sensors
-from crosscue.localization.drive_simulator import Outcome, Result
-from crosscue.localization.random_stream import key_of
+from crosscue.localization.town.kernel import Keys, drive_many, drive_traced
+from crosscue.localization.town.random_stream import key_of
+from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
+from crosscue.localization.town.simulator import Outcome, Result
 
 NEES = Result._fields.index("nees")
 FINE_M = 1e-4

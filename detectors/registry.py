@@ -21,10 +21,10 @@ from .base import Detector
 GROUP: Final = "crosscue.detectors"
 
 BUILTIN: Final[Mapping[str, str]] = {
-    "mask-rcnn": "crosscue.detectors.mask_rcnn:build",
-    "model": "crosscue.detectors.model_detector:build",
-    "road": "crosscue.detectors.road_detector:build",
-    "signs": "crosscue.detectors.sign_detector:build",
+    "mask-rcnn": "crosscue.detectors.networks.mask_rcnn.detector:build",
+    "model": "crosscue.detectors.networks.model_detector:build",
+    "road": "crosscue.detectors.networks.road.detector:build",
+    "signs": "crosscue.detectors.signs.detector:build",
 }
 """From name to ``module:factory``."""
 

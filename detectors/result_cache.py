@@ -19,10 +19,10 @@ from typing import Any, Final, Self
 import numpy as np
 
 from crosscue.replay.errors import OutputError
-from crosscue.replay.tree_text import json_tree
+from crosscue.replay.files.tree_text import json_tree
 
 from .base import Detections, Found, RoadMask
-from .pictures import Encoded
+from .images import Encoded
 
 _SCHEMA: Final = (
     "CREATE TABLE IF NOT EXISTS found "

@@ -11,7 +11,7 @@ from crosscue.replay.columns import Block, Bytes, Images
 from crosscue.replay.errors import CrosscueError, LogError, UsageError, one_line
 
 from .base import Detector, Found, Frame, View
-from .pictures import Encoded, decode, encoded, reduction, size_of
+from .images import Encoded, decode, encoded, reduction, size_of
 from .result_cache import ResultCache, picture_key
 
 BATCH: Final = 8

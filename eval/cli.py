@@ -19,8 +19,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Final, NoReturn, Protocol, cast
 
 from crosscue.replay.errors import CrosscueError, one_line
-
-from .plain_text import visible
+from crosscue.replay.safe_text import visible
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -29,7 +28,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "info": ("info", "topics, counts, clocks, gaps and health of a log"),
     "convert": ("convert", "any log or data set to MCAP with ROS 2 types"),
     "seal": ("seal", "a hash of each MiB beside a log, or check a log against it"),
-    "vehicle init": ("vehicle_init", "write a first vehicle file from what a log holds"),
+    "vehicle init": ("vehicle.init", "write a first vehicle file from what a log holds"),
     "decode": ("decode", "every stream as columns: a Parquet file for each topic or CAN message"),
     "detect": ("detect", "run detectors over the camera: detections, road, cues"),
     "estimate": ("estimate", "estimate a run again, from what detectors found before"),
@@ -38,30 +37,30 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "compare": ("compare", "what changed between two runs, with tolerances"),
     "merge": ("merge", "the runs of batches as one folder of tables"),
     "view": ("view", "a run in Rerun"),
-    "fit compass": ("fit_compass", "compass mounting, hard and soft iron from a drive"),
-    "fit signs": ("fit_signs", "the sign threshold for a wanted precision"),
-    "fit ranges": ("fit_ranges", "from heights in pixels to ranges, with residuals"),
-    "fit messages": ("fit_messages", "how far each cue is to be believed, from annotated drives"),
-    "fit landmarks": ("fit_landmarks", "the match threshold for a wanted false-match rate"),
-    "landmarks add": ("landmarks_add", "pictures and where they were taken into a database"),
-    "landmarks list": ("landmarks_list", "what a landmark database holds"),
-    "landmarks match": ("landmarks_match", "one picture against a landmark database"),
-    "truth": ("truth", "write the truth that a data set carries"),
-    "truth import": ("truth_import", "annotations from COCO or CVAT as truth"),
-    "truth check": ("truth_check", "does a truth file fit its log?"),
-    "truth schema": ("truth_schema", "the JSON Schema of truth.json"),
+    "fit compass": ("fit.compass", "compass mounting, hard and soft iron from a drive"),
+    "fit signs": ("fit.signs", "the sign threshold for a wanted precision"),
+    "fit ranges": ("fit.ranges", "from heights in pixels to ranges, with residuals"),
+    "fit messages": ("fit.messages", "how far each cue is to be believed, from annotated drives"),
+    "fit landmarks": ("fit.landmarks", "the match threshold for a wanted false-match rate"),
+    "landmarks add": ("landmarks.add", "pictures and where they were taken into a database"),
+    "landmarks list": ("landmarks.list", "what a landmark database holds"),
+    "landmarks match": ("landmarks.match", "one picture against a landmark database"),
+    "truth": ("truth.write", "write the truth that a data set carries"),
+    "truth import": ("truth.import_annotations", "annotations from COCO or CVAT as truth"),
+    "truth check": ("truth.check", "does a truth file fit its log?"),
+    "truth schema": ("truth.schema", "the JSON Schema of truth.json"),
     "simulate": ("simulate", "drives up to intersections, with camera, CAN, Mobileye and truth"),
-    "train road": ("train_road", "the road network, on simulated or own pictures"),
+    "train road": ("train.road", "the road network, on simulated or own pictures"),
     "study intersections": (
-        "study_intersections",
+        "study.intersections",
         "the published experiment on simulated drives, table beside table",
     ),
-    "train frames": ("train_frames", "pictures of simulated intersections to train on, with COCO"),
-    "train mask-rcnn": ("train_mask_rcnn", "a Mask R-CNN on COCO annotations"),
-    "study range": ("study_range", "how far without landmarks: thousands of simulated drives"),
-    "study landmarks": ("study_landmarks", "who reaches the goal, by strategy, density and rate"),
-    "study field": ("study_field", "the field protocol, simulated, through logs and the replay"),
-    "study drive": ("study_drive", "one simulated drive: picture, log, replay, recording"),
+    "train frames": ("train.frames", "pictures of simulated intersections to train on, with COCO"),
+    "train mask-rcnn": ("train.mask_rcnn", "a Mask R-CNN on COCO annotations"),
+    "study range": ("study.range", "how far without landmarks: thousands of simulated drives"),
+    "study landmarks": ("study.landmarks", "who reaches the goal, by strategy, density and rate"),
+    "study field": ("study.field", "the field protocol, simulated, through logs and the replay"),
+    "study drive": ("study.drive", "one simulated drive: picture, log, replay, recording"),
     "demo": ("demo", "make a small drive, replay it, score it, show it"),
 }
 

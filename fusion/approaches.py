@@ -24,7 +24,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from crosscue.replay.fusion_settings import Fusion, RangeFilter
+from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
 
 from .belief import Belief, Situation, Speaker, begin, establish, multiply, probabilities
 from .factor_graph import FactorGraph

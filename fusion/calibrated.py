@@ -28,7 +28,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from crosscue.replay.fusion_settings import Calibrated, Fade, Rates
+from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
 
 from .belief import Situation
 from .factor_graph import CueNode, FactorGraph, log_odds

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
-from crosscue.replay.fusion_settings import Fusion
+from crosscue.replay.vehicle.fusion import Fusion
 
 LOG_ODDS_LIMIT: Final = 30.0
 """Beyond it a probability is reported as that of the limit, 1e-13 from 0 or 1. Sums are kept

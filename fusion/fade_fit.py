@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.fusion_settings import Fade
+from crosscue.replay.vehicle.fusion import Fade
 
 from .annotated_approach import AnnotatedApproach, Bools
 from .calibrated import USUAL_FADE

@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.replay.columns import Floats
-from crosscue.replay.fusion_settings import Calibrated, Fade, Rates
+from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
 
 from .annotated_approach import NOT_LOOKED, AnnotatedApproach
 from .belief import Situation

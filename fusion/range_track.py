@@ -12,7 +12,7 @@ import math
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from crosscue.replay.fusion_settings import RangeFilter
+from crosscue.replay.vehicle.fusion import RangeFilter
 
 from .independence import independent_share
 from .intersection_range import RangeBelief, initialise, nis, predict, update

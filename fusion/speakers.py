@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from crosscue.replay.fusion_settings import Fusion
+from crosscue.replay.vehicle.fusion import Fusion
 
 from .belief import Speaker, source_speaker
 from .calibrated import CalibratedSpeaker, voices_of

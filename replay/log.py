@@ -118,48 +118,51 @@ class Format:
 
 
 FORMATS: Final[dict[str, Format]] = {
-    "mcap": Format((".mcap",), (), "crosscue.replay.readers.mcap:open_mcap", "MCAP"),
+    "mcap": Format((".mcap",), (), "crosscue.replay.readers.mcap.reader:open_mcap", "MCAP"),
     "rosbag1": Format(
-        (".bag", ".active"), (), "crosscue.replay.readers.rosbag1:open_bag", "ROS 1 bag"
+        (".bag", ".active"), (), "crosscue.replay.readers.rosbag1.reader:open_bag", "ROS 1 bag"
     ),
     "rosbag2-sqlite3": Format(
-        (".db3",), (), "crosscue.replay.readers.rosbag2_db3:open_db3", "ROS 2 bag (sqlite3)"
+        (".db3",), (), "crosscue.replay.readers.rosbag2.db3:open_db3", "ROS 2 bag (sqlite3)"
     ),
     "rosbag2": Format(
         (),
         ("metadata.yaml", "*.db3", "*.mcap", "*.db3.zstd", "*.mcap.zstd"),
-        "crosscue.replay.readers.rosbag2:open_folder",
+        "crosscue.replay.readers.rosbag2.folder:open_folder",
         "ROS 2 bag folder",
     ),
     "candump": Format(
-        (".log", ".candump"), (), "crosscue.replay.readers.candump:open_candump", "candump log"
+        (".log", ".candump"),
+        (),
+        "crosscue.replay.readers.can_text.candump:open_candump",
+        "candump log",
     ),
-    "asc": Format((".asc",), (), "crosscue.replay.readers.asc:open_asc", "Vector ASC log"),
-    "blf": Format((".blf",), (), "crosscue.replay.readers.blf:open_blf", "Vector BLF log"),
-    "trc": Format((".trc",), (), "crosscue.replay.readers.trc:open_trc", "PEAK TRC log"),
-    "mf4": Format((".mf4",), (), "crosscue.replay.readers.mf4:open_mf4", "ASAM MDF 4"),
+    "asc": Format((".asc",), (), "crosscue.replay.readers.can_text.asc:open_asc", "Vector ASC log"),
+    "blf": Format((".blf",), (), "crosscue.replay.readers.blf.reader:open_blf", "Vector BLF log"),
+    "trc": Format((".trc",), (), "crosscue.replay.readers.can_text.trc:open_trc", "PEAK TRC log"),
+    "mf4": Format((".mf4",), (), "crosscue.replay.readers.mf4.reader:open_mf4", "ASAM MDF 4"),
     "comma2k19": Format(
         (),
         ("processed_log", "global_pose"),
-        "crosscue.datasets.comma2k19:open_segment",
+        "crosscue.datasets.adapters.comma2k19:open_segment",
         "comma2k19 segment",
     ),
     "kitti-raw": Format(
         (),
         ("oxts/data", "oxts/timestamps.txt", "oxts/*.txt"),
-        "crosscue.datasets.kitti:open_drive",
+        "crosscue.datasets.adapters.kitti:open_drive",
         "KITTI raw drive",
     ),
     "video": Format(
         (".mp4", ".avi", ".mkv", ".mov", ".hevc", ".h264"),
         (),
-        "crosscue.replay.readers.video:open_video",
+        "crosscue.replay.readers.images.video:open_video",
         "video with a time file",
     ),
     "images": Format(
         (),
         ("*.png", "*.jpg", "*.jpeg", "*.webp", "*.PNG", "*.JPG", "*.JPEG"),
-        "crosscue.replay.readers.images:open_images",
+        "crosscue.replay.readers.images.folder:open_images",
         "folder of images with a time file",
     ),
 }
@@ -178,10 +181,10 @@ def open_log(path: Path | str, limits: Limits = DEFAULT) -> Log:
             readable record in it.
     """
     if isinstance(path, str) and "://" in path:
-        from .remote import open_remote
+        from crosscue.replay.remote.logs import open_remote
 
         return open_remote(path, lambda fetched: open_log(fetched, limits), limits)
-    from .sealed_log import with_seal
+    from crosscue.replay.seal.log import with_seal
 
     place = Path(path)
     return with_seal(place, lambda: open_unsealed(place, limits))

@@ -15,19 +15,20 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from .clocks import MAX_OFFSET_NS, Clock, ClockWatch, times_of
+from crosscue.replay.clocks.reports import MAX_OFFSET_NS, Clock, ClockWatch, times_of
+from crosscue.replay.vehicle.roles import Role, role_of
+from crosscue.replay.vehicle.vehicle import AngleSignal, Vehicle
+
 from .columns import Block, Floats, Images, Int64s, Table, Topic
 from .decode import Decoder, decoder_for
 from .errors import MissingTopicError, VehicleError
 from .ledger import Ledger
-from .roles import Role, role_of
-from .vehicle import AngleSignal, Vehicle
 
 if TYPE_CHECKING:
-    from .can.database import CanDatabase
-    from .can.decode import BusDecoder
-    from .decode.packets import PacketDecoder
-    from .mobileye.samples import MobileyeStream
+    from crosscue.replay.can.database import CanDatabase
+    from crosscue.replay.can.decode import BusDecoder
+    from crosscue.replay.decode.packets import PacketDecoder
+    from crosscue.replay.mobileye.samples import MobileyeStream
 
 SPEED_UNITS: Final[Mapping[str, float]] = {
     "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6, "kph": 1 / 3.6, "kmh": 1 / 3.6, "kmph": 1 / 3.6,
@@ -373,7 +374,7 @@ class Extractor:
 
     def _show(self, block: Block, images: Images) -> None:
         """Pictures to whoever looks at them, packets of a video decoded first."""
-        from .decode.packets import PacketDecoder, is_stream
+        from crosscue.replay.decode.packets import PacketDecoder, is_stream
 
         if self.on_pictures is _no_pictures:
             return
@@ -394,7 +395,7 @@ class Extractor:
 
     def _mobileye_stream(self, source: Source) -> MobileyeStream:
         if self._mobileye is None:
-            from .mobileye.samples import MobileyeStream
+            from crosscue.replay.mobileye.samples import MobileyeStream
 
             types = {
                 one.topic.name: one.topic.type_name
@@ -431,9 +432,9 @@ class Extractor:
     def _bus_decoder(self, source: Source) -> BusDecoder:
         bus = source.topic.name
         if bus not in self._buses:
-            from .can.decode import BusDecoder
-            from .mobileye.admit import all_ids
-            from .mobileye.samples import settings_of
+            from crosscue.replay.can.decode import BusDecoder
+            from crosscue.replay.mobileye.admit import all_ids
+            from crosscue.replay.mobileye.samples import settings_of
 
             database = _database(self.vehicle.can.dbc)
             for sentence in database.notices:
@@ -449,7 +450,7 @@ class Extractor:
 @lru_cache(maxsize=8)
 def _database(files: tuple[str, ...]) -> CanDatabase:
     """Read once for the probe of the clocks and the run."""
-    from .can.database import CanDatabase
+    from crosscue.replay.can.database import CanDatabase
 
     return CanDatabase.load([Path(name) for name in files])
 

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from crosscue.replay.remote.logs import name_of
+
 from .columns import Block, Topic
 from .decode import decoder_for
 from .errors import UsageError
 from .ledger import Ledger
 from .log import Log, Selection
-from .remote import name_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from .camera import Camera
+from crosscue.datasets.scenes.rendering.camera import Camera
+
 from .mobileye import MOUNTING
 
 STOP_SIGN_M: Final = (0.71690, 2.79455)

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.random import Generator
 
-from .mesh import Floats, Mesh, Rgb, disc, joined, quad, triangles
+from crosscue.datasets.scenes.rendering.mesh import Floats, Mesh, Rgb, disc, joined, quad, triangles
 
 SKIRT_M: Final = 0.24
 GLASS: Final[Rgb] = (0.09, 0.11, 0.13)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
-from crosscue.datasets.truth import CUES, Cue, CueTruth
+from crosscue.datasets.scenes.rendering.render import Picture
+from crosscue.datasets.truth.truth import CUES, Cue, CueTruth
 
 from .layout import Layout
-from .render import Picture
 from .world import Thing
 
 LEAST_PIXELS: Final = 12

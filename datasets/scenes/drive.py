@@ -13,25 +13,25 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.datasets.simulated_drive import START_NS, DriveSettings, TrueMotion, dbc_path, sense
-from crosscue.datasets.simulated_log import sensor_blocks
-from crosscue.datasets.truth import Approach, Features, Truth, save
-from crosscue.datasets.tum import planar, write_tum
+from crosscue.datasets.scenes.export.coco import Objects
+from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.render import DEFAULTS, Picture, PictureSettings, Renderer
+from crosscue.datasets.simulated.drive import START_NS, DriveSettings, TrueMotion, dbc_path, sense
+from crosscue.datasets.simulated.log_files import sensor_blocks
+from crosscue.datasets.truth.truth import Approach, Features, Truth, save
+from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.replay.columns import Block, Images, Int64s, Messages, Topic
 from crosscue.replay.encode.outgoing import standard_type
 from crosscue.replay.encode.template import filled, template_of
+from crosscue.replay.files.run_folder import sha256_of, write_text
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.run_folder import sha256_of, write_text
-from crosscue.replay.writing import LogWriter
+from crosscue.replay.write.convert import LogWriter
 
-from .camera import Camera
 from .car_file import vehicle_text
-from .coco import Objects
 from .conditions import Conditions, conditions_of
 from .cues import CueRuns, present
 from .layout import Layout, layout_named
 from .mobileye import Device
-from .render import DEFAULTS, Picture, PictureSettings, Renderer
 from .world import World, build
 
 CAR_BUS: Final = "/can/car"

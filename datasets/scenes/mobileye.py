@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.random import Generator
 
+from crosscue.datasets.scenes.rendering.render import Picture, Seen
 from crosscue.replay.columns import Block, Int64s, Table
 from crosscue.replay.mobileye.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting
@@ -20,7 +21,6 @@ from crosscue.replay.mobileye.tables import table_block
 
 from .layout import Layout
 from .motion import FRONT_M, lane_y_m
-from .render import Picture, Seen
 from .world import World
 
 MOUNTING: Final = Mounting(x_m=FRONT_M)

@@ -8,11 +8,11 @@ from typing import Final, Literal
 import numpy as np
 from numpy.random import Generator
 
-from crosscue.datasets.simulated_drive import RATE_HZ, START_NS, TrueMotion
+from crosscue.datasets.scenes.rendering.mesh import Floats
+from crosscue.datasets.simulated.drive import RATE_HZ, START_NS, TrueMotion
 
 from .conditions import Conditions
 from .layout import NEAR_KERB_M, PARKING_LANE_M, Layout
-from .mesh import Floats
 
 FRONT_M: Final = 3.75
 """From rear axle to front bumper."""

@@ -9,14 +9,16 @@ from typing import Final, Literal
 import numpy as np
 from numpy.random import Generator
 
-from .cars import Look, any_look, car
-from .conditions import Conditions
-from .ground import Ground, Patch, cast_shadows, paint, with_levels
-from .layout import NEAR_KERB_M, Layout
-from .lighting import Daylight, daylight
-from .mesh import Floats, Mesh, joined
-from .motion import Approach, approach, lane_y_m
-from .scenery import (
+from crosscue.datasets.scenes.rendering.ground import (
+    Ground,
+    Patch,
+    cast_shadows,
+    paint,
+    with_levels,
+)
+from crosscue.datasets.scenes.rendering.lighting import Daylight, daylight
+from crosscue.datasets.scenes.rendering.mesh import Floats, Mesh, joined
+from crosscue.datasets.scenes.rendering.scenery import (
     Shadows,
     building,
     bush,
@@ -30,7 +32,12 @@ from .scenery import (
     utility_pole,
     wire,
 )
-from .textures import Atlas, make_atlas
+from crosscue.datasets.scenes.rendering.textures import Atlas, make_atlas
+
+from .cars import Look, any_look, car
+from .conditions import Conditions
+from .layout import NEAR_KERB_M, Layout
+from .motion import Approach, approach, lane_y_m
 
 Category = Literal[
     "car", "stop_sign", "traffic_light", "one_way_left", "one_way_right", "do_not_enter"

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors import rle
-from crosscue.replay.bounded import read_at_most
 from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import SchemaError
-from crosscue.replay.tree_text import json_tree
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import json_tree
 
 MOST_BYTES: Final = 2 << 30
 """Largest file read."""

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.mask_rcnn_checkpoint import Calibration
-from crosscue.detectors.model_detector import overlaps
+from crosscue.detectors.networks.mask_rcnn.checkpoint import Calibration
+from crosscue.detectors.networks.model_detector import overlaps
 from crosscue.detectors.rle import area_px
-from crosscue.detectors.sign_threshold import Judged
 from crosscue.replay.columns import Floats
 
 from .annotations import Labelled, LabelledPicture, LabelledSet
+from .operating_point import Judged
 from .scores import LEAST_AREA_PX
 
 OVERLAP: Final = 0.3

@@ -13,27 +13,24 @@ import numpy as np
 import torch
 
 from crosscue.detectors.devices import chosen_device
-from crosscue.detectors.mask_rcnn import (
-    MaskRcnnSettings,
-    checkpoint_named,
-)
-from crosscue.detectors.mask_rcnn_checkpoint import (
+from crosscue.detectors.networks.mask_rcnn.checkpoint import (
     Calibration,
     Checkpoint,
     Facts,
     save_checkpoint,
 )
-from crosscue.detectors.mask_rcnn_coco import COCO_NETWORKS
-from crosscue.detectors.mask_rcnn_network import Plan, build_network
-from crosscue.detectors.sign_threshold import Judged
+from crosscue.detectors.networks.mask_rcnn.coco import COCO_NETWORKS
+from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, checkpoint_named
+from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network
 from crosscue.replay.errors import OutputError
-from crosscue.replay.run_folder import strict_json, write_text
-from crosscue.replay.tree_text import json_tree
+from crosscue.replay.files.run_folder import strict_json, write_text
+from crosscue.replay.files.tree_text import json_tree
 
 from .annotations import LabelledSet
 from .calibration import fitted, judged
 from .loop import Schedule, Training
 from .measure import rates_by_score, raw_detections
+from .operating_point import Judged
 from .reproducible import decides_bits, reproducible
 from .samples import Sampler, Window
 from .scores import average_precisions

@@ -18,11 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from crosscue.detectors.mask_rcnn_network import forward_training
+from crosscue.detectors.networks.mask_rcnn.network import forward_training
 from crosscue.detectors.weights_file import serialised
 from crosscue.replay.errors import CrosscueError, SchemaError, one_line
-from crosscue.replay.run_folder import write_bytes
-from crosscue.replay.tree_text import json_tree
+from crosscue.replay.files.run_folder import write_bytes
+from crosscue.replay.files.tree_text import json_tree
 
 from .samples import Sample, Sampler
 

@@ -14,13 +14,13 @@ import numpy as np
 import torch
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.mask_rcnn import MaskRcnnSettings, calibrated, detector_of
-from crosscue.detectors.mask_rcnn_checkpoint import Calibration, Checkpoint, Facts
-from crosscue.detectors.mask_rcnn_network import Plan
-from crosscue.detectors.sign_threshold import Judged, Rates, rates_at
+from crosscue.detectors.networks.mask_rcnn.checkpoint import Calibration, Checkpoint, Facts
+from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, calibrated, detector_of
+from crosscue.detectors.networks.mask_rcnn.network import Plan
 
 from .annotations import LabelledSet
 from .calibration import judged
+from .operating_point import Judged, Rates, rates_at
 from .scores import average_precisions, detections_on
 
 LEAST_SCORE: Final = 0.02

@@ -14,8 +14,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import View
-from crosscue.detectors.mask_rcnn_network import MEAN, SPREAD, Plan
-from crosscue.detectors.pictures import decode, read_file
+from crosscue.detectors.images import decode, read_file
+from crosscue.detectors.networks.mask_rcnn.network import MEAN, SPREAD, Plan
 from crosscue.replay.columns import Bytes, Floats
 from crosscue.replay.errors import LogError, SchemaError
 

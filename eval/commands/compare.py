@@ -20,7 +20,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TypeVar
 
-from crosscue.eval.compare_runs import (
+from crosscue.eval.catalog.compare import (
     Comparison,
     MetricChange,
     TableChange,
@@ -29,9 +29,8 @@ from crosscue.eval.compare_runs import (
     open_scored,
     read_tolerance,
 )
-from crosscue.eval.plain_text import visible
-
-from .common import print_json
+from crosscue.eval.commands.shared.options import print_json
+from crosscue.replay.safe_text import visible
 
 T = TypeVar("T")
 MOST_LINES = 20

@@ -22,16 +22,21 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from crosscue.eval.empty_result import empty_result
-from crosscue.eval.plain_text import table, terminal_width, visible, wrapped
+from crosscue.eval.commands.shared.options import (
+    add_part_arguments,
+    limits_of,
+    print_json,
+    selection_of,
+    with_progress,
+)
+from crosscue.eval.pipeline.empty_result import empty_result
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import LogError, OutputError, UsageError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger, TopicAccount
 from crosscue.replay.log import Log, Selection, open_log, unless_damaged
-from crosscue.replay.seal import seal_path
-from crosscue.replay.writing import LogWriter
-
-from .common import add_part_arguments, limits_of, print_json, selection_of, with_progress
+from crosscue.replay.safe_text import table, terminal_width, visible, wrapped
+from crosscue.replay.seal.seal import seal_path
+from crosscue.replay.write.convert import LogWriter
 
 NOT_ASKED = frozenset({NOT_ASKED_TIME, NOT_ASKED_TOPIC})
 SHOWN = 20

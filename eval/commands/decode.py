@@ -9,14 +9,18 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.eval.decode_tables import decode_tables
-from crosscue.eval.plain_text import visible
-from crosscue.eval.run_account import account_lines
+from crosscue.eval.catalog.decoded_logs import decode_tables
+from crosscue.eval.commands.shared.options import (
+    add_log_arguments,
+    limits_of,
+    print_json,
+    selection_of,
+)
+from crosscue.eval.pipeline.run_account import account_lines
+from crosscue.replay.files.run_folder import create
 from crosscue.replay.log import open_logs
-from crosscue.replay.run_folder import create
-from crosscue.replay.vehicle import Vehicle, load
-
-from .common import add_log_arguments, limits_of, print_json, selection_of
+from crosscue.replay.safe_text import visible
+from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

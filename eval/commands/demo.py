@@ -16,20 +16,20 @@ from pathlib import Path
 from crosscue.datasets.scenes.drive import SceneSettings, write_scene
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.detectors.registry import EMBEDDED, chosen
-from crosscue.eval.detect_stage import choices_of
+from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.pipeline.detect import choices_of
+from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.recording import save
-from crosscue.eval.replay_drive import Detecting, replay_drive
-from crosscue.eval.report_page import write_report
-from crosscue.eval.score_pose import summary as pose_summary
-from crosscue.eval.score_pose import truth_track
-from crosscue.eval.score_run import FOLDER, judge_run, metrics_of, scores_of, write_scores
-from crosscue.eval.score_summary import summary
+from crosscue.eval.report.page import write_report
+from crosscue.eval.report.summary import summary
+from crosscue.eval.scoring.pose.score import summary as pose_summary
+from crosscue.eval.scoring.pose.score import truth_track
+from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of, write_scores
 from crosscue.replay.errors import UsageError
+from crosscue.replay.files.run_folder import create
 from crosscue.replay.log import EVERYTHING, open_log
-from crosscue.replay.run_folder import create
-from crosscue.replay.vehicle import load
+from crosscue.replay.vehicle.vehicle import load
 
-from .common import print_json
 from .replay import Progress
 from .replay import summary as replay_summary
 
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _settings(args: argparse.Namespace) -> SceneSettings:
-    from crosscue.datasets.scenes.camera import Camera
+    from crosscue.datasets.scenes.rendering.camera import Camera
 
     if not 64 <= args.width <= 3840 or args.width % 16:
         raise UsageError(f"--width {args.width}: want a multiple of 16 from 64 to 3840")

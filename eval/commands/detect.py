@@ -14,15 +14,20 @@ import sys
 from pathlib import Path
 
 from crosscue.detectors.registry import known
-from crosscue.eval.detect_stage import DetectOutcome, detect_drive
-from crosscue.eval.plain_text import visible
-from crosscue.eval.run_account import account_lines
+from crosscue.eval.commands.shared.options import (
+    add_log_arguments,
+    limits_of,
+    print_json,
+    selection_of,
+)
+from crosscue.eval.pipeline.detect import DetectOutcome, detect_drive
+from crosscue.eval.pipeline.run_account import account_lines
 from crosscue.replay.errors import UsageError
+from crosscue.replay.files.run_folder import create
 from crosscue.replay.log import open_logs
-from crosscue.replay.run_folder import create
-from crosscue.replay.vehicle import Vehicle, load
+from crosscue.replay.safe_text import visible
+from crosscue.replay.vehicle.vehicle import Vehicle, load
 
-from .common import add_log_arguments, limits_of, print_json, selection_of
 from .replay import Progress, add_detector_arguments, cache_of, detectors_of
 
 

@@ -12,11 +12,11 @@ import argparse
 import sys
 from pathlib import Path
 
-from crosscue.eval.estimate_run import estimate_run
-from crosscue.eval.merge_runs import open_one
-from crosscue.replay.vehicle import load
+from crosscue.eval.batch.merge import open_one
+from crosscue.eval.commands.shared.options import add_logs_argument, print_json
+from crosscue.eval.pipeline.reestimate import estimate_run
+from crosscue.replay.vehicle.vehicle import load
 
-from .common import add_logs_argument, print_json
 from .replay import Progress, as_json, summary
 
 

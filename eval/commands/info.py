@@ -15,7 +15,15 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import Enum
 
-from crosscue.eval.log_summary import (
+from crosscue.eval.commands.shared.options import (
+    add_limit_arguments,
+    limits_of,
+    print_json,
+    with_progress,
+)
+from crosscue.replay.columns import Block
+from crosscue.replay.log import open_logs
+from crosscue.replay.log_summary import (
     LogSummary,
     Together,
     TopicSummary,
@@ -25,11 +33,7 @@ from crosscue.eval.log_summary import (
     summarise,
     together,
 )
-from crosscue.eval.plain_text import table, terminal_width, visible, wrapped
-from crosscue.replay.columns import Block
-from crosscue.replay.log import open_logs
-
-from .common import add_limit_arguments, limits_of, print_json, with_progress
+from crosscue.replay.safe_text import table, terminal_width, visible, wrapped
 
 LOSSES_SHOWN = 10
 

@@ -13,12 +13,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.eval.merge_runs import gathered, merge_runs
-from crosscue.eval.plain_text import visible
+from crosscue.eval.batch.merge import gathered, merge_runs
+from crosscue.eval.commands.shared.options import print_json
 from crosscue.replay.errors import RunError
-from crosscue.replay.run_folder import create
-
-from .common import print_json
+from crosscue.replay.files.run_folder import create
+from crosscue.replay.safe_text import visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

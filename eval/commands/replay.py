@@ -25,12 +25,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from crosscue.detectors.registry import Choice, chosen
-from crosscue.eval.accounts import versions
-from crosscue.eval.detect_stage import choices_of
-from crosscue.eval.drive_list import DriveInput, DriveList, drives_of
-from crosscue.eval.estimate_stage import Outcome
-from crosscue.eval.landmark_stage import matcher_for, open_for
-from crosscue.eval.many_drives import (
+from crosscue.eval.batch.drive_list import DriveInput, DriveList, drives_of
+from crosscue.eval.batch.jobs import (
     Done,
     Engine,
     Job,
@@ -39,19 +35,28 @@ from crosscue.eval.many_drives import (
     fingerprint_of,
     run_many,
 )
-from crosscue.eval.many_drives import Progress as DrivesDone
-from crosscue.eval.merge_runs import FOLDER, gathered, merge_runs
-from crosscue.eval.plain_text import terminal_width, visible, wrapped
-from crosscue.eval.replay_drive import Detecting, replay_drive
-from crosscue.eval.run_account import account_lines
-from crosscue.eval.scene_stage import ApproachSummary, SceneOutcome
-from crosscue.eval.worker_pool import Processes
+from crosscue.eval.batch.jobs import Progress as DrivesDone
+from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
+from crosscue.eval.batch.processes import Processes
+from crosscue.eval.commands.shared.options import (
+    add_part_arguments,
+    first_ns,
+    limits_of,
+    print_json,
+    selection_of,
+)
+from crosscue.eval.pipeline.accounts import versions
+from crosscue.eval.pipeline.detect import choices_of
+from crosscue.eval.pipeline.estimate import Outcome
+from crosscue.eval.pipeline.landmarks import matcher_for, open_for
+from crosscue.eval.pipeline.replay import Detecting, replay_drive
+from crosscue.eval.pipeline.run_account import account_lines
+from crosscue.eval.pipeline.scene import ApproachSummary, SceneOutcome
 from crosscue.replay.errors import CrosscueError, UsageError
+from crosscue.replay.files.run_folder import create
 from crosscue.replay.log import open_logs
-from crosscue.replay.run_folder import create
-from crosscue.replay.vehicle import Vehicle, load
-
-from .common import add_part_arguments, first_ns, limits_of, print_json, selection_of
+from crosscue.replay.safe_text import terminal_width, visible, wrapped
+from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -245,7 +250,7 @@ def engine_of(workers: int | None, ray: str | None) -> Engine:
     if workers is not None and workers < 1:
         raise UsageError(f"--workers {workers}: want 1 or more")
     if ray is not None:
-        from crosscue.eval.ray_drives import OnRay
+        from crosscue.eval.batch.ray_jobs import OnRay
 
         return OnRay(ray, workers)
     return Processes(workers or 1)

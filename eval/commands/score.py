@@ -25,7 +25,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from crosscue.eval.attribution import (
+from crosscue.eval.catalog.find_runs import runs_of
+from crosscue.eval.commands.shared.options import (
+    add_logs_argument,
+    metres,
+    print_json,
+    with_progress,
+)
+from crosscue.eval.pipeline.run_account import account_lines
+from crosscue.eval.report.junit import write_junit
+from crosscue.eval.report.page import REPORT, write_report
+from crosscue.eval.report.score_runs import Failed, Scored, ScoreWork, score_runs
+from crosscue.eval.report.summary import gate_lines, headline, summary, told_line
+from crosscue.eval.scoring.drives import DEFAULTS, Scores, ScoreSettings
+from crosscue.eval.scoring.gates import Gate, GateResult, check_gates, load_gates
+from crosscue.eval.scoring.metric_values import metric_values
+from crosscue.eval.scoring.pose.score import summary as pose_summary
+from crosscue.eval.scoring.pose.smoother import told
+from crosscue.eval.scoring.runs import FOLDER, metrics_of, scores_of, write_scores
+from crosscue.eval.studies.attribution import (
     Attribution,
     Drive,
     attribute,
@@ -33,23 +51,9 @@ from crosscue.eval.attribution import (
     attribution_tree,
     estimate_of,
 )
-from crosscue.eval.gates import Gate, GateResult, check_gates, load_gates
-from crosscue.eval.junit import write_junit
-from crosscue.eval.metric_values import metric_values
-from crosscue.eval.plain_text import visible
-from crosscue.eval.report_page import REPORT, write_report
-from crosscue.eval.run_account import account_lines
-from crosscue.eval.run_list import runs_of
-from crosscue.eval.score_drives import DEFAULTS, Scores, ScoreSettings
-from crosscue.eval.score_many import Failed, Scored, ScoreWork, score_runs
-from crosscue.eval.score_pose import summary as pose_summary
-from crosscue.eval.score_run import FOLDER, metrics_of, scores_of, write_scores
-from crosscue.eval.score_summary import gate_lines, headline, summary, told_line
-from crosscue.eval.smooth_pose import told
 from crosscue.replay.errors import UsageError, one_line
-from crosscue.replay.run_folder import locked
-
-from .common import add_logs_argument, metres, print_json, with_progress
+from crosscue.replay.files.run_folder import locked
+from crosscue.replay.safe_text import visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -19,14 +19,13 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
-from crosscue.datasets.scenes.camera import Camera
 from crosscue.datasets.scenes.drive import SceneFiles, SceneSettings, write_scene
+from crosscue.datasets.scenes.export.contact_sheet import contact_sheet, sheet_jpeg
 from crosscue.datasets.scenes.layout import SCORED
-from crosscue.datasets.scenes.sheet import contact_sheet, sheet_jpeg
+from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.eval.commands.shared.options import print_json, with_progress
 from crosscue.replay.errors import OutputError, UsageError
-from crosscue.replay.run_folder import write_bytes
-
-from .common import print_json, with_progress
+from crosscue.replay.files.run_folder import write_bytes
 
 PUBLISHED_RUNS = 10
 

@@ -16,15 +16,14 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from crosscue.eval.merge_runs import open_one
+from crosscue.eval.batch.merge import open_one
+from crosscue.eval.commands.shared.options import add_logs_arguments
+from crosscue.eval.pipeline.run_account import is_whole
 from crosscue.eval.recording import TruthTrack, save
-from crosscue.eval.run_account import is_whole
-from crosscue.eval.score_pose import truth_track
-from crosscue.eval.score_truth import TrueRanges, load
+from crosscue.eval.scoring.pose.score import truth_track
+from crosscue.eval.scoring.truth import TrueRanges, load
 from crosscue.replay.errors import CrosscueError, UsageError
-from crosscue.replay.run_folder import RunFolder
-
-from .common import add_logs_arguments
+from crosscue.replay.files.run_folder import RunFolder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crosscue.eval.score_truth import TrueRanges
-from crosscue.eval.stored_pictures import StoredCamera, camera_of
+from crosscue.eval.pipeline.stored_images import StoredCamera, camera_of
+from crosscue.eval.scoring.pose.truth_track import TruthTrack
+from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.columns import Floats
-from crosscue.replay.run_folder import RunFolder, write_whole
-from crosscue.replay.vehicle import of_manifest
-
-from .truth import TruthTrack
+from crosscue.replay.files.run_folder import RunFolder, write_whole
+from crosscue.replay.vehicle.vehicle import of_manifest
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -106,8 +105,8 @@ def _log_all(
 def _log_marks(
     recording: rr.RecordingStream, time: DriveTime, run: RunFolder, manifest: Mapping[str, Any]
 ) -> None:
-    from crosscue.eval.estimate_stage import detected_part
-    from crosscue.eval.stored_frames import stored_frames
+    from crosscue.eval.pipeline.estimate import detected_part
+    from crosscue.eval.pipeline.stored_frames import stored_frames
 
     from .marks import FRAMES_HELD, Marks, log_styles
 

@@ -12,13 +12,13 @@ from typing import Final
 import numpy as np
 import rerun as rr
 
-from crosscue.eval.mobileye_tables import StoredMobileye
-from crosscue.eval.score_truth import TrueRanges
+from crosscue.eval.pipeline.mobileye_tables import StoredMobileye
+from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.columns import Floats
+from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.mobileye.geometry import evaluate
 from crosscue.replay.mobileye.samples import LANE_COLUMNS, OBSTACLE_COLUMNS
-from crosscue.replay.run_folder import RunFolder
-from crosscue.replay.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .colours import END, ESTIMATE, FAINT, LANE, QUIET, START, TRUTH, VEHICLE
 from .columns import Shapes, boxes, labelled_strips, points, strips

@@ -8,8 +8,8 @@ from typing import Final
 import rerun as rr
 
 from crosscue.detectors.base import View
-from crosscue.detectors.pictures import Encoded, decode, encoded
-from crosscue.eval.stored_pictures import StoredCamera, read_pictures
+from crosscue.detectors.images import Encoded, decode, encoded
+from crosscue.eval.pipeline.stored_images import StoredCamera, read_pictures
 from crosscue.replay.columns import Block, Images
 from crosscue.replay.errors import LogError
 

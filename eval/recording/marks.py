@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, RoadMask
-from crosscue.detectors.cars import (
+from crosscue.detectors.cues.cars import (
     CarShapes,
     Pairs,
     car_shapes,
@@ -24,10 +24,10 @@ from crosscue.detectors.cars import (
     pair_cars,
     parked_cars,
 )
-from crosscue.detectors.road import RoadShares, road_shares
-from crosscue.eval.stored_frames import StoredFrame
+from crosscue.detectors.cues.road import RoadShares, road_shares
+from crosscue.eval.pipeline.stored_frames import StoredFrame
 from crosscue.replay.columns import Floats
-from crosscue.replay.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .columns import Colour, Shapes, arrows, boxes, labelled_strips, strips
 from .drive_time import DriveTime

@@ -8,8 +8,8 @@ from typing import Final
 
 import rerun as rr
 
-from crosscue.eval.plain_text import visible
-from crosscue.replay.run_folder import RunFolder
+from crosscue.replay.files.run_folder import RunFolder
+from crosscue.replay.safe_text import visible
 
 COLOURS: Final = (
     "- camera: cars blue, stop signs red, traffic lights yellow, sign windows magenta, what is "

@@ -8,13 +8,13 @@ from typing import Final
 import numpy as np
 import rerun as rr
 
+from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.replay.columns import Floats, Int64s
 
 from .colours import ELLIPSE, END, ESTIMATE, LANDMARK, START, TRUTH
 from .columns import Shapes, strips_above
 from .drive_time import DriveTime
 from .scene_rows import SceneRows
-from .truth import TruthTrack
 
 PATH_POINTS: Final = 20_000
 ELLIPSES_PER_S: Final = 5.0

@@ -11,10 +11,10 @@ import pyarrow.compute as pc
 import rerun as rr
 from numpy.typing import NDArray
 
-from crosscue.eval.log_time import LABELS
-from crosscue.eval.score_truth import TrueRanges
+from crosscue.eval.pipeline.log_time import LABELS
+from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .colours import END, QUIET, START, TRUTH, of_feature
 from .columns import Colour

@@ -20,7 +20,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.bounded import read_at_most
+from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.limits import MIB
 
 from .layout import CanMessage, CanSignal

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.bounded import read_at_most
 from crosscue.replay.errors import LogTooLargeError, SchemaError
+from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.limits import Limits
 
 _MOST_BITS: Final = 8 * 2048

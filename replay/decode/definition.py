@@ -15,7 +15,7 @@ from typing import Final
 
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.roles import ros2_spelling
+from crosscue.replay.vehicle.roles import ros2_spelling
 
 PRIMITIVES: Final[Mapping[str, str]] = {
     "bool": "u1",

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import Block, Messages, Table, Topic
 from crosscue.replay.errors import SchemaError, one_line
+from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT
-from crosscue.replay.tree_text import json_tree
 
 from .coding import MAGIC_BYTES
 from .foxglove import PICTURES, TABLES, Picture, Source

@@ -11,7 +11,7 @@ import numpy as np
 from crosscue.replay.columns import Block, Messages, Topic
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.roles import ros2_spelling
+from crosscue.replay.vehicle.roles import ros2_spelling
 
 from .definition import Definitions, definitions_of, well_known
 from .fields import Fields, Part, WalkedFields

@@ -9,7 +9,7 @@ from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.definition import definitions_of
 from crosscue.replay.decode.ros import RosDecoder
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.roles import ros2_spelling
+from crosscue.replay.vehicle.roles import ros2_spelling
 
 from .can import can_messages
 from .definitions import completed, standard_text

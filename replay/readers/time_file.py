@@ -28,9 +28,9 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.bounded import read_at_most
 from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import LogFormatError, LogTooLargeError
+from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.limits import Limits
 
 NAMES: Final = ("timestamps.txt", "times.txt", "rgb.txt")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from crosscue.replay.clocks import ClockReport, ClockWatch
+from crosscue.replay.clocks.reports import ClockReport, ClockWatch
 from crosscue.replay.columns import Block, Int64s, Table
 
 SECOND_NS = 1_000_000_000

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from crosscue.eval.many_drives import Job
-from crosscue.eval.run_account import account, line
+from crosscue.eval.batch.jobs import Job
+from crosscue.eval.pipeline.run_account import account, line
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.run_folder import TableSink, clear, create, locked, write_manifest
+from crosscue.replay.files.run_folder import TableSink, clear, create, locked, write_manifest
 
 SCHEMA = pa.schema([("t_ns", pa.int64()), ("letter", pa.string())])
 

@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from crosscue.detectors.cue_names import Cue
+from crosscue.detectors.cues.names import Cue
 from crosscue.fusion.annotated_approach import AnnotatedApproach
 from crosscue.fusion.approaches import FrameEvidence, SignRange
 from crosscue.fusion.belief import Situation

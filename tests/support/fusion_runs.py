@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from crosscue.datasets.truth import Approach, Features, Truth, save
-from crosscue.eval import measurements
-from crosscue.eval.scene_stage import schemas
+from crosscue.datasets.truth.truth import Approach, Features, Truth, save
+from crosscue.eval.pipeline import measurements
+from crosscue.eval.pipeline.scene import schemas
 from crosscue.fusion.approaches import Approaches, FrameEvidence, Step
 from crosscue.fusion.factor_graph import graph_of
-from crosscue.replay.run_folder import RunFolder, TableSink, create, write_manifest
-from crosscue.replay.vehicle import Vehicle
+from crosscue.replay.files.run_folder import RunFolder, TableSink, create, write_manifest
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .fusion import NONE_SEEN, SECOND_NS, sign
 

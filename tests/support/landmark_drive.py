@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from crosscue.localization.ekf import PoseBelief
-from crosscue.localization.landmark_database import LandmarkDatabase, LandmarkWriter, Place
-from crosscue.localization.landmark_features import Features, Match
-from crosscue.localization.landmark_update import LandmarkSearch, LandmarkSettings
+from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
+from crosscue.localization.landmarks.features import Features, Match
+from crosscue.localization.landmarks.update import LandmarkSearch, LandmarkSettings
 from crosscue.replay.columns import Bytes, Floats
 from support.simulated_drive import Truth
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from crosscue.localization.landmark_database import LandmarkWriter, Place
-from crosscue.localization.landmark_features import CameraGeometry, Features, Match
+from crosscue.localization.landmarks.database import LandmarkWriter, Place
+from crosscue.localization.landmarks.features import CameraGeometry, Features, Match
 from crosscue.replay.columns import Bytes, Floats
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from crosscue.detectors.base import Frame
-from crosscue.detectors.mask_rcnn_checkpoint import Checkpoint, Facts
-from crosscue.detectors.mask_rcnn_network import Plan, build_network
+from crosscue.detectors.networks.mask_rcnn.checkpoint import Checkpoint, Facts
+from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network
 from crosscue.replay.columns import Bytes
 
 CLASSES: Final = ("car", "stop sign", "traffic light")

@@ -16,7 +16,7 @@ from crosscue.replay.columns import Messages
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import EVERYTHING, Selection
-from crosscue.replay.readers.mcap import open_mcap
+from crosscue.replay.readers.mcap.reader import open_mcap
 
 MAGIC = b"\x89MCAP0\r\n"
 Message: TypeAlias = tuple[int, int, bytes]

@@ -10,14 +10,14 @@ import numpy as np
 import pyarrow as pa
 
 from crosscue.detectors import rle
-from crosscue.eval.detect_stage import schemas
-from crosscue.eval.pose_tables import pose_schema
-from crosscue.eval.run_account import line
+from crosscue.eval.pipeline.detect import schemas
+from crosscue.eval.pipeline.pose_tables import pose_schema
+from crosscue.eval.pipeline.run_account import line
 from crosscue.replay.columns import Block, Images, Messages, Topic
+from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.run_folder import RunFolder
-from crosscue.replay.vehicle import Vehicle
-from crosscue.replay.writing import LogWriter
+from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.write.convert import LogWriter
 
 from .scoring import (
     BELIEF,

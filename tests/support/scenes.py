@@ -8,12 +8,12 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.datasets.scenes.camera import Camera
 from crosscue.datasets.scenes.conditions import conditions_of
-from crosscue.datasets.scenes.ground import Ground
 from crosscue.datasets.scenes.layout import layout_named
-from crosscue.datasets.scenes.mesh import Mesh
-from crosscue.datasets.scenes.render import Picture, PictureSettings, Renderer
+from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.ground import Ground
+from crosscue.datasets.scenes.rendering.mesh import Mesh
+from crosscue.datasets.scenes.rendering.render import Picture, PictureSettings, Renderer
 from crosscue.datasets.scenes.world import Thing, World, build
 
 SMALL: Final = Camera(width_px=384, height_px=216)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from crosscue.detectors.sign_drawings import MARGIN_PX, Kind, draw
+from crosscue.detectors.signs.templates import MARGIN_PX, Kind, draw
 from crosscue.replay.columns import Bytes, Floats
 
 

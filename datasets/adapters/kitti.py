@@ -1,0 +1,356 @@
+"""KITTI: a raw drive, or one sequence of the tracking set, as a log; its truth from the INS.
+
+A raw drive has folders ``image_00`` to ``image_03`` and ``oxts``, each with ``data/`` (one file a
+row) and ``timestamps.txt`` (UTC date-times to the nanosecond). The tracking set keeps one line of
+``oxts/SEQ.txt`` and one picture ``image_0x/SEQ/NNNNNN.png`` for every frame, and no times: they are
+made from the frame number at 10 Hz, which is told.
+
+Topics: one per camera folder; from the OXTS box ``oxts/imu``, ``oxts/gnss`` and ``oxts/ins_speed``.
+All of the box's numbers come from one filter: ``ins_speed`` is no wheel speed, and ``gnss`` is no
+raw fix.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.datasets.geodesy import geodetic_to_enu
+from crosscue.datasets.truth.truth import Origin, Truth, save
+from crosscue.datasets.truth.tum import Trajectory, write_tum
+from crosscue.replay.columns import Block, Int64s, Table, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.readers.images.files import SUFFIXES, PictureFiles
+from crosscue.replay.readers.time_file import read_time_file
+from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files, pair
+
+from .kitti_oxts import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse
+
+POSE_FILE: Final = "pose.tum"
+TRACKING_PERIOD_NS: Final = 100_000_000
+ROWS_PER_BLOCK: Final = 100
+FRAMES_FOR_PERIOD: Final = 10_000
+Unreadable: TypeAlias = tuple[str, str, int | None, str]
+"""Topic, reason, count and detail of a stream that cannot be read."""
+
+Line: TypeAlias = tuple[str, int, bytes | str]
+"""Place, time and bytes of a packet; a text in place of bytes says why there are none."""
+
+TOPICS: Final[dict[str, tuple[str, Callable[[Packets], Table]]]] = {
+    "oxts/imu": ("sensor_msgs/msg/Imu", lambda packets: packets.table(IMU)),
+    "oxts/gnss": ("sensor_msgs/msg/NavSatFix", lambda packets: packets.gnss()),
+    "oxts/ins_speed": ("crosscue/Table", lambda packets: packets.table(INS_SPEED)),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Oxts:
+    """The box's packets as they lie on disk: one file each, or one line each of one file.
+
+    Attributes:
+        files: One file a packet, and times; for a single file, times of its lines.
+        single: The one file, or None.
+    """
+
+    files: TimedFiles
+    single: Path | None = None
+
+    def lines(self) -> Iterator[Line]:
+        """Every packet in stored order."""
+        if self.single is not None:
+            yield from self._lines_of(self.single)
+            return
+        for path, t_ns in zip(self.files.paths, self.files.t_ns.tolist(), strict=True):
+            try:
+                with path.open("rb") as file:
+                    raw: bytes | str = file.read(LINE_BYTES)
+            except OSError as error:
+                raw = error.strerror or str(error)
+            yield path.name, t_ns, raw
+
+    def _lines_of(self, single: Path) -> Iterator[Line]:
+        with single.open("rb") as file:
+            number = 0
+            while raw := file.readline(LINE_BYTES):
+                rest = raw
+                while rest and not rest.endswith(b"\n"):
+                    rest = file.readline(LINE_BYTES)
+                yield f"{single.name} line {number + 1}", number * TRACKING_PERIOD_NS, raw
+                number += 1
+
+
+class Drive(Closing):
+    """One drive as a ``Log``."""
+
+    format: Final = "kitti-raw"
+
+    def __init__(
+        self,
+        path: Path,
+        cameras: Sequence[PictureFiles],
+        oxts: Oxts | None,
+        unreadable: Sequence[Unreadable],
+        notices: Sequence[str],
+        limits: Limits,
+    ) -> None:
+        """Put a drive together; ``unreadable`` holds arguments for ``Ledger.drop``."""
+        self.path: Final = path
+        self._cameras: Final = tuple(cameras)
+        self._oxts: Final = oxts
+        self._unreadable: Final = tuple(unreadable)
+        self._notices: Final = tuple(notices)
+        self._limits: Final = limits
+
+    @property
+    def oxts(self) -> Oxts | None:
+        """The box's packets, or None where there are none with times."""
+        return self._oxts
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """Cameras, then what the box gives."""
+        cameras = tuple(camera.topic for camera in self._cameras)
+        if self._oxts is None:
+            return cameras
+        declared = self._oxts.files.declared
+        return cameras + tuple(
+            Topic(name, type_name, "columns", declared=declared)
+            for name, (type_name, _) in TOPICS.items()
+        )
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """All streams side by side, in order of each block's first time; see ``Log.read``."""
+        for sentence in self._notices:
+            ledger.notice(sentence)
+        for loss in self._unreadable:
+            ledger.drop(*loss)
+        streams = [camera.read(ledger, selection, self._limits) for camera in self._cameras]
+        if self._oxts is not None:
+            streams.append(_read_oxts(self._oxts, ledger, selection))
+        yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
+        ledger.integrity = "; ".join(
+            part
+            for part in (
+                ledger.integrity if ledger.integrity != "not checked" else "",
+                "OXTS text has no checksum" if self._oxts is not None else "",
+            )
+            if part
+        )
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def open_drive(path: Path, limits: Limits) -> Drive:
+    """Open a drive's folder; see ``crosscue.replay.log.FORMATS``.
+
+    Raises:
+        LogFormatError: No stream with times, or several sequences in one folder.
+    """
+    if (path / "oxts" / "data").is_dir() or (path / "oxts" / "timestamps.txt").is_file():
+        return _open_raw(path, limits)
+    return _open_tracking(path, limits)
+
+
+def write_truth(path: Path, folder: Path) -> Path:
+    """Write the INS's track of a drive, relative to its first position.
+
+    Raises:
+        LogFormatError: Fewer than two packets with times.
+        OutputError: It cannot be written.
+    """
+    oxts = open_drive(path, DEFAULT).oxts
+    packets = _in_time_order(_packets(list(oxts.lines()))) if oxts is not None else None
+    if packets is None or len(packets) < 2:
+        raise LogFormatError(f"{path}/oxts: fewer than two packets; the drive carries no truth")
+    latitude, longitude, altitude = (float(packets[name][0]) for name in ("lat", "lon", "alt"))
+    xyz_m = geodetic_to_enu(
+        packets["lat"], packets["lon"], packets["alt"], (latitude, longitude, altitude)
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    note = "KITTI OXTS: the GNSS/INS box in a local frame, x east, y north, z up"
+    write_tum(folder / POSE_FILE, Trajectory(packets.t_ns, xyz_m, packets.attitude_wxyz()), note)
+    truth = Truth(
+        version=1,
+        log=path.resolve().name,
+        start_ns=int(packets.t_ns[0]),
+        end_ns=int(packets.t_ns[-1]) + 1,
+        pose=POSE_FILE,
+        pose_point="rear_axle",
+        origin=Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude),
+        source=(
+            "KITTI: OXTS RT3003 GNSS/INS; the box's own position, taken for the rear axle; "
+            f"it claims {float(np.median(packets['pos_accuracy'])):.2g} m"
+        ),
+    )
+    return save(truth, folder)
+
+
+def _open_raw(path: Path, limits: Limits) -> Drive:
+    cameras: list[PictureFiles] = []
+    unreadable: list[Unreadable] = []
+    for folder in sorted(path.glob("image_[0-9][0-9]")):
+        files = _timed(folder, SUFFIXES, folder.name, unreadable, limits)
+        if files is not None:
+            topic = Topic(folder.name, "crosscue/Images", "columns", declared=files.declared)
+            cameras.append(PictureFiles(topic, files))
+    lost: list[Unreadable] = []
+    packets = _timed(path / "oxts", (".txt",), "oxts", lost, limits)
+    unreadable += [(name, *loss[1:]) for loss in lost for name in TOPICS]
+    if not cameras and packets is None:
+        why = unreadable[0][3] if unreadable else "no image_0x and no oxts with files in data/"
+        raise LogFormatError(f"{path}: no stream of a KITTI raw drive can be read: {why}")
+    notices = ["velodyne_points: laser scans are not read"]
+    return Drive(
+        path,
+        cameras,
+        None if packets is None else Oxts(packets),
+        unreadable,
+        notices if (path / "velodyne_points").is_dir() else [],
+        limits,
+    )
+
+
+def _timed(
+    folder: Path, suffixes: Sequence[str], topic: str, unreadable: list[Unreadable], limits: Limits
+) -> TimedFiles | None:
+    """The files of one stream with times; else None, and why is added to ``unreadable``."""
+    time_file = folder / "timestamps.txt"
+    paths = list_files(folder / "data", suffixes) if (folder / "data").is_dir() else []
+    if not time_file.is_file():
+        if paths:
+            why = f"{folder.name}/timestamps.txt is missing; put it back"
+            unreadable.append((topic, "rows without times", len(paths), why))
+        return None
+    try:
+        times = read_time_file(time_file, limits)
+        if paths:
+            return pair(paths, times)
+    except LogFormatError as error:
+        unreadable.append((topic, "times cannot be read", len(paths) or None, str(error)))
+        return None
+    why = f"{folder.name}/data holds no file"
+    unreadable.append((topic, "a time without its file", len(times.t_ns), why))
+    return None
+
+
+def _open_tracking(path: Path, limits: Limits) -> Drive:
+    singles = sorted((path / "oxts").glob("*.txt"))
+    if len(singles) != 1:
+        raise LogFormatError(
+            f"{path}/oxts: {len(singles)} sequences; want a folder with one of them, "
+            "or a raw drive with oxts/timestamps.txt"
+        )
+    name = singles[0].stem
+    cameras = []
+    for folder in sorted(path.glob(f"image_[0-9][0-9]/{name}")):
+        paths = list_files(folder, SUFFIXES)
+        if paths:
+            topic = Topic(folder.parent.name, "crosscue/Images", "columns")
+            t_ns = np.array([_frame_ns(path.stem) for path in paths], dtype=np.int64)
+            files = TimedFiles(tuple(paths), t_ns, _no_times(), None, ())
+            cameras.append(PictureFiles(topic, files))
+    oxts = Oxts(TimedFiles((), _no_times(), _no_times(), None, ()), singles[0])
+    notice = (
+        f"{name}: the tracking set keeps no times; they are made from frame numbers at "
+        f"{1e9 / TRACKING_PERIOD_NS:g} Hz, starting at 0"
+    )
+    if (period_s := _driven_period_s(oxts)) is not None:
+        notice += f" (distance over speed says {period_s * 1e3:.1f} ms a frame)"
+    return Drive(path, cameras, oxts, [], [notice], limits)
+
+
+def _driven_period_s(oxts: Oxts) -> float | None:
+    """Time between frames that makes the box's speeds add up to the way between its positions."""
+    packets = _packets(list(islice(oxts.lines(), FRAMES_FOR_PERIOD)))
+    if len(packets) < 2:
+        return None
+    origin = (float(packets["lat"][0]), float(packets["lon"][0]), float(packets["alt"][0]))
+    enu_m = geodetic_to_enu(packets["lat"], packets["lon"], packets["alt"], origin)
+    way_m = float(np.hypot(*np.diff(enu_m[:, :2], axis=0).T).sum())
+    speed_mps = np.hypot(packets["ve"], packets["vn"])
+    speeds_mps = float((speed_mps[1:] + speed_mps[:-1]).sum()) / 2.0
+    return way_m / speeds_mps if speeds_mps > len(packets) else None
+
+
+def _frame_ns(stem: str) -> int:
+    """Time of a numbered frame, or -1 for a name that is no number."""
+    is_number = stem.isascii() and stem.isdecimal() and len(stem) <= 9
+    return int(stem) * TRACKING_PERIOD_NS if is_number else -1
+
+
+def _read_oxts(oxts: Oxts, ledger: Ledger, selection: Selection) -> Iterator[Block]:
+    for name in TOPICS:
+        ledger.declare(name, oxts.files.declared)
+    for sentence in oxts.files.notices:
+        ledger.notice(sentence)
+    lines = oxts.lines()
+    while some := list(islice(lines, ROWS_PER_BLOCK)):
+        packets = _packets(some)
+        wanted = is_inside(packets.t_ns, selection) & (packets.t_ns >= 0)
+        for name in TOPICS:
+            _account(name, some, packets, wanted, ledger, selection)
+        for name, (_, to_table) in TOPICS.items():
+            if wanted.any() and selection.wants(name):
+                yield Block(name, packets.t_ns, to_table(packets)).take(wanted)
+    missing = oxts.files.missing_ns[is_inside(oxts.files.missing_ns, selection)]
+    for name in TOPICS:
+        ledger.drop(name, "a time without its packet", len(missing))
+        if selection.start_ns is None and selection.end_ns is None:
+            ledger.settle(name)
+
+
+def _account(
+    name: str,
+    some: Sequence[Line],
+    packets: Packets,
+    wanted: NDArray[np.bool_],
+    ledger: Ledger,
+    selection: Selection,
+) -> None:
+    """Book one stretch of packets for one topic."""
+    n = len(packets)
+    ledger.find(name, n)
+    if not selection.wants(name):
+        ledger.skip(name, NOT_ASKED_TOPIC, n)
+    else:
+        timeless = int(np.count_nonzero(packets.t_ns < 0))
+        ledger.skip(name, "a packet without its time", timeless)
+        ledger.skip(name, NOT_ASKED_TIME, n - timeless - int(np.count_nonzero(wanted)))
+    for place, t_ns, raw in some:
+        why = raw if isinstance(raw, str) else parse(raw)
+        if isinstance(why, str):
+            ledger.drop(name, "not an OXTS packet", 1, f"{place}: {why}", t_ns)
+
+
+def _packets(some: Sequence[Line]) -> Packets:
+    """Those lines that are packets."""
+    good = [
+        (t_ns, row)
+        for _, t_ns, raw in some
+        if not isinstance(raw, str) and not isinstance(row := parse(raw), str)
+    ]
+    rows = np.array([row for _, row in good], dtype=np.float64).reshape(-1, len(COLUMNS))
+    return Packets(np.array([t_ns for t_ns, _ in good], dtype=np.int64), rows)
+
+
+def _in_time_order(packets: Packets) -> Packets:
+    """Packets with times, each time once."""
+    _, first = np.unique(packets.t_ns, return_index=True)
+    first = first[packets.t_ns[first] >= 0]
+    return Packets(packets.t_ns[first], packets.numbers[first])
+
+
+def _no_times() -> Int64s:
+    return np.zeros(0, dtype=np.int64)

@@ -1,0 +1,55 @@
+"""Road pictures of one's own: ``images/NAME.jpg`` with ``masks/NAME.png``, white where road is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.datasets.scenes.export.road_frames import RoadFrames, shrunk
+from crosscue.detectors.base import View
+from crosscue.detectors.images import decode, read_file
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import LogError, UsageError
+
+SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
+
+
+def load_folder(folder: Path, size_px: tuple[int, int]) -> RoadFrames:
+    """All pictures of a folder that have a mask, by name.
+
+    Args:
+        folder: With ``images`` and ``masks``.
+        size_px: Width and height wanted.
+
+    Raises:
+        UsageError: No pictures, one without a mask, or of another size than its mask, or one that
+            does not decode.
+    """
+    images = sorted(
+        path for path in (folder / "images").glob("*") if path.suffix.lower() in SUFFIXES
+    )
+    if not images:
+        raise UsageError(f"{folder / 'images'}: no pictures; want {', '.join(SUFFIXES)}")
+    pixels, road = [], []
+    for path in images:
+        picture = _decoded(path, View())
+        mask = _decoded(folder / "masks" / f"{path.stem}.png", View(is_grey=True))
+        if mask.shape != picture.shape[:2]:
+            raise UsageError(
+                f"{path}: {picture.shape[1]} x {picture.shape[0]} pixels, but its mask has "
+                f"{mask.shape[1]} x {mask.shape[0]}; make them alike"
+            )
+        pixels.append(shrunk(picture, size_px))
+        road.append(shrunk(np.where(mask > 127, 255, 0).astype(np.uint8), size_px))
+    return RoadFrames(np.stack(pixels), np.stack(road))
+
+
+def _decoded(path: Path, view: View) -> Bytes:
+    try:
+        return decode(read_file(path), view)[0]
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}; every picture wants its mask") from None
+    except LogError as error:
+        raise UsageError(f"{path}: {error}; mend it or take it out") from None

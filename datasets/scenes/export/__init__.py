@@ -1,0 +1,1 @@
+"""What simulated scenes are written as: COCO, road masks, contact sheets."""

@@ -1,0 +1,62 @@
+"""Labelled objects of a drive as a COCO file, images by ``t_ns``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from crosscue.datasets.scenes.cues import LEAST_PIXELS
+from crosscue.datasets.scenes.rendering.render import Picture
+from crosscue.datasets.scenes.world import CATEGORIES
+from crosscue.detectors.rle import encode
+from crosscue.replay.files.run_folder import strict_json, write_text
+
+COCO_IDS: Final = {
+    "car": (3, "car"), "traffic_light": (10, "traffic light"), "stop_sign": (13, "stop sign"),
+    "one_way_left": (101, "one way left"), "one_way_right": (102, "one way right"),
+    "do_not_enter": (103, "do not enter"),
+}  # fmt: skip
+"""COCO's own numbers and names where COCO has the class."""
+
+
+@dataclass(slots=True)
+class Objects:
+    """Annotations of a drive, picture by picture."""
+
+    images: list[dict[str, Any]] = field(default_factory=list)
+    annotations: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, t_ns: int, picture: Picture, tags: tuple[str, ...], distance_m: float) -> None:
+        """Take in all objects of a picture with enough pixels."""
+        high, wide = picture.owner.shape
+        number = len(self.images) + 1
+        self.images.append({"id": number, "t_ns": t_ns, "file_name": f"{t_ns}.jpg", "width": wide,
+                            "height": high, "tags": list(tags),
+                            "intersection_m": round(distance_m, 3)})  # fmt: skip
+        for seen in picture.seen:
+            area = int(seen.mask.sum())
+            if area < LEAST_PIXELS:
+                continue
+            x0, y0, x1, y1 = seen.box_px
+            counts = encode(seen.mask, (x0, y0), (wide, high)).decode("ascii")
+            self.annotations.append({
+                "id": len(self.annotations) + 1, "image_id": number,
+                "category_id": COCO_IDS[seen.thing.category][0],
+                "bbox": [x0, y0, x1 - x0, y1 - y0], "area": area, "iscrowd": 0,
+                "segmentation": {"size": [high, wide], "counts": counts},
+                "track_id": seen.thing.number, "role": seen.thing.role,
+                "visible": round(seen.visible, 3), "in_picture": round(seen.in_picture, 3),
+                "distance_m": round(seen.distance_m, 3),
+            })  # fmt: skip
+
+    def save(self, path: Path, source: str) -> None:
+        """Write the file.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        categories = [{"id": COCO_IDS[c][0], "name": COCO_IDS[c][1]} for c in CATEGORIES]
+        tree = {"info": {"description": source}, "images": self.images,
+                "annotations": self.annotations, "categories": categories}  # fmt: skip
+        write_text(path, strict_json(tree) + "\n")

@@ -1,0 +1,75 @@
+"""Pictures of simulated intersections with their road pixels, to train road networks on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from crosscue.datasets.scenes.drive import SceneSettings, world_of
+from crosscue.datasets.scenes.rendering.render import Renderer
+from crosscue.replay.columns import Bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoadFrames:
+    """N pictures of one size.
+
+    Attributes:
+        pixels: Shape (N, H, W, 3), uint8, blue, green, red.
+        road: Shape (N, H, W), uint8: 0 to 255, the share of the pixel that is road.
+    """
+
+    pixels: Bytes
+    road: Bytes
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+def joined(parts: Sequence[RoadFrames]) -> RoadFrames:
+    """All frames of several."""
+    return RoadFrames(
+        np.concatenate([p.pixels for p in parts]), np.concatenate([p.road for p in parts])
+    )
+
+
+def frames_of(settings: SceneSettings, count: int, size_px: tuple[int, int]) -> RoadFrames:
+    """Pictures of one run, evenly along the way, a few of them within the intersection.
+
+    Args:
+        settings: The run; its camera should be about twice as wide as wanted.
+        count: How many.
+        size_px: Width and height wanted.
+    """
+    _, conditions, world = world_of(settings)
+    rng = np.random.default_rng([conditions.seed, 13])
+    motion = world.approach.motion
+    last_m = min(0.6 * world.layout.end_m, float(motion.x_m.max()))
+    step_m = (last_m - float(motion.x_m[0])) / count
+    way = motion.x_m[0] + step_m * (np.arange(count) + rng.random(count))
+    renderer = Renderer(world, settings.camera, settings.picture)
+    pixels, road = [], []
+    for number, x_m in enumerate(way.tolist()):
+        t_s = float(np.argmax(motion.x_m >= x_m)) / 100.0
+        picture = renderer.picture(t_s, number, with_road=True)
+        assert picture.road is not None
+        pixels.append(shrunk(np.ascontiguousarray(picture.rgb[..., ::-1]), size_px))
+        road.append(shrunk(np.where(picture.road, 255, 0).astype(np.uint8), size_px))
+    return RoadFrames(np.stack(pixels), np.stack(road))
+
+
+def rendered(
+    runs: Sequence[SceneSettings], count: int, size_px: tuple[int, int]
+) -> Iterator[RoadFrames]:
+    """``frames_of`` for each run."""
+    for settings in runs:
+        yield frames_of(settings, count, size_px)
+
+
+def shrunk(picture: Bytes, size_px: tuple[int, int]) -> Bytes:
+    """At another size, each pixel the mean of those it covers."""
+    import cv2
+
+    return np.asarray(cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,66 @@
+"""Which pixels of a picture show road: the truth that road segmentation is held to.
+
+Road is what cars drive on between the kerbs: the approach, the crossroad, the way ahead, rounded
+corners, with lines, crosswalks and parking lanes. Sidewalks, driveways, parking lots and grass are
+none, nor are pixels of which half or more shows an object that stands on the road or before it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.datasets.scenes.rendering.camera import View
+from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M
+
+SKY_UP = -0.002
+"""Rays that fall less than this share of their length do not meet the ground, as in the picture."""
+
+
+def road_seen(
+    road: NDArray[np.uint8], depth: NDArray[np.float32], samples: int, view: View
+) -> NDArray[np.bool_]:
+    """Road pixels, shape (H, W).
+
+    Args:
+        road: The ground's map of road, 0 or 1, as ``Ground.road``.
+        depth: The samples' buffer of 1/z, 0 where no object is; (H * samples, W * samples).
+        samples: Samples a pixel, across and down.
+        view: The camera.
+    """
+    import cv2
+
+    high, wide = depth.shape[0] // samples, depth.shape[1] // samples
+    ray = _rays(view)
+    up = ray[2]
+    # A ray meets the ground at camera - ray * height / up; times up, that is linear in the pixel.
+    camera, z = view.at_m, float(view.at_m[2])
+    onto = np.stack(
+        [
+            ((camera[0] - X_M[0]) * up - z * ray[0]) * TEXELS_PER_M,
+            ((camera[1] - Y_M[0]) * up - z * ray[1]) * TEXELS_PER_M,
+            up,
+        ]
+    )
+    flat = cv2.warpPerspective(
+        road, onto, (wide, high), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    free = (depth == 0.0).reshape(high, samples, wide, samples).sum(axis=(1, 3), dtype=np.uint8)
+    seen: NDArray[np.bool_] = (flat > 0) & _falls(ray, wide, high) & (2 * free > samples**2)
+    return seen
+
+
+def _rays(view: View) -> NDArray[np.float64]:
+    """Shape (3, 3): from a pixel's column, row, 1 to its ray's direction in the local frame."""
+    f, (cx, cy) = view.camera.focal, view.camera.centre_px
+    lens = np.array([[1 / f, 0.0, (0.5 - cx) / f], [0.0, 1 / f, (0.5 - cy) / f], [0.0, 0.0, 1.0]])
+    ray: NDArray[np.float64] = view.eye_axes.T @ lens
+    return ray
+
+
+def _falls(ray: NDArray[np.float64], wide: int, high: int) -> NDArray[np.bool_]:
+    column, row = np.arange(wide, dtype=np.float32), np.arange(high, dtype=np.float32)[:, None]
+    x, y, z = (k[0] * column + k[1] * row + k[2] for k in ray.astype(np.float32))
+    falls: NDArray[np.bool_] = (z < 0.0) & (z * z > SKY_UP**2 * (x * x + y * y + z * z))
+    return falls

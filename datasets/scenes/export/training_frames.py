@@ -1,0 +1,98 @@
+"""Pictures for training: a few of each of many simulated runs, with their objects as COCO.
+
+Consecutive pictures of a drive hardly differ, so a network learns more from eight pictures of a
+hundred intersections than from a thousand pictures of one.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from crosscue.datasets.scenes.drive import SceneSettings, jpeg, world_of
+from crosscue.datasets.scenes.rendering.render import Renderer
+from crosscue.datasets.scenes.world import World
+from crosscue.datasets.simulated.drive import START_NS
+from crosscue.replay.columns import Floats
+from crosscue.replay.files.run_folder import write_bytes
+
+from .coco import Objects
+
+BEFORE_ENTRY: Final = 0.9
+"""Share of the pictures from before the intersection; the others are from within it."""
+
+
+def times_s(world: World, count: int, rng: np.random.Generator) -> Floats:
+    """When to take pictures: half evenly along the way, half evenly in time, sorted.
+
+    A car that waits at a red light spends most of its time in one place, but others drive by.
+    """
+    motion, enter_s = world.approach.motion, world.approach.enter_s
+    last_s = (len(motion) - 2) / 100.0
+    share = rng.random(count)
+    until_s = np.where(rng.random(count) < BEFORE_ENTRY, min(enter_s, last_s), last_s)
+    step_m = np.abs(motion.speed_mps) * 0.01 + 1e-9
+    way_m = np.concatenate([[0.0], np.cumsum(step_m)[:-1]])
+    at = np.arange(len(motion)) * 0.01
+    by_way = np.interp(share * np.interp(until_s, at, way_m), way_m, at)
+    return np.sort(np.where(rng.random(count) < 0.5, by_way, share * until_s))
+
+
+def frames_of(settings: SceneSettings, count: int, folder: Path) -> Objects:
+    """Render and write ``count`` pictures of one run into ``folder``; gives their annotations.
+
+    Raises:
+        OutputError: A picture cannot be written.
+    """
+    layout, conditions, world = world_of(settings)
+    renderer = Renderer(world, settings.camera, settings.picture)
+    rng = np.random.default_rng([conditions.seed, 12])
+    objects = Objects()
+    for number, t_s in enumerate(times_s(world, count, rng).tolist()):
+        picture = renderer.picture(t_s, number)
+        t_ns = START_NS + round(t_s * 1e9)
+        tags = conditions.tags(layout)
+        objects.add(t_ns, picture, tags, -picture.view.rear_axle[0])
+        name = f"{settings.name}-{number:03d}.jpg"
+        objects.images[-1]["file_name"] = name
+        write_bytes(folder / name, jpeg(picture, settings.picture.jpeg_quality))
+    return objects
+
+
+def frames(
+    runs: Sequence[SceneSettings], count: int, folder: Path, jobs: int = 1
+) -> Iterator[Objects]:
+    """``frames_of`` for each run, in order, several made at a time."""
+    make = partial(frames_of, count=count, folder=folder)
+    if jobs == 1:
+        yield from map(make, runs)
+        return
+    fresh = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(jobs, len(runs)), mp_context=fresh) as pool:
+        yield from pool.map(make, runs)
+
+
+def joined(parts: Sequence[Objects]) -> Objects:
+    """The annotations of many runs as those of one set, numbered anew."""
+    whole = Objects()
+    for part in parts:
+        images, annotations = len(whole.images), len(whole.annotations)
+        whole.images += [{**image, "id": image["id"] + images} for image in part.images]
+        whole.annotations += [
+            _moved(annotation, images, annotations) for annotation in part.annotations
+        ]
+    return whole
+
+
+def _moved(annotation: dict[str, Any], images: int, annotations: int) -> dict[str, Any]:
+    return {
+        **annotation,
+        "id": annotation["id"] + annotations,
+        "image_id": annotation["image_id"] + images,
+    }

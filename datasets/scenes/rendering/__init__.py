@@ -1,0 +1,1 @@
+"""The renderer of simulated scenes: meshes, textures, light, ground, weather."""

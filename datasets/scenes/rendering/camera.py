@@ -1,0 +1,100 @@
+"""A pinhole camera behind the windscreen, and where it is at any time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from crosscue.datasets.scenes.motion import Approach
+
+from .mesh import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Size, lens and mounting.
+
+    Attributes:
+        width_px: Of the picture.
+        height_px: Of the picture.
+        focal_px: None for 0.55 picture widths (85 degrees across).
+        x_m: Ahead of the rear axle.
+        z_m: Above the road.
+        pitch_rad: Downwards positive.
+    """
+
+    width_px: int = 1280
+    height_px: int = 720
+    focal_px: float | None = None
+    x_m: float = 1.7
+    z_m: float = 1.45
+    pitch_rad: float = 0.01
+
+    @property
+    def focal(self) -> float:
+        """Focal length, pixels."""
+        return 0.55 * self.width_px if self.focal_px is None else self.focal_px
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """Where the optical axis meets the picture."""
+        return 0.5 * self.width_px, 0.5 * self.height_px
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A camera at one time.
+
+    Attributes:
+        camera: Which.
+        eye_axes: Shape (3, 3): turns local axes into right, down, ahead.
+        at_m: Shape (3,): the camera in the local frame.
+        rear_axle: x, y and heading of the car.
+        speed_mps: Of the car.
+        yaw_rate_radps: Of the car.
+    """
+
+    camera: Camera
+    eye_axes: Floats
+    at_m: Floats
+    rear_axle: tuple[float, float, float]
+    speed_mps: float
+    yaw_rate_radps: float
+
+    def project(self, points_m: Floats) -> Floats:
+        """Pixels and depth, (N, 3), of local points (N, 3); x = y = 0 is the picture's corner."""
+        eye = (points_m - self.at_m) @ self.eye_axes.T
+        cx, cy = self.camera.centre_px
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = cx + self.camera.focal * eye[:, 0] / eye[:, 2]
+            y = cy + self.camera.focal * eye[:, 1] / eye[:, 2]
+        return np.column_stack([x, y, eye[:, 2]])
+
+
+def view_at(camera: Camera, approach: Approach, t_s: float) -> View:
+    """Where the camera is; the body nods with its acceleration and shakes a little."""
+    motion = approach.motion
+    at = np.arange(len(motion)) * 0.01
+    x, y, heading, speed, rate = (
+        float(np.interp(t_s, at, column))
+        for column in (motion.x_m, motion.y_m, motion.heading_rad, motion.speed_mps,
+                       motion.yaw_rate_radps)
+    )  # fmt: skip
+    before, after = np.interp([t_s - 0.25, t_s + 0.05], at, motion.speed_mps)
+    nod = -0.0045 * float(after - before) / 0.3
+    shake = 0.0011 * min(speed / 8.0, 1.0)
+    nod += shake * (np.sin(9.1 * t_s) + 0.7 * np.sin(23.7 * t_s + 1.0))
+    return _view(camera, (x, y, heading), camera.pitch_rad + nod, speed, rate)
+
+
+def _view(
+    camera: Camera, rear_axle: tuple[float, float, float], pitch: float, speed: float, rate: float
+) -> View:
+    x, y, heading = rear_axle
+    c, s = np.cos(heading), np.sin(heading)
+    ahead = np.array([c * np.cos(pitch), s * np.cos(pitch), -np.sin(pitch)])
+    right = np.array([s, -c, 0.0])
+    down = np.cross(ahead, right)
+    at = np.array([x + camera.x_m * c, y + camera.x_m * s, camera.z_m])
+    return View(camera, np.stack([right, down, ahead]), at, rear_axle, speed, rate)

@@ -1,0 +1,280 @@
+"""Pictures of a world, with which object each pixel belongs to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.datasets.scenes.export.road_truth import road_seen
+from crosscue.datasets.scenes.world import Thing, World
+
+from .camera import Camera, View, view_at
+from .ground import TEXELS_PER_M, X_M, Y_M
+from .kernels import compiled
+from .mesh import Floats, Mesh
+from .textures import smooth_noise
+
+MOST_ABOUT: Final = 3
+"""An object's picture is measured at most so many pictures about the picture itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class PictureSettings:
+    """How pictures are made.
+
+    Attributes:
+        samples: Samples a pixel, across and down, on edges of objects.
+        exposure_s: While the shutter is open a turning camera smears the picture.
+        blur_px: Standard deviation of the lens's blur at 1280 pixels width.
+        jpeg_quality: 1 to 100.
+    """
+
+    samples: int = 2
+    exposure_s: float = 0.012
+    blur_px: float = 0.55
+    jpeg_quality: int = 90
+
+
+DEFAULTS: Final = PictureSettings()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """One object in one picture.
+
+    Attributes:
+        thing: The object.
+        mask: Shape (H, W), bool, of its box's pixels alone.
+        box_px: x0, y0, x1, y1 of the visible part, half open, whole pixels.
+        visible: Share of the object within the picture that nothing hides.
+        in_picture: Share of the object that is within the picture.
+        distance_m: From the rear axle along the car's axis.
+    """
+
+    thing: Thing
+    mask: NDArray[np.bool_]
+    box_px: tuple[int, int, int, int]
+    visible: float
+    in_picture: float
+    distance_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """One camera frame with its truth.
+
+    Attributes:
+        t_s: From the start of the drive.
+        rgb: Shape (H, W, 3), uint8.
+        view: The camera.
+        owner: Shape (H, W), int16: number of the thing, -1 for none.
+        seen: Every labelled object with at least one pixel.
+        road: Shape (H, W), bool: road, by the rule of ``road_truth``; None where not asked for.
+    """
+
+    t_s: float
+    rgb: NDArray[np.uint8]
+    view: View
+    owner: NDArray[np.int16]
+    seen: tuple[Seen, ...]
+    road: NDArray[np.bool_] | None = None
+
+
+class Renderer:
+    """Draws one world; holds what does not change from picture to picture."""
+
+    def __init__(
+        self, world: World, camera: Camera | None = None, settings: PictureSettings = DEFAULTS
+    ) -> None:
+        """Light the scenery and get the buffers."""
+        self.world = world
+        self.camera = Camera() if camera is None else camera
+        self.settings = settings
+        self._kernels = compiled()
+        self._atlas, self._places = world.atlas.packed()
+        self._scenery = (world.scenery, world.light.on(world.scenery))
+        self._movers = [
+            (
+                thing,
+                world.light.on(thing.mesh),
+                None if thing.later is None else world.light.on(thing.later),
+            )
+            for thing in world.things
+            if not thing.is_fixed
+        ]
+        n = settings.samples
+        high, wide = self.camera.height_px, self.camera.width_px
+        self._depth = np.zeros((high * n, wide * n), np.float32)
+        self._colour = np.zeros((high * n, wide * n, 3), np.uint8)
+        self._owner = np.zeros((high * n, wide * n), np.int16)
+        rng = np.random.default_rng([world.conditions.seed, 5])
+        self._grain = (smooth_noise(rng, 256, 64) * 140 + rng.random((256, 256)) * 116).astype(
+            np.uint8
+        )
+        self._noise = np.clip(rng.normal(0.0, 32.0, (512, 512)), -127, 127).astype(np.int8)
+
+    def picture(self, t_s: float, number: int = 0, *, with_road: bool = False) -> Picture:
+        """The camera's picture at a time; ``number`` seeds its noise."""
+        view = view_at(self.camera, self.world.approach, t_s)
+        self._depth.fill(0.0)
+        self._owner.fill(-1)
+        for thing, tint, later in self._movers:
+            if thing.is_there(t_s):
+                mesh = thing.mesh_at(t_s)
+                lit = later if later is not None and mesh is thing.later else tint
+                self._draw(mesh, lit, thing.shift(t_s), view)
+        self._draw(*self._scenery, np.zeros(3), view)
+        rgb, owner = self._composed(view, t_s)
+        self._finish(rgb, view, number)
+        road = None
+        if with_road:
+            on_map = self.world.ground.road.view(np.uint8)
+            road = road_seen(on_map, self._depth, self.settings.samples, view)
+        return Picture(t_s, rgb, view, owner, self._seen(owner, view, t_s), road)
+
+    def _lens(self, scale: float) -> tuple[float, float, float]:
+        cx, cy = self.camera.centre_px
+        return self.camera.focal * scale, cx * scale, cy * scale
+
+    def _draw(self, mesh: Mesh, tint: NDArray[np.float32], shift: Floats, view: View) -> None:
+        light = self.world.light
+        ahead = mesh.corners.mean(axis=1) @ view.eye_axes[2].astype(np.float32)
+        self._kernels.draw(
+            np.argsort(ahead, kind="stable"),
+            mesh.corners, mesh.uv, mesh.texture, tint, mesh.instance, shift.astype(np.float32),
+            view.eye_axes, view.at_m, *self._lens(self.settings.samples), light.haze_per_m,
+            light.haze, self._atlas, self._places, self._depth, self._colour, self._owner,
+        )  # fmt: skip
+
+    def _composed(self, view: View, t_s: float) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
+        light, ground = self.world.light, self.world.ground
+        high, wide = self.camera.height_px, self.camera.width_px
+        rgb = np.zeros((high, wide, 3), np.uint8)
+        owner = np.zeros((high, wide), np.int16)
+        self._kernels.compose(
+            self._depth, self._colour, self._owner, self.settings.samples, ground.texels,
+            ground.levels, X_M[0], Y_M[0], float(TEXELS_PER_M), self._grain, light.on_ground,
+            self._shadows(view, t_s), light.shine, light.sky,
+            np.ascontiguousarray(view.eye_axes.T), view.at_m, *self._lens(1.0),
+            light.haze_per_m, light.haze, rgb, owner,
+        )  # fmt: skip
+        return rgb, owner
+
+    def _shadows(self, view: View, t_s: float) -> NDArray[np.uint8]:
+        """Shadows of the cars that move, straight below and away from the sun."""
+        import cv2
+
+        light = self.world.light
+        shade = np.full((self.camera.height_px, self.camera.width_px), 255, np.uint8)
+        slide = -light.to_sun[:2] / max(float(light.to_sun[2]), 0.3) * 0.9
+        for thing, _, _ in self._movers:
+            if thing.category != "car" or not thing.is_there(t_s):
+                continue
+            middle = np.array(thing.at)[:2] + thing.shift(t_s)[:2]
+            along = np.array([np.cos(thing.heading_rad), np.sin(thing.heading_rad)])
+            across = np.array([-along[1], along[0]])
+            a, b = along * thing.size[0] / 2, across * thing.size[1] / 2
+            foot = np.array([-a - b, a - b, a + b, b - a]) + middle
+            if light.sun.max() > 0.1:
+                foot = np.concatenate([foot, foot + slide])
+            flat = view.project(np.column_stack([foot, np.zeros(len(foot))]))
+            if (flat[:, 2] > 1.0).all() and np.abs(flat[:, :2]).max() < 30_000:
+                hull = cv2.convexHull(flat[:, :2].astype(np.float32))
+                dark = int(255 * max(0.35, light.in_shadow * 0.9))
+                cv2.fillConvexPoly(shade, np.rint(hull * 16).astype(np.int32), dark,
+                                   cv2.LINE_AA, 4)  # fmt: skip
+        return shade
+
+    def _finish(self, rgb: NDArray[np.uint8], view: View, number: int) -> None:
+        """Rain, lens and sensor, in place."""
+        import cv2
+
+        from .weather import drops, streaks
+
+        light, wide = self.world.light, self.camera.width_px
+        rng = np.random.default_rng([self.world.conditions.seed, 6, number])
+        rain = self.world.conditions.rain
+        if rain > 0.0:
+            streaks(rgb, rain, view.speed_mps, rng)
+            still = np.random.default_rng([self.world.conditions.seed, 7, number // 7])
+            drops(rgb, rain, still)
+        smear = abs(view.yaw_rate_radps) * self.settings.exposure_s * self.camera.focal
+        if smear >= 1.5:
+            rgb[:] = cv2.blur(rgb, (round(smear), 1))
+        sigma = self.settings.blur_px * wide / 1280
+        if sigma > 0.2:
+            rgb[:] = cv2.GaussianBlur(rgb, (3, 3), sigma)
+        sun = view.project(view.at_m[None] + light.to_sun[None] * 1e4)[0]
+        flare = light.flare if sun[2] > 0 else 0.0
+        row, column = (int(k) for k in rng.integers(0, 512, 2))
+        self._kernels.develop(
+            rgb, self._noise, row, column, light.noise / 32.0, 0.22,
+            np.array([255.0, 226.0, 180.0]), float(np.clip(sun[0], -1e5, 1e5)),
+            float(np.clip(sun[1], -1e5, 1e5)), flare, light.contrast,
+        )  # fmt: skip
+
+    def _seen(self, owner: NDArray[np.int16], view: View, t_s: float) -> tuple[Seen, ...]:
+        counts = np.bincount(owner.ravel().astype(np.int64) + 1, minlength=1)[1:]
+        seen = []
+        for number in np.flatnonzero(counts):
+            thing = self.world.things[int(number)]
+            corners = view.project(_corners(thing, t_s))
+            mask, box = _cut_out(owner, int(number), corners)
+            visible, inside = self._shares(thing, t_s, view, int(counts[number]), corners)
+            seen.append(Seen(thing, mask, box, visible, inside, distance_m(thing, t_s, view)))
+        return tuple(seen)
+
+    def _shares(
+        self, thing: Thing, t_s: float, view: View, pixels: int, corners: Floats
+    ) -> tuple[float, float]:
+        """Visible share of what is in the picture, and the share that is in the picture."""
+        wide, high = self.camera.width_px, self.camera.height_px
+        ahead = corners[corners[:, 2] > 0.3]
+        if len(ahead) < len(corners):
+            return 0.0, 0.0
+        left, top = np.floor(ahead[:, :2].min(0)).astype(int)
+        right, bottom = np.ceil(ahead[:, :2].max(0)).astype(int)
+        left, right = max(left, -MOST_ABOUT * wide), min(right, (1 + MOST_ABOUT) * wide)
+        top, bottom = max(top, -MOST_ABOUT * high), min(bottom, (1 + MOST_ABOUT) * high)
+        covered = np.zeros((max(bottom - top, 1), max(right - left, 1)), np.uint8)
+        mesh = thing.mesh_at(t_s)
+        total = self._kernels.cover(
+            mesh.corners, thing.shift(t_s).astype(np.float32), view.eye_axes, view.at_m,
+            *self._lens(1.0), covered, left, top,
+        )  # fmt: skip
+        part = covered[max(-top, 0) : max(high - top, 0), max(-left, 0) : max(wide - left, 0)]
+        within = int(part.sum())
+        return min(1.0, pixels / max(within, 1)), within / max(total, 1)
+
+
+def distance_m(thing: Thing, t_s: float, view: View) -> float:
+    """From the rear axle to a thing's middle, along the car's axis."""
+    x, y, heading = view.rear_axle
+    middle = np.array(thing.at) + thing.shift(t_s)
+    return float((middle[0] - x) * np.cos(heading) + (middle[1] - y) * np.sin(heading))
+
+
+def _corners(thing: Thing, t_s: float) -> Floats:
+    points: Floats = thing.mesh_at(t_s).corners.reshape(-1, 3).astype(np.float64)
+    low, high = points.min(0) + thing.shift(t_s), points.max(0) + thing.shift(t_s)
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1])
+                     for z in (low[2], high[2])])  # fmt: skip
+
+
+def _cut_out(
+    owner: NDArray[np.int16], number: int, corners: Floats
+) -> tuple[NDArray[np.bool_], tuple[int, int, int, int]]:
+    """Mask within its box, searched only where the object can be."""
+    high, wide = owner.shape
+    x0, y0, x1, y1 = 0, 0, wide, high
+    if (corners[:, 2] > 0.3).all():
+        x0, y0 = np.clip(np.floor(corners[:, :2].min(0)).astype(int) - 2, 0, (wide, high))
+        x1, y1 = np.clip(np.ceil(corners[:, :2].max(0)).astype(int) + 2, 0, (wide, high))
+    window = owner[y0:y1, x0:x1] == number
+    rows, columns = np.flatnonzero(window.any(1)), np.flatnonzero(window.any(0))
+    top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
+    box = (int(x0 + left), int(y0 + top), int(x0 + right), int(y0 + bottom))
+    return window[top:bottom, left:right].copy(), box

@@ -1,0 +1,1 @@
+"""A simulated drive without camera: vehicle, CAN, gyro, magnetometer, true pose."""

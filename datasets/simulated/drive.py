@@ -1,0 +1,247 @@
+"""A simulated drive without pictures: a car in town, its CAN, gyro, magnetometer and true pose.
+
+Everything here is made up from a seed. Sensor errors are of the kinds that the pose filter models
+(quantised wheels, slip, gyro bias and noise) and of one that it does not (magnetic disturbance that
+comes and goes along the road), so that the demo's numbers are not a filter scored on its own model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+
+from crosscue.replay.columns import Floats, Int64s
+
+WHEELBASE_M: Final = 2.7
+TRACK_WIDTH_M: Final = 1.55
+STEERING_RATIO: Final = 15.0
+FIELD_T: Final = np.array([20e-6, -43e-6])
+"""Horizontal (towards magnetic north) and vertical (up) part of the Earth's field."""
+START_NS: Final = 1_700_000_000_000_000_000
+RATE_HZ: Final = 100
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSettings:
+    """One simulated drive.
+
+    Attributes:
+        seed: Everything random comes from it.
+        blocks: Street blocks driven.
+        block_m: Length of a block.
+        top_speed_mps: Between turns.
+        declination_rad: East of north.
+        mounting_yaw_rad: How the magnetometer is turned in the car.
+        gyro_bias_radps: Constant error of the gyro.
+    """
+
+    seed: int = 7
+    blocks: int = 12
+    block_m: float = 120.0
+    top_speed_mps: float = 12.0
+    declination_rad: float = 0.23
+    mounting_yaw_rad: float = 0.1
+    gyro_bias_radps: float = 0.002
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueMotion:
+    """The car's rear axle, 100 times a second.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        x_m: Shape (N,), east.
+        y_m: Shape (N,), north.
+        heading_rad: Shape (N,), counter-clockwise from east, not wrapped.
+        speed_mps: Shape (N,).
+        yaw_rate_radps: Shape (N,).
+    """
+
+    t_ns: Int64s
+    x_m: Floats
+    y_m: Floats
+    heading_rad: Floats
+    speed_mps: Floats
+    yaw_rate_radps: Floats
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+def drive(settings: DriveSettings) -> TrueMotion:
+    """Where the car really was."""
+    rng = np.random.default_rng([settings.seed, 1])
+    curvature, limit_mps = _road(settings, rng)
+    speed = _speed_along(limit_mps, settings.top_speed_mps)
+    step_s = 1.0 / RATE_HZ
+    at_m, along, speeds = 0.0, [], []
+    v = 0.5
+    while at_m < len(curvature) - 1:
+        target = float(speed[int(at_m)])
+        v += float(np.clip(target - v, -2.5 * step_s, 1.8 * step_s))
+        at_m += v * step_s
+        along.append(at_m)
+        speeds.append(v)
+    bend = np.interp(np.array(along), np.arange(len(curvature)), _smoothed(curvature))
+    speed_mps = np.array(speeds)
+    yaw_rate = bend * speed_mps
+    heading = np.concatenate(([0.3], 0.3 + np.cumsum(yaw_rate * step_s)))[:-1]
+    middle = heading + yaw_rate * step_s / 2
+    x = np.concatenate(([0.0], np.cumsum(speed_mps * step_s * np.cos(middle))))[:-1]
+    y = np.concatenate(([0.0], np.cumsum(speed_mps * step_s * np.sin(middle))))[:-1]
+    t_ns = START_NS + np.arange(len(x), dtype=np.int64) * (1_000_000_000 // RATE_HZ)
+    return TrueMotion(t_ns, x, y, heading, speed_mps, yaw_rate)
+
+
+def _road(settings: DriveSettings, rng: Generator) -> tuple[Floats, Floats]:
+    """Curvature and speed limit for each metre of the way."""
+    pieces: list[Floats] = []
+    limits: list[Floats] = []
+    radius_m = 9.0
+    for _ in range(settings.blocks):
+        straight = np.zeros(round(settings.block_m))
+        turn = int(rng.choice([-1, 0, 1], p=[0.3, 0.4, 0.3]))
+        corner = np.full(round(radius_m * np.pi / 2) if turn else 8, turn / radius_m)
+        pieces += [straight, corner]
+        slow = 4.5 if turn else settings.top_speed_mps
+        limits += [np.full(len(straight), settings.top_speed_mps), np.full(len(corner), slow)]
+    pieces.append(np.zeros(40))
+    limits.append(np.full(40, 1.0))
+    return np.concatenate(pieces), np.concatenate(limits)
+
+
+def _smoothed(curvature: Floats) -> Floats:
+    # A steering wheel takes time: five metres from straight to full lock keep each turn's angle.
+    kernel = np.hanning(7)[1:-1]
+    return np.convolve(curvature, kernel / kernel.sum(), mode="same")
+
+
+def _speed_along(limit_mps: Floats, top_mps: float) -> Floats:
+    """The fastest speed at each metre that still brakes in time (2 m/s2)."""
+    speed = np.minimum(limit_mps, top_mps)
+    for i in range(len(speed) - 2, -1, -1):
+        speed[i] = min(speed[i], np.sqrt(speed[i + 1] ** 2 + 2 * 2.0))
+    return speed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensed:
+    """What the car's sensors said.
+
+    Attributes:
+        wheel_t_ns: Shape (W,), 50 Hz.
+        wheels_mps: Shape (W, 4): front left, front right, rear left, rear right.
+        steering_rad: Shape (W,): at the steering wheel, left positive.
+        gyro_t_ns: Shape (G,), 100 Hz.
+        gyro_radps: Shape (G, 3): about forward, left, up.
+        mag_t_ns: Shape (M,), 10 Hz.
+        mag_t: Shape (M, 3), tesla, in the sensor's axes.
+    """
+
+    wheel_t_ns: Int64s
+    wheels_mps: Floats
+    steering_rad: Floats
+    gyro_t_ns: Int64s
+    gyro_radps: Floats
+    mag_t_ns: Int64s
+    mag_t: Floats
+
+
+def sense(motion: TrueMotion, settings: DriveSettings) -> Sensed:
+    """Simulated readings of ``motion``."""
+    rng = np.random.default_rng([settings.seed, 2])
+    half = slice(None, None, 2)
+    v, w = motion.speed_mps[half], motion.yaw_rate_radps[half]
+    side = np.array([-1.0, 1.0]) * TRACK_WIDTH_M / 2
+    rear = v[:, None] + w[:, None] * side
+    front = np.hypot(rear, (w * WHEELBASE_M)[:, None])
+    true_wheels = np.concatenate([front, rear], axis=1)
+    tyre = 1.0 + rng.normal(0.0, 0.003, 4)
+    slip = _wander(rng, len(v), 4, rate_hz=RATE_HZ / 2, time_s=2.0) * 0.004
+    wheels = true_wheels * tyre * (1.0 + slip) + rng.normal(0.0, 0.02, true_wheels.shape)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        road_wheel = np.where(v > 0.1, np.arctan(WHEELBASE_M * w / np.maximum(v, 0.1)), 0.0)
+    gyro = rng.normal(0.0, 0.004, (len(motion), 3))
+    gyro[:, 2] += motion.yaw_rate_radps + settings.gyro_bias_radps
+    tenth = slice(None, None, 10)
+    return Sensed(
+        motion.t_ns[half],
+        wheels,
+        road_wheel * STEERING_RATIO + rng.normal(0.0, 0.01, len(v)),
+        motion.t_ns,
+        gyro,
+        motion.t_ns[tenth],
+        _magnetometer(motion.heading_rad[tenth], settings, rng),
+    )
+
+
+def _magnetometer(heading_rad: Floats, settings: DriveSettings, rng: Generator) -> Floats:
+    # Angle of magnetic north as seen from the sensor's own forward axis.
+    north = np.pi / 2 - settings.declination_rad - heading_rad - settings.mounting_yaw_rad
+    disturbed = north + _wander(rng, len(north), 1, rate_hz=10.0, time_s=4.0)[:, 0] * np.deg2rad(8)
+    level = FIELD_T[0] * np.stack([np.cos(disturbed), np.sin(disturbed)], axis=1)
+    field = np.concatenate([level, np.full((len(north), 1), FIELD_T[1])], axis=1)
+    return field + rng.normal(0.0, 0.3e-6, field.shape)
+
+
+def _wander(rng: Generator, n: int, k: int, *, rate_hz: float, time_s: float) -> Floats:
+    """First-order Gauss-Markov noise with unit variance, shape (n, k)."""
+    keep = float(np.exp(-1.0 / (rate_hz * time_s)))
+    kicks = rng.normal(0.0, 1.0, (n, k))
+    kicks[1:] *= np.sqrt(1.0 - keep * keep)
+    out = np.empty((n, k))
+    state = np.zeros(k)
+    for i in range(n):
+        state = keep * state + kicks[i]
+        out[i] = state
+    return out
+
+
+def dbc_path() -> Path:
+    """The DBC file of the simulated car's bus."""
+    return Path(str(files("crosscue.datasets.simulated").joinpath("simulated_car.dbc")))
+
+
+VEHICLE: Final = """\
+# The simulated car of crosscue's demo.
+version = 1
+name = "crosscue simulated car"
+
+[can]
+bus = "/can"
+dbc = ["{dbc}"]
+
+[can.wheel_speeds]
+front_left = "WHEEL_SPEEDS.FRONT_LEFT"
+front_right = "WHEEL_SPEEDS.FRONT_RIGHT"
+rear_left = "WHEEL_SPEEDS.REAR_LEFT"
+rear_right = "WHEEL_SPEEDS.REAR_RIGHT"
+
+[odometry]
+wheelbase_m = 2.7
+track_width_m = 1.55
+
+[compass]
+mounting_yaw_rad = {mounting_yaw_rad}
+declination_rad = {declination_rad}
+heading_sd_rad = 0.16
+interval_s = 8.0
+
+[start]
+heading_rad = 0.3
+heading_sd_rad = 0.05
+"""
+
+
+def vehicle_text(settings: DriveSettings, dbc: str) -> str:
+    """The vehicle file that fits the simulated car."""
+    return VEHICLE.format(
+        dbc=dbc,
+        mounting_yaw_rad=settings.mounting_yaw_rad,
+        declination_rad=settings.declination_rad,
+    )

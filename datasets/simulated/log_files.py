@@ -1,0 +1,147 @@
+"""A simulated drive as files: log, vehicle file, DBC file and truth, as a user would have them."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.datasets.truth.truth import Truth, save
+from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.can.encode import encode
+from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table, Topic
+from crosscue.replay.files.run_folder import write_text
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.write.convert import LogWriter
+
+from .drive import DriveSettings, Sensed, TrueMotion, dbc_path, drive, sense, vehicle_text
+
+BUS: Final = Topic("/can", "crosscue/CanFrames", "columns")
+GYRO: Final = Topic("/imu", "sensor_msgs/msg/Imu", "columns")
+MAGNETOMETER: Final = Topic("/compass", "sensor_msgs/msg/MagneticField", "columns")
+BATCH_ROWS: Final = 1000
+SOURCE: Final = "simulated by crosscue, exact"
+
+
+@dataclass(frozen=True, slots=True)
+class DriveFiles:
+    """What was written.
+
+    Attributes:
+        log: ``drive.mcap``.
+        vehicle: ``vehicle.toml``.
+        truth: ``truth.json``.
+        seconds: Length of the drive.
+        metres: Way driven.
+    """
+
+    log: Path
+    vehicle: Path
+    truth: Path
+    seconds: float
+    metres: float
+
+
+def write_drive(folder: Path, settings: DriveSettings, *, overwrite: bool = False) -> DriveFiles:
+    """Simulate a drive and write its files into ``folder``.
+
+    Raises:
+        OutputError: A file is there already, or cannot be written.
+    """
+    motion = drive(settings)
+    sensed = sense(motion, settings)
+    log = folder / "drive.mcap"
+    ledger = Ledger(str(log))
+    with LogWriter(log, ledger, overwrite=overwrite) as writer:
+        for topic in (BUS, GYRO, MAGNETOMETER):
+            writer.add_topic(topic)
+        for block in sensor_blocks(sensed, settings.seed):
+            writer.write(block)
+    shutil.copyfile(dbc_path(), folder / "simulated_car.dbc")
+    write_text(folder / "vehicle.toml", vehicle_text(settings, "simulated_car.dbc"))
+    return DriveFiles(
+        log,
+        folder / "vehicle.toml",
+        _write_truth(folder, motion),
+        float(motion.t_ns[-1] - motion.t_ns[0]) * 1e-9,
+        float(np.hypot(np.diff(motion.x_m), np.diff(motion.y_m)).sum()),
+    )
+
+
+def sensor_blocks(sensed: Sensed, seed: int) -> list[Block]:
+    """What the sensors said as rows of a log, in batches, in order of the batches' first rows."""
+    rng = np.random.default_rng([seed, 3])
+    blocks = [
+        *_batches(_can_block(sensed, rng)),
+        *_batches(_stamped(GYRO.name, sensed.gyro_t_ns, "gyro_{}_radps", sensed.gyro_radps, rng)),
+        *_batches(_stamped(MAGNETOMETER.name, sensed.mag_t_ns, "mag_{}_t", sensed.mag_t, rng)),
+    ]
+    return sorted(blocks, key=lambda block: int(block.log_ns[0]))
+
+
+def _batches(block: Block) -> list[Block]:
+    return [
+        block.take(slice(start, start + BATCH_ROWS)) for start in range(0, len(block), BATCH_ROWS)
+    ]
+
+
+def _late(t_ns: Int64s, rng: np.random.Generator, least_ms: float, mean_ms: float) -> Int64s:
+    """When the recorder stored what was measured at ``t_ns``; the order is kept."""
+    delay = least_ms + rng.exponential(mean_ms, len(t_ns))
+    late: Int64s = np.maximum.accumulate(t_ns + np.rint(delay * 1e6).astype(np.int64))
+    return late
+
+
+def _stamped(topic: str, t_ns: Int64s, column: str, xyz: Floats, rng: np.random.Generator) -> Block:
+    columns = {column.format(axis): xyz[:, i] for i, axis in enumerate("xyz")}
+    return Block(topic, _late(t_ns, rng, 2.0, 0.7), Table(columns), header_ns=t_ns)
+
+
+def _can_block(sensed: Sensed, rng: np.random.Generator) -> Block:
+    database = CanDatabase.load([dbc_path()])
+    n = len(sensed.wheel_t_ns)
+    kmh = np.round(sensed.wheels_mps * 3.6, 2)
+    names = ("FRONT_LEFT", "FRONT_RIGHT", "REAR_LEFT", "REAR_RIGHT")
+    wheels = encode(database.named("WHEEL_SPEEDS"), dict(zip(names, kmh.T, strict=True)))
+    steering = encode(
+        database.named("STEERING"),
+        {
+            "WHEEL_ANGLE": np.round(np.rad2deg(sensed.steering_rad), 1),
+            "COUNTER": np.arange(n) % 16,
+        },
+    )
+    payload = np.zeros((2 * n, 8), np.uint8)
+    payload[0::2, : wheels.shape[1]] = wheels
+    payload[1::2, : steering.shape[1]] = steering
+    frames = CanFrames(
+        np.tile(np.array([176, 192], np.uint32), n),
+        np.zeros(2 * n, np.bool_),
+        np.full(2 * n, DATA, np.uint8),
+        np.tile(np.array([wheels.shape[1], steering.shape[1]], np.uint8), n),
+        payload,
+        np.zeros(2 * n, np.bool_),
+    )
+    sent = np.repeat(sensed.wheel_t_ns, 2) + np.tile(np.array([0, 250_000]), n)
+    return Block(BUS.name, _late(sent, rng, 0.3, 0.1), frames)
+
+
+def _write_truth(folder: Path, motion: TrueMotion) -> Path:
+    tenth = slice(None, None, 10)
+    turned = np.angle(np.exp(1j * motion.heading_rad[tenth]))
+    track = planar(motion.t_ns[tenth], motion.x_m[tenth], motion.y_m[tenth], turned)
+    write_tum(folder / "pose.tum", track, SOURCE)
+    return save(
+        Truth(
+            version=1,
+            log="drive.mcap",
+            start_ns=int(motion.t_ns[0]),
+            end_ns=int(motion.t_ns[-1]) + 1,
+            pose="pose.tum",
+            source=SOURCE,
+        ),
+        folder,
+    )

@@ -1,0 +1,1 @@
+"""Ground truth: its file format, trajectories, annotations of other tools."""

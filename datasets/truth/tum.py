@@ -1,0 +1,192 @@
+"""Trajectories in TUM files: ``timestamp x y z qx qy qz qw``, one pose a line, ``#`` for comments.
+
+Times are decimal seconds; text and integer nanoseconds are turned into each other without a
+detour through floats, which cannot hold a nanosecond of this century.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
+from itertools import chain
+from pathlib import Path
+from typing import Final, TextIO
+
+import numpy as np
+
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
+from crosscue.replay.files.run_folder import write_text
+from crosscue.replay.limits import DEFAULT, Limits
+
+_COLUMNS: Final = 8
+_LINE_CHARACTERS: Final = 4096
+_NORM_OFF: Final = 1e-2
+_LATEST_S: Final = (2**63 - 1) // 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """N poses of one body in one frame.
+
+    Attributes:
+        t_ns: Shape (N,), int64, increasing.
+        xyz_m: Shape (N, 3).
+        quat_wxyz: Shape (N, 4), unit quaternions that turn body axes into the frame's.
+    """
+
+    t_ns: Int64s
+    xyz_m: Floats
+    quat_wxyz: Floats
+
+    def __post_init__(self) -> None:
+        """Refuse columns that do not line up or are no poses.
+
+        Raises:
+            ValueError: Naming the column, what is wanted and what is given.
+        """
+        n = len(self.t_ns)
+        if self.xyz_m.shape != (n, 3):
+            raise ValueError(f"xyz_m: want ({n}, 3), got {self.xyz_m.shape}")
+        if self.quat_wxyz.shape != (n, 4):
+            raise ValueError(f"quat_wxyz: want ({n}, 4), got {self.quat_wxyz.shape}")
+        if (np.diff(self.t_ns) <= 0).any():
+            raise ValueError("t_ns: want increasing times")
+        if not (np.isfinite(self.xyz_m).all() and np.isfinite(self.quat_wxyz).all()):
+            raise ValueError("poses: want finite numbers, got NaN or infinity")
+        if (np.abs(np.linalg.norm(self.quat_wxyz, axis=1) - 1.0) > 1e-6).any():
+            raise ValueError("quat_wxyz: want unit quaternions")
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+def planar(t_ns: Int64s, x_m: Floats, y_m: Floats, heading_rad: Floats) -> Trajectory:
+    """Poses on the ground, turned about the vertical alone.
+
+    Args:
+        t_ns: Shape (N,), increasing.
+        x_m: Shape (N,).
+        y_m: Shape (N,).
+        heading_rad: Shape (N,), counter-clockwise from +x.
+    """
+    zero = np.zeros(len(t_ns))
+    quat = np.column_stack([np.cos(heading_rad / 2), zero, zero, np.sin(heading_rad / 2)])
+    return Trajectory(t_ns, np.column_stack([x_m, y_m, zero]), quat)
+
+
+def heading_rad(trajectory: Trajectory) -> Floats:
+    """Direction of each pose's x axis in the ground plane, counter-clockwise from +x."""
+    w, x, y, z = trajectory.quat_wxyz.T
+    east: Floats = 1.0 - 2.0 * (y * y + z * z)
+    north: Floats = 2.0 * (w * z + x * y)
+    return np.arctan2(north, east)
+
+
+def read_tum(path: Path, limits: Limits = DEFAULT) -> Trajectory:
+    """Read a trajectory; times beyond the nanosecond are rounded to it.
+
+    Raises:
+        LogError: Not there or not readable.
+        LogTooLargeError: Larger than one chunk may be.
+        LogFormatError: A line is no pose or goes back in time; its number is told.
+    """
+    try:
+        size = path.stat().st_size
+        if not path.is_file():
+            raise LogError(f"{path}: not a regular file; give a TUM trajectory")
+        if size > limits.chunk_bytes:
+            raise LogTooLargeError(
+                f"{path}: {size} bytes, more than the {limits.chunk_bytes} allowed; cut it"
+            )
+        with path.open(encoding="utf-8-sig") as lines:
+            return _read(path, lines)
+    except OSError as error:
+        raise LogError(f"{path}: {error.strerror or error}; check the path") from None
+    except UnicodeDecodeError:
+        raise LogFormatError(f"{path}: not text; give a TUM trajectory") from None
+
+
+def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
+    """Write a trajectory that ``read_tum`` gives back number for number.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    heads = [f"# {line}" for line in [*comment.splitlines(), "timestamp x y z qx qy qz qw"]]
+    numbers = np.column_stack([trajectory.xyz_m, trajectory.quat_wxyz[:, [1, 2, 3, 0]]])
+    poses = (
+        " ".join([seconds_text(t_ns), *map(repr, row)])
+        for t_ns, row in zip(trajectory.t_ns.tolist(), numbers.tolist(), strict=True)
+    )
+    write_text(path, "\n".join(chain(heads, poses)) + "\n")
+
+
+def seconds_text(t_ns: int) -> str:
+    """Nanoseconds as decimal seconds, all nine places."""
+    whole, rest = divmod(abs(t_ns), 1_000_000_000)
+    return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}"
+
+
+def nanoseconds(text: str) -> int:
+    """Decimal seconds as nanoseconds, rounded half to even beyond the ninth place.
+
+    Raises:
+        ValueError: No number, or outside 64 bits.
+    """
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        raise ValueError(f"{text!r} is no number of seconds") from None
+    # The exponent first: arithmetic on 1e999999999 overflows.
+    if not seconds.is_finite() or seconds.adjusted() > 9 or abs(seconds) > _LATEST_S:
+        raise ValueError(f"{text!r} is no time that 64 bits of nanoseconds hold")
+    return int((seconds * 1_000_000_000).quantize(Decimal(1), rounding=ROUND_HALF_EVEN))
+
+
+def _read(path: Path, lines: TextIO) -> Trajectory:
+    times: list[int] = []
+    rows: list[list[float]] = []
+    number = 0
+    while line := lines.readline(_LINE_CHARACTERS):
+        number += 1
+        if line.startswith("#") or not line.strip():
+            if not line.endswith("\n"):
+                _skip_rest(lines)
+            continue
+        try:
+            t_ns, row = _pose(line)
+            if times and t_ns <= times[-1]:
+                raise ValueError(f"time {line.split()[0]} is not after the line before")
+        except ValueError as error:
+            raise LogFormatError(
+                f"{path}, line {number}: {error}; want timestamp x y z qx qy qz qw"
+            ) from None
+        times.append(t_ns)
+        rows.append(row)
+    poses = np.array(rows).reshape(-1, 7)
+    quat = poses[:, [6, 3, 4, 5]]
+    off = np.abs(np.linalg.norm(quat, axis=1, keepdims=True))
+    is_unit = np.abs(off - 1.0) < 1e-12
+    return Trajectory(np.array(times, np.int64), poses[:, :3], np.where(is_unit, quat, quat / off))
+
+
+def _pose(line: str) -> tuple[int, list[float]]:
+    words = line.replace(",", " ").split()
+    if len(words) != _COLUMNS:
+        raise ValueError(f"{len(words)} numbers instead of {_COLUMNS}")
+    t_ns = nanoseconds(words[0])
+    row = [float(word) for word in words[1:]]
+    if not all(map(math.isfinite, row)):
+        raise ValueError("a number that is not finite")
+    norm = math.hypot(*row[3:])
+    if abs(norm - 1.0) > _NORM_OFF:
+        raise ValueError(f"a quaternion of length {norm:.3g}")
+    return t_ns, row
+
+
+def _skip_rest(lines: TextIO) -> None:
+    """Go to the end of a comment longer than one read."""
+    while (rest := lines.readline(_LINE_CHARACTERS)) and not rest.endswith("\n"):
+        pass

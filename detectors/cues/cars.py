@@ -1,0 +1,192 @@
+"""Crossing and parked cars from masks in two consecutive frames (eq. 15, 16).
+
+A car seen from the side is longer than twice its height. Between two frames it is the same car when
+its mask's area and its position hardly change. Then its motion says which it is: steadily to the
+side is cross traffic, none at all is a parked car, whose nose is the lower end of its mask.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.vehicle.vehicle import Cars
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CarShapes:
+    """Cars of one frame that pass the rules of shape and score, as columns of length N.
+
+    Attributes:
+        t_ns: Log time.
+        size_px: Width and height of the picture.
+        center_px: Shape (N, 2), float64: middle of the box.
+        area_px: Shape (N,), float64: of the mask; of the box where there is no mask.
+        nose: Shape (N,), int64: -1 for a nose at the left, 1 at the right, 0 unknown.
+    """
+
+    t_ns: int
+    size_px: tuple[int, int]
+    center_px: Floats
+    area_px: Floats
+    nose: Int64s
+
+    def __len__(self) -> int:
+        return len(self.area_px)
+
+
+class Sides(NamedTuple):
+    """How many say left and how many right."""
+
+    left: int
+    right: int
+
+
+NONE: Final = Sides(0, 0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Cars of one frame that were found again in the next, as columns of length M.
+
+    Attributes:
+        step_px: Shape (M, 2), float64: how their middles moved.
+        center_px: Shape (M, 2), float64: where these are in the later frame.
+        nose: Shape (M,), int64: as in ``CarShapes``, of the later frame.
+        width_px: Of the picture.
+    """
+
+    step_px: Floats
+    center_px: Floats
+    nose: Int64s
+    width_px: int
+
+
+class Tracker(Protocol):
+    """Finds the cars of one frame again in the next; another may stand in for ``pair_cars``."""
+
+    def __call__(self, before: CarShapes, now: CarShapes, settings: Cars, /) -> Pairs:
+        """Pair them, each at most once."""
+        ...
+
+
+def car_shapes(found: Sequence[Detections], settings: Cars) -> CarShapes:
+    """The cars of one frame that are seen from the side (eq. 15: length over height, score).
+
+    Args:
+        found: One or more detectors' results for the frame.
+        settings: Labels, score and shape.
+
+    Raises:
+        ValueError: No result at all, or a mask that is none.
+    """
+    if not found:
+        raise ValueError("found: want at least one detector's result")
+    t_ns, size = found[0].t_ns, found[0].size_px
+    rows = [
+        (box, mask)
+        for detections in found
+        for label, score, box, mask in zip(
+            detections.labels, detections.scores.tolist(), detections.boxes_px.tolist(),
+            detections.masks, strict=True,
+        )
+        if label in settings.labels and score > settings.score and _is_long(box, settings)
+    ]  # fmt: skip
+    boxes = np.array([box for box, _ in rows], np.float64).reshape(-1, 4)
+    # Counting pixels by column gives both area and nose from one reading of the runs.
+    heights = [rle.column_heights_px(mask, size) if mask else None for _, mask in rows]
+    areas = [
+        (box[2] - box[0]) * (box[3] - box[1]) if columns is None else float(columns.sum())
+        for columns, (box, _) in zip(heights, rows, strict=True)
+    ]
+    noses = [0 if columns is None else nose_of(columns) for columns in heights]
+    center = (boxes[:, :2] + boxes[:, 2:]) / 2.0
+    return CarShapes(t_ns, size, center, np.array(areas), np.array(noses, np.int64))
+
+
+def _is_long(box: Sequence[float], settings: Cars) -> bool:
+    x0, y0, x1, y1 = box
+    return x1 - x0 > settings.length_per_height * (y1 - y0)
+
+
+def nose_of(heights_px: Floats) -> int:
+    """-1 where the mask's left end is lower than its right, 1 where the right is, 0 where equal.
+
+    An end is the outer quarter of the mask's length: single columns are too noisy.
+
+    Args:
+        heights_px: Shape (width,): mask pixels in each column.
+    """
+    (columns,) = heights_px.nonzero()
+    if len(columns) < 4:
+        return 0
+    heights = heights_px[columns[0] : columns[-1] + 1]
+    quarter = max(len(heights) // 4, 1)
+    difference = heights[-quarter:].sum() - heights[:quarter].sum()
+    return int(difference < 0) - int(difference > 0)
+
+
+def pair_cars(before: CarShapes, now: CarShapes, settings: Cars) -> Pairs:
+    """The same cars in two frames: areas and positions hardly differ; the nearest pairs first.
+
+    Frames of different size, out of order or too far apart have none.
+    """
+    gap_s = (now.t_ns - before.t_ns) * 1e-9
+    width = now.size_px[0]
+    is_apart = not 0.0 < gap_s <= settings.most_gap_s or before.size_px != now.size_px
+    if is_apart or not len(before) or not len(now):
+        return _no_pairs(width)
+    steps = now.center_px[None, :, :] - before.center_px[:, None, :]
+    distance = np.hypot(steps[:, :, 0], steps[:, :, 1])
+    change = np.abs(now.area_px[None, :] - before.area_px[:, None]) / before.area_px[:, None]
+    fits = (change < settings.area_change) & (distance < settings.position_change * width)
+    if not fits.any():
+        return _no_pairs(width)
+    first, second = _nearest(np.where(fits, distance, np.inf))
+    return Pairs(steps[first, second], now.center_px[second], now.nose[second], width)
+
+
+def _no_pairs(width_px: int) -> Pairs:
+    return Pairs(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), width_px)
+
+
+def _nearest(cost: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row and column of the cheapest finite entries, each row and column at most once."""
+    rows, columns = np.nonzero(np.isfinite(cost))
+    order = np.argsort(cost[rows, columns], kind="stable")
+    kept: list[int] = []
+    used_rows: set[int] = set()
+    used_columns: set[int] = set()
+    for i in order.tolist():
+        row, column = int(rows[i]), int(columns[i])
+        if row not in used_rows and column not in used_columns:
+            used_rows.add(row)
+            used_columns.add(column)
+            kept.append(i)
+    return rows[kept], columns[kept]
+
+
+def cross_traffic(pairs: Pairs, settings: Cars) -> Sides:
+    """Cars that move to the left and to the right: horizontally, and not just a little (eq. 15)."""
+    if not len(pairs.nose):
+        return NONE
+    x, y = pairs.step_px[:, 0], pairs.step_px[:, 1]
+    least = settings.still_change * pairs.width_px
+    is_moving = (np.abs(x) > least) & (np.abs(y) <= settings.slope * np.abs(x))
+    return Sides(int(np.sum(is_moving & (x < 0))), int(np.sum(is_moving & (x > 0))))
+
+
+def parked_cars(pairs: Pairs, settings: Cars) -> Sides:
+    """Cars that stand and face left, and right (eq. 16); an unknown nose says nothing."""
+    if not len(pairs.nose):
+        return NONE
+    least = settings.still_change * pairs.width_px
+    is_still = (np.abs(pairs.step_px) <= least).all(axis=1)
+    return Sides(int(np.sum(is_still & (pairs.nose < 0))), int(np.sum(is_still & (pairs.nose > 0))))

@@ -1,0 +1,63 @@
+"""How much of the left, straight and right region of a picture is road (eq. 13, 14)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import RoadMask
+from crosscue.replay.vehicle.vehicle import Polygon, Regions
+
+
+@dataclass(frozen=True, slots=True)
+class RoadShares:
+    """How much of each region of interest is road (eq. 13).
+
+    Attributes:
+        left: Share of the left region's pixels, 0 to 1.
+        straight: Of the straight one.
+        right: Of the right one.
+    """
+
+    left: float
+    straight: float
+    right: float
+
+    def positive(self, least_share: float) -> tuple[bool, bool, bool]:
+        """Left, straight and right road: more than ``least_share`` of the region (eq. 14)."""
+        return self.left > least_share, self.straight > least_share, self.right > least_share
+
+
+@lru_cache(maxsize=64)
+def region_mask(polygon: Polygon, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """The pixels whose centres lie in a polygon, shape (h, w), by the even-odd rule."""
+    height, width = shape
+    y, x = np.mgrid[0:height, 0:width]
+    x, y = (x + 0.5) / width, (y + 0.5) / height
+    inside = np.zeros(shape, np.bool_)
+    for (x0, y0), (x1, y1) in zip(polygon, (*polygon[1:], polygon[0]), strict=True):
+        if y0 == y1:
+            continue
+        crosses = (y0 <= y) != (y1 <= y)
+        inside ^= crosses & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
+    return inside
+
+
+def road_shares(road: RoadMask, regions: Regions) -> RoadShares:
+    """Road pixels over all pixels of each region (eq. 13); regions are scaled with the mask.
+
+    Raises:
+        ValueError: The mask is none.
+    """
+    width, height = road.mask_size_px
+    is_road = rle.decode(road.mask, road.mask_size_px)
+    shares = []
+    for polygon in (regions.left, regions.straight, regions.right):
+        inside = region_mask(polygon, (height, width))
+        count = int(np.count_nonzero(inside))
+        shares.append(np.count_nonzero(is_road & inside) / count if count else 0.0)
+    return RoadShares(*shares)

@@ -1,0 +1,191 @@
+"""Encoded pictures to pixels: sizes are checked before decoding, and no file name reaches OpenCV.
+
+A megabyte of PNG can ask for gigabytes, so the picture's own header is read first. EXIF orientation
+is ignored: calibration belongs to the pixels as the sensor gave them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Bytes, Images
+from crosscue.replay.decode.coding import MAGIC_BYTES, coding_of
+from crosscue.replay.errors import LogFormatError, LogTooLargeError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.image_header import size_in_header
+from crosscue.replay.limits import DEFAULT
+from crosscue.replay.readers.images.damage import damage_of
+
+from .base import View
+
+MOST_PIXELS: Final = 64_000_000
+"""Largest picture decoded: 192 MB of colour."""
+_REDUCTIONS: Final = (8, 4, 2)
+"""What a JPEG decoder can leave out by itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Encoded:
+    """One picture of an ``Images`` block.
+
+    Attributes:
+        coding: As in ``Images``.
+        content: Its bytes, not copied.
+        layout: Width, height, bytes a row and pixel format of a raw picture, else None.
+    """
+
+    coding: str
+    content: memoryview
+    layout: tuple[int, int, int, str] | None = None
+
+
+def encoded(images: Images, row: int) -> Encoded:
+    """One row of a block."""
+    content, coding = images.bytes_.payload(row), images.coding[row]
+    columns = (images.width_px, images.height_px, images.step_bytes)
+    if coding != "raw" or images.pixel_format is None:
+        return Encoded(coding, content)
+    width, height, step = (0 if column is None else int(column[row]) for column in columns)
+    return Encoded(coding, content, (width, height, step, images.pixel_format[row]))
+
+
+def read_file(path: Path, most_bytes: int = DEFAULT.message_bytes) -> Encoded:
+    """A picture file's bytes; what they code is told by the first of them, not by the name.
+
+    Raises:
+        OSError: It cannot be read.
+        LogFormatError: No picture that is known here.
+        LogTooLargeError: Larger than one encoded picture may be.
+    """
+    content = read_at_most(path, most_bytes)
+    if content is None:
+        raise LogTooLargeError(f"more than {most_bytes:,} bytes in one picture")
+    coding = coding_of(content[:MAGIC_BYTES], "")
+    if coding is None:
+        raise LogFormatError("not a JPEG, PNG or WebP picture" if content else "empty picture")
+    return Encoded(coding, memoryview(content))
+
+
+def size_of(picture: Encoded) -> tuple[int, int]:
+    """Width and height as the picture's header says.
+
+    Raises:
+        LogFormatError: It says nothing, or the coding is not decoded here.
+        LogTooLargeError: More than ``MOST_PIXELS``.
+    """
+    if picture.layout is not None:
+        size: tuple[int, int] | None = picture.layout[:2]
+    else:
+        size = size_in_header(picture.content, picture.coding)
+    if size is None:
+        raise LogFormatError(f"{picture.coding} picture without a size, or not decoded here")
+    if min(size) < 1:
+        raise LogFormatError(f"picture of {size[0]} x {size[1]} pixels: want at least one")
+    if size[0] * size[1] > MOST_PIXELS:
+        raise LogTooLargeError(
+            f"picture of {size[0]} x {size[1]} pixels: more than {MOST_PIXELS:,} are not decoded"
+        )
+    return size
+
+
+def decode(picture: Encoded, view: View, depth_bits: int = 16) -> tuple[Bytes, tuple[int, int]]:
+    """The pixels a view asks for, and the width and height of the whole picture.
+
+    Args:
+        picture: Encoded.
+        view: How wide and whether grey; a JPEG is decoded at the smallest scale that serves.
+        depth_bits: How many bits of a 16-bit picture the camera uses (12 for many).
+
+    Raises:
+        LogFormatError: Damaged, cut short, or of a coding not decoded here.
+        LogTooLargeError: As ``size_of``.
+    """
+    if not len(picture.content):
+        raise LogFormatError("empty picture")
+    size = size_of(picture)
+    if picture.layout is not None:
+        return _raw(picture, picture.layout, view, depth_bits), size
+    if why := damage_of(bytes(picture.content), picture.coding):
+        raise LogFormatError(f"{picture.coding} {why}")
+    by = reduction(size[0], view) if picture.coding == "jpeg" else 1
+    return _compressed(picture, size, by, view, depth_bits), size
+
+
+def reduction(width_px: int, view: View) -> int:
+    """The largest of 8, 4, 2, 1 that leaves the view's width."""
+    if view.least_width_px is None:
+        return 1
+    return next((by for by in _REDUCTIONS if width_px // by >= view.least_width_px), 1)
+
+
+def _compressed(
+    picture: Encoded, size: tuple[int, int], by: int, view: View, depth_bits: int
+) -> Bytes:
+    import cv2
+
+    # OpenCV numbers its modes so: grey reductions 16, 32, 64; colour 17, 33, 65.
+    mode = (0 if view.is_grey else 1) if by == 1 else 8 * by + (not view.is_grey)
+    flags = int(mode) | cv2.IMREAD_IGNORE_ORIENTATION | (0 if by > 1 else cv2.IMREAD_ANYDEPTH)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(picture.content, np.uint8), flags)
+    except cv2.error as error:
+        raise LogFormatError(f"{picture.coding} picture does not decode: {error.err}") from None
+    want = (-(-size[1] // by), -(-size[0] // by))
+    if pixels is None or pixels.shape[:2] != want:
+        raise LogFormatError(f"{picture.coding} picture does not decode")
+    return _eight_bits(np.asarray(pixels), depth_bits)
+
+
+def _eight_bits(pixels: np.ndarray[tuple[int, ...], np.dtype[np.generic]], bits: int) -> Bytes:
+    if pixels.dtype == np.uint8:
+        return np.asarray(pixels, np.uint8)
+    if pixels.dtype != np.uint16:
+        raise LogFormatError(f"picture with {pixels.dtype} pixels is not decoded here")
+    shifted = np.asarray(pixels, np.uint16) >> max(bits - 8, 0)
+    return np.asarray(np.minimum(shifted, 255), np.uint8)
+
+
+_RAW: Final = {
+    "mono8": (1, 1, None), "8UC1": (1, 1, None), "mono16": (1, 2, None), "16UC1": (1, 2, None),
+    "bgr8": (3, 1, None), "8UC3": (3, 1, None), "rgb8": (3, 1, "COLOR_RGB2BGR"),
+    "bgra8": (4, 1, "COLOR_BGRA2BGR"), "rgba8": (4, 1, "COLOR_RGBA2BGR"),
+    "bayer_rggb8": (1, 1, "COLOR_BayerRGGB2BGR"), "bayer_bggr8": (1, 1, "COLOR_BayerBGGR2BGR"),
+    "bayer_gbrg8": (1, 1, "COLOR_BayerGBRG2BGR"), "bayer_grbg8": (1, 1, "COLOR_BayerGRBG2BGR"),
+}  # fmt: skip
+"""From a ROS encoding to channels, bytes of each, and OpenCV's conversion to blue, green, red."""
+
+
+def _raw(picture: Encoded, layout: tuple[int, int, int, str], view: View, bits: int) -> Bytes:
+    width, height, step, name = layout
+    if name not in _RAW:
+        raise LogFormatError(f"raw picture in {name!r} is not decoded; there are: {sorted(_RAW)}")
+    channels, depth, conversion = _RAW[name]
+    row = width * channels * depth
+    step = step or row
+    if step < row or len(picture.content) < step * (height - 1) + row:
+        raise LogFormatError("raw picture has fewer bytes than its size needs")
+    flat = np.frombuffer(picture.content, np.uint8)
+    rows = np.lib.stride_tricks.as_strided(flat, (height, row), (step, 1), writeable=False)
+    pixels = np.ascontiguousarray(rows)
+    if depth == 2:
+        pixels = _eight_bits(pixels.view("<u2"), bits)
+    pixels = pixels.reshape((height, width) if channels == 1 else (height, width, channels))
+    import cv2
+
+    if conversion is not None:
+        pixels = np.asarray(cv2.cvtColor(pixels, getattr(cv2, conversion)), np.uint8)
+    return channels_as(pixels, view.is_grey)
+
+
+def channels_as(pixels: Bytes, is_grey: bool) -> Bytes:
+    """The same pixels with one channel, or with three."""
+    import cv2
+
+    if is_grey == (pixels.ndim == 2):
+        return pixels
+    turn = cv2.COLOR_BGR2GRAY if is_grey else cv2.COLOR_GRAY2BGR
+    return np.asarray(cv2.cvtColor(pixels, turn), np.uint8)

@@ -1,0 +1,1 @@
+"""Neural networks and the back ends that run them."""

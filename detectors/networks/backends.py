@@ -1,0 +1,186 @@
+"""Neural networks from bytes, behind whichever back end is installed.
+
+ONNX runs in ONNX Runtime where that is installed, else in OpenCV; OpenVINO IR in
+OpenVINO, TFLite in LiteRT.
+Weights always come as bytes whose hash was compared, and never pull in another file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import PurePath
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.detectors.catalog.card import Weights
+from crosscue.replay.errors import VehicleError, one_line
+
+from .onnx_input import input_shape
+from .openvino import import_openvino
+
+Array = NDArray[np.generic]
+_EXTERNAL: Final = b"\x0a\x08location"
+"""How a protobuf spells the key of a tensor that lies in another file."""
+
+
+class Network(Protocol):
+    """A network ready to run."""
+
+    @property
+    def backend(self) -> str:
+        """Name and version of what runs it."""
+        ...
+
+    def __call__(self, batch: Array, /) -> Mapping[str, Array]:
+        """All outputs by name."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class _Function:
+    """A back end's network as a function."""
+
+    backend: str
+    call: Callable[[Array], Mapping[str, Array]]
+
+    def __call__(self, batch: Array, /) -> Mapping[str, Array]:
+        return self.call(batch)
+
+
+def load_network(weights: Weights, backend: str | None = None, threads: int = 1) -> Network:
+    """Make weights ready to run.
+
+    Args:
+        weights: Verified.
+        backend: ``onnxruntime``, ``opencv``, ``openvino``, ``litert``; None for the best.
+        threads: How many the back end may use, where it can be told.
+
+    Raises:
+        VehicleError: No installed back end reads them, or they are damaged.
+    """
+    suffix = PurePath(weights.name).suffix.lower()
+    able = BACKENDS.get(suffix)
+    if able is None:
+        raise VehicleError(f"{weights.name}: weights of a kind not known; want {sorted(BACKENDS)}")
+    if suffix == ".onnx" and _EXTERNAL in weights.content:
+        raise VehicleError(
+            f"{weights.name}: keeps tensors in other files, which no hash covers; save it whole"
+        )
+    if backend is not None and backend not in able:
+        raise VehicleError(f"{weights.name}: {backend} does not run it; one of: {', '.join(able)}")
+    name = backend or next((n for n in able if find_spec(_PACKAGE[n]) is not None), able[0])
+    if find_spec(_PACKAGE[name]) is None:
+        raise VehicleError(
+            f"{weights.name}: runs in {name}, which is not installed: "
+            f"pip install {_PROJECT.get(name, name)}"
+        )
+    try:
+        return _LOADERS[name](weights, threads)
+    except VehicleError:
+        raise
+    except Exception as error:
+        raise VehicleError(
+            f"{weights.name}: {name} cannot read it: {one_line(error, 200)}; is it whole?"
+        ) from None
+
+
+def _in_onnxruntime(weights: Weights, threads: int) -> Network:
+    ort: Any = import_module("onnxruntime")
+
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 4
+    session = ort.InferenceSession(weights.content, options, providers=_ort_providers(ort))
+    given, names = session.get_inputs()[0].name, [out.name for out in session.get_outputs()]
+
+    def call(batch: Array) -> Mapping[str, Array]:
+        return dict(zip(names, session.run(names, {given: batch}), strict=True))
+
+    return _Function(f"onnxruntime {ort.__version__} {session.get_providers()[0]}", call)
+
+
+def _ort_providers(ort: Any) -> list[str]:
+    wanted = ("CUDAExecutionProvider", "CPUExecutionProvider")
+    return [name for name in wanted if name in ort.get_available_providers()]
+
+
+def _in_opencv(weights: Weights, threads: int) -> Network:
+    import cv2
+
+    net = cv2.dnn.readNetFromONNX(np.frombuffer(weights.content, np.uint8))
+    names = list(net.getUnconnectedOutLayersNames())
+    wanted = input_shape(weights.content)
+
+    def call(batch: Array) -> Mapping[str, Array]:
+        if wanted is not None and not _fits(batch.shape, wanted):
+            raise ValueError(f"got {batch.shape}, the network's own input is {wanted}")
+        net.setInput(np.asarray(batch))
+        outputs = net.forward(names)
+        return {name: np.asarray(out) for name, out in zip(names, outputs, strict=True)}
+
+    return _Function(f"opencv {cv2.__version__}", call)
+
+
+def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(wanted) and all(
+        want is None or size == want for size, want in zip(shape, wanted, strict=True)
+    )
+
+
+def _in_openvino(weights: Weights, threads: int) -> Network:
+    ov = import_openvino()
+    core = ov.Core()
+    core.set_property("CPU", {"INFERENCE_NUM_THREADS": threads})
+    # Speed hints may pick half precision, and results must not depend on the processor.
+    core.set_property("CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+    model = core.read_model(weights.content, weights.second)
+    compiled = core.compile_model(model, "CPU")
+    names = [_output_name(out, i) for i, out in enumerate(compiled.outputs)]
+
+    def call(batch: Array) -> Mapping[str, Array]:
+        found = compiled([batch])
+        return {name: np.asarray(found[i]) for i, name in enumerate(names)}
+
+    return _Function(f"openvino {ov.__version__}", call)
+
+
+def _in_litert(weights: Weights, threads: int) -> Network:
+    litert: Any = import_module("ai_edge_litert.interpreter")
+    net = litert.Interpreter(model_content=weights.content, num_threads=threads)
+    net.allocate_tensors()
+    given, outputs = net.get_input_details()[0], net.get_output_details()
+
+    def call(batch: Array) -> Mapping[str, Array]:
+        net.set_tensor(given["index"], batch)
+        net.invoke()
+        return {str(out["name"]): np.asarray(net.get_tensor(out["index"])) for out in outputs}
+
+    return _Function(f"litert {version('ai-edge-litert')}", call)
+
+
+def _output_name(output: Any, index: int) -> str:
+    names = sorted(output.get_names())
+    return str(names[0]) if names else f"output{index}"
+
+
+BACKENDS: Final[Mapping[str, tuple[str, ...]]] = {
+    ".onnx": ("onnxruntime", "opencv", "openvino"),
+    ".xml": ("openvino",),
+    ".tflite": ("litert",),
+}
+"""From the weights' suffix to the back ends that run them, the preferred first."""
+_PACKAGE: Final = {"onnxruntime": "onnxruntime", "opencv": "cv2", "openvino": "openvino",
+             "litert": "ai_edge_litert"}  # fmt: skip
+_PROJECT: Final = {"opencv": "opencv-python-headless", "litert": "ai-edge-litert"}
+_LOADERS: Final[Mapping[str, Callable[[Weights, int], Network]]] = {
+    "onnxruntime": _in_onnxruntime,
+    "opencv": _in_opencv,
+    "openvino": _in_openvino,
+    "litert": _in_litert,
+}

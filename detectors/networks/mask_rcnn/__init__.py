@@ -1,0 +1,1 @@
+"""Mask R-CNN: weights, graph, back ends."""

@@ -1,0 +1,172 @@
+"""Checkpoints: weights as safetensors, with what they are written in the file's own header.
+
+Nothing that unpickles is ever opened: a pickle runs whatever program its maker put in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import torch
+from pydantic import Field, ValidationError
+from torch import Tensor
+
+from crosscue.detectors.settings import Settings
+from crosscue.detectors.weights_file import embedded, packed, unpacked
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.run_folder import write_bytes
+
+from .network import Plan, build_network
+
+KEY: Final = "crosscue"
+VERSION: Final = 1
+MOST_BYTES: Final = 2 << 30
+_PICKLES: Final = frozenset({".pth", ".pt", ".pkl", ".pickle", ".bin", ".ckpt", ".joblib", ".npy"})
+"""Suffixes under which pickles travel."""
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Calibration(Settings):
+    """From a network's score s to the share of such detections that are right.
+
+    The logit of the share is ``slope * logit(s) + offset`` (Platt 1999).
+    """
+
+    slope: Annotated[float, Field(gt=0.0, le=100.0)] = 1.0
+    offset: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
+
+
+class Facts(Settings):
+    """What a checkpoint says of itself.
+
+    Attributes:
+        version: Of this description.
+        plan: What to build.
+        calibration: By class; a class without one keeps its scores.
+        measured: Average precisions, precisions and recalls on held-out pictures, by name.
+        recipe: How it was made, in words and numbers.
+    """
+
+    version: Annotated[int, Field(ge=1, le=VERSION)] = VERSION
+    plan: Plan
+    calibration: dict[str, Calibration] = Field(default_factory=dict)
+    measured: dict[str, Finite | None] = Field(default_factory=dict)
+    recipe: dict[str, str | int | Finite] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checkpoint:
+    """A network with its weights.
+
+    Attributes:
+        facts: Of the file.
+        network: A torchvision ``MaskRCNN`` in evaluation mode.
+        sha256: Of the file, hexadecimal.
+    """
+
+    facts: Facts
+    network: Any
+    sha256: str
+
+
+def save_checkpoint(path: Path, network: Any, facts: Facts, *, halve: bool = True) -> None:
+    """Write weights and facts.
+
+    Args:
+        path: Where, ending in ``.safetensors``.
+        network: A torchvision ``MaskRCNN``.
+        facts: Of it.
+        halve: Keep 16 bits of each weight.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    tensors = {name: _stored(value, halve) for name, value in network.state_dict().items()}
+    content = packed(tensors, KEY, json.dumps(facts.model_dump(mode="json"), sort_keys=True))
+    write_bytes(path, content)
+
+
+def _stored(value: Tensor, halve: bool) -> Tensor:
+    kept = value.detach().cpu().contiguous(memory_format=torch.contiguous_format)
+    return kept.half() if halve and kept.dtype == torch.float32 else kept
+
+
+def embedded_path() -> Path:
+    """The checkpoint that comes with crosscue."""
+    return embedded("compact_simulated.safetensors")
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Read weights and build their network.
+
+    Raises:
+        VehicleError: Not there, a pickle, damaged, not made by crosscue, or facts and weights do
+            not fit each other.
+    """
+    content = _content(path)
+    description, tensors = unpacked(content, KEY, path)
+    facts = _facts(description, path)
+    network = build_network(facts.plan)
+    fill(network, tensors, path)
+    return Checkpoint(facts, network.eval(), hashlib.sha256(content).hexdigest())
+
+
+def _content(path: Path) -> bytes:
+    if path.suffix.lower() in _PICKLES:
+        raise VehicleError(
+            f"{path}: weights of this kind can run programs when read; want .safetensors "
+            "(convert with safetensors.torch.save_file where you trust the file)"
+        )
+    try:
+        content = read_at_most(path, MOST_BYTES)
+    except OSError as error:
+        raise VehicleError(f"{path}: {error.strerror}; check the network's file name") from None
+    if content is None:
+        raise VehicleError(f"{path}: more than {MOST_BYTES:,} bytes; want a checkpoint")
+    return content
+
+
+def _facts(description: str | None, path: Path) -> Facts:
+    if description is None:
+        raise VehicleError(
+            f"{path}: says nothing of its classes and size; want one that crosscue train mask-rcnn "
+            "wrote"
+        )
+    try:
+        return Facts.model_validate_json(description)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = ".".join(str(part) for part in first["loc"])
+        raise VehicleError(
+            f"{path}: its description does not fit: {name}: {first['msg'].lower()}; train it again"
+        ) from None
+
+
+def fill(network: Any, tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Put weights into a network.
+
+    Raises:
+        VehicleError: A weight is missing, unknown, of another shape, or not finite.
+    """
+    wanted: Mapping[str, Tensor] = network.state_dict()
+    if missing := sorted(set(wanted) ^ set(tensors)):
+        raise VehicleError(
+            f"{path}: weights do not fit the network it names: {missing[0]} "
+            f"(and {len(missing) - 1} more) in only one of them; take the file it was trained as"
+        )
+    for name, value in sorted(tensors.items()):
+        if value.shape != wanted[name].shape:
+            raise VehicleError(
+                f"{path}: {name}: want shape {tuple(wanted[name].shape)} for its classes, "
+                f"got {tuple(value.shape)}; take the file it was trained as"
+            )
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            raise VehicleError(f"{path}: {name}: holds numbers that are none; train it again")
+    network.load_state_dict({name: tensors[name].to(wanted[name].dtype) for name in wanted})

@@ -1,0 +1,87 @@
+"""Torchvision's Mask R-CNN networks with COCO weights, fetched by torchvision on a user's machine.
+
+The file is checked against the hash in its name, and read with ``weights_only=True``, which refuses
+everything but tensors.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+from urllib.error import URLError
+
+import torch
+from torch import nn
+
+from crosscue.replay.errors import VehicleError, one_line
+
+from .checkpoint import Checkpoint, Facts
+from .network import Plan, build_network
+
+COCO_NETWORKS: Final[Mapping[str, str]] = {
+    "resnet50": "MaskRCNN_ResNet50_FPN_Weights",
+    "resnet50-v2": "MaskRCNN_ResNet50_FPN_V2_Weights",
+}
+"""From our names to torchvision's sets of weights."""
+NO_EPSILON: Final = frozenset({"resnet50"})
+"""Learnt when torchvision's frozen normalisation added nothing to variances; so run that way."""
+WIDTH_PX: Final = 1333
+"""Torchvision scales a 16:9 picture to this width."""
+
+
+def load_coco(name: str) -> Checkpoint:
+    """One of ``COCO_NETWORKS``, fetched if it is not yet on this machine.
+
+    Raises:
+        VehicleError: It cannot be fetched, or is not the file that torchvision means.
+    """
+    from torchvision.models import detection
+
+    weights = getattr(detection, COCO_NETWORKS[name]).DEFAULT
+    place = Path(torch.hub.get_dir()) / "checkpoints" / weights.url.rsplit("/", 1)[-1]
+    try:
+        if place.exists():
+            _check_whole(place)
+        tensors = weights.get_state_dict(progress=False, check_hash=True, weights_only=True)
+    except (URLError, TimeoutError, ConnectionError) as error:
+        raise VehicleError(
+            f"detector mask-rcnn: {name}: cannot fetch {weights.url} ({error}); fetch it elsewhere "
+            f'and put it at {place}, or take network = "embedded"'
+        ) from None
+    except (OSError, RuntimeError, ValueError) as error:
+        why = one_line(error, 160)
+        raise VehicleError(
+            f"detector mask-rcnn: {name}: {place} is not usable ({why}); delete it and run again"
+        ) from None
+    return coco_checkpoint(name, weights, tensors)
+
+
+def _check_whole(path: Path) -> None:
+    """What torchvision does with a file that it has just fetched, and not with one it finds.
+
+    Raises:
+        ValueError: Its hash is not the one in its name.
+        OSError: It cannot be read.
+    """
+    wanted = path.stem.rsplit("-", 1)[-1]
+    with path.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if not found.startswith(wanted):
+        raise ValueError(f"damaged: sha256 {found[:8]}, want {wanted}")
+
+
+def coco_checkpoint(name: str, weights: Any, tensors: Mapping[str, Any]) -> Checkpoint:
+    """Torchvision's weights in the network they are for, with the names of COCO's classes."""
+    classes = tuple(None if c == "N/A" else str(c) for c in weights.meta["categories"][1:])
+    plan = Plan.model_validate({"architecture": name, "classes": classes, "width_px": WIDTH_PX})
+    network = build_network(plan)
+    network.load_state_dict(tensors)
+    if name in NO_EPSILON:
+        for module in network.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eps = 0.0
+    # The file's name carries the start of its own hash, which torchvision has compared.
+    digest = hashlib.sha256(weights.url.encode()).hexdigest()
+    return Checkpoint(Facts(plan=plan), network.eval(), digest)

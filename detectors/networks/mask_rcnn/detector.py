@@ -1,0 +1,338 @@
+"""Mask R-CNN as a detector: boxes, scores and masks of cars, stop signs and traffic lights.
+
+Settings: ``network`` (``embedded``, ``resnet50``, ``resnet50-v2``, or a ``.safetensors`` file),
+``score``, ``proposals``, ``objectness``, ``batch``, ``device``, ``backend``, ``threads``.
+
+Faster than torchvision's own loop with equal results: masks only for boxes that pass the score, and
+laid into their box, never into the picture; on a processor also convolutions by Winograd's way
+(``mask_rcnn_cpu``) or OpenVINO (``mask_rcnn_openvino``), and of many proposals a rough look first
+(``box_screening``). Fewer proposals save the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import Tensor
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections, Detector, Found, Frame, View
+from crosscue.detectors.devices import chosen_device
+from crosscue.detectors.settings import Settings, Share, identity_of, settings_of
+from crosscue.replay.columns import Bytes, Floats
+from crosscue.replay.errors import CrosscueError, VehicleError
+
+from .checkpoint import Calibration, Checkpoint, embedded_path, load_checkpoint
+from .coco import COCO_NETWORKS, load_coco
+from .cpu import for_cpu
+from .network import MEAN, STRIDE, Plan, set_limits
+from .openvino import OpenVinoParts
+from .parts import Parts, TorchParts, detected
+from .screening import FEWEST, ScreenedParts, can_screen
+
+VERSION: Final = 3
+"""Counts up when the same pixels, weights and settings would give other numbers."""
+EMBEDDED: Final = "embedded"
+GPU_BATCH: Final = 8
+PROPOSALS: Final = 100
+_PAD: Final = np.rint(np.array(MEAN[::-1]) * 255.0).astype(np.uint8)
+
+
+class MaskRcnnSettings(Settings):
+    """How to run it."""
+
+    network: str = EMBEDDED
+    """``embedded``, ``resnet50``, ``resnet50-v2``, or the file name of a checkpoint."""
+    score: Share = 0.5
+    """Least score of a detection that is given; the cues have their own, higher ones."""
+    proposals: Annotated[int, Field(ge=1, le=2000)] = PROPOSALS
+    """Most places that are looked at more closely; torchvision's own number is 1000."""
+    objectness: Share = 0.0
+    """Least probability that such a place holds anything; torchvision's own is 0."""
+    batch: Annotated[int, Field(ge=1, le=256)] | None = None
+    """Pictures at a time; without it 1 on a CPU and 8 on a GPU."""
+    device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    backend: Literal["torch", "openvino"] = "torch"
+    """What runs the layers; ``openvino`` on a CPU only."""
+    threads: Annotated[int, Field(ge=1, le=256)] = 1
+    """On a CPU."""
+    halve: bool = True
+    """On a GPU, compute in 16 bits where that is safe."""
+
+
+def build(**given: Any) -> Detector:
+    """The detector.
+
+    Raises:
+        VehicleError: Settings, checkpoint, device or back end do not fit, or weights cannot be
+            fetched.
+    """
+    settings = settings_of(MaskRcnnSettings, given, "detector mask-rcnn")
+    device = _device_of(settings)
+    return detector_of(checkpoint_named(settings.network), settings, device)
+
+
+def checkpoint_named(name: str) -> Checkpoint:
+    """The embedded checkpoint, one that torchvision fetches, or one from a file.
+
+    Raises:
+        VehicleError: As ``build``.
+    """
+    if name == EMBEDDED:
+        return load_checkpoint(embedded_path())
+    if name in COCO_NETWORKS:
+        return load_coco(name)
+    if "." not in Path(name).name:
+        names = ", ".join((EMBEDDED, *COCO_NETWORKS))
+        raise VehicleError(
+            f"detector mask-rcnn: network: {name!r} is none of {names}; or give a .safetensors file"
+        )
+    return load_checkpoint(Path(name))
+
+
+def _device_of(settings: MaskRcnnSettings) -> torch.device:
+    if settings.backend == "torch":
+        return chosen_device(settings.device, "detector mask-rcnn")
+    if settings.device not in ("auto", "cpu"):
+        raise VehicleError(
+            f"detector mask-rcnn: backend {settings.backend} runs on a cpu only, got device "
+            f'{settings.device}; set device = "cpu", or backend = "torch"'
+        )
+    return torch.device("cpu")
+
+
+def detector_of(
+    checkpoint: Checkpoint, settings: MaskRcnnSettings, device: torch.device
+) -> MaskRcnnDetector:
+    """A detector around a network."""
+    network = checkpoint.network.to(device).eval()
+    lowest = min(
+        raw_score(settings.score, checkpoint.facts.calibration.get(name or "", Calibration()))
+        for name in checkpoint.facts.plan.classes
+    )
+    set_limits(network, settings.proposals, lowest, settings.objectness)
+    batch = settings.batch or (1 if device.type == "cpu" else GPU_BATCH)
+    with _threads(settings.threads, device):
+        parts = _parts(network, settings, device)
+    return MaskRcnnDetector(checkpoint, settings, device, parts, _Batch(batch))
+
+
+def _parts(network: Any, settings: MaskRcnnSettings, device: torch.device) -> Parts:
+    if settings.backend == "openvino":
+        return OpenVinoParts(network, settings.threads)
+    if device.type == "cpu":
+        own = for_cpu(network)
+        if settings.proposals >= FEWEST and can_screen(own):
+            return ScreenedParts(own)
+        return TorchParts(own, device)
+    return TorchParts(network.to(memory_format=torch.channels_last), device)
+
+
+@dataclass(slots=True)
+class _Batch:
+    """Pictures at a time; shrinks when memory runs out."""
+
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class MaskRcnnDetector:
+    """Boxes and masks."""
+
+    checkpoint: Checkpoint
+    settings: MaskRcnnSettings
+    device: torch.device
+    parts: Parts
+    _batch: _Batch = field(repr=False)
+
+    @property
+    def view(self) -> View:
+        """No finer than the network's input."""
+        return View(least_width_px=self.checkpoint.facts.plan.width_px)
+
+    @property
+    def identity(self) -> str:
+        """Of weights, settings, device kind and torch."""
+        asked = self.settings.model_dump(
+            include={"score", "proposals", "objectness", "halve", "backend"}
+        )
+        return identity_of(
+            "mask-rcnn", VERSION, self.checkpoint.sha256, asked, self.device.type,
+            str(torch.__version__),
+        )  # fmt: skip
+
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        """Detect.
+
+        Raises:
+            CrosscueError: Not even one picture fits into memory.
+        """
+        found: list[Found] = []
+        while len(found) < len(frames):
+            part = _alike(frames[len(found) : len(found) + self._batch.size])
+            try:
+                found += self._detect(part)
+            except (torch.OutOfMemoryError, MemoryError):
+                self._shrink(len(part))
+        return found
+
+    def _shrink(self, tried: int) -> None:
+        if tried == 1:
+            width = self.checkpoint.facts.plan.width_px
+            raise CrosscueError(
+                f"detector mask-rcnn: no memory on {self.device} for one picture {width} pixels "
+                'wide; close other programs, set device = "cpu", or take a smaller network'
+            ) from None
+        self._batch.size = max(tried // 2, 1)
+        if self.device.type == "cuda":
+            torch.cuda.empty_cache()
+
+    def _detect(self, frames: Sequence[Frame]) -> list[Found]:
+        plan = self.checkpoint.facts.plan
+        placed = [place(frame.pixels, plan) for frame in frames]
+        with torch.inference_mode(), _threads(self.settings.threads, self.device):
+            pictures = np.stack([one.pixels for one in placed])
+            is_halved = self.settings.halve and self.device.type == "cuda"
+            with torch.autocast(self.device.type, enabled=is_halved):
+                raw = detected(self.checkpoint.network, self.parts, pictures)
+            return [
+                self._told(frame, one, tensors)
+                for frame, one, tensors in zip(frames, placed, raw, strict=True)
+            ]
+
+    def _told(self, frame: Frame, placed: Placed, raw: dict[str, Tensor]) -> Detections:
+        facts = self.checkpoint.facts
+        names = [facts.plan.classes[int(label) - 1] for label in raw["labels"].tolist()]
+        boxes, raw_scores, masks = (
+            raw[key].float().cpu().numpy() for key in ("boxes", "scores", "masks")
+        )
+        scores = np.array(
+            [calibrated(s, facts.calibration.get(name or "", Calibration()))
+             for s, name in zip(raw_scores.tolist(), names, strict=True)], np.float64
+        )  # fmt: skip
+        width, height = frame.size_px
+        boxes_px = (
+            (boxes.astype(np.float64) + np.tile(placed.corner_px, 2))
+            / np.tile(placed.scale, 2)
+            * np.tile(frame.scale, 2)
+        )
+        boxes_px = np.clip(boxes_px, 0.0, [width, height, width, height])
+        keep = [i for i, name in enumerate(names) if name and scores[i] >= self.settings.score]
+        return Detections(
+            frame.t_ns, frame.size_px, boxes_px[keep], scores[keep],
+            tuple(str(names[i]) for i in keep),
+            tuple(laid_in(masks[i, 0], boxes_px[i], frame.size_px) for i in keep),
+        )  # fmt: skip
+
+
+def _alike(frames: Sequence[Frame]) -> Sequence[Frame]:
+    """The first of them that are of one size."""
+    shape = frames[0].pixels.shape
+    count = next((i for i, f in enumerate(frames) if f.pixels.shape != shape), len(frames))
+    return frames[:count]
+
+
+@contextmanager
+def _threads(count: int, device: torch.device) -> Iterator[None]:
+    """So many threads on a CPU; more than there are cores free make it slower by far."""
+    before = torch.get_num_threads()
+    if device.type == "cpu" and before != count:
+        torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        if torch.get_num_threads() != before:
+            torch.set_num_threads(before)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A picture as a network sees it.
+
+    Attributes:
+        pixels: Shape (H, W, 3), uint8, blue green red; scaled, cut and padded.
+        scale: From the given pixels to the scaled ones, along x and y.
+        corner_px: Column and row of the network's first pixel in the scaled picture.
+        inner_px: Width and height without padding.
+    """
+
+    pixels: Bytes
+    scale: tuple[float, float]
+    corner_px: tuple[int, int]
+    inner_px: tuple[int, int]
+
+
+def place(pixels: Bytes, plan: Plan) -> Placed:
+    """Scale a picture to the plan's width, cut off top and bottom, pad to whole strides."""
+    import cv2
+
+    if pixels.ndim == 2:
+        pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR), np.uint8)
+    height, width = pixels.shape[:2]
+    first = min(round(plan.top * height), height - 1)
+    last = max(round((1.0 - plan.bottom) * height), first + 1)
+    size = (plan.width_px, max(round((last - first) * plan.width_px / width), 1))
+    scaled = np.asarray(pixels[first:last], np.uint8)
+    if size != (width, last - first):
+        scaled = np.asarray(cv2.resize(scaled, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+    scale = (size[0] / width, size[1] / (last - first))
+    padded = np.empty((_whole(size[1]), _whole(size[0]), 3), np.uint8)
+    padded[: size[1], : size[0]] = scaled
+    padded[size[1] :] = padded[: size[1], size[0] :] = _PAD
+    return Placed(padded, scale, (0, round(first * scale[1])), size)
+
+
+def _whole(side: int) -> int:
+    return -(-side // STRIDE) * STRIDE
+
+
+def calibrated(score: float, by: Calibration) -> float:
+    """From a network's score to the share of such detections that are right."""
+    if by == Calibration():
+        return score
+    kept = min(max(score, 1e-9), 1.0 - 1e-9)
+    logit = by.slope * float(np.log(kept / (1.0 - kept))) + by.offset
+    return float(1.0 / (1.0 + np.exp(-logit)))
+
+
+def raw_score(score: float, by: Calibration) -> float:
+    """The network's score that ``calibrated`` turns into this one."""
+    kept = min(max(score, 1e-9), 1.0 - 1e-9)
+    if by == Calibration():
+        return score
+    logit = (float(np.log(kept / (1.0 - kept))) - by.offset) / by.slope
+    return float(1.0 / (1.0 + np.exp(-logit)))
+
+
+def laid_in(mask: NDArray[np.float32], box_px: Floats, size_px: tuple[int, int]) -> bytes:
+    """A mask of its box as runs over the picture; where it is likelier object than not.
+
+    Args:
+        mask: Shape (28, 28): likelihoods over the box.
+        box_px: x0, y0, x1, y1.
+        size_px: Width and height of the picture.
+    """
+    import cv2
+
+    width, height = size_px
+    x0, y0 = (
+        min(max(int(np.floor(v)), 0), side - 1) for v, side in zip(box_px, size_px, strict=False)
+    )
+    x1, y1 = (min(max(int(np.ceil(v)), low + 1), side)
+              for v, low, side in zip(box_px[2:], (x0, y0), size_px, strict=True))  # fmt: skip
+    rim = np.pad(mask, 1)
+    step = np.maximum(box_px[2:] - box_px[:2], 1e-6) / mask.shape[::-1]
+    # Pixel middles in the mask's grid, whose own first middle lies at 1 because of the rim.
+    columns = (np.arange(x0, x1) + 0.5 - box_px[0]) / step[0] + 0.5
+    rows = (np.arange(y0, y1) + 0.5 - box_px[1]) / step[1] + 0.5
+    grid = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
+    fine = cv2.remap(rim, grid[0], grid[1], cv2.INTER_LINEAR)
+    return rle.encode(np.asarray(fine) > 0.5, (x0, y0), (width, height))

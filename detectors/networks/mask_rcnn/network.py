@@ -1,0 +1,210 @@
+"""Mask R-CNN networks: torchvision's own with a ResNet-50, and a compact one for a CPU.
+
+The compact one has a small residual body with three levels (strides 8, 16, 32), 64 channels
+throughout the pyramid and small heads: 3 million parameters, trained from nothing on a CPU.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Annotated, Any, Final, Literal
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+from torch.nn import functional
+
+from crosscue.detectors.settings import Settings, Share
+
+Architecture = Literal["compact", "resnet50", "resnet50-v2"]
+CHANNELS: Final = 64
+"""Of the compact network's pyramid and heads."""
+MEAN: Final = (0.485, 0.456, 0.406)
+SPREAD: Final = (0.229, 0.224, 0.225)
+"""Mean and standard deviation of red, green and blue, as torchvision's weights want them."""
+STRIDE: Final = 32
+"""Pictures are padded to a multiple of it, as torchvision pads them."""
+ANCHORS_PX: Final = ((6, 11), (20, 36), (64, 112), (176, 288))
+ASPECTS: Final = (0.45, 1.0, 2.6)
+"""Height over width: an upright light, a sign, a car from the side."""
+MOST_BEFORE_SUPPRESSION: Final = 1000
+"""Boxes of a level that compete to be proposals; torchvision's own number."""
+
+
+class Plan(Settings):
+    """What a network must be built as, before weights fit it.
+
+    Attributes:
+        architecture: Which.
+        classes: Names of the classes, without the background; None in places not used.
+        width_px: Pictures are scaled to this width.
+        top: Share of the picture's height above what the network looks at.
+        bottom: Likewise below.
+    """
+
+    architecture: Architecture
+    classes: Annotated[tuple[str | None, ...], Field(min_length=1, max_length=1000, strict=False)]
+    width_px: Annotated[int, Field(ge=64, le=4096)]
+    top: Share = 0.0
+    bottom: Share = 0.0
+
+    @model_validator(mode="after")
+    def _something_is_left(self) -> Plan:
+        if self.top + self.bottom > 0.9:
+            raise ValueError("top and bottom leave less than a tenth of the picture")
+        return self
+
+
+def build_network(plan: Plan) -> Any:
+    """A torchvision ``MaskRCNN`` with random weights.
+
+    Nothing is fetched; for the proposals and scores asked of it, see ``set_limits``.
+    """
+    from torchvision.models import detection
+
+    classes = len(plan.classes) + 1
+    if plan.architecture == "compact":
+        return _compact(classes)
+    make = {
+        "resnet50": detection.maskrcnn_resnet50_fpn,
+        "resnet50-v2": detection.maskrcnn_resnet50_fpn_v2,
+    }[plan.architecture]
+    return make(weights=None, weights_backbone=None, num_classes=classes)
+
+
+def set_limits(network: Any, proposals: int, score: float, objectness: float = 0.0) -> None:
+    """Which places the network looks at more closely, and the least score of what it gives.
+
+    Boxes below the score never reach the mask head, so this is also where the masks' time is saved.
+
+    Args:
+        network: A torchvision ``MaskRCNN``.
+        proposals: The most places of a picture.
+        score: Of a detection, from 0 to 1.
+        objectness: Least probability that a place holds anything, from 0 to 1; torchvision's own
+            is 0, so that most of its 1000 places are plain background.
+    """
+    rpn, heads = network.rpn, network.roi_heads
+    before = max(proposals, min(3 * proposals, MOST_BEFORE_SUPPRESSION))
+    rpn._pre_nms_top_n = {**rpn._pre_nms_top_n, "testing": before}
+    rpn._post_nms_top_n = {**rpn._post_nms_top_n, "testing": proposals}
+    rpn.score_thresh = objectness
+    heads.score_thresh = score
+
+
+def _compact(classes: int) -> Any:
+    from torchvision.models.detection import MaskRCNN
+    from torchvision.models.detection.faster_rcnn import TwoMLPHead
+    from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
+    from torchvision.models.detection.rpn import AnchorGenerator
+    from torchvision.ops import MultiScaleRoIAlign
+
+    levels = ["0", "1", "2"]
+    return MaskRCNN(
+        CompactBackbone(),
+        num_classes=None,
+        rpn_anchor_generator=AnchorGenerator(ANCHORS_PX, (ASPECTS,) * len(ANCHORS_PX)),
+        rpn_pre_nms_top_n_train=400,
+        rpn_post_nms_top_n_train=200,
+        rpn_pre_nms_top_n_test=300,
+        rpn_post_nms_top_n_test=100,
+        rpn_batch_size_per_image=128,
+        box_roi_pool=MultiScaleRoIAlign(levels, output_size=7, sampling_ratio=2),
+        box_head=TwoMLPHead(CHANNELS * 49, 256),
+        box_predictor=_BoxPredictor(256, classes),
+        box_batch_size_per_image=64,
+        mask_roi_pool=MultiScaleRoIAlign(levels, output_size=14, sampling_ratio=2),
+        mask_head=MaskRCNNHeads(CHANNELS, (CHANNELS, CHANNELS), 1),
+        mask_predictor=MaskRCNNPredictor(CHANNELS, CHANNELS, classes),
+    )
+
+
+class _BoxPredictor(nn.Module):
+    """Class scores and, for each class, a box."""
+
+    def __init__(self, inputs: int, classes: int) -> None:
+        super().__init__()
+        self.cls_score = nn.Linear(inputs, classes)
+        self.bbox_pred = nn.Linear(inputs, 4 * classes)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.cls_score(x), self.bbox_pred(x)
+
+
+class CompactBackbone(nn.Module):
+    """From pictures (N, 3, H, W) to levels of 64 channels at strides 8, 16, 32 and 64."""
+
+    def __init__(self) -> None:
+        """Random weights."""
+        from torchvision.ops import FeaturePyramidNetwork
+        from torchvision.ops.feature_pyramid_network import LastLevelMaxPool
+
+        super().__init__()
+        self.out_channels = CHANNELS
+        self.stem = nn.Sequential(_conv(3, 16, 2), _conv(16, 32, 2), Residual(32, 32, 1))
+        self.level0 = nn.Sequential(Residual(32, 64, 2), Residual(64, 64, 1))
+        self.level1 = nn.Sequential(Residual(64, 128, 2), Residual(128, 128, 1))
+        self.level2 = nn.Sequential(Residual(128, 192, 2), Residual(192, 192, 1))
+        self.pyramid = FeaturePyramidNetwork(
+            [64, 128, 192], CHANNELS, LastLevelMaxPool(), norm_layer=nn.BatchNorm2d
+        )
+
+    def forward(self, pictures: Tensor) -> OrderedDict[str, Tensor]:
+        """All levels, finest first."""
+        fine = self.level0(self.stem(pictures))
+        middle = self.level1(fine)
+        coarse = self.level2(middle)
+        levels: OrderedDict[str, Tensor] = self.pyramid(
+            OrderedDict([("0", fine), ("1", middle), ("2", coarse)])
+        )
+        return levels
+
+
+class Residual(nn.Module):
+    """Two 3 x 3 convolutions beside a short cut (He et al. 2016, fig. 2)."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        """Random weights."""
+        super().__init__()
+        self.first = _conv(inputs, outputs, stride)
+        self.second = nn.Sequential(
+            nn.Conv2d(outputs, outputs, 3, padding=1, bias=False), nn.BatchNorm2d(outputs)
+        )
+        self.short_cut = (
+            nn.Identity()
+            if stride == 1
+            else nn.Sequential(
+                nn.AvgPool2d(2, ceil_mode=True),
+                nn.Conv2d(inputs, outputs, 1, bias=False),
+                nn.BatchNorm2d(outputs),
+            )
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The same size, or half of it."""
+        sum_of_both = self.second(self.first(x))
+        sum_of_both += self.short_cut(x)
+        return functional.relu_(sum_of_both)
+
+
+def _conv(inputs: int, outputs: int, stride: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
+    )
+
+
+def forward_training(network: Any, pictures: Tensor, targets: list[dict[str, Tensor]]) -> Tensor:
+    """Sum of all losses of a batch of normalised pictures (N, 3, H, W) of one size.
+
+    Torchvision's own transform is left out: it would scale pictures that have their size already.
+    """
+    from torchvision.models.detection.image_list import ImageList
+
+    size = (int(pictures.shape[2]), int(pictures.shape[3]))
+    images = ImageList(pictures, [size] * len(pictures))
+    features = network.backbone(pictures)
+    proposals, of_proposals = network.rpn(images, features, targets)
+    _, of_objects = network.roi_heads(features, proposals, images.image_sizes, targets)
+    return torch.stack([*of_proposals.values(), *of_objects.values()]).sum()

@@ -1,0 +1,100 @@
+"""A road network's weights as safetensors, with the picture size they were trained at."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import torch
+from pydantic import Field, ValidationError
+
+from crosscue.detectors.settings import Settings
+from crosscue.detectors.weights_file import packed, unpacked
+from crosscue.replay.errors import VehicleError, one_line
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.run_folder import write_bytes
+
+from .network import RoadNetwork
+
+KEY: Final = "crosscue-road"
+MOST_BYTES: Final = 64 << 20
+
+
+class RoadFacts(Settings):
+    """What the file says of itself.
+
+    Attributes:
+        version: Of this description.
+        width_px: Pictures are brought to this size.
+        height_px: Likewise.
+        recipe: How it was made, and what it reached, in words and numbers.
+    """
+
+    version: Annotated[int, Field(ge=1, le=1)] = 1
+    width_px: Annotated[int, Field(ge=32, le=2048)]
+    height_px: Annotated[int, Field(ge=32, le=2048)]
+    recipe: dict[str, str | int | float] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoadCheckpoint:
+    """A network with its weights, in evaluation mode."""
+
+    facts: RoadFacts
+    network: RoadNetwork
+    sha256: str
+
+
+def save_road(path: Path, network: RoadNetwork, facts: RoadFacts) -> None:
+    """Write weights, 16 bits each, and facts.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    kept = {
+        name: value.detach().cpu().contiguous().half() if value.is_floating_point() else value.cpu()
+        for name, value in network.state_dict().items()
+    }
+    content = packed(kept, KEY, json.dumps(facts.model_dump(mode="json"), sort_keys=True))
+    write_bytes(path, content)
+
+
+def load_road(path: Path) -> RoadCheckpoint:
+    """Read weights and put them into the network.
+
+    Raises:
+        VehicleError: Not there, no safetensors, damaged, or not of a road network.
+    """
+    if path.suffix != ".safetensors":
+        raise VehicleError(f"{path}: want .safetensors; other files can run programs when read")
+    try:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
+            raise VehicleError(f"{path}: more than {MOST_BYTES:,} bytes; want a road network")
+    except OSError as error:
+        raise VehicleError(f"{path}: {error.strerror}; check the file name") from None
+    description, tensors = unpacked(content, KEY, path)
+    if description is None:
+        raise VehicleError(f"{path}: not what crosscue train road wrote; give such a file")
+    try:
+        facts = RoadFacts.model_validate_json(description)
+    except ValidationError as error:
+        why = one_line(error, 120)
+        raise VehicleError(
+            f"{path}: its description does not fit ({why}); train it again"
+        ) from None
+    network = RoadNetwork()
+    if not all(bool(value.isfinite().all()) for value in tensors.values()):
+        raise VehicleError(f"{path}: holds numbers that are none; train it again")
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as error:
+        why = one_line(error, 160)
+        raise VehicleError(f"{path}: weights do not fit: {why}; train it again") from None
+    return RoadCheckpoint(
+        facts, network.eval().to(memory_format=torch.channels_last),
+        hashlib.sha256(content).hexdigest(),
+    )  # fmt: skip

@@ -1,0 +1,95 @@
+"""The detector ``road``: road pixels by a road network; the embedded one knows simulated scenes.
+
+Settings: ``checkpoint``, ``device``, ``probability``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Found, Frame, RoadMask, View
+from crosscue.detectors.devices import chosen_device
+from crosscue.detectors.settings import Settings, identity_of, settings_of
+from crosscue.replay.columns import Bytes
+
+from .checkpoint import RoadCheckpoint, load_road
+from .network import embedded_path, logits_of
+
+VERSION: Final = 1
+"""Counts up when the same pixels, weights and settings would give another mask."""
+
+
+class RoadSettings(Settings):
+    """How to run a road network."""
+
+    checkpoint: str | None = None
+    """A safetensors file; None for the embedded one."""
+    device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    probability: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
+    """A pixel with more is road."""
+
+
+def build(**given: Any) -> RoadNetworkDetector:
+    """The detector.
+
+    Raises:
+        VehicleError: The settings or the checkpoint do not fit.
+    """
+    settings = settings_of(RoadSettings, given, "detector road")
+    path = embedded_path() if settings.checkpoint is None else Path(settings.checkpoint)
+    device = chosen_device(settings.device, "detector road")
+    checkpoint = load_road(path)
+    checkpoint.network.to(device)
+    return RoadNetworkDetector(checkpoint, settings, device)
+
+
+@dataclass(frozen=True, slots=True)
+class RoadNetworkDetector:
+    """Road pixels at the network's resolution."""
+
+    checkpoint: RoadCheckpoint
+    settings: RoadSettings
+    device: torch.device
+
+    @property
+    def view(self) -> View:
+        """No finer than the network's input."""
+        return View(least_width_px=self.checkpoint.facts.width_px)
+
+    @property
+    def identity(self) -> str:
+        """Of weights, settings and what runs them."""
+        runs = (torch.__version__, self.device.type, self.settings.probability)
+        return identity_of("road", VERSION, self.checkpoint.sha256, runs)
+
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        """Segment."""
+        if not frames:
+            return []
+        size = (self.checkpoint.facts.width_px, self.checkpoint.facts.height_px)
+        given = np.stack([resized(frame.pixels, size) for frame in frames])
+        least = float(np.log(self.settings.probability / (1.0 - self.settings.probability)))
+        with torch.inference_mode():
+            logits = logits_of(self.checkpoint.network, torch.from_numpy(given).to(self.device))
+            road = (logits > least).cpu().numpy()
+        return [
+            RoadMask(frame.t_ns, frame.size_px, rle.encode(mask, (0, 0), size), size)
+            for frame, mask in zip(frames, road, strict=True)
+        ]
+
+
+def resized(pixels: Bytes, size_px: tuple[int, int]) -> Bytes:
+    """A picture at the network's size, grey ones as three equal channels."""
+    import cv2
+
+    coloured = pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
+    small = cv2.resize(coloured, size_px, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)

@@ -1,0 +1,140 @@
+"""Pictures with what was found drawn into them, for a person to look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.detectors.cues.frame import FrameCues
+from crosscue.replay.columns import Bytes
+from crosscue.replay.files.run_folder import write_bytes
+
+from . import rle
+from .base import Detections, RoadMask, View
+from .images import decode
+from .runner import FrameResult
+
+GREEN: Final = (80, 220, 60)
+BLUE: Final = (255, 140, 0)
+MARGIN_PX: Final = 10
+"""Left and right of the cues' line."""
+
+
+@dataclass(slots=True)
+class Drawer:
+    """Writes pictures of frames, evenly along the drive, however long it turns out to be.
+
+    Every frame at first; whenever there are too many, each second one goes, and half as many come.
+
+    Attributes:
+        folder: Made when first needed.
+        most: How many pictures at most.
+    """
+
+    folder: Path
+    most: int
+    _seen: int = field(default=0)
+    _every: int = field(default=1)
+    _written: list[Path] = field(default_factory=list)
+
+    def __call__(self, result: FrameResult, cues: FrameCues) -> None:
+        """Look at one frame.
+
+        Raises:
+            OutputError: A picture cannot be written.
+        """
+        number, self._seen = self._seen, self._seen + 1
+        if not self.most or number % self._every:
+            return
+        if len(self._written) == self.most:
+            self._thin()
+            if number % self._every:
+                return
+        import cv2
+
+        pixels, _ = decode(result.picture, View())
+        _, encoded = cv2.imencode(".jpg", draw(pixels, result, cues))
+        path = self.folder / f"{result.t_ns}.jpg"
+        write_bytes(path, encoded.tobytes())
+        self._written.append(path)
+
+    def _thin(self) -> None:
+        for path in self._written[1::2]:
+            path.unlink(missing_ok=True)
+        del self._written[1::2]
+        self._every *= 2
+
+
+def draw(pixels: Bytes, result: FrameResult, cues: FrameCues, enlarge: float = 1.0) -> Bytes:
+    """A copy with road tinted, boxes and labels, and the positive cues at the bottom.
+
+    Args:
+        pixels: Shape (H, W, 3), uint8, blue first.
+        result: What was found in it.
+        cues: And what follows.
+        enlarge: Text and lines, for a picture that will be shrunk.
+    """
+    canvas = pixels.copy()
+    for found in result.found:
+        if isinstance(found, RoadMask):
+            _tint(canvas, found)
+    for found in result.found:
+        if isinstance(found, Detections):
+            _boxes(canvas, found, enlarge)
+    positive = [f"{cue} {count}" for cue, count in cues.counts.items() if count]
+    text = "  ".join(positive) or "no cue"
+    scale = _fitting(text, canvas.shape[1] - 2 * MARGIN_PX, 0.6 * enlarge)
+    write_label(canvas, text, (MARGIN_PX, canvas.shape[0] - 14), (255, 255, 255), scale)
+    return canvas
+
+
+def _fitting(text: str, width_px: int, scale: float) -> float:
+    """The scale, or a smaller one at which the text is no wider than that."""
+    import cv2
+
+    # Strokes are whole pixels, so a text at half the scale is not half as wide: look again.
+    for _ in range(4):
+        (wide, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, _thickness(scale))
+        scale *= min(1.0, width_px / wide)
+    return scale
+
+
+def _tint(canvas: Bytes, road: RoadMask) -> None:
+    import cv2
+
+    mask = rle.decode(road.mask, road.mask_size_px).astype(np.uint8)
+    size = (canvas.shape[1], canvas.shape[0])
+    is_road = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
+    canvas[is_road] = canvas[is_road] // 2 + np.array(BLUE, np.uint8) // 2
+
+
+def _boxes(canvas: Bytes, found: Detections, enlarge: float) -> None:
+    import cv2
+
+    for box, score, label in zip(found.boxes_px, found.scores, found.labels, strict=True):
+        x0, y0, x1, y1 = (round(float(side)) for side in box)
+        cv2.rectangle(canvas, (x0, y0), (x1, y1), GREEN, round(2 * enlarge))
+        place = (x0, max(y0 - 4, round(12 * enlarge)))
+        write_label(canvas, f"{label} {score:.2f}", place, GREEN, 0.5 * enlarge)
+
+
+def write_label(
+    canvas: Bytes, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float
+) -> None:
+    """Write on a dark box; ``at`` is the left end of the line that letters stand on."""
+    import cv2
+
+    # On a box: an outline of thicker letters has other widths from OpenCV 5 on, and covers them.
+    thick = _thickness(scale)
+    (wide, high), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thick)
+    corners = (at[0] - 1, at[1] - high - 2), (at[0] + wide + 1, at[1] + below)
+    cv2.rectangle(canvas, *corners, (0, 0, 0), -1)
+    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thick)
+
+
+def _thickness(scale: float) -> int:
+    """Of a text's strokes, pixels."""
+    return max(round(2 * scale), 1)

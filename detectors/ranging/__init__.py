@@ -1,0 +1,1 @@
+"""From a detection's size to its range."""

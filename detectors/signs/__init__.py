@@ -1,0 +1,1 @@
+"""Sliding-window ORB detection of one-way and do-not-enter signs."""

@@ -1,0 +1,274 @@
+"""One-way and do-not-enter signs: pyramid, ORB, ratio test, votes in windows (eq. 17).
+
+The source runs ORB in every window of every level. Here points are found once for a level; each
+that looks like a point of a drawing votes for the place where the sign's middle would then be, and
+a window counts the different points of the drawing that vote for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from crosscue.detectors.base import Detections, Detector, Found, Frame, View
+from crosscue.detectors.settings import Settings, Share, identity_of, settings_of
+from crosscue.replay.columns import Bytes, Floats, Int64s
+
+from .matching import Counts, Words, nearest, window_counts
+from .templates import AMERICAN, LABELS, Drawing, Kind, drawings
+
+VERSION: Final = 1
+POINTS_DRAWN: Final = 500
+"""More than any drawing has."""
+LEAST_SIDE_PX: Final = 32
+"""Of a level; ORB's border of 8 pixels and patch of 16 leave next to nothing of less."""
+_CELL_PX: Final = 4
+"""Side of the squares that votes are counted in."""
+_SAME_SIGN: Final = 0.5
+"""Windows that overlap more (intersection over union) speak of one sign."""
+
+
+class SignSettings(Settings):
+    """Numbers of the search; ``crosscue fit signs`` chooses ``least_score``."""
+
+    kinds: tuple[Kind, ...] = AMERICAN
+    """The international disc has few corners and needs a threshold of its own: search it alone."""
+    heights_px: tuple[Annotated[int, Field(ge=16, le=256)], ...] = (48, 64)
+    """Sizes of the drawings, in pixels of a pyramid level."""
+    levels: Annotated[int, Field(ge=1, le=16)] = 9
+    factor: Annotated[float, Field(gt=1.0, le=2.0)] = 1.25
+    """From one level of the pyramid to the next."""
+    enlarge: Annotated[float, Field(ge=1.0, le=4.0)] = 2.5
+    """The first level, for signs smaller than the drawings."""
+    points: Annotated[int, Field(ge=50, le=20000)] = 4000
+    """Kept at a level."""
+    drawing_fast: Annotated[int, Field(ge=1, le=100)] = 6
+    """Least contrast of a drawing's point (FAST)."""
+    ratio: Share = 0.9
+    fast: Annotated[int, Field(ge=1, le=100)] = 6
+    """The same of a picture's."""
+    reach: Share = 0.1
+    """A vote may miss the middle by this share of the sign's height."""
+    crop_top: Share = 0.0
+    """Share of the picture without signs above."""
+    crop_bottom: Share = 0.25
+    """And below."""
+    most_bits: Annotated[int, Field(ge=1, le=256)] = 64
+    """Two points are alike only if their descriptors differ in fewer bits of 256."""
+    least_votes: Annotated[int, Field(ge=2)] = 4
+    """Different points that must agree."""
+    least_share: Share = 0.25
+    """And the share of the drawing's points that they must be."""
+    least_score: Share = 0.065
+    """For precision 0.95 on simulated layouts L800 to L838; one's own camera wants its own."""
+    overlap: Share = 0.2
+    """Of two signs that overlap more, the better stays."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """ORB points of a picture or of drawings, as columns of length N.
+
+    Attributes:
+        at_px: Shape (N, 2), float64.
+        words: Shape (N, 4), uint64: descriptors.
+    """
+
+    at_px: Floats
+    words: Words
+
+
+def orb_points(grey: Bytes, most: int, fast: int = 10) -> Points:
+    """Points with upright descriptors; patches small enough for signs of fifty pixels.
+
+    Signs stand upright. Descriptors turned with the picture would take a left arrow for a right one
+    turned round, and the ends of a bar for each other, which the ratio test then drops.
+    """
+    import cv2
+
+    # OpenCV's defaults leave no point in a window of 64 pixels: border and patch of 31.
+    orb = cv2.ORB.create(
+        nfeatures=most, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=fast
+    )  # fmt: skip
+    # ORB's detection is FAST, then a choice of the best and angles: needless where all may stay.
+    keypoints = cv2.FastFeatureDetector.create(fast).detect(grey, None)
+    if len(keypoints) > most:
+        keypoints = orb.detect(grey, None)
+    for keypoint in keypoints:
+        keypoint.angle = 0.0
+    keypoints, descriptors = orb.compute(grey, keypoints)
+    if descriptors is None or not len(keypoints):
+        return Points(np.empty((0, 2)), np.empty((0, 4), np.uint64))
+    at = np.asarray(cv2.KeyPoint.convert(keypoints), np.float64)
+    return Points(at, np.ascontiguousarray(descriptors).view(np.uint64))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Gallery:
+    """All drawings' points, one after the other."""
+
+    drawn: tuple[Drawing, ...]
+    points: Points
+    first: Int64s
+    to_middle_px: Floats
+
+
+def _gallery(settings: SignSettings) -> _Gallery:
+    drawn = drawings(settings.kinds, settings.heights_px)
+    found = [orb_points(one.grey, POINTS_DRAWN, settings.drawing_fast) for one in drawn]
+    first = np.concatenate([[0], np.cumsum([len(p.words) for p in found])]).astype(np.int64)
+    middles = [
+        np.array(one.grey.shape[::-1]) / 2.0 - p.at_px for one, p in zip(drawn, found, strict=True)
+    ]
+    points = Points(
+        np.concatenate([p.at_px for p in found]),
+        np.concatenate([p.words for p in found]),
+    )
+    return _Gallery(tuple(drawn), points, first, np.concatenate(middles))
+
+
+def build(**given: Any) -> Detector:
+    """The detector with settings by name.
+
+    Raises:
+        VehicleError: A setting that does not fit.
+    """
+    settings = settings_of(SignSettings, given, "detector signs")
+    return SignDetector(settings, _gallery(settings))
+
+
+@dataclass(frozen=True, slots=True)
+class SignDetector:
+    """Finds signs that look like our drawings."""
+
+    settings: SignSettings
+    gallery: _Gallery
+
+    @property
+    def view(self) -> View:
+        """Full size, grey: signs are small."""
+        return View(is_grey=True)
+
+    @property
+    def identity(self) -> str:
+        """Of settings and OpenCV's version."""
+        import cv2
+
+        return identity_of("signs", VERSION, self.settings.model_dump(mode="json"), cv2.__version__)
+
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        """Detect."""
+        return [self._one(frame) for frame in frames]
+
+    def _one(self, frame: Frame) -> Detections:
+        height = frame.pixels.shape[0]
+        top = int(height * self.settings.crop_top)
+        bottom = height - int(height * self.settings.crop_bottom)
+        grey = frame.pixels[top:bottom]
+        candidates: list[tuple[float, Kind, Floats]] = []
+        for level in range(self.settings.levels if grey.size else 0):
+            scale = self.settings.enlarge / self.settings.factor**level
+            candidates += self._level(grey, scale)
+        best = _apart(candidates, self.settings.overlap)
+        kept = [one for one in best if one[0] >= self.settings.least_score]
+        stretch = np.tile(np.array(frame.scale), 2)
+        boxes = np.array([box for _, _, box in kept], np.float64).reshape(-1, 4)
+        boxes = (boxes + np.array([0, top, 0, top])) * stretch
+        boxes = np.clip(boxes, 0.0, np.tile(np.array(frame.size_px, np.float64), 2))
+        labels = tuple(LABELS.get(kind, kind) for _, kind, _ in kept)
+        scores = np.array([score for score, _, _ in kept])
+        return Detections(frame.t_ns, frame.size_px, boxes, scores, labels, (b"",) * len(labels))
+
+    def _level(self, grey: Bytes, scale: float) -> list[tuple[float, Kind, Floats]]:
+        import cv2
+
+        size = (round(grey.shape[1] * scale), round(grey.shape[0] * scale))
+        if min(size) < LEAST_SIDE_PX:
+            return []
+        mode = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
+        level = np.asarray(cv2.resize(grey, size, interpolation=mode), np.uint8)
+        points = orb_points(level, self.settings.points, self.settings.fast)
+        matched = nearest(
+            points.words,
+            self.gallery.points.words,
+            self.gallery.first,
+            self.settings.ratio,
+            self.settings.most_bits,
+        )
+        found: list[tuple[float, Kind, Floats]] = []
+        for k, drawing in enumerate(self.gallery.drawn):
+            which = np.flatnonzero(matched[k] >= 0)
+            at = matched[k, which]
+            # Small numbers sort by radix.
+            order = np.argsort((at - self.gallery.first[k]).astype(np.uint16), kind="stable")
+            which, at = which[order], at[order]
+            votes = points.at_px[which] + self.gallery.to_middle_px[at]
+            points_drawn = int(self.gallery.first[k + 1] - self.gallery.first[k])
+            found += self._windows(votes, at, level.shape, drawing, points_drawn, scale)
+        return found
+
+    def _windows(
+        self,
+        votes: Floats,
+        at: Int64s,
+        shape: tuple[int, ...],
+        drawing: Drawing,
+        points_drawn: int,
+        scale: float,
+    ) -> list[tuple[float, Kind, Floats]]:
+        reach = max(round(self.settings.reach * drawing.size_px[1] / _CELL_PX), 1)
+        rows, columns = shape[0] // _CELL_PX + 1, shape[1] // _CELL_PX + 1
+        cells = np.floor(votes / _CELL_PX).astype(np.int64)
+        counts = window_counts(cells, at, rows, columns, reach)
+        least = max(self.settings.least_share * points_drawn, self.settings.least_votes)
+        if counts.max(initial=0) < least:
+            return []
+        half = np.array(drawing.size_px) / 2.0
+        found = []
+        for row, column in np.argwhere(_is_peak(counts, reach) & (counts >= least)):
+            middle = (np.array([column, row]) + 0.5) * _CELL_PX
+            box = np.concatenate([middle - half, middle + half]) / scale
+            found.append((float(counts[row, column]) / points_drawn, drawing.kind, box))
+        return found
+
+
+def _is_peak(counts: Counts, reach: int) -> NDArray[np.bool_]:
+    import cv2
+
+    # A window that no other within reach beats; OpenCV's dilation gives the largest near by.
+    around = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    values = counts.astype(np.float32)
+    return np.asarray(values >= cv2.dilate(values, around), np.bool_)
+
+
+def _apart(
+    candidates: list[tuple[float, Kind, Floats]], overlap: float
+) -> list[tuple[float, Kind, Floats]]:
+    """The best windows, without those that lie over a better one, of whatever kind.
+
+    A sign is found on neighbouring levels and by drawings of several sizes, a chance likeness
+    hardly ever. So a window's score is its share of the drawing's points, times
+    S / (S + 1), where S sums the shares of all windows of its kind over the same place.
+    """
+    from crosscue.detectors.networks.model_detector import overlaps
+
+    if not candidates:
+        return []
+    boxes = np.array([box for _, _, box in candidates])
+    shares = np.array([share for share, _, _ in candidates])
+    kinds = np.array([kind for _, kind, _ in candidates])
+    sums = np.array([
+        shares[(overlaps(box, boxes) > _SAME_SIGN) & (kinds == kind)].sum()
+        for _, kind, box in candidates
+    ])  # fmt: skip
+    scores = shares * sums / (sums + 1.0)
+    kept: list[int] = []
+    for i in np.lexsort((-shares, -scores)).tolist():
+        if not kept or float(overlaps(boxes[i], boxes[kept]).max()) <= overlap:
+            kept.append(i)
+    return [(float(scores[i]), candidates[i][1], boxes[i]) for i in kept]

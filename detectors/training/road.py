@@ -1,0 +1,229 @@
+"""Training of road networks: pictures with their share of road a pixel in, weights out.
+
+AdamW with a warm-up and a cosine; pixels near the road's edge weigh more, since the near road,
+which is most of it, is soon learnt. State is kept as safetensors, so training goes on after a kill
+as if none had come.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from crosscue.detectors.networks.road.network import RoadNetwork, logits_of
+from crosscue.detectors.weights_file import serialised
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import SchemaError, one_line
+from crosscue.replay.files.run_folder import write_bytes
+from crosscue.replay.files.tree_text import json_tree
+
+STATE_KEY: Final = "crosscue_road_training"
+EDGE_WEIGHT: Final = 6.0
+EDGE_PX: Final = 9
+GRADIENT_LIMIT: Final = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class RoadSchedule:
+    """How long and how fast to learn.
+
+    Attributes:
+        steps: Batches altogether.
+        batch: Pictures in one.
+        rate: Highest learning rate.
+        warm_up: Steps until that is reached.
+        decay: Of weights.
+        seed: Everything random comes from it.
+    """
+
+    steps: int = 1200
+    batch: int = 12
+    rate: float = 4e-3
+    warm_up: int = 60
+    decay: float = 0.01
+    seed: int = 0
+
+    def rate_at(self, step: int) -> float:
+        """The learning rate of a step."""
+        if step < self.warm_up:
+            return self.rate * (step + 1) / self.warm_up
+        share = (step - self.warm_up) / max(self.steps - self.warm_up, 1)
+        return self.rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0))))
+
+
+class RoadTraining:
+    """A network that learns; ``steps`` goes on, ``save`` and ``resume`` keep and restore it.
+
+    Attributes:
+        network: Learns.
+        done: Steps taken.
+    """
+
+    def __init__(self, schedule: RoadSchedule, device: torch.device) -> None:
+        """Begin with random weights."""
+        torch.manual_seed(schedule.seed)
+        self.schedule, self.device = schedule, device
+        self.network = RoadNetwork().to(device).to(memory_format=torch.channels_last)
+        self.done = 0
+        self._optimizer = torch.optim.AdamW(
+            self.network.parameters(), schedule.rate, weight_decay=schedule.decay, foreach=True
+        )
+
+    def steps(self, pixels: Bytes, road: Bytes) -> Iterator[tuple[int, float]]:
+        """Number and loss of each step until all are done.
+
+        Args:
+            pixels: Shape (N, H, W, 3), uint8, blue, green, red.
+            road: Shape (N, H, W), uint8: share of road, 255 for all.
+        """
+        self.network.train()
+        while self.done < self.schedule.steps:
+            rng = np.random.default_rng([self.schedule.seed, 0xD0, self.done])
+            picked = rng.integers(0, len(pixels), self.schedule.batch)
+            pairs = [varied(pixels[i], road[i], rng) for i in picked]
+            loss = self._learn(np.stack([p for p, _ in pairs]), np.stack([r for _, r in pairs]))
+            yield self.done, loss
+
+    def _learn(self, pixels: Bytes, road: Bytes) -> float:
+        for group in self._optimizer.param_groups:
+            group["lr"] = self.schedule.rate_at(self.done)
+        wanted = torch.from_numpy(road).to(self.device).float() / 255.0
+        logits = logits_of(self.network, torch.from_numpy(pixels).to(self.device))
+        losses = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
+        weight = edge_weight(wanted)
+        loss = (losses * weight).sum() / weight.sum()
+        self._optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), GRADIENT_LIMIT)
+        self._optimizer.step()
+        self.done += 1
+        return float(loss.detach())
+
+    def save(self, path: Path) -> None:
+        """All that ``resume`` needs.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        tensors = {f"network.{k}": v.detach().cpu().contiguous().clone()
+                   for k, v in self.network.state_dict().items()}  # fmt: skip
+        for number, slot in self._optimizer.state_dict()["state"].items():
+            for name, value in slot.items():
+                tensors[f"optimizer.{number}.{name}"] = value.detach().cpu().contiguous().clone()
+        header = {STATE_KEY: json.dumps({"done": self.done, "seed": self.schedule.seed})}
+        write_bytes(path, serialised(tensors, header))
+
+    def resume(self, path: Path) -> None:
+        """Go on where ``save`` left off.
+
+        Raises:
+            SchemaError: Not such a file, or of another seed.
+        """
+        from safetensors import SafetensorError
+        from safetensors.torch import load
+
+        try:
+            content = path.read_bytes()
+            tensors = load(content)
+            size = int.from_bytes(content[:8], "little")
+            state = json_tree(json_tree(content[8 : 8 + size])["__metadata__"][STATE_KEY])
+            done, seed = int(state["done"]), int(state["seed"])
+            self._fill(tensors)
+        except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
+            why = one_line(error, 120)
+            raise SchemaError(f"{path}: cannot go on from it ({why}); begin anew") from None
+        if seed != self.schedule.seed:
+            raise SchemaError(f"{path}: of seed {seed}, not {self.schedule.seed}; give that --seed")
+        self.done = done
+
+    def _fill(self, tensors: dict[str, Tensor]) -> None:
+        own = {
+            k.removeprefix("network."): v for k, v in tensors.items() if k.startswith("network.")
+        }
+        self.network.load_state_dict(own)
+        kept = self._optimizer.state_dict()
+        state: dict[int, dict[str, Tensor]] = {}
+        for key, value in tensors.items():
+            if key.startswith("optimizer."):
+                _, number, name = key.split(".")
+                state.setdefault(int(number), {})[name] = value
+        self._optimizer.load_state_dict({**kept, "state": state})
+
+
+def edge_weight(wanted: Tensor) -> Tensor:
+    """1 for pixels far from the road's edge, up to ``EDGE_WEIGHT`` more at it."""
+    around = functional.avg_pool2d(
+        wanted[:, None], EDGE_PX, 1, EDGE_PX // 2, count_include_pad=False
+    )[:, 0]
+    return 1.0 + EDGE_WEIGHT * 2.0 * (wanted - around).abs()
+
+
+def varied(pixels: Bytes, road: Bytes, rng: np.random.Generator) -> tuple[Bytes, Bytes]:
+    """Another picture of the same place: mirrored, nearer, higher, darker, noisier."""
+    import cv2
+
+    high, wide = road.shape
+    zoom = float(rng.uniform(0.92, 1.12))
+    shift = rng.uniform(-1.0, 1.0, 2) * (0.03 * wide, 0.035 * high)
+    onto = np.array([
+        [zoom, 0.0, (1 - zoom) * wide / 2 + shift[0]],
+        [0.0, zoom, (1 - zoom) * high / 2 + shift[1]],
+    ])  # fmt: skip
+    picture = cv2.warpAffine(pixels, onto, (wide, high), borderMode=cv2.BORDER_REPLICATE)
+    mask = cv2.warpAffine(road, onto, (wide, high), borderMode=cv2.BORDER_REPLICATE)
+    if rng.random() < 0.5:
+        picture, mask = picture[:, ::-1], mask[:, ::-1]
+    light = 255.0 * (np.arange(256) / 255.0) ** float(np.exp(rng.uniform(-0.35, 0.35)))
+    gain = float(np.exp(rng.uniform(-0.35, 0.3))) * np.exp(rng.uniform(-0.07, 0.07, 3))
+    table = np.clip(light[:, None] * gain, 0, 255).astype(np.uint8)
+    changed = cv2.LUT(np.ascontiguousarray(picture), table[None])
+    noise = rng.normal(0.0, rng.uniform(0.0, 6.0), (high, wide, 1))
+    noisy = np.clip(changed + noise, 0, 255).astype(np.uint8)
+    return noisy, np.ascontiguousarray(mask)
+
+
+@dataclass(frozen=True, slots=True)
+class RoadScore:
+    """Over all pixels of all pictures, those half covered left out.
+
+    Attributes:
+        iou: Pixels rightly called road over those that are road or were called so.
+        precision: Over those called road.
+        recall: Over those that are road.
+        pictures: How many.
+    """
+
+    iou: float
+    precision: float
+    recall: float
+    pictures: int
+
+
+def road_score(network: RoadNetwork, pixels: Bytes, road: Bytes, device: torch.device) -> RoadScore:
+    """How well a network does on pictures it has not seen."""
+    network.eval()
+    right = called = there = 0
+    with torch.inference_mode():
+        for begin in range(0, len(pixels), 8):
+            batch = torch.from_numpy(pixels[begin : begin + 8]).to(device)
+            found = (logits_of(network, batch) > 0.0).cpu().numpy()
+            truth = road[begin : begin + 8]
+            clear = np.abs(truth.astype(np.int16) - 127) > 60
+            is_road = truth > 127
+            right += int((found & is_road & clear).sum())
+            called += int((found & clear).sum())
+            there += int((is_road & clear).sum())
+    network.train()
+    either = called + there - right
+    return RoadScore(
+        right / max(either, 1), right / max(called, 1), right / max(there, 1), len(pixels)
+    )

@@ -1,0 +1,61 @@
+"""What a Mask R-CNN reaches on labelled pictures, as text for a person and as a tree for JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from .measure import Measured
+    from .operating_point import Rates
+
+COLUMNS: Final = (("", "AP"), ("50", "AP50"), (" small", "small"), (" medium", "medium"),
+                  (" large", "large"))  # fmt: skip
+"""How a kind's name goes on, and what stands above the column."""
+
+
+def measured_text(network: str, pictures: int, proposals: int, reached: Measured) -> str:
+    """A table of average precision and one of precision and recall."""
+    heads = " ".join(f"{head:>6}" for _, head in COLUMNS)
+    lines = [
+        f"{network} on {pictures} pictures, {proposals} proposals: {reached.cpu_s:.3f} CPU s each",
+        f"{'COCO AP, %':14} box {heads}   mask {heads}",
+    ]
+    for name in ("", *reached.rates):
+        box, mask = (_row(reached.ap, kind, name) for kind in ("box", "mask"))
+        lines.append(f"{name or 'all':14}     {box}        {mask}")
+    for name, rates in reached.rates.items():
+        lines += [_rates_line(name, aim, at) for aim, at in rates.items()]
+    return "\n".join(lines)
+
+
+def _row(ap: Mapping[str, float | None], kind: str, name: str) -> str:
+    values = [ap.get(_key(kind, name, column)) for column, _ in COLUMNS]
+    return " ".join(f"{'none' if value is None else f'{value:.1f}':>6}" for value in values)
+
+
+def _key(kind: str, name: str, column: str) -> str:
+    """As ``average_precisions`` names it: ``box50 car``, ``box car small``."""
+    if column == "50":
+        return f"{kind}50 {name}".rstrip()
+    return f"{kind} {name}".rstrip() + column
+
+
+def _rates_line(name: str, score: float, at: Rates) -> str:
+    precision, recall = _share(at.right, at.found), _share(at.right, at.signs)
+    return f"{name:14} score from {score:<4}  precision {precision}  recall {recall}"
+
+
+def _share(right: int, of: int) -> str:
+    return f"{100.0 * right / of:5.1f} % ({right} of {of})" if of else "none (0 of 0)"
+
+
+def measured_tree(proposals: int, reached: Measured) -> dict[str, object]:
+    """The same for JSON."""
+    rates: Sequence[dict[str, object]] = [
+        {"label": name, "score": score, "found": at.found, "right": at.right, "objects": at.signs}
+        for name, by_score in reached.rates.items() for score, at in by_score.items()
+    ]  # fmt: skip
+    return {
+        "proposals": proposals, "cpu_s": reached.cpu_s, "ap": dict(reached.ap), "rates": rates,
+    }  # fmt: skip

@@ -1,0 +1,1 @@
+"""Many drives: lists, worker processes, Ray, merging."""

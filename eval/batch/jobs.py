@@ -1,0 +1,356 @@
+"""Many drives, one after another or side by side; one that fails costs only itself.
+
+A drive is a ``Job``: its logs, its run folder and a fingerprint of every setting. Engines work
+through jobs: ``in_turn`` in this process, ``worker_pool.Processes`` on this machine's cores,
+``ray_drives.OnRay`` on a Ray cluster. What has been done stands in a journal beside the run
+folders, written before and after each drive, so that a second start does only what is missing,
+however the first one ended.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
+
+from crosscue.replay.errors import CrosscueError, RunError, UsageError, one_line
+from crosscue.replay.files.identity import as_row, identity_of, identity_of_all
+from crosscue.replay.files.run_folder import MANIFEST, RunFolder, strict_json, write_text
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.remote.logs import version_of
+
+JOURNAL: Final = ".drives"
+FORMAT_VERSION: Final = 2
+
+
+class Result(Protocol):
+    """What the work on a drive gives back: something that can be pickled."""
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 3 when something was dropped."""
+        ...
+
+
+R = TypeVar("R", bound=Result)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One drive to work on.
+
+    Attributes:
+        name: Unique among the jobs, and a file name.
+        logs: Paths or URLs of the drive's logs.
+        run: The run folder.
+        fingerprint: Of all settings that decide the result, see ``fingerprint_of``.
+        vehicle: The drive's own vehicle file, if it has one.
+        truth: The drive's own truth, if it has one.
+    """
+
+    name: str
+    logs: tuple[str, ...]
+    run: Path
+    fingerprint: str
+    vehicle: Path | None = None
+    truth: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Done(Generic[R]):
+    """What became of a job.
+
+    Attributes:
+        job: The job.
+        exit_status: As the command would have ended for this drive alone.
+        error: One line, or None.
+        result: What the work gave back; None after an error, and for an earlier run.
+        seconds: Wall time of the last attempt.
+        attempts: How often it was begun; 0 for an earlier run.
+    """
+
+    job: Job
+    exit_status: int
+    error: str | None = None
+    result: R | None = None
+    seconds: float = 0.0
+    attempts: int = 1
+
+    @property
+    def is_earlier(self) -> bool:
+        """Was it done before this start?"""
+        return self.attempts == 0 and self.error is None
+
+
+Events: TypeAlias = Generator[Done[R] | None, None, None]
+
+
+class Engine(Protocol):
+    """How jobs are worked through."""
+
+    def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
+        """Yield each job once, as it ends, and None about once a second in between.
+
+        Closing the generator stops all work within seconds and leaves no process behind.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far many drives have come.
+
+    Attributes:
+        total: Jobs in all.
+        earlier: Done before this start.
+        done: Done now, failures included.
+        failed: How many of them failed.
+        seconds: Since the start.
+    """
+
+    total: int
+    earlier: int
+    done: int
+    failed: int
+    seconds: float
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Judged by the drives done so far; None before the first."""
+        left = self.total - self.earlier - self.done
+        return self.seconds / self.done * left if self.done else None
+
+
+class State(StrEnum):
+    """What lies in a job's run folder."""
+
+    MISSING = "nothing there"
+    CUT_SHORT = "cut short"
+    DONE = "done"
+    OTHER = "another run"
+
+
+def run_many(
+    jobs: Sequence[Job],
+    work: Callable[[Job], R],
+    engine: Engine,
+    *,
+    overwrite: bool = False,
+    on_progress: Callable[[Progress], None] = lambda _: None,
+) -> tuple[Done[R], ...]:
+    """Work on every drive that is not done yet.
+
+    Args:
+        jobs: Drives, their names unique.
+        work: What to do with one; an importable function, or a ``partial`` of one. It clears the
+            run folder itself and writes its manifest last.
+        engine: Where to work.
+        overwrite: Replace run folders that hold a run of other logs or settings.
+        on_progress: Told about once a second.
+
+    Returns:
+        One for each job, in the order of ``jobs``.
+
+    Raises:
+        UsageError: Two jobs have one name or one run folder.
+    """
+    _check_unique(jobs)
+    began = time.monotonic()
+    found: dict[str, Done[R]] = {}
+    missing: list[Job] = []
+    for job in jobs:
+        earlier: Done[R] | None = _earlier(job, overwrite)
+        if earlier is None:
+            missing.append(job)
+        else:
+            found[job.name] = earlier
+    earlier_count = len(found)
+    refused = failed = sum(done.error is not None for done in found.values())
+
+    def tell() -> None:
+        now = time.monotonic() - began
+        done_now = len(found) - earlier_count
+        on_progress(Progress(len(jobs), earlier_count - refused, done_now, failed, now))
+
+    if missing:
+        # Closed here and now whatever happens, so that no worker outlives an interrupt.
+        with closing(engine(missing, work)) as events:
+            for done in events:
+                if done is not None:
+                    found[done.job.name] = done
+                    failed += done.error is not None
+                tell()
+    return tuple(found[job.name] for job in jobs)
+
+
+def in_turn(jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
+    """The simplest engine: here, one after another; a crash in a library ends it all."""
+    for job in jobs:
+        yield attempt(work, job)
+
+
+def exit_status_of(results: Iterable[Done[R]]) -> int:
+    """One exit status for many drives.
+
+    0 when all are whole; 3 when something was dropped or some drives failed; when all failed, the
+    status that they share, or 1.
+    """
+    results = tuple(results)
+    failures = {done.exit_status for done in results if done.error is not None}
+    if failures and all(done.error is not None for done in results):
+        return failures.pop() if len(failures) == 1 else 1
+    return 3 if failures or any(done.exit_status for done in results) else 0
+
+
+def fingerprint_of(*settings: object) -> str:
+    """A hash of everything that decides a result besides the logs: settings, flags, versions.
+
+    Args:
+        settings: Values that JSON can hold, as for a manifest.
+    """
+    return hashlib.sha256(strict_json(settings).encode()).hexdigest()
+
+
+def files_named_in(settings: object) -> dict[str, str]:
+    """Files that settings name, such as DBC files and model cards, with size and time of each.
+
+    A name alone would not tell that a file was edited.
+    """
+    if isinstance(settings, str):
+        # Longer texts are no names, and some systems fail on them.
+        is_file = "/" in settings and len(settings) < 4096 and Path(settings).is_file()
+        return {settings: version_of(settings)} if is_file else {}
+    if isinstance(settings, Mapping):
+        settings = list(settings.values())
+    if isinstance(settings, list | tuple):
+        return {name: of for one in settings for name, of in files_named_in(one).items()}
+    return {}
+
+
+def attempt(work: Callable[[Job], R], job: Job) -> Done[R]:
+    """Work on one drive here and now, keeping the journal; engines call this in their workers."""
+    began = time.monotonic()
+    try:
+        inputs = _inputs(job)
+        _write_entry(job, {"inputs": inputs})
+        result = work(job)
+        manifest = _manifest_hash(job)
+        _write_entry(
+            job, {"inputs": inputs, "manifest": manifest, "exit_status": result.exit_status}
+        )
+    except Exception as error:
+        status, line = told(error)
+        return Done(job, status, line, seconds=time.monotonic() - began)
+    return Done(job, result.exit_status, None, result, time.monotonic() - began)
+
+
+def told(error: Exception) -> tuple[int, str]:
+    """For any error the exit status that a command of its own would give, and one line."""
+    if isinstance(error, CrosscueError):
+        return error.exit_status, one_line(error)
+    if isinstance(error, MemoryError):
+        return 1, "out of memory; use fewer workers or a machine with more"
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return 1, f"{where}{error.strerror or error}; check the path, its mode and the disk"
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    return 1, f"{text}; a bug in crosscue: replay this drive alone with -v and report it"
+
+
+def state_of(job: Job) -> State:
+    """What a start finds in the job's run folder.
+
+    Raises:
+        CrosscueError: A log cannot be looked at.
+    """
+    entry = _entry(job)
+    if not _holds_anything(job.run):
+        return State.MISSING
+    if not job.run.joinpath(MANIFEST).exists():
+        return State.CUT_SHORT
+    if entry is None:
+        return State.OTHER
+    if "manifest" not in entry:
+        return State.CUT_SHORT
+    is_same = (
+        entry["inputs"] == _inputs(job)
+        and entry["manifest"] == _manifest_hash(job)
+        and isinstance(entry.get("exit_status"), int)
+    )
+    return State.DONE if is_same else State.OTHER
+
+
+def is_done(job: Job) -> bool:
+    """Is there a whole run of the same logs, as they are now, with the same settings?"""
+    return state_of(job) is State.DONE
+
+
+def _check_unique(jobs: Sequence[Job]) -> None:
+    for of in (lambda job: job.name, lambda job: str(job.run)):
+        seen: set[str] = set()
+        for job in jobs:
+            if of(job) in seen:
+                raise UsageError(f"{of(job)}: two drives of this name; name their folders apart")
+            seen.add(of(job))
+
+
+def _earlier(job: Job, overwrite: bool) -> Done[R] | None:
+    """The job as ended before this start, or None where there is work to do."""
+    try:
+        state = state_of(job)
+        if state is State.DONE:
+            entry = _entry(job)
+            return Done(job, 0 if entry is None else int(entry["exit_status"]), attempts=0)
+        if state is State.OTHER and not overwrite:
+            raise RunError(
+                f"{job.run}: holds a run of other logs, settings or versions; "
+                "give another folder or --overwrite"
+            )
+    except (CrosscueError, OSError) as error:
+        status, line = told(error)
+        return Done(job, status, line, attempts=0)
+    return None
+
+
+def _inputs(job: Job) -> dict[str, object]:
+    """What decides the result: the logs' identity and the settings."""
+    identity = identity_of_all([identity_of(log) for log in job.logs])
+    return {"fingerprint": job.fingerprint, "identity": as_row(identity)}
+
+
+def _manifest_hash(job: Job) -> str:
+    RunFolder(job.run).manifest()
+    return hashlib.sha256(job.run.joinpath(MANIFEST).read_bytes()).hexdigest()
+
+
+def _holds_anything(folder: Path) -> bool:
+    return folder.is_dir() and next(folder.iterdir(), None) is not None
+
+
+def _entry_path(job: Job) -> Path:
+    return job.run.parent / JOURNAL / f"{job.name}.json"
+
+
+def _write_entry(job: Job, entry: dict[str, object]) -> None:
+    write_text(_entry_path(job), strict_json({"format_version": FORMAT_VERSION, **entry}) + "\n")
+
+
+def _entry(job: Job) -> dict[str, Any] | None:
+    """The journal's entry; None where there is none, or none that can be believed."""
+    try:
+        entry = json_tree(_entry_path(job).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    is_ours = isinstance(entry, dict) and entry.get("format_version") == FORMAT_VERSION
+    return entry if is_ours and "inputs" in entry else None
+
+
+def after_death(done: Done[R], attempts: int, how: str) -> Done[R]:
+    """A job whose worker died as often as it may: a failure with a line of its own."""
+    line = f"{done.job.name}: its worker {how}, {attempts} times; replay this drive alone"
+    return replace(done, error=line, attempts=attempts)

@@ -1,0 +1,277 @@
+"""The runs of many drives as one folder of tables, each row with its drive's name.
+
+Tables are streamed, so memory does not grow with the number of drives. The merged manifest tells
+which drives are in it, which failed and why, and adds up every topic's account. Merging is a set
+union: the order does not matter, a run that is met twice counts once, and what comes out is the
+same bytes however the drives were spread over batches.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from crosscue.eval.pipeline.run_account import is_whole, summed
+from crosscue.replay.errors import RunError, UsageError, one_line
+from crosscue.replay.files.run_folder import (
+    MANIFEST,
+    RunFolder,
+    TableSink,
+    clear,
+    locked,
+    open_run,
+    strict_json,
+    write_manifest,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+STAGE: Final = "merged"
+DRIVE: Final = "drive"
+FOLDER: Final = "merged"
+"""What the merged run is called among those that it was made of."""
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """What was merged.
+
+    Attributes:
+        run: The folder that holds all drives' rows.
+        drives: How many.
+        rows: By table.
+        drive_seconds: Log time of all drives, from first to last pose.
+    """
+
+    run: RunFolder
+    drives: int
+    rows: dict[str, int]
+    drive_seconds: float
+
+
+@dataclass(slots=True)
+class _Drive:
+    name: str
+    run: RunFolder
+    manifest: dict[str, Any]
+    rows: dict[str, int] = field(default_factory=dict)
+    first_ns: int | None = None
+    last_ns: int | None = None
+
+    @property
+    def seconds(self) -> float:
+        """From first to last pose."""
+        if self.first_ns is None or self.last_ns is None:
+            return 0.0
+        return (self.last_ns - self.first_ns) * 1e-9
+
+
+def merge_runs(
+    runs: Mapping[str, RunFolder], out: RunFolder, failures: Mapping[str, str]
+) -> Merged:
+    """Write one table of each kind with a ``drive`` column, and a manifest.
+
+    Args:
+        runs: By name; rows come in the order of names.
+        out: Where to; cleared first.
+        failures: By name of the drive, why there is no run of it.
+
+    Raises:
+        RunError: A run is damaged, or two have columns of one name and different types.
+        OutputError: The disk is full.
+    """
+    drives = [_Drive(name, run, run.manifest()) for name, run in sorted(runs.items())]
+    kinds = sorted({path.stem for one in drives for path in one.run.path.glob("*.parquet")})
+    with locked(out):
+        clear(out)
+        for kind in kinds:
+            _merge_table(kind, drives, out)
+        write_manifest(out, _manifest(drives, kinds, failures))
+    rows = {kind: sum(one.rows.get(kind, 0) for one in drives) for kind in kinds}
+    return Merged(out, len(drives), rows, sum(one.seconds for one in drives))
+
+
+def _merge_table(kind: str, drives: Sequence[_Drive], out: RunFolder) -> None:
+    import pyarrow.compute as pc
+
+    holding = [one for one in drives if one.run.file(f"{kind}.parquet").exists()]
+    schema = _schema(kind, holding)
+    with TableSink(out, kind, schema) as sink:
+        for one in holding:
+            one.rows[kind] = 0
+            for batch in one.run.batches(kind):
+                sink.write(_named(batch, one.name, schema))
+                one.rows[kind] += batch.num_rows
+                if kind == "pose" and batch.num_rows:
+                    times = pc.min_max(batch["t_ns"]).as_py()
+                    one.first_ns = times["min"] if one.first_ns is None else one.first_ns
+                    one.last_ns = times["max"]
+
+
+def _named(batch: pa.RecordBatch, drive: str, schema: pa.Schema) -> dict[str, object]:
+    import pyarrow as pa
+
+    there = set(batch.schema.names)
+    columns: dict[str, object] = {
+        name: batch[name] if name in there else pa.nulls(batch.num_rows, schema.field(name).type)
+        for name in schema.names
+        if name != DRIVE
+    }
+    return {DRIVE: pa.repeat(pa.scalar(drive), batch.num_rows), **columns}
+
+
+def _schema(kind: str, holding: Sequence[_Drive]) -> pa.Schema:
+    """All columns that any drive has, the drive's name first."""
+    import pyarrow as pa
+
+    whole = pa.schema([(DRIVE, pa.string())])
+    for one in holding:
+        try:
+            whole = pa.unify_schemas([whole, one.run.schema(kind)])
+        except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
+            line = one_line(error)
+            raise RunError(
+                f"{one.run.path}: {kind}.parquet does not fit those of other drives ({line}); "
+                "replay all with one version and one set of features"
+            ) from None
+    return whole
+
+
+def _manifest(
+    drives: Sequence[_Drive], kinds: Sequence[str], failures: Mapping[str, str]
+) -> dict[str, object]:
+    return {
+        "stage": STAGE,
+        "tables": list(kinds),
+        "drives": [
+            {
+                "name": one.name,
+                "logs": [
+                    {"name": log["name"], "identity": log["identity"]}
+                    for log in one.manifest.get("logs", [])
+                ],
+                "settings_sha256": _settings_hash(one.manifest),
+                "is_whole": is_whole(one.manifest),
+                "rows": one.rows,
+                "seconds": one.seconds,
+                "tables_sha256": _tables_hash(one.run),
+            }
+            for one in drives
+        ],
+        "failures": dict(sorted(failures.items())),
+        "account": summed(one.manifest["account"] for one in drives),
+        "notices": dict(Counter(text for one in drives for text in _notices(one)).most_common()),
+        "versions": _versions(drives),
+    }
+
+
+def _settings_hash(manifest: Mapping[str, Any]) -> str:
+    """Of the settings and detectors that a run was made with."""
+    detected = manifest.get("detect") or {}
+    made_with = [manifest.get("settings"), detected.get("detectors"), manifest.get("selection")]
+    return hashlib.sha256(strict_json(made_with).encode()).hexdigest()
+
+
+def _tables_hash(run: RunFolder) -> str:
+    """Of a run's tables."""
+    digest = hashlib.sha256()
+    for path in sorted(run.path.glob("*.parquet")):
+        with path.open("rb") as file:
+            digest.update(path.stem.encode() + b"\0")
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
+
+
+def gathered(
+    folders: Sequence[Path],
+) -> tuple[dict[str, RunFolder], dict[str, str]]:
+    """All runs of batches, and the failures of drives that none of them has a run of.
+
+    Args:
+        folders: Run folders, or folders of them, as ``replay`` of many drives writes.
+
+    Returns:
+        Runs by name, and by name of a drive why there is no run of it.
+
+    Raises:
+        UsageError: Two different runs have one name.
+        RunError: A run is damaged or of another version.
+    """
+    runs: dict[str, RunFolder] = {}
+    failures: dict[str, str] = {}
+    for folder in folders:
+        for path in _finished(folder):
+            run = open_run(path)
+            first = runs.setdefault(path.resolve().name, run)
+            if first is not run and _content(first) != _content(run):
+                raise UsageError(
+                    f"{first.path} and {path}: two different runs of one name; merging would "
+                    "drop one: rename it, or replay it as the other was"
+                )
+        merged = RunFolder(folder / FOLDER)
+        if is_merged(merged):
+            for name, why in merged.manifest()["failures"].items():
+                failures.setdefault(name, why)
+    return runs, {name: why for name, why in failures.items() if name not in runs}
+
+
+def _finished(folder: Path) -> list[Path]:
+    """Runs of single drives in a folder, which may be one itself."""
+    if folder.joinpath(MANIFEST).exists():
+        if is_merged(RunFolder(folder)):
+            raise UsageError(
+                f"{folder}: tables that were merged before; give the folder that holds the runs"
+            )
+        return [folder]
+    try:
+        inside = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    except OSError as error:
+        raise RunError(f"{folder}: {error.strerror}; give a folder of runs") from None
+    holding = [entry for entry in inside if entry.joinpath(MANIFEST).exists()]
+    return [entry for entry in holding if not is_merged(RunFolder(entry))]
+
+
+def _content(run: RunFolder) -> tuple[str, ...]:
+    """What makes two runs the same: logs, settings and every table."""
+    manifest = run.manifest()
+    logs = sorted(str(log["identity"]["digest"]) for log in manifest.get("logs", []))
+    return (*logs, _settings_hash(manifest), _tables_hash(run))
+
+
+def _notices(one: _Drive) -> set[str]:
+    return set(one.manifest.get("notices", []))
+
+
+def _versions(drives: Sequence[_Drive]) -> dict[str, list[str]]:
+    """All that were used: more than one of a library is worth a look."""
+    found: dict[str, set[str]] = {}
+    for one in drives:
+        for library, version in one.manifest.get("versions", {}).items():
+            found.setdefault(library, set()).add(version)
+    return {library: sorted(used) for library, used in sorted(found.items())}
+
+
+def open_one(path: Path, logs: Path | None = None, *, without_pictures: bool = False) -> RunFolder:
+    """The run of one drive; arguments as of ``open_run``.
+
+    Raises:
+        RunError: It holds many drives; else as ``open_run``.
+    """
+    run = open_run(path, logs, without_pictures=without_pictures)
+    if is_merged(run):
+        raise RunError(f"{path}: holds the tables of many drives; give one of the runs beside it")
+    return run
+
+
+def is_merged(run: RunFolder) -> bool:
+    """Does it hold many drives?
+
+    Raises:
+        RunError: It has no manifest that can be read.
+    """
+    return run.file(MANIFEST).exists() and run.manifest().get("stage") == STAGE

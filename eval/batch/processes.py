@@ -1,0 +1,190 @@
+"""Drives side by side in processes of this machine.
+
+Each worker has a pipe of its own, so that a worker which dies (killed, out of memory, a crash in a
+library) is known with the drive it was at: that drive is begun again in a fresh process, and given
+up when that one dies, too. The standard library's pool would lose every drive under way.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pickle import PicklingError
+from types import FrameType
+from typing import Any, Final, NoReturn
+
+from .jobs import Done, Events, Job, R, after_death, attempt, told
+
+TICK_S: Final = 1.0
+GRACE_S: Final = 5.0
+"""For a worker to take its half-written files away."""
+THREAD_VARIABLES: Final = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+    "RAYON_NUM_THREADS",
+    "POLARS_MAX_THREADS",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Processes:
+    """An engine of worker processes.
+
+    Attributes:
+        workers: How many drives at a time.
+        attempts: How often a drive is begun when its worker dies.
+        threads: For each worker's numerical libraries; None shares the machine's cores.
+    """
+
+    workers: int
+    attempts: int = 2
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse counts below one.
+
+        Raises:
+            ValueError: Naming the count.
+        """
+        if min(self.workers, self.attempts, self.threads or 1) < 1:
+            raise ValueError(f"want counts of 1 or more, got {self}")
+
+    def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
+        """Work; see ``many_drives.Engine``."""
+        waiting = deque((job, 1) for job in jobs)
+        threads = self.threads or max(1, (os.cpu_count() or 1) // self.workers)
+        idle: list[_Worker] = []
+        busy: list[_Worker] = []
+        try:
+            while waiting or busy:
+                while waiting and len(busy) < self.workers:
+                    worker = idle.pop() if idle else _Worker(work, threads)
+                    busy.append(worker)
+                    worker.begin(*waiting.popleft())
+                ready = wait([worker.pipe for worker in busy], timeout=TICK_S)
+                for worker in [one for one in busy if one.pipe in ready]:
+                    busy.remove(worker)
+                    done = worker.take()
+                    if isinstance(done, Done):
+                        idle.append(worker)
+                        yield done
+                    elif worker.number < self.attempts:
+                        waiting.appendleft((worker.job, worker.number + 1))
+                    else:
+                        yield after_death(Done(worker.job, 1), worker.number, done)
+                if not ready:
+                    yield None
+        finally:
+            _stop(idle, busy)
+
+
+class _Worker:
+    """A process and the job it is at."""
+
+    def __init__(self, work: Callable[[Job], Any], threads: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.process: BaseProcess = context.Process(
+            target=_serve, args=(theirs, threads), daemon=True
+        )
+        self.process.start()
+        theirs.close()
+        self._work = work
+        self.job: Job
+        self.number = 0
+
+    def begin(self, job: Job, number: int) -> None:
+        """Hand over a job, begun for the ``number``-th time."""
+        is_first = self.number == 0
+        self.job, self.number = job, number
+        try:
+            if is_first:
+                self.pipe.send(self._work)
+            self.pipe.send(job)
+        except OSError:
+            # It is dead already; ``take`` finds that out.
+            return
+
+    def take(self) -> Done[Any] | str:
+        """What it did, or how it died."""
+        try:
+            done = self.pipe.recv()
+        except (EOFError, OSError):
+            self.pipe.close()
+            self.process.join(GRACE_S)
+            return _how(self.process.exitcode)
+        return replace(done, attempts=self.number) if isinstance(done, Done) else str(done)
+
+
+def _how(code: int | None) -> str:
+    if code is not None and code < 0:
+        why = " (out of memory?)" if code == -signal.SIGKILL else ""
+        return f"was killed by {signal.Signals(-code).name}{why}"
+    return f"ended with status {code}"
+
+
+def _stop(idle: Sequence[_Worker], busy: Sequence[_Worker]) -> None:
+    """End every process: idle ones by closing their pipe, others by a signal, late ones hard."""
+    for worker in busy:
+        worker.process.terminate()
+    for worker in idle:
+        worker.pipe.close()
+    until = time.monotonic() + GRACE_S
+    for worker in (*busy, *idle):
+        worker.process.join(max(0.0, until - time.monotonic()))
+        if worker.process.is_alive():
+            worker.process.kill()
+            worker.process.join()
+        worker.pipe.close()
+        worker.process.close()
+
+
+class _StoppedError(BaseException):
+    """The pool stops; a BaseException, so that files are taken away and nothing keeps us."""
+
+
+def _raise_stopped(number: int, frame: FrameType | None) -> NoReturn:
+    raise _StoppedError
+
+
+def _serve(pipe: Connection, threads: int) -> None:
+    """A worker's life."""
+    # Libraries read these when loaded; nothing numerical has been loaded here yet.
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
+    # Ctrl-C reaches the whole foreground group; the parent decides what that means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _raise_stopped)
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    try:
+        work = pipe.recv()
+        while True:
+            job: Job = pipe.recv()
+            done = attempt(work, job)
+            try:
+                pipe.send(done)
+            except (PicklingError, AttributeError, TypeError) as error:
+                pipe.send(Done(job, *told(error)))
+    except (EOFError, BrokenPipeError):
+        return
+    except _StoppedError:
+        sys.exit(143)
+
+
+def _leave_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)

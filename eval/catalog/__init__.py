@@ -1,0 +1,1 @@
+"""Runs below a folder: finding, comparing, decoded logs."""

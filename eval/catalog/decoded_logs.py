@@ -1,0 +1,232 @@
+"""Every stream of a drive as columns on disk: one Parquet file for each topic or CAN message."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+
+from crosscue.eval.pipeline.accounts import versions
+from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
+from crosscue.eval.pipeline.run_account import Account, account, reading_of
+from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
+from crosscue.replay.decode import Decoder, decoder_for
+from crosscue.replay.decode.interfaces import why_not_decoded
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.files.run_folder import RunFolder, TableSink, clear, locked, write_manifest
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.mobileye.admit import all_ids
+from crosscue.replay.mobileye.decode import MobileyeDecoder
+from crosscue.replay.mobileye.ros.reader import RosMobileye
+from crosscue.replay.mobileye.samples import settings_of
+from crosscue.replay.remote.logs import name_of
+from crosscue.replay.vehicle.roles import Role, role_of
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+ROWS_HELD: Final = 8192
+"""Rows of one table held back until they are worth a row group."""
+
+
+class _BlockDecoder(Protocol):
+    def __call__(self, block: Block) -> list[Block]: ...
+
+
+@dataclass(slots=True, eq=False)
+class _Table:
+    """One output file and the rows that wait for it."""
+
+    run: RunFolder
+    name: str
+    stack: ExitStack
+    rows: int = 0
+    sink: TableSink | None = None
+    held: list[Block] = field(default_factory=list)
+    held_rows: int = 0
+
+    def add(self, block: Block) -> None:
+        self.held.append(block)
+        self.held_rows += len(block)
+        if self.held_rows >= ROWS_HELD:
+            self.write()
+
+    def write(self) -> None:
+        """Write the rows that wait."""
+        if not self.held:
+            return
+        columns = _joined(self.held)
+        if self.sink is None:
+            sink = TableSink(self.run, self.name, _schema_of(columns))
+            self.sink = self.stack.enter_context(sink)
+        self.sink.write(columns)
+        self.rows += self.held_rows
+        self.held, self.held_rows = [], 0
+
+
+def decode_tables(
+    logs: Sequence[Log], vehicle: Vehicle, run: RunFolder, selection: Selection
+) -> tuple[dict[str, int], Account]:
+    """Write all streams of a drive as tables.
+
+    Args:
+        logs: Open logs.
+        vehicle: DBC files, buses and the Mobileye's mounting.
+        run: Folder for the tables; cleared first.
+        selection: What part.
+
+    Returns:
+        Rows for each file written, and the account.
+
+    Raises:
+        SchemaError: A DBC file cannot be read.
+        EmptyResultError: Not one row in the part asked for; the folder is empty again.
+        OutputError: The disk is full.
+    """
+    ledgers = tuple(Ledger(name_of(log)) for log in logs)
+    tables: dict[str, _Table] = {}
+    with locked(run), nothing_left(run):
+        clear(run)
+        with ExitStack() as stack:
+            for log, ledger in zip(logs, ledgers, strict=True):
+                for block in _decoded(log, vehicle, ledger, selection):
+                    if block.topic not in tables:
+                        name = file_name(block.topic, {t.name.lower() for t in tables.values()})
+                        tables[block.topic] = _Table(run, name, stack)
+                    tables[block.topic].add(block)
+            for table in tables.values():
+                table.write()
+        rows = {f"{table.name}.parquet": table.rows for table in tables.values()}
+        if not any(rows.values()):
+            raise empty_result("no topic gave a row for a table", logs, selection)
+        made = account(reading_of(ledgers))
+        content = {
+            "versions": versions(),
+            "tables": {topic: f"{table.name}.parquet" for topic, table in tables.items()},
+            "rows": rows,
+            "settings": vehicle.model_dump(mode="json"),
+            "account": made,
+        }
+        write_manifest(run, content)
+    return rows, made
+
+
+def _decoded(log: Log, vehicle: Vehicle, ledger: Ledger, selection: Selection) -> Iterator[Block]:
+    topics = {topic.name: topic for topic in log.topics}
+    mobileye = _ros_mobileye(log, vehicle, ledger)
+    decoders: dict[str, Decoder | None] = {}
+    buses: dict[str, tuple[list[_BlockDecoder], list[MobileyeDecoder]]] = {}
+    for block in ledger.handing_on(log.read(ledger, selection)):
+        topic = topics.get(block.topic) or _late_topic(log, block.topic)
+        if isinstance(block.rows, Messages):
+            if block.topic not in decoders:
+                decoders[block.topic] = _decoder(topic, ledger)
+            decode = decoders[block.topic]
+            if decode is None:
+                reason = why_not_decoded(topic, "type not understood")
+                ledger.skip(block.topic, reason, len(block))
+                continue
+            block = decode(block, ledger)
+        if isinstance(block.rows, Table) and len(block):
+            yield block
+            if mobileye is not None:
+                yield from mobileye(block)
+        elif isinstance(block.rows, CanFrames):
+            if block.topic not in buses:
+                buses[block.topic] = _bus_decoders(block.topic, vehicle, ledger)
+            of_bus, _ = buses[block.topic]
+            if not of_bus:
+                ledger.skip(block.topic, "no DBC file and no Mobileye for this bus", len(block))
+            for on_bus in of_bus:
+                yield from on_bus(block)
+        elif isinstance(block.rows, Images):
+            ledger.skip(block.topic, "pictures are not tables", len(block))
+    for _, mobileyes in buses.values():
+        for on_bus in mobileyes:
+            yield from on_bus.flush()
+    if mobileye is not None:
+        yield from mobileye.flush()
+
+
+def _ros_mobileye(log: Log, vehicle: Vehicle, ledger: Ledger) -> RosMobileye | None:
+    """Tables from ``mobileye_560_660_msgs``, where the log has them."""
+    types = {t.name: t.type_name for t in log.topics if role_of(t) is Role.MOBILEYE}
+    if not types:
+        return None
+    return RosMobileye("ros", types, ledger, settings_of(vehicle.mobileye, is_shared_bus=False))
+
+
+def _decoder(topic: Topic, ledger: Ledger) -> Decoder | None:
+    try:
+        return decoder_for(topic)
+    except SchemaError as error:
+        ledger.notice(str(error))
+        return None
+
+
+def _late_topic(log: Log, name: str) -> Topic:
+    """A topic that came to light only while reading."""
+    return next(topic for topic in log.topics if topic.name == name)
+
+
+def _bus_decoders(
+    bus: str, vehicle: Vehicle, ledger: Ledger
+) -> tuple[list[_BlockDecoder], list[MobileyeDecoder]]:
+    decoders: list[_BlockDecoder] = []
+    mobileyes: list[MobileyeDecoder] = []
+    has_dbc = bool(vehicle.can.dbc) and vehicle.can.bus in (None, bus)
+    settings = settings_of(vehicle.mobileye, is_shared_bus=has_dbc)
+    has_mobileye = vehicle.mobileye.bus == bus
+    if has_dbc:
+        from crosscue.replay.can.database import CanDatabase
+        from crosscue.replay.can.decode import BusDecoder
+
+        database = CanDatabase.load([Path(name) for name in vehicle.can.dbc])
+        for sentence in database.notices:
+            ledger.notice(sentence)
+        elsewhere = all_ids(settings) if has_mobileye else ()
+        decoders.append(BusDecoder(database, bus, ledger, elsewhere=elsewhere))
+    if has_mobileye:
+        mobileyes.append(MobileyeDecoder(bus, ledger, settings))
+        decoders += mobileyes
+    return decoders, mobileyes
+
+
+def file_name(topic: str, taken: Collection[str]) -> str:
+    """A topic's name as a file name without folders, unlike those already taken."""
+    plain = "".join(c if c.isascii() and (c.isalnum() or c in "-.") else "_" for c in topic)
+    plain = plain.strip("_.")[:100] or "topic"
+    name, number = plain, 2
+    while name.lower() in taken:
+        name, number = f"{plain}-{number}", number + 1
+    return name
+
+
+def _joined(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:
+    columns: dict[str, NDArray[np.generic]] = {"log_ns": np.concatenate([b.log_ns for b in blocks])}
+    for name in ("publish_ns", "header_ns"):
+        parts = [getattr(block, name) for block in blocks]
+        if all(part is not None for part in parts):
+            columns[name] = np.concatenate(parts)
+    tables = [block.rows for block in blocks if isinstance(block.rows, Table)]
+    for name in tables[0].columns:
+        joined = np.concatenate([table.columns[name] for table in tables])
+        if joined.ndim == 1:
+            columns[name] = joined
+            continue
+        flat = joined.reshape(len(joined), -1)
+        columns |= {f"{name}.{i}": flat[:, i] for i in range(flat.shape[1])}
+    return columns
+
+
+def _schema_of(columns: Mapping[str, NDArray[np.generic]]) -> pa.Schema:
+    import pyarrow as pa
+
+    return pa.schema([(name, pa.array(values[:0]).type) for name, values in columns.items()])

@@ -1,0 +1,104 @@
+"""Which runs a command line means: run folders, folders that hold some, patterns, lists."""
+
+from __future__ import annotations
+
+import glob
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from crosscue.eval.batch.merge import is_merged
+from crosscue.replay.errors import RunError, UsageError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.run_folder import MANIFEST, RunFolder
+
+METRICS: Final = "metrics.json"
+"""What a folder of pooled scores holds, which has tables, too."""
+DEPTH: Final = 4
+LIST_BYTES: Final = 64 << 20
+
+
+def runs_of(arguments: Sequence[str]) -> tuple[Path, ...]:
+    """The run folders that RUN arguments mean, in the order given.
+
+    A folder with a manifest or tables is a run, whole or cut short; any other stands for the runs
+    in it, without those that were merged of others; ``@runs.txt`` names one a line; a pattern that
+    the shell left alone stands for what it matches.
+
+    Raises:
+        RunError: A folder that neither is nor holds a run.
+        UsageError: A pattern without a match, a list that cannot be read, or a run named twice.
+    """
+    found = tuple(path for text in arguments for path in _expanded(text))
+    for path, count in Counter(path.resolve() for path in found).items():
+        if count > 1:
+            raise UsageError(f"{path}: a run named twice; name each once")
+    return found
+
+
+def _expanded(text: str) -> Iterator[Path]:
+    if text.startswith("@"):
+        for line in _lines(Path(text[1:])):
+            yield from _expanded(line)
+    elif glob.has_magic(text) and not Path(text).exists():
+        matched = [path for path in sorted(glob.glob(text)) if Path(path).is_dir()]  # noqa: PTH207
+        if not matched:
+            raise UsageError(f"{text}: nothing matches; give folders of runs")
+        for path in matched:
+            yield from _expanded(path)
+    else:
+        yield from _in_folder(Path(text))
+
+
+def _in_folder(folder: Path) -> Iterator[Path]:
+    if _is_run(folder) or not folder.is_dir():
+        # What is wrong with it, if anything, is told when it is opened.
+        yield folder
+        return
+    found = list(_below(folder, DEPTH))
+    if not found:
+        raise RunError(f"{folder}: neither a run folder nor a folder of some; replay first")
+    yield from found
+
+
+def _below(folder: Path, depth: int) -> Iterator[Path]:
+    try:
+        entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    except OSError as error:
+        raise RunError(f"{folder}: {error.strerror}; check its owner and mode") from None
+    for entry in entries:
+        if _is_run(entry):
+            if not _is_merged(entry):
+                yield entry
+        elif depth > 1 and entry.is_dir() and not entry.is_symlink():
+            yield from _below(entry, depth - 1)
+
+
+def _is_run(folder: Path) -> bool:
+    """Does it hold what a run writes? Cut short it must be told of, not passed over."""
+    if folder.joinpath(MANIFEST).exists():
+        return True
+    is_scored = folder.joinpath(METRICS).exists()
+    return not is_scored and next(folder.glob("*.parquet"), None) is not None
+
+
+def _is_merged(folder: Path) -> bool:
+    try:
+        return is_merged(RunFolder(folder))
+    except RunError:
+        return False
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        content = read_at_most(path, LIST_BYTES)
+        if content is None:
+            raise UsageError(f"@{path}: larger than {LIST_BYTES >> 20} MiB; give a list of runs")
+        lines = content.decode("utf-8", "surrogateescape").splitlines()
+    except OSError as error:
+        raise UsageError(f"@{path}: {error.strerror}; give a text file") from None
+    named = [line.strip() for line in lines if line.strip() and not line.startswith("#")]
+    if not named:
+        raise UsageError(f"@{path}: names no run; give a line for each")
+    return [str(path.parent / line) for line in named]

@@ -1,0 +1,142 @@
+"""Choose the match threshold for a wanted false-match rate, from labelled pictures.
+
+Half of the query pictures choose it, the other half tell the rates. Pairs come from a CSV file
+query,known,same (pictures relative to its folder; same is 1 or 0), or from a drive with known poses
+against a database that another drive made.
+
+example:
+  crosscue fit landmarks --pairs pairs.csv --false-match-rate 0.01
+  crosscue fit landmarks second.mcap --database town.sqlite --poses truth.json \
+--vehicle car.toml --write
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from crosscue.eval.commands.shared.options import (
+    add_part_arguments,
+    limits_of,
+    metres,
+    print_json,
+    selection_of,
+)
+from crosscue.eval.fit.landmark_database import camera_frames, read_poses
+from crosscue.eval.fit.landmark_pairs import pairs_of_drive, pairs_of_table, with_min_score
+from crosscue.eval.pipeline.landmarks import matcher_for, open_for
+from crosscue.localization.landmarks.features import Matcher
+from crosscue.localization.landmarks.fit import LandmarkFit, Rate, ScoredPairs, fit_landmarks
+from crosscue.replay.errors import SchemaError, UsageError
+from crosscue.replay.files.run_folder import write_text
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import open_logs
+from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("logs", nargs="*", type=Path, metavar="LOG", help="recordings of one drive")
+    parser.add_argument("--pairs", type=Path, metavar="FILE.csv", help="labelled pairs of pictures")
+    parser.add_argument("--database", type=Path, metavar="DB", help="landmarks of another drive")
+    parser.add_argument("--poses", type=Path, metavar="RUN|T.json", help="where the drive went")
+    parser.add_argument(
+        "--false-match-rate", type=_share, default=0.001, metavar="P",
+        help="share of two-place pairs that may match (default: 0.001)",
+    )  # fmt: skip
+    for flag, default, what in (
+        ("--every", 5.0, "distance between frames taken"),
+        ("--near", 5.0, "landmarks up to here show the same place"),
+        ("--far", 50.0, "landmarks from here on show another"),
+    ):
+        parser.add_argument(
+            flag, type=metres, default=default, metavar="M", help=f"{what} (default: {default:g})"
+        )
+    parser.add_argument(
+        "--most", type=int, default=50, metavar="N", help="landmarks for one frame (default: 50)"
+    )
+    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="camera and matcher")
+    parser.add_argument("--matcher", metavar="NAME", help="orb, or module:factory of your own")
+    parser.add_argument("--write", action="store_true", help="put it into the vehicle file")
+    add_part_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def _share(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < 1.0:
+        raise ValueError(text)
+    return value
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit, tell, and write where asked."""
+    given = (bool(args.pairs), bool(args.logs), bool(args.database), bool(args.poses))
+    if given not in ((True, False, False, False), (False, True, True, True)):
+        raise UsageError("fit landmarks: give --pairs, or LOG... with --database and --poses")
+    if args.write and args.vehicle is None:
+        raise UsageError("--write: give the file to write into with --vehicle V.toml")
+    if args.most < 1:
+        raise UsageError(f"--most {args.most}: want 1 or more")
+    if args.near >= args.far:
+        raise UsageError(f"--near {args.near:g}: want less than --far {args.far:g}")
+    vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
+    matcher = matcher_for(vehicle, args.matcher)
+    if args.pairs:
+        pairs = pairs_of_table(args.pairs, matcher)
+    else:
+        pairs = _pairs_of_logs(args, vehicle, matcher)
+    try:
+        fitted = fit_landmarks(pairs, args.false_match_rate)
+    except ValueError as error:
+        raise SchemaError(f"fit landmarks: {error}; give more labelled pictures") from None
+    if args.write:
+        text = with_min_score(args.vehicle.read_text(encoding="utf-8"), fitted.min_score)
+        parse(text, str(args.vehicle))
+        write_text(args.vehicle, text)
+    if args.json:
+        print_json({**asdict(fitted), "is_shown": fitted.is_shown, "matcher": matcher.kind})
+    elif not args.quiet:
+        print(_told(fitted))
+        if args.write:
+            print(f"written to {args.vehicle}")
+    return 0
+
+
+def _pairs_of_logs(args: argparse.Namespace, vehicle: Vehicle, matcher: Matcher) -> ScoredPairs:
+    poses = read_poses(args.poses, vehicle)
+    with (
+        open_for(args.database, matcher) as database,
+        open_logs(args.logs, limits_of(args)) as logs,
+    ):
+        ledgers = [Ledger(str(log.path)) for log in logs]
+        frames = camera_frames(logs, vehicle, selection_of(args, logs), ledgers)
+        return pairs_of_drive(
+            frames, poses, database, matcher, args.every, args.near, args.far, args.most
+        )
+
+
+def _told(fitted: LandmarkFit) -> str:
+    lines = [
+        f"threshold   min_score = {fitted.min_score:g} for a false-match rate of "
+        f"{fitted.wanted_rate:g}",
+        "",
+        "                       fitted                        held out",
+    ]
+    for name, fit, held in (
+        ("false matches", fitted.fitted_false, fitted.held_out_false),
+        ("places found", fitted.fitted_found, fitted.held_out_found),
+    ):
+        lines.append(f"{name:14} {_rate(fit):>29} {_rate(held):>31}")
+    if not fitted.is_shown:
+        lines += [
+            "",
+            f"the {fitted.held_out_false.of} held-out pairs cannot show a rate of "
+            f"{fitted.wanted_rate:g}: it may be up to {fitted.held_out_false.high:.2g}",
+        ]
+    return "\n".join(lines)
+
+
+def _rate(rate: Rate) -> str:
+    return f"{rate.hits} of {rate.of} ({rate.low:.2g} to {rate.high:.2g})"

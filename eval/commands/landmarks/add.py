@@ -1,0 +1,121 @@
+"""Add landmarks to a database: from a log with poses, or from pictures with coordinates.
+
+All pictures of one call are added, or none. Coordinates are metres in the map frame: x east, y
+north. The CSV file has the columns image,x_m,y_m,sd_m (or var_x_m2,cov_xy_m2,var_y_m2 for sd_m)
+and may have heading_rad.
+
+example:
+  crosscue landmarks add town.sqlite drive.mcap --poses runs/drive --every 10
+  crosscue landmarks add town.sqlite --images photos --coordinates photos.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from crosscue.eval.commands.shared.options import (
+    add_part_arguments,
+    limits_of,
+    metres,
+    print_json,
+    selection_of,
+)
+from crosscue.eval.fit.landmark_database import (
+    AddCounts,
+    add_from_images,
+    add_from_log,
+    camera_frames,
+    read_poses,
+)
+from crosscue.eval.pipeline.landmarks import matcher_for
+from crosscue.localization.landmarks.database import LandmarkWriter
+from crosscue.localization.landmarks.features import Matcher
+from crosscue.replay.errors import UsageError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import open_logs
+from crosscue.replay.safe_text import visible
+from crosscue.replay.vehicle.vehicle import Vehicle, load
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("database", type=Path, metavar="DB", help="made where it is not there")
+    parser.add_argument("logs", nargs="*", type=Path, metavar="LOG", help="recordings of one drive")
+    parser.add_argument(
+        "--poses", type=Path, metavar="RUN|T.json", help="where the car was: a run, or a truth"
+    )
+    parser.add_argument("--images", type=Path, metavar="DIR", help="folder of pictures")
+    parser.add_argument(
+        "--coordinates", type=Path, metavar="FILE.csv", help="where each picture was taken"
+    )
+    parser.add_argument(
+        "--every", type=metres, default=10.0, metavar="M",
+        help="distance between landmarks from a log (default: 10)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--sd", type=metres, default=3.0, metavar="M",
+        help="how far the car may be off when it matches, added to the poses' own error "
+        "(default: 3)",
+    )  # fmt: skip
+    parser.add_argument("--source", metavar="NAME", help="who took them (default: the log's name)")
+    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="camera and matcher")
+    parser.add_argument("--matcher", metavar="NAME", help="orb, or module:factory of your own")
+    add_part_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print the counts as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Add; 3 when a log was damaged."""
+    _check(args)
+    vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
+    matcher = matcher_for(vehicle, args.matcher)
+    is_whole = True
+    if args.images:
+        source = visible(args.source or args.images.resolve().name)
+        with LandmarkWriter(args.database, matcher.kind) as writer:
+            counts = add_from_images(writer, matcher, args.images, args.coordinates, source)
+    else:
+        counts, is_whole = _add_logs(args, vehicle, matcher)
+    if args.json:
+        print_json({"database": str(args.database), **asdict(counts)})
+    elif not args.quiet:
+        print(_told(args.database, counts))
+    return 0 if is_whole else 3
+
+
+def _check(args: argparse.Namespace) -> None:
+    given = (bool(args.logs), bool(args.poses), bool(args.images), bool(args.coordinates))
+    if given not in ((True, True, False, False), (False, False, True, True)):
+        raise UsageError("landmarks add: give LOG... with --poses, or --images with --coordinates")
+
+
+def _add_logs(
+    args: argparse.Namespace, vehicle: Vehicle, matcher: Matcher
+) -> tuple[AddCounts, bool]:
+    poses = read_poses(args.poses, vehicle)
+    with open_logs(args.logs, limits_of(args)) as logs:
+        ledgers = [Ledger(str(log.path)) for log in logs]
+        frames = camera_frames(logs, vehicle, selection_of(args, logs), ledgers)
+        source = visible(args.source or args.logs[0].resolve().stem)
+        with LandmarkWriter(args.database, matcher.kind) as writer:
+            counts = add_from_log(
+                writer, matcher, frames, poses, args.every, args.sd, source, ledgers[0]
+            )
+    return counts, all(ledger.is_whole for ledger in ledgers)
+
+
+def _told(database: Path, counts: AddCounts) -> str:
+    left_out = [
+        f"{count} {why}"
+        for count, why in (
+            (counts.too_near, "too near the last"),
+            (counts.without_pose, "without a pose at their time"),
+            (counts.undecodable, "do not decode"),
+            (counts.blank, "show too little"),
+        )
+        if count
+    ]
+    rest = f"; not: {', '.join(left_out)}" if left_out else ""
+    return f"{database}: {counts.added} landmarks added of {counts.pictures} pictures{rest}"

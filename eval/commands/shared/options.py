@@ -1,0 +1,192 @@
+"""What several commands share: which logs, which part of them, and how results are printed."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+from crosscue.replay.errors import MissingTopicError, UsageError
+from crosscue.replay.files.run_folder import strict_json
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.remote.logs import RangedLog, name_of
+
+T = TypeVar("T")
+
+
+def add_log_arguments(parser: argparse.ArgumentParser) -> None:
+    """``LOG...``, ``--from``, ``--to`` and ``--topics``."""
+    parser.add_argument(
+        "logs", nargs="+", metavar="LOG", help="recordings of one drive; paths or URLs"
+    )
+    add_part_arguments(parser)
+
+
+def add_part_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--from``, ``--to`` and ``--topics``."""
+    parser.add_argument(
+        "--from", dest="start", metavar="T",
+        help="begin here: seconds after the log's first row (12.5) or absolute nanoseconds (...ns)",
+    )  # fmt: skip
+    parser.add_argument("--to", dest="end", metavar="T", help="end before this time")
+    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="only these topics")
+    add_limit_arguments(parser)
+
+
+def add_limit_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--max-chunk``."""
+    parser.add_argument(
+        "--max-chunk", type=_mebibytes, default=DEFAULT.chunk_bytes, metavar="MIB",
+        help="the largest chunk, container or page that is decompressed "
+        f"(default: {DEFAULT.chunk_bytes >> 20})",
+    )  # fmt: skip
+
+
+def limits_of(args: argparse.Namespace) -> Limits:
+    """The limits that a log is read with."""
+    return replace(DEFAULT, chunk_bytes=args.max_chunk)
+
+
+def _mebibytes(text: str) -> int:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and 0.0 < value <= 1 << 20):
+        raise argparse.ArgumentTypeError(f"{text!r}: want MiB, above 0 and up to {1 << 20}")
+    return max(int(value * (1 << 20)), 1)
+
+
+def add_logs_argument(parser: argparse.ArgumentParser) -> None:
+    """``--logs``."""
+    parser.add_argument(
+        "--logs", type=Path, metavar="DIR",
+        help="the run's logs have moved to this folder; each is known by its content",
+    )  # fmt: skip
+
+
+def add_logs_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--logs`` and ``--without-pictures``."""
+    add_logs_argument(parser)
+    parser.add_argument(
+        "--without-pictures", action="store_true",
+        help="leave out the pictures in the run's logs, which may be gone",
+    )  # fmt: skip
+
+
+def metres(text: str) -> float:
+    """A length from the command line.
+
+    Raises:
+        argparse.ArgumentTypeError: Not a finite number above 0.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r}: want metres, above 0")
+    return value
+
+
+def selection_of(args: argparse.Namespace, logs: Sequence[Log]) -> Selection:
+    """The part asked for by ``--from``, ``--to`` and ``--topics``.
+
+    Raises:
+        UsageError: A time that cannot be read, an empty span, or a topic that no log has.
+    """
+    topics = None
+    if args.topics:
+        known = {topic.name for log in logs for topic in log.topics}
+        for name in args.topics:
+            if name not in known:
+                raise MissingTopicError(
+                    f"--topics {name}: no such topic; there are: {', '.join(sorted(known))}"
+                )
+        topics = frozenset(args.topics)
+    if args.start is None and args.end is None:
+        return Selection(topics)
+    start_ns = _time_ns("--from", args.start, logs)
+    end_ns = _time_ns("--to", args.end, logs)
+    if start_ns is not None and end_ns is not None and end_ns <= start_ns:
+        raise UsageError(f"--to {args.end}: not after --from {args.start}; give a later time")
+    return Selection(topics, start_ns, end_ns)
+
+
+def _time_ns(flag: str, text: str | None, logs: Sequence[Log]) -> int | None:
+    if text is None:
+        return None
+    if re.fullmatch(r"-?\d+ns", text):
+        return int(text[:-2])
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise UsageError(
+            f"{flag} {text}: want seconds after the start (12.5) or absolute time (17...ns)"
+        )
+    return first_ns(logs) + round(seconds * 1e9)
+
+
+def first_ns(logs: Sequence[Log]) -> int:
+    """Log time of the first stored row of the earliest log.
+
+    Raises:
+        UsageError: No log holds a single row.
+    """
+    starts: list[int] = []
+    for log in logs:
+        blocks = log.first_blocks if isinstance(log, RangedLog) else log.read
+        for block in blocks(Ledger(name_of(log))):
+            if len(block):
+                starts.append(int(block.log_ns.min()))
+                break
+    if not starts:
+        raise MissingTopicError(
+            "--from, --to: the log holds no row, so it has no start; leave them out"
+        )
+    return min(starts)
+
+
+def print_json(value: object) -> None:
+    """Strict JSON on stdout: sorted keys, NaN and infinities as null."""
+    print(strict_json(value))
+
+
+def with_progress(
+    items: Iterable[T], done_share: Callable[[], float], args: argparse.Namespace, what: str
+) -> Iterator[T]:
+    """Yield ``items``; on a terminal, keep one line with share done and time left on stderr.
+
+    Args:
+        items: What is worked through.
+        done_share: Asked at most five times a second; gives the share done, 0 to 1.
+        args: With ``quiet``.
+        what: The word before the bar.
+    """
+    if args.quiet or not sys.stderr.isatty():
+        yield from items
+        return
+    began = shown = time.monotonic()
+    try:
+        for item in items:
+            yield item
+            now = time.monotonic()
+            if now - shown > 0.2:
+                shown = now
+                share = min(max(done_share(), 1e-6), 1.0)
+                left_s = (now - began) * (1.0 - share) / share
+                sys.stderr.write(f"\r{what} {100 * share:3.0f} %  {left_s:5.0f} s left \x1b[K")
+                sys.stderr.flush()
+    finally:
+        sys.stderr.write("\r\x1b[K")
+        sys.stderr.flush()

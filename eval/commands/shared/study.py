@@ -1,0 +1,101 @@
+"""What the study commands share: flags, and a run with its progress and tables."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.tree_text import json_tree
+
+from .options import print_json, with_progress
+
+if TYPE_CHECKING:
+    from crosscue.eval.studies.town.settings import FieldStudy, LandmarkStudy, RangeStudy
+    from crosscue.eval.studies.town.whole import Made
+
+FLAGS: Final = ("drives", "seed", "range_runs", "landmark_runs", "minutes")
+
+S = TypeVar("S", "RangeStudy", "LandmarkStudy")
+AnyStudy = TypeVar("AnyStudy", "RangeStudy", "LandmarkStudy", "FieldStudy")
+
+
+def add_study_arguments(parser: argparse.ArgumentParser, folder: str) -> None:
+    """``-o``, ``--settings``, ``--seed``, ``--workers``, ``--overwrite`` and ``--json``."""
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path(folder), metavar="DIR",
+        help=f"folder for drives, summary, figures, page (default: {folder})",
+    )  # fmt: skip
+    parser.add_argument("--settings", type=Path, metavar="X.toml", help="a study of one's own")
+    parser.add_argument("--seed", type=int, help="everything random comes from it")
+    parser.add_argument("--workers", type=int, metavar="N", help="cores (default: all)")
+    parser.add_argument("--overwrite", action="store_true", help="replace another study's results")
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+
+def add_cluster_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--drives`` and ``--ray``."""
+    parser.add_argument("--drives", type=int, metavar="N", help="with each combination")
+    parser.add_argument("--ray", metavar="ADDRESS",
+                        help="drive on a Ray cluster: its address, auto, or local")  # fmt: skip
+
+
+def study_of(args: argparse.Namespace, kind: type[AnyStudy]) -> AnyStudy:
+    """The study asked for: the published one, or a file's, with flags on top.
+
+    Raises:
+        UsageError: A flag out of range.
+        StudyFileError: The file does not fit.
+    """
+    from pydantic import ValidationError
+
+    from crosscue.eval.studies.town.settings import load_study
+
+    study = kind() if args.settings is None else load_study(args.settings, kind)
+    flags = {name: getattr(args, name, None) for name in FLAGS}
+    changed = {name: value for name, value in flags.items() if value is not None}
+    try:
+        return kind.model_validate({**dict(study), **changed})
+    except ValidationError as error:
+        first = error.errors()[0]
+        flag = str(first["loc"][0])
+        raise UsageError(
+            f"--{flag.replace('_', '-')} {changed.get(flag)}: {first['msg'].lower()}"
+        ) from None
+
+
+def workers_of(args: argparse.Namespace) -> int:
+    """How many threads.
+
+    Raises:
+        UsageError: Fewer than one.
+    """
+    from crosscue.eval.studies.town.work import default_workers
+
+    if args.workers is None:
+        return default_workers()
+    if args.workers < 1:
+        raise UsageError(f"--workers {args.workers}: want 1 or more")
+    return int(args.workers)
+
+
+def run_study(
+    args: argparse.Namespace, study: S, finish: Callable[[S, Path], Made], what: str
+) -> int:
+    """Drive, summarise, tell."""
+    from crosscue.eval.studies.town.whole import PAGE, SUMMARY, drive_study
+
+    done = [0.0]
+    shares = drive_study(study, args.output, workers_of(args), args.ray, overwrite=args.overwrite)
+    for share in with_progress(shares, lambda: done[0], args, what):
+        done[0] = share
+    made = finish(study, args.output)
+    if args.json:
+        print_json(json_tree((args.output / SUMMARY).read_text(encoding="utf-8")))
+    elif not args.quiet:
+        print("\n\n".join(table.as_text() for table in made.tables))
+        print("\n" + "\n".join(made.notes))
+        print(f"\npage       {args.output / PAGE}\ndrives     {args.output / 'drives.parquet'}")
+    return 0

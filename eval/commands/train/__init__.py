@@ -1,0 +1,1 @@
+"""``crosscue train ...``."""

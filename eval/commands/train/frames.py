@@ -1,0 +1,66 @@
+"""Pictures of simulated intersections with COCO annotations, to train networks on.
+
+Takes a few pictures of each of many runs: OUT/coco.json and OUT/images. Layouts are L and a number;
+A to H are those that crosscue is scored on, so nothing may learn from them.
+
+examples:
+  crosscue train frames L0-L299 --each 8 -o frames
+  crosscue train frames L900-L949 --each 4 -o held_out
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from crosscue.datasets.scenes.drive import SOURCE, SceneSettings
+from crosscue.datasets.scenes.export.coco import Objects
+from crosscue.datasets.scenes.export.training_frames import frames, joined
+from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.eval.commands.shared.options import print_json, with_progress
+from crosscue.eval.commands.shared.training import check_place, learnt_layouts_of
+from crosscue.replay.errors import OutputError, UsageError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("layouts", nargs="+", metavar="LAYOUT", help="L0, L17 or a span: L0-L99")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--each", type=int, default=8, help="pictures of each layout")
+    parser.add_argument("--seed", type=int, default=0, help="of what differs from run to run")
+    parser.add_argument("--width", type=int, default=1280, help="of the picture (9/16 high)")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="layouts at a time")
+    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render and write."""
+    if args.each < 1 or args.jobs < 1 or args.seed < 0:
+        raise UsageError("--each, --jobs: want 1 or more; --seed: want 0 or more")
+    wanted = [_settings(name, args) for name in learnt_layouts_of(args.layouts, "train frames")]
+    target = args.output / "coco.json"
+    if target.exists():
+        raise OutputError(f"{target}: exists; give another folder")
+    images = args.output / "images"
+    check_place(images / "any")
+    parts: list[Objects] = []
+    made = frames(wanted, args.each, images, args.jobs)
+    for part in with_progress(made, lambda: len(parts) / len(wanted), args, "rendering"):
+        parts.append(part)
+    whole = joined(parts)
+    whole.save(target, f"{SOURCE}; layouts {' '.join(args.layouts)}, seed {args.seed}")
+    told = {"coco": str(target), "pictures": len(whole.images), "objects": len(whole.annotations)}
+    if args.json:
+        print_json(told)
+    elif not args.quiet:
+        print(f"{target}: {told['pictures']} pictures, {told['objects']} objects")
+    return 0
+
+
+def _settings(layout: str, args: argparse.Namespace) -> SceneSettings:
+    # Conditions come in ten kinds; layout and run count up together, so each kind comes as often.
+    run = int(layout[1:]) % 10 + 1
+    if not 64 <= args.width <= 3840 or args.width % 16:
+        raise UsageError(f"--width {args.width}: want a multiple of 16 from 64 to 3840")
+    camera = Camera(width_px=args.width, height_px=args.width * 9 // 16)
+    return SceneSettings(layout=layout, run=run, seed=args.seed, camera=camera)

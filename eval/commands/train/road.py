@@ -1,0 +1,235 @@
+"""Train the road network, on simulated intersections or on pictures with masks of one's own.
+
+Simulated: renders --each pictures of each layout of --layouts (L and a number), and measures on
+layouts it has not seen, --held. A to H may only be --score-d, never trained on. One's own: a folder
+--data with images/NAME.jpg and masks/NAME.png, white where road is; every tenth is held out.
+--measure trains nothing: it tells how well a network does on --score or --data.
+
+examples:
+  crosscue train road --layouts L400-L519 --held L600-L611 --score A-H -o road.safetensors
+  crosscue train road --data my_frames --from road.safetensors -o mine.safetensors
+  crosscue train road --measure embedded --score A-H
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from crosscue.datasets.scenes.drive import SceneSettings
+from crosscue.datasets.scenes.export.road_frames import RoadFrames, joined, rendered
+from crosscue.datasets.scenes.layout import SCORED
+from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.eval.commands.shared.options import print_json, with_progress
+from crosscue.eval.commands.shared.training import check_place, layouts_of, learnt_layouts_of
+from crosscue.replay.errors import OutputError, UsageError
+
+if TYPE_CHECKING:
+    import torch
+
+    from crosscue.detectors.networks.road.network import RoadNetwork
+    from crosscue.detectors.training.road import RoadTraining
+
+Size: TypeAlias = tuple[int, int]
+"""Width and height, pixels."""
+HELD_EVERY = 10
+SAVED_EVERY = 100
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("--layouts", nargs="+", metavar="LAYOUT", help="L400 or a span: L400-L519")
+    parser.add_argument("--held", nargs="+", metavar="LAYOUT", default=[],
+                        help="layouts to measure on, none of them trained on")  # fmt: skip
+    parser.add_argument("--score", nargs="+", metavar="LAYOUT", default=[],
+                        help="further layouts to measure on at the end: A-H")  # fmt: skip
+    parser.add_argument("--data", type=Path, metavar="DIR", help="images/ and masks/ of one's own")
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT.safetensors")
+    parser.add_argument("--measure", metavar="NETWORK",
+                        help="train nothing, measure this one: embedded, or a file")  # fmt: skip
+    parser.add_argument("--from", dest="start", type=Path, metavar="FILE",
+                        help="begin with these weights")  # fmt: skip
+    parser.add_argument("--resume", action="store_true",
+                        help="go on after an interruption, from OUT.state")  # fmt: skip
+    parser.add_argument("--each", type=int, default=12, help="pictures of each layout")
+    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--stop-at", type=int, metavar="N",
+                        help="end after so many of the schedule's steps")  # fmt: skip
+    parser.add_argument("--batch", type=int, default=12)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--width", type=int, default=384, help="of the network's input (9/16 high)")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda", "mps"), default="auto")
+    parser.add_argument("--threads", type=int, default=0, help="on a CPU; 0 for as many as it has")
+    parser.add_argument("--overwrite", action="store_true", help="replace OUT")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render or read, train, measure, write."""
+    _check(args)
+    if args.measure is not None:
+        return _measure(args)
+    import torch
+
+    from crosscue.detectors.devices import chosen_device
+    from crosscue.detectors.networks.road.checkpoint import RoadFacts, load_road, save_road
+    from crosscue.detectors.training.reproducible import decides_bits, reproducible
+    from crosscue.detectors.training.road import RoadSchedule, RoadTraining
+
+    if args.threads:
+        torch.set_num_threads(args.threads)
+    check_place(args.output)
+    size = _size(args)
+    learn, held = _frames(args)
+    schedule = RoadSchedule(args.steps, args.batch, seed=args.seed)
+    device = chosen_device(args.device, "train road")
+    with reproducible(device):
+        training = RoadTraining(schedule, device)
+        if args.start is not None:
+            training.network.load_state_dict(load_road(args.start).network.state_dict())
+        loss = _trained(training, learn, args)
+    recipe: dict[str, str | int | float] = {
+        "layouts": " ".join(args.layouts or []), "pictures": len(learn), "steps": args.steps,
+        "stopped_at": training.done, "batch": args.batch, "seed": args.seed, "loss": round(loss, 5),
+        **_measured(training.network, training.device, "held_out", held),
+        **_measured(training.network, training.device, "scored", _scored(args, size)),
+        **decides_bits(device),
+    }  # fmt: skip
+    facts = RoadFacts(width_px=size[0], height_px=size[1], recipe=recipe)
+    save_road(args.output, training.network, facts)
+    _state(args).unlink(missing_ok=True)
+    _tell(str(args.output), recipe, args)
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    if args.width % 16 or not 128 <= args.width <= 1024:
+        raise UsageError(f"--width {args.width}: want a multiple of 16 from 128 to 1024")
+    if min(args.each, args.steps, args.batch, args.stop_at or 1) < 1:
+        raise UsageError("--each, --steps, --stop-at, --batch: want 1 or more")
+    if min(args.seed, args.threads) < 0:
+        raise UsageError("--seed, --threads: want 0 or more")
+    layouts_of(args.score, "--score")
+    if args.measure is not None:
+        if args.output is not None or args.layouts is not None:
+            raise UsageError("--measure: trains nothing, so not with -o or --layouts; leave those")
+        if (args.data is None) == (not args.score):
+            raise UsageError("--measure: give --score with layouts, or --data with pictures")
+        return
+    if args.output is None:
+        raise UsageError("train road: give -o OUT.safetensors, or --measure")
+    if args.output.suffix != ".safetensors":
+        raise UsageError(f"-o {args.output}: want a name that ends in .safetensors")
+    if args.output.exists() and not args.overwrite:
+        raise OutputError(f"{args.output}: exists; give another name or --overwrite")
+    if (args.data is None) == (args.layouts is None):
+        raise UsageError("train road: give --layouts to simulate, or --data with pictures")
+
+
+def _measure(args: argparse.Namespace) -> int:
+    """Tell how well a network does."""
+    from crosscue.datasets.adapters.road_folder import load_folder
+    from crosscue.detectors.devices import chosen_device
+    from crosscue.detectors.networks.road.checkpoint import load_road
+    from crosscue.detectors.networks.road.network import embedded_path
+
+    device = chosen_device(args.device, "train road")
+    checkpoint = load_road(embedded_path() if args.measure == "embedded" else Path(args.measure))
+    size = (checkpoint.facts.width_px, checkpoint.facts.height_px)
+    frames = _scored(args, size) if args.data is None else load_folder(args.data, size)
+    network = checkpoint.network.to(device)
+    _tell(args.measure, _measured(network, device, "measured", frames), args)
+    return 0
+
+
+def _tell(name: str, facts: dict[str, str | int | float], args: argparse.Namespace) -> None:
+    if args.json:
+        print_json({"checkpoint": name, **facts})
+    elif not args.quiet:
+        print("\n".join([name, *(f"  {k:22} {v}" for k, v in facts.items())]))
+
+
+def _state(args: argparse.Namespace) -> Path:
+    output: Path = args.output
+    return output.with_suffix(".state")
+
+
+def _trained(training: RoadTraining, learn: RoadFrames, args: argparse.Namespace) -> float:
+    """Train, keeping the state for ``--resume``; the last loss."""
+    state, loss = _state(args), float("nan")
+    if args.resume and state.exists():
+        training.resume(state)
+    steps = training.steps(learn.pixels, learn.road)
+    for done, now in with_progress(steps, lambda: training.done / args.steps, args, "training"):
+        loss = now
+        if done % SAVED_EVERY == 0:
+            training.save(state)
+        if done == args.stop_at:
+            break
+    return loss
+
+
+def _measured(
+    network: RoadNetwork, device: torch.device, name: str, frames: RoadFrames | None
+) -> dict[str, str | int | float]:
+    """How well the network does on frames it has not seen."""
+    if frames is None:
+        return {}
+    from crosscue.detectors.training.road import road_score
+
+    score = road_score(network, frames.pixels, frames.road, device)
+    return {
+        f"{name}_iou": round(score.iou, 4),
+        f"{name}_precision": round(score.precision, 4),
+        f"{name}_recall": round(score.recall, 4),
+        f"{name}_pictures": score.pictures,
+    }
+
+
+def _frames(args: argparse.Namespace) -> tuple[RoadFrames, RoadFrames | None]:
+    """What to learn from and what to hold out."""
+    size = _size(args)
+    if args.data is not None:
+        from crosscue.datasets.adapters.road_folder import load_folder
+
+        whole = load_folder(args.data, size)
+        kept = [i for i in range(len(whole)) if i % HELD_EVERY or len(whole) < HELD_EVERY]
+        out = [i for i in range(len(whole)) if i not in set(kept)]
+        held = RoadFrames(whole.pixels[out], whole.road[out]) if out else None
+        return RoadFrames(whole.pixels[kept], whole.road[kept]), held
+    layouts = learnt_layouts_of(args.layouts, "--layouts")
+    held_out = layouts_of(args.held, "--held")
+    if both := sorted({*layouts} & {*held_out}):
+        raise UsageError(f"--held {both[0]}: also trained on; hold out others")
+    learn = _rendered(layouts, size, args)
+    return learn, _rendered(held_out, size, args) if held_out else None
+
+
+def _size(args: argparse.Namespace) -> Size:
+    return (args.width, args.width * 9 // 16)
+
+
+def _scored(args: argparse.Namespace, size: Size) -> RoadFrames | None:
+    names = layouts_of(args.score, "--score")
+    return _rendered(names, size, args) if names else None
+
+
+def _rendered(names: list[str], size: Size, args: argparse.Namespace) -> RoadFrames:
+    camera = Camera(width_px=2 * size[0], height_px=2 * size[1])
+    # Conditions come in ten kinds; each comes as often.
+    runs = [
+        SceneSettings(layout=name, run=number % 10 + 1, seed=args.seed, camera=camera)
+        for number, name in enumerate(names)
+    ]
+    if len(names) <= len(SCORED) and {*names} <= {*SCORED}:
+        runs = [
+            SceneSettings(layout=name, run=run, seed=args.seed, camera=camera)
+            for name in names for run in range(1, 11)
+        ]  # fmt: skip
+    parts: list[RoadFrames] = []
+    made: Iterator[RoadFrames] = rendered(runs, args.each, size)
+    for part in with_progress(made, lambda: len(parts) / len(runs), args, "rendering"):
+        parts.append(part)
+    return joined(parts)

@@ -1,0 +1,75 @@
+"""Turn annotated pictures of a log into its truth.
+
+Takes COCO (.json) and CVAT for images or video, XML 1.1 (.xml). Pictures find their frames by t_ns,
+by file name, or by the frame's number. A label that is a cue's name ("stop sign", "parked_left")
+says that the cue is there, and pictures annotated without it that it is not; --map says what other
+labels mean. Approaches are no part of such files: write them into the truth file by hand (see
+crosscue truth schema), and --add leaves them as they are. Cues of your own are those that the
+vehicle file has under [cues.own].
+
+examples:
+  crosscue truth import coco.json --log drive.mcap -o truth.json
+  crosscue truth import annotations.xml --log drive.mcap -o truth.json --map 'halt=stop_sign' 'dog='
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from crosscue.datasets.truth.truth import FILE
+from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.fit.truth_check import Imported, import_annotations
+from crosscue.replay.errors import OutputError, UsageError
+from crosscue.replay.safe_text import visible
+from crosscue.replay.vehicle.vehicle import Vehicle, load
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("source", type=Path, metavar="ANNOTATIONS", help="COCO .json, CVAT .xml")
+    parser.add_argument("--log", type=Path, required=True, metavar="LOG", help="the annotated log")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="T.json",
+                        help="the truth file, or a folder for it")  # fmt: skip
+    parser.add_argument("--vehicle", type=Path, metavar="V.toml",
+                        help="names the camera of several, and cues of your own")  # fmt: skip
+    parser.add_argument("--map", nargs="+", default=[], metavar="LABEL=CUE",
+                        help="what labels mean; nothing after = for no cue")  # fmt: skip
+    parser.add_argument("--add", action="store_true",
+                        help="keep approaches and track of the truth that is there")  # fmt: skip
+    parser.add_argument("--overwrite", action="store_true", help="replace an earlier truth file")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Import, and tell what came of it."""
+    output = args.output / FILE if args.output.is_dir() else args.output
+    if output.exists() and not (args.add or args.overwrite):
+        raise OutputError(f"{output}: exists; --add to it, --overwrite it, or give another name")
+    vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
+    own = dict(_meaning(text) for text in args.map)
+    found = import_annotations(args.source, args.log, output, vehicle, own, add=args.add)
+    if args.json:
+        print_json(asdict(found) | {"truth": str(found.truth), "objects": str(found.objects)})
+    elif not args.quiet:
+        _tell(found)
+    return 0
+
+
+def _meaning(text: str) -> tuple[str, str]:
+    label, equals, cue = text.rpartition("=")
+    if not equals or not label:
+        raise UsageError(f"--map {text}: want LABEL=CUE")
+    return label, cue
+
+
+def _tell(found: Imported) -> None:
+    print(f"pictures   {found.pictures} with {found.things} things, placed {found.rule}")
+    for cue, pictures in found.cues.items():
+        print(f"           {cue}: there in {pictures}")
+    if not found.cues:
+        print("           no label is a cue; only objects were imported")
+    for kind, count in found.ignored.items():
+        print(f"not taken  {count} {kind}")
+    print(f"written to {visible(str(found.truth))}\n           {visible(str(found.objects))}")

@@ -1,0 +1,85 @@
+"""Fit the compass of a vehicle file to a drive, with the GNSS course as the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import tomlkit
+
+from crosscue.eval.pipeline.pose import compass_settings
+from crosscue.localization.compass import course_at
+from crosscue.localization.compass_fit import CompassFit, fit_compass
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.remote.logs import name_of
+from crosscue.replay.signals import Extractor, Samples, Signal, plan
+from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.windows import windows
+
+
+def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassFit:
+    """Fit hard iron, soft iron and mounting as far as the drive shows them.
+
+    Raises:
+        VehicleError: No magnetometer, or too few readings with a reference.
+    """
+    planned = plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+    magnetometer = planned.source_of(Signal.MAGNETIC_FIELD)
+    if magnetometer is None:
+        raise VehicleError(f"no magnetometer: {planned.missing[Signal.MAGNETIC_FIELD]}")
+    course = planned.source_of(Signal.COURSE)
+    wanted = {source.topic.name for source in (magnetometer, course) if source is not None}
+    narrowed = Selection(frozenset(wanted), selection.start_ns, selection.end_ns)
+    extractors = [
+        Extractor(planned, vehicle, i, Ledger(name_of(log))) for i, log in enumerate(logs)
+    ]
+    found: dict[Signal, list[Samples]] = {Signal.MAGNETIC_FIELD: [], Signal.COURSE: []}
+    for window in windows(logs, extractors, [narrowed] * len(logs), planned):
+        for signal, parts in found.items():
+            if signal in window.samples:
+                parts.append(window.samples[signal])
+    field = _joined(found[Signal.MAGNETIC_FIELD])
+    if field is None:
+        raise VehicleError(f"{magnetometer.topic.name}: not one magnetometer reading in this part")
+    reference = None
+    ground = _joined(found[Signal.COURSE])
+    if ground is not None:
+        reference = course_at(field.t_ns, ground.t_ns, ground.values[:, 0], ground.values[:, 1])
+    return fit_compass(field.t_ns, field.values, reference, compass_settings(vehicle))
+
+
+def _joined(parts: Sequence[Samples]) -> Samples | None:
+    if not parts:
+        return None
+    t_ns = np.concatenate([part.t_ns for part in parts])
+    later = np.diff(t_ns, prepend=t_ns[0] - 1) > 0
+    values = np.concatenate([part.values for part in parts])
+    return Samples(parts[0].signal, t_ns[later], values[later])
+
+
+def section_of(fitted: CompassFit) -> dict[str, object]:
+    """The fit as a vehicle file's [compass] section."""
+    compass = fitted.settings
+    section: dict[str, object] = {
+        "mounting_rotation": [list(row) for row in compass.mounting_rotation],
+        "mounting_yaw_rad": round(compass.mounting_yaw_rad, 6),
+        "hard_iron_t": [float(f"{value:.6g}") for value in compass.hard_iron_t],
+        "soft_iron": [[round(value, 6) for value in row] for row in compass.soft_iron],
+        "declination_rad": compass.declination_rad,
+    }
+    if np.isfinite(fitted.residual_sd_rad):
+        section["heading_sd_rad"] = round(fitted.residual_sd_rad, 4)
+    if np.isfinite(fitted.persists_s):
+        section["interval_s"] = round(2.0 * fitted.persists_s, 2)
+    return section
+
+
+def with_section(text: str, fitted: CompassFit) -> str:
+    """A vehicle file's text with its [compass] values replaced; comments stay."""
+    document = tomlkit.parse(text)
+    section = document.setdefault("compass", tomlkit.table())
+    for key, value in section_of(fitted).items():
+        section[key] = value
+    return tomlkit.dumps(document)

@@ -1,0 +1,323 @@
+"""Building a landmark database: from a log with poses, or from pictures with coordinates."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from crosscue.datasets.truth.tum import heading_rad
+from crosscue.detectors.images import Encoded
+from crosscue.eval.pipeline.accounts import probe_clocks
+from crosscue.eval.scoring.pose.score import load_truth
+from crosscue.localization.angles import interpolate_angle
+from crosscue.localization.landmarks.database import LandmarkWriter, Place
+from crosscue.localization.landmarks.features import Matcher
+from crosscue.localization.landmarks.images import grey_of, picture_of, read_picture
+from crosscue.replay.columns import Block, Floats, Images, Int64s
+from crosscue.replay.errors import LogError, SchemaError, UsageError, VehicleError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.run_folder import open_run
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.signals import Extractor, Plan, camera_of, with_pictures
+from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
+
+LEAST_POINTS: Final = 20
+"""Pictures with fewer points (a blank wall, the dark) are no landmarks."""
+MAX_GAP_NS: Final = 500_000_000
+MOST_COORDINATE_BYTES: Final = 256 << 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPoses:
+    """Where the camera was, N times.
+
+    Attributes:
+        t_ns: Shape (N,), increasing.
+        xy_m: Shape (N, 2): of the camera.
+        heading_rad: Shape (N,): of the car.
+        cov_m2: Shape (N, 2, 2): of ``xy_m``; zero where the source claims no error.
+    """
+
+    t_ns: Int64s
+    xy_m: Floats
+    heading_rad: Floats
+    cov_m2: Floats
+
+
+@dataclass(slots=True)
+class AddCounts:
+    """What became of the pictures.
+
+    Attributes:
+        pictures: Met.
+        added: As landmarks.
+        too_near: Left out: less than the wanted distance from the last one.
+        without_pose: Left out: no pose at their time.
+        undecodable: Left out: do not decode.
+        blank: Left out: too little to see on them.
+    """
+
+    pictures: int = 0
+    added: int = 0
+    too_near: int = 0
+    without_pose: int = 0
+    undecodable: int = 0
+    blank: int = 0
+
+
+class Frame(NamedTuple):
+    """One picture of a log."""
+
+    t_ns: int
+    topic: str
+    picture: Encoded
+
+
+def read_poses(path: Path, vehicle: Vehicle) -> CameraPoses:
+    """Poses of a run folder, or of a truth file (``truth.json`` or its folder).
+
+    Args:
+        path: Where.
+        vehicle: For the camera's place, where a truth speaks of the rear axle.
+
+    Raises:
+        RunError: A run that cannot be read.
+        SchemaError: A truth that cannot be read.
+    """
+    if path.is_dir() and (path / "manifest.json").exists():
+        return _run_poses(path)
+    truth, track = load_truth(path)
+    heading = heading_rad(track)
+    lever = (vehicle.camera.x_m, vehicle.camera.y_m)
+    xy_m = track.xyz_m[:, :2]
+    if truth.pose_point != "camera":
+        xy_m = xy_m + _turned(lever, heading)
+    return CameraPoses(track.t_ns, xy_m, heading, np.zeros((len(xy_m), 2, 2)))
+
+
+def _run_poses(path: Path) -> CameraPoses:
+    run = open_run(path)
+    vehicle = of_manifest(run.manifest()["settings"])
+    names = ["t_ns", "x_m", "y_m", "heading_rad", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2"]
+    table = run.table("pose", names)
+    x, y, heading, xx, xy, yy = (table[name].to_numpy() for name in names[1:])
+    offset = _turned((vehicle.camera.x_m, vehicle.camera.y_m), heading)
+    cov = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
+    return CameraPoses(table["t_ns"].to_numpy(), np.column_stack([x, y]) + offset, heading, cov)
+
+
+def _turned(lever_m: tuple[float, float], heading: Floats) -> Floats:
+    turned = complex(*lever_m) * np.exp(1j * heading)
+    return np.column_stack([turned.real, turned.imag])
+
+
+def camera_frames(
+    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, ledgers: Sequence[Ledger]
+) -> Iterator[Frame]:
+    """The camera's pictures of a drive, on the clock that a replay would choose.
+
+    Raises:
+        VehicleError: No camera, or several.
+    """
+    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
+    camera = camera_of(topics, vehicle)
+    if camera is None:
+        raise VehicleError("the logs hold no camera; give a log with pictures")
+    log, topic = logs[camera[0]], camera[1]
+    planned = with_pictures(Plan((), {}), camera)
+    wanted = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
+    probe = Extractor(planned, vehicle, camera[0], Ledger(""))
+    clocks = probe_clocks(log, probe, wanted)
+    found: list[Block] = []
+    extractor = Extractor(
+        planned, vehicle, camera[0], ledgers[camera[0]], clocks, on_pictures=found.append
+    )
+    for block in log.read(ledgers[camera[0]], wanted):
+        for _ in extractor(block):
+            pass
+        for pictures in found:
+            assert isinstance(pictures.rows, Images)
+            for row, t_ns in enumerate(pictures.log_ns.tolist()):
+                yield Frame(t_ns, topic.name, picture_of(pictures.rows, row))
+        found.clear()
+
+
+def add_from_log(
+    writer: LandmarkWriter,
+    matcher: Matcher,
+    frames: Iterator[Frame],
+    poses: CameraPoses,
+    every_m: float,
+    sd_m: float,
+    source: str,
+    ledger: Ledger,
+) -> AddCounts:
+    """Add a landmark each ``every_m`` of the way.
+
+    The errors of a run's poses are shared by neighbouring landmarks; a later replay takes them as
+    independent. Where the run drifted, make ``every_m`` large, or give a truth.
+
+    Args:
+        writer: Of the database.
+        matcher: Makes the features.
+        frames: In order of time.
+        poses: Of the same drive.
+        every_m: Straight distance between two landmarks.
+        sd_m: How far the car may be from the landmark when it matches best; added to the poses'
+            own covariance.
+        source: Name of the drive; landmarks are called ``source/time``.
+        ledger: Pictures that do not decode are skipped in it.
+    """
+    counts = AddCounts()
+    last: Floats | None = None
+    for frame in frames:
+        counts.pictures += 1
+        place = place_at(frame.t_ns, poses, sd_m, source)
+        if place is None:
+            counts.without_pose += 1
+            continue
+        if last is not None and math.dist(place.xy_m, last) < every_m:
+            counts.too_near += 1
+            continue
+        try:
+            features = matcher.describe(grey_of(frame.picture))
+        except LogError as error:
+            counts.undecodable += 1
+            ledger.skip(frame.topic, "picture does not decode", 1, str(error), frame.t_ns)
+            continue
+        if len(features) < LEAST_POINTS:
+            counts.blank += 1
+            continue
+        writer.add(place, features)
+        counts.added += 1
+        last = place.xy_m
+    return counts
+
+
+def place_at(t_ns: int, poses: CameraPoses, sd_m: float, source: str) -> Place | None:
+    """The camera's place at a time, called ``source/time``; None where no pose is near."""
+    after = int(np.searchsorted(poses.t_ns, t_ns))
+    if after == len(poses.t_ns) or (after == 0 and poses.t_ns[0] != t_ns):
+        return None
+    before = max(after - 1, 0) if poses.t_ns[after] != t_ns else after
+    span_ns = int(poses.t_ns[after] - poses.t_ns[before])
+    if span_ns > MAX_GAP_NS:
+        return None
+    share = (t_ns - int(poses.t_ns[before])) / span_ns if span_ns else 0.0
+    xy_m = (1.0 - share) * poses.xy_m[before] + share * poses.xy_m[after]
+    two = slice(before, after + 1)
+    at = np.array([t_ns], np.int64)
+    heading = interpolate_angle(at, poses.t_ns[two], poses.heading_rad[two])
+    cov = poses.cov_m2[after] + sd_m**2 * np.eye(2)
+    return Place(f"{source}/{t_ns}", xy_m, cov, float(heading[0]), source)
+
+
+def add_from_images(
+    writer: LandmarkWriter, matcher: Matcher, folder: Path, coordinates: Path, source: str
+) -> AddCounts:
+    """Add each picture that a table of coordinates names.
+
+    The table is a CSV file with a header: ``image,x_m,y_m`` and ``sd_m`` or ``var_x_m2``,
+    ``cov_xy_m2``, ``var_y_m2``, and, if wanted, ``heading_rad`` (counter-clockwise from east).
+
+    Raises:
+        SchemaError: The table cannot be understood; names the line.
+        LogError: A picture is missing or does not decode: here each was asked for by name.
+    """
+    counts = AddCounts()
+    for name, place in read_coordinates(coordinates, source):
+        counts.pictures += 1
+        path = folder / name
+        try:
+            features = matcher.describe(grey_of(read_picture(path)))
+        except LogError as error:
+            text = str(error)
+            raise type(error)(text if text.startswith(str(path)) else f"{path}: {text}") from None
+        if len(features) < LEAST_POINTS:
+            counts.blank += 1
+            continue
+        writer.add(place, features)
+        counts.added += 1
+    return counts
+
+
+_PLACE_COLUMNS: Final = {"image", "x_m", "y_m"}
+_COV_COLUMNS: Final = ("var_x_m2", "cov_xy_m2", "var_y_m2")
+
+
+def read_coordinates(path: Path, source: str) -> Iterator[tuple[str, Place]]:
+    """Picture names and places of a table; see ``add_from_images``.
+
+    Raises:
+        SchemaError: As there.
+    """
+    try:
+        content = read_at_most(path, MOST_COORDINATE_BYTES)
+        if content is None:
+            raise SchemaError(f"{path}: more than {MOST_COORDINATE_BYTES >> 20} MiB; split it")
+        with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
+            rows = csv.DictReader(file)
+            known = set(rows.fieldnames or ())
+            missing = _PLACE_COLUMNS - known
+            if missing or not ("sd_m" in known or known.issuperset(_COV_COLUMNS)):
+                raise SchemaError(
+                    f"{path}:1: want columns image,x_m,y_m,sd_m (or {','.join(_COV_COLUMNS)} for "
+                    f"sd_m), got {','.join(rows.fieldnames or ())}; mend the header"
+                )
+            for row in rows:
+                yield str(row["image"]), _place_of(row, f"{path}:{rows.line_num}", source)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        raise SchemaError(f"{path}: {why}; give a CSV file in UTF-8") from None
+
+
+def _place_of(row: dict[str, str], where: str, source: str) -> Place:
+    def number(column: str) -> float:
+        text = row.get(column)
+        try:
+            value = float(text or "")
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise SchemaError(f"{where}: {column}: want a finite number, got {text!r}; mend it")
+        return value
+
+    xy_m = np.array([number("x_m"), number("y_m")])
+    if row.get("sd_m"):
+        sd_m = number("sd_m")
+        if not sd_m > 0.0:
+            raise SchemaError(f"{where}: sd_m: want > 0, got {sd_m}; mend it")
+        cov = sd_m**2 * np.eye(2)
+    else:
+        xx, xy, yy = (number(column) for column in _COV_COLUMNS)
+        cov = np.array([[xx, xy], [xy, yy]])
+    heading = number("heading_rad") if row.get("heading_rad") else None
+    try:
+        return Place(f"{source}/{row['image']}", xy_m, cov, heading, source)
+    except ValueError as error:
+        raise SchemaError(f"{where}: {error}; mend it") from None
+
+
+def near_of(text: str | None) -> tuple[Floats, float] | None:
+    """``x,y,r`` as a position and a radius in metres.
+
+    Raises:
+        UsageError: It is not that.
+    """
+    if text is None:
+        return None
+    try:
+        x, y, radius = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = radius = math.nan
+    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(radius) and radius >= 0.0):
+        raise UsageError(f"--near {text}: want x,y,radius in metres, such as --near=-12.5,80,50")
+    return np.array([x, y]), radius

@@ -1,0 +1,148 @@
+"""Labelled pairs of pictures for the fit of the match threshold."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import tomlkit
+
+from crosscue.localization.angles import wrap
+from crosscue.localization.landmarks.database import LandmarkDatabase, Nearby
+from crosscue.localization.landmarks.features import Features, Matcher
+from crosscue.localization.landmarks.fit import ScoredPairs
+from crosscue.localization.landmarks.images import grey_of, read_picture
+from crosscue.replay.errors import LogError, SchemaError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.limits import MIB
+
+from .landmark_database import CameraPoses, Frame, place_at
+
+MOST_PAIRS: Final = 1_000_000
+MOST_PAIR_BYTES: Final = 256 * MIB
+SAME_TURN_RAD: Final = math.pi / 4
+"""Pictures taken in directions further apart are no pair of either kind when they are near."""
+_LABELS: Final = {"1": True, "0": False, "true": True, "false": False}
+
+
+def pairs_of_table(path: Path, matcher: Matcher) -> ScoredPairs:
+    """Pairs named in a CSV file ``query,known,same``; picture names are relative to its folder.
+
+    Raises:
+        SchemaError: The table cannot be understood; names the line.
+        LogError: A picture cannot be read.
+    """
+
+    @lru_cache(maxsize=256)
+    def features(name: str) -> Features:
+        try:
+            return matcher.describe(grey_of(read_picture(path.parent / name)))
+        except LogError as error:
+            raise type(error)(f"{path.parent / name}: {error}") from None
+
+    numbers: dict[str, int] = {}
+    rows: list[tuple[float, bool, int]] = []
+    for query, known, is_same in _labelled(path):
+        match = matcher.match(features(query), features(known))
+        rows.append((match.score, is_same, numbers.setdefault(query, len(numbers))))
+    return _columns(rows)
+
+
+def _labelled(path: Path) -> Iterator[tuple[str, str, bool]]:
+    try:
+        content = read_at_most(path, MOST_PAIR_BYTES)
+        if content is None:
+            raise SchemaError(f"{path}: more than {MOST_PAIR_BYTES // MIB} MiB; split it")
+        with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
+            table = csv.DictReader(file)
+            if not {"query", "known", "same"} <= set(table.fieldnames or ()):
+                raise SchemaError(f"{path}:1: want columns query,known,same; mend the header")
+            for row in table:
+                label = _LABELS.get(str(row["same"]).strip().lower())
+                if label is None or table.line_num > MOST_PAIRS:
+                    raise SchemaError(
+                        f"{path}:{table.line_num}: same: want 1 or 0 (and at most {MOST_PAIRS:,} "
+                        f"lines), got {row['same']!r}; mend it"
+                    )
+                yield str(row["query"]), str(row["known"]), label
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        raise SchemaError(f"{path}: {why}; give a CSV file in UTF-8") from None
+
+
+def pairs_of_drive(
+    frames: Iterator[Frame],
+    poses: CameraPoses,
+    database: LandmarkDatabase,
+    matcher: Matcher,
+    every_m: float,
+    near_m: float,
+    far_m: float,
+    most_per_frame: int,
+) -> ScoredPairs:
+    """Frames with known poses against landmarks: near ones show the same place, far ones do not.
+
+    Args:
+        frames: Of another drive than the landmarks', or the rates say too much.
+        poses: Of that drive.
+        database: The landmarks.
+        matcher: Scores.
+        every_m: Distance between frames that are taken.
+        near_m: Same place below, and looking the same way.
+        far_m: Another place above; what lies between is not judged.
+        most_per_frame: Landmarks compared with one frame: all near ones first, then far ones drawn
+            with a fixed seed.
+    """
+    marks = list(database)
+    rng = np.random.default_rng(0)
+    rows: list[tuple[float, bool, int]] = []
+    last = None
+    for number, frame in enumerate(frames):
+        place = place_at(frame.t_ns, poses, 1.0, "frame")
+        if place is None or (last is not None and math.dist(place.xy_m, last) < every_m):
+            continue
+        last = place.xy_m
+        try:
+            seen = matcher.describe(grey_of(frame.picture))
+        except LogError:
+            continue
+        apart = [math.dist(mark.place.xy_m, place.xy_m) for mark in marks]
+        same = [
+            i
+            for i, metres in enumerate(apart)
+            if metres <= near_m and _looks_along(marks[i], place.heading_rad)
+        ]
+        other = [i for i, metres in enumerate(apart) if metres >= far_m]
+        drawn = rng.permutation(other)[: max(most_per_frame - len(same), 0)].tolist()
+        for i in (*same, *drawn):
+            match = matcher.match(seen, database.features(marks[i].key))
+            rows.append((match.score, i in same, number))
+    return _columns(rows)
+
+
+def _looks_along(mark: Nearby, heading_rad: float | None) -> bool:
+    if mark.place.heading_rad is None or heading_rad is None:
+        return True
+    return abs(wrap(mark.place.heading_rad - heading_rad)) <= SAME_TURN_RAD
+
+
+def _columns(rows: list[tuple[float, bool, int]]) -> ScoredPairs:
+    return ScoredPairs(
+        np.array([score for score, _, _ in rows], np.float64),
+        np.array([is_same for _, is_same, _ in rows], np.bool_),
+        np.array([query for _, _, query in rows], np.int64),
+    )
+
+
+def with_min_score(text: str, min_score: float) -> str:
+    """A vehicle file's text with ``landmarks.min_score`` replaced; comments stay."""
+    document = tomlkit.parse(text)
+    section = document.setdefault("landmarks", tomlkit.table())
+    section["min_score"] = min_score
+    return tomlkit.dumps(document)

@@ -1,0 +1,88 @@
+"""When and how large the pictures of a log's camera are, on the clock that runs use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from crosscue.datasets.truth.annotations import LogPictures
+from crosscue.detectors.images import encoded, size_of
+from crosscue.eval.pipeline.accounts import probe_clocks
+from crosscue.replay.columns import Block, Images
+from crosscue.replay.errors import LogError, VehicleError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT
+from crosscue.replay.log import Log, Selection, open_log
+from crosscue.replay.readers.images.files import SUFFIXES
+from crosscue.replay.readers.time_file import find_time_file, read_time_file
+from crosscue.replay.readers.timed_files import list_files, pair
+from crosscue.replay.signals import Extractor, Plan, Source, camera_of
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+
+def log_pictures(path: Path, vehicle: Vehicle) -> LogPictures:
+    """The pictures of the one camera of a log.
+
+    Raises:
+        LogError: It cannot be read, or its first picture cannot.
+        VehicleError: No camera, or several.
+    """
+    with open_log(path) as log:
+        camera = camera_of([(0, topic) for topic in log.topics], vehicle)
+        if camera is None:
+            raise VehicleError(f"{path}: no camera in the log; annotations need its pictures")
+        topic = camera[1]
+        planned = Plan((Source(0, topic, ()),), {})
+        wanted = Selection(frozenset({topic.name}))
+        clocks = probe_clocks(log, Extractor(planned, vehicle, 0, Ledger("")), wanted)
+        times: list[np.typing.NDArray[np.int64]] = []
+        sizes: list[tuple[int, int]] = []
+
+        def see(block: Block) -> None:
+            times.append(block.log_ns)
+            if not sizes and isinstance(block.rows, Images):
+                sizes.append(size_of(encoded(block.rows, 0)))
+
+        extractor = Extractor(planned, vehicle, 0, Ledger(str(path)), clocks, on_pictures=see)
+        for block in log.read(extractor.ledger, wanted):
+            for _ in extractor(block):
+                pass
+        if not times:
+            raise LogError(f"{path}: {topic.name}: not one picture; annotations need them")
+        names = _names(log)
+    return LogPictures(str(path), np.unique(np.concatenate(times)), sizes[0], names)
+
+
+def log_span(path: Path) -> tuple[int, int]:
+    """Log times of a log's first row and just after its last.
+
+    Raises:
+        LogError: It cannot be read, or holds no row.
+    """
+    first, last = 2**63 - 1, -(2**63)
+    with open_log(path) as log:
+        for block in log.read(Ledger(str(path))):
+            if len(block):
+                first, last = (
+                    min(first, int(block.log_ns.min())),
+                    max(last, int(block.log_ns.max())),
+                )
+    if last < first:
+        raise LogError(f"{path}: holds no row")
+    return first, last + 1
+
+
+def _names(log: Log) -> Mapping[str, int]:
+    """From file name to time, for a folder of pictures."""
+    if log.format != "images":
+        return {}
+    time_file = find_time_file(log.path)
+    assert time_file is not None
+    files = pair(list_files(log.path, SUFFIXES), read_time_file(time_file, DEFAULT))
+    return {
+        path.name: t_ns
+        for path, t_ns in zip(files.paths, files.t_ns.tolist(), strict=True)
+        if t_ns >= 0
+    }

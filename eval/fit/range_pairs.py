@@ -1,0 +1,182 @@
+"""Pairs of an object's height in pixels and the true range it measures, to fit curves to."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from crosscue.datasets.truth.truth import FILE, load
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import SchemaError, UsageError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.parquet import opened
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.limits import MIB
+
+MOST_BYTES: Final = 256 * MIB
+LABELS: Final[Mapping[str, str]] = {"stop_sign": "stop sign", "traffic_light": "traffic light"}
+REFERENCES: Final[Mapping[str, str]] = {"stop_sign": "start_m", "traffic_light": "end_m"}
+"""A stop sign measures the start of the intersection, a light its end."""
+LEAST_VISIBLE: Final = 0.9
+"""The height of an object that something hides says nothing of its range."""
+NEAREST_NS: Final = 20_000_000
+"""A detection belongs to the true range of a picture this near in time."""
+
+
+class RangePairs(NamedTuple):
+    """N heights in pixels and true ranges of the rear axle in metres, along the path."""
+
+    height_px: Floats
+    range_m: Floats
+
+
+def together(parts: Iterable[RangePairs]) -> RangePairs:
+    """Several as one."""
+    heights, ranges = zip(*parts, strict=True)
+    return RangePairs(np.concatenate(heights), np.concatenate(ranges))
+
+
+def pairs_of_table(path: Path) -> RangePairs:
+    """From a CSV or Parquet file with the columns ``height_px`` and ``range_m``.
+
+    Raises:
+        UsageError: Not there, too large, or without these columns.
+    """
+    try:
+        columns = _parquet(path) if path.suffix == ".parquet" else _csv(path, RangePairs._fields)
+    except OSError as error:
+        raise UsageError(
+            f"{path}: {error.strerror or error}; give a table (CSV or Parquet) with height_px and "
+            "range_m"
+        ) from None
+    except UnicodeDecodeError:
+        raise UsageError(
+            f"{path}: is no text; give a table (CSV or .parquet) with height_px and range_m"
+        ) from None
+    except (KeyError, ValueError):
+        raise UsageError(f"{path}: want the columns height_px and range_m, all numbers") from None
+    return RangePairs(*columns)
+
+
+def pairs_of_truth(truth: Path, cue: str) -> RangePairs:
+    """From a drive's annotated objects, those that nothing hides and no edge cuts.
+
+    Args:
+        truth: ``truth.json``, or its folder.
+        cue: ``stop_sign`` or ``traffic_light``.
+
+    Raises:
+        SchemaError: The truth has no objects or ranges, or they cannot be read.
+    """
+    t_ns, range_m = _true_ranges(truth, cue)
+    tree = _objects(truth)
+    try:
+        numbers = {c["id"] for c in tree["categories"] if c["name"] == LABELS[cue]}
+        times = {image["id"]: int(image["t_ns"]) for image in tree["images"]}
+        rows = [
+            (times[one["image_id"]], float(one["bbox"][3]))
+            for one in tree["annotations"]
+            if one["category_id"] in numbers
+            and one.get("visible", 1.0) >= LEAST_VISIBLE
+            and one.get("in_picture", 1.0) >= 1.0
+        ]
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise SchemaError(f"{truth}: objects: no COCO file ({error!r}); mend it") from None
+    return _paired(rows, t_ns, range_m)
+
+
+def pairs_of_run(run: Path, truth: Path, cue: str, score: float) -> RangePairs:
+    """From what detectors found in a run.
+
+    Args:
+        run: A run folder with ``detections.parquet``.
+        truth: Of its drive.
+        cue: ``stop_sign`` or ``traffic_light``.
+        score: Detections must have more.
+
+    Raises:
+        UsageError: The run has no detections.
+        SchemaError: The truth has no ranges.
+    """
+    import pyarrow.parquet as pq
+
+    path = run / "detections.parquet"
+    if not path.exists():
+        raise UsageError(f"{path}: not there; run crosscue detect first")
+    names = ["t_ns", "label", "score", "height_px"]
+    with opened(path) as file:
+        table = pq.read_table(file, columns=names, page_checksum_verification=True)
+    t_ns, label, scores, height = (table[name].to_pylist() for name in names)
+    rows = [
+        (t, float(h))
+        for t, one, s, h in zip(t_ns, label, scores, height, strict=True)
+        if one == LABELS[cue] and s > score and h is not None and h > 0.0
+    ]
+    return _paired(rows, *_true_ranges(truth, cue))
+
+
+def _paired(rows: list[tuple[int, float]], t_ns: Int64s, range_m: Floats) -> RangePairs:
+    if not rows or not len(t_ns):
+        return RangePairs(np.empty(0), np.empty(0))
+    times = np.array([t for t, _ in rows], np.int64)
+    height = np.array([h for _, h in rows])
+    after = np.clip(np.searchsorted(t_ns, times), 1, max(len(t_ns) - 1, 1))
+    before, after = after - 1, np.minimum(after, len(t_ns) - 1)
+    nearer = np.abs(t_ns[before] - times) <= np.abs(t_ns[after] - times)
+    at = np.where(nearer, before, after)
+    keep = (np.abs(t_ns[at] - times) <= NEAREST_NS) & (range_m[at] > 0.0)
+    return RangePairs(height[keep], range_m[at][keep])
+
+
+def _true_ranges(truth: Path, cue: str) -> tuple[Int64s, Floats]:
+    """Times and ranges of a drive's pictures, sorted."""
+    name = load(truth).ranges
+    if name is None:
+        raise SchemaError(f"{truth}: has no ranges; name a file with them as ranges")
+    path = _folder(truth) / name
+    try:
+        t_ns, range_m = _csv(path, ("t_ns", REFERENCES[cue]))
+    except (OSError, UnicodeDecodeError, KeyError, ValueError) as error:
+        raise SchemaError(f"{path}: no table of true ranges ({error}); mend it") from None
+    order = np.argsort(t_ns, kind="stable")
+    return t_ns[order].astype(np.int64), range_m[order]
+
+
+def _objects(truth: Path) -> Any:
+    name = load(truth).objects
+    if name is None:
+        raise SchemaError(f"{truth}: has no objects; name a COCO file with them as objects")
+    path = _folder(truth) / name
+    try:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
+            raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
+        return json_tree(content)
+    except (OSError, ValueError) as error:
+        raise SchemaError(f"{path}: not readable as JSON ({error}); mend it") from None
+
+
+def _folder(truth: Path) -> Path:
+    return truth.parent if truth.name == FILE or truth.is_file() else truth
+
+
+def _csv(path: Path, names: tuple[str, ...]) -> tuple[Floats, ...]:
+    content = read_at_most(path, MOST_BYTES)
+    if content is None:
+        raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; give fewer rows")
+    rows = list(csv.DictReader(content.decode("utf-8").splitlines()))
+    # Nanoseconds since 1970 are kept to 256 ns, which is near enough to find a picture by.
+    return tuple(np.array([float(row[name] or "nan") for row in rows]) for name in names)
+
+
+def _parquet(path: Path) -> tuple[Floats, ...]:
+    import pyarrow.parquet as pq
+
+    names = list(RangePairs._fields)
+    with opened(path) as file:
+        table = pq.read_table(file, columns=names, page_checksum_verification=True)
+    return tuple(np.asarray(table[name].to_numpy(), np.float64) for name in names)

@@ -1,0 +1,87 @@
+"""The pictures of a drive with the signs that its truth has in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from crosscue.detectors.images import Encoded, encoded
+from crosscue.eval.batch.drive_list import DriveInput, drives_of
+from crosscue.eval.pipeline.accounts import probe_clocks
+from crosscue.replay.columns import Block, Images
+from crosscue.replay.errors import LogError, SchemaError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import MIB
+from crosscue.replay.log import Log, Selection, open_log
+from crosscue.replay.signals import Extractor, Plan, Source, camera_of
+from crosscue.replay.vehicle.vehicle import Vehicle, load
+
+from .sign_labels import Boxes, Labelled, coco_boxes
+from .truth_check import OBJECTS
+
+MOST_BYTES: Final = 512 * MIB
+
+
+def drive_pictures(folder: Path) -> Iterator[Labelled]:
+    """All annotated pictures of a drive's folder, in the order of the log.
+
+    Raises:
+        SchemaError: The folder is no drive's, or has no annotated objects with times.
+        LogError: The log cannot be read, or has no camera.
+    """
+    drives = drives_of([str(folder)])
+    if len(drives.drives) != 1 or len(drives.drives[0].logs) != 1:
+        raise SchemaError(f"{folder}: holds not one log; give the folder of one drive")
+    return _pictures(drives.drives[0], _boxes(folder / OBJECTS))
+
+
+def _boxes(path: Path) -> dict[int, Boxes]:
+    try:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
+            raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
+        text = content.decode("utf-8")
+    except OSError as error:
+        raise SchemaError(
+            f"{path}: {error.strerror}; labels of a drive's signs stand there"
+        ) from None
+    except UnicodeDecodeError:
+        raise SchemaError(f"{path}: is no text; labels of a drive's signs stand there") from None
+    found: dict[int, Boxes] = {}
+    for image, boxes in coco_boxes(text, path):
+        if not isinstance(image.get("t_ns"), int):
+            raise SchemaError(f"{path}: images without t_ns; crosscue truth import gives them")
+        found[image["t_ns"]] = boxes
+    return found
+
+
+def _pictures(drive: DriveInput, boxes: dict[int, Boxes]) -> Iterator[Labelled]:
+    vehicle = load(drive.vehicle) if drive.vehicle else Vehicle(version=1)
+    with open_log(Path(drive.logs[0])) as log:
+        for t_ns, picture in _camera(log, vehicle):
+            if t_ns in boxes:
+                name = f"{log.path} at {t_ns}"
+                yield Labelled(name, picture, boxes[t_ns])
+
+
+def _camera(log: Log, vehicle: Vehicle) -> Iterator[tuple[int, Encoded]]:
+    camera = camera_of([(0, topic) for topic in log.topics], vehicle)
+    if camera is None:
+        raise LogError(f"{log.path}: no camera in the log; signs need its pictures")
+    planned = Plan((Source(0, camera[1], ()),), {})
+    wanted = Selection(frozenset({camera[1].name}))
+    clocks = probe_clocks(log, Extractor(planned, vehicle, 0, Ledger("")), wanted)
+    waiting: list[Block] = []
+    extractor = Extractor(
+        planned, vehicle, 0, Ledger(str(log.path)), clocks, on_pictures=waiting.append
+    )
+    for block in log.read(extractor.ledger, wanted):
+        for _ in extractor(block):
+            pass
+        for pictures in waiting:
+            if isinstance(pictures.rows, Images):
+                for i, t_ns in enumerate(pictures.log_ns.tolist()):
+                    yield t_ns, encoded(pictures.rows, i)
+        waiting.clear()

@@ -1,0 +1,124 @@
+"""Labelled pictures of signs, from a CSV file of boxes or a COCO file."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from crosscue.detectors.images import Encoded
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.limits import MIB
+
+COLUMNS: Final = ("picture", "label", "x0", "y0", "x1", "y1")
+MOST_BYTES: Final = 64 * MIB
+_WANTED: Final = "give a CSV or COCO file of boxes, or a drive's folder"
+
+Boxes = dict[str, list[tuple[float, float, float, float]]]
+"""From label to boxes (x0, y0, x1, y1) in pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Labelled:
+    """One picture and its true signs.
+
+    Attributes:
+        name: What a person may look for.
+        picture: Its bytes, or where they are.
+        boxes: Its signs.
+    """
+
+    name: str
+    picture: Path | Encoded
+    boxes: Boxes
+
+
+def read_labels(path: Path) -> list[Labelled]:
+    """Read a CSV file, where an empty label says that the picture has no sign, or COCO (.json).
+
+    Raises:
+        UsageError: Not there, not such a file, or a box that is none; with the line.
+    """
+    text = _text(path)
+    return _of_coco(text, path) if path.suffix == ".json" else _of_csv(text, path)
+
+
+def _text(path: Path) -> str:
+    try:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
+            raise UsageError(f"{path}: over {MOST_BYTES // MIB} MiB; split it")
+        return content.decode("utf-8")
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}; {_WANTED}") from None
+    except UnicodeDecodeError:
+        raise UsageError(f"{path}: is no text; {_WANTED}") from None
+
+
+def _of_coco(text: str, path: Path) -> list[Labelled]:
+    """Pictures lie beside the file or in a folder ``images`` beside it."""
+    found = []
+    for image, boxes in coco_boxes(text, path):
+        try:
+            place = path.parent / image["file_name"]
+            place = place if place.exists() else path.parent / "images" / image["file_name"]
+        except (KeyError, TypeError) as error:
+            raise UsageError(f"{path}: no COCO file ({error!r}); mend it") from None
+        found.append(Labelled(str(place), place, boxes))
+    return found
+
+
+def coco_boxes(text: str, path: Path) -> list[tuple[dict[str, Any], Boxes]]:
+    """The images of a COCO file with their boxes, by id.
+
+    Raises:
+        UsageError: It is none, holds no image, or a box is none.
+    """
+    try:
+        tree = json_tree(text)
+        names = {one["id"]: str(one["name"]) for one in tree["categories"]}
+        found: dict[int, tuple[dict[str, Any], Boxes]] = {
+            image["id"]: (image, {}) for image in tree["images"]
+        }
+        for one in tree["annotations"]:
+            x, y, wide, high = (float(number) for number in one["bbox"])
+            box = (x, y, x + wide, y + high)
+            if not all(map(math.isfinite, box)) or wide <= 0.0 or high <= 0.0:
+                raise UsageError(f"{path}: annotation {one['id']}: box {box}: want a real one")
+            found[one["image_id"]][1].setdefault(names[one["category_id"]], []).append(box)
+    except (ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{path}: no COCO file ({error!r}); mend it") from None
+    if not found:
+        raise UsageError(f"{path}: no picture in it; add some")
+    return [found[number] for number in sorted(found)]
+
+
+def _of_csv(text: str, path: Path) -> list[Labelled]:
+    reader = csv.DictReader(text.splitlines())
+    if reader.fieldnames is None or set(COLUMNS) - set(reader.fieldnames):
+        raise UsageError(f"{path}:1: want the columns {','.join(COLUMNS)}")
+    found: dict[str, Labelled] = {}
+    for row in reader:
+        where = f"{path}:{reader.line_num}"
+        name = row["picture"] or ""
+        place = path.parent / name
+        one = found.setdefault(name, Labelled(str(place), place, {}))
+        if row["label"]:
+            one.boxes.setdefault(row["label"], []).append(_box(row, where))
+    if not found:
+        raise UsageError(f"{path}: no picture in it; add rows")
+    return [found[name] for name in sorted(found)]
+
+
+def _box(row: dict[str, str], where: str) -> tuple[float, float, float, float]:
+    try:
+        x0, y0, x1, y1 = (float(row[name]) for name in COLUMNS[2:])
+    except (TypeError, ValueError):
+        raise UsageError(f"{where}: want four numbers x0,y0,x1,y1") from None
+    if not all(map(math.isfinite, (x0, y0, x1, y1))) or x0 >= x1 or y0 >= y1:
+        raise UsageError(f"{where}: box {x0}, {y0}, {x1}, {y1}: want x0 < x1 and y0 < y1")
+    return x0, y0, x1, y1

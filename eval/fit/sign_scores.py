@@ -1,0 +1,83 @@
+"""How good a sign detector is on labelled pictures: of files, or of drives with truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from crosscue.detectors.base import Detections, Detector, Frame
+from crosscue.detectors.images import decode, read_file
+from crosscue.detectors.training.operating_point import Judged, judge, together
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import LogError, UsageError
+
+from .sign_drives import drive_pictures
+from .sign_labels import Labelled, read_labels
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What of labelled pictures is asked, and what is right.
+
+    Attributes:
+        labels: The signs to find.
+        least_overlap: With the true box (intersection over union).
+        least_height_px: True signs that are lower do not count.
+    """
+
+    labels: Sequence[str]
+    least_overlap: float
+    least_height_px: float = 0.0
+
+    @property
+    def of_judge(self) -> tuple[float, float]:
+        """As ``judge`` takes them."""
+        return self.least_overlap, self.least_height_px
+
+
+def judged_pictures(path: Path, detector: Detector, rules: Rules, every: slice) -> Judged:
+    """What a detector finds in some of a file's or drive's pictures, and what of it is right.
+
+    Args:
+        path: Of a file with labels, or a drive's folder.
+        detector: For signs.
+        rules: Of judging.
+        every: Which pictures.
+
+    Raises:
+        UsageError: No such file, a picture that cannot be read, or a box outside its picture.
+        LogError: A drive's log cannot be read.
+        SchemaError: A drive has no truth, or it does not fit.
+    """
+    chosen = islice(_labelled(path), every.start, every.stop, every.step)
+    return together([_judged(one, detector, rules) for one in chosen])
+
+
+def _labelled(path: Path) -> Iterator[Labelled]:
+    yield from drive_pictures(path) if path.is_dir() else read_labels(path)
+
+
+def _judged(one: Labelled, detector: Detector, rules: Rules) -> Judged:
+    try:
+        picture = read_file(one.picture) if isinstance(one.picture, Path) else one.picture
+        pixels, size = decode(picture, detector.view)
+    except OSError as error:
+        raise UsageError(f"{one.name}: {error.strerror}; check the picture column") from None
+    except LogError as error:
+        raise UsageError(f"{one.name}: {error}; mend the picture or leave it out") from None
+    width, height = size
+    found = detector([Frame(0, one.name, pixels, size)])[0]
+    if not isinstance(found, Detections):
+        raise UsageError("the detector gives no boxes; choose one for signs")
+    parts = []
+    for label in rules.labels:
+        truth: Floats = np.array(one.boxes.get(label, []), np.float64).reshape(-1, 4)
+        if len(truth) and (truth.min() < -1 or (truth[:, 2:] > (width + 1, height + 1)).any()):
+            raise UsageError(f"{one.name}: a box lies outside its {width} x {height} px; mend it")
+        which = np.array([name == label for name in found.labels], np.bool_)
+        parts.append(judge(found.boxes_px[which], found.scores[which], truth, *rules.of_judge))
+    return together(parts)

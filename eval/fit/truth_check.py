@@ -1,0 +1,240 @@
+"""Does a truth file fit its log? And truth made from annotations of a log's pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.datasets.truth import truth as truth_file
+from crosscue.datasets.truth.annotations import (
+    Annotations,
+    LogPictures,
+    Placed,
+    check_boxes,
+    coco_tree,
+    cue_truths,
+    meanings,
+    place,
+)
+from crosscue.datasets.truth.coco import read_coco
+from crosscue.datasets.truth.cvat import read_cvat
+from crosscue.datasets.truth.truth import Truth
+from crosscue.datasets.truth.tum import read_tum
+from crosscue.eval.scoring import truth as score_truth
+from crosscue.replay.errors import SchemaError, UsageError
+from crosscue.replay.files.run_folder import sha256_of, strict_json, write_text
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .log_images import log_pictures, log_span
+
+OBJECTS: Final = "objects.json"
+SLACK_NS: Final = 1_000_000_000
+"""Truth may begin or end so far outside its log: clocks and last pictures differ a little."""
+
+
+@dataclass(frozen=True, slots=True)
+class TruthFit:
+    """What a truth file that fits its log tells.
+
+    Attributes:
+        seconds: Its length.
+        approaches: How many.
+        cues: Statements about cues.
+        moments_with_frame: Of statements about a moment, those at which the log has a picture.
+        moments: Statements about a moment.
+        objects: Labelled objects.
+        ranges: Rows with true ranges.
+        poses: Of the track.
+        is_checked_by_hash: Whether the truth names the log's hash.
+    """
+
+    seconds: float
+    approaches: int
+    cues: int
+    moments_with_frame: int
+    moments: int
+    objects: int
+    ranges: int
+    poses: int
+    is_checked_by_hash: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """What came of an import.
+
+    Attributes:
+        truth: Path of the truth file.
+        objects: Path of the COCO file beside it.
+        pictures: Annotated ones.
+        things: Annotated things.
+        rule: How pictures found their frames.
+        cues: From cue to pictures in which it is there.
+        ignored: Shapes that were not taken, by kind.
+    """
+
+    truth: Path
+    objects: Path
+    pictures: int
+    things: int
+    rule: str
+    cues: dict[str, int]
+    ignored: Mapping[str, int]
+
+
+def check_truth(path: Path, log_path: Path, vehicle: Vehicle) -> TruthFit:
+    """Check a truth file and all files that it names against a log.
+
+    Raises:
+        SchemaError: Something does not fit; the first thing found is told.
+        LogError: The log or the track cannot be read.
+    """
+    drive = score_truth.load(path, str(log_path))
+    truth = drive.truth
+    folder = path if path.is_dir() else path.parent
+    has_hash = bool(truth.log_sha256)
+    if has_hash and not set(truth.log_sha256.values()) & set(sha256_of(log_path).values()):
+        raise SchemaError(
+            f"{path}: belongs to {truth.log or 'another log'} by its hash, not to {log_path}"
+        )
+    _check_times(truth, log_span(log_path), path, log_path)
+    poses = 0
+    if truth.pose is not None:
+        track = read_tum(folder / truth.pose)
+        poses = len(track.t_ns)
+        _check_overlap(f"{folder / truth.pose}: track", track.t_ns, truth, path)
+    moments = np.array([one.t_ns for one in truth.cues if one.t_ns is not None], np.int64)
+    pictures, objects = None, 0
+    if len(moments) or truth.objects is not None:
+        pictures = log_pictures(log_path, vehicle)
+    if truth.objects is not None:
+        assert pictures is not None
+        objects = _check_objects(folder / truth.objects, pictures, truth.own_cues)
+    matched = 0 if pictures is None else int(np.isin(moments, pictures.t_ns).sum())
+    if len(moments) and not matched:
+        raise SchemaError(
+            f"{path}: cues: at none of {len(moments)} moments has {log_path} a picture; the times "
+            "are of another log or clock"
+        )
+    ranges = 0 if drive.ranges is None else len(drive.ranges.t_ns)
+    return TruthFit(
+        (truth.end_ns - truth.start_ns) * 1e-9, len(truth.approaches), len(truth.cues), matched,
+        len(moments), objects, ranges, poses, has_hash,
+    )  # fmt: skip
+
+
+def _check_times(truth: Truth, span: tuple[int, int], path: Path, log_path: Path) -> None:
+    first, last = span[0] - SLACK_NS, span[1] + SLACK_NS
+    where = f"{log_path} lasts from {span[0]} to {span[1]} ns; give the truth of this log"
+    if truth.start_ns >= last or truth.end_ns <= first:
+        raise SchemaError(f"{path}: truth from {truth.start_ns} to {truth.end_ns} ns, but {where}")
+    for one in truth.approaches:
+        if one.start_ns < first or one.enter_ns > last:
+            raise SchemaError(
+                f"{path}: approach {one.id} from {one.start_ns} to {one.enter_ns} ns, but {where}"
+            )
+    for number, cue in enumerate(truth.cues):
+        begin = cue.t_ns if cue.start_ns is None else cue.start_ns
+        end = cue.t_ns if cue.end_ns is None else cue.end_ns
+        assert begin is not None
+        assert end is not None
+        if begin < first or end > last:
+            raise SchemaError(
+                f"{path}: cues.{number} ({cue.cue}) from {begin} to {end} ns, but {where}"
+            )
+
+
+def _check_overlap(what: str, t_ns: np.typing.NDArray[np.int64], truth: Truth, path: Path) -> None:
+    if not ((t_ns >= truth.start_ns - SLACK_NS) & (t_ns < truth.end_ns + SLACK_NS)).any():
+        raise SchemaError(
+            f"{what} from {t_ns.min()} to {t_ns.max()} ns, but {path} speaks of {truth.start_ns} "
+            f"to {truth.end_ns} ns; it belongs to another log"
+        )
+
+
+def _check_objects(path: Path, pictures: LogPictures, own_cues: Sequence[str]) -> int:
+    annotations = read_coco(path)
+    meanings(annotations, {}, own_cues, any_thing=True)
+    place(annotations, pictures)
+    check_boxes(annotations)
+    return sum(len(picture.things) for picture in annotations.pictures)
+
+
+def read_annotations(path: Path) -> Annotations:
+    """Read a COCO (``.json``) or CVAT (``.xml``) file.
+
+    Raises:
+        UsageError: Another kind of file.
+        SchemaError: Not what it should be.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return read_coco(path)
+    if suffix == ".xml":
+        return read_cvat(path)
+    raise UsageError(f"{path}: want a COCO .json or a CVAT .xml file")
+
+
+def import_annotations(
+    source: Path, log_path: Path, output: Path, vehicle: Vehicle, own: Mapping[str, str],
+    *, add: bool = False,
+) -> Imported:  # fmt: skip
+    """Turn annotated pictures of a log into its truth.
+
+    Args:
+        source: COCO or CVAT.
+        log_path: The log whose pictures were annotated.
+        output: The truth file to write; labelled objects go beside it.
+        vehicle: Names the camera where the log has several, and cues of the user's own.
+        own: From label to cue, see ``meanings``.
+        add: Keep everything but cues and objects of the truth file that is there.
+
+    Raises:
+        SchemaError: The annotations do not fit the log.
+        OutputError: The files cannot be written.
+    """
+    annotations = read_annotations(source)
+    cues = meanings(annotations, own, tuple(vehicle.cues.own))
+    check_boxes(annotations)
+    pictures = log_pictures(log_path, vehicle)
+    placed = place(annotations, pictures)
+    truth = _truth(annotations, placed, cues, pictures, log_path, source)
+    if add:
+        before = truth_file.load(output)
+        kept = {"start_ns": min(before.start_ns, truth.start_ns),
+                "end_ns": max(before.end_ns, truth.end_ns), "cues": truth.cues,
+                "own_cues": truth.own_cues,
+                "objects": truth.objects, "log_sha256": truth.log_sha256}  # fmt: skip
+        truth = before.model_copy(update=kept)
+    objects = output.parent / OBJECTS
+    write_text(objects, strict_json(coco_tree(annotations, placed, cues)) + "\n")
+    write_text(output, strict_json(truth.model_dump(mode="json")) + "\n")
+    there: dict[str, int] = {}
+    for one in truth.cues:
+        there[one.cue] = there.get(one.cue, 0) + one.present
+    return Imported(
+        output, objects, len(annotations.pictures),
+        sum(len(picture.things) for picture in annotations.pictures), placed.rule, there,
+        annotations.ignored,
+    )  # fmt: skip
+
+
+def _truth(
+    annotations: Annotations, placed: Placed, cues: Mapping[str, str | None],
+    pictures: LogPictures, log_path: Path, source: Path,
+) -> Truth:  # fmt: skip
+    return Truth(
+        version=1,
+        log=log_path.name,
+        log_sha256=sha256_of(log_path),
+        start_ns=int(pictures.t_ns[0]),
+        end_ns=int(pictures.t_ns[-1]) + 1,
+        source=f"annotations in {source.name}",
+        cues=cue_truths(annotations, placed, cues),
+        own_cues=tuple(sorted({cue for cue in cues.values() if cue} - {*truth_file.CUES})),
+        objects=OBJECTS,
+    )

@@ -1,0 +1,1 @@
+"""The stages of one drive: detect, estimate, and the tables between them."""

@@ -1,0 +1,202 @@
+"""What a run's manifest and ``skipped.parquet`` tell of logs, clocks and versions."""
+
+from __future__ import annotations
+
+import platform
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Final
+
+from crosscue.replay.clocks.reports import Clock
+from crosscue.replay.files.run_folder import RunFolder, TableSink
+from crosscue.replay.ledger import Ledger, TopicAccount
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.signals import Extractor
+from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
+
+from .labelled import labelled
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+UNATTRIBUTED: Final = ""
+"""The topic of what no topic can be named for."""
+PROBE_NS: Final = 10_000_000_000
+"""Log time looked at before a clock is chosen for each topic."""
+
+
+def probe_clocks(log: Log, extractor: Extractor, selection: Selection) -> dict[str, Clock]:
+    """Which clock to use for each planned topic, judged by the log's first seconds."""
+    first_ns: int | None = None
+    for block in log.read(extractor.ledger, selection):
+        if not len(block):
+            continue
+        first_ns = int(block.log_ns[0]) if first_ns is None else first_ns
+        for _ in extractor(block):
+            pass
+        if int(block.log_ns[0]) - first_ns > PROBE_NS:
+            break
+    return {name: report.used for name, report in extractor.watch.reports().items()}
+
+
+def clock_rows(extractor: Extractor) -> dict[str, object]:
+    """Clock used and the whole pass's report for each topic, as plain values."""
+    return {
+        name: {
+            "used": extractor.clocks.get(name, Clock.LOG).value,
+            "why": report.why,
+            "rows": report.of_used.rows,
+            "rate_hz": report.rate_hz,
+        }
+        for name, report in extractor.watch.reports().items()
+    }
+
+
+def clock_changes(extractors: Sequence[Extractor]) -> list[str]:
+    """Topics whose clock would have been chosen otherwise in hindsight."""
+    return [
+        f"{name}: used the {extractor.clocks[name].value}, but over the whole log: {report.why}"
+        for extractor in extractors
+        for name, report in extractor.watch.reports().items()
+        if name in extractor.clocks and extractor.clocks[name] is not report.used
+    ]
+
+
+def skipped_schema() -> pa.Schema:
+    """Columns of ``skipped.parquet``."""
+    import pyarrow as pa
+
+    return pa.schema(
+        [
+            ("t_ns", pa.int64()),
+            ("topic", pa.string()),
+            ("reason", pa.string()),
+            ("detail", pa.string()),
+            ("count", pa.int64()),
+            ("is_dropped", pa.bool_()),
+            ("log", pa.string()),
+        ]
+    )
+
+
+def _skipped_rows(ledger: Ledger) -> list[dict[str, Any]]:
+    """Single skips and drops of one log."""
+    return [asdict(detail) | {"log": ledger.log} for detail in ledger.details]
+
+
+def account_of(ledger: Ledger) -> dict[str, object]:
+    """One log's account as plain values, for manifest and JSON output."""
+    return {
+        "log": ledger.log,
+        "integrity": ledger.integrity,
+        "is_whole": ledger.is_whole,
+        "notices": list(ledger.notices),
+        "topics": {name: _account(a) for name, a in sorted(ledger.accounts.items())},
+    }
+
+
+def _account(account: TopicAccount) -> dict[str, object]:
+    return {
+        "declared": account.declared,
+        "in": account.in_file,
+        "found": account.found,
+        "used": account.used,
+        "skipped": dict(sorted(account.skipped.items())),
+        "dropped": dict(sorted(account.dropped.items())),
+        "dropped_unknown": sorted(set(account.dropped_unknown)),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of crosscue, Python and the libraries that results depend on."""
+    libraries = ("crosscue", "numpy", "numba", "cantools", "rosbags", "mcap", "pyarrow")
+    return {"python": platform.python_version(), **{name: version(name) for name in libraries}}
+
+
+def write_skipped(
+    run: RunFolder,
+    ledgers: Sequence[Ledger],
+    reading: Sequence[Mapping[str, Any]],
+    kept: pa.Table | None = None,
+    timeline: Timeline = ONE_SEGMENT,
+) -> None:
+    """Write ``skipped.parquet``; its counts are those of the account, reason by reason.
+
+    Args:
+        run: The run.
+        ledgers: Of all logs.
+        reading: The account's part on them, as it goes into the manifest.
+        kept: Rows of an earlier stage; those of topics that it alone has read stay.
+        timeline: The drive's time segments; stamps here are as recorded.
+    """
+    rows = [row for ledger in ledgers for row in _skipped_rows(ledger)]
+    earlier = [] if kept is None else kept.to_pylist()
+    with TableSink(run, "skipped", labelled(skipped_schema())) as sink:
+        for log in reading:
+            for topic, account in log["topics"].items():
+                # What both stages have met stands in either's rows, a camera's in the first's.
+                for rest in (rows, earlier) if topic == UNATTRIBUTED else (earlier, rows):
+                    mine = [r for r in rest if (r["log"], r["topic"]) == (log["log"], topic)]
+                    if mine:
+                        break
+                mine += _in_bulk(mine, log["log"], topic, account)
+                if mine:
+                    names = skipped_schema().names
+                    times = [row["t_ns"] for row in mine]
+                    numbers = [timeline.number_of_stamp(t_ns) for t_ns in times]
+                    columns = {name: [row[name] for row in mine] for name in names}
+                    sink.write({**columns, "segment": numbers, "log_t_ns": times})
+
+
+def _in_bulk(
+    single: Sequence[Mapping[str, Any]], log: str, topic: str, account: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """A row for each reason of which the single rows tell less than the account."""
+    rows = []
+    for key, is_dropped in (("skipped", False), ("dropped", True)):
+        listed: Counter[str] = Counter()
+        for row in single:
+            if row["is_dropped"] is is_dropped:
+                listed[row["reason"]] += row["count"] or 0
+        counts: list[tuple[str, int | None]] = [
+            (why, n - listed[why]) for why, n in account[key].items() if n != listed[why]
+        ]
+        if is_dropped:
+            known = {row["reason"] for row in single if row["count"] is None}
+            counts += [(why, None) for why in account["dropped_unknown"] if why not in known]
+        rows += [
+            {"t_ns": None, "topic": topic, "reason": why, "detail": "not listed one by one",
+             "count": count, "is_dropped": is_dropped, "log": log}
+            for why, count in counts
+        ]  # fmt: skip
+    return rows
+
+
+def joined_accounts(
+    ours: Sequence[Mapping[str, Any]], earlier: Sequence[Mapping[str, Any]], topic: str
+) -> list[dict[str, Any]]:
+    """Accounts of one stage with that of ``topic`` taken from an earlier one, which read it."""
+    logs = {account["log"]: account for account in earlier}
+    joined = []
+    for account in ours:
+        one = dict(account)
+        before = logs.get(account["log"])
+        if before is not None and topic in before["topics"]:
+            one["topics"] = {**account["topics"], topic: before["topics"][topic]}
+            if UNATTRIBUTED not in account["topics"] and UNATTRIBUTED in before["topics"]:
+                one["topics"][UNATTRIBUTED] = before["topics"][UNATTRIBUTED]
+            one["is_whole"] = account["is_whole"] and before["is_whole"]
+            one["notices"] = list(dict.fromkeys([*before["notices"], *account["notices"]]))
+        joined.append(one)
+    return joined
+
+
+def selection_told(selection: Selection) -> dict[str, object]:
+    """Which part of the logs was asked for, for the manifest."""
+    return {
+        "start_ns": selection.start_ns,
+        "end_ns": selection.end_ns,
+        "topics": None if selection.topics is None else sorted(selection.topics),
+    }

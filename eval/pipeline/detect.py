@@ -1,0 +1,381 @@
+"""From a drive's camera to detections, road shares and cues in a run folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections, RoadMask
+from crosscue.detectors.cues.frame import CuePass, FrameCues, Role, role_of, seen
+from crosscue.detectors.overlay import Drawer
+from crosscue.detectors.ranging.height_to_range import range_of
+from crosscue.detectors.registry import Choice, make
+from crosscue.detectors.result_cache import ResultCache
+from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
+from crosscue.replay.columns import Block
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.files.run_folder import RunFolder, clear, locked, write_manifest
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.signals import Extractor, Plan, Source, camera_of
+from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_told, shift_of
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .accounts import clock_rows, probe_clocks, selection_told, versions, write_skipped
+from .drive_time import camera_timeline, time_told
+from .empty_result import empty_result, nothing_left
+from .labelled import LabelledSink
+from .run_account import Account, account, detecting_of, reading_of
+from .run_input import input_of
+from .run_logs import log_names, log_rows
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+OnFrames = Callable[[int, int | None], None]
+"""Told how many frames are done, and of how many where that is known."""
+
+
+def unwatched(_done: int, _of: int | None) -> None:
+    """Nobody looks."""
+
+
+@dataclass(frozen=True, slots=True)
+class DetectOutcome:
+    """What a detection run did.
+
+    Attributes:
+        run: Its folder.
+        ledger: The camera log's account.
+        counts: Frames, by detector what ran and what came from the cache.
+        objects: Detections by detector and label.
+        cues: Frames in which each cue was positive.
+        notices: Plain sentences.
+        seconds: Wall time.
+        account: What became of every row and frame.
+        has_gaps: The drive has more than one time segment.
+    """
+
+    run: RunFolder
+    ledger: Ledger
+    counts: Counts
+    objects: dict[str, int]
+    cues: dict[str, int]
+    notices: tuple[str, ...]
+    seconds: float
+    account: Account
+    has_gaps: bool = False
+
+    @property
+    def exit_status(self) -> int:
+        """3 when anything was dropped or the drive has gaps, else 0."""
+        return 0 if self.account["is_whole"] and not self.has_gaps else 3
+
+
+def choices_of(vehicle: Vehicle) -> dict[str, Choice]:
+    """The vehicle file's own detectors by name."""
+    return {
+        name: Choice(
+            name,
+            section.kind,
+            section.settings | ({} if section.card is None else {"card": section.card}),
+        )
+        for name, section in vehicle.detectors.items()
+    }
+
+
+def detect_drive(
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    run: RunFolder,
+    selection: Selection,
+    choices: Sequence[Choice],
+    cache: Path | None = None,
+    draw: int = 0,
+    on_frames: OnFrames = unwatched,
+) -> DetectOutcome:
+    """Run detectors over the one camera of a drive, into an empty run folder.
+
+    The folder is locked while this works, and cleared first; otherwise as ``detect_into``.
+    """
+    with locked(run), nothing_left(run):
+        clear(run, input_of(logs, vehicle, selection, choices, draw, None))
+        return detect_into(logs, vehicle, run, selection, choices, cache, draw, on_frames)
+
+
+def detect_into(
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    run: RunFolder,
+    selection: Selection,
+    choices: Sequence[Choice],
+    cache: Path | None = None,
+    draw: int = 0,
+    on_frames: OnFrames = unwatched,
+    timeline: Timeline | None = None,
+) -> DetectOutcome:
+    """Run detectors over the one camera of a drive, into a run folder that is locked.
+
+    Args:
+        logs: All logs of the drive, open.
+        vehicle: What the vehicle file says.
+        run: Where to.
+        selection: Which part of the logs.
+        choices: Detectors, in order.
+        cache: File with results of earlier runs, or None for none.
+        draw: How many pictures to write at most, with detections drawn, spread over the drive.
+        on_frames: Told how many frames are done, and of how many where the log declares it.
+        timeline: The drive's time segments, if they have been found already.
+
+    Raises:
+        VehicleError: No camera or several; a card, weights or settings that do not fit.
+        EmptyResultError: Not one frame in the part asked for.
+        OutputError: The disk is full.
+    """
+    began = time.monotonic()
+    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
+    camera = camera_of(topics, vehicle)
+    if camera is None:
+        raise VehicleError(f"{logs[0].path}: no camera in the logs; name its topic under [topics]")
+    named = [Named(choice.name, make(choice)) for choice in choices]
+    log, topic = logs[camera[0]], camera[1]
+    ledger = Ledger(log_names(logs)[camera[0]])
+    planned = Plan((Source(camera[0], topic, ()),), {})
+    narrowed = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
+    probe = Extractor(planned, vehicle, camera[0], Ledger(""))
+    clocks = probe_clocks(log, probe, narrowed)
+    timeline = timeline or camera_timeline(logs, vehicle, selection, camera)
+    clock = timeline.clock(camera[0])
+    extractor = Extractor(
+        planned, vehicle, camera[0], ledger, clocks, shift_at=shift_of(timeline, camera[0])
+    )
+    is_sign = [choice.kind == "signs" for choice in choices]
+    with ResultCache(cache) as results:
+        runner = Runner(
+            named, results, topic.name, vehicle.camera.depth_bits,
+            lambda t_ns, reason, why: ledger.spoil(
+                topic.name, reason, 1, why, int(clock.log_times(np.array([t_ns]))[0])
+            ),
+        )  # fmt: skip
+        drawer = Drawer(run.path / "pictures", draw)
+        tables = _Tables(
+            run, topic.name, vehicle, named, drawer, CuePass(vehicle), is_sign, timeline, clock
+        )
+
+        def declared() -> int | None:
+            is_whole = selection.start_ns is None and selection.end_ns is None
+            return ledger.topic(topic.name).declared if is_whole else None
+
+        with tables:
+            extractor.on_pictures = lambda block: _through(
+                runner, block, tables, lambda: on_frames(runner.counts.frames, declared())
+            )
+            for block in ledger.handing_on(TimedLog(log, clock).read(ledger, narrowed)):
+                for _ in extractor(block):
+                    pass
+            for _ in extractor.finish():
+                pass
+        if not runner.counts.frames:
+            gone = ledger.topic(topic.name).dropped.total()
+            dropped = f" ({gone:,} are damaged)" if gone else ""
+            what = f"the camera, planned from {topic.name}, found no frames{dropped}"
+            raise empty_result(what, logs, selection)
+        made = account(reading_of([ledger]), detecting_of(topic.name, ledger, runner.counts.frames))
+        write_skipped(run, [ledger], made["reading"], timeline=timeline)
+        seconds = time.monotonic() - began
+        notices = (*gaps_told(timeline.segments), *tables.notices)
+        write_manifest(run, {
+            "stage": "detect",
+            "versions": versions(),
+            "logs": log_rows(logs, run),
+            "selection": selection_told(selection),
+            "settings": vehicle.model_dump(mode="json"),
+            "camera": topic.name,
+            "camera_log": camera[0],
+            "time": time_told(timeline),
+            "detectors": [
+                {"name": one.name, "identity": one.detector.identity, "kind": choice.kind,
+                 "role": tables.roles.get(one.name), "settings": dict(choice.settings)}
+                for one, choice in zip(named, choices, strict=True)
+            ],
+            "clocks": [clock_rows(extractor)],
+            "account": made,
+            "counts": {
+                "frames": runner.counts.frames, "decoded": runner.counts.decoded,
+                "ran": runner.counts.ran, "from_cache": runner.counts.from_cache,
+                "objects": tables.objects, "cues": tables.cue_frames,
+            },
+            "notices": list(notices),
+            "timings": {"seconds": seconds},
+        })  # fmt: skip
+    return DetectOutcome(
+        run, ledger, runner.counts, tables.objects, tables.cue_frames, notices, seconds, made,
+        timeline.has_gaps,
+    )  # fmt: skip
+
+
+def _through(runner: Runner, block: Block, tables: _Tables, on_frame: Callable[[], None]) -> None:
+    for result in runner(block):
+        tables.add(result)
+        on_frame()
+
+
+@dataclass(slots=True)
+class _Tables:
+    """The three tables of a run, filled frame by frame."""
+
+    run: RunFolder
+    camera: str
+    vehicle: Vehicle
+    detectors: Sequence[Named]
+    drawer: Drawer
+    cues: CuePass
+    is_for_signs: Sequence[bool]
+    timeline: Timeline
+    clock: LogClock
+    notices: list[str] = field(default_factory=list)
+    objects: dict[str, int] = field(default_factory=dict)
+    cue_frames: dict[str, int] = field(default_factory=dict)
+    _sinks: dict[str, LabelledSink] = field(default_factory=dict)
+    _open: ExitStack = field(default_factory=ExitStack)
+    roles: dict[str, Role] = field(default_factory=dict)
+    _held: dict[str, list[dict[str, object]]] = field(default_factory=dict)
+    _size: tuple[int, int] | None = None
+    _frame: int = -1
+
+    def __enter__(self) -> _Tables:
+        with ExitStack() as stack:
+            for name, schema in schemas().items():
+                sink = LabelledSink(self.run, name, schema, self.timeline, self.clock)
+                self._sinks[name] = stack.enter_context(sink)
+                self._held[name] = []
+            self._open = stack.pop_all()
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        if failure[0] is not None:
+            self._open.__exit__(*failure)  # type: ignore[arg-type]
+            return
+        with self._open:
+            for name in self._sinks:
+                self._write(name)
+
+    def add(self, result: FrameResult) -> None:
+        """Rows of one frame."""
+        if self._size not in (None, result.size_px):
+            self.notices.append(
+                f"{self.camera}: pictures of {self._size} became {result.size_px} px at "
+                f"{result.t_ns} ns"
+            )
+        self._size = result.size_px
+        self._frame += 1
+        sorted_by_role = seen(result.t_ns, result.found, self.is_for_signs)
+        cues = self.cues(sorted_by_role)
+        self._held["frames"].append({
+            "frame": self._frame, "t_ns": result.t_ns, "camera": self.camera,
+            "width_px": result.size_px[0], "height_px": result.size_px[1],
+        })  # fmt: skip
+        for named, found, for_signs in zip(
+            self.detectors, result.found, self.is_for_signs, strict=True
+        ):
+            self.roles[named.name] = role_of(found, for_signs)
+            if isinstance(found, Detections):
+                self._held["detections"] += self._detection_rows(named.name, found)
+        road = sorted_by_role.road
+        if cues.road is not None and isinstance(road, RoadMask):
+            self._held["road"].append({
+                "frame": self._frame, "t_ns": result.t_ns, "camera": self.camera,
+                "share_left": cues.road.left, "share_straight": cues.road.straight,
+                "share_right": cues.road.right, "mask": road.mask,
+                "mask_width_px": road.mask_size_px[0], "mask_height_px": road.mask_size_px[1],
+            })  # fmt: skip
+        self._add_cues(result.t_ns, cues)
+        self.drawer(result, cues)
+        for name, rows in self._held.items():
+            if len(rows) > 8192:
+                self._write(name)
+
+    def _add_cues(self, t_ns: int, cues: FrameCues) -> None:
+        for cue, count in cues.counts.items():
+            row: dict[str, object] = {
+                "t_ns": t_ns,
+                "approach": None,
+                "cue": cue,
+                "count": count,
+            }
+            self._held["cues"].append(row)
+            self.cue_frames[cue] = self.cue_frames.get(cue, 0) + (count > 0)
+
+    def _detection_rows(self, name: str, found: Detections) -> list[dict[str, object]]:
+        rows: list[dict[str, object]] = []
+        for i, label in enumerate(found.labels):
+            x0, y0, x1, y1 = found.boxes_px[i].tolist()
+            key = f"{name}: {label}"
+            self.objects[key] = self.objects.get(key, 0) + 1
+            height = _height_px(found, i)
+            rows.append({
+                "frame": self._frame, "t_ns": found.t_ns, "camera": self.camera,
+                "detector": name, "label": label,
+                "score": float(found.scores[i]), "x0": x0, "y0": y0, "x1": x1, "y1": y1,
+                "mask": found.masks[i] or None, "height_px": height,
+                "range_m": self._range_m(label, height),
+                "picture_width_px": found.size_px[0], "picture_height_px": found.size_px[1],
+            })  # fmt: skip
+        return rows
+
+    def _range_m(self, label: str, height_px: float) -> float | None:
+        cues, ranges = self.vehicle.cues, self.vehicle.ranges
+        curve = ranges.stop_sign if label in cues.stop_sign_labels else None
+        curve = ranges.traffic_light if label in cues.traffic_light_labels else curve
+        if curve is None or height_px <= 0.0:
+            return None
+        return float(range_of(np.array([height_px]), curve)[0])
+
+    def _write(self, name: str) -> None:
+        rows, self._held[name] = self._held[name], []
+        if rows:
+            self._sinks[name].write({key: [row[key] for row in rows] for key in rows[0]})
+
+
+def _height_px(found: Detections, i: int) -> float:
+    """Rows that the mask spans, or the box's height where there is no mask."""
+    if not found.masks[i]:
+        return float(found.boxes_px[i, 3] - found.boxes_px[i, 1])
+    rows = np.flatnonzero(rle.decode(found.masks[i], found.size_px).any(axis=1))
+    return float(rows[-1] - rows[0] + 1) if len(rows) else 0.0
+
+
+def schemas() -> dict[str, pa.Schema]:
+    """Columns of the tables that this stage writes."""
+    import pyarrow as pa
+
+    number, text = pa.float64(), pa.string()
+    return {
+        "frames": pa.schema([
+            ("frame", pa.int64()), ("t_ns", pa.int64()), ("camera", text),
+            ("width_px", pa.int32()), ("height_px", pa.int32()),
+        ]),
+        "detections": pa.schema([
+            ("frame", pa.int64()), ("t_ns", pa.int64()), ("camera", text),
+            ("detector", text), ("label", text),
+            ("score", number), ("x0", number), ("y0", number), ("x1", number), ("y1", number),
+            ("mask", pa.binary()), ("height_px", number), ("range_m", number),
+            ("picture_width_px", pa.int32()), ("picture_height_px", pa.int32()),
+        ]),
+        "road": pa.schema([
+            ("frame", pa.int64()), ("t_ns", pa.int64()), ("camera", text),
+            ("share_left", number), ("share_straight", number), ("share_right", number),
+            ("mask", pa.binary()), ("mask_width_px", pa.int32()), ("mask_height_px", pa.int32()),
+        ]),
+        "cues": pa.schema([
+            ("t_ns", pa.int64()), ("approach", pa.int64()), ("cue", text), ("count", pa.int64()),
+        ]),
+    }  # fmt: skip

@@ -1,0 +1,85 @@
+"""A drive's time segments, found once and used by all of its stages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.signals import Extractor, Plan, plan, with_pictures
+from crosscue.replay.time.scan import scan
+from crosscue.replay.time.segments import Timeline, gaps_told, timeline_of
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .accounts import probe_clocks
+
+
+def drive_timeline(
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    selection: Selection,
+    camera: tuple[int, Topic] | None = None,
+    known: Timeline | None = None,
+) -> Timeline:
+    """Read a drive's stamps once and find its segments.
+
+    Args:
+        logs: All logs of the drive, open.
+        vehicle: What the vehicle file says.
+        selection: Which part of the logs will be read.
+        camera: Its stamps are looked at, too.
+        known: What an earlier stage found; its shifts are kept.
+
+    Raises:
+        VehicleError: The vehicle file does not fit the logs.
+    """
+    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
+    planned = plan(topics, vehicle)
+    if camera is not None:
+        planned = with_pictures(planned, camera)
+    selections = selections_of(logs, planned, selection)
+    clocks = [
+        probe_clocks(log, Extractor(planned, vehicle, i, Ledger("")), selections[i])
+        for i, log in enumerate(logs)
+    ]
+    return scan(logs, planned, vehicle, selections, clocks, known)
+
+
+def camera_timeline(
+    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, camera: tuple[int, Topic]
+) -> Timeline:
+    """As ``drive_timeline``, for a stage that needs the camera alone.
+
+    Where the vehicle file does not fit the odometry, only the camera's own clock is looked at: the
+    stage that needs the odometry says what is wrong.
+    """
+    try:
+        return drive_timeline(logs, vehicle, selection, camera)
+    except VehicleError:
+        planned = with_pictures(Plan((), {}), camera)
+        selections = selections_of(logs, planned, selection)
+        return scan(logs, planned, vehicle, selections, [{} for _ in logs])
+
+
+def selections_of(logs: Sequence[Log], planned: Plan, selection: Selection) -> list[Selection]:
+    """What is read of each log: the topics that are used."""
+    return [_narrowed(selection, planned.topics_of(i)) for i in range(len(logs))]
+
+
+def _narrowed(selection: Selection, planned: frozenset[str]) -> Selection:
+    topics = planned if selection.topics is None else planned & selection.topics
+    return Selection(topics, selection.start_ns, selection.end_ns)
+
+
+def time_told(timeline: Timeline) -> dict[str, Any]:
+    """The manifest's part on time."""
+    return timeline.as_dict() | {"notices": gaps_told(timeline.segments)}
+
+
+def timeline_in(manifest: Mapping[str, Any]) -> Timeline:
+    """The timeline of a finished run, or of its detect stage."""
+    told = manifest.get("time")
+    return timeline_of(None if told is None else told)

@@ -1,0 +1,89 @@
+"""Nothing came of what was asked for: one line that says what there is instead."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Final
+
+from crosscue.replay.errors import CrosscueError, EmptyResultError, LogError
+from crosscue.replay.files.run_folder import RunFolder, clear
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.signals import Plan, Signal
+
+TOPICS_SHOWN: Final = 12
+ROLES: Final[Mapping[Signal, str]] = {
+    Signal.WHEEL_SPEEDS: "wheel speeds",
+    Signal.YAW_RATE: "yaw rate",
+    Signal.STEERING: "steering",
+    Signal.MAGNETIC_FIELD: "compass",
+    Signal.HEADING: "heading",
+}
+
+
+def empty_result(what: str, logs: Sequence[Log], selection: Selection) -> CrosscueError:
+    """The error to raise; the logs are read once more to say what they do hold.
+
+    It is a ``LogError`` where damage has left not one row in them.
+
+    Args:
+        what: What found no rows, and where it looked.
+        logs: Open.
+        selection: What was asked for.
+    """
+    rows: Counter[str] = Counter({topic.name: 0 for log in logs for topic in log.topics})
+    first_ns: int | None = None
+    last_ns: int | None = None
+    damage: list[str] = []
+    for log in logs:
+        ledger = Ledger(str(log.path))
+        for block in log.read(ledger):
+            if len(block):
+                rows[block.topic] += len(block)
+                low, high = int(block.log_ns.min()), int(block.log_ns.max())
+                first_ns = low if first_ns is None else min(first_ns, low)
+                last_ns = high if last_ns is None else max(last_ns, high)
+        damage += [f"{loss.reason} ({loss.detail})" for loss in ledger.drops()]
+    named = [f"{name} ({count:,} rows)" for name, count in rows.most_common(TOPICS_SHOWN)]
+    more = f" and {len(rows) - TOPICS_SHOWN} more" if len(rows) > TOPICS_SHOWN else ""
+    holds = "no row at all"
+    if first_ns is not None and last_ns is not None:
+        seconds = (last_ns - first_ns) * 1e-9
+        holds = f"{first_ns}ns to {last_ns}ns ({seconds:.1f} s), topics {', '.join(named)}{more}"
+    asked = ""
+    if selection.start_ns is not None or selection.end_ns is not None:
+        asked = (
+            f" from {_or(selection.start_ns, 'the start')} to {_or(selection.end_ns, 'the end')}"
+        )
+    paths = ", ".join(str(log.path) for log in logs)
+    if first_ns is None and damage:
+        return LogError(f"{paths}: {damage[0]}, and not one row is left; copy it again")
+    return EmptyResultError(
+        f"{paths}: {what}{asked}; the log holds {holds}; check --vehicle, --from, --to and --topics"
+    )
+
+
+def _or(time_ns: int | None, word: str) -> str:
+    return word if time_ns is None else f"{time_ns}ns"
+
+
+def silent_roles(planned: Plan, received: Mapping[Signal, int]) -> dict[Signal, str]:
+    """Roles that a topic was planned for and that found no row, each in words."""
+    found = {}
+    for signal, name in ROLES.items():
+        source = planned.source_of(signal)
+        if source is not None and not received.get(signal):
+            found[signal] = f"the {name}, planned from {source.topic.name}, found no rows"
+    return found
+
+
+@contextmanager
+def nothing_left(run: RunFolder) -> Iterator[None]:
+    """Take a run's files away again when nothing came of it, so that it does not look finished."""
+    try:
+        yield
+    except (EmptyResultError, LogError):
+        clear(run)
+        raise

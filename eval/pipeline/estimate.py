@@ -1,0 +1,405 @@
+"""The second stage: pose from the logs' signals, and the scene from what detectors found before.
+
+No picture is opened here, unless landmarks are to be looked for: a detector's results come from
+the run's own tables.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from crosscue.localization.landmarks.database import LandmarkDatabase
+from crosscue.replay.columns import Topic
+from crosscue.replay.files.run_folder import (
+    MANIFEST,
+    RunFolder,
+    TableSink,
+    sha256_of,
+    write_manifest,
+)
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.signals import Extractor, Plan, Signal, camera_of, plan, with_pictures
+from crosscue.replay.time.segments import (
+    ONE_SEGMENT,
+    LogClock,
+    Segment,
+    TimedLog,
+    Timeline,
+    gaps_told,
+    shift_of,
+)
+from crosscue.replay.vehicle.roles import Role, role_of
+from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.windows import windows
+
+from . import measurements
+from .accounts import (
+    UNATTRIBUTED,
+    clock_changes,
+    clock_rows,
+    joined_accounts,
+    probe_clocks,
+    selection_told,
+    versions,
+    write_skipped,
+)
+from .detect import DetectOutcome
+from .drive_time import drive_timeline, selections_of, time_told, timeline_in
+from .empty_result import empty_result, silent_roles
+from .labelled import LabelledSink
+from .landmarks import looking
+from .mobileye_tables import MobileyeSink, StoredMobileye
+from .pose import PoseStage, turn_signal_of
+from .pose_tables import PoseTally, pose_rows, pose_schema
+from .run_account import Account, account, estimating_of, reading_of
+from .run_logs import log_names, log_rows, relative
+from .scene import SceneOutcome, estimate_scene, features_of, schemas
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+DETECT: Final = "detect"
+"""Stage name and key of the manifest's part on detection."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a replay, or its second stage alone, did.
+
+    Attributes:
+        run: Its folder.
+        ledgers: One account for each log.
+        rows: Pose rows written.
+        travelled_m: Along the estimated track.
+        major_axis_m: At the end; NaN without any pose.
+        notices: Plain sentences for the person who ran it.
+        seconds: Wall time, detection included where it ran.
+        drive_seconds: Log time from first to last pose row.
+        landmark_counts: What became of camera frames; empty where no landmarks were given.
+        account: What became of every row, frame and reading.
+        detected: What the detect stage did, where it ran just now.
+        scene: Cues, ranges and beliefs, where detectors have run.
+        segments: Time segments of the drive.
+    """
+
+    run: RunFolder
+    ledgers: tuple[Ledger, ...]
+    rows: int
+    travelled_m: float
+    major_axis_m: float
+    notices: tuple[str, ...]
+    seconds: float
+    drive_seconds: float
+    landmark_counts: dict[str, int]
+    account: Account
+    detected: DetectOutcome | None = None
+    scene: SceneOutcome | None = None
+    segments: tuple[Segment, ...] = ONE_SEGMENT.segments
+
+    @property
+    def exit_status(self) -> int:
+        """3 when anything was dropped or the drive has gaps, else 0."""
+        return 0 if self.account["is_whole"] and len(self.segments) == 1 else 3
+
+
+def detected_part(manifest: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """What a manifest says of the detect stage; None where none ran."""
+    if manifest.get("stage") == DETECT:
+        return manifest
+    found: Mapping[str, Any] | None = manifest.get(DETECT)
+    return found
+
+
+def estimate_into(
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    run: RunFolder,
+    selection: Selection,
+    on_time: Callable[[int], None] = lambda _: None,
+    landmarks: LandmarkDatabase | None = None,
+    detected: DetectOutcome | None = None,
+    earlier: Mapping[str, Any] | None = None,
+    told: Sequence[Mapping[str, object]] | None = None,
+    timeline: Timeline | None = None,
+) -> Outcome:
+    """Write pose, cues, ranges, beliefs and the manifest into a run folder that is locked.
+
+    Args:
+        logs: All logs of the drive, open.
+        vehicle: What the vehicle file says.
+        run: With the detect stage's tables, or without any.
+        selection: Which part of the logs.
+        on_time: Told the log time that has been reached.
+        landmarks: Camera frames are compared with these, where given.
+        detected: The detect stage, if it ran just now.
+        earlier: The manifest's part on the detect stage, if it ran earlier.
+        told: ``log_rows(logs, run)``, if they have been hashed already.
+        timeline: The drive's time segments, if they have been found already.
+
+    Raises:
+        VehicleError: The vehicle file does not fit the logs.
+        EmptyResultError: The part asked for holds nothing to estimate from.
+        OutputError: The disk is full.
+    """
+    began = time.monotonic()
+    found = earlier if detected is None else detected_part(run.manifest())
+    kept = None if found is None else _camera_skips(run, found["camera"])
+    reading = _Reading(logs, vehicle, selection, landmarks, timeline, found)
+    timeline = reading.timeline
+    stage = PoseStage(vehicle, turn_signal_of(reading.planned, vehicle), timeline=timeline)
+    if reading.camera is not None and landmarks is not None:
+        at = reading.camera[0]
+        stage.landmarks = looking(landmarks, vehicle, reading.ledgers[at])
+        reading.extractors[at].on_pictures = stage.landmarks.see
+    if detected is None:
+        begin_again(run, found)
+    tally = _pose(reading, stage, run, on_time)
+    silent = silent_roles(reading.planned, stage.received)
+    if Signal.WHEEL_SPEEDS in silent:
+        raise empty_result(silent[Signal.WHEEL_SPEEDS], logs, selection)
+    if not tally.rows and found is None and landmarks is None:
+        why = reading.planned.missing.get(Signal.WHEEL_SPEEDS, "they gave no pose")
+        what = f"no detector has run over a camera, and of the wheel speeds: {why}"
+        raise empty_result(what, logs, selection)
+    scene = None if found is None else _scene(run, vehicle, found, reading)
+    accounts = reading_of(reading.ledgers)
+    if found is not None:
+        accounts = joined_accounts(accounts, found["account"]["reading"], found["camera"])
+    frames = None if scene is None or found is None else (found["counts"]["frames"], scene.frames)
+    made = account(
+        accounts, {} if found is None else found["account"]["detecting"],
+        estimating_of(stage, frames),
+    )  # fmt: skip
+    write_skipped(run, reading.ledgers, made["reading"], kept, timeline)
+    before = 0.0 if detected is None else detected.seconds
+    seconds = time.monotonic() - began
+    notices = (
+        *gaps_told(timeline.segments),
+        *_missing(reading.planned),
+        *silent.values(),
+        *_no_camera(landmarks, reading.camera),
+        *_no_mobileye(found, reading.planned),
+        *_no_scene(found, reading),
+        *_of_detecting(found),
+        *stage.notices,
+        *stage.doubts(),
+        *clock_changes(reading.extractors),
+    )
+    write_manifest(run, {
+        "stage": "estimate",
+        "versions": versions(),
+        "logs": _hashed(logs, run, found) if told is None else list(told),
+        "selection": selection_told(selection),
+        "settings": vehicle.model_dump(mode="json"),
+        "sources": _sources(reading.planned, logs),
+        "clocks": [clock_rows(extractor) for extractor in reading.extractors],
+        "account": made,
+        "counts": stage.counts(),
+        "time": time_told(timeline),
+        "landmarks": None if landmarks is None else {
+            "database": relative(landmarks.path, run), "landmarks": len(landmarks),
+            "sha256": sha256_of(landmarks.path),
+        },
+        "notices": list(notices),
+        "pose": {"rows": tally.rows, "travelled_m": tally.travelled_m,
+                 "major_axis_m": tally.major_axis_m},
+        "scene": None if scene is None else _scene_told(scene),
+        DETECT: None if found is None else {
+            key: value for key, value in found.items() if key != "format_version"
+        },
+        "timings": {"seconds": seconds + before, "detect_seconds": before},
+    })  # fmt: skip
+    return Outcome(
+        run, reading.ledgers, tally.rows, tally.travelled_m, tally.major_axis_m, notices,
+        seconds + before, _driven_s(timeline, tally), stage.landmarks.counts(), made, detected,
+        scene, timeline.segments,
+    )  # fmt: skip
+
+
+def _of_detecting(found: Mapping[str, Any] | None) -> list[str]:
+    """What the detect stage had to say, but for the gaps: those are said of the whole run."""
+    if found is None:
+        return []
+    return [one for one in found["notices"] if one not in found["time"]["notices"]]
+
+
+def _driven_s(timeline: Timeline, tally: PoseTally) -> float:
+    """From the first row to the last, gaps left out."""
+    later = timeline.segments[1:]
+    pairs = zip(timeline.segments, later, strict=False)
+    gaps_ns = sum(b.start_ns - a.end_ns for a, b in pairs if b.breaks_odometry)
+    return tally.seconds - gaps_ns * 1e-9
+
+
+def _hashed(
+    logs: Sequence[Log], run: RunFolder, found: Mapping[str, Any] | None
+) -> Sequence[Mapping[str, object]]:
+    """Paths and hashes of the logs; the detect stage of this very run has taken them already."""
+    told: Sequence[Mapping[str, object]] = log_rows(logs, run) if found is None else found["logs"]
+    return told
+
+
+def begin_again(run: RunFolder, found: Mapping[str, Any] | None) -> None:
+    """Make the run what the detect stage left: cut short, it must not pass for a whole one."""
+    if found is None:
+        run.file(MANIFEST).unlink(missing_ok=True)
+    else:
+        write_manifest(run, {key: value for key, value in found.items() if key != "format_version"})
+
+
+class _Reading:
+    """A drive's logs, planned and with their clocks chosen."""
+
+    def __init__(
+        self, logs: Sequence[Log], vehicle: Vehicle, selection: Selection,
+        landmarks: LandmarkDatabase | None, timeline: Timeline | None,
+        found: Mapping[str, Any] | None,
+    ) -> None:  # fmt: skip
+        topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
+        self.logs = logs
+        self.has_camera = any(role_of(topic) is Role.CAMERA for _, topic in topics)
+        self.planned = plan(topics, vehicle)
+        self.camera = None if landmarks is None else camera_of(topics, vehicle)
+        if self.camera is not None:
+            self.planned = with_pictures(self.planned, self.camera)
+        self.ledgers = tuple(Ledger(name) for name in log_names(logs))
+        self.selections = selections_of(logs, self.planned, selection)
+        if timeline is None:
+            known = None if found is None else timeline_in(found)
+            timeline = drive_timeline(logs, vehicle, selection, self.camera, known)
+        self.timeline = timeline
+        clocks = [
+            probe_clocks(log, Extractor(self.planned, vehicle, i, Ledger("")), self.selections[i])
+            for i, log in enumerate(logs)
+        ]
+        self.extractors = [
+            Extractor(self.planned, vehicle, i, ledger, clocks[i], shift_at=shift_of(timeline, i))
+            for i, ledger in enumerate(self.ledgers)
+        ]
+
+    @property
+    def timed(self) -> list[TimedLog]:
+        """The logs in drive time."""
+        return [TimedLog(log, self.timeline.clock(i)) for i, log in enumerate(self.logs)]
+
+    def clock_of(self, signal: Signal) -> LogClock:
+        """The clock of the log that a signal comes from."""
+        source = self.planned.source_of(signal)
+        return self.timeline.clock(0 if source is None else source.log)
+
+
+def _pose(
+    reading: _Reading, stage: PoseStage, run: RunFolder, on_time: Callable[[int], None]
+) -> PoseTally:
+    tally = PoseTally()
+    timeline, clock = reading.timeline, reading.clock_of(Signal.WHEEL_SPEEDS)
+    with (
+        LabelledSink(run, "pose", pose_schema(), timeline, clock) as sink,
+        LabelledSink(run, measurements.TABLE, measurements.schema(), timeline, clock) as measured,
+        MobileyeSink(run, timeline, reading.clock_of(Signal.MOBILEYE_OBSTACLES)) as mobileye,
+    ):
+        for window in windows(
+            reading.timed, reading.extractors, reading.selections, reading.planned
+        ):
+            for poses in stage(window):
+                sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
+                tally.add(poses)
+            _write_all(measured, stage.take_measured())
+            mobileye.write(window.samples)
+            on_time(window.end_ns)
+        for poses in stage.finish():
+            sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
+            tally.add(poses)
+        _write_all(measured, stage.take_measured())
+    return tally
+
+
+def _write_all(sink: TableSink, parts: Sequence[Mapping[str, object]]) -> None:
+    for columns in parts:
+        if columns["kind"]:
+            sink.write(columns)
+
+
+def _scene(
+    run: RunFolder, vehicle: Vehicle, found: Mapping[str, Any], reading: _Reading
+) -> SceneOutcome:
+    timeline, clock = reading.timeline, reading.timeline.clock(found["camera_log"])
+    with ExitStack() as stack:
+        sinks = {
+            name: stack.enter_context(LabelledSink(run, name, schema, timeline, clock))
+            for name, schema in schemas(features_of(vehicle)).items()
+        }
+        past = StoredMobileye(run, vehicle.past)
+        return estimate_scene(
+            run, vehicle, found, lambda name, rows: sinks[name].write(rows), past.cues,
+            timeline=timeline, on_restart=past.forget_before,
+        )  # fmt: skip
+
+
+def _scene_told(scene: SceneOutcome) -> dict[str, object]:
+    return {
+        "frames": scene.frames,
+        "positive": dict(scene.positive),
+        "counts": dict(scene.counts),
+        "without_odometry": scene.without_odometry,
+        "approaches": [asdict(one) for one in scene.approaches],
+    }
+
+
+def _camera_skips(run: RunFolder, camera: str) -> pa.Table:
+    """What the detect stage told of the camera; the other topics are read again."""
+    import pyarrow.compute as pc
+
+    table = run.table("skipped")
+    ours = pc.or_(pc.equal(table["topic"], camera), pc.equal(table["topic"], UNATTRIBUTED))
+    return table.filter(ours)
+
+
+def _sources(planned: Plan, logs: Sequence[Log]) -> dict[str, str | None]:
+    """From a signal to the log and topic that gave it."""
+    names = log_names(logs)
+    found = {signal: planned.source_of(signal) for signal in Signal}
+    return {
+        signal.name.lower(): None if source is None else f"{names[source.log]}: {source.topic.name}"
+        for signal, source in found.items()
+    }
+
+
+def _missing(planned: Plan) -> list[str]:
+    """What the run had to do without, in plain words."""
+    names = {
+        Signal.WHEEL_SPEEDS: "no wheel speeds, so no pose",
+        Signal.MAGNETIC_FIELD: "no compass, so the heading drifts",
+    }
+    has_heading = planned.source_of(Signal.HEADING) is not None
+    return [
+        f"{what}: {planned.missing[signal]}"
+        for signal, what in names.items()
+        if signal in planned.missing and not (signal is Signal.MAGNETIC_FIELD and has_heading)
+    ]
+
+
+def _no_camera(landmarks: LandmarkDatabase | None, camera: tuple[int, Topic] | None) -> list[str]:
+    if landmarks is None or camera is not None:
+        return []
+    return ["landmarks were given, but the logs have no camera: none is looked for"]
+
+
+def _no_mobileye(found: Mapping[str, Any] | None, planned: Plan) -> list[str]:
+    reason = planned.missing.get(Signal.MOBILEYE_OBSTACLES)
+    if found is None or reason is None:
+        return []
+    return [f"no Mobileye, so no lane lines or vehicles past the intersection: {reason}"]
+
+
+def _no_scene(found: Mapping[str, Any] | None, reading: _Reading) -> list[str]:
+    if found is not None:
+        return []
+    if not reading.has_camera:
+        return ["no camera in the logs, so no cue and no belief"]
+    return ["no detector has looked at the camera, so no cue and no belief; name some"]

@@ -1,0 +1,54 @@
+"""The two columns that every table of a run carries: ``segment`` and ``log_t_ns``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crosscue.replay.files.run_folder import RunFolder, TableSink
+from crosscue.replay.time.segments import LogClock, Timeline
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+def labelled(schema: pa.Schema) -> pa.Schema:
+    """A table's columns with those two behind them."""
+    import pyarrow as pa
+
+    return schema.append(pa.field("segment", pa.int32())).append(pa.field("log_t_ns", pa.int64()))
+
+
+def with_labels(table: pa.Table, timeline: Timeline, clock: LogClock) -> pa.Table:
+    """A table in memory with those two."""
+    import pyarrow as pa
+
+    times = table["t_ns"].to_numpy()
+    numbers = pa.array(timeline.numbers(times), pa.int32())
+    original = pa.array(clock.log_times(times), pa.int64())
+    return table.append_column("segment", numbers).append_column("log_t_ns", original)
+
+
+class LabelledSink(TableSink):
+    """A table of a run; each row's segment and original stamp are added by its ``t_ns``."""
+
+    def __init__(
+        self, run: RunFolder, name: str, schema: pa.Schema, timeline: Timeline, clock: LogClock
+    ) -> None:
+        """Begin ``NAME.parquet``; ``clock`` is that of the log whose rows these are."""
+        super().__init__(run, name, labelled(schema))
+        self._timeline = timeline
+        self._clock = clock
+
+    def write(self, columns: Mapping[str, object]) -> None:
+        """Append rows given as columns without those two.
+
+        Raises:
+            OutputError: The disk is full.
+        """
+        times = np.asarray(columns["t_ns"], np.int64)
+        numbers = self._timeline.numbers(times)
+        original = self._clock.log_times(times)
+        super().write({**columns, "segment": numbers, "log_t_ns": original})

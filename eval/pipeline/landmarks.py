@@ -1,0 +1,168 @@
+"""The camera's part of a replay: frames kept until the pose track comes by, then looked at."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from crosscue.detectors.images import Encoded
+from crosscue.localization.ekf import PoseBelief
+from crosscue.localization.landmarks.database import LandmarkDatabase
+from crosscue.localization.landmarks.features import CameraGeometry, Features, Matcher, make_matcher
+from crosscue.localization.landmarks.images import grey_of, picture_of
+from crosscue.localization.landmarks.update import LandmarkSearch, LandmarkSettings, Sighting
+from crosscue.localization.pose_track import ACCEPTED, NoLooks
+from crosscue.replay.columns import Block, Images, Int64s
+from crosscue.replay.errors import LogError, UsageError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+UNDECODABLE: Final = "picture does not decode"
+
+
+def landmark_settings(vehicle: Vehicle) -> LandmarkSettings:
+    """The vehicle file's [landmarks] section and the camera's place, as the search takes them."""
+    section, camera = vehicle.landmarks, vehicle.camera
+    return LandmarkSettings(
+        min_score=section.min_score,
+        sigmas=section.sigmas,
+        most_candidates=section.most_candidates,
+        gate_nis=section.gate_nis,
+        interval_m=section.interval_m,
+        revisit_m=section.revisit_m,
+        lever_m=(camera.x_m, camera.y_m),
+    )
+
+
+def matcher_for(vehicle: Vehicle, name: str | None = None) -> Matcher:
+    """The matcher that the vehicle file, or a flag, names.
+
+    Raises:
+        UsageError: No such matcher.
+    """
+    camera = CameraGeometry(vehicle.camera.focal_px, vehicle.camera.center_px)
+    return make_matcher(name or vehicle.landmarks.matcher, camera)
+
+
+def open_for(path: Path, matcher: Matcher) -> LandmarkDatabase:
+    """A database whose features ``matcher`` can compare.
+
+    Raises:
+        LogError: It cannot be read.
+        UsageError: It holds another matcher's features.
+    """
+    database = LandmarkDatabase(path)
+    if database.kind != matcher.kind:
+        database.close()
+        raise UsageError(
+            f"{path}: holds features of matcher {database.kind!r}, not {matcher.kind!r}; set "
+            "landmarks.matcher in the vehicle file, or give another database"
+        )
+    return database
+
+
+class NoLandmarks(NoLooks):
+    """A replay without a landmark database."""
+
+    def take_sightings(self) -> list[Sighting]:
+        """None."""
+        return []
+
+    def take_names(self, t_ns: Int64s) -> list[str | None]:
+        """None at any time."""
+        return [None] * len(t_ns)
+
+    def let_go(self, before_ns: int) -> None:
+        """Nothing is held."""
+
+    def counts(self) -> dict[str, int]:
+        """Nothing to count."""
+        return {}
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class _Frame:
+    t_ns: int
+    topic: str = field(compare=False)
+    picture: Encoded = field(compare=False)
+
+
+@dataclass(slots=True)
+class LandmarkStage:
+    """``Looks`` of a pose track: the camera's frames against a landmark database.
+
+    Attributes:
+        search: Owns database, matcher and counts.
+        ledger: The camera's log; pictures that do not decode are skipped in it.
+        interval_ns: Frames closer to the one before are not kept.
+        names: From a time to the landmark weighed in then, for the rows of the pose track.
+    """
+
+    search: LandmarkSearch
+    ledger: Ledger
+    interval_ns: int
+    names: dict[int, str] = field(default_factory=dict)
+    _frames: list[_Frame] = field(default_factory=list)
+    _kept_ns: int | None = None
+
+    def see(self, block: Block) -> None:
+        """Keep a block's frames, still encoded."""
+        if not isinstance(block.rows, Images):
+            return
+        for row, t_ns in enumerate(block.log_ns.tolist()):
+            if self._kept_ns is not None and abs(t_ns - self._kept_ns) < self.interval_ns:
+                self.search.counts.frames += 1
+                self.search.counts.thinned += 1
+                continue
+            self._kept_ns = t_ns
+            insort(self._frames, _Frame(t_ns, block.topic, picture_of(block.rows, row)))
+
+    def times_ns(self) -> Sequence[int]:
+        """Of the frames that wait."""
+        return [frame.t_ns for frame in self._frames]
+
+    def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
+        """Look at the frame of the belief's time."""
+        self.let_go(belief.t_ns)
+        frame = self._frames.pop(0)
+        found = self.search.look(belief, travelled_m, partial(self._describe, frame))
+        for sighting in self.search.sightings:
+            if sighting.outcome == ACCEPTED:
+                self.names[sighting.t_ns] = sighting.name
+        return found
+
+    def take_sightings(self) -> list[Sighting]:
+        """The sightings since the last call."""
+        return self.search.take_sightings()
+
+    def take_names(self, t_ns: Int64s) -> list[str | None]:
+        """The landmark weighed in at each row's time, or None."""
+        return [self.names.pop(t, None) for t in t_ns.tolist()]
+
+    def let_go(self, before_ns: int) -> None:
+        """Drop frames that no odometry will reach any more."""
+        late = bisect_left(self._frames, before_ns, key=lambda frame: frame.t_ns)
+        self.search.counts.frames += late
+        self.search.counts.late += late
+        del self._frames[:late]
+
+    def counts(self) -> dict[str, int]:
+        """What became of every frame, for the manifest."""
+        return self.search.counts.as_dict()
+
+    def _describe(self, frame: _Frame) -> Features | None:
+        try:
+            return self.search.matcher.describe(grey_of(frame.picture))
+        except LogError as error:
+            self.ledger.spoil(frame.topic, UNDECODABLE, 1, str(error), frame.t_ns)
+            return None
+
+
+def looking(database: LandmarkDatabase, vehicle: Vehicle, ledger: Ledger) -> LandmarkStage:
+    """A stage that looks for the landmarks of ``database`` as the vehicle file says."""
+    search = LandmarkSearch(database, matcher_for(vehicle), landmark_settings(vehicle))
+    return LandmarkStage(search, ledger, round(vehicle.landmarks.interval_s * 1e9))

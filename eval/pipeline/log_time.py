@@ -1,0 +1,87 @@
+"""Tables of a run in the time of its logs, as truth is: for scoring.
+
+A drive whose clock was never set back has one time, and nothing changes. After a set-back some
+moments of the log's clock come twice; which of the two a truth means cannot be known, so rows of
+either are left out and counted.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Int64s
+from crosscue.replay.errors import RunError
+from crosscue.replay.files.run_folder import RunFolder
+from crosscue.replay.time.segments import Cause, Timeline
+
+from .drive_time import timeline_in
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+LABELS: Final = frozenset({"segment", "log_t_ns"})
+"""Columns that every table has besides its own."""
+
+
+def was_set_back(timeline: Timeline) -> bool:
+    """Was a clock of the drive set back?"""
+    return any(one.cause is Cause.SET_BACK for one in timeline.segments)
+
+
+def ambiguous(timeline: Timeline, log_ns: Int64s, numbers: Int64s) -> NDArray[np.bool_]:
+    """Which rows have a log time that another segment has, too, shape (N,)."""
+    found = np.zeros(len(log_ns), np.bool_)
+    for one in timeline.segments:
+        inside = (log_ns >= one.log_start_ns) & (log_ns <= one.log_end_ns)
+        found |= inside & (numbers != one.number)
+    return found
+
+
+def table_in_log_time(table: pa.Table, timeline: Timeline) -> pa.Table:
+    """A run's table with ``t_ns`` as recorded, in order, without rows whose time comes twice."""
+    if not was_set_back(timeline) or not table.num_rows:
+        return table
+    import pyarrow as pa
+
+    log_ns = table["log_t_ns"].to_numpy()
+    keep = ~ambiguous(timeline, log_ns, table["segment"].to_numpy().astype(np.int64))
+    moved = table.set_column(table.schema.get_field_index("t_ns"), "t_ns", pa.array(log_ns))
+    return moved.filter(pa.array(keep)).sort_by("t_ns")
+
+
+def pose_in_log_time(run: RunFolder) -> pa.Table:
+    """``pose.parquet`` so.
+
+    Raises:
+        RunError: It is missing or damaged.
+    """
+    return table_in_log_time(run.table("pose"), timeline_in(run.manifest()))
+
+
+def left_out(run: RunFolder) -> int:
+    """How many rows of the run's pose and frames have a log time that comes twice."""
+    timeline = timeline_in(run.manifest())
+    if not was_set_back(timeline):
+        return 0
+    total = 0
+    for name in ("pose", "frames"):
+        if run.file(f"{name}.parquet").exists():
+            table = run.table(name, ["t_ns", "segment", "log_t_ns"])
+            total += table.num_rows - table_in_log_time(table, timeline).num_rows
+    return total
+
+
+def refuse_set_back(run: RunFolder, what: str) -> None:
+    """Say that a run's times do not fit the truth's.
+
+    Raises:
+        RunError: A clock was set back during it.
+    """
+    if was_set_back(timeline_in(run.manifest())):
+        raise RunError(
+            f"{run.path}: a clock was set back during the drive, so its times are not the truth's; "
+            f"{what} takes drives without: replay each side alone with --from and --to"
+        )

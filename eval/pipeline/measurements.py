@@ -1,0 +1,190 @@
+"""What the pose filter was given, as a table: the smoother's input, written beside the pose.
+
+``measurements.parquet`` has one row a measurement and nulls where a column does not apply:
+``start`` (the first belief), ``odometry`` (from ``start_ns`` to ``t_ns``), ``gap`` (likewise: what
+was assumed between two time segments), ``heading`` (those that counted), ``landmark`` (those
+weighed in).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from crosscue.localization.ekf import PoseBelief
+from crosscue.localization.gap import Crossed
+from crosscue.localization.landmarks.update import Sighting
+from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
+from crosscue.localization.pose_track import ACCEPTED, HeadingColumns, Headings
+from crosscue.localization.smoother import Fixes
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import RunError
+from crosscue.replay.files.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+TABLE: Final = "measurements"
+_NUMBERS: Final = (
+    "distance_m", "turn_rad", "distance_var_m2", "turn_var_rad2", "speed_mps", "speed_var_m2ps2",
+    "heading_rad", "heading_var_rad2", "x_m", "y_m", "xx_m2", "xy_m2", "yy_m2",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """All measurements of a run.
+
+    Attributes:
+        start: The first belief.
+        increments: Odometry.
+        headings: Those that counted.
+        fixes: Positions of the camera by landmarks.
+    """
+
+    start: PoseBelief
+    increments: Increments
+    headings: Headings
+    fixes: Fixes
+
+
+def schema() -> pa.Schema:
+    """Columns of ``measurements.parquet``."""
+    import pyarrow as pa
+
+    return pa.schema(
+        [
+            ("kind", pa.dictionary(pa.int8(), pa.string())),
+            ("start_ns", pa.int64()),
+            ("t_ns", pa.int64()),
+            *((name, pa.float64()) for name in _NUMBERS),
+            ("landmark", pa.string()),
+        ]
+    )
+
+
+def start_rows(belief: PoseBelief) -> dict[str, object]:
+    """The first belief as a row."""
+    x, y, heading, speed = belief.mean.tolist()
+    cov = belief.cov.tolist()
+    return _rows(
+        "start",
+        np.array([belief.t_ns]),
+        {
+            "x_m": [x], "y_m": [y], "heading_rad": [heading], "speed_mps": [speed],
+            "xx_m2": [cov[0][0]], "xy_m2": [cov[0][1]], "yy_m2": [cov[1][1]],
+            "heading_var_rad2": [cov[2][2]], "speed_var_m2ps2": [cov[3][3]],
+        },
+    )  # fmt: skip
+
+
+def odometry_rows(made: Increments) -> dict[str, object]:
+    """Increments as rows."""
+    names = _NUMBERS[:6]
+    columns: dict[str, object] = {name: getattr(made, name) for name in names}
+    return _rows("odometry", made.stop_ns, columns | {"start_ns": made.start_ns})
+
+
+def gap_rows(start_ns: int, crossed: Crossed) -> dict[str, object]:
+    """A gap as a row."""
+    _, _, _, speed_mps = crossed.belief.mean.tolist()
+    return _rows(
+        "gap",
+        np.array([crossed.belief.t_ns]),
+        {
+            "start_ns": [start_ns], "distance_m": [crossed.distance_m], "turn_rad": [0.0],
+            "distance_var_m2": [crossed.distance_var_m2], "turn_var_rad2": [crossed.turn_var_rad2],
+            "speed_mps": [speed_mps], "speed_var_m2ps2": [crossed.belief.cov[3, 3]],
+        },
+    )  # fmt: skip
+
+
+def heading_rows(used: HeadingColumns) -> dict[str, object]:
+    """Headings that counted as rows."""
+    good = used.outcome == ACCEPTED
+    columns: dict[str, object] = {
+        "heading_rad": used.heading_rad[good], "heading_var_rad2": used.var_rad2[good],
+    }  # fmt: skip
+    return _rows("heading", used.t_ns[good], columns)
+
+
+def landmark_rows(sightings: list[Sighting]) -> dict[str, object]:
+    """Landmarks weighed in as rows."""
+    good = [s for s in sightings if s.outcome == ACCEPTED]
+    columns: dict[str, object] = {
+        "x_m": [s.xy_m[0] for s in good], "y_m": [s.xy_m[1] for s in good],
+        "xx_m2": [s.cov_m2[0, 0] for s in good], "xy_m2": [s.cov_m2[0, 1] for s in good],
+        "yy_m2": [s.cov_m2[1, 1] for s in good], "landmark": [s.name for s in good],
+    }  # fmt: skip
+    return _rows("landmark", np.array([s.t_ns for s in good], np.int64), columns)
+
+
+def _rows(kind: str, t_ns: object, columns: Mapping[str, object]) -> dict[str, object]:
+    times = np.asarray(t_ns, np.int64)
+    nothing = [None] * len(times)
+    names = ("start_ns", *_NUMBERS, "landmark")
+    return {
+        "kind": [kind] * len(times),
+        "t_ns": times,
+        **{name: columns.get(name, nothing) for name in names},
+    }
+
+
+def read_measured(run: RunFolder) -> Measured:
+    """The measurements of a finished run.
+
+    Raises:
+        RunError: The table is missing (a run of an older crosscue), damaged, or empty.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    table = run.table(TABLE)
+
+    def of(*kinds: str) -> dict[str, Floats]:
+        part = table.filter(pc.is_in(table["kind"].cast("string"), pa.array(kinds)))
+        names = ("start_ns", "t_ns", *_NUMBERS)
+        return {name: part[name].to_numpy() for name in names}
+
+    start, heading, landmark = map(of, ("start", "heading", "landmark"))
+    odometry, gaps = of("odometry", "gap"), of("gap")
+    is_gap = np.isin(odometry["t_ns"], gaps["t_ns"]) & np.isin(
+        odometry["start_ns"], gaps["start_ns"]
+    )
+    if len(start["t_ns"]) != 1 or not len(odometry["t_ns"]):
+        raise RunError(f"{run.path}: no odometry in it, so there is nothing to smooth")
+    cov = np.zeros((4, 4))
+    cov[:2, :2] = _matrices(start)[0]
+    cov[2, 2], cov[3, 3] = start["heading_var_rad2"][0], start["speed_var_m2ps2"][0]
+    mean = np.array([start[name][0] for name in ("x_m", "y_m", "heading_rad", "speed_mps")])
+    return Measured(
+        PoseBelief(int(start["t_ns"][0]), mean, cov),
+        Increments(
+            start_ns=odometry["start_ns"].astype(np.int64),
+            stop_ns=odometry["t_ns"].astype(np.int64),
+            distance_m=odometry["distance_m"],
+            turn_rad=odometry["turn_rad"],
+            distance_var_m2=odometry["distance_var_m2"],
+            turn_var_rad2=odometry["turn_var_rad2"],
+            speed_mps=odometry["speed_mps"],
+            speed_var_m2ps2=odometry["speed_var_m2ps2"],
+            turn_source=np.where(is_gap, BY_NOTHING, BY_YAW_RATE).astype(np.uint8),
+            is_gap=is_gap,
+        ),
+        Headings(
+            heading["t_ns"].astype(np.int64), heading["heading_rad"], heading["heading_var_rad2"]
+        ),
+        Fixes(
+            landmark["t_ns"].astype(np.int64),
+            np.column_stack([landmark["x_m"], landmark["y_m"]]),
+            _matrices(landmark),
+        ),
+    )  # fmt: skip
+
+
+def _matrices(columns: Mapping[str, Floats]) -> Floats:
+    xx, xy, yy = (columns[name] for name in ("xx_m2", "xy_m2", "yy_m2"))
+    return np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)

@@ -1,0 +1,147 @@
+"""What a Mobileye said during a drive, kept with the run: written once, read at any setting.
+
+``mobileye_obstacles.parquet`` and ``mobileye_lanes.parquet`` hold the decoded rows in the rear
+axle's frame (x ahead, y left), so that cues past the intersection need no log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+
+from crosscue.detectors.cues.far_side import end_of, past_counts
+from crosscue.detectors.cues.mobileye_state import MobileyeState, state_at
+from crosscue.fusion.approaches import PastCues
+from crosscue.fusion.intersection_range import RangeBelief, Reference
+from crosscue.replay.files.run_folder import RunFolder
+from crosscue.replay.mobileye.samples import LANE_COLUMNS, OBSTACLE_COLUMNS
+from crosscue.replay.signals import MOBILEYE_SIGNALS, Samples, Signal
+from crosscue.replay.time.segments import BEGINNING, LogClock, Timeline
+from crosscue.replay.vehicle.mobileye_cues import Past
+
+from .labelled import LabelledSink
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+TABLES: Final[Mapping[Signal, tuple[str, tuple[str, ...]]]] = {
+    Signal.MOBILEYE_OBSTACLES: ("mobileye_obstacles", OBSTACLE_COLUMNS),
+    Signal.MOBILEYE_LANES: ("mobileye_lanes", LANE_COLUMNS),
+}
+
+
+def schema(signal: Signal) -> pa.Schema:
+    """Columns of one of the two tables."""
+    import pyarrow as pa
+
+    return pa.schema([("t_ns", pa.int64()), *((name, pa.float64()) for name in TABLES[signal][1])])
+
+
+class MobileyeSink:
+    """Writes both tables, a window at a time; a context manager."""
+
+    def __init__(self, run: RunFolder, timeline: Timeline, clock: LogClock) -> None:
+        self._stack: Final = ExitStack()
+        self._sinks: Final = {
+            signal: LabelledSink(run, name, schema(signal), timeline, clock)
+            for signal, (name, _) in TABLES.items()
+        }
+
+    def write(self, samples: Mapping[Signal, Samples]) -> None:
+        """Append what a window holds of the device."""
+        for signal in MOBILEYE_SIGNALS:
+            found = samples.get(signal)
+            if found is not None and len(found.t_ns):
+                columns = dict(zip(TABLES[signal][1], found.values.T, strict=True))
+                self._sinks[signal].write({"t_ns": found.t_ns, **columns})
+
+    def __enter__(self) -> Self:
+        for sink in self._sinks.values():
+            self._stack.enter_context(sink)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+
+class StoredMobileye:
+    """Both tables read forwards in time; memory holds a batch of each."""
+
+    def __init__(self, run: RunFolder, past: Past) -> None:
+        self._past: Final = past
+        self._since_ns = BEGINNING
+        self._readers: Final = {signal: _Reader(signal, _parts(run, signal)) for signal in TABLES}
+
+    def at(self, t_ns: int) -> MobileyeState:
+        """What was known at ``t_ns``; call it with times that do not go back."""
+        keep_ns = round((self._past.most_age_s + 1.0) * 1e9)
+        obstacles, lanes = (
+            self._readers[signal].around(t_ns, keep_ns) for signal in MOBILEYE_SIGNALS
+        )
+        return state_at(self._fresh(obstacles), self._fresh(lanes), t_ns, self._past)
+
+    def forget_before(self, t_ns: int) -> None:
+        """Nothing told before ``t_ns`` counts any more."""
+        self._since_ns = t_ns
+
+    def _fresh(self, held: Samples | None) -> Samples | None:
+        if held is None or held.t_ns[0] >= self._since_ns:
+            return held
+        return held.take(held.t_ns >= self._since_ns)
+
+    def cues(self, t_ns: int) -> PastCues:
+        """The cues past the intersection at ``t_ns``, once a range is known."""
+        past = self._past
+
+        def counts(best: RangeBelief | None, reference: Reference | None) -> Mapping[str, int]:
+            if best is None:
+                return {}
+            end_m = end_of(best.mean_m, is_end=reference is Reference.END, past=past)
+            found = past_counts(self.at(t_ns), end_m, past)
+            return {cue.value: count for cue, count in found.items()}
+
+        return counts
+
+
+@dataclass(slots=True)
+class _Reader:
+    signal: Signal
+    parts: Iterator[Samples]
+    held: Samples | None = None
+
+    def around(self, t_ns: int, keep_ns: int) -> Samples | None:
+        """Samples from some way before ``t_ns`` to beyond it."""
+        while self.held is None or self.held.t_ns[-1] <= t_ns:
+            fresh = next(self.parts, None)
+            if fresh is None:
+                break
+            self.held = fresh if self.held is None else _joined(self.held, fresh, t_ns - keep_ns)
+        return self.held
+
+
+def _joined(before: Samples, fresh: Samples, from_ns: int) -> Samples:
+    rest = before.take(before.t_ns >= from_ns)
+    return Samples(
+        fresh.signal,
+        np.concatenate([rest.t_ns, fresh.t_ns]),
+        np.concatenate([rest.values, fresh.values]),
+    )
+
+
+def _parts(run: RunFolder, signal: Signal) -> Iterator[Samples]:
+    name, columns = TABLES[signal]
+    if not run.file(f"{name}.parquet").exists():
+        return
+    for batch in run.batches(name):
+        values: list[Any] = [batch[column].to_numpy(zero_copy_only=False) for column in columns]
+        yield Samples(signal, batch["t_ns"].to_numpy(), np.stack(values, axis=1))

@@ -1,0 +1,310 @@
+"""The pose part of the one loop: windows of signals in, rows of the pose track out."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from crosscue.localization import compass, odometry, pose_track
+from crosscue.localization.gap import GapSettings, cross_gap
+from crosscue.localization.odometry import OdometrySettings, Pending, TurnSignal, WheelSpeeds
+from crosscue.localization.pose_track import (
+    NO_HEADINGS,
+    Headings,
+    PoseColumns,
+    TrackCounts,
+    TrackSettings,
+    TrackState,
+)
+from crosscue.replay.columns import Floats
+from crosscue.replay.signals import Plan, Samples, Signal
+from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Segment, Timeline
+from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.windows import Window
+
+from .landmarks import LandmarkStage, NoLandmarks
+from .measurements import gap_rows, heading_rows, landmark_rows, odometry_rows, start_rows
+
+REJECTED_SHARE: Final = 0.1
+"""An honest filter refuses one reading in a thousand; above this something is wrong."""
+FRAMES_WAIT_NS: Final = 10_000_000_000
+"""Frames without odometry are kept this long."""
+FOREVER_NS: Final = int(np.iinfo(np.int64).max)
+OWN_FRAME_SD_RAD: Final = 1e-3
+"""Where the car itself lays the map's axes, its first heading is right by definition."""
+
+
+def turn_signal_of(planned: Plan, vehicle: Vehicle) -> Signal | None:
+    """Which signal turns the pose; None leaves it to the wheels' difference."""
+    wish = vehicle.odometry.heading_from
+    offers = {"yaw_rate": Signal.YAW_RATE, "steering": Signal.STEERING}
+    if wish == "auto":
+        return next((s for s in offers.values() if planned.source_of(s) is not None), None)
+    return offers.get(wish)
+
+
+def odometry_settings(vehicle: Vehicle) -> OdometrySettings:
+    """The vehicle file's odometry section as the integrator takes it."""
+    fields = vehicle.odometry.model_dump(exclude={"heading_from", "accel_var_m2ps3"})
+    return OdometrySettings(**fields)
+
+
+def track_settings(vehicle: Vehicle) -> TrackSettings:
+    """The vehicle file's filter settings."""
+    return TrackSettings(
+        heading_interval_m=vehicle.compass.interval_m,
+        heading_interval_s=vehicle.compass.interval_s,
+        heading_gate_nis=vehicle.compass.gate_nis,
+        accel_var_m2ps3=vehicle.odometry.accel_var_m2ps3,
+    )
+
+
+def gap_settings(vehicle: Vehicle) -> GapSettings:
+    """What the vehicle file says a car can do in a gap."""
+    fields = vehicle.time.model_dump(exclude={"max_silence_s", "unknown_gap_s"})
+    return GapSettings(**fields)
+
+
+@dataclass(slots=True)
+class PoseStage:
+    """Carries belief and pending rows from window to window, and the belief across gaps.
+
+    Attributes:
+        vehicle: The vehicle file.
+        turn: What turns the pose, from ``turn_signal_of``.
+        notices: Plain sentences about the start, for the manifest.
+        odometry_counts: What became of wheel rows.
+        track_counts: What became of headings and intervals.
+        landmarks: What looks for landmarks meanwhile.
+        received: Samples that arrived, by signal.
+        started_with: Headings that the first belief was made of.
+        turn_early: Turn samples that came before the first wheel speeds.
+        timeline: Where the drive has gaps.
+    """
+
+    vehicle: Vehicle
+    turn: Signal | None
+    landmarks: LandmarkStage | NoLandmarks = field(default_factory=NoLandmarks)
+    notices: list[str] = field(default_factory=list)
+    odometry_counts: odometry.OdometryCounts = field(default_factory=odometry.OdometryCounts)
+    track_counts: TrackCounts = field(default_factory=TrackCounts)
+    received: Counter[Signal] = field(default_factory=Counter)
+    started_with: int = 0
+    turn_early: int = 0
+    timeline: Timeline = ONE_SEGMENT
+    _pending: Pending = field(default_factory=Pending)
+    _state: TrackState | None = None
+    _last_ns: int | None = None
+    _measured: list[dict[str, object]] = field(default_factory=list)
+    _gap: Segment | None = None
+    _segment: int = 0
+
+    def __call__(self, window: Window) -> Iterator[PoseColumns]:
+        """Rows that this window completes."""
+        self.received.update({signal: len(of.t_ns) for signal, of in window.samples.items()})
+        while (following := self._following(window.end_ns)) is not None:
+            if following.begins_ns > window.start_ns:
+                before, window = _split(window, following.begins_ns)
+                yield from self._advance(before, before.end_ns)
+            if following.breaks_odometry:
+                yield from self._end_segment(following)
+        yield from self._advance(window, window.end_ns)
+
+    def _following(self, until_ns: int) -> Segment | None:
+        """The next segment, if it begins before ``until_ns``."""
+        segments = self.timeline.segments
+        if self._segment + 1 >= len(segments):
+            return None
+        following = segments[self._segment + 1]
+        if following.begins_ns >= until_ns:
+            return None
+        self._segment += 1
+        return following
+
+    def finish(self) -> Iterator[PoseColumns]:
+        """Rows that waited for more odometry."""
+        yield from self._close()
+        self.landmarks.let_go(FOREVER_NS)
+
+    def _close(self) -> Iterator[PoseColumns]:
+        """Rows that waited for odometry that does not come."""
+        if self._state is not None and self._last_ns is not None:
+            yield from self._advance(Window(self._last_ns, self._last_ns, {}), None)
+
+    def _end_segment(self, following: Segment) -> Iterator[PoseColumns]:
+        """Close a segment; what follows is another drive that begins about here."""
+        yield from self._close()
+        self._pending = Pending()
+        if self._state is not None:
+            self._gap = following
+
+    def _cross(self, segment: Segment, until_ns: int) -> None:
+        """Carry the belief over the gap before ``segment``, to its first wheel speed."""
+        assert self._state is not None
+        restarts = segment.cause is Cause.SET_BACK
+        before_ns = self._state.belief.t_ns
+        crossed = cross_gap(
+            self._state.belief, until_ns, gap_settings(self.vehicle), restarts=restarts
+        )
+        self._state = replace(self._state, belief=crossed.belief, counted_ns=None)
+        self._measured.append(gap_rows(before_ns, crossed))
+        self._gap = None
+
+    def take_measured(self) -> list[dict[str, object]]:
+        """What the filter was given since the last call, as rows of ``measurements.parquet``."""
+        taken, self._measured = self._measured, []
+        return taken
+
+    def doubts(self) -> list[str]:
+        """What the counts say against the settings, in plain words."""
+        if self._state is None:
+            return ["not one wheel speed in the part that was asked for, so no pose"]
+        counts = self.track_counts
+        judged = counts.headings_accepted + counts.headings_rejected
+        if not judged or counts.headings_rejected <= REJECTED_SHARE * judged:
+            return []
+        return [
+            f"{counts.headings_rejected} of {judged} compass readings were refused by the gate: "
+            "compass or odometry err more than the vehicle file says; fit the compass, or raise "
+            "heading_sd_rad and the odometry's noise"
+        ]
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """What became of every odometry row and heading, for the manifest."""
+        return {
+            "odometry": asdict(self.odometry_counts),
+            "track": asdict(self.track_counts),
+            "landmarks": self.landmarks.counts(),
+        }
+
+    @property
+    def waiting(self) -> int:
+        """Headings that wait for wheel speeds."""
+        return 0 if self._state is None else len(self._state.waiting)
+
+    def _advance(self, window: Window, until_ns: int | None) -> Iterator[PoseColumns]:
+        wheels = window.samples.get(Signal.WHEEL_SPEEDS)
+        headings = self._headings(window)
+        if self._state is None:
+            if wheels is None:
+                self._missed(headings)
+                self.turn_early += 0 if (turn := self._turn(window)) is None else len(turn)
+                self.landmarks.let_go(window.end_ns)
+                return
+            headings = self._start(int(wheels.t_ns[0]), headings)
+        assert self._state is not None
+        self._last_ns = window.end_ns
+        if self._gap is not None:
+            if wheels is None:
+                self._missed(headings)
+                self.turn_early += 0 if (turn := self._turn(window)) is None else len(turn)
+                self.landmarks.let_go(window.end_ns)
+                return
+            self._cross(self._gap, int(wheels.t_ns[0]))
+        step = odometry.integrate(
+            _wheels(wheels), odometry_settings(self.vehicle), self._turn(window), self._pending,
+            until_ns,
+        )  # fmt: skip
+        self._pending = step.pending
+        self.odometry_counts += step.counts
+        made = pose_track.advance(
+            self._state, step.increments, track_settings(self.vehicle), headings,
+            looks=self.landmarks,
+        )  # fmt: skip
+        self._state = made.state
+        self._measured += [
+            odometry_rows(step.increments),
+            heading_rows(made.headings),
+            landmark_rows(self.landmarks.take_sightings()),
+        ]
+        self.landmarks.let_go(window.end_ns - FRAMES_WAIT_NS)
+        self.track_counts += made.counts
+        if len(made.poses):
+            yield made.poses
+
+    def _start(self, t_ns: int, headings: Headings) -> Headings:
+        """Fix the first belief; the headings used for it are not used again."""
+        start = self.vehicle.start
+        heading_rad, sd_rad = start.heading_rad, start.heading_sd_rad
+        if heading_rad is None and len(headings):
+            mean = np.exp(1j * headings.heading_rad).mean()
+            heading_rad, sd_rad = float(np.angle(mean)), float(np.sqrt(headings.var_rad2[0]))
+            self.notices.append(
+                f"start heading {np.rad2deg(heading_rad):.1f} deg from the first "
+                f"{len(headings)} compass readings"
+            )
+            self.started_with = len(headings)
+            headings = NO_HEADINGS
+        elif heading_rad is None:
+            heading_rad, sd_rad = 0.0, OWN_FRAME_SD_RAD
+            self.notices.append(
+                "no start heading and no compass: the map's x axis points where the car did"
+            )
+        belief = pose_track.start_belief(
+            t_ns, start.x_m, start.y_m, heading_rad,
+            position_sd_m=start.position_sd_m, heading_sd_rad=sd_rad,
+        )  # fmt: skip
+        self._state = TrackState(belief)
+        self._measured.append(start_rows(belief))
+        return headings
+
+    def _missed(self, headings: Headings) -> None:
+        self.track_counts += TrackCounts(headings=len(headings), headings_late=len(headings))
+
+    def _turn(self, window: Window) -> TurnSignal | None:
+        if self.turn is None:
+            return None
+        kind: odometry.TurnKind = "yaw rate" if self.turn is Signal.YAW_RATE else "steering"
+        found = window.samples.get(self.turn)
+        if found is None:
+            return TurnSignal(np.empty(0, np.int64), np.empty(0), kind)
+        return TurnSignal(found.t_ns, found.values, kind)
+
+    def _headings(self, window: Window) -> Headings:
+        variance = self.vehicle.compass.heading_sd_rad**2
+        found = window.samples.get(Signal.HEADING)
+        if found is not None:
+            return Headings(found.t_ns, found.values, np.full(len(found.t_ns), variance))
+        found = window.samples.get(Signal.MAGNETIC_FIELD)
+        if found is None:
+            return NO_HEADINGS
+        heading_rad = compass.heading(found.values, compass_settings(self.vehicle))
+        return Headings(found.t_ns, heading_rad, np.full(len(found.t_ns), variance))
+
+
+def _split(window: Window, at_ns: int) -> tuple[Window, Window]:
+    """A window's part before a time, and the rest."""
+    before: dict[Signal, Samples] = {}
+    after: dict[Signal, Samples] = {}
+    for signal, samples in window.samples.items():
+        is_before = samples.t_ns < at_ns
+        if is_before.any():
+            before[signal] = samples.take(is_before)
+        if not is_before.all():
+            after[signal] = samples.take(~is_before)
+    return Window(window.start_ns, at_ns, before), Window(at_ns, window.end_ns, after)
+
+
+def compass_settings(vehicle: Vehicle) -> compass.CompassSettings:
+    """The vehicle file's compass section as the compass takes it."""
+    section = vehicle.compass
+    return compass.CompassSettings(
+        mounting_rotation=section.mounting_rotation,
+        mounting_yaw_rad=section.mounting_yaw_rad,
+        hard_iron_t=section.hard_iron_t,
+        soft_iron=section.soft_iron,
+        declination_rad=section.declination_rad,
+    )
+
+
+def _wheels(found: Samples | None) -> WheelSpeeds:
+    if found is None:
+        return WheelSpeeds(np.empty(0, np.int64), np.empty((0, 4)))
+    speeds: Floats = found.values
+    if np.isnan(speeds[:, :2]).all():
+        speeds = speeds[:, 2:]
+    return WheelSpeeds(found.t_ns, speeds)

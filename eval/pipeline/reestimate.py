@@ -1,0 +1,87 @@
+"""The second stage once more, over a run whose detections are there already."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from crosscue.replay.errors import RunError
+from crosscue.replay.files.run_folder import MANIFEST, RunFolder, locked, sha256_of, write_input
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
+
+from .estimate import Outcome, begin_again, detected_part, estimate_into
+from .run_input import settings_changed
+from .run_logs import reopened
+
+
+def selection_used(manifest: Mapping[str, Any]) -> Selection:
+    """The part of the logs that a run was made of."""
+    said = manifest["selection"]
+    topics = said.get("topics")
+    return Selection(
+        None if topics is None else frozenset(topics), said["start_ns"], said["end_ns"]
+    )
+
+
+def estimate_run(
+    run: RunFolder,
+    vehicle: Vehicle | None = None,
+    on_time: Callable[[int], None] = lambda _: None,
+) -> Outcome:
+    """Estimate again into the same run folder; no picture is opened.
+
+    Args:
+        run: A finished run, or one whose detect stage has finished.
+        vehicle: Other settings; those of the run, if left out.
+        on_time: Told the log time that has been reached.
+
+    Raises:
+        RunError: Its logs are gone or have changed, or it was made with landmarks.
+        VehicleError: The settings do not fit the logs.
+    """
+    manifest = run.manifest()
+    if manifest.get("landmarks"):
+        raise RunError(
+            f"{run.path}: landmarks are looked for in pictures, which estimate does not open; run "
+            "crosscue replay --landmarks again"
+        )
+    with ExitStack() as stack:
+        logs = [stack.enter_context(_reopened(run, said)) for said in manifest["logs"]]
+        stack.enter_context(locked(run))
+        settings = vehicle or of_manifest(manifest["settings"])
+        changed = None if vehicle is None else settings_changed(run, vehicle)
+        if changed is not None:
+            # In this order a run cut short between them does not pass for a whole one.
+            begin_again(run, detected_part(manifest))
+            write_input(run, changed)
+        return estimate_into(
+            logs, settings, run, selection_used(manifest), on_time,
+            earlier=detected_part(manifest), told=manifest["logs"],
+        )  # fmt: skip
+
+
+def _reopened(run: RunFolder, said: Mapping[str, Any]) -> Log:
+    log = reopened(run, said)
+    if not _is_older(log.path, run) and sha256_of(log.path) != said["sha256"]:
+        log.close()
+        raise RunError(f"{run.path}: its log {log.path} has changed since; replay again")
+    return log
+
+
+def _is_older(log: Path, run: RunFolder) -> bool:
+    """Has nobody touched the log since the run hashed it? Then there is no need to read it all.
+
+    The time of its entry counts, too: a file put in its place may bring an older time of its own.
+    """
+    files = [log] if log.is_file() else [entry for entry in log.rglob("*") if entry.is_file()]
+    hashed_ns = run.file(MANIFEST).stat().st_mtime_ns
+    touched = (time for entry in files for time in _times(entry))
+    return all(time < hashed_ns for time in touched)
+
+
+def _times(file: Path) -> tuple[int, int]:
+    found = file.stat()
+    return found.st_mtime_ns, found.st_ctime_ns

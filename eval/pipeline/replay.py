@@ -1,0 +1,157 @@
+"""The main job: a drive's logs into a run folder, by its two stages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from crosscue.detectors.registry import Choice, make
+from crosscue.localization.landmarks.database import LandmarkDatabase
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import RunError
+from crosscue.replay.files.run_folder import RunFolder, clear, locked
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.signals import camera_of
+from crosscue.replay.time.segments import Timeline
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .accounts import selection_told
+from .detect import DetectOutcome, OnFrames, detect_into, unwatched
+from .drive_time import drive_timeline
+from .empty_result import nothing_left
+from .estimate import Outcome, detected_part, estimate_into
+from .run_input import input_of, refuse_another
+from .run_logs import log_rows
+
+TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
+"""What the second stage reads of the first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Detecting:
+    """What the detect stage is to do.
+
+    Attributes:
+        choices: Detectors, in order.
+        cache: File with results of earlier runs, or None for none.
+        draw: How many pictures to write with detections drawn.
+        resume: Keep detections of an earlier start that would come out the same.
+        on_frames: Told how many frames are done, and of how many where that is known.
+    """
+
+    choices: tuple[Choice, ...]
+    cache: Path | None = None
+    draw: int = 0
+    resume: bool = False
+    on_frames: OnFrames = unwatched
+
+
+NO_DETECTORS: Final = Detecting(())
+
+
+def replay_drive(
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    run: RunFolder,
+    selection: Selection,
+    on_time: Callable[[int], None] = lambda _: None,
+    landmarks: LandmarkDatabase | None = None,
+    detecting: Detecting = NO_DETECTORS,
+    *,
+    overwrite: bool = False,
+) -> Outcome:
+    """Replay one drive into an empty or to be overwritten run folder.
+
+    Args:
+        logs: All logs of the drive, open.
+        vehicle: What the vehicle file says.
+        run: Where to; locked while this works, cleared first unless its detections are kept.
+        selection: Which part of the logs.
+        on_time: Told the log time that has been reached, for progress.
+        landmarks: Camera frames are compared with these, where given.
+        detecting: Detectors to run over the camera; without any, the run has pose alone.
+        overwrite: Replace a run of other logs or settings, though ``detecting`` says to resume.
+
+    Raises:
+        UsageError: It is to be resumed, and the folder holds a run of other logs or settings.
+        VehicleError: The vehicle file does not fit the logs.
+        EmptyResultError: Nothing came of it; the folder is empty again.
+        OutputError: The disk is full.
+    """
+    mine = input_of(
+        logs, vehicle, selection, detecting.choices, detecting.draw,
+        None if landmarks is None else landmarks.path,
+    )  # fmt: skip
+    with locked(run):
+        if detecting.resume and not overwrite:
+            refuse_another(run, mine)
+        timeline = drive_timeline(
+            logs, vehicle, selection, _camera(logs, vehicle, detecting, landmarks)
+        )
+        earlier = _kept(logs, vehicle, run, selection, detecting) if detecting.resume else None
+        with nothing_left(run):
+            if earlier is None:
+                clear(run, mine)
+                found = _detect(logs, vehicle, run, selection, detecting, timeline)
+            else:
+                found = None
+            return estimate_into(
+                logs, vehicle, run, selection, on_time, landmarks, found, earlier, timeline=timeline
+            )
+
+
+def _camera(
+    logs: Sequence[Log], vehicle: Vehicle, detecting: Detecting,
+    landmarks: LandmarkDatabase | None,
+) -> tuple[int, Topic] | None:  # fmt: skip
+    """The camera, where anything will look at it."""
+    if not detecting.choices and landmarks is None:
+        return None
+    return camera_of([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+
+
+def _detect(
+    logs: Sequence[Log], vehicle: Vehicle, run: RunFolder, selection: Selection,
+    detecting: Detecting, timeline: Timeline,
+) -> DetectOutcome | None:  # fmt: skip
+    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
+    if not detecting.choices or camera_of(topics, vehicle) is None:
+        return None
+    return detect_into(
+        logs, vehicle, run, selection, detecting.choices, detecting.cache, detecting.draw,
+        detecting.on_frames, timeline,
+    )  # fmt: skip
+
+
+def _kept(
+    logs: Sequence[Log], vehicle: Vehicle, run: RunFolder, selection: Selection,
+    detecting: Detecting,
+) -> Mapping[str, Any] | None:  # fmt: skip
+    """The detect stage of an earlier start, where its tables are what it would give again."""
+    try:
+        earlier = detected_part(run.manifest())
+    except RunError:
+        return None
+    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
+    camera = camera_of(topics, vehicle)
+    if earlier is None or camera is None or not all(run.file(name).exists() for name in TABLES):
+        return None
+    wanted = {
+        "logs": log_rows(logs, run),
+        "selection": selection_told(selection),
+        "camera": camera[1].name,
+        "identities": [make(choice).identity for choice in detecting.choices],
+        "depth_bits": vehicle.camera.depth_bits,
+        "time": vehicle.time.model_dump(mode="json"),
+    }
+    there = {
+        "logs": earlier["logs"],
+        "selection": earlier["selection"],
+        "camera": earlier["camera"],
+        "identities": [detector["identity"] for detector in earlier["detectors"]],
+        "depth_bits": earlier["settings"]["camera"]["depth_bits"],
+        "time": earlier["settings"]["time"],
+    }
+    return earlier if wanted == there else None

@@ -1,0 +1,126 @@
+"""What decides a run: its logs' identity and every setting, kept in the run folder as it begins.
+
+``--resume`` goes on with a run only if both are the same; anything else would be destroyed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from crosscue.detectors.registry import Choice
+from crosscue.eval.batch.jobs import files_named_in
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.identity import Identity, as_row, identity_of, identity_of_all, of_row
+from crosscue.replay.files.run_folder import INPUT, LOCK, MANIFEST, RunFolder, strict_json
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .accounts import selection_told, versions
+from .run_logs import origin
+
+
+def input_of(
+    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, choices: Sequence[Choice],
+    draw: int, landmarks: Path | None,
+) -> dict[str, object]:  # fmt: skip
+    """The content of ``input.json``.
+
+    Args:
+        logs: All logs of the drive, open.
+        vehicle: What the vehicle file says.
+        selection: Which part of the logs.
+        choices: Detectors, in order.
+        draw: How many pictures are drawn.
+        landmarks: The database that frames are compared with.
+    """
+    settings = {
+        "vehicle": vehicle.model_dump(mode="json"),
+        "selection": selection_told(selection),
+        "detectors": [asdict(choice) for choice in choices],
+        "draw": draw,
+        "landmarks": None if landmarks is None else str(landmarks.resolve()),
+        "versions": versions(),
+    }
+    identity = identity_of_all([identity_of(origin(log)) for log in logs])
+    return {
+        "identity": as_row(identity),
+        "settings": json.loads(strict_json({**settings, "files": files_named_in(settings)})),
+    }
+
+
+def refuse_another(run: RunFolder, mine: Mapping[str, Any]) -> None:
+    """Let ``--resume`` go on with a run of this very input, or with an empty folder.
+
+    Raises:
+        UsageError: The folder holds another run, or one of which nothing is known.
+        RunError: It holds a run of another version of crosscue.
+    """
+    there = _read(run)
+    if there is None:
+        if run.file(MANIFEST).exists():
+            run.manifest()
+        if any(entry.name != LOCK for entry in run.path.iterdir()):
+            raise UsageError(
+                f"{run.path}: holds a run of which no {INPUT} tells what it is made of; --resume "
+                "would destroy it: give another folder or --overwrite"
+            )
+        return
+    theirs, ours = of_row(there["identity"]), of_row(mine["identity"])
+    if theirs.digest != ours.digest:
+        raise UsageError(
+            f"{run.path}: holds a run of {theirs}, not of {ours}: --resume would destroy it; give "
+            "another folder or --overwrite"
+        )
+    different = _difference(there["settings"], mine["settings"])
+    if different is not None:
+        raise UsageError(
+            f"{run.path}: holds a run of {theirs} with other settings ({different}), which "
+            f"--resume of {ours} would destroy; give another folder or --overwrite"
+        )
+
+
+def _read(run: RunFolder) -> Mapping[str, Any] | None:
+    """What the folder's run is made of; None where nothing believable says so."""
+    try:
+        found = json.loads(run.file(INPUT).read_text(encoding="utf-8"))
+        of_row(found["identity"])
+        return found if isinstance(found["settings"], dict) else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _difference(there: object, here: object, name: str = "") -> str | None:
+    """The first setting that is not the same, with both values."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        for key in sorted({*there, *here}):
+            found = _difference(there.get(key), here.get(key), f"{name}.{key}" if name else key)
+            if found is not None:
+                return found
+        return None
+    return None if there == here else f"{name}: {_short(there)} there, {_short(here)} here"
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def settings_changed(run: RunFolder, vehicle: Vehicle) -> dict[str, Any] | None:
+    """``input.json`` with other vehicle settings, after which ``estimate`` estimates again."""
+    there = _read(run)
+    if there is None:
+        return None
+    settings = {**there["settings"], "vehicle": vehicle.model_dump(mode="json")}
+    settings.pop("files", None)
+    settings["files"] = files_named_in(settings)
+    return {**there, "settings": settings}
+
+
+def identity_in(run: RunFolder) -> Identity | None:
+    """Which logs the run is made of, where it says so."""
+    there = _read(run)
+    return None if there is None else of_row(there["identity"])

@@ -1,0 +1,129 @@
+"""A run's logs: what its manifest says of them, and how they are found again.
+
+Paths in a run are relative to its folder; tables and accounts name a log by its file name alone, so
+that they are the same bytes wherever run and logs lie. A log is opened again only if it is the one
+that the run was made of, by its identity.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from crosscue.replay.errors import CrosscueError, RunError
+from crosscue.replay.files.identity import as_row, identity_of, of_row
+from crosscue.replay.files.run_folder import RunFolder, sha256_of
+from crosscue.replay.log import Log, open_log
+from crosscue.replay.remote.logs import RangedLog, RemoteLog, is_remote
+from crosscue.replay.vehicle.roles import Role, role_of
+
+DEPTH: Final = 8
+"""Of folders looked through for logs that have moved."""
+
+
+def log_names(logs: Sequence[Log]) -> list[str]:
+    """What the logs of a drive are called in its tables: file names, told apart where equal."""
+    places = [origin(log) for log in logs]
+    names = [place_name(place) for place in places]
+    count = Counter(names)
+    return [
+        name if count[name] == 1 else f"{name}#{identity_of(place).short}"
+        for name, place in zip(names, places, strict=True)
+    ]
+
+
+def origin(log: Log) -> Path | str:
+    """Where a log comes from: a path or a URL."""
+    return log.url if isinstance(log, RemoteLog | RangedLog) else log.path
+
+
+def place_name(place: Path | str) -> str:
+    """The last part of a path or URL."""
+    if isinstance(place, str) and is_remote(place):
+        return place.rstrip("/").rpartition("/")[2]
+    return Path(place).name or Path(place).resolve().name
+
+
+def log_rows(logs: Sequence[Log], run: RunFolder) -> list[dict[str, object]]:
+    """Name, place, format, identity, cameras and hashes of every log, for the manifest."""
+    return [
+        {
+            "name": name,
+            "path": place if isinstance(place := origin(log), str) else relative(place, run),
+            "format": log.format,
+            "identity": as_row(identity_of(place)),
+            "cameras": sorted(one.name for one in log.topics if role_of(one) is Role.CAMERA),
+            "sha256": sha256_of(log.path),
+        }
+        for name, log in zip(log_names(logs), logs, strict=True)
+    ]
+
+
+def relative(place: Path, run: RunFolder) -> str:
+    """A path as a run's manifest holds it: from the run's folder."""
+    whole = place.absolute()
+    return os.path.relpath(whole.parent.resolve() / whole.name, run.path.resolve())
+
+
+def place_of(run: RunFolder, said: Mapping[str, Any]) -> Path | str:
+    """Where a log of a run lies now: a URL, or a path whose content is what the run was made of.
+
+    Args:
+        run: The run; its ``logs`` folder is where its logs have moved to, if anybody said so.
+        said: The log's row in the manifest.
+
+    Raises:
+        RunError: It is gone, or another log lies there.
+    """
+    where = str(said["path"])
+    wanted = of_row(said["identity"])
+    if is_remote(where):
+        places: list[Path | str] = [where]
+    elif run.logs is None:
+        places = [run.path.resolve() / where]
+    else:
+        places = list(_moved(run.logs, Path(where)))
+    others = []
+    for place in places:
+        if isinstance(place, Path) and not place.exists():
+            continue
+        try:
+            found = identity_of(place)
+        except CrosscueError as error:
+            raise RunError(f"{run.path}: its log cannot be looked at: {error}") from None
+        if found.digest == wanted.digest:
+            return place if isinstance(place, str) else Path(os.path.normpath(place))
+        others.append((place, found))
+    if others:
+        place, found = others[0]
+        raise RunError(
+            f"{run.path}: its log {place} has changed since: {found} there, {wanted} wanted; "
+            "--logs DIR says where that is, or replay again"
+        )
+    gone = f"{places[0]} is gone" if run.logs is None else f"{wanted} is not in {run.logs}"
+    raise RunError(f"{run.path}: its log {gone}; say where it is with --logs DIR, or replay again")
+
+
+def _moved(folder: Path, where: Path) -> Iterator[Path]:
+    """Places below ``folder`` where a log of this name may have gone, the likeliest first."""
+    parts = [part for part in where.parts if part != ".."]
+    for count in range(len(parts), 0, -1):
+        yield folder.joinpath(*parts[-count:])
+    for place, folders, names in os.walk(folder):
+        depth = len(Path(place).relative_to(folder).parts)
+        folders[:] = sorted(n for n in folders if not n.startswith(".")) if depth < DEPTH else []
+        if where.name in names or where.name in folders:
+            yield Path(place, where.name)
+
+
+def reopened(run: RunFolder, said: Mapping[str, Any]) -> Log:
+    """A log of a run, open.
+
+    Raises:
+        RunError: As ``place_of``.
+        LogError: It cannot be opened.
+    """
+    return open_log(place_of(run, said))

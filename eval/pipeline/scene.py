@@ -1,0 +1,304 @@
+"""The scene part of the one loop: stored frames in; cues, ranges and beliefs out, frame by frame.
+
+Everything comes from the run's own tables (frames, detections, road, measurements), so no picture
+is opened and no log read: settings of cues, ranges and belief can be changed and tried in seconds,
+and each cue left out to see what it was worth.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.names import Cue
+from crosscue.fusion.approaches import Approaches, FrameEvidence, PastCues, SignRange, Step
+from crosscue.fusion.factor_graph import graph_of
+from crosscue.fusion.intersection_range import Reference
+from crosscue.replay.files.run_folder import RunFolder
+from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .sign_ranges import sign_ranges
+from .stored_frames import StoredFrame, stored_frames
+from .travelled import Odometer, odometer_of
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+ROWS_HELD: Final = 8192
+FEATURES: Final = ("intersection", "left", "right", "straight")
+"""Columns of ``belief.parquet``, unless the vehicle file's graph has others."""
+
+Sink = Callable[[str, dict[str, list[Any]]], None]
+"""Takes a batch of a table: its name and columns."""
+
+
+@dataclass(slots=True)
+class ApproachSummary:
+    """One approach as the run itself saw it; no truth is asked.
+
+    Attributes:
+        number: From 1 in the order of the drive.
+        start_ns: First step.
+        end_ns: Last step.
+        detected_ns: When the intersection was first held present with a range known.
+        detected_m: The range then.
+        reference: What that range goes to.
+        probabilities: At the last step.
+    """
+
+    number: int
+    start_ns: int
+    end_ns: int
+    detected_ns: int | None = None
+    detected_m: float | None = None
+    reference: str | None = None
+    probabilities: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class SceneOutcome:
+    """What the scene part did.
+
+    Attributes:
+        frames: Looked at.
+        positive: Frames in which each cue was positive.
+        approaches: In order.
+        counts: What became of the evidence, as ``Approaches`` counts it.
+        without_odometry: Frames before which the odometry has a hole.
+    """
+
+    frames: int
+    positive: Mapping[str, int]
+    approaches: tuple[ApproachSummary, ...]
+    counts: Mapping[str, int]
+    without_odometry: int
+
+
+def nothing_past(_t_ns: int) -> PastCues | None:
+    """No Mobileye: no cue past the intersection is looked for."""
+    return None
+
+
+def estimate_scene(
+    run: RunFolder,
+    vehicle: Vehicle,
+    detected: Mapping[str, Any],
+    sink: Sink,
+    past: Callable[[int], PastCues | None] = nothing_past,
+    without: frozenset[str] = frozenset(),
+    on_time: Callable[[int], None] = lambda _: None,
+    timeline: Timeline = ONE_SEGMENT,
+    on_restart: Callable[[int], None] = lambda _: None,
+) -> SceneOutcome:
+    """Run cues, range filter and belief over a run's stored frames.
+
+    Args:
+        run: With the tables of the detect stage and ``measurements.parquet``.
+        vehicle: Settings.
+        detected: The manifest's part on the detect stage.
+        sink: Given the rows of ``cues``, ``range`` and ``belief``.
+        past: From a time to the Mobileye's cues past the intersection then.
+        without: Cues to leave out as if nothing had looked for them, with the ranges they give.
+        on_time: Told the log time reached.
+        timeline: Where the drive has gaps; beyond a long one everything starts anew.
+        on_restart: Told the drive time from which on a new start counts.
+
+    Raises:
+        RunError: A table is missing or damaged.
+        VehicleError: A cue or feature of the settings does not exist.
+    """
+    graph = graph_of(vehicle.fusion)
+    scene = _Scene(
+        vehicle,
+        Approaches(graph, vehicle.fusion, vehicle.range_filter),
+        odometer_of(run),
+        _Rows(sink, features_of(vehicle)),
+    )
+    restarts = _Restarts(vehicle, timeline)
+    fresh_regions = detected["settings"]["regions"] != vehicle.model_dump(mode="json")["regions"]
+    for frame in stored_frames(run, detected["detectors"], with_road_masks=fresh_regions):
+        fresh_ns = restarts.before(frame.seen.t_ns)
+        if fresh_ns is not None:
+            scene.restart(fresh_ns)
+            on_restart(fresh_ns)
+        scene.step(frame, past(frame.seen.t_ns), without)
+        on_time(frame.seen.t_ns)
+    scene.rows.flush()
+    scene.approaches.finish()
+    return SceneOutcome(
+        scene.frames, dict(sorted(scene.positive.items())), tuple(scene.summaries.values()),
+        scene.approaches.counts, scene.without_odometry,
+    )  # fmt: skip
+
+
+@dataclass(slots=True)
+class _Restarts:
+    """Follows the segments along the frames."""
+
+    vehicle: Vehicle
+    timeline: Timeline
+    _number: int = 0
+
+    def before(self, t_ns: int) -> int | None:
+        """Where the new segment begins if a frame at ``t_ns`` is the first after a long gap."""
+        segments, found = self.timeline.segments, None
+        limit_ns = round(self.vehicle.time.restart_after_s * 1e9)
+        while self._number + 1 < len(segments):
+            following = segments[self._number + 1]
+            if following.begins_ns > t_ns:
+                break
+            self._number += 1
+            if following.gap_ns is None or following.gap_ns > limit_ns:
+                found = following.begins_ns
+        return found
+
+
+@dataclass(slots=True)
+class _Scene:
+    vehicle: Vehicle
+    approaches: Approaches
+    odometer: Odometer
+    rows: _Rows
+    cues: CuePass = field(init=False)
+    frames: int = 0
+    without_odometry: int = 0
+    positive: Counter[str] = field(default_factory=Counter)
+    summaries: dict[int, ApproachSummary] = field(default_factory=dict)
+    _last_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        self.cues = CuePass(self.vehicle)
+
+    def step(self, frame: StoredFrame, past: PastCues | None, without: frozenset[str]) -> None:
+        seen = frame.seen
+        counts = {cue: count for cue, count in self.cues(seen).counts.items() if cue not in without}
+        signs = tuple(
+            sign
+            for sign in sign_ranges(seen.objects, frame.heights_px, self.vehicle)
+            if _MEASURES[sign.reference] not in without
+        )
+        evidence = self._evidence(seen.t_ns, counts, signs)
+        step = self.approaches(evidence) if past is None else self.approaches(
+            evidence, _leaving_out(past, without)
+        )  # fmt: skip
+        self.frames += 1
+        self.positive.update(cue for cue, count in step.counts.items() if count)
+        self.rows.add(step)
+        self._sum_up(step)
+
+    def restart(self, t_ns: int) -> None:
+        """Know nothing of what was before ``t_ns``."""
+        self.approaches.restart()
+        self.odometer.skip_to(t_ns)
+        self.cues = CuePass(self.vehicle)
+        self._last_ns = None
+
+    def _evidence(
+        self, t_ns: int, counts: Mapping[str, int], signs: tuple[SignRange, ...]
+    ) -> FrameEvidence:
+        way = self.odometer.until(t_ns)
+        gap_ns = 0 if self._last_ns is None else t_ns - self._last_ns
+        is_covered = way.covered_ns >= 0.9 * gap_ns
+        self.without_odometry += not is_covered
+        self._last_ns = t_ns if self._last_ns is None else max(t_ns, self._last_ns)
+        return FrameEvidence(
+            t_ns=t_ns,
+            travelled_m=way.distance_m if is_covered else None,
+            travelled_var_m2=way.var_m2,
+            signs=signs,
+            counts=counts,
+            turned_rad=way.turn_rad if is_covered else None,
+        )
+
+    def _sum_up(self, step: Step) -> None:
+        if step.approach is None:
+            return
+        one = self.summaries.setdefault(
+            step.approach, ApproachSummary(step.approach, step.t_ns, step.t_ns)
+        )
+        one.end_ns = step.t_ns
+        one.probabilities = step.probabilities
+        is_sure = step.probabilities.get(FEATURES[0], 0.0) > self.vehicle.fusion.established
+        if is_sure and step.ranges and one.detected_ns is None:
+            one.detected_ns = step.t_ns
+            one.detected_m = step.ranges[0].range_m
+            one.reference = str(step.ranges[0].reference)
+
+
+_MEASURES: Final = {Reference.START: Cue.STOP_SIGN.value, Reference.END: Cue.TRAFFIC_LIGHT.value}
+
+
+def _leaving_out(past: PastCues, without: frozenset[str]) -> PastCues:
+    if not without:
+        return past
+    return lambda belief, reference: {
+        cue: count for cue, count in past(belief, reference).items() if cue not in without
+    }
+
+
+@dataclass(slots=True)
+class _Rows:
+    """Rows of the three tables, handed to the sink some thousand at a time."""
+
+    sink: Sink
+    features: Sequence[str]
+    cues: list[tuple[Any, ...]] = field(default_factory=list)
+    ranges: list[tuple[Any, ...]] = field(default_factory=list)
+    beliefs: list[tuple[Any, ...]] = field(default_factory=list)
+
+    def add(self, step: Step) -> None:
+        t_ns, number = step.t_ns, step.approach
+        self.cues += [(t_ns, number, cue, count) for cue, count in step.counts.items()]
+        self.ranges += [
+            (t_ns, number, str(row.reference), row.range_m, row.var_m2, row.measured_m)
+            for row in step.ranges
+        ]
+        if number is not None:
+            values = (step.probabilities[feature] for feature in self.features)
+            self.beliefs.append((t_ns, number, *values, step.established))
+        if len(self.cues) > ROWS_HELD:
+            self.flush()
+
+    def flush(self) -> None:
+        for name, rows, columns in (
+            ("cues", self.cues, CUE_COLUMNS),
+            ("range", self.ranges, RANGE_COLUMNS),
+            ("belief", self.beliefs, ("t_ns", "approach", *self.features, "established")),
+        ):
+            if rows:
+                parts = zip(*rows, strict=True)
+                self.sink(name, dict(zip(columns, map(list, parts), strict=True)))
+                rows.clear()
+
+
+CUE_COLUMNS: Final = ("t_ns", "approach", "cue", "count")
+RANGE_COLUMNS: Final = ("t_ns", "approach", "reference", "range_m", "var_m2", "measured_m")
+
+
+def features_of(vehicle: Vehicle) -> tuple[str, ...]:
+    """Names of the features that are believed in, a user's own among them."""
+    return tuple(feature.name for feature in graph_of(vehicle.fusion).features)
+
+
+def schemas(features: Sequence[str] = FEATURES) -> dict[str, pa.Schema]:
+    """Columns of the tables that this stage writes."""
+    import pyarrow as pa
+
+    number, integer, text = pa.float64(), pa.int64(), pa.string()
+    return {
+        "cues": pa.schema(
+            [("t_ns", integer), ("approach", integer), ("cue", text), ("count", integer)]
+        ),
+        "range": pa.schema([
+            ("t_ns", integer), ("approach", integer), ("reference", text), ("range_m", number),
+            ("var_m2", number), ("measured_m", number),
+        ]),
+        "belief": pa.schema([
+            ("t_ns", integer), ("approach", integer), *((name, number) for name in features),
+            ("established", pa.bool_()),
+        ]),
+    }  # fmt: skip

@@ -1,0 +1,135 @@
+"""Frames of a run with what detectors found in them, read back from its tables one by one."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from crosscue.detectors.base import Detections, RoadMask
+from crosscue.detectors.cues.frame import Role, Seen
+from crosscue.detectors.cues.road import RoadShares
+from crosscue.replay.columns import Floats
+from crosscue.replay.files.run_folder import RunFolder
+
+NO_BOXES: Final = np.empty((0, 4))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredFrame:
+    """One frame of the camera.
+
+    Attributes:
+        seen: What was found, by role.
+        size_px: Width and height of the picture.
+        heights_px: One array a detections object of ``seen.objects``: rows that each mask spans.
+    """
+
+    seen: Seen
+    size_px: tuple[int, int]
+    heights_px: tuple[Floats, ...]
+
+
+@dataclass(slots=True)
+class _Rows:
+    """A table read forwards, as rows that belong to one frame after another."""
+
+    batches: Iterator[Any]
+    names: Sequence[str]
+    _frames: list[int] = field(default_factory=list)
+    _rows: list[tuple[Any, ...]] = field(default_factory=list)
+    _next: int = 0
+
+    def of(self, frame: int) -> list[tuple[Any, ...]]:
+        """Rows of a frame; call with frames in order."""
+        rows: list[tuple[Any, ...]] = []
+        while self._fill():
+            start = bisect_left(self._frames, frame, self._next)
+            self._next = bisect_right(self._frames, frame, start)
+            rows += self._rows[start : self._next]
+            if self._next < len(self._frames):
+                break
+        return rows
+
+    def _fill(self) -> bool:
+        while self._next == len(self._frames):
+            batch = next(self.batches, None)
+            if batch is None:
+                return False
+            self._frames = batch["frame"].to_pylist()
+            columns = (batch[name].to_pylist() for name in self.names)
+            self._rows, self._next = list(zip(*columns, strict=True)), 0
+        return True
+
+
+FOUND: Final = ("detector", "label", "score", "x0", "y0", "x1", "y1", "mask", "height_px")
+SHARES: Final = ("share_left", "share_straight", "share_right")
+MASK: Final = ("mask", "mask_width_px", "mask_height_px")
+
+
+def stored_frames(
+    run: RunFolder, detectors: Sequence[Mapping[str, Any]], *, with_road_masks: bool = False
+) -> Iterator[StoredFrame]:
+    """All frames of a run in the order they were looked at; memory holds one batch of rows.
+
+    Args:
+        run: With the tables of the detect stage.
+        detectors: The manifest's list: name and role of each.
+        with_road_masks: Give road pixels instead of their shares of the regions.
+
+    Raises:
+        RunError: A table is missing or damaged.
+    """
+    objects = [d["name"] for d in detectors if d["role"] == Role.OBJECTS]
+    signs = [d["name"] for d in detectors if d["role"] == Role.SIGNS]
+    has_road = any(d["role"] == Role.ROAD for d in detectors)
+    found = _Rows(run.batches("detections", ["frame", *FOUND]), FOUND)
+    columns = MASK if with_road_masks else SHARES
+    road = _Rows(run.batches("road", ["frame", *columns]), columns)
+    for batch in run.batches("frames", ["frame", "t_ns", "width_px", "height_px"]):
+        for frame, t_ns, width, height in zip(
+            *(batch[name].to_pylist() for name in batch.schema.names), strict=True
+        ):
+            size = (width, height)
+            by_name: dict[str, list[tuple[Any, ...]]] = {}
+            for row in found.of(frame):
+                by_name.setdefault(row[0], []).append(row)
+            shares = road.of(frame) if has_road else []
+            some = tuple(_detections(t_ns, size, by_name.get(name, [])) for name in objects)
+            yield StoredFrame(
+                Seen(
+                    t_ns,
+                    some,
+                    tuple(_detections(t_ns, size, by_name.get(name, [])) for name in signs),
+                    _road(t_ns, size, shares[0], with_road_masks) if shares else None,
+                ),
+                size,
+                tuple(
+                    np.array([row[8] for row in by_name.get(name, [])], np.float64)
+                    for name in objects
+                ),
+            )
+
+
+def _detections(t_ns: int, size: tuple[int, int], rows: list[tuple[Any, ...]]) -> Detections:
+    if not rows:
+        return Detections(t_ns, size, NO_BOXES, np.empty(0), (), ())
+    return Detections(
+        t_ns,
+        size,
+        np.array([row[3:7] for row in rows], np.float64),
+        np.array([row[2] for row in rows], np.float64),
+        tuple(row[1] for row in rows),
+        tuple(row[7] or b"" for row in rows),
+    )
+
+
+def _road(
+    t_ns: int, size: tuple[int, int], row: tuple[Any, ...], with_mask: bool
+) -> RoadMask | RoadShares:
+    if with_mask:
+        return RoadMask(t_ns, size, row[0], (row[1], row[2]))
+    return RoadShares(*row)

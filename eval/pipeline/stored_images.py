@@ -1,0 +1,130 @@
+"""The pictures of a run, read again from its log, on the clock that the run's tables have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from crosscue.detectors.images import Encoded, encoded
+from crosscue.replay.clocks.reports import Clock
+from crosscue.replay.columns import Block, Images, Topic
+from crosscue.replay.files.run_folder import RunFolder
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Selection, open_log
+from crosscue.replay.signals import Extractor, Plan, Source
+from crosscue.replay.time.segments import UNSHIFTED, LogClock, TimedLog
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .drive_time import timeline_in
+from .run_logs import place_of
+
+AROUND_NS: Final = 2_000_000_000
+"""A picture's own clock and the log's may differ by this much."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredCamera:
+    """Where a run's pictures lie.
+
+    Attributes:
+        log: Path or URL.
+        topic: In it.
+        clock: Whose times the run's tables have.
+        selection: What part of the log the run looked at.
+        time: The log's clock against the times of the run's tables.
+    """
+
+    log: Path | str
+    topic: Topic
+    clock: Clock
+    selection: Selection
+    time: LogClock = UNSHIFTED
+
+
+def camera_of(run: RunFolder) -> StoredCamera | None:
+    """The camera; None where the run's logs have none, or several and no line says which.
+
+    Raises:
+        RunError: The manifest cannot be read; its log is gone, or another lies in its place.
+        LogError: The log cannot be opened.
+    """
+    if run.without_pictures:
+        return None
+    manifest = run.manifest()
+    detected = manifest if manifest.get("stage") == "detect" else manifest.get("detect")
+    named = None if detected is None else detected["camera"]
+    if detected is None:
+        named = manifest["settings"].get("topics", {}).get("camera")
+    cameras = [
+        (number, entry, name)
+        for number, entry in enumerate(manifest["logs"])
+        for name in entry["cameras"]
+        if named in (None, name)
+    ]
+    if len(cameras) != 1:
+        return None
+    number, entry, name = cameras[0]
+    place = place_of(run, entry)
+    with open_log(place) as log:
+        topic = next(one for one in log.topics if one.name == name)
+    part = manifest.get("selection", {})
+    selection = Selection(frozenset({topic.name}), part.get("start_ns"), part.get("end_ns"))
+    clock = timeline_in(manifest).clock(number)
+    return StoredCamera(place, topic, _clock(detected, topic.name), selection, clock)
+
+
+def _clock(detected: Mapping[str, Any] | None, topic: str) -> Clock:
+    for told in [] if detected is None else detected["clocks"]:
+        if topic in told:
+            return Clock(told[topic]["used"])
+    return Clock.LOG
+
+
+def picture_at(camera: StoredCamera, t_ns: int) -> Encoded | None:
+    """The picture taken at exactly this time of the run's tables; None where there is none.
+
+    Raises:
+        LogError: The log cannot be opened.
+    """
+    found: list[Encoded] = []
+
+    def keep(block: Block) -> None:
+        assert isinstance(block.rows, Images)
+        found.extend(encoded(block.rows, int(i)) for i in np.flatnonzero(block.log_ns == t_ns))
+
+    read_pictures(camera, keep, around_ns=t_ns)
+    return found[0] if found else None
+
+
+def read_pictures(
+    camera: StoredCamera, on_pictures: Callable[[Block], None], around_ns: int | None = None
+) -> None:
+    """Give every block of pictures to ``on_pictures``.
+
+    Args:
+        camera: Where they lie.
+        on_pictures: Told of blocks of ``Images`` with times as in the run's tables.
+        around_ns: Only those about this time.
+
+    Raises:
+        LogError: The log cannot be opened.
+    """
+    ledger = Ledger(str(camera.log))
+    extractor = Extractor(
+        Plan((Source(0, camera.topic, ()),), {}), Vehicle(version=1), 0, ledger,
+        {camera.topic.name: camera.clock}, on_pictures=on_pictures,
+        shift_at=camera.time.shift_at if len(camera.time.epochs) > 1 else None,
+    )  # fmt: skip
+    selection = camera.selection
+    # Rows are told apart by counting where stamps alone do not do.
+    if around_ns is not None and camera.topic.name not in camera.time.topics:
+        begin, end = around_ns - AROUND_NS, around_ns + AROUND_NS
+        selection = Selection(selection.topics, begin, end)
+    with open_log(camera.log) as log:
+        for block in TimedLog(log, camera.time).read(ledger, selection):
+            for _ in extractor(block):
+                pass

@@ -1,0 +1,72 @@
+"""A run's scene once more with other settings or without a cue, in memory: what was it worth?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from crosscue.replay.errors import RunError
+from crosscue.replay.files.run_folder import RunFolder
+from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
+
+from .drive_time import timeline_in
+from .estimate import detected_part
+from .labelled import with_labels
+from .mobileye_tables import StoredMobileye
+from .scene import estimate_scene, features_of, schemas
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
+    "stop_sign": ("stop_sign",),
+    "traffic_light": ("traffic_light",),
+    "road": ("road_left", "road_straight", "road_right"),
+    "cross_traffic": ("cross_traffic_left", "cross_traffic_right"),
+    "parked": ("parked_left", "parked_right"),
+    "lanes_past": ("lanes_past",),
+    "vehicles_past": ("vehicles_past",),
+    "one_way": ("one_way_left", "one_way_right"),
+    "do_not_enter": ("do_not_enter",),
+}
+"""The nine cues of Table 5 and the columns that each has; left out together."""
+
+
+def scene_tables(
+    run: RunFolder, vehicle: Vehicle | None = None, without: frozenset[str] = frozenset()
+) -> dict[str, pa.Table]:
+    """Tables ``cues``, ``range`` and ``belief`` as the run would have them.
+
+    Args:
+        run: With a finished detect stage and a pose.
+        vehicle: Other settings; the run's, if left out.
+        without: Cues to leave out as if nothing had looked for them.
+
+    Raises:
+        RunError: No detector has looked at the run's camera.
+    """
+    import pyarrow as pa
+
+    manifest = run.manifest()
+    detected = detected_part(manifest)
+    if detected is None:
+        raise RunError(f"{run.path}: no detector has looked at its camera; replay with detectors")
+    settings = of_manifest(manifest["settings"]) if vehicle is None else vehicle
+    wanted = schemas(features_of(settings))
+    parts: dict[str, list[pa.Table]] = {
+        name: [schema.empty_table()] for name, schema in wanted.items()
+    }
+
+    def keep(name: str, rows: dict[str, list[Any]]) -> None:
+        parts[name].append(pa.table(rows, schema=wanted[name]))
+
+    timeline = timeline_in(manifest)
+    past = StoredMobileye(run, settings.past)
+    estimate_scene(
+        run, settings, detected, keep, past.cues, without,
+        timeline=timeline, on_restart=past.forget_before,
+    )  # fmt: skip
+    clock = timeline.clock(detected["camera_log"])
+    return {
+        name: with_labels(pa.concat_tables(some), timeline, clock) for name, some in parts.items()
+    }

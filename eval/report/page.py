@@ -1,0 +1,244 @@
+"""The report of scored runs: one HTML file that needs no network and runs no script.
+
+Whatever comes from logs, truth or settings is escaped. The same runs and scores give the same
+bytes.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from crosscue.eval.scoring.drives import Scores
+from crosscue.eval.scoring.runs import RunScored
+from crosscue.replay.files.run_folder import strict_json, write_text
+from crosscue.replay.vehicle.fusion import CUES
+
+from .html import render_page
+from .worst_frames import WorstFrame, worst_frames
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+
+REPORT: Final = "report.html"
+TEMPLATE: Final = "page.html.j2"
+POSE_FIGURES: Final = {
+    "pose_plan.png": "True and estimated track, with the 2-sigma ellipse at twelve moments.",
+    "pose_error.png": "Distance from the truth, and what the filter claims.",
+    "pose_heading.png": "Heading error, and what the filter claims.",
+    "pose_nees.png": "Squared error in units of the claimed covariance; the band holds 95 % of it "
+    "where claims are honest.",
+    "pose_major_axis.png": "Length of the 2-sigma ellipse against distance travelled.",
+}
+BELIEFS: Final = 12
+"""Most approaches with a chart of their own."""
+YEAR_2000_NS: Final = 946_684_800_000_000_000
+TUNED: Final = ("one_way_left", "one_way_right", "do_not_enter")
+"""Their published precision is what the source tuned them to reach."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    name: str
+    manifest: Mapping[str, Any]
+    clocks: str
+    settings: str
+    versions: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    base64: str
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Chart:
+    svg: Markup
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Figures:
+    distances: Markup | None
+    beliefs: tuple[_Chart, ...]
+    beliefs_left_out: int
+    reliability: Markup | None
+    range: Markup | None
+    range_is_traced: bool
+
+
+def write_report(
+    folder: Path, scored: Sequence[RunScored], scores: Scores, metrics: Mapping[str, Any]
+) -> Path:
+    """Write ``report.html`` over one run or many; its path comes back.
+
+    Args:
+        folder: Where to; for one run its ``score`` folder.
+        scored: All runs, at least one.
+        scores: Of all of them together.
+        metrics: From ``metrics_of``, with whatever the command added.
+
+    Raises:
+        RunError: A run's manifest or tables cannot be read.
+        OutputError: It cannot be written.
+    """
+    page = render_page(
+        TEMPLATE,
+        {**_content(folder, scored, metrics), "figures": _figures(scored, scores)},
+        {"number": _number, "signed": _signed, "never": _never, "span": _span, "ends": _ends},
+    )
+    write_text(folder / REPORT, page)
+    return folder / REPORT
+
+
+def _content(
+    folder: Path, scored: Sequence[RunScored], metrics: Mapping[str, Any]
+) -> dict[str, Any]:
+    runs = [_run(one) for one in scored]
+    sources = [one.truth.truth.source for one in scored]
+    cues = [_cue(name, one) for name, one in metrics["cues"].items()]
+    pose = metrics["pose"]
+    is_alone = len(scored) == 1
+    accounts = [account for run in runs for account in run.manifest["account"]["reading"]]
+    return {
+        "title": runs[0].name if is_alone else f"{len(runs)} drives",
+        "runs": runs,
+        "sources": sorted(set(sources)),
+        "simulated": sum("simulated" in source.lower() for source in sources),
+        "failed": metrics["coverage"].get("failed", {}),
+        "same_log": metrics["coverage"].get("same_log", ()),
+        "dropped": sum(not account["is_whole"] for account in accounts),
+        "coverage": metrics["coverage"],
+        "settings": metrics["settings"],
+        "approaches": metrics["approaches"],
+        "cues": [one for one in cues if one["scored"]],
+        "cues_all": cues,
+        "belief": metrics["belief"],
+        "range_scores": metrics["range"],
+        "attribution": metrics.get("attribution"),
+        "has_scene": bool(metrics["approaches"] or metrics["belief"]),
+        "frames": [_frame(one) for one in worst_frames(scored)],
+        "pose": pose if is_alone else None,
+        "poses": None if is_alone else pose,
+        "pose_figures": _pose_figures(folder) if is_alone else [],
+    }
+
+
+def _run(one: RunScored) -> _Run:
+    manifest = one.run.manifest()
+    return _Run(
+        name=_name(one),
+        manifest=manifest,
+        clocks=strict_json(manifest["clocks"]),
+        settings=strict_json(manifest["settings"]),
+        versions=strict_json({"versions": manifest["versions"], "logs": manifest["logs"]}),
+    )
+
+
+def _name(one: RunScored) -> str:
+    """The folder's name, with its parent's where that says more than ``run``."""
+    path = one.run.path.resolve()
+    return "/".join(path.parts[-2:]) if path.name.startswith("run") else path.name
+
+
+def _cue(name: str, score: Mapping[str, Any]) -> dict[str, Any]:
+    """A cue's scores with what the source published beside them."""
+    published = CUES.get(name)
+    bound = "at least " if name in TUNED else ""
+    leading = score["readings"][score["reading"]]
+    return {
+        **score,
+        "name": name,
+        "frames": leading["frames"],
+        "left_out": leading["left_out"],
+        "published": "-" if published is None else f"{bound}{published.precision:.2f}",
+    }
+
+
+def _frame(one: WorstFrame) -> dict[str, Any]:
+    return {
+        **asdict(one),
+        "distance": "" if math.isnan(one.distance_m) else f"{one.distance_m:.0f}",
+        "when": told_time(one.t_ns),
+    }
+
+
+def told_time(t_ns: int) -> str:
+    """As the viewer shows it: a date, or seconds for a clock that begins with the machine."""
+    if t_ns <= YEAR_2000_NS:
+        return f"{t_ns * 1e-9:.3f} s"
+    at = datetime.fromtimestamp(t_ns // 1_000_000_000, UTC)
+    return f"{at:%Y-%m-%d %H:%M:%S}.{t_ns // 1_000_000 % 1000:03d} UTC"
+
+
+def _figures(scored: Sequence[RunScored], scores: Scores) -> _Figures:
+    from . import scene_figures
+
+    threshold = scores.settings.threshold
+    curves = [
+        (one, curve)
+        for one in scored
+        if one.judged.approaches is not None
+        for curve in one.judged.approaches.curves
+    ]
+    ranges = [part for one in scored for part in one.judged.ranges]
+    tracks = sum(len(set(part.approach.tolist())) for part in ranges)
+    results = [] if scores.approaches is None else scores.approaches.results
+    return _Figures(
+        distances=scene_figures.draw_distances(results) if results else None,
+        beliefs=tuple(
+            _Chart(
+                scene_figures.draw_belief(curve, one.judged.cues, threshold),
+                _told(one, curve.intersection),
+            )
+            for one, curve in curves[:BELIEFS]
+        ),
+        beliefs_left_out=max(len(curves) - BELIEFS, 0),
+        reliability=scene_figures.draw_reliability(scores.belief) if scores.belief else None,
+        range=scene_figures.draw_range(ranges, scores.range) if scores.range else None,
+        range_is_traced=tracks <= scene_figures.TRACES,
+    )
+
+
+def _told(one: RunScored, intersection: str) -> str:
+    return f"{_name(one)}: approach to {intersection}. Dashed: established above it."
+
+
+def _pose_figures(folder: Path) -> list[_Picture]:
+    return [
+        _Picture(base64.b64encode((folder / name).read_bytes()).decode(), caption)
+        for name, caption in POSE_FIGURES.items()
+        if (folder / name).exists()
+    ]
+
+
+def _number(value: float | None, digits: int = 2) -> str:
+    return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _signed(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None or math.isnan(value) else f"{value:+.{digits}f}"
+
+
+def _never(value: float | None) -> str:
+    return "never" if value is None else "unknown" if math.isnan(value) else f"{value:.1f}"
+
+
+def _ends(low: float | None, high: float | None) -> str:
+    if low is None or high is None or math.isnan(low) or math.isnan(high):
+        return "-"
+    return f"{low:.2f} to {high:.2f}"
+
+
+def _span(mean: Mapping[str, Any], digits: int = 2) -> str:
+    """An interval in brackets, or nothing where there is none."""
+    low, high = mean["low"], mean["high"]
+    if low is None or high is None or math.isnan(low) or math.isnan(high):
+        return ""
+    return f" ({low:.{digits}f} to {high:.{digits}f})"

@@ -1,0 +1,159 @@
+"""Pictures of a pose track against its truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from crosscue.eval.scoring.consistency import mean_band
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.files.run_folder import write_whole
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+ESTIMATE: Final = "#1f77b4"
+TRUTH: Final = "#2ca02c"
+BAND: Final = "#ff7f0e"
+ELLIPSES: Final = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoredPoses:
+    """Estimated and true poses at the same times, in the map frame.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        estimate_m: Shape (N, 2).
+        truth_m: Shape (N, 2).
+        heading_error_rad: Shape (N,): estimate less truth, wrapped.
+        cov: Shape (N, 3, 3): of x, y, heading as the filter claims it.
+        nees: Shape (N,): normalised estimation error squared of x, y, heading.
+        travelled_m: Shape (N,).
+        major_axis_m: Shape (N,).
+    """
+
+    t_ns: Int64s
+    estimate_m: Floats
+    truth_m: Floats
+    heading_error_rad: Floats
+    cov: Floats
+    nees: Floats
+    travelled_m: Floats
+    major_axis_m: Floats
+
+    @property
+    def seconds(self) -> Floats:
+        """Seconds since the first pose."""
+        seconds: Floats = (self.t_ns - self.t_ns[0]) * 1e-9
+        return seconds
+
+
+def draw_all(poses: ScoredPoses, folder: Path, title: str, lost_above_m: float) -> list[Path]:
+    """Write the four figures as PNG files; their paths come back."""
+    jobs: dict[str, tuple[Callable[[Axes, ScoredPoses], None], tuple[float, float]]] = {
+        "pose_plan.png": (_plan, (7.0, 6.0)),
+        "pose_error.png": (_error, (7.0, 3.4)),
+        "pose_heading.png": (_heading, (7.0, 3.4)),
+        "pose_nees.png": (_nees, (7.0, 3.4)),
+        "pose_major_axis.png": (lambda axes, p: _major_axis(axes, p, lost_above_m), (7.0, 3.4)),
+    }
+    return [_draw(folder / name, paint, poses, title, size) for name, (paint, size) in jobs.items()]
+
+
+def _draw(
+    path: Path,
+    paint: Callable[[Axes, ScoredPoses], None],
+    poses: ScoredPoses,
+    title: str,
+    size: tuple[float, float],
+) -> Path:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    paint(axes, poses)
+    axes.set_title(title, fontsize=9, loc="left", color="0.35")
+    axes.grid(alpha=0.3)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    # The library's own stamp would make the same input give other bytes in another version.
+    write_whole(path, lambda p: figure.savefig(p, dpi=130, format="png", metadata={"Software": ""}))
+    return path
+
+
+def _plan(axes: Axes, poses: ScoredPoses) -> None:
+    axes.plot(*poses.truth_m.T, color=TRUTH, lw=3, alpha=0.6, label="truth")
+    axes.plot(*poses.estimate_m.T, color=ESTIMATE, lw=1.2, label="estimate")
+    rows = np.unique(np.linspace(0, len(poses.t_ns) - 1, ELLIPSES).astype(int))
+    for i, row in enumerate(rows):
+        ring = _ellipse(poses.estimate_m[row], poses.cov[row, :2, :2])
+        axes.plot(*ring, color=BAND, lw=0.8, label="2-sigma ellipse" if i == 0 else None)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x, east (m)")
+    axes.set_ylabel("y, north (m)")
+    axes.legend(frameon=False)
+
+
+def _ellipse(centre: Floats, cov: Floats) -> Floats:
+    angle = np.linspace(0.0, 2.0 * np.pi, 61)
+    values, vectors = np.linalg.eigh(cov)
+    axes = vectors * (2.0 * np.sqrt(np.maximum(values, 0.0)))
+    ring: Floats = axes @ np.stack([np.cos(angle), np.sin(angle)]) + centre[:, None]
+    return ring
+
+
+def _error(axes: Axes, poses: ScoredPoses) -> None:
+    error = np.linalg.norm(poses.estimate_m - poses.truth_m, axis=1)
+    claimed = 2.0 * np.sqrt(np.linalg.eigvalsh(poses.cov[:, :2, :2])[:, 1])
+    axes.fill_between(poses.seconds, 0.0, claimed, color=BAND, alpha=0.25, lw=0, label="2 sigma")
+    axes.plot(poses.seconds, error, color=ESTIMATE, lw=1.2, label="position error")
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlim(0.0, float(poses.seconds[-1]))
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel("metres")
+    axes.legend(frameon=False)
+
+
+def _heading(axes: Axes, poses: ScoredPoses) -> None:
+    claimed = np.rad2deg(2.0 * np.sqrt(poses.cov[:, 2, 2]))
+    axes.fill_between(
+        poses.seconds, -claimed, claimed, color=BAND, alpha=0.25, lw=0, label="2 sigma"
+    )
+    axes.plot(
+        poses.seconds, np.rad2deg(poses.heading_error_rad), color=ESTIMATE, lw=1.2,
+        label="heading error",
+    )  # fmt: skip
+    axes.set_xlim(0.0, float(poses.seconds[-1]))
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel("degrees")
+    axes.legend(frameon=False)
+
+
+def _nees(axes: Axes, poses: ScoredPoses) -> None:
+    low, high = mean_band(3, 1)
+    axes.axhspan(low, high, color=BAND, alpha=0.2, lw=0, label="95 % band of chi-square(3)")
+    axes.plot(poses.seconds, poses.nees, color=ESTIMATE, lw=1.0, label="NEES of x, y, heading")
+    axes.set_yscale("log")
+    axes.set_xlim(0.0, float(poses.seconds[-1]))
+    axes.set_xlabel("time (s)")
+    axes.legend(frameon=False)
+
+
+def _major_axis(axes: Axes, poses: ScoredPoses, lost_above_m: float) -> None:
+    axes.plot(poses.travelled_m, poses.major_axis_m, color=ESTIMATE, lw=1.4)
+    axes.axhline(lost_above_m, color="0.3", ls="--", lw=1.0)
+    axes.annotate(
+        "lost above this", (0.0, lost_above_m), xytext=(4, 3), textcoords="offset points",
+        fontsize=8, color="0.3",
+    )  # fmt: skip
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("distance travelled (m)")
+    axes.set_ylabel("2-sigma ellipse, full major axis (m)")

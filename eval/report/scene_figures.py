@@ -1,0 +1,257 @@
+"""Charts of a scored scene for the report, after the source's Fig. 29 and 31."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from crosscue.eval.scoring.approaches import THRESHOLD, ApproachResult, Curve
+from crosscue.eval.scoring.belief import BeliefScore
+from crosscue.eval.scoring.cues import READING, CueJudged
+from crosscue.eval.scoring.ranges import RangeJudged, RangeScore
+from crosscue.eval.scoring.run_tables import NONE
+from crosscue.replay.columns import Floats
+
+from .svg_plot import Drawing, Panel
+
+STYLES: Final[Mapping[str, str]] = {
+    "intersection": "s0", "left": "s1", "right": "s2", "straight": "s3",
+}  # fmt: skip
+WIDTH: Final = 480.0
+PUBLISHED_DETECTED_M: Final = 34.4
+PUBLISHED_FULL_M: Final = 16.2
+TRACES: Final = 12
+"""More approaches than this are shown as bins alone."""
+
+
+def style_of(feature: str) -> str:
+    """A user's own features share one colour."""
+    return STYLES.get(feature, "s4")
+
+
+def draw_distances(results: Sequence[ApproachResult]) -> Markup:
+    """Distance at detection and at full detection: a row an intersection, a dot an approach."""
+    names = sorted({one.intersection for one in results})
+    known = _known([v for one in results for v in (one.detected_m, one.full_m)])
+    panel = Panel(66, 34, WIDTH - 82, 30.0 * len(names), (0.0, max([40.0, *known]) * 1.05), (0, 1))
+    drawing = Drawing(
+        WIDTH, panel.bottom + 56, "Distance at detection",
+        "True distance of the rear axle to the intersection when it was detected and when all "
+        "that is there was, for each approach; the numbers are in the table.",
+    )  # fmt: skip
+    drawing.axes(panel, "true distance to the intersection (m)", "", y_ticks=[])
+    for value, style in (
+        (PUBLISHED_DETECTED_M, "line s0 dash"),
+        (PUBLISHED_FULL_M, "line s1 dash"),
+    ):
+        drawing.rule(panel.x(value), panel.top, panel.x(value), panel.bottom, style)
+    for row, name in enumerate(names):
+        y = panel.top + 30.0 * row + 15.0
+        drawing.text(panel.left - 6, y + 4, name[:9], "tick", "end")
+        mine = [one for one in results if one.intersection == name]
+        for what, style, up in (("detected_m", "s0", -5.0), ("full_m", "s1", 6.0)):
+            _dots(drawing, panel, y + up, [(one, getattr(one, what)) for one in mine], style)
+    drawing.legend(10, 14, [("fill s0", "detected"), ("fill s1", "in full"),
+                            ("line dash", "published means, real drives"),
+                            ("line bad", "never")])  # fmt: skip
+    return drawing.svg()
+
+
+def _dots(
+    drawing: Drawing, panel: Panel, y: float,
+    found: Sequence[tuple[ApproachResult, float | None]], style: str,
+) -> None:  # fmt: skip
+    values = _known([value for _, value in found])
+    if values:
+        mean = panel.x(sum(values) / len(values))
+        drawing.rule(mean, y - 6, mean, y + 6, f"line {style} thick")
+    for place, (one, value) in enumerate(found):
+        if value is None:
+            drawing.cross(panel.left + 6 + 5 * place, y, f"line bad {style}", one.drive)
+        elif math.isfinite(value):
+            drawing.dot(panel.x(value), y, 3.5, f"fill {style}", f"{one.drive}: {value:.1f} m")
+
+
+def _known(values: Sequence[float | None]) -> list[float]:
+    return [value for value in values if value is not None and math.isfinite(value)]
+
+
+def draw_belief(curve: Curve, cues: Sequence[CueJudged], threshold: float = THRESHOLD) -> Markup:
+    """Probability against true distance over one approach, with the cues found on the way.
+
+    Args:
+        curve: Of the approach.
+        cues: Of the same drive.
+        threshold: Above it a feature is detected.
+    """
+    shown = [
+        (one, found) for one in cues
+        for found in [(one.count > 0) & (one.approach == curve.approach)] if found.any()
+    ]  # fmt: skip
+    seen_m = [one.distance_m[found] for one, found in shown]
+    far = max([1.0, *_known(np.concatenate([curve.distance_m, *seen_m]).tolist())])
+    panel = Panel(112, 30, WIDTH - 96, 170, (far, 0.0), (0.0, 1.0))
+    lanes = Panel(112, panel.bottom + 38, WIDTH - 96, 14.0 * len(shown), panel.x_range, (0, 1))
+    drawing = Drawing(
+        WIDTH + 24, lanes.bottom + 8, f"Probability against distance: {curve.intersection}",
+        "Probability of each feature over the true distance still to go, and below it at which "
+        "distances each cue was found: "
+        + "; ".join(_told(name, curve, threshold) for name in curve.features),
+    )  # fmt: skip
+    drawing.axes(panel, "true distance to the intersection (m)", "",
+                 y_ticks=[0.0, 0.25, 0.5, 0.75, 1.0])  # fmt: skip
+    drawing.rule(panel.left, panel.y(threshold), panel.right, panel.y(threshold), "line dash")
+    for name, values in curve.features.items():
+        drawing.curve(panel, curve.distance_m, values, f"line {style_of(name)}")
+    drawing.legend(10, 14, [(f"line {style_of(name)}", name) for name in curve.features])
+    for lane, (one, found) in enumerate(shown):
+        _lane(drawing, lanes, lanes.top + 14.0 * lane, one, found)
+    return drawing.svg()
+
+
+def _told(name: str, curve: Curve, threshold: float) -> str:
+    above = np.flatnonzero(curve.features[name] > threshold)
+    if not len(above):
+        return f"{name} stays below {threshold:g}"
+    return f"{name} exceeds {threshold:g} from {curve.distance_m[above[0]]:.0f} m on"
+
+
+def _lane(
+    drawing: Drawing, panel: Panel, y: float, cue: CueJudged, found: NDArray[np.bool_]
+) -> None:
+    """A bar wherever the cue was found in one look after the other."""
+    side = next((s for s in ("left", "right", "straight") if cue.cue.endswith(s)), "intersection")
+    side = "straight" if cue.cue.endswith("past") else side
+    drawing.rule(panel.left, y + 7, panel.right, y + 7, "grid")
+    for rows, style in (
+        (found & ~is_wrong(cue), f"bar {style_of(side)}"),
+        (found & is_wrong(cue), "bar wrong"),
+    ):
+        places = np.flatnonzero(rows)
+        for part in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1):
+            across = [panel.x(d) for d in _known(cue.distance_m[part].tolist())]
+            if across:
+                drawing.rect(min(across) - 1, y + 2, max(across) - min(across) + 3, 10, style)
+    drawing.text(panel.left - 6, y + 11, cue.cue.replace("_", " "), "tick", "end")
+
+
+def is_wrong(cue: CueJudged) -> NDArray[np.bool_]:
+    """Rows in which the cue was found and, in the reading that leads its score, is not so."""
+    readings = [cue.is_object, cue.is_feature]
+    if READING.get(cue.cue) == "feature":
+        readings.reverse()
+    leading = next((one for one in readings if (one != NONE).any()), readings[0])
+    return np.asarray((cue.count > 0) & (leading == 0))
+
+
+def draw_range(judged: Sequence[RangeJudged], scores: Mapping[str, RangeScore]) -> Markup:
+    """Range error over true distance, and whether the claimed variances are honest.
+
+    Above, a line for each approach while they are few, else bias and rms error by bin; below, the
+    mean NEES by bin: 1 is honest, above it the filter is too sure.
+    """
+    rows = [one for one in judged if len(one.true_m)]
+    few = sum(len(np.unique(one.approach)) for one in rows) <= TRACES
+    errors = np.concatenate([np.abs(one.error_m) for one in rows])
+    most = max(1.0, float(np.percentile(errors, 99.0)) * 1.15)
+    far = max(10.0, max(float(one.true_m.max()) for one in rows))
+    near = min(0.0, min(float(one.true_m.min()) for one in rows))
+    above = Panel(40, 46, WIDTH - 50, 130, (far, near), (-most, most))
+    below = Panel(40, above.bottom + 62, WIDTH - 50, 80, (far, near), (0.0, _most_nees(scores)))
+    drawing = Drawing(
+        WIDTH, below.bottom + 38, "Range errors and their honesty",
+        "; ".join(
+            f"range to {name}: bias {one.bias_m.value:.2f} m, rms error {one.rmse_m:.2f} m, mean "
+            f"NEES {one.nees.mean:.2f}" for name, one in scores.items()
+        ),
+    )  # fmt: skip
+    drawing.axes(above, "true range (m)", "estimate less truth (m)")
+    for one in rows:
+        style = "s2" if one.reference == "start" else "s5"
+        if few:
+            _traces(drawing, above, one, style)
+        else:
+            _bins(drawing, above, scores[one.reference], style)
+    drawing.axes(below, "true range (m)", "mean NEES, 1 is honest")
+    drawing.rule(below.left, below.y(1.0), below.right, below.y(1.0), "line dash")
+    for name, score in scores.items():
+        middles = {bin_: _middle(bin_) for bin_ in score.by_distance}
+        for bin_, middle in middles.items():
+            if middle is not None and near <= middle <= far:
+                nees = min(score.by_distance[bin_].nees, below.y_range[1])
+                style = "s2" if name == "start" else "s5"
+                drawing.dot(below.x(middle), below.y(nees), 4.0, f"fill {style}", bin_)
+    drawing.legend(10, 14, [("line s2", "to the start"), ("line s5", "to the end"),
+                            ("bandkey", "claimed 2 sigma" if few else "rms error")])  # fmt: skip
+    return drawing.svg()
+
+
+def _traces(drawing: Drawing, panel: Panel, one: RangeJudged, style: str) -> None:
+    low, high = panel.y_range
+    for number in np.unique(one.approach).tolist():
+        mine = one.approach == number
+        two_sd = np.minimum(2.0 * np.sqrt(one.var_m2[mine]), high)
+        drawing.band(panel, one.true_m[mine], -two_sd, two_sd, f"band {style}")
+        drawing.curve(panel, one.true_m[mine], np.clip(one.error_m[mine], low, high),
+                      f"line {style}")  # fmt: skip
+
+
+def _bins(drawing: Drawing, panel: Panel, score: RangeScore, style: str) -> None:
+    known = {_middle(name): one for name, one in score.by_distance.items()}
+    places = sorted(middle for middle in known if middle is not None)
+    x = np.array(places, np.float64)
+    bias: Floats = np.array([known[p].bias_m for p in places])
+    rmse: Floats = np.array([known[p].rmse_m for p in places])
+    drawing.band(panel, x, -rmse, rmse, f"band {style}")
+    drawing.curve(panel, x, bias, f"line {style}")
+
+
+def _middle(name: str) -> float | None:
+    """Of a bin such as ``10-20``; the open ones at both ends have none."""
+    low, dash, high = name.partition("-")
+    return (float(low) + float(high)) / 2.0 if dash else None
+
+
+def _most_nees(scores: Mapping[str, RangeScore]) -> float:
+    found = [one.nees for score in scores.values() for one in score.by_distance.values()]
+    return max(2.0, min(10.0, max(found, default=2.0)) * 1.1)
+
+
+def draw_reliability(belief: Mapping[str, BeliefScore]) -> Markup:
+    """How often a feature is there against how probable it was held; bars are 95 % intervals."""
+    panel = Panel(40, 46, 300, 260, (0.0, 1.0), (0.0, 1.0))
+    drawing = Drawing(
+        panel.right + 20, panel.bottom + 38, "Reliability",
+        "Share of steps in which a feature was there, for ten bins of its stated probability; "
+        "points on the diagonal are honest.",
+    )  # fmt: skip
+    drawing.axes(panel, "stated probability", "share that is so")
+    drawing.rule(panel.x(0), panel.y(0), panel.x(1), panel.y(1), "line dash")
+    most = max((one.steps for score in belief.values() for one in score.reliability), default=1)
+    for place, (name, score) in enumerate(belief.items()):
+        for one in score.reliability:
+            # A little apart, so that features do not hide each other.
+            x = panel.x(one.mean_probability) + 3.0 * (place - 1.5)
+            low, high = interval(one.there.low, one.there.high,
+                                 one.there.clusters_low, one.there.clusters_high)  # fmt: skip
+            drawing.rule(x, panel.y(low), x, panel.y(high), f"line {style_of(name)}")
+            radius = 2.0 + 4.0 * math.sqrt(one.steps / most)
+            hint = f"{name}: {one.steps} steps, stated {one.mean_probability:.2f}, so in "
+            drawing.dot(x, panel.y(one.there.value), radius, f"fill {style_of(name)}",
+                        f"{hint}{one.there.value:.2f}")  # fmt: skip
+    drawing.legend(8, 14, [(f"fill {style_of(name)}", name) for name in belief])
+    return drawing.svg()
+
+
+def interval(
+    low: float, high: float, clusters_low: float, clusters_high: float
+) -> tuple[float, float]:
+    """The wider of both intervals."""
+    if math.isnan(clusters_low):
+        return low, high
+    return min(low, clusters_low), max(high, clusters_high)

@@ -1,0 +1,115 @@
+"""Many runs scored, side by side if asked; one that fails does not stop the rest."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from crosscue.eval.scoring.drives import ScoreSettings
+from crosscue.eval.scoring.pose.smoother import SmootherScore, score_smoother
+from crosscue.eval.scoring.runs import (
+    FOLDER,
+    RunScored,
+    find_truth,
+    judge_run,
+    metrics_of,
+    scores_of,
+    write_scores,
+)
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.files.run_folder import locked, open_run
+
+from .page import write_report
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """A run that was scored, its files written.
+
+    Attributes:
+        one: Laid beside its truth.
+        metrics: What its ``metrics.json`` holds.
+        report: Its page.
+        smoothed: The batch smoother beside the filter, if asked for.
+    """
+
+    one: RunScored
+    metrics: dict[str, Any]
+    report: Path
+    smoothed: SmootherScore | None
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """A run that could not be scored.
+
+    Attributes:
+        path: Its folder.
+        error: What would have ended the command for this run alone.
+    """
+
+    path: Path
+    error: CrosscueError
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreWork:
+    """What is done for one run, here or in another process.
+
+    Attributes:
+        truth: The truth of all runs, or None for the one beside each run's log.
+        settings: Of the scores.
+        rpe_m: Distances of the relative pose error.
+        has_smoother: Run the batch smoother as well?
+        any_log: Take truth that names the hash of another file?
+        logs: Where the runs' logs have moved to, if they have.
+    """
+
+    truth: Path | None
+    settings: ScoreSettings
+    rpe_m: tuple[float, ...]
+    has_smoother: bool = False
+    any_log: bool = False
+    logs: Path | None = None
+
+    def __call__(self, path: Path) -> Scored:
+        """Score one run and write its files.
+
+        Raises:
+            CrosscueError: It cannot be scored.
+        """
+        folder = open_run(path, self.logs)
+        truth_path = find_truth(folder, self.truth)
+        with locked(folder):
+            one = judge_run(folder, truth_path, self.settings, self.rpe_m, any_log=self.any_log)
+            scores = scores_of([one], self.settings)
+            metrics = metrics_of([one], scores)
+            smoothed = score_smoother(folder, truth_path) if self.has_smoother else None
+            if smoothed is not None:
+                metrics["smoother"] = asdict(smoothed)
+            write_scores(folder.file(FOLDER), [one], metrics)
+            report = write_report(folder.file(FOLDER), [one], scores, metrics)
+        return Scored(one, metrics, report, smoothed)
+
+    def attempt(self, path: Path) -> Scored | Failed:
+        """Score one run; an error of ours becomes a result."""
+        try:
+            return self(path)
+        except CrosscueError as error:
+            return Failed(path, error)
+
+
+def score_runs(
+    paths: Sequence[Path], work: ScoreWork, workers: int = 1
+) -> Iterator[Scored | Failed]:
+    """Score runs, in order; with several workers in as many processes."""
+    if workers == 1 or len(paths) == 1:
+        yield from map(work.attempt, paths)
+        return
+    fresh = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(paths)), mp_context=fresh) as pool:
+        yield from pool.map(work.attempt, paths)

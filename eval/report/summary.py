@@ -1,0 +1,203 @@
+"""Scores for a person, within 80 columns, coverage first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+from crosscue.eval.scoring.approaches import ApproachScore
+from crosscue.eval.scoring.belief import BeliefScore
+from crosscue.eval.scoring.cues import CueScore
+from crosscue.eval.scoring.drives import Scores
+from crosscue.eval.scoring.gates import GateResult
+from crosscue.eval.scoring.intervals import Mean, Share
+from crosscue.eval.scoring.metric_values import MetricValue
+from crosscue.eval.scoring.ranges import RangeScore
+from crosscue.replay.safe_text import visible
+
+WIDTH: Final = 80
+LABEL: Final = 11
+
+
+def summary(scores: Scores, why_no_pose: str = "") -> str:
+    """The pooled scores of any number of drives."""
+    missing = scores.not_scored() | ({"pose": why_no_pose} if why_no_pose else {})
+    lines = [*_coverage(scores), *(_line("not scored", f"{k}: {v}") for k, v in missing.items())]
+    if scores.cues:
+        lines += ["", *_cues(scores.cues)]
+    if scores.approaches is not None:
+        lines += ["", *_approaches(scores.approaches)]
+    if scores.belief:
+        lines += ["", *_belief(scores.belief)]
+    if scores.range:
+        lines += ["", *_range(scores.range)]
+    return "\n".join(part for line in lines for part in _wrapped(line))
+
+
+def told_line(label: str, text: str) -> str:
+    """One labelled line, going on below where it is too long."""
+    return "\n".join(_wrapped(_line(label, text)))
+
+
+def gate_lines(results: Sequence[GateResult]) -> str:
+    """One line for each gate, failures last."""
+    ordered = sorted(results, key=lambda one: bool(one.failure))
+    lines = [
+        _line("FAILED" if one.failure else "passed", visible(one.gate.told()) + _end(one))
+        for one in ordered
+    ]
+    return "\n".join(part for line in lines for part in _wrapped(line))
+
+
+def _end(one: GateResult) -> str:
+    return f": {one.failure}" if one.failure else f" ({_number(one.value)})"
+
+
+def _line(label: str, text: str) -> str:
+    return f"{label:{LABEL}}{text}"
+
+
+def _wrapped(line: str) -> Iterator[str]:
+    """A line too long goes on below, behind the label's column."""
+    while len(line) > WIDTH:
+        cut = line.rfind(" ", LABEL + 1, WIDTH + 1)
+        cut = cut if cut > LABEL else WIDTH
+        yield line[:cut].rstrip()
+        line = " " * LABEL + line[cut:].lstrip()
+    yield line
+
+
+def _coverage(scores: Scores) -> list[str]:
+    frames = sum(one.frames for one in scores.drives)
+    told = sum(one.frames_told for one in scores.drives)
+    truth_s = sum(one.truth_s for one in scores.drives)
+    covered_s = sum(one.truth_covered_s for one in scores.drives)
+    n = len(scores.drives)
+    return [
+        _line("drives", f"{n}: of {frames} frames the truth speaks of {told}"),
+        _line("truth", f"{truth_s:.1f} s, of which the runs cover {covered_s:.1f} s"),
+    ]
+
+
+def _cues(cues: Mapping[str, CueScore]) -> list[str]:
+    shown = {name: one for name, one in cues.items() if one.scored}
+    lines = ["cue                  scored  found  precision (95 %)      recall (95 %)"]
+    for name, one in shown.items():
+        star = " " if one.is_sources_reading else "*"
+        recall = "-" if one.recall is None else _share(one.recall)
+        lines.append(
+            f"{visible(name):19}{star} {one.scored:6} {one.positives:6}  "
+            f"{_share(one.precision):20}  {recall}".rstrip()
+        )
+    if any(not one.is_sources_reading for one in shown.values()):
+        lines.append("* judged by the feature or thing that the source does not judge it by")
+    if any(math.isnan(one.precision.clusters_low) for one in shown.values() if one.positives):
+        lines.append("few approaches: intervals count frames as independent, which they are not")
+    return [*lines, *_left_out(cues)]
+
+
+def _left_out(cues: Mapping[str, CueScore]) -> list[str]:
+    """Why frames were not scored, cues with the same reasons together."""
+    same: dict[tuple[tuple[str, int], ...], list[str]] = {}
+    for name, one in cues.items():
+        reasons = one.readings[one.reading].left_out
+        if reasons:
+            same.setdefault(tuple(reasons.items()), []).append(visible(name))
+    lines = []
+    for why, names in same.items():
+        told = ", ".join(f"{count} {reason}" for reason, count in why)
+        whom = "all cues" if len(names) == len(cues) else ", ".join(names)
+        lines.append(_line("left out", f"{told}: {whom}"))
+    return lines
+
+
+def _share(one: Share) -> str:
+    if not one.of:
+        return "-"
+    low, high = _ends(one)
+    return f"{one.value:.3f} ({low:.2f} to {high:.2f})"
+
+
+def _ends(one: Share) -> tuple[float, float]:
+    """The wider interval of the two."""
+    if math.isnan(one.clusters_low):
+        return one.low, one.high
+    return min(one.low, one.clusters_low), max(one.high, one.clusters_high)
+
+
+def _approaches(one: ApproachScore) -> list[str]:
+    lines = [
+        _line("approaches", f"{one.approaches} true, the runs know {one.matched}; extra "
+              f"{one.extra} ({one.extra_detected} believed), in pieces {one.splits}"),
+        _line("detected", _distance(one.detected, one.detected_m)),
+        _line("in full", _distance(one.full, one.full_m)),
+    ]  # fmt: skip
+    if one.false_by_feature:
+        told = ", ".join(f"{name} {n}" for name, n in one.false_by_feature.items())
+        lines.append(
+            _line("false", f"absent features believed in {one.false_features.right} of "
+                           f"{one.false_features.of} approaches: {told}")
+        )  # fmt: skip
+    for what, reasons in one.failures.items():
+        for reason, count in reasons.items():
+            lines.append(_line("failed", f"{what}: {count} {reason}"))
+    if one.not_judged:
+        lines.append(_line("not judged", f"{one.not_judged} outside the truth's time"))
+    return lines
+
+
+def _distance(found: Share, distance: Mean) -> str:
+    text = f"{found.right} of {found.of}"
+    if not distance.of:
+        return text
+    text += f", {distance.value:.1f} m away on average"
+    if not math.isnan(distance.low):
+        text += f" ({distance.low:.1f} to {distance.high:.1f})"
+    return text
+
+
+def _belief(belief: Mapping[str, BeliefScore]) -> list[str]:
+    if not any(one.scored for one in belief.values()):
+        return [_line("belief", "no step that the truth could judge")]
+    lines = ["belief         scored of steps   there   Brier  of base rate  log score"]
+    for name, one in belief.items():
+        lines.append(
+            f"{visible(name):14} {one.scored:6} {one.steps:8}  {_number(one.share_there):>6}  "
+            f"{_number(one.brier.value):>6}  {_number(one.brier_of_share):>12}  "
+            f"{_number(one.log_score.value):>9}"
+        )
+    return lines
+
+
+def _range(ranges: Mapping[str, RangeScore]) -> list[str]:
+    lines = ["range to       scored  of rows    bias    rmse  mean NEES  inside 95 %"]
+    for name, one in ranges.items():
+        inside = 100.0 * one.nees.share_inside_95
+        lines.append(
+            f"{name:14} {one.scored:6} {one.rows:8} {_number(one.bias_m.value, 2):>6}m "
+            f"{_number(one.rmse_m, 2):>6}m  {_number(one.nees.mean, 2):>9}  "
+            f"{_number(inside, 0):>9} %"
+        )
+        for control, part in one.by_control.items() if len(one.by_control) > 1 else ():
+            lines.append(
+                f"  {control.replace('_', ' '):12} {part.rows:6} {'':8} "
+                f"{_number(part.bias_m, 2):>6}m {_number(part.rmse_m, 2):>6}m  "
+                f"{_number(part.nees, 2):>9}  {_number(100.0 * part.share_inside_95, 0):>9} %"
+            )
+    return lines
+
+
+def _number(value: float, digits: int = 3) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def headline(name: str, values: Mapping[str, MetricValue]) -> str:
+    """One line for one drive of many."""
+    parts = []
+    for label, path in (("detected", "approaches.detected_m"), ("in full", "approaches.full_m"),
+                        ("pose", "pose.ape.none.translation_m.rmse")):  # fmt: skip
+        value = values[path].value if path in values else math.nan
+        if not math.isnan(value):
+            parts.append(f"{label} {value:.1f} m")
+    return f"{visible(name)}: {', '.join(parts) or 'nothing detected'}"

@@ -1,0 +1,172 @@
+"""The worst frames of a run: cues found that are not there, with their pictures."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from crosscue.detectors.base import Detections, View
+from crosscue.detectors.cues.frame import SIGN_CUES, FrameCues
+from crosscue.detectors.cues.names import Cue
+from crosscue.detectors.images import Encoded, decode
+from crosscue.detectors.overlay import draw
+from crosscue.detectors.runner import FrameResult
+from crosscue.eval.pipeline.stored_images import camera_of, picture_at
+from crosscue.eval.scoring.cues import CueJudged
+from crosscue.eval.scoring.runs import RunScored
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.files.run_folder import RunFolder
+from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
+
+from .scene_figures import is_wrong
+
+MOST: Final = 6
+APART_NS: Final = 2_000_000_000
+"""Wrong frames of one cue closer than this are one mistake; its most confident frame is shown."""
+WIDTH_PX: Final = 640
+QUALITY: Final = 80
+FOUND: Final = ("t_ns", "label", "score", "x0", "y0", "x1", "y1", "picture_width_px",
+                "picture_height_px")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class WorstFrame:
+    """A cue that was found and is not there.
+
+    Attributes:
+        run: Its drive's name in the scores.
+        t_ns: Log time.
+        cue: Name.
+        count: How many were found.
+        true_count: How many there are, or None where the truth does not say.
+        distance_m: To the intersection ahead, NaN where none is.
+        confidence: Highest score of what stands behind the cue, or None where nothing scores it.
+        frames: Wrong frames of this cue around this one.
+        picture: A JPEG as base64; empty where the log or the picture is gone.
+        size_px: Its width and height.
+    """
+
+    run: str
+    t_ns: int
+    cue: str
+    count: int
+    true_count: int | None
+    distance_m: float
+    confidence: float | None
+    frames: int
+    picture: str = ""
+    size_px: tuple[int, int] = (0, 0)
+
+
+def worst_frames(scored: Sequence[RunScored], most: int = MOST) -> list[WorstFrame]:
+    """The most confident wrong cues of all runs, most confident first.
+
+    Raises:
+        RunError: A run's tables are damaged.
+    """
+    found = [wrong for one in scored for wrong in _wrong(one)]
+    found.sort(key=lambda one: (-(one.confidence or 0.0), -one.frames, one.run, one.t_ns, one.cue))
+    folders = {one.judged.coverage.drive: one.run for one in scored}
+    return [_with_picture(one, folders[one.run]) for one in found[:most]]
+
+
+def _wrong(scored: RunScored) -> list[WorstFrame]:
+    mistakes = [(cue, row) for cue in scored.judged.cues for row in _mistakes(cue)]
+    if not mistakes:
+        return []
+    vehicle = of_manifest(scored.run.manifest()["settings"])
+    times = {int(cue.t_ns[i]) for cue, rows in mistakes for i in rows}
+    scores = _scores(scored.run, times)
+    found = []
+    for cue, rows in mistakes:
+        labels = _labels(cue.cue, vehicle)
+        sure = [_confidence(scores.get(int(cue.t_ns[i]), []), labels) for i in rows]
+        at = int(rows[int(np.argmax([-1.0 if value is None else value for value in sure]))])
+        true = int(cue.true_count[at])
+        found.append(WorstFrame(
+            run=scored.judged.coverage.drive, t_ns=int(cue.t_ns[at]), cue=cue.cue,
+            count=int(cue.count[at]), true_count=None if true < 0 else true,
+            distance_m=float(cue.distance_m[at]),
+            confidence=max((value for value in sure if value is not None), default=None),
+            frames=len(rows),
+        ))  # fmt: skip
+    return found
+
+
+def _mistakes(cue: CueJudged) -> list[np.typing.NDArray[np.intp]]:
+    """Rows in which the cue is wrong, those close in time together."""
+    rows = np.flatnonzero(is_wrong(cue))
+    breaks = np.flatnonzero(np.diff(cue.t_ns[rows]) > APART_NS) + 1
+    return [part for part in np.split(rows, breaks) if len(part)]
+
+
+def _labels(cue: str, vehicle: Vehicle) -> tuple[str, ...]:
+    """Labels of the things that stand behind a cue; none for road and Mobileye."""
+    known: Mapping[str, tuple[str, ...]] = {
+        Cue.STOP_SIGN.value: vehicle.cues.stop_sign_labels,
+        Cue.TRAFFIC_LIGHT.value: vehicle.cues.traffic_light_labels,
+        **{sign.value: (label,) for label, sign in SIGN_CUES.items()},
+    }
+    if cue.startswith(("parked", "cross_traffic")):
+        return vehicle.cars.labels
+    return known.get(cue, ())
+
+
+def _confidence(rows: Sequence[Mapping[str, Any]], labels: tuple[str, ...]) -> float | None:
+    return max((row["score"] for row in rows if row["label"] in labels), default=None)
+
+
+def _scores(run: RunFolder, times: set[int]) -> dict[int, list[dict[str, Any]]]:
+    """Detections at some times."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    found: dict[int, list[dict[str, Any]]] = {}
+    if not run.file("detections.parquet").exists():
+        return found
+    wanted = pa.array(sorted(times), pa.int64())
+    for batch in run.batches("detections", list(FOUND)):
+        for row in batch.filter(pc.is_in(batch["t_ns"], wanted)).to_pylist():
+            found.setdefault(row["t_ns"], []).append(row)
+    return found
+
+
+def _with_picture(one: WorstFrame, run: RunFolder) -> WorstFrame:
+    labels = _labels(one.cue, of_manifest(run.manifest()["settings"]))
+    rows = [row for row in _scores(run, {one.t_ns}).get(one.t_ns, []) if row["label"] in labels]
+    try:
+        camera = camera_of(run)
+        if camera is None:
+            return one
+        picture = picture_at(camera, one.t_ns)
+        return one if picture is None else _drawn(picture, one, rows)
+    except CrosscueError:
+        # The page is about the run: it says that a picture has gone or cannot be read.
+        return one
+
+
+def _drawn(picture: Encoded, one: WorstFrame, rows: Sequence[Mapping[str, Any]]) -> WorstFrame:
+    """With the picture, small, and the boxes of what stands behind the cue."""
+    import cv2
+
+    pixels, whole = decode(picture, View(least_width_px=WIDTH_PX))
+    size = (WIDTH_PX, round(whole[1] * WIDTH_PX / whole[0]))
+    if pixels.shape[1] > WIDTH_PX:
+        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    size = (pixels.shape[1], pixels.shape[0])
+    boxes = np.array([[row[k] for k in ("x0", "y0", "x1", "y1")] for row in rows], np.float64)
+    found = Detections(
+        one.t_ns, size, boxes.reshape(-1, 4) * (size[0] / whole[0]),
+        np.array([row["score"] for row in rows], np.float64),
+        tuple(row["label"] for row in rows), (b"",) * len(rows),
+    )  # fmt: skip
+    cues = FrameCues({one.cue: one.count}, None)
+    canvas = draw(pixels, FrameResult(one.t_ns, size, picture, (found,)), cues)
+    ok, jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    if not ok:
+        return one
+    return replace(one, picture=base64.b64encode(jpeg.tobytes()).decode(), size_px=size)

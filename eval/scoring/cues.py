@@ -1,0 +1,432 @@
+"""Cues against truth: precision, recall, how much was scored and why not the rest.
+
+A positive is right in one of two readings, and both are given:
+
+* *object*: the thing that the cue names is truly there in this frame (a parked car facing left, a
+  stop sign, road to the left);
+* *feature*: what the cue stands for is true of the intersection ahead (a left turn, an
+  intersection); for one-way and do-not-enter signs that the way they rule out is closed.
+
+The source compares detections of signs, lights and cars with the things themselves, and what roads,
+lanes and vehicles past the intersection say with the direction of travel (chapter 3). ``READING``
+follows it; where the truth knows only the other reading, that one leads, and the result says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.datasets.truth.truth import CUES, Approach
+from crosscue.replay.columns import Floats, Int64s
+
+from .intervals import Share, share
+from .pooling import cluster_numbers, first_reasons, summed
+from .run_tables import NONE, CueRows, RunTables
+from .truth import DriveTruth, cue_at
+
+Reading = Literal["object", "feature"]
+
+
+class Claim(NamedTuple):
+    """What a cue says of the intersection ahead."""
+
+    feature: str
+    is_there: bool = True
+
+
+CLAIMS: Final[Mapping[str, Claim]] = {
+    "stop_sign": Claim("intersection"),
+    "traffic_light": Claim("intersection"),
+    "road_left": Claim("left"),
+    "road_straight": Claim("straight"),
+    "road_right": Claim("right"),
+    "cross_traffic_left": Claim("left"),
+    "cross_traffic_right": Claim("right"),
+    "parked_left": Claim("left"),
+    "parked_right": Claim("right"),
+    "lanes_past": Claim("straight"),
+    "vehicles_past": Claim("straight"),
+    "one_way_left": Claim("right", is_there=False),
+    "one_way_right": Claim("left", is_there=False),
+    "do_not_enter": Claim("straight", is_there=False),
+}
+READING: Final[Mapping[str, Reading]] = {
+    "lanes_past": "feature",
+    "vehicles_past": "feature",
+}
+"""The source's definition where it is not ``object``."""
+BINS_M: Final = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
+SEEN: Final = 0.5
+"""A thing of which less than this share can be seen does not count in ``recall_seen``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CueJudged:
+    """One cue in N frames of one drive.
+
+    Attributes:
+        drive: Name.
+        cue: Name.
+        t_ns: Shape (N,): frames in which it was looked for.
+        count: Shape (N,): how many were found.
+        approach: Shape (N,): ids of true approaches; ``NONE`` outside.
+        distance_m: Shape (N,): true range to the start of the intersection; NaN unknown.
+        is_object: Shape (N,), int8: whether the thing is there; ``NONE`` unknown.
+        is_feature: Shape (N,), int8: whether what it stands for is true; ``NONE`` unknown.
+        true_count: Shape (N,): ``NONE`` unknown.
+        visible: Shape (N,): NaN unknown.
+        frames: How many frames the run has.
+        moments_unmatched: True moments (not spans) at which the run has no frame.
+        left_out: By reading, from reason to frames that could not be scored.
+        conditions: From approach id to its tags.
+    """
+
+    drive: str
+    cue: str
+    t_ns: Int64s
+    count: Int64s
+    approach: Int64s
+    distance_m: Floats
+    is_object: NDArray[np.int8]
+    is_feature: NDArray[np.int8]
+    true_count: Int64s
+    visible: Floats
+    frames: int
+    moments_unmatched: int
+    left_out: Mapping[Reading, Mapping[str, int]]
+    conditions: Mapping[int, tuple[str, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """One cue in one reading, coverage first.
+
+    Attributes:
+        frames: In the run.
+        with_truth: Of which the truth speaks.
+        scored: Of which it speaks and in which the cue was looked for.
+        left_out: From reason to frames; with ``scored`` they sum up to ``frames``.
+        positives: Scored frames in which the cue was found.
+        precision: Of the positives, those that were right.
+        recall: Of frames with the thing, those in which it was found; only objects have one.
+        recall_seen: The same for things at least half of which can be seen.
+        by_distance: Precision and recall by true range to the intersection, such as ``10-20``.
+        by_condition: The same by condition tag of the approach.
+    """
+
+    frames: int
+    with_truth: int
+    scored: int
+    left_out: dict[str, int]
+    positives: int
+    precision: Share
+    recall: Share | None
+    recall_seen: Share | None
+    by_distance: dict[str, Part]
+    by_condition: dict[str, Part]
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Of the frames in a distance bin or with a condition tag."""
+
+    frames: int
+    precision: Share
+    recall: Share | None
+
+
+@dataclass(frozen=True, slots=True)
+class Things:
+    """Single things over all frames whose true count is known.
+
+    Attributes:
+        frames: With a true count.
+        reported: Things found.
+        true: Things there.
+        matched: In each frame the smaller of both numbers, summed: no more can be right.
+        same_count: Frames in which both numbers agree.
+    """
+
+    frames: int
+    reported: int
+    true: int
+    matched: int
+    same_count: int
+
+
+@dataclass(frozen=True, slots=True)
+class CueScore:
+    """All about one cue.
+
+    Attributes:
+        reading: Which reading leads.
+        is_sources_reading: Whether that is the source's definition.
+        precision: Of the leading reading.
+        recall: Of the object reading, or None without such truth.
+        positives: Of the leading reading.
+        scored: Of the leading reading.
+        readings: Both.
+        things: Single things.
+        moments_unmatched: True moments at which no run has a frame.
+    """
+
+    reading: Reading
+    is_sources_reading: bool
+    precision: Share
+    recall: Share | None
+    positives: int
+    scored: int
+    readings: dict[Reading, Judgement]
+    things: Things
+    moments_unmatched: int
+
+
+def judge_cues(tables: RunTables, truth: DriveTruth) -> list[CueJudged]:
+    """Lay the run's cues beside the truth; nothing for a run without cues."""
+    if tables.cues is None:
+        return []
+    rows = tables.cues
+    frames = np.unique(rows.t_ns)
+    if tables.frames_ns is not None:
+        frames = np.union1d(frames, tables.frames_ns)
+    told = {one.cue for one in truth.truth.cues}
+    others = sorted({*np.unique(rows.cue).tolist(), *told} - {*CUES})
+    return [_judge(cue, rows, frames, truth) for cue in (*CUES, *others)]
+
+
+def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth) -> CueJudged:
+    looked, count = _largest(rows, cue)
+    spans = [one for one in truth.truth.cues if one.cue == cue]
+    everywhere = cue_at(spans, frames)
+    features = _feature_at(cue, frames, truth)
+    at = np.searchsorted(frames, looked)
+    was_looked = np.zeros(len(frames), np.bool_)
+    was_looked[at] = True
+    told, crossing = truth.is_told(frames), truth.is_crossing(frames)
+    moments = np.array([one.t_ns for one in spans if one.t_ns is not None], np.int64)
+    return CueJudged(
+        drive=truth.drive,
+        cue=cue,
+        t_ns=looked,
+        count=count,
+        approach=truth.approach_at(looked),
+        distance_m=truth.start_m(looked),
+        is_object=everywhere.present[at],
+        is_feature=features[at],
+        true_count=everywhere.count[at],
+        visible=everywhere.visible[at],
+        frames=len(frames),
+        moments_unmatched=int((~np.isin(moments, frames)).sum()),
+        left_out={
+            "object": _reasons(everywhere.present != NONE, was_looked, told, crossing),
+            "feature": _reasons(features != NONE, was_looked, told, crossing),
+        },
+        conditions={one.id: one.conditions for one in truth.truth.approaches},
+    )
+
+
+def _largest(rows: CueRows, cue: str) -> tuple[Int64s, Int64s]:
+    """Times in which a cue was looked for, each once, and the largest count given for each."""
+    mine = rows.cue == cue
+    times, which = np.unique(rows.t_ns[mine], return_inverse=True)
+    count = np.zeros(len(times), np.int64)
+    np.maximum.at(count, which, rows.count[mine])
+    return times, count
+
+
+def _feature_at(cue: str, t_ns: Int64s, truth: DriveTruth) -> NDArray[np.int8]:
+    """Whether what the cue stands for is true, at each time; ``NONE`` unknown."""
+    found = np.full(len(t_ns), NONE, np.int8)
+    claim = CLAIMS.get(cue)
+    if claim is None or not truth.truth.approaches:
+        return found
+    # Where the truth speaks and no intersection is ahead, a cue of one stands for nothing.
+    found[truth.is_told(t_ns)] = 0
+    found[truth.is_crossing(t_ns)] = NONE
+    at = truth.approach_at(t_ns)
+    for one in truth.truth.approaches:
+        found[at == one.id] = int(has_feature(one, claim.feature) == claim.is_there)
+    return found
+
+
+def has_feature(approach: Approach, feature: str) -> bool | None:
+    """Whether an approach's intersection has a feature; None for one that truth does not know."""
+    if feature == "intersection":
+        return True
+    there = {"left": approach.features.left, "right": approach.features.right,
+             "straight": approach.features.straight}  # fmt: skip
+    return there.get(feature)
+
+
+def _reasons(
+    has_truth: NDArray[np.bool_], was_looked: NDArray[np.bool_],
+    is_told: NDArray[np.bool_], is_crossing: NDArray[np.bool_],
+) -> dict[str, int]:  # fmt: skip
+    """Why frames are not scored; each has one reason, the first that holds."""
+    reasons = {
+        "outside the truth's time": ~is_told & ~has_truth,
+        "in the intersection": is_crossing & ~has_truth,
+        "no truth at this time": ~has_truth,
+        "not looked for": ~was_looked,
+    }
+    return first_reasons(np.ones(len(has_truth), np.bool_), reasons)[1]
+
+
+@dataclass(slots=True)
+class _Pooled:
+    """One cue's rows of all drives, with a number for each approach of each drive."""
+
+    rows: Sequence[CueJudged]
+    cluster: Int64s = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.cluster = cluster_numbers(
+            [one.drive for one in self.rows], [one.approach for one in self.rows]
+        )
+
+    def tag_masks(self) -> dict[str, NDArray[np.bool_]]:
+        """Which rows belong to approaches with each tag; ``no tag`` for the others."""
+        tags: dict[int, tuple[str, ...]] = {}
+        first = 0
+        for one in self.rows:
+            cluster = self.cluster[first : first + len(one.approach)]
+            first += len(one.approach)
+            for place in np.unique(cluster, return_index=True)[1].tolist():
+                approach = int(one.approach[place])
+                tags[int(cluster[place])] = one.conditions.get(approach, ())
+        by_cluster = [tags[number] for number in range(len(tags))]
+        names = sorted({name for one in by_cluster for name in one})
+        has = {name: [name in one for one in by_cluster] for name in names}
+        has["no tag"] = [not one for one in by_cluster]
+        return {name: np.array(holds, np.bool_)[self.cluster] for name, holds in has.items()}
+
+    def ints(self, name: str) -> Int64s:
+        return np.concatenate([getattr(one, name) for one in self.rows]).astype(np.int64)
+
+    def floats(self, name: str) -> Floats:
+        return np.concatenate([getattr(one, name) for one in self.rows]).astype(np.float64)
+
+
+def score_cues(
+    judged: Sequence[CueJudged], bins_m: Sequence[float] = BINS_M, seed: int = 0
+) -> dict[str, CueScore]:
+    """Scores by cue, over all drives together.
+
+    Args:
+        judged: From ``judge_cues``, of any number of drives.
+        bins_m: Borders of distance bins.
+        seed: Of the resampling for intervals.
+    """
+    by_cue: dict[str, list[CueJudged]] = {}
+    for one in judged:
+        by_cue.setdefault(one.cue, []).append(one)
+    return {cue: _score(cue, rows, bins_m, seed) for cue, rows in by_cue.items()}
+
+
+def _score(
+    cue: str, rows: Sequence[CueJudged], bins_m: Sequence[float], seed: int
+) -> CueScore:  # fmt: skip
+    pooled = _Pooled(rows)
+    readings: dict[Reading, Judgement] = {
+        reading: _judgement(pooled, reading, bins_m, seed) for reading in ("object", "feature")
+    }
+    wanted = READING.get(cue, "object")
+    other: Reading = "feature" if wanted == "object" else "object"
+    leading = wanted if readings[wanted].scored or not readings[other].scored else other
+    return CueScore(
+        reading=leading,
+        is_sources_reading=leading == wanted,
+        precision=readings[leading].precision,
+        recall=readings["object"].recall,
+        positives=readings[leading].positives,
+        scored=readings[leading].scored,
+        readings=readings,
+        things=_things(pooled),
+        moments_unmatched=sum(one.moments_unmatched for one in rows),
+    )
+
+
+def _judgement(
+    pooled: _Pooled, reading: Reading, bins_m: Sequence[float], seed: int
+) -> Judgement:  # fmt: skip
+    truth = pooled.ints("is_object" if reading == "object" else "is_feature")
+    left_out = summed(one.left_out[reading] for one in pooled.rows)
+    frames = sum(one.frames for one in pooled.rows)
+    known = truth != NONE
+    cut = _Cut(truth, pooled.ints("count") > 0, pooled.cluster, reading == "object", seed)
+    visible = pooled.floats("visible")
+    # A thing whose visibility nobody noted counts as seen.
+    seen = known & ((truth == 0) | np.isnan(visible) | (visible >= SEEN))
+    return Judgement(
+        frames=frames,
+        with_truth=frames - sum(n for why, n in left_out.items() if why != "not looked for"),
+        scored=int(known.sum()),
+        left_out=left_out,
+        positives=int((known & cut.is_found).sum()),
+        precision=cut.precision(known),
+        recall=cut.recall(known),
+        recall_seen=cut.recall(seen),
+        by_distance={
+            name: cut.part(known & mask)
+            for name, mask in distance_bins(pooled.floats("distance_m"), bins_m).items()
+            if (known & mask).any()
+        },
+        by_condition={
+            tag: cut.part(known & mask)
+            for tag, mask in pooled.tag_masks().items()
+            if (known & mask).any()
+        },
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cut:
+    """Shares over any subset of frames."""
+
+    truth: Int64s
+    is_found: NDArray[np.bool_]
+    cluster: Int64s
+    has_recall: bool
+    seed: int
+
+    def precision(self, rows: NDArray[np.bool_]) -> Share:
+        rows = rows & self.is_found
+        return share(self.truth[rows] == 1, self.cluster[rows], self.seed)
+
+    def recall(self, rows: NDArray[np.bool_]) -> Share | None:
+        if not self.has_recall:
+            return None
+        rows = rows & (self.truth == 1)
+        return share(self.is_found[rows], self.cluster[rows], self.seed)
+
+    def part(self, rows: NDArray[np.bool_]) -> Part:
+        return Part(int(rows.sum()), self.precision(rows), self.recall(rows))
+
+
+def distance_bins(distance_m: Floats, borders_m: Sequence[float]) -> dict[str, NDArray[np.bool_]]:
+    """Which rows lie in which half-open bin; every row lies in exactly one."""
+    found = {f"under {borders_m[0]:g}": distance_m < borders_m[0]}
+    for low, high in pairwise(borders_m):
+        found[f"{low:g}-{high:g}"] = (distance_m >= low) & (distance_m < high)
+    found[f"over {borders_m[-1]:g}"] = distance_m >= borders_m[-1]
+    found["unknown"] = np.isnan(distance_m)
+    return found
+
+
+def _things(pooled: _Pooled) -> Things:
+    true, found = pooled.ints("true_count"), pooled.ints("count")
+    known = true != NONE
+    true, found = true[known], found[known]
+    return Things(
+        frames=int(known.sum()),
+        reported=int(found.sum()),
+        true=int(true.sum()),
+        matched=int(np.minimum(true, found).sum()),
+        same_count=int((true == found).sum()),
+    )

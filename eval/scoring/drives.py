@@ -1,0 +1,228 @@
+"""All scores of one drive or many, from tables: coverage, cues, approaches, belief, range.
+
+``judge`` lays one drive beside its truth; ``score`` pools any number of judged drives. Notebooks,
+the command line and CI use these two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from crosscue.replay.errors import SchemaError
+
+from . import approaches as score_approaches
+from . import belief as score_belief
+from . import intervals
+from . import truth as score_truth
+from .approaches import ApproachesJudged, ApproachScore, judge_approaches
+from .belief import BeliefJudged, BeliefScore, judge_belief
+from .cues import BINS_M, CueJudged, CueScore, judge_cues, score_cues
+from .ranges import RangeJudged, RangeScore, judge_range, score_range
+from .run_tables import RunTables
+from .truth import DriveTruth
+
+FORMAT: Final = 1
+SECTIONS: Final = ("cues", "approaches", "belief", "range")
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreSettings:
+    """What may be chosen.
+
+    Attributes:
+        threshold: A feature is detected above this probability.
+        bins_m: Borders of bins of true range.
+        seed: Of the resampling for intervals.
+    """
+
+    threshold: float = score_approaches.THRESHOLD
+    bins_m: tuple[float, ...] = BINS_M
+    seed: int = intervals.SEED
+
+    def __post_init__(self) -> None:
+        """Refuse what means nothing.
+
+        Raises:
+            ValueError: Naming what was wanted.
+        """
+        if not 0.0 < self.threshold < 1.0:
+            raise ValueError(f"threshold: want in (0, 1), got {self.threshold}")
+        if len(self.bins_m) < 2 or (np.diff(self.bins_m) <= 0.0).any():
+            raise ValueError(f"bins_m: want two or more growing borders, got {self.bins_m}")
+
+
+DEFAULTS: Final = ScoreSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class DriveCoverage:
+    """How much of a drive could be scored.
+
+    Attributes:
+        drive: Name.
+        frames: In the run.
+        frames_told: Of which the truth speaks.
+        truth_s: Length of the truth.
+        truth_covered_s: Of which the run tells something.
+        not_scored: Sections that were not scored at all, and why.
+    """
+
+    drive: str
+    frames: int
+    frames_told: int
+    truth_s: float
+    truth_covered_s: float
+    not_scored: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class DriveJudged:
+    """One drive laid beside its truth."""
+
+    coverage: DriveCoverage
+    cues: tuple[CueJudged, ...]
+    approaches: ApproachesJudged | None
+    belief: tuple[BeliefJudged, ...]
+    ranges: tuple[RangeJudged, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """All drives together.
+
+    Attributes:
+        settings: As used.
+        drives: Coverage of each.
+        cues: By cue.
+        approaches: None where no drive has any.
+        belief: By feature.
+        range: By reference.
+    """
+
+    settings: ScoreSettings
+    drives: tuple[DriveCoverage, ...]
+    cues: dict[str, CueScore]
+    approaches: ApproachScore | None
+    belief: dict[str, BeliefScore]
+    range: dict[str, RangeScore]
+
+    def not_scored(self) -> dict[str, str]:
+        """Sections that no drive has, and why."""
+        return {
+            section: self.drives[0].not_scored[section]
+            for section in SECTIONS
+            if all(section in one.not_scored for one in self.drives)
+        }
+
+
+def judge(tables: RunTables, truth: DriveTruth, settings: ScoreSettings = DEFAULTS) -> DriveJudged:
+    """Lay one drive beside its truth.
+
+    Raises:
+        SchemaError: They share no moment: the truth belongs to another log or clock.
+    """
+    covered_s = _check_fits(tables, truth)
+    cues = tuple(judge_cues(tables, truth))
+    approaches = judge_approaches(tables, truth, settings.threshold)
+    belief, ranges = tuple(judge_belief(tables, truth)), tuple(judge_range(tables, truth))
+    frames = _frames(tables)
+    coverage = DriveCoverage(
+        drive=truth.drive,
+        frames=len(frames),
+        frames_told=int(truth.is_told(frames).sum()),
+        truth_s=(truth.truth.end_ns - truth.truth.start_ns) * 1e-9,
+        truth_covered_s=covered_s,
+        not_scored=_not_scored(tables, truth),
+    )
+    return DriveJudged(coverage, cues, approaches, belief, ranges)
+
+
+def _frames(tables: RunTables) -> np.typing.NDArray[np.int64]:
+    parts = [np.empty(0, np.int64)]
+    parts += [] if tables.frames_ns is None else [tables.frames_ns]
+    parts += [] if tables.cues is None else [tables.cues.t_ns]
+    return np.unique(np.concatenate(parts))
+
+
+def _check_fits(tables: RunTables, truth: DriveTruth) -> float:
+    """Seconds of the truth's time that the run covers."""
+    span, told = tables.span_ns(), truth.truth
+    if span is None:
+        return 0.0
+    if span[1] < told.start_ns or span[0] >= told.end_ns:
+        raise SchemaError(
+            f"{truth.drive}: its truth speaks of {told.start_ns} to {told.end_ns} ns, the run of "
+            f"{span[0]} to {span[1]} ns; it belongs to another log or clock: give the right one"
+        )
+    return (min(span[1], told.end_ns) - max(span[0], told.start_ns)) * 1e-9
+
+
+def _not_scored(tables: RunTables, truth: DriveTruth) -> dict[str, str]:
+    told = truth.truth
+    found: dict[str, str] = {}
+    if tables.cues is None:
+        found["cues"] = "the run has no cues"
+    elif not told.cues and not told.approaches:
+        found["cues"] = "the truth tells neither cues nor approaches"
+    for section, table in (("approaches", tables.belief), ("belief", tables.belief),
+                           ("range", tables.ranges)):  # fmt: skip
+        if table is None:
+            what = "range" if section == "range" else "belief"
+            found[section] = f"the run has no {what}"
+        elif not told.approaches:
+            found[section] = "the truth tells no approaches"
+    if "range" not in found and truth.ranges is None:
+        found["range"] = "the truth tells neither ranges nor a track"
+    return found
+
+
+def score(drives: Sequence[DriveJudged], settings: ScoreSettings = DEFAULTS) -> Scores:
+    """Score any number of judged drives together.
+
+    Raises:
+        ValueError: No drive, or two of one name.
+    """
+    names = [one.coverage.drive for one in drives]
+    if not names or len(set(names)) != len(names):
+        raise ValueError(f"drives: want one or more with different names, got {names}")
+    bins_m, seed = settings.bins_m, settings.seed
+    return Scores(
+        settings=settings,
+        drives=tuple(one.coverage for one in drives),
+        cues=score_cues([cue for one in drives for cue in one.cues], bins_m, seed),
+        approaches=score_approaches.score_approaches(
+            [one.approaches for one in drives if one.approaches is not None], seed
+        ),
+        belief=score_belief.score_belief([part for one in drives for part in one.belief], seed),
+        range=score_range([part for one in drives for part in one.ranges], bins_m, seed),
+    )
+
+
+def as_metrics(scores: Scores) -> dict[str, Any]:
+    """What ``metrics.json`` holds of these scores, as plain values; coverage first."""
+    tree = asdict(scores)
+    return {
+        "format": FORMAT,
+        "coverage": {
+            "drives": len(scores.drives),
+            "frames": sum(one.frames for one in scores.drives),
+            "frames_told": sum(one.frames_told for one in scores.drives),
+            "truth_s": sum(one.truth_s for one in scores.drives),
+            "truth_covered_s": sum(one.truth_covered_s for one in scores.drives),
+            "not_scored": scores.not_scored(),
+            "by_drive": tree["drives"],
+        },
+        "settings": tree["settings"] | {
+            "confidence": intervals.CONFIDENCE, "resampling_rounds": intervals.ROUNDS,
+            "log_score_clip": score_belief.CLIP,
+            "crossing_s": score_truth.CROSSING_NS * 1e-9,
+        },
+        "cues": tree["cues"],
+        "approaches": tree["approaches"],
+        "belief": tree["belief"],
+        "range": tree["range"],
+    }  # fmt: skip

@@ -1,0 +1,159 @@
+"""Gates: bounds on metrics, for CI.
+
+A gate file is TOML::
+
+    version = 1
+
+    [[gate]]
+    metric = "cues.stop_sign.precision"
+    min = 0.95
+    use = "low"      # the interval's lower end must reach it; default: "value"
+    least = 100      # on fewer rows than this the gate fails; default: 1
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import toml_tree
+from crosscue.replay.limits import MIB
+from crosscue.replay.vehicle.validation_errors import explain
+
+from .metric_values import MetricValue
+
+MOST_BYTES: Final = 1 * MIB
+Bound = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Gate(BaseModel):
+    """One bound on one metric."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    metric: Annotated[str, Field(min_length=1)]
+    min: Bound | None = None
+    max: Bound | None = None
+    use: Literal["value", "low", "high"] = "value"
+    """The metric itself, or an end of its interval (the wider one where there are two)."""
+    least: Annotated[int, Field(ge=1)] = 1
+    """Rows that the metric must stand on, where it says how many."""
+
+    @model_validator(mode="after")
+    def _has_bounds(self) -> Self:
+        if self.min is None and self.max is None:
+            raise ValueError("want min, max or both")
+        if self.min is not None and self.max is not None and self.min > self.max:
+            raise ValueError(f"min {self.min:g} is above max {self.max:g}")
+        return self
+
+    def told(self) -> str:
+        """Metric and bounds for a person."""
+        end = "" if self.use == "value" else f" ({self.use} end)"
+        low = "" if self.min is None else f" >= {self.min:g}"
+        high = "" if self.max is None else f" <= {self.max:g}"
+        return f"{self.metric}{end}{low}{high}"
+
+
+class GateFile(BaseModel):
+    """A whole gate file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    version: Literal[1]
+    gate: Annotated[tuple[Gate, ...], Field(min_length=1)]
+
+
+@dataclass(frozen=True, slots=True)
+class GateResult:
+    """What became of a gate.
+
+    Attributes:
+        gate: The gate.
+        value: What was compared; NaN where nothing was scored.
+        failure: Empty when it passed.
+    """
+
+    gate: Gate
+    value: float
+    failure: str
+
+
+def load_gates(path: Path) -> tuple[Gate, ...]:
+    """Read a gate file.
+
+    Raises:
+        UsageError: Not there, not TOML, or not what version 1 says.
+    """
+    try:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
+            raise UsageError(f"{path}: over {MOST_BYTES // MIB} MiB; this is no gate file")
+        text = content.decode("utf-8")
+        tree = toml_tree(text)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path}: not readable as TOML ({error}); mend it") from None
+    try:
+        return GateFile.model_validate(tree).gate
+    except ValidationError as error:
+        raise UsageError(explain(error, text, str(path), GateFile)) from None
+
+
+def check_gates(
+    gates: Sequence[Gate],
+    values: Mapping[str, MetricValue],
+    not_scored: Mapping[str, str],
+) -> tuple[GateResult, ...]:
+    """Hold gates against metrics.
+
+    Args:
+        gates: In order.
+        values: From ``metric_values``.
+        not_scored: Sections without any score, and why: gates on them fail.
+
+    Raises:
+        UsageError: A metric that there is not; the message names close ones.
+    """
+    return tuple(_check(gate, values, not_scored) for gate in gates)
+
+
+def _check(
+    gate: Gate, values: Mapping[str, MetricValue], not_scored: Mapping[str, str]
+) -> GateResult:
+    found = values.get(gate.metric)
+    section = gate.metric.partition(".")[0]
+    if section in not_scored and (found is None or math.isnan(found.value)):
+        return GateResult(gate, math.nan, f"not scored: {not_scored[section]}")
+    if found is None:
+        raise UsageError(f"gate {gate.metric!r}: no such metric; {_close(gate.metric, values)}")
+    value = {"value": found.value, "low": found.low, "high": found.high}[gate.use]
+    return GateResult(gate, value, _failure(gate, found, value))
+
+
+def _close(name: str, values: Mapping[str, MetricValue]) -> str:
+    close = difflib.get_close_matches(name, values, n=3, cutoff=0.6)
+    if close:
+        return f"close ones: {', '.join(close)}"
+    return f"there are {len(values)}, see score --json; such as {', '.join(sorted(values)[:2])}"
+
+
+def _failure(gate: Gate, found: MetricValue, value: float) -> str:
+    if math.isnan(found.value):
+        return "not scored: nothing to measure it by"
+    if math.isnan(value):
+        return f"its interval has no {gate.use} end: too few drives"
+    if found.of is not None and found.of < gate.least:
+        return f"stands on {found.of} rows, want {gate.least} or more"
+    if gate.min is not None and value < gate.min:
+        return f"{value:.6g} is below {gate.min:g}"
+    if gate.max is not None and value > gate.max:
+        return f"{value:.6g} is above {gate.max:g}"
+    return ""

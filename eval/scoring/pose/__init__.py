@@ -1,0 +1,1 @@
+"""Pose errors, consistency and the batch smoother."""

@@ -1,0 +1,410 @@
+"""How far an estimated trajectory is from the true one, and whether it knew.
+
+Absolute (APE) and relative (RPE) pose errors as evo defines them (M. Grupp, *evo*; Sturm et al.,
+"A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012), and the normalised estimation
+error squared (NEES; Bar-Shalom, Li, Kirubarajan, section 5.4).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.datasets.truth.tum import Trajectory, heading_rad
+from crosscue.eval.scoring.consistency import mean_band, quantile
+from crosscue.localization.angles import wrap_all
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import UsageError
+
+from .quaternions import about_z, angle_rad, between, inverse, product, rotate
+
+Alignment: TypeAlias = Literal["none", "origin", "yaw", "se3"]
+Pairing: TypeAlias = Literal["interpolated", "nearest"]
+Indices: TypeAlias = NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """How many true poses were scored, and why the others were not.
+
+    Attributes:
+        truth_poses: All.
+        scored: With an estimate.
+        before_estimate: Earlier than the first estimate.
+        after_estimate: Later than the last one.
+        in_gap: Within the estimate's time, but none near enough.
+    """
+
+    truth_poses: int
+    scored: int
+    before_estimate: int
+    after_estimate: int
+    in_gap: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Paired:
+    """N true poses and the estimates for the same times.
+
+    Attributes:
+        truth: N poses.
+        estimate: N poses; their times are the true ones.
+        cov_xyh: Shape (N, 6): the estimate's covariance of x, y, heading: xx, xy, xh, yy, yh, hh;
+            or None.
+        coverage: What was left out.
+    """
+
+    truth: Trajectory
+    estimate: Trajectory
+    cov_xyh: Floats | None
+    coverage: Coverage
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """Of N errors, under evo's names; all NaN for none."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+    sse: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseErrors:
+    """N errors.
+
+    Attributes:
+        t_ns: Shape (N,): of the pose, or of the later one of a pair.
+        translation_m: Shape (N,).
+        rotation_rad: Shape (N,), in [0, pi].
+    """
+
+    t_ns: NDArray[np.int64]
+    translation_m: Floats
+    rotation_rad: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class NeesSummary:
+    """Are errors as large as claimed?
+
+    Attributes:
+        dimensions: Of the error; also what the mean should be.
+        rows: With a covariance that can be inverted.
+        rows_singular: Without; left out.
+        mean: NEES on average.
+        band_low: The mean lies above this with 97.5 %, ...
+        band_high: ... and below this with 97.5 %, if the claims are right.
+        share_inside_95: Of rows inside their own 95 % region; should be 0.95.
+    """
+
+    dimensions: int
+    rows: int
+    rows_singular: int
+    mean: float
+    band_low: float
+    band_high: float
+    share_inside_95: float
+
+
+class RpeDelta(NamedTuple):
+    """Over what a relative error is taken.
+
+    Attributes:
+        size: Frames (a whole number) or metres of the path.
+        unit: Which.
+        all_pairs: Every pair of that distance, not only one after the other.
+        tolerance: In metres with ``all_pairs``: how far off a pair may be, as a share of ``size``.
+    """
+
+    size: float
+    unit: Literal["frames", "metres"]
+    all_pairs: bool = False
+    tolerance: float = 0.1
+
+
+def pair(
+    truth: Trajectory,
+    estimate: Trajectory,
+    max_difference_ns: int,
+    cov_xyh: Floats | None = None,
+    how: Pairing = "interpolated",
+) -> Paired:
+    """For each true pose the estimate at its time.
+
+    Args:
+        truth: True poses.
+        estimate: Estimated poses.
+        max_difference_ns: A true pose is scored if an estimate is at least this near in time.
+        cov_xyh: Shape (M, 6): the estimate's covariance; comes along.
+        how: Interpolate between the estimates around, or take the nearest one.
+
+    Raises:
+        ValueError: ``cov_xyh`` does not fit the estimate.
+        UsageError: No true pose has an estimate.
+    """
+    if cov_xyh is not None and cov_xyh.shape != (len(estimate), 6):
+        raise ValueError(f"cov_xyh: want ({len(estimate)}, 6), got {cov_xyh.shape}")
+    if len(truth) == 0 or len(estimate) == 0:
+        raise UsageError(f"{len(truth)} true and {len(estimate)} estimated poses: nothing to score")
+    after = np.clip(np.searchsorted(estimate.t_ns, truth.t_ns), 0, len(estimate) - 1)
+    before = np.maximum(after - (estimate.t_ns[after] > truth.t_ns), 0)
+    to_before = np.abs(truth.t_ns - estimate.t_ns[before])
+    to_after = np.abs(estimate.t_ns[after] - truth.t_ns)
+    near = np.minimum(to_before, to_after) <= max_difference_ns
+    early, late = truth.t_ns < estimate.t_ns[0], truth.t_ns > estimate.t_ns[-1]
+    if how == "interpolated":
+        near &= ~early & ~late
+    coverage = Coverage(
+        len(truth),
+        int(near.sum()),
+        int((early & ~near).sum()),
+        int((late & ~near).sum()),
+        int((~near & ~early & ~late).sum()),
+    )
+    if not near.any():
+        raise UsageError(f"no true pose has an estimate within {max_difference_ns} ns: {coverage}")
+    if how == "nearest":
+        before = after = np.where(to_before <= to_after, before, after)
+    at = _taken(truth, near)
+    found, cov = _between(estimate, before[near], after[near], at.t_ns, cov_xyh)
+    return Paired(at, found, cov, coverage)
+
+
+def align(truth: Trajectory, estimate: Trajectory, how: Alignment) -> Trajectory:
+    """The estimate moved as a whole onto the truth, without scaling.
+
+    Args:
+        truth: N poses.
+        estimate: N poses at the same times.
+        how: ``origin``: the first poses meet. ``yaw``: turned about the vertical and shifted, by
+            least squares of the positions. ``se3``: turned any way (Umeyama's solution, by Horn's
+            quaternions, JOSA A 4, 1987).
+
+    Raises:
+        UsageError: The positions do not fix the rotation.
+    """
+    if how == "none":
+        return estimate
+    if how == "origin":
+        turn = product(truth.quat_wxyz[0], inverse(estimate.quat_wxyz[0]))
+        return _moved(estimate, turn, estimate.xyz_m[0], truth.xyz_m[0])
+    center, to = estimate.xyz_m.mean(axis=0), truth.xyz_m.mean(axis=0)
+    products = (estimate.xyz_m - center).T @ (truth.xyz_m - to)
+    turn = _yaw_turn(products) if how == "yaw" else _free_turn(products)
+    return _moved(estimate, turn, center, to)
+
+
+def ape(truth: Trajectory, estimate: Trajectory) -> PoseErrors:
+    """Error of each pose: evo's translation part and rotation angle."""
+    turn = product(inverse(estimate.quat_wxyz), truth.quat_wxyz)
+    distance = np.linalg.norm(estimate.xyz_m - truth.xyz_m, axis=1)
+    return PoseErrors(truth.t_ns, distance, angle_rad(turn))
+
+
+def rpe(truth: Trajectory, estimate: Trajectory, delta: RpeDelta) -> PoseErrors:
+    """Error of the motion between poses a given way apart: evo's RPE.
+
+    Pairs are chosen along the estimate, as evo does.
+
+    Raises:
+        UsageError: No two poses are that far apart.
+    """
+    first, second = rpe_pairs(estimate.xyz_m, delta)
+    if len(first) == 0:
+        raise UsageError(
+            f"no two of {len(estimate)} poses are {delta.size:g} {delta.unit} apart; take less"
+        )
+    true_step, true_turn = _steps(truth, first, second)
+    step, turn = _steps(estimate, first, second)
+    apart = np.linalg.norm(step - true_step, axis=1)
+    return PoseErrors(truth.t_ns[second], apart, angle_rad(product(inverse(true_turn), turn)))
+
+
+def rpe_pairs(xyz_m: Floats, delta: RpeDelta) -> tuple[Indices, Indices]:
+    """Indices of the earlier and the later pose of each pair.
+
+    Raises:
+        ValueError: A size that is not positive, or a broken number of frames.
+    """
+    if not (math.isfinite(delta.size) and delta.size > 0.0):
+        raise ValueError(f"size: want > 0, got {delta.size}")
+    if delta.unit == "metres":
+        return _metre_pairs(xyz_m, delta)
+    frames = int(delta.size)
+    if frames != delta.size:
+        raise ValueError(f"size: want a whole number of frames, got {delta.size}")
+    first = np.arange(0, max(len(xyz_m) - frames, 0), 1 if delta.all_pairs else frames)
+    return first, first + frames
+
+
+def statistics(errors: Floats) -> Statistics:
+    """Root mean square, mean, median, population s.d., extremes and sum of squares."""
+    if len(errors) == 0:
+        return Statistics(*[math.nan] * 7)
+    squares = errors**2
+    return Statistics(
+        rmse=math.sqrt(squares.mean()),
+        mean=float(errors.mean()),
+        median=float(np.median(errors)),
+        std=float(errors.std()),
+        min=float(errors.min()),
+        max=float(errors.max()),
+        sse=float(squares.sum()),
+    )
+
+
+def nees(paired: Paired, dimensions: Literal[2, 3]) -> Floats:
+    """Squared error of (x, y) or (x, y, heading) in units of the claimed covariance.
+
+    Returns:
+        Shape (N,); NaN where the covariance cannot be inverted.
+
+    Raises:
+        ValueError: The estimate has no covariance.
+    """
+    if paired.cov_xyh is None:
+        raise ValueError("cov_xyh: wanted for NEES, got None")
+    turn = wrap_all(heading_rad(paired.estimate) - heading_rad(paired.truth))
+    error = np.column_stack([(paired.estimate.xyz_m - paired.truth.xyz_m)[:, :2], turn])
+    upper = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+    cov = paired.cov_xyh[:, upper][:, :dimensions, :dimensions]
+    error = error[:, :dimensions]
+    sd = np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0.0))
+    claimed = np.asarray(np.isfinite(cov).all(axis=(1, 2)) & (sd > 0.0).all(axis=1))
+    sd[~claimed] = 1.0
+    correlation = np.where(claimed[:, None, None], cov, np.eye(dimensions))
+    correlation = correlation / (sd[:, :, None] * sd[:, None, :])
+    claimed &= np.linalg.eigvalsh(correlation)[:, 0] > 1e-12
+    correlation[~claimed] = np.eye(dimensions)
+    scaled = error / sd
+    weighed = np.linalg.solve(correlation, scaled[:, :, None])[:, :, 0]
+    return np.where(claimed, np.sum(scaled * weighed, axis=1), np.nan)
+
+
+def summarise_nees(values: Floats, dimensions: int, independent: int = 1) -> NeesSummary:
+    """Mean NEES with its 95 % band.
+
+    Args:
+        values: Shape (N,); NaN rows are left out.
+        dimensions: Of the error.
+        independent: As how many independent errors the rows count. Rows of one drive hang together
+            and count as one; give the number of drives for rows from many.
+    """
+    kept = values[np.isfinite(values)]
+    low, high = mean_band(dimensions, independent)
+    limit = quantile(0.95, dimensions)
+    some = len(kept) > 0
+    return NeesSummary(
+        dimensions=dimensions,
+        rows=len(kept),
+        rows_singular=len(values) - len(kept),
+        mean=float(kept.mean()) if some else math.nan,
+        band_low=low,
+        band_high=high,
+        share_inside_95=float((kept <= limit).mean()) if some else math.nan,
+    )
+
+
+def _taken(trajectory: Trajectory, index: Indices | NDArray[np.bool_]) -> Trajectory:
+    return Trajectory(trajectory.t_ns[index], trajectory.xyz_m[index], trajectory.quat_wxyz[index])
+
+
+def _between(
+    estimate: Trajectory,
+    before: Indices,
+    after: Indices,
+    t_ns: NDArray[np.int64],
+    cov_xyh: Floats | None,
+) -> tuple[Trajectory, Floats | None]:
+    span_ns = np.maximum(estimate.t_ns[after] - estimate.t_ns[before], 1)
+    share = np.where(after > before, (t_ns - estimate.t_ns[before]) / span_ns, 0.0)
+
+    def mixed(columns: Floats) -> Floats:
+        return columns[before] + share[:, None] * (columns[after] - columns[before])
+
+    quat = between(estimate.quat_wxyz[before], estimate.quat_wxyz[after], share)
+    found = Trajectory(t_ns, mixed(estimate.xyz_m), quat)
+    return found, None if cov_xyh is None else mixed(cov_xyh)
+
+
+def _moved(estimate: Trajectory, turn: Floats, center: Floats, to: Floats) -> Trajectory:
+    """Turned about ``center``, which goes to ``to``."""
+    xyz = rotate(turn, estimate.xyz_m - center) + to
+    return Trajectory(estimate.t_ns, xyz, product(turn, estimate.quat_wxyz))
+
+
+def _yaw_turn(products: Floats) -> Floats:
+    along = products[0, 0] + products[1, 1]
+    across = products[0, 1] - products[1, 0]
+    if math.hypot(along, across) <= 1e-12 * max(float(np.abs(products).max()), 1e-300):
+        raise UsageError("the positions do not fix the yaw (no motion?); align by origin or none")
+    return about_z(math.atan2(across, along))
+
+
+def _free_turn(products: Floats) -> Floats:
+    """Horn's quaternion: the eigenvector of the largest eigenvalue."""
+    cross = np.array(
+        [
+            products[1, 2] - products[2, 1],
+            products[2, 0] - products[0, 2],
+            products[0, 1] - products[1, 0],
+        ]
+    )
+    trace = np.trace(products)
+    form = np.empty((4, 4))
+    form[0, 0] = trace
+    form[0, 1:] = form[1:, 0] = cross
+    form[1:, 1:] = products + products.T - trace * np.eye(3)
+    values, vectors = np.linalg.eigh(form)
+    if values[3] - values[2] <= 1e-12 * max(values[3], 1e-300):
+        raise UsageError(
+            "the positions do not fix the rotation (a straight drive?); align by yaw or origin"
+        )
+    return np.asarray(vectors[:, 3])
+
+
+def _steps(trajectory: Trajectory, first: Indices, second: Indices) -> tuple[Floats, Floats]:
+    """Each later pose as seen from the earlier one."""
+    back = inverse(trajectory.quat_wxyz[first])
+    step = rotate(back, trajectory.xyz_m[second] - trajectory.xyz_m[first])
+    return step, product(back, trajectory.quat_wxyz[second])
+
+
+def _metre_pairs(xyz_m: Floats, delta: RpeDelta) -> tuple[Indices, Indices]:
+    steps = np.linalg.norm(np.diff(xyz_m, axis=0), axis=1)
+    if not delta.all_pairs:
+        stops, gone = [0], 0.0
+        for i, step in enumerate(steps.tolist(), start=1):
+            gone += step
+            if gone >= delta.size:
+                stops.append(i)
+                gone = 0.0
+        ends = np.array(stops, np.intp)
+        return ends[:-1], ends[1:]
+    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    first = np.arange(max(len(xyz_m) - 1, 0))
+    return _nearest_pairs(travelled, first, delta.size, delta.size * delta.tolerance)
+
+
+def _nearest_pairs(
+    travelled: Floats, first: Indices, size_m: float, tolerance_m: float
+) -> tuple[Indices, Indices]:
+    """For each pose the later one whose way from it is nearest to ``size_m``."""
+    wanted = travelled[first] + size_m
+    above = np.clip(np.searchsorted(travelled, wanted), first + 1, len(travelled) - 1)
+    below = np.searchsorted(travelled, travelled[above - 1])
+    below = np.maximum(below, first + 1)
+    off_above = np.abs(travelled[above] - travelled[first] - size_m)
+    off_below = np.abs(travelled[below] - travelled[first] - size_m)
+    second = np.where(off_below <= off_above, below, above)
+    keep = np.minimum(off_below, off_above) <= tolerance_m
+    return first[keep], second[keep]

@@ -1,0 +1,307 @@
+"""A run's pose against truth: errors as evo defines them, consistency, figures.
+
+Both tracks are laid into the plane (z, roll and pitch are dropped: the filter has none) and
+compared at the point the truth speaks of. They are written out as TUM files, so that evo gives the
+same numbers from them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.datasets.truth import truth as truth_file
+from crosscue.datasets.truth.truth import Truth
+from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
+from crosscue.eval.pipeline.log_time import pose_in_log_time
+from crosscue.eval.recording import TruthTrack
+from crosscue.eval.report.pose_figures import ScoredPoses, draw_all
+from crosscue.localization.angles import wrap_all
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.files.run_folder import RunFolder, strict_json, write_text
+from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
+
+from .errors import (
+    Alignment,
+    Coverage,
+    NeesSummary,
+    Paired,
+    RpeDelta,
+    Statistics,
+    align,
+    ape,
+    nees,
+    pair,
+    rpe,
+    statistics,
+    summarise_nees,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MAX_DIFFERENCE_NS: Final = 100_000_000
+COVARIANCES: Final = ("xx_m2", "xy_m2", "xh_mrad", "yy_m2", "yh_mrad", "hh_rad2")
+ALIGNMENTS: Final[tuple[Alignment, ...]] = ("none", "origin", "yaw")
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Translation in metres and rotation in degrees, under evo's names."""
+
+    translation_m: Statistics
+    rotation_deg: Statistics
+
+
+@dataclass(frozen=True, slots=True)
+class PoseScore:
+    """Everything that is measured of a pose track.
+
+    Attributes:
+        coverage: How much truth was scored, and why the rest was not.
+        distance_m: Way of the true track that was scored.
+        ape: By alignment.
+        rpe: By distance, such as ``100 m``; distances longer than the drive are left out.
+        nees_xy: Are position errors as large as claimed?
+        nees_xyh: The same with heading.
+        major_axis_m: Full major axis of the 2-sigma ellipse at the end.
+        lost_at_m: Distance travelled when it first exceeded the vehicle file's limit, or None.
+    """
+
+    coverage: Coverage
+    distance_m: float
+    ape: dict[str, Errors]
+    rpe: dict[str, Errors]
+    nees_xy: NeesSummary
+    nees_xyh: NeesSummary
+    major_axis_m: float
+    lost_at_m: float | None
+
+
+def load_truth(path: Path) -> tuple[Truth, Trajectory]:
+    """A truth file and its trajectory.
+
+    Raises:
+        SchemaError: The file does not fit, or speaks of no pose.
+        LogError: The trajectory cannot be read.
+    """
+    truth = truth_file.load(path)
+    folder = path if path.is_dir() else path.parent
+    if truth.pose is None:
+        raise SchemaError(f"{path}: pose: missing; name a TUM file with the true track")
+    return truth, read_tum(folder / truth.pose)
+
+
+def truth_track(path: Path, run: RunFolder) -> TruthTrack:
+    """The true track inside a run's time, for drawing.
+
+    Raises:
+        SchemaError: The truth does not fit the run.
+    """
+    _, track = load_truth(path)
+    table = pose_in_log_time(run)
+    inside = _inside(track, table, path)
+    return TruthTrack(track.t_ns[inside], track.xyz_m[inside, 0], track.xyz_m[inside, 1])
+
+
+def score(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.0)) -> PoseScore:
+    """Score a run's pose alone; metrics, tracks and figures go into its ``score`` folder.
+
+    Args:
+        run: A finished run.
+        truth_path: ``truth.json``.
+        rpe_m: Distances for the relative error.
+
+    Raises:
+        RunError: The run's tables are missing or damaged.
+        SchemaError: The truth does not fit the run.
+    """
+    truth, _ = load_truth(truth_path)
+    result = measure(run, truth_path, rpe_m)
+    content = {"truth": truth.model_dump(mode="json"), "pose": asdict(result)}
+    write_text(run.file("score") / "metrics.json", strict_json(content) + "\n")
+    return result
+
+
+def measure(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.0)) -> PoseScore:
+    """As ``score``, with tracks and figures written but no metrics."""
+    truth, track = load_truth(truth_path)
+    table = pose_in_log_time(run)
+    vehicle = of_manifest(run.manifest()["settings"])
+    inside = _inside(track, table, truth_path)
+    estimate, cov = _estimate(table, vehicle, truth)
+    flat = planar(track.t_ns, track.xyz_m[:, 0], track.xyz_m[:, 1], heading_rad(track))
+    paired = pair(flat, estimate, MAX_DIFFERENCE_NS, cov)
+    values = nees(paired, 3)
+    result = PoseScore(
+        coverage=paired.coverage,
+        distance_m=_length(paired.truth.xyz_m),
+        ape={how: _ape(paired, how) for how in ALIGNMENTS},
+        rpe=_rpe(paired, rpe_m),
+        nees_xy=summarise_nees(nees(paired, 2), 2),
+        nees_xyh=summarise_nees(values, 3),
+        major_axis_m=float(table["major_axis_m"][-1].as_py()),
+        lost_at_m=_lost_at(table, vehicle.lost_above_m),
+    )
+    folder = run.file("score")
+    write_tum(folder / "estimate.tum", paired.estimate, "crosscue estimate, planar")
+    write_tum(folder / "truth.tum", paired.truth, "truth, planar")
+    if inside.any():
+        title = f"{run.path.name} against {truth.source or truth_path.name}"
+        draw_all(_scored(paired, values, table), folder, title, vehicle.lost_above_m)
+    return result
+
+
+def _inside(track: Trajectory, table: pa.Table, path: Path) -> NDArray[np.bool_]:
+    """Which true poses lie within the run's time.
+
+    Raises:
+        SchemaError: None does, so the truth belongs to another log or clock.
+    """
+    if not table.num_rows:
+        raise SchemaError(f"{path}: the run has no pose to score; see its notices")
+    first_ns, last_ns = table["t_ns"][0].as_py(), table["t_ns"][-1].as_py()
+    inside = (track.t_ns >= first_ns) & (track.t_ns <= last_ns)
+    if not inside.any():
+        raise SchemaError(
+            f"{path}: truth speaks of {track.t_ns[0]} to {track.t_ns[-1]} ns, the run of "
+            f"{first_ns} to {last_ns} ns; it belongs to another log or clock"
+        )
+    return np.asarray(inside)
+
+
+def _estimate(table: pa.Table, vehicle: Vehicle, truth: Truth) -> tuple[Trajectory, Floats]:
+    """The estimated track at the point the truth speaks of, with its covariance."""
+    xyh = np.column_stack([table[name].to_numpy() for name in ("x_m", "y_m", "heading_rad")])
+    cov = np.column_stack([table[f"cov_{name}"].to_numpy() for name in COVARIANCES])
+    return at_truths_point(table["t_ns"].to_numpy(), xyh, cov, vehicle, truth)
+
+
+def at_truths_point(
+    t_ns: Int64s, xyh: Floats, cov_xyh: Floats, vehicle: Vehicle, truth: Truth
+) -> tuple[Trajectory, Floats]:
+    """Rear-axle poses, shape (N, 3), moved to the point the truth speaks of.
+
+    Args:
+        t_ns: Shape (N,).
+        xyh: Shape (N, 3).
+        cov_xyh: Shape (N, 6): covariance of x, y, heading: xx, xy, xh, yy, yh, hh.
+        vehicle: For the camera's place.
+        truth: Names the point.
+    """
+    x, y, heading = xyh.T
+    cov = cov_xyh
+    if truth.pose_point == "camera":
+        ahead, left = vehicle.camera.x_m, vehicle.camera.y_m
+        cos, sin = np.cos(heading), np.sin(heading)
+        dx, dy = ahead * cos - left * sin, ahead * sin + left * cos
+        x, y = x + dx, y + dy
+        # The point swings sideways with the heading's error: the covariance swings along.
+        xx, xy, xh, yy, yh, hh = cov.T
+        cov = np.column_stack(
+            [
+                xx - 2 * dy * xh + dy * dy * hh,
+                xy + dx * xh - dy * yh - dx * dy * hh,
+                xh - dy * hh,
+                yy + 2 * dx * yh + dx * dx * hh,
+                yh + dx * hh,
+                hh,
+            ]
+        )
+    return planar(t_ns, x, y, heading), cov
+
+
+def _ape(paired: Paired, how: Alignment) -> Errors:
+    errors = ape(paired.truth, align(paired.truth, paired.estimate, how))
+    return Errors(statistics(errors.translation_m), statistics(np.rad2deg(errors.rotation_rad)))
+
+
+def _rpe(paired: Paired, sizes_m: Sequence[float]) -> dict[str, Errors]:
+    found: dict[str, Errors] = {}
+    way_m = _length(paired.estimate.xyz_m)
+    for size_m in sizes_m:
+        if size_m >= way_m:
+            continue
+        errors = rpe(paired.truth, paired.estimate, RpeDelta(size_m, "metres"))
+        found[f"{size_m:g} m"] = Errors(
+            statistics(errors.translation_m), statistics(np.rad2deg(errors.rotation_rad))
+        )
+    return found
+
+
+def _length(xyz_m: Floats) -> float:
+    return float(np.linalg.norm(np.diff(xyz_m, axis=0), axis=1).sum())
+
+
+def _lost_at(table: pa.Table, limit_m: float) -> float | None:
+    over = np.flatnonzero(table["major_axis_m"].to_numpy() > limit_m)
+    return float(table["travelled_m"][int(over[0])].as_py()) if len(over) else None
+
+
+def _scored(paired: Paired, values: Floats, table: pa.Table) -> ScoredPoses:
+    assert paired.cov_xyh is not None
+    at = np.searchsorted(table["t_ns"].to_numpy(), paired.truth.t_ns)
+    at = np.minimum(at, table.num_rows - 1)
+    upper = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+    turn = wrap_all(heading_rad(paired.estimate) - heading_rad(paired.truth))
+    return ScoredPoses(
+        t_ns=paired.truth.t_ns,
+        estimate_m=paired.estimate.xyz_m[:, :2],
+        truth_m=paired.truth.xyz_m[:, :2],
+        heading_error_rad=turn,
+        cov=paired.cov_xyh[:, upper],
+        nees=values,
+        travelled_m=table["travelled_m"].to_numpy()[at],
+        major_axis_m=table["major_axis_m"].to_numpy()[at],
+    )
+
+
+def summary(result: PoseScore) -> str:
+    """The score for a person, within 80 columns."""
+    covered = result.coverage
+    left_out = [
+        f"{count} {why}"
+        for count, why in (
+            (covered.before_estimate, "before the first estimate"),
+            (covered.after_estimate, "after the last"),
+            (covered.in_gap, "in a gap of the estimate"),
+        )
+        if count
+    ]
+    lines = [
+        f"truth      {covered.scored} of {covered.truth_poses} poses scored over "
+        f"{result.distance_m:.0f} m" + (f"; not: {', '.join(left_out)}" if left_out else ""),
+        "",
+        "error                       rmse     mean   median      max     rotation rmse",
+    ]
+    lines += [_row(f"APE, aligned: {how}", errors) for how, errors in result.ape.items()]
+    lines += [_row(f"RPE over {size}", errors) for size, errors in result.rpe.items()]
+    lines += ["", *_nees_lines(result)]
+    lost = "never lost" if result.lost_at_m is None else f"lost after {result.lost_at_m:.0f} m"
+    lines.append(f"2-sigma ellipse at the end: {result.major_axis_m:.1f} m long; {lost}")
+    return "\n".join(lines)
+
+
+def _row(name: str, errors: Errors) -> str:
+    t = errors.translation_m
+    numbers = " ".join(f"{value:8.3f}" for value in (t.rmse, t.mean, t.median, t.max))
+    return f"{name:22} {numbers} m {errors.rotation_deg.rmse:9.3f} deg"
+
+
+def _nees_lines(result: PoseScore) -> list[str]:
+    lines = []
+    for name, n in (("x, y", result.nees_xy), ("x, y, heading", result.nees_xyh)):
+        if math.isnan(n.mean):
+            continue
+        lines.append(
+            f"NEES of {name}: mean {n.mean:.2f} (honest for one drive: {n.band_low:.2f} to "
+            f"{n.band_high:.2f}), {100 * n.share_inside_95:.0f} % inside 95 %"
+        )
+    return lines

@@ -1,0 +1,144 @@
+"""How far the filter is from the best that its measurements allow: a batch smoother beside it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar
+from crosscue.eval.pipeline.log_time import refuse_set_back
+from crosscue.eval.pipeline.measurements import read_measured
+from crosscue.localization.angles import wrap_all
+from crosscue.localization.smoother import smooth
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.files.run_folder import RunFolder, strict_json, write_text
+from crosscue.replay.vehicle.vehicle import of_manifest
+
+from .errors import NeesSummary, nees, pair, summarise_nees
+from .score import COVARIANCES, MAX_DIFFERENCE_NS, at_truths_point, load_truth
+
+LEAST_STEP_NS: Final = 1_000_000_000
+UPPER: Final = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
+
+
+@dataclass(frozen=True, slots=True)
+class SmootherScore:
+    """Filter and smoother at the same true poses, a second or more apart, not aligned.
+
+    Attributes:
+        poses: How many.
+        filter_rmse_m: Of position.
+        smoother_rmse_m: Of position.
+        filter_heading_rmse_rad: Of heading.
+        smoother_heading_rmse_rad: Of heading.
+        filter_end_m: Error of the last position: there both know the same.
+        smoother_end_m: The same of the smoother.
+        filter_nees_xyh: Are the filter's errors as large as claimed?
+        smoother_nees_xyh: Are the smoother's?
+    """
+
+    poses: int
+    filter_rmse_m: float
+    smoother_rmse_m: float
+    filter_heading_rmse_rad: float
+    smoother_heading_rmse_rad: float
+    filter_end_m: float
+    smoother_end_m: float
+    filter_nees_xyh: NeesSummary
+    smoother_nees_xyh: NeesSummary
+
+
+def score_smoother(run: RunFolder, truth_path: Path) -> SmootherScore:
+    """Smooth a run's measurements, compare with truth, write ``score/smoother.json``.
+
+    Raises:
+        UsageError: GTSAM is not installed.
+        RunError: The run has no table of measurements.
+        SchemaError: The truth does not fit the run.
+    """
+    truth, track = load_truth(truth_path)
+    refuse_set_back(run, "the smoother")
+    measured = read_measured(run)
+    vehicle = of_manifest(run.manifest()["settings"])
+    first_ns, last_ns = measured.start.t_ns, int(measured.increments.stop_ns[-1])
+    wanted = _thinned(track.t_ns[(track.t_ns > first_ns) & (track.t_ns <= last_ns)])
+    if not len(wanted):
+        raise SchemaError(
+            f"{truth_path}: truth speaks of other times than the run; it belongs to another log"
+        )
+    lever_m = (vehicle.camera.x_m, vehicle.camera.y_m)
+    found = smooth(
+        measured.start, measured.increments, measured.headings, measured.fixes, wanted, lever_m
+    )
+    rows = np.searchsorted(track.t_ns, wanted)
+    x_m, y_m, _ = track.xyz_m[rows].T
+    true = planar(wanted, x_m, y_m, heading_rad(track)[rows])
+    smoothed = at_truths_point(
+        found.t_ns, found.xyh, found.cov[:, UPPER[0], UPPER[1]], vehicle, truth
+    )
+    table = run.table("pose")
+    names = ("x_m", "y_m", "heading_rad")
+    cov = [table[f"cov_{name}"].to_numpy() for name in COVARIANCES]
+    filtered = at_truths_point(
+        table["t_ns"].to_numpy(), np.column_stack([table[name].to_numpy() for name in names]),
+        np.column_stack(cov), vehicle, truth,
+    )  # fmt: skip
+    result = _compared(true, filtered, smoothed)
+    folder = run.file("score")
+    folder.mkdir(exist_ok=True)
+    write_text(folder / "smoother.json", strict_json(asdict(result)) + "\n")
+    return result
+
+
+def _thinned(t_ns: Int64s) -> Int64s:
+    """Times at least ``LEAST_STEP_NS`` apart, the last one among them."""
+    kept: list[int] = []
+    for t in reversed(t_ns.tolist()):
+        if not kept or kept[-1] - t >= LEAST_STEP_NS:
+            kept.append(t)
+    return np.array(kept[::-1], np.int64)
+
+
+def _compared(
+    true: Trajectory, filtered: tuple[Trajectory, Floats], smoothed: tuple[Trajectory, Floats]
+) -> SmootherScore:
+    apart: list[tuple[float, float, float]] = []
+    honest: list[NeesSummary] = []
+    for track, cov in (filtered, smoothed):
+        paired = pair(true, track, MAX_DIFFERENCE_NS, cov)
+        errors = paired.estimate.xyz_m[:, :2] - paired.truth.xyz_m[:, :2]
+        metres = np.hypot(*errors.T)
+        turns = wrap_all(heading_rad(paired.estimate) - heading_rad(paired.truth))
+        apart.append((_rms(metres), _rms(turns), float(metres[-1])))
+        honest.append(summarise_nees(nees(paired, 3), 3))
+    (filter_m, filter_rad, filter_end), (smoother_m, smoother_rad, smoother_end) = apart
+    return SmootherScore(
+        len(true), filter_m, smoother_m, filter_rad, smoother_rad, filter_end, smoother_end,
+        honest[0], honest[1],
+    )  # fmt: skip
+
+
+def _rms(values: Floats) -> float:
+    return math.sqrt(float(np.mean(values**2)))
+
+
+def told(result: SmootherScore) -> str:
+    """For a person, below the score's summary."""
+    ratio = result.filter_rmse_m / result.smoother_rmse_m if result.smoother_rmse_m else math.inf
+    degrees = 180.0 / math.pi
+    return "\n".join(
+        [
+            f"filter against batch smoother, {result.poses} poses: rmse {result.filter_rmse_m:.3f} "
+            f"and {result.smoother_rmse_m:.3f} m (ratio {ratio:.2f}),",
+            f"  heading {degrees * result.filter_heading_rmse_rad:.3f} and "
+            f"{degrees * result.smoother_heading_rmse_rad:.3f} deg, at the end "
+            f"{result.filter_end_m:.3f} and {result.smoother_end_m:.3f} m,",
+            f"  mean NEES {result.filter_nees_xyh.mean:.2f} and "
+            f"{result.smoother_nees_xyh.mean:.2f} (3 is honest)",
+        ]
+    )

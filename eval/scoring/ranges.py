@@ -1,0 +1,168 @@
+"""The range filter against truth: errors, and whether its variances are honest (NEES)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
+from crosscue.replay.columns import Floats, Int64s
+
+from .cues import BINS_M, distance_bins
+from .intervals import Mean, mean
+from .pooling import cluster_numbers, first_reasons, summed
+from .run_tables import RunTables
+from .truth import DriveTruth
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeJudged:
+    """One reference (``start`` or ``end``) at N steps of one drive; arrays of shape (N,).
+
+    Attributes:
+        drive: Name.
+        reference: Name.
+        t_ns: Times.
+        approach: Ids of true approaches.
+        true_m: True ranges.
+        error_m: Estimate minus truth.
+        var_m2: What the filter claims.
+        left_out: From reason to rows that could not be judged.
+        controls: From approach id to what controls the intersection, as truth says.
+    """
+
+    drive: str
+    reference: str
+    t_ns: Int64s
+    approach: Int64s
+    true_m: Floats
+    error_m: Floats
+    var_m2: Floats
+    left_out: dict[str, int]
+    controls: Mapping[int, str]
+
+
+@dataclass(frozen=True, slots=True)
+class RangeBin:
+    """Rows in one bin of true range, or at one kind of intersection."""
+
+    rows: int
+    bias_m: float
+    rmse_m: float
+    nees: float
+    share_inside_95: float
+
+
+@dataclass(frozen=True, slots=True)
+class RangeScore:
+    """One reference over all drives.
+
+    Attributes:
+        rows: All.
+        scored: With a true range.
+        left_out: Reason to rows.
+        bias_m: Mean error, resampled by approach.
+        rmse_m: Root mean square error.
+        p95_m: 95 % of errors are smaller.
+        nees: With its band as if each approach were one independent error.
+        by_distance: By true range.
+        by_control: By what controls the intersection. A range to the end where no light stands
+            was measured by something that is none.
+    """
+
+    rows: int
+    scored: int
+    left_out: dict[str, int]
+    bias_m: Mean
+    rmse_m: float
+    p95_m: float
+    nees: NeesSummary
+    by_distance: dict[str, RangeBin]
+    by_control: dict[str, RangeBin]
+
+
+def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
+    """Lay the run's ranges beside the true ones; nothing without either."""
+    if tables.ranges is None or truth.ranges is None:
+        return []
+    rows = tables.ranges
+    at = truth.approach_at(rows.t_ns)
+    start, end = truth.ranges.at(rows.t_ns, at)
+    controls = {one.id: one.control for one in truth.truth.approaches}
+    judged = []
+    for reference, true_m in (("start", start), ("end", end)):
+        mine = rows.reference == reference
+        if not mine.any():
+            continue
+        reasons = {
+            "not a number": ~(np.isfinite(rows.range_m) & np.isfinite(rows.var_m2)),
+            "variance not positive": rows.var_m2 <= 0.0,
+            "in the intersection": truth.is_crossing(rows.t_ns),
+            "no true range at this time": ~np.isfinite(true_m),
+        }
+        mine, left_out = first_reasons(mine, reasons)
+        judged.append(
+            RangeJudged(truth.drive, reference, rows.t_ns[mine], at[mine], true_m[mine],
+                        rows.range_m[mine] - true_m[mine], rows.var_m2[mine], left_out,
+                        controls)
+        )  # fmt: skip
+    return judged
+
+
+def score_range(
+    judged: Sequence[RangeJudged], bins_m: Sequence[float] = BINS_M, seed: int = 0
+) -> dict[str, RangeScore]:
+    """Scores by reference, over all drives together."""
+    return {
+        reference: _score([one for one in judged if one.reference == reference], bins_m, seed)
+        for reference in dict.fromkeys(one.reference for one in judged)
+    }
+
+
+def _score(rows: Sequence[RangeJudged], bins_m: Sequence[float], seed: int) -> RangeScore:
+    error = np.concatenate([one.error_m for one in rows])
+    nees = error**2 / np.concatenate([one.var_m2 for one in rows])
+    true_m = np.concatenate([one.true_m for one in rows])
+    clusters = cluster_numbers([one.drive for one in rows], [one.approach for one in rows])
+    left_out = summed(one.left_out for one in rows)
+    return RangeScore(
+        rows=len(error) + sum(left_out.values()),
+        scored=len(error),
+        left_out=left_out,
+        bias_m=mean(error, clusters, seed),
+        rmse_m=_rms(error),
+        p95_m=float(np.percentile(np.abs(error), 95)) if len(error) else math.nan,
+        nees=summarise_nees(nees, 1, max(len(np.unique(clusters)), 1)),
+        by_distance={
+            name: _bin(error[mask], nees[mask])
+            for name, mask in distance_bins(true_m, bins_m).items()
+            if mask.any()
+        },
+        by_control={
+            name: _bin(error[mask], nees[mask]) for name, mask in _by_control(rows).items()
+        },
+    )
+
+
+def _by_control(rows: Sequence[RangeJudged]) -> dict[str, NDArray[np.bool_]]:
+    names = [one.controls.get(number, "") for one in rows for number in one.approach.tolist()]
+    found = np.array(names, np.str_)
+    return {name: found == name for name in sorted(set(names) - {""})}
+
+
+def _rms(error: Floats) -> float:
+    return float(np.sqrt(np.mean(error**2))) if len(error) else math.nan
+
+
+def _bin(error: Floats, nees: NDArray[np.float64]) -> RangeBin:
+    return RangeBin(
+        rows=len(error),
+        bias_m=float(error.mean()),
+        rmse_m=_rms(error),
+        nees=float(nees.mean()),
+        share_inside_95=summarise_nees(nees, 1).share_inside_95,
+    )

@@ -1,0 +1,227 @@
+"""The tables of a run that are scored, as columns; from a run folder or from tables in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.eval.pipeline.drive_time import timeline_in
+from crosscue.eval.pipeline.log_time import LABELS, table_in_log_time
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import RunError
+from crosscue.replay.files.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+NONE: Final = -1
+"""Stands for a null approach."""
+NAMES: Final = ("frames", "cues", "range", "belief")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CueRows:
+    """N rows: what was looked for in a frame and how many were found.
+
+    Attributes:
+        t_ns: Shape (N,).
+        approach: Shape (N,); ``NONE`` outside approaches.
+        cue: Shape (N,), names.
+        count: Shape (N,), never negative.
+    """
+
+    t_ns: Int64s
+    approach: Int64s
+    cue: NDArray[np.str_]
+    count: Int64s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeRows:
+    """N rows of the range filter; ``reference`` is ``start`` or ``end``."""
+
+    t_ns: Int64s
+    approach: Int64s
+    reference: NDArray[np.str_]
+    range_m: Floats
+    var_m2: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeliefRows:
+    """N steps.
+
+    Attributes:
+        t_ns: Shape (N,).
+        approach: Shape (N,); ``NONE`` outside approaches.
+        features: A feature's name to its N probabilities, NaN where missing.
+        established: Shape (N,): presence of the intersection is established.
+    """
+
+    t_ns: Int64s
+    approach: Int64s
+    features: Mapping[str, Floats]
+    established: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunTables:
+    """What a run says; None where it has no such table.
+
+    Attributes:
+        frames_ns: Sorted times of all frames looked at.
+        cues: From ``cues.parquet``.
+        ranges: From ``range.parquet``.
+        belief: From ``belief.parquet``.
+    """
+
+    frames_ns: Int64s | None
+    cues: CueRows | None
+    ranges: RangeRows | None
+    belief: BeliefRows | None
+
+    def span_ns(self) -> tuple[int, int] | None:
+        """First and last time in any table, or None for nothing at all."""
+        tables = (self.cues, self.ranges, self.belief)
+        times = [part.t_ns for part in tables if part is not None]
+        if self.frames_ns is not None:
+            times.append(self.frames_ns)
+        times = [t_ns for t_ns in times if len(t_ns)]
+        if not times:
+            return None
+        return min(int(t.min()) for t in times), max(int(t.max()) for t in times)
+
+
+def tables_of(run: RunFolder) -> RunTables:
+    """Read a run's tables; one that is not there becomes None.
+
+    Raises:
+        RunError: A table is damaged or has other columns.
+    """
+    timeline = timeline_in(run.manifest())
+    found = {
+        name: table_in_log_time(run.table(name), timeline)
+        if run.file(f"{name}.parquet").exists()
+        else None
+        for name in NAMES
+    }
+    return run_tables(str(run.path), **{f"{name}_table": table for name, table in found.items()})
+
+
+def run_tables(
+    where: str,
+    *,
+    frames_table: pa.Table | None = None,
+    cues_table: pa.Table | None = None,
+    range_table: pa.Table | None = None,
+    belief_table: pa.Table | None = None,
+) -> RunTables:
+    """Check tables in memory and take their columns.
+
+    Args:
+        where: Named in errors.
+        frames_table: Columns as in ``frames.parquet``; likewise the other three.
+        cues_table: See there.
+        range_table: See there.
+        belief_table: See there.
+
+    Raises:
+        RunError: A column is missing, or holds what cannot be.
+    """
+    frames = None
+    if frames_table is not None:
+        frames = np.unique(_whole(frames_table, "t_ns", f"{where}: frames"))
+    return RunTables(
+        frames_ns=frames,
+        cues=None if cues_table is None else _cues(cues_table, f"{where}: cues"),
+        ranges=None if range_table is None else _ranges(range_table, f"{where}: range"),
+        belief=None if belief_table is None else _belief(belief_table, f"{where}: belief"),
+    )
+
+
+def _cues(table: pa.Table, where: str) -> CueRows:
+    count = _whole(table, "count", where)
+    if len(count) and count.min() < 0:
+        raise RunError(f"{where}: count {count.min()}: want 0 or more; run crosscue replay again")
+    return CueRows(
+        _whole(table, "t_ns", where), _approach(table, where), _texts(table, "cue", where), count
+    )
+
+
+def _ranges(table: pa.Table, where: str) -> RangeRows:
+    reference = _texts(table, "reference", where)
+    strange = sorted(set(reference.tolist()) - {"start", "end"})
+    if strange:
+        raise RunError(f"{where}: reference {strange[0]!r}: want start or end; replay again")
+    return RangeRows(
+        _whole(table, "t_ns", where),
+        _approach(table, where),
+        reference,
+        _numbers(table, "range_m", where),
+        _numbers(table, "var_m2", where),
+    )
+
+
+def _belief(table: pa.Table, where: str) -> BeliefRows:
+    features: dict[str, Floats] = {}
+    for name in table.column_names:
+        if name in ("t_ns", "approach", "established", *LABELS):
+            continue
+        values = _numbers(table, name, where)
+        # NaN compares false: it is left out later, and counted.
+        if ((values < 0.0) | (values > 1.0)).any():
+            raise RunError(f"{where}: {name}: a probability outside 0 to 1; replay again")
+        features[name] = values
+    established = np.zeros(table.num_rows, np.bool_)
+    if "established" in table.column_names:
+        told = table["established"].fill_null(False)
+        established = told.to_numpy(zero_copy_only=False).astype(np.bool_)
+    return BeliefRows(_whole(table, "t_ns", where), _approach(table, where), features, established)
+
+
+def _column(table: pa.Table, name: str, where: str) -> pa.ChunkedArray:
+    if name not in table.column_names:
+        there = ", ".join(table.column_names)
+        raise RunError(f"{where}: no column {name}; there are: {there}; another version wrote it")
+    return table[name]
+
+
+def _whole(table: pa.Table, name: str, where: str) -> Int64s:
+    import pyarrow as pa
+
+    column = _column(table, name, where)
+    if column.null_count or not pa.types.is_integer(column.type):
+        raise RunError(f"{where}: {name}: want whole numbers in every row; replay again")
+    return np.asarray(column.cast(pa.int64()).to_numpy(), np.int64)
+
+
+def _approach(table: pa.Table, where: str) -> Int64s:
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    column = _column(table, "approach", where)
+    if not (pa.types.is_integer(column.type) or pa.types.is_null(column.type)):
+        raise RunError(f"{where}: approach: want whole numbers or nulls; replay again")
+    filled = pc.fill_null(column.cast(pa.int64()), NONE)
+    return np.asarray(filled.to_numpy(), np.int64)
+
+
+def _numbers(table: pa.Table, name: str, where: str) -> Floats:
+    import pyarrow as pa
+
+    column = _column(table, name, where)
+    if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
+        raise RunError(f"{where}: {name}: want numbers, got {column.type}; replay again")
+    return np.asarray(column.cast(pa.float64()).to_numpy(), np.float64)
+
+
+def _texts(table: pa.Table, name: str, where: str) -> NDArray[np.str_]:
+    column = _column(table, name, where)
+    values = column.to_pylist()
+    if not all(isinstance(value, str) for value in values):
+        raise RunError(f"{where}: {name}: want text in every row; replay again")
+    return np.array(values, np.str_)

@@ -1,0 +1,312 @@
+"""Run folders against their truth: scored one by one, pooled, and written down."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from crosscue.datasets.truth.truth import FILE, Truth
+from crosscue.eval.batch import merge as merge_runs
+from crosscue.eval.pipeline.run_account import Account, check, scoring_of, summed
+from crosscue.eval.pipeline.run_logs import place_of
+from crosscue.eval.scoring.pose.score import PoseScore
+from crosscue.replay.errors import RunError, SchemaError, UsageError
+from crosscue.replay.files.run_folder import RunFolder, strict_json, write_text, write_whole
+from crosscue.replay.remote.logs import is_remote
+
+from . import intervals
+from . import truth as score_truth
+from .approaches import FEATURES
+from .drives import DEFAULTS, DriveJudged, Scores, ScoreSettings, as_metrics, judge, score
+from .pose import score as score_pose
+from .run_tables import RunTables, tables_of
+from .truth import DriveTruth
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+FOLDER: Final = "score"
+METRICS: Final = "metrics.json"
+CURVES: Final = "curves"
+CUE_FRAMES: Final = "cue_frames"
+SLACK_NS: Final = 1_000_000_000
+"""An approach may lie so far outside the run: clocks and last pictures differ a little."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunScored:
+    """One run laid beside its truth.
+
+    Attributes:
+        run: Its folder.
+        truth_path: Where the truth is.
+        truth: The truth.
+        judged: Everything but the pose.
+        pose: None where it was not scored.
+        why_no_pose: Empty where it was.
+    """
+
+    run: RunFolder
+    truth_path: Path
+    truth: DriveTruth
+    judged: DriveJudged
+    pose: PoseScore | None
+    why_no_pose: str
+
+
+def find_truth(run: RunFolder, given: Path | None) -> Path:
+    """The truth file given, or the one beside (or in) a log of the run.
+
+    Raises:
+        UsageError: None was given and none is there.
+        RunError: The manifest cannot be read.
+    """
+    if given is not None:
+        return given
+    looked: list[str] = []
+    for log in run.manifest().get("logs", []):
+        if is_remote(log["path"]):
+            continue
+        path = _place(run, log)
+        for folder in (path, path.parent):
+            if (folder / FILE).is_file():
+                return folder / FILE
+            looked.append(str(folder))
+    raise UsageError(f"{run.path}: no {FILE} beside its logs ({', '.join(looked)}); give --truth")
+
+
+def _place(run: RunFolder, log: Mapping[str, Any]) -> Path:
+    """Where a log lies or lay; its truth may still be there."""
+    try:
+        return Path(place_of(run, log))
+    except RunError:
+        return Path(os.path.normpath(run.path.resolve() / log["path"]))
+
+
+def judge_run(
+    run: RunFolder,
+    truth_path: Path,
+    settings: ScoreSettings = DEFAULTS,
+    rpe_m: Sequence[float] = (10.0, 100.0),
+    *,
+    any_log: bool = False,
+) -> RunScored:
+    """Lay a run beside its truth; pose tracks and figures go into its ``score`` folder.
+
+    Args:
+        run: A finished run.
+        truth_path: Its truth.
+        settings: Of the scores.
+        rpe_m: Distances of the relative pose error.
+        any_log: Take the truth though it names the hash of another file: the same drive, converted.
+
+    Raises:
+        RunError: A table is damaged, or it holds many drives merged.
+        SchemaError: The truth does not fit the run, or there is nothing to score.
+    """
+    if run.manifest().get("stage") == merge_runs.STAGE:
+        raise RunError(
+            f"{run.path}: many drives merged, whose times are mixed; score their run folders"
+        )
+    truth = score_truth.load(truth_path, str(run.path))
+    if not any_log:
+        _check_log(run, truth.truth, truth_path)
+    tables = tables_of(run)
+    _check_times(run, truth.truth, tables, truth_path)
+    judged = judge(tables, truth, settings)
+    why = _why_no_pose(run, truth.truth)
+    pose = None if why else score_pose.measure(run, truth_path, rpe_m)
+    nothing = judged.coverage.not_scored
+    if why and {"cues", "belief", "range"} <= nothing.keys():
+        reasons = "; ".join(dict.fromkeys([*nothing.values(), why]))
+        raise SchemaError(f"{truth_path}: nothing of {run.path} can be scored: {reasons}")
+    return RunScored(run, truth_path, truth, judged, pose, why)
+
+
+def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
+    told = set(truth.log_sha256.values())
+    logs = run.manifest().get("logs", [])
+    found = {digest for log in logs for digest in log.get("sha256", {}).values()}
+    if told and found and not told & found:
+        names = ", ".join(log["name"] for log in logs)
+        raise SchemaError(
+            f"{path}: by its hash it belongs to another {truth.log or 'log'}, not to {names}; "
+            "give the truth of that log, or --any-log for the same drive in another file"
+        )
+
+
+def _check_times(run: RunFolder, truth: Truth, tables: RunTables, path: Path) -> None:
+    """Refuse truth of approaches that lie wholly outside a run over its whole log.
+
+    A truth that shares no moment with the run at all is refused by ``judge``.
+    """
+    selection = run.manifest().get("selection") or {}
+    span = tables.span_ns()
+    is_whole = selection.get("start_ns") is None and selection.get("end_ns") is None
+    if span is None or not is_whole or truth.start_ns > span[1] or truth.end_ns <= span[0]:
+        return
+    for one in truth.approaches:
+        if one.start_ns > span[1] + SLACK_NS or one.enter_ns < span[0] - SLACK_NS:
+            raise SchemaError(
+                f"{path}: approach {one.id} from {one.start_ns} to {one.enter_ns} ns lies outside "
+                f"the log, of which {run.path} has {span[0]} to {span[1]} ns; mend the truth"
+            )
+
+
+def _why_no_pose(run: RunFolder, truth: Truth) -> str:
+    if truth.pose is None:
+        return "the truth tells no track (pose: missing)"
+    if not run.file("pose.parquet").exists():
+        return "the run has no pose"
+    return "" if run.table("pose", ["t_ns"]).num_rows else "the run's pose has no row"
+
+
+def scores_of(scored: Sequence[RunScored], settings: ScoreSettings = DEFAULTS) -> Scores:
+    """The pooled scores of runs."""
+    return score([one.judged for one in scored], settings)
+
+
+def metrics_of(scored: Sequence[RunScored], scores: Scores) -> dict[str, Any]:
+    """The content of ``metrics.json``: everything pooled, with the pose.
+
+    A single run's pose is given whole; of several, means over drives and each one by itself.
+    """
+    tree = as_metrics(scores)
+    tree["account"] = _account_of(scored)
+    poses = {str(one.run.path): one.pose for one in scored if one.pose is not None}
+    if not poses:
+        tree["coverage"]["not_scored"]["pose"] = scored[0].why_no_pose
+    if len(scored) == 1:
+        (only,) = scored
+        tree["truth"] = only.truth.truth.model_dump(mode="json")
+        tree["pose"] = None if only.pose is None else asdict(only.pose)
+    else:
+        tree["coverage"]["same_log"] = same_logs(scored)
+        tree["pose"] = _poses(poses)
+    return tree
+
+
+def _account_of(scored: Sequence[RunScored]) -> Account:
+    """The account of one run, or of all added up, with the scoring as its last stage."""
+    if len(scored) == 1:
+        (only,) = scored
+        found: Account = only.run.manifest()["account"] | {"scoring": scoring_of(only)}
+        check(found)
+        return found
+    return summed(_account_of([one]) for one in scored)
+
+
+def same_logs(scored: Sequence[RunScored]) -> list[tuple[str, str]]:
+    """Pairs of runs of one log: pooled, such a drive counts twice."""
+    first: dict[str, str] = {}
+    pairs: list[tuple[str, str]] = []
+    for one in scored:
+        name = str(one.run.path)
+        logs = one.run.manifest().get("logs", [])
+        for digest in {digest for log in logs for digest in log.get("sha256", {}).values()}:
+            if first.setdefault(digest, name) != name:
+                pairs.append((first[digest], name))
+    return sorted(set(pairs))
+
+
+def _poses(poses: Mapping[str, PoseScore]) -> dict[str, Any]:
+    drives = np.arange(len(poses))
+    rmse = np.array([one.ape["none"].translation_m.rmse for one in poses.values()], np.float64)
+    ends = np.array([one.nees_xyh.mean for one in poses.values()], np.float64)
+    return {
+        "drives": len(poses),
+        "ape_rmse_m": asdict(intervals.mean(rmse, drives)),
+        "nees_xyh": asdict(intervals.mean(ends, drives)),
+        "lost": sum(one.lost_at_m is not None for one in poses.values()),
+        "by_drive": {name: asdict(one) for name, one in poses.items()},
+    }
+
+
+def write_scores(folder: Path, scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> None:
+    """Write ``metrics.json`` and, for figures, ``curves`` and ``cue_frames`` as Parquet.
+
+    Raises:
+        OutputError: They cannot be written.
+    """
+    write_text(folder / METRICS, strict_json(metrics) + "\n")
+    judged = [one.judged for one in scored]
+    for name, table in ((CURVES, curve_table(judged)), (CUE_FRAMES, cue_frame_table(judged))):
+        write_whole(folder / f"{name}.parquet", _writer(table))
+
+
+def _writer(table: pa.Table) -> Any:
+    import pyarrow.parquet as pq
+
+    def write(path: Path) -> None:
+        pq.write_table(table, path, compression="zstd", write_page_checksum=True)
+
+    return write
+
+
+def curve_table(judged: Sequence[DriveJudged]) -> pa.Table:
+    """Probabilities against true distance, a row for each step of each matched approach.
+
+    Columns: drive, approach (id in the truth), intersection, t_ns, distance_m, then features.
+    """
+    import pyarrow as pa
+
+    curves = [
+        curve for one in judged if one.approaches is not None for curve in one.approaches.curves
+    ]
+    own = sorted({name for curve in curves for name in curve.features} - set(FEATURES))
+    missing = {len(c.t_ns): np.full(len(c.t_ns), math.nan) for c in curves}
+    columns: dict[str, Any] = {
+        "drive": _repeated([(c.drive, len(c.t_ns)) for c in curves]),
+        "approach": pa.array([c.approach for c in curves for _ in c.t_ns], pa.int64()),
+        "intersection": _repeated([(c.intersection, len(c.t_ns)) for c in curves]),
+        "t_ns": _joined([c.t_ns for c in curves], np.int64),
+        "distance_m": _joined([c.distance_m for c in curves], np.float64),
+    }
+    for name in (*FEATURES, *own):
+        parts = [c.features.get(name, missing[len(c.t_ns)]) for c in curves]
+        columns[name] = _joined(parts, np.float64)
+    return pa.table(columns)
+
+
+def cue_frame_table(judged: Sequence[DriveJudged]) -> pa.Table:
+    """Every frame in which a cue was looked for, with what is true of it.
+
+    Columns: drive, t_ns, cue, count, approach, distance_m, object, feature (1 so, 0 not so,
+    null unknown), true_count (null unknown), visible.
+    """
+    import pyarrow as pa
+
+    rows = [cue for one in judged for cue in one.cues if len(cue.t_ns)]
+    columns: dict[str, Any] = {
+        "drive": _repeated([(c.drive, len(c.t_ns)) for c in rows]),
+        "t_ns": _joined([c.t_ns for c in rows], np.int64),
+        "cue": _repeated([(c.cue, len(c.t_ns)) for c in rows]),
+        "count": _joined([c.count for c in rows], np.int64),
+    }
+    for name, parts in (
+        ("approach", [c.approach for c in rows]),
+        ("object", [c.is_object for c in rows]),
+        ("feature", [c.is_feature for c in rows]),
+        ("true_count", [c.true_count for c in rows]),
+    ):
+        values = _joined(parts, np.int64)
+        columns[name] = pa.array(values, mask=values < 0)
+    columns["distance_m"] = _joined([c.distance_m for c in rows], np.float64)
+    columns["visible"] = _joined([c.visible for c in rows], np.float64)
+    return pa.table(columns)
+
+
+def _repeated(names: Sequence[tuple[str, int]]) -> pa.Array:
+    import pyarrow as pa
+
+    return pa.array([name for name, times in names for _ in range(times)], pa.string())
+
+
+def _joined(parts: Sequence[Any], kind: type) -> Any:
+    return np.concatenate([np.empty(0, kind), *parts]).astype(kind)

@@ -1,0 +1,237 @@
+"""What is true at a time of a drive: which approach, how far to go, what is there to be seen."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.datasets.truth import truth as truth_file
+from crosscue.datasets.truth.truth import Approach, CueTruth, Truth
+from crosscue.datasets.truth.tum import read_tum
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.limits import MIB
+
+from .run_tables import NONE
+
+COLUMNS: Final = ("t_ns", "approach", "start_m", "end_m")
+MOST_BYTES: Final = 256 * MIB
+NEAREST_NS: Final = 500_000_000
+"""A true range further away in time than this says nothing about a moment."""
+CROSSING_NS: Final = 10_000_000_000
+"""After entering, so long is the car taken to be in the intersection: nothing is judged then."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueRanges:
+    """N true ranges of the rear axle, sorted by time.
+
+    Attributes:
+        t_ns: Shape (N,).
+        approach: Shape (N,): ids.
+        start_m: Shape (N,), to the start of the intersection along the path.
+        end_m: Shape (N,), to its end; NaN where unknown.
+    """
+
+    t_ns: Int64s
+    approach: Int64s
+    start_m: Floats
+    end_m: Floats
+
+    def at(self, t_ns: Int64s, approach: Int64s) -> tuple[Floats, Floats]:
+        """Ranges to start and end, shape (M,) each; NaN where no true one is near in time.
+
+        Args:
+            t_ns: Shape (M,).
+            approach: Shape (M,): which approach the ranges must belong to.
+        """
+        start, end = np.full(len(t_ns), math.nan), np.full(len(t_ns), math.nan)
+        for one in np.unique(approach[approach != NONE]).tolist():
+            rows, asked = self.approach == one, approach == one
+            if rows.any():
+                known, when = self.t_ns[rows], t_ns[asked]
+                start[asked] = _between(when, known, self.start_m[rows])
+                end[asked] = _between(when, known, self.end_m[rows])
+        return start, end
+
+
+def _between(when: Int64s, known: Int64s, values: Floats) -> Floats:
+    """Linear between neighbours, drawn on past the ends; NaN far from any."""
+    after = np.clip(np.searchsorted(known, when), 1, max(len(known) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(known) - 1)
+    step = (known[after] - known[before]).astype(np.float64)
+    gone = (when - known[before]).astype(np.float64)
+    part = np.divide(gone, step, out=np.zeros(len(when)), where=step > 0)
+    found = values[before] + part * (values[after] - values[before])
+    off = np.minimum(np.abs(when - known[before]), np.abs(when - known[after]))
+    return np.where(off <= NEAREST_NS, found, math.nan)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveTruth:
+    """The truth of one drive.
+
+    Attributes:
+        drive: What the drive is called in results.
+        truth: The file.
+        ranges: None where it tells neither ranges nor a track.
+    """
+
+    drive: str
+    truth: Truth
+    ranges: TrueRanges | None
+
+    def approach_at(self, t_ns: Int64s) -> Int64s:
+        """Ids of the approaches under way, shape (N,); ``NONE`` where none is."""
+        found = np.full(len(t_ns), NONE, np.int64)
+        for one in self.truth.approaches:
+            found[(t_ns >= one.start_ns) & (t_ns < one.enter_ns)] = one.id
+        return found
+
+    def is_crossing(self, t_ns: Int64s) -> np.typing.NDArray[np.bool_]:
+        """Whether the car has just entered an intersection and no other approach has begun."""
+        found = np.zeros(len(t_ns), np.bool_)
+        for one in self.truth.approaches:
+            found |= (t_ns >= one.enter_ns) & (t_ns < one.enter_ns + CROSSING_NS)
+        found &= self.approach_at(t_ns) == NONE
+        return found
+
+    def is_told(self, t_ns: Int64s) -> np.typing.NDArray[np.bool_]:
+        """Whether the truth speaks of these times at all."""
+        return np.asarray((t_ns >= self.truth.start_ns) & (t_ns < self.truth.end_ns))
+
+    def start_m(self, t_ns: Int64s) -> Floats:
+        """Ranges to the start of the intersection ahead, NaN where unknown."""
+        if self.ranges is None:
+            return np.full(len(t_ns), math.nan)
+        return self.ranges.at(t_ns, self.approach_at(t_ns))[0]
+
+    def approach(self, number: int) -> Approach:
+        """By its id."""
+        return next(one for one in self.truth.approaches if one.id == number)
+
+
+def load(path: Path, drive: str) -> DriveTruth:
+    """Read a truth file and the ranges beside it.
+
+    Ranges come from its CSV file, or where there is none from the way along its track.
+
+    Raises:
+        SchemaError: A file does not fit.
+        LogError: The trajectory cannot be read.
+    """
+    truth = truth_file.load(path)
+    folder = path if path.is_dir() else path.parent
+    ranges = None
+    if truth.ranges is not None:
+        ranges = _read_ranges(folder / truth.ranges, truth)
+    elif truth.pose is not None and truth.approaches:
+        ranges = _ranges_along(folder / truth.pose, truth)
+    return DriveTruth(drive, truth, ranges)
+
+
+def _read_ranges(path: Path, truth: Truth) -> TrueRanges:
+    known = {one.id for one in truth.approaches}
+    rows: list[tuple[int, int, float, float]] = []
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
+        with path.open(encoding="utf-8", newline="") as file:
+            reader = csv.DictReader(file)
+            if set(COLUMNS) - set(reader.fieldnames or ()):
+                raise SchemaError(f"{path}:1: want the columns {','.join(COLUMNS)}")
+            for row in reader:
+                rows.append(_range_row(row, known, f"{path}:{reader.line_num}"))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SchemaError(f"{path}: {error}; the truth names it under ranges") from None
+    rows.sort()
+    t_ns, approach, start, end = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return TrueRanges(
+        np.array(t_ns, np.int64), np.array(approach, np.int64),
+        np.array(start, np.float64), np.array(end, np.float64),
+    )  # fmt: skip
+
+
+def _range_row(row: dict[str, str], known: set[int], where: str) -> tuple[int, int, float, float]:
+    try:
+        t_ns, approach = int(row["t_ns"]), int(row["approach"])
+        start_m = float(row["start_m"])
+        end_m = float(row["end_m"]) if row["end_m"] else math.nan
+    except (TypeError, ValueError):
+        raise SchemaError(f"{where}: want whole t_ns and approach, numbers in metres") from None
+    if not math.isfinite(start_m) or math.isinf(end_m) or not -(2**62) < t_ns < 2**62:
+        raise SchemaError(f"{where}: want finite numbers")
+    if approach not in known:
+        raise SchemaError(f"{where}: no approach {approach}; there are: {sorted(known)}")
+    return t_ns, approach, start_m, end_m
+
+
+def _ranges_along(path: Path, truth: Truth) -> TrueRanges:
+    """From the way still to go along the true track until the rear axle enters."""
+    track = read_tum(path)
+    steps = np.linalg.norm(np.diff(track.xyz_m[:, :2], axis=0), axis=1)
+    gone = np.concatenate([[0.0], np.cumsum(steps)])
+    parts: list[TrueRanges] = []
+    for one in truth.approaches:
+        inside = (track.t_ns >= one.start_ns) & (track.t_ns <= one.enter_ns)
+        enter_m = _between(np.array([one.enter_ns]), track.t_ns, gone)[0]
+        if not inside.any() or math.isnan(enter_m):
+            continue
+        start = enter_m - gone[inside]
+        end = start + (math.nan if one.length_m is None else one.length_m)
+        ids = np.full(len(start), one.id, np.int64)
+        parts.append(TrueRanges(track.t_ns[inside], ids, start, end))
+    if not parts:
+        empty = np.empty(0, np.int64)
+        return TrueRanges(empty, empty, np.empty(0), np.empty(0))
+    return TrueRanges(
+        np.concatenate([part.t_ns for part in parts]),
+        np.concatenate([part.approach for part in parts]),
+        np.concatenate([part.start_m for part in parts]),
+        np.concatenate([part.end_m for part in parts]),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CueTruthAt:
+    """What is true of one cue at M times.
+
+    Attributes:
+        present: Shape (M,), int8: 1 there, 0 not there, ``NONE`` unknown.
+        count: Shape (M,): how many things; ``NONE`` unknown.
+        visible: Shape (M,): share of the most visible one; NaN unknown.
+    """
+
+    present: np.typing.NDArray[np.int8]
+    count: Int64s
+    visible: Floats
+
+
+def cue_at(spans: list[CueTruth], t_ns: Int64s) -> CueTruthAt:
+    """Look times up in the spans and moments of one cue.
+
+    Where two speak of one time, a thing that is there wins over one that is not: they are two
+    things.
+    """
+    present = np.full(len(t_ns), NONE, np.int8)
+    count = np.full(len(t_ns), NONE, np.int64)
+    visible = np.full(len(t_ns), math.nan)
+    order = np.argsort(t_ns, kind="stable")
+    in_order = t_ns[order]
+    for span in sorted(spans, key=lambda span: span.present):
+        first = span.t_ns if span.start_ns is None else span.start_ns
+        assert first is not None
+        last = first + 1 if span.end_ns is None else span.end_ns
+        low, high = np.searchsorted(in_order, [first, last])
+        rows = order[low:high]
+        present[rows] = int(span.present)
+        told = (0 if not span.present else NONE) if span.count is None else span.count
+        count[rows] = told
+        visible[rows] = math.nan if span.visible is None else span.visible
+    return CueTruthAt(present, count, visible)

@@ -1,0 +1,217 @@
+"""What each cue was worth: every measure again with the cue left out, as if nobody had looked.
+
+Nothing is detected again; who calls supplies the estimates. Distances and log scores are compared
+approach by approach, so their intervals come from resampling paired differences.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+
+from crosscue.eval.pipeline.drive_time import timeline_in
+from crosscue.eval.pipeline.log_time import table_in_log_time
+from crosscue.eval.pipeline.variants import GROUPS, scene_tables
+from crosscue.eval.scoring.approaches import ApproachResult
+from crosscue.eval.scoring.belief import BeliefDifference, compare_belief
+from crosscue.eval.scoring.drives import (
+    DEFAULTS,
+    DriveJudged,
+    Scores,
+    ScoreSettings,
+    as_metrics,
+    judge,
+    score,
+)
+from crosscue.eval.scoring.intervals import Mean, mean
+from crosscue.eval.scoring.metric_values import metric_values
+from crosscue.eval.scoring.run_tables import RunTables, run_tables
+from crosscue.eval.scoring.truth import DriveTruth
+from crosscue.replay.files.run_folder import RunFolder
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+SHOWN: Final = ("approaches", "belief", "range")
+PASSED_OVER: Final = frozenset({"by_intersection", "by_condition", "by_distance", "by_control",
+                                    "failures"})  # fmt: skip
+
+
+class EstimateWithout(Protocol):
+    """Estimates a drive again as if some cues had not been looked for."""
+
+    def __call__(self, cues: frozenset[str], /) -> RunTables:
+        """The run's tables without these cues."""
+        ...
+
+
+class Drive(NamedTuple):
+    """A judged drive, its truth, and how to estimate it again."""
+
+    judged: DriveJudged
+    truth: DriveTruth
+    estimate: EstimateWithout
+
+
+@dataclass(frozen=True, slots=True)
+class Worth:
+    """A measure with all cues and without one; NaN where it could not be scored."""
+
+    with_all: float
+    without: float
+
+
+@dataclass(frozen=True, slots=True)
+class Attribution:
+    """What one cue (or one with both its sides) was worth.
+
+    Attributes:
+        cues: Left out together.
+        scores: All scores without them.
+        measures: Every measure that changed, by path.
+        detected_m: How much further away intersections were detected thanks to the cue, over the
+            approaches detected with and without it.
+        full_m: The same for the full intersection.
+        detected_only_with: Approaches detected only thanks to the cue.
+        detected_only_without: Approaches that it kept from being detected.
+        full_only_with: The same for the full intersection.
+        full_only_without: The same.
+        belief: Without minus with all, by feature: positive where the cue helped.
+    """
+
+    cues: tuple[str, ...]
+    scores: Scores
+    measures: dict[str, Worth]
+    detected_m: Mean
+    full_m: Mean
+    detected_only_with: int
+    detected_only_without: int
+    full_only_with: int
+    full_only_without: int
+    belief: dict[str, BeliefDifference]
+
+
+def estimate_of(run: RunFolder, vehicle: Vehicle | None = None) -> EstimateWithout:
+    """Estimates from a run's own detections and pose; no picture is opened.
+
+    Args:
+        run: With a finished detect stage.
+        vehicle: Other settings; the run's, if left out.
+
+    Raises (when called):
+        RunError: No detector has looked at the run's camera.
+    """
+
+    def estimate(cues: frozenset[str], /) -> RunTables:
+        timeline = timeline_in(run.manifest())
+        tables = scene_tables(run, vehicle, cues)
+        columns = {f"{name}_table": table_in_log_time(t, timeline) for name, t in tables.items()}
+        frames = run.table("frames", ["t_ns", "segment", "log_t_ns"])
+        frames = table_in_log_time(frames, timeline)
+        return run_tables(str(run.path), frames_table=frames, **columns)
+
+    return estimate
+
+
+def attribute(
+    drives: Sequence[Drive],
+    groups: Mapping[str, Sequence[str]] = GROUPS,
+    settings: ScoreSettings = DEFAULTS,
+) -> dict[str, Attribution]:
+    """Leave out each group of cues in turn, in all drives.
+
+    Args:
+        drives: Judged with the same settings.
+        groups: From name to the cues that are left out together.
+        settings: Of the scores.
+    """
+    scores = score([one.judged for one in drives], settings)
+    return {name: _without(drives, scores, tuple(cues), settings) for name, cues in groups.items()}
+
+
+def _without(
+    drives: Sequence[Drive], whole: Scores, cues: tuple[str, ...], settings: ScoreSettings
+) -> Attribution:
+    left = frozenset(cues)
+    judged = [judge(one.estimate(left), one.truth, settings) for one in drives]
+    scores = score(judged, settings)
+    pairs = _pairs(whole, scores)
+    detected = [(a.detected_m, b.detected_m) for a, b in pairs]
+    full = [(a.full_m, b.full_m) for a, b in pairs]
+    return Attribution(
+        cues=cues,
+        scores=scores,
+        measures=_changed(whole, scores),
+        detected_m=_gain(detected, settings.seed),
+        full_m=_gain(full, settings.seed),
+        detected_only_with=_only(detected, 0),
+        detected_only_without=_only(detected, 1),
+        full_only_with=_only(full, 0),
+        full_only_without=_only(full, 1),
+        belief=compare_belief(
+            [part for one in drives for part in one.judged.belief],
+            [part for one in judged for part in one.belief],
+            settings.seed,
+        ),
+    )
+
+
+def _pairs(whole: Scores, without: Scores) -> list[tuple[ApproachResult, ApproachResult]]:
+    if whole.approaches is None or without.approaches is None:
+        return []
+    others = {(one.drive, one.approach): one for one in without.approaches.results}
+    return [(one, others[one.drive, one.approach]) for one in whole.approaches.results]
+
+
+def _gain(pairs: Sequence[tuple[float | None, float | None]], seed: int) -> Mean:
+    gains = [math.nan if a is None or b is None else a - b for a, b in pairs]
+    return mean(np.array(gains, np.float64), np.arange(len(gains)), seed)
+
+
+def _only(pairs: Sequence[tuple[float | None, float | None]], side: int) -> int:
+    return sum(pair[side] is not None and pair[1 - side] is None for pair in pairs)
+
+
+def _changed(whole: Scores, without: Scores) -> dict[str, Worth]:
+    trees = [as_metrics(one) for one in (whole, without)]
+    values = [
+        metric_values({name: tree[name] or {} for name in SHOWN}, parts=False) for tree in trees
+    ]
+    found: dict[str, Worth] = {}
+    for path in dict.fromkeys([*values[0], *values[1]]):
+        if PASSED_OVER & set(path.split(".")):
+            continue
+        a, b = (one[path].value if path in one else math.nan for one in values)
+        if a != b and not (math.isnan(a) and math.isnan(b)):
+            found[path] = Worth(a, b)
+    return found
+
+
+def attribution_tree(found: Mapping[str, Attribution]) -> dict[str, Any]:
+    """As plain values for ``metrics.json``, without the whole scores again."""
+    return {
+        name: {key: value for key, value in asdict(one).items() if key != "scores"}
+        for name, one in found.items()
+    }
+
+
+def attribution_lines(found: Mapping[str, Attribution]) -> list[str]:
+    """A table for a person: what each cue was worth, within 80 columns."""
+    lines = ["left out        full m   only with  only w/o  log score: left   right  straight"]
+    for name, one in found.items():
+        scores = [
+            _signed(one.belief[key].log_score.value) if key in one.belief else "-"
+            for key in ("left", "right", "straight")
+        ]
+        lines.append(
+            f"{name:14} {_signed(one.full_m.value, 1):>7} {one.full_only_with:>11} "
+            f"{one.full_only_without:>9} {scores[0]:>16} {scores[1]:>7} {scores[2]:>9}"
+        )
+    lines.append("full m: how much further away thanks to the cue; log score: loss without it")
+    return lines
+
+
+def _signed(value: float, digits: int = 3) -> str:
+    return "-" if math.isnan(value) else f"{value:+.{digits}f}"

@@ -1,0 +1,292 @@
+"""Why an approach was missed, found late, or given a feature that is not there, in plain words.
+
+Causes are read off the frames, not guessed from the weather: which cues could have shown a feature,
+in how many frames what they look for was there and to be seen, in how many they found it, and
+whether another cue or the order of things (eq. 18's gate) held the belief back. The conditions of a
+drive are told beside the cause, since the source names its own by them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.eval.scoring.approaches import NEAR_M, ApproachResult
+from crosscue.eval.scoring.cues import CLAIMS, SEEN, CueJudged
+from crosscue.eval.scoring.drives import DriveJudged
+from crosscue.eval.scoring.intervals import Mean, mean
+
+Failing = Literal["missing", "late", "invented"]
+Cause = Literal[
+    "nothing shows it", "hidden", "not found", "denied", "waited for presence", "too little",
+    "claimed wrongly",
+]  # fmt: skip
+
+MOSTLY: Final = 0.5
+"""Found in less than this share of the frames that show it: the detectors are the cause."""
+GOOD: Final = frozenset({"clear", "overcast"})
+"""Conditions that no failure is laid to."""
+
+
+@dataclass(frozen=True, slots=True)
+class CueEvidence:
+    """One cue in the frames of an approach that are at least ``NEAR_M`` before the intersection.
+
+    Attributes:
+        cue: Name.
+        frames: In which it was looked for.
+        there: In which what it looks for was there, as far as truth knows.
+        seen: Of those, in which at least half of it could be seen.
+        found: In which it was positive.
+        found_seen: In which it was positive and what it looks for could be seen.
+        first_m: True range at its first positive; None without any.
+    """
+
+    cue: str
+    frames: int
+    there: int
+    seen: int
+    found: int
+    found_seen: int
+    first_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One feature of one approach that came late, never, or wrongly.
+
+    Attributes:
+        drive: Name.
+        intersection: Its name.
+        conditions: Tags that are not good weather.
+        feature: Which.
+        failing: How.
+        at_m: True range at which it was believed after all; None for never.
+        cause: By the rules of ``_cause``.
+        told: The same in a short sentence with its numbers.
+        cues: What each cue that speaks of it did.
+    """
+
+    drive: str
+    intersection: str
+    conditions: tuple[str, ...]
+    feature: str
+    failing: Failing
+    at_m: float | None
+    cause: Cause
+    told: str
+    cues: tuple[CueEvidence, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ConditionCost:
+    """What a condition cost, against runs at the same intersections in good conditions.
+
+    Attributes:
+        condition: Tag.
+        approaches: With it, at intersections that were also approached in good conditions.
+        detected_m: How much further away it was detected; negative is later.
+        full_m: The same for the full intersection.
+        undetected: Approaches with the tag that were never detected, though good ones were.
+        not_full: The same for the full intersection.
+    """
+
+    condition: str
+    approaches: int
+    detected_m: Mean
+    full_m: Mean
+    undetected: int
+    not_full: int
+
+
+def condition_costs(results: Sequence[ApproachResult]) -> tuple[ConditionCost, ...]:
+    """Every bad condition against good ones at the same intersection.
+
+    What always holds at an intersection (its vegetation) has nothing to be compared with and is
+    left out of the tags that tell good from bad.
+    """
+    always = _always(results)
+    tags = sorted({tag for one in results for tag in one.conditions} - GOOD)
+    return tuple(
+        _cost(tag, results, always) for tag in tags
+        if any(tag in _changing(one, always) for one in results)
+    )  # fmt: skip
+
+
+def _always(results: Sequence[ApproachResult]) -> dict[str, frozenset[str]]:
+    shared: dict[str, frozenset[str]] = {}
+    for one in results:
+        tags = frozenset(one.conditions)
+        shared[one.intersection] = shared.get(one.intersection, tags) & tags
+    return shared
+
+
+def _changing(one: ApproachResult, always: Mapping[str, frozenset[str]]) -> set[str]:
+    return set(one.conditions) - GOOD - always[one.intersection]
+
+
+def _cost(
+    tag: str, results: Sequence[ApproachResult], always: Mapping[str, frozenset[str]]
+) -> ConditionCost:
+    good: dict[str, list[ApproachResult]] = {}
+    for one in results:
+        if not _changing(one, always):
+            good.setdefault(one.intersection, []).append(one)
+    bad = [one for one in results if tag in _changing(one, always) and one.intersection in good]
+    pairs = [(one, good[one.intersection]) for one in bad]
+    detected = [_less(one.detected_m, [g.detected_m for g in some]) for one, some in pairs]
+    full = [_less(one.full_m, [g.full_m for g in some]) for one, some in pairs]
+    return ConditionCost(
+        tag,
+        len(bad),
+        mean(np.array(detected), np.arange(len(bad))),
+        mean(np.array(full), np.arange(len(bad))),
+        sum(
+            one.detected_m is None and any(g.detected_m is not None for g in some)
+            for one, some in pairs
+        ),
+        sum(one.full_m is None and any(g.full_m is not None for g in some) for one, some in pairs),
+    )
+
+
+def _less(value: float | None, others: Sequence[float | None]) -> float:
+    known = [one for one in others if one is not None]
+    return math.nan if value is None or not known else value - sum(known) / len(known)
+
+
+def findings(drives: Sequence[DriveJudged]) -> tuple[Finding, ...]:
+    """All late, missing and invented features, drive by drive."""
+    return tuple(
+        one
+        for drive in drives
+        if drive.approaches is not None
+        for result in drive.approaches.results
+        for one in approach_findings(result, drive.cues)
+    )
+
+
+def by_cause(found: Sequence[Finding]) -> dict[str, Counter[str]]:
+    """From cause to the intersections at which it was one, with the number of drives."""
+    drives = {(one.cause, one.intersection, one.drive) for one in found}
+    counts: dict[str, Counter[str]] = {}
+    for cause, intersection, _ in sorted(drives):
+        counts.setdefault(cause, Counter())[intersection] += 1
+    return counts
+
+
+def approach_findings(result: ApproachResult, cues: Sequence[CueJudged]) -> list[Finding]:
+    """Those of one approach, from its drive's cues."""
+    mine = {one.cue: _evidence(one, result.approach) for one in cues}
+    found = []
+    for feature, at_m in result.features_m.items():
+        if at_m is None or at_m < NEAR_M:
+            found.append(_absent(result, feature, at_m, mine))
+    found += [_invented(result, feature, mine) for feature in result.false_features]
+    return found
+
+
+def _evidence(judged: CueJudged, approach: int) -> CueEvidence:
+    far = (judged.approach == approach) & (judged.distance_m >= NEAR_M)
+    is_there = far & (judged.is_object == 1)
+    # Where truth does not tell how much can be seen, it counts as seen.
+    is_seen = is_there & ~(judged.visible < SEEN)
+    is_found = far & (judged.count > 0)
+    return CueEvidence(
+        judged.cue, _count(far), _count(is_there), _count(is_seen), _count(is_found),
+        _count(is_found & is_seen),
+        float(judged.distance_m[is_found].max()) if is_found.any() else None,
+    )  # fmt: skip
+
+
+def _count(rows: NDArray[np.bool_]) -> int:
+    return int(np.count_nonzero(rows))
+
+
+def _speaking(
+    feature: str, is_there: bool, cues: Mapping[str, CueEvidence]
+) -> tuple[CueEvidence, ...]:
+    return tuple(
+        cues[name]
+        for name, claim in CLAIMS.items()
+        if name in cues and claim.feature == feature and claim.is_there == is_there
+    )
+
+
+def _absent(
+    result: ApproachResult, feature: str, at_m: float | None, cues: Mapping[str, CueEvidence]
+) -> Finding:
+    for_it, against = _speaking(feature, True, cues), _speaking(feature, False, cues)
+    cause, told = _cause(result, feature, for_it, against)
+    return Finding(
+        drive=result.drive,
+        intersection=result.intersection,
+        conditions=_bad(result),
+        feature=feature,
+        failing="missing" if at_m is None else "late",
+        at_m=at_m,
+        cause=cause,
+        told=told,
+        cues=(*for_it, *against),
+    )
+
+
+def _cause(
+    result: ApproachResult, feature: str, for_it: Sequence[CueEvidence],
+    against: Sequence[CueEvidence],
+) -> tuple[Cause, str]:  # fmt: skip
+    """The first that holds; each rule needs what the ones before it have ruled out."""
+    there, seen = sum(one.there for one in for_it), sum(one.seen for one in for_it)
+    found, denied = sum(one.found for one in for_it), sum(one.found for one in against)
+    if there == 0:
+        return "nothing shows it", f"nothing that its cues look for is there up to {NEAR_M:.0f} m"
+    if seen == 0:
+        return "hidden", f"more than half hidden in all {there} frames that have it"
+    if denied > found:
+        return "denied", f"{_names(against)} in {denied} frames against {found}"
+    found_seen = sum(one.found_seen for one in for_it)
+    if found_seen < MOSTLY * seen:
+        return "not found", f"found in {found_seen} of {seen} looks: {_shares(for_it)}"
+    presence_m = result.features_m.get("intersection")
+    if feature != "intersection" and (presence_m is None or presence_m < NEAR_M):
+        when = "never" if presence_m is None else f"only at {presence_m:.0f} m"
+        return "waited for presence", f"found in {found} looks; the intersection {when}"
+    return "too little", f"found in {found} looks of {seen}: {_shares(for_it)}"
+
+
+def _invented(result: ApproachResult, feature: str, cues: Mapping[str, CueEvidence]) -> Finding:
+    for_it = sorted(_speaking(feature, True, cues), key=lambda one: -one.found)
+    loud = [one for one in for_it if one.found]
+    told = ", ".join(f"{_name(one.cue)} in {one.found} of {one.frames}" for one in loud)
+    return Finding(
+        drive=result.drive,
+        intersection=result.intersection,
+        conditions=_bad(result),
+        feature=feature,
+        failing="invented",
+        at_m=loud[0].first_m if loud else None,
+        cause="claimed wrongly",
+        told=told or "no cue of its own: only what others left over",
+        cues=tuple(for_it),
+    )
+
+
+def _bad(result: ApproachResult) -> tuple[str, ...]:
+    return tuple(tag for tag in result.conditions if tag not in GOOD)
+
+
+def _shares(cues: Sequence[CueEvidence]) -> str:
+    return ", ".join(f"{_name(one.cue)} {one.found_seen}/{one.seen}" for one in cues if one.seen)
+
+
+def _names(cues: Sequence[CueEvidence]) -> str:
+    return ", ".join(_name(one.cue) for one in cues if one.found)
+
+
+def _name(cue: str) -> str:
+    return cue.replace("_", " ")

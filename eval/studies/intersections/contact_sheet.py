@@ -1,0 +1,106 @@
+"""One picture of a whole study: a frame of every drive with what was found, for people to judge."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.detectors.base import Found, RoadMask, View
+from crosscue.detectors.cues.frame import FrameCues
+from crosscue.detectors.images import decode
+from crosscue.detectors.overlay import draw, write_label
+from crosscue.detectors.runner import FrameResult
+from crosscue.eval.pipeline.stored_frames import StoredFrame, stored_frames
+from crosscue.eval.pipeline.stored_images import StoredCamera, camera_of, picture_at
+from crosscue.eval.scoring.runs import RunScored
+from crosscue.replay.columns import Bytes, Int64s
+from crosscue.replay.files.run_folder import RunFolder, write_bytes
+
+AWAY_M: Final = 18.0
+"""True distance to the intersection at which the frame is taken."""
+TILE_PX: Final = (480, 270)
+ENLARGE: Final = 2.0
+"""Text and lines, before a frame is shrunk to its tile."""
+QUALITY: Final = 80
+
+
+def write_sheet(
+    drives: Sequence[RunScored], path: Path, columns: int = 8, quality: int = QUALITY
+) -> None:
+    """Write a JPEG with a tile a drive.
+
+    Args:
+        drives: Runs with a finished detect stage; one without its log has a black tile.
+        path: Of the JPEG.
+        columns: Most tiles beside one another.
+        quality: Of the JPEG, 1 to 100.
+
+    Raises:
+        RunError: A table is damaged.
+        OutputError: It cannot be written.
+    """
+    import cv2
+
+    tiles = [_tile(one) for one in drives]
+    blank = np.zeros((TILE_PX[1], TILE_PX[0], 3), np.uint8)
+    columns = min(columns, len(tiles))
+    tiles += [blank] * (-len(tiles) % columns)
+    rows = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
+    _, coded = cv2.imencode(".jpg", np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    write_bytes(path, coded.tobytes())
+
+
+def _tile(one: RunScored) -> Bytes:
+    import cv2
+
+    camera = camera_of(one.run)
+    frame = _frame_near(one)
+    picture = None if camera is None or frame is None else _picture(camera, frame, one.run)
+    if picture is None:
+        picture = np.zeros((TILE_PX[1], TILE_PX[0], 3), np.uint8)
+    tile = cv2.resize(picture, TILE_PX, interpolation=cv2.INTER_AREA)
+    name = one.run.path.name
+    found: Bytes = np.asarray(tile, np.uint8)
+    write_label(found, name, (8, 20), (255, 255, 255), 0.6)
+    return found
+
+
+def _frame_near(one: RunScored) -> StoredFrame | None:
+    """The frame that was taken nearest to ``AWAY_M`` before the first intersection."""
+    times: Int64s = one.run.table("frames", ["t_ns"])["t_ns"].to_numpy()
+    inside = times[one.truth.approach_at(times) >= 0]
+    if not len(inside):
+        return None
+    away = np.abs(one.truth.start_m(inside) - AWAY_M)
+    if not np.isfinite(away).any():
+        return None
+    wanted = int(inside[int(np.nanargmin(away))])
+    detectors = one.run.manifest()["detect"]["detectors"]
+    for frame in stored_frames(one.run, detectors, with_road_masks=True):
+        if frame.seen.t_ns == wanted:
+            return frame
+    return None
+
+
+def _picture(camera: StoredCamera, frame: StoredFrame, run: RunFolder) -> Bytes | None:
+    t_ns = frame.seen.t_ns
+    found: list[Found] = [*frame.seen.objects, *frame.seen.signs]
+    if isinstance(frame.seen.road, RoadMask):
+        found.insert(0, frame.seen.road)
+    picture = picture_at(camera, t_ns)
+    if picture is None:
+        return None
+    pixels, _ = decode(picture, View())
+    result = FrameResult(t_ns, frame.size_px, picture, tuple(found))
+    return draw(pixels, result, FrameCues(_cues_at(run, t_ns), None), ENLARGE)
+
+
+def _cues_at(run: RunFolder, t_ns: int) -> dict[str, int]:
+    import pyarrow.compute as pc
+
+    table = run.table("cues", ["t_ns", "cue", "count"])
+    rows = table.filter(pc.equal(table["t_ns"], t_ns)).to_pylist()
+    return {row["cue"]: row["count"] for row in rows}

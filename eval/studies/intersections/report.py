@@ -1,0 +1,197 @@
+"""The study's files: metrics as JSON, figures, and one page with the tables side by side."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from crosscue.eval.batch.jobs import Done
+from crosscue.eval.pipeline.accounts import versions
+from crosscue.eval.pipeline.estimate import Outcome
+from crosscue.eval.report.html import render_page
+from crosscue.eval.scoring.approaches import ApproachScore
+from crosscue.eval.scoring.runs import metrics_of, write_scores
+from crosscue.replay.files.run_folder import strict_json, write_text
+
+from .causes import Finding, by_cause, condition_costs, findings
+from .contact_sheet import write_sheet
+from .figures import draw_beliefs, draw_distances, draw_reliability
+from .study import StudyScores, StudySettings
+from .tables import (
+    PUBLISHED_DETECTED_M,
+    PUBLISHED_FULL_M,
+    attribution_rows,
+    cue_rows,
+    intersection_rows,
+    quoted_rows,
+    told,
+)
+
+PAGE: Final = "study.html"
+TEMPLATE: Final = "intersections.html.j2"
+TABLES: Final = "study.json"
+SHEET: Final = "detections.jpg"
+
+
+@dataclass(frozen=True, slots=True)
+class StudyFiles:
+    """What was written."""
+
+    page: Path
+    tables: Path
+    metrics: Path
+    sheet: Path
+
+
+def write_study(
+    out: Path, settings: StudySettings, done: Sequence[Done[Outcome]], scored: StudyScores
+) -> StudyFiles:
+    """Write metrics, tables, figures and page into ``out``.
+
+    Raises:
+        OutputError: They cannot be written.
+    """
+    approaches = scored.scores.approaches
+    assert approaches is not None
+    folder = out / "score"
+    metrics = metrics_of(scored.scored, scored.scores)
+    write_scores(folder, scored.scored, metrics)
+    found = findings([one.judged for one in scored.scored])
+    tables = _tables(settings, done, scored, approaches, found)
+    write_text(out / TABLES, strict_json(tables) + "\n")
+    content = {
+        **tables,
+        "coverage": metrics["coverage"],
+        "approaches": approaches,
+        "belief": scored.scores.belief,
+        "range": scored.scores.range,
+        "difference": scored.difference,
+        "calibrated": None if scored.calibrated is None else scored.calibrated.approaches,
+        "figures": _figures(out, scored, approaches),
+    }
+    page = render_page(
+        TEMPLATE, content, {"number": _number, "signed": _signed, "between": _between}
+    )
+    write_text(out / PAGE, page)
+    write_sheet(scored.scored, out / SHEET)
+    return StudyFiles(out / PAGE, out / TABLES, folder / "metrics.json", out / SHEET)
+
+
+def _tables(
+    settings: StudySettings, done: Sequence[Done[Outcome]], scored: StudyScores,
+    approaches: ApproachScore, found: Sequence[Finding],
+) -> dict[str, Any]:  # fmt: skip
+    learned = None if scored.calibrated is None else scored.calibrated.approaches
+    flags = f"--runs {settings.runs} --seed {settings.seed} --width {settings.width_px}"
+    return {
+        "is_simulated": True,
+        "wanted": len(done),
+        "done": len(scored.scored),
+        "failed": sum(one.error is not None for one in done),
+        "failures": [f"{one.job.name}: {one.error}" for one in done if one.error is not None],
+        "seed": settings.seed,
+        "command": f"crosscue study intersections {flags}",
+        "versions": versions(),
+        "published": {"detected_m": PUBLISHED_DETECTED_M, "full_m": PUBLISHED_FULL_M},
+        "detected_m": told(approaches.detected_m),
+        "full_m": told(approaches.full_m),
+        "calibrated_detected_m": "" if learned is None else told(learned.detected_m),
+        "calibrated_full_m": "" if learned is None else told(learned.full_m),
+        "intersections": intersection_rows(approaches.results),
+        "findings": [asdict(one) for one in found],
+        "causes": by_cause(found),
+        "conditions": [asdict(one) for one in condition_costs(approaches.results)],
+        "quoted": quoted_rows(scored),
+        "cues": cue_rows(scored.scores.cues),
+        "attribution": attribution_rows(scored),
+        "calibrated_less_source": {
+            feature: asdict(difference) for feature, difference in scored.difference.items()
+        },
+    }
+
+
+def _figures(out: Path, scored: StudyScores, approaches: ApproachScore) -> dict[str, str]:
+    paths = {name: out / f"{name}.png" for name in ("distances", "beliefs", "reliability")}
+    draw_distances(approaches.results, paths["distances"])
+    curves = [
+        curve
+        for one in scored.scored
+        if one.judged.approaches is not None
+        for curve in one.judged.approaches.curves
+    ]
+    draw_beliefs(curves, paths["beliefs"])
+    learned = None if scored.calibrated is None else scored.calibrated.belief
+    draw_reliability(scored.scores.belief, learned, paths["reliability"])
+    return {
+        name: f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"
+        for name, path in paths.items()
+    }
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    return "never" if value is None else "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _signed(value: float | None, digits: int = 0) -> str:
+    return "-" if value is None or math.isnan(value) else f"{value:+.{digits}f}"
+
+
+def summary(done: Sequence[Done[Outcome]], scored: StudyScores, written: StudyFiles) -> str:
+    """The study in a terminal of 80 columns."""
+    approaches = scored.scores.approaches
+    assert approaches is not None
+    failed = [one for one in done if one.error is not None]
+    wrong = approaches.false_features
+    lines = [
+        f"simulated drives   {len(scored.scored)} of {len(done)} done, {len(failed)} failed",
+        *(f"  failed           {one.job.name}: {one.error}" for one in failed),
+        f"detected           {_of(approaches.detected.right, approaches.detected.of)} at "
+        f"{told(approaches.detected_m)}; published 34.4 m",
+        f"full intersection  {_of(approaches.full.right, approaches.full.of)} at "
+        f"{told(approaches.full_m)}; published 16.2 m, 76 of 80",
+        f"false features     in {_of(wrong.right, wrong.of)}",
+        "",
+        f"{'intersection':<14}{'detected':>12}{'mean':>9}{'full':>12}{'mean':>9}",
+    ]
+    for row in intersection_rows(approaches.results):
+        lines.append(
+            f"{row['intersection']:<14}{_of(row['detected'], row['approaches']):>12}"
+            f"{_number(row['detected_m']):>9}{_of(row['full'], row['approaches']):>12}"
+            f"{_number(row['full_m']):>9}"
+        )
+    lines += ["", "late, missing or invented (drives):"]
+    for cause, places in by_cause(findings([one.judged for one in scored.scored])).items():
+        told_places = ", ".join(f"{place} {drives}" for place, drives in places.items())
+        lines.append(f"  {cause:<20} {told_places}")
+    lines += ["", f"{'cue':<20}{'precision':>10}{'95 %':>16}{'positives':>11}{'published':>11}"]
+    for row in cue_rows(scored.scores.cues):
+        ends = f"{_number(row['wilson_low'], 2)} to {_number(row['wilson_high'], 2)}"
+        lines.append(
+            f"{row['cue']:<20}{_number(row['precision'], 2):>10}{ends:>16}"
+            f"{row['positives']:>11,}{row['published']:>11.2f}"
+        )
+    lines += [
+        "",
+        f"page       {written.page}",
+        f"tables     {written.tables}",
+        f"pictures   {written.sheet}: a frame of each drive, with what was found",
+    ]
+    return "\n".join(lines)
+
+
+def _between(mean: Mapping[str, Any], digits: int = 1) -> str:
+    """A difference as ``asdict`` gives it, with its interval."""
+    value, low, high = mean["value"], mean["low"], mean["high"]
+    if math.isnan(value):
+        return "-"
+    if math.isnan(low):
+        return f"{value:+.{digits}f}"
+    return f"{value:+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
+
+
+def _of(some: int, of: int) -> str:
+    return f"{some} of {of}"

@@ -1,0 +1,1 @@
+"""The Monte Carlo studies of chapter 2."""

@@ -1,0 +1,112 @@
+"""One simulated drive as a picture: streets, paths, ellipses, landmarks, goals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from crosscue.eval.studies.pictures import figure, save
+from crosscue.localization.town.city import City, make_city
+from crosscue.localization.town.kernel import (
+    GOAL_SET,
+    LANDMARK_MISSED,
+    LANDMARK_REFUSED,
+    LANDMARK_SET,
+    LANDMARK_TAKEN,
+    Traced,
+)
+from crosscue.localization.town.random_stream import Stream, key_of
+from crosscue.localization.town.settings import Drive
+from crosscue.localization.town.simulator import CITY_STREAM, Outcome
+from crosscue.replay.columns import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+ELLIPSES: Final = 14
+MARGIN_M: Final = 250.0
+TRUTH: Final = "#2ca02c"
+ESTIMATE: Final = "#1f77b4"
+ELLIPSE: Final = "#ff7f0e"
+ENDS: Final = {Outcome.REACHED: "reached its goal", Outcome.LOST: "lost",
+               Outcome.GIVEN_UP: "given up"}  # fmt: skip
+
+
+def draw(settings: Drive, traced: Traced, seed: int, folder: Path) -> Path:
+    """Write ``drive_plan.png`` and ``drive_plan.svg``; the PNG's path comes back.
+
+    Raises:
+        OutputError: They cannot be written.
+    """
+    made, (axes,) = figure(1, 9.0, 8.2)
+    axes.grid(visible=False)
+    _streets(axes, make_city(Stream(key_of(seed, CITY_STREAM)), settings.city).city)
+    x, y = traced.steps[:, 0], traced.steps[:, 1]
+    axes.plot(x, y, color=TRUTH, lw=3.0, alpha=0.6, label="truth")
+    axes.plot(traced.steps[:, 7], traced.steps[:, 8], color=ESTIMATE, lw=1.2, label="estimate")
+    for i, row in enumerate(np.unique(np.linspace(0, len(x) - 1, ELLIPSES).astype(int))):
+        ring = _ellipse(traced.steps[row])
+        axes.plot(*ring, color=ELLIPSE, lw=1.0, label="2-sigma ellipse" if i == 0 else None)
+    _places(axes, traced, GOAL_SET, "*", "#d62728", 13, "goal")
+    _places(axes, traced, LANDMARK_SET, "s", "0.45", 4, "landmark")
+    _places(axes, traced, LANDMARK_TAKEN, "s", "k", 7, "landmark weighed in")
+    _places(axes, traced, LANDMARK_REFUSED, "X", "#9467bd", 8, "landmark refused by the gate")
+    _places(axes, traced, LANDMARK_MISSED, "s", "w", 7, "landmark passed unnoticed")
+    axes.plot(x[0], y[0], "o", color="k", ms=7, mfc="w", label="start")
+    axes.set_aspect("equal", adjustable="box")
+    shown = np.vstack([traced.steps[:, :2], traced.of_kind(GOAL_SET)[:, 2:4]])
+    middle, half_m = 0.5 * (shown.min(0) + shown.max(0)), 0.5 * np.ptp(shown, axis=0).max()
+    for limits, centre in ((axes.set_xlim, middle[0]), (axes.set_ylim, middle[1])):
+        limits(centre - half_m - MARGIN_M, centre + half_m + MARGIN_M)
+    axes.set_xlabel("x, east (m)")
+    axes.set_ylabel("y, north (m)")
+    result = traced.result
+    compass = settings.sensors.compass_2sigma_deg
+    axes.set_title(
+        f"Simulated drive, seed {seed}: {settings.navigation.strategy}, "
+        f"{'no compass' if compass is None else f'compass ±{compass:g}°'}\n"
+        f"{ENDS[Outcome(result.outcome)]} after {result.travelled_m / 1e3:.1f} km, "
+        f"error {result.error_m:.0f} m, major axis {result.major_axis_m:.0f} m",
+        fontsize=9, loc="left", color="0.3",
+    )  # fmt: skip
+    axes.legend(frameon=True, framealpha=0.9, fontsize=8, loc="best")
+    return save(made, folder, "drive_plan")
+
+
+def _places(
+    axes: Axes, traced: Traced, kind: int, marker: str, colour: str, size: float, label: str
+) -> None:
+    found = traced.of_kind(kind)
+    if len(found):
+        axes.plot(
+            found[:, 2], found[:, 3], marker, color=colour, ms=size, mec="k", mew=0.7, label=label
+        )
+
+
+def _streets(axes: Axes, city: City) -> None:
+    """Two-way streets grey, one-way streets lighter."""
+    from matplotlib.collections import LineCollection
+
+    both: list[list[tuple[float, float]]] = []
+    single: list[list[tuple[float, float]]] = []
+    for node in range(len(city)):
+        for way in np.flatnonzero(city.ways[node]).tolist():
+            there = city.neighbour(node, way)
+            is_both = bool(city.ways[there, (way + 2) % 4])
+            if is_both and there < node:
+                continue
+            (both if is_both else single).append([city.place(node), city.place(there)])
+    axes.add_collection(LineCollection(both, colors="0.78", linewidths=1.2, zorder=0))
+    axes.add_collection(
+        LineCollection(single, colors="0.78", linewidths=1.0, linestyles=":", zorder=0)
+    )
+
+
+def _ellipse(row: Floats) -> Floats:
+    angle = np.linspace(0.0, 2.0 * np.pi, 61)
+    values, vectors = np.linalg.eigh(np.array([[row[10], row[11]], [row[11], row[13]]]))
+    axes = vectors * (2.0 * np.sqrt(np.maximum(values, 0.0)))
+    ring: Floats = axes @ np.stack([np.cos(angle), np.sin(angle)]) + row[7:9, None]
+    return ring

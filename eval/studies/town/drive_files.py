@@ -1,0 +1,319 @@
+"""A simulated drive of the studies as files that ``crosscue replay`` reads as it reads a real one.
+
+CAN with the rear wheels' speeds, a magnetometer, and, where there are landmarks, a camera that sees
+a made-up wall at each landmark passed, with a landmark database beside. A landmark passed unnoticed
+shows a wall that the database does not hold. Truth stands in ``truth.json``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.datasets.simulated.drive import FIELD_T, START_NS
+from crosscue.datasets.truth.truth import Truth
+from crosscue.datasets.truth.truth import save as save_truth
+from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.localization.angles import wrap_all
+from crosscue.localization.town.kernel import (
+    LANDMARK_MISSED,
+    LANDMARK_REFUSED,
+    LANDMARK_TAKEN,
+    Traced,
+)
+from crosscue.localization.town.random_stream import key_of
+from crosscue.localization.town.settings import Drive
+from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.can.encode import encode
+from crosscue.replay.columns import (
+    DATA,
+    Block,
+    Bytes,
+    CanFrames,
+    Floats,
+    Images,
+    Int64s,
+    Messages,
+    Table,
+    Topic,
+)
+from crosscue.replay.files.run_folder import write_text
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.write.convert import LogWriter
+
+BUS: Final = Topic("/can", "crosscue/CanFrames", "columns")
+COMPASS: Final = Topic("/compass", "sensor_msgs/msg/MagneticField", "columns")
+CAMERA: Final = Topic("/camera", "crosscue/Images", "columns")
+WHEELS_ID: Final = 176
+BATCH_ROWS: Final = 1000
+SOURCE: Final = "simulated by crosscue, exact"
+WIDTH_PX, HEIGHT_PX = 480, 360
+TRUTH_EVERY: Final = 5
+
+DBC: Final = f"""\
+VERSION "1"
+
+NS_ :
+
+BS_:
+
+BU_: CAR
+
+BO_ {WHEELS_ID} REAR_WHEELS: 4 CAR
+ SG_ REAR_LEFT : 0|16@1+ (0.01,-100) [-100|555.35] "km/h" CAR
+ SG_ REAR_RIGHT : 16|16@1+ (0.01,-100) [-100|555.35] "km/h" CAR
+
+CM_ "The bus of a simulated car; no real car's.";
+"""
+
+VEHICLE: Final = """\
+# The simulated car of crosscue's studies.
+version = 1
+name = "crosscue study car"
+lost_above_m = {lost_above_m}
+
+[can]
+bus = "/can"
+dbc = ["study_car.dbc"]
+
+[can.wheel_speeds]
+rear_left = "REAR_WHEELS.REAR_LEFT"
+rear_right = "REAR_WHEELS.REAR_RIGHT"
+
+[odometry]
+wheelbase_m = {wheelbase_m}
+track_width_m = {track_width_m}
+heading_from = "wheels"
+slip_per_sqrt_m = {slip}
+wheel_turn_rad_per_sqrt_m = {turn}
+
+[compass]
+use = {use_compass}
+heading_sd_rad = {compass_sd_rad}
+interval_m = {compass_interval_m}
+interval_s = 0.0
+
+[landmarks]
+gate_nis = {gate_nis}
+sigmas = 4.0
+interval_m = 0.0
+interval_s = 0.0
+
+[start]
+x_m = {x_m}
+y_m = {y_m}
+position_sd_m = {position_sd_m}
+heading_rad = {heading_rad}
+heading_sd_rad = {heading_sd_rad}
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class StudyDriveFiles:
+    """What was written.
+
+    Attributes:
+        log: ``drive.mcap``.
+        vehicle: ``vehicle.toml``.
+        truth: ``truth.json``.
+        landmarks: ``landmarks.db``, or None where no landmark was passed.
+    """
+
+    log: Path
+    vehicle: Path
+    truth: Path
+    landmarks: Path | None
+
+
+def write_drive_files(
+    folder: Path, settings: Drive, traced: Traced, seed: int, *, overwrite: bool = False
+) -> StudyDriveFiles:
+    """Write log, vehicle file, DBC file, truth and landmark database of one drive.
+
+    Args:
+        folder: Where to.
+        settings: As driven.
+        traced: The drive.
+        seed: Of the drive; walls come from it.
+        overwrite: Replace files that are there.
+
+    Raises:
+        OutputError: A file is there already, or cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    log = folder / "drive.mcap"
+    t_ns = _times(settings, len(traced.steps))
+    passed = traced.of_kind(LANDMARK_MISSED, LANDMARK_TAKEN, LANDMARK_REFUSED)
+    write_text(folder / "study_car.dbc", DBC)
+    write_text(folder / "vehicle.toml", vehicle_text(settings, traced))
+    with LogWriter(log, Ledger(str(log)), overwrite=overwrite) as writer:
+        topics = [BUS]
+        topics += [COMPASS] if settings.sensors.compass_2sigma_deg is not None else []
+        topics += [CAMERA] if len(passed) else []
+        for topic in topics:
+            writer.add_topic(topic)
+        for block in _in_order(settings, traced, t_ns, passed, seed, folder):
+            writer.write(block)
+    landmarks = None
+    if len(passed):
+        landmarks = folder / "landmarks.db"
+        landmarks.unlink(missing_ok=True)
+        _write_landmarks(landmarks, passed, settings.sensors.landmark_sd_m, seed)
+    return StudyDriveFiles(
+        log, folder / "vehicle.toml", _write_truth(folder, traced, t_ns), landmarks
+    )
+
+
+def vehicle_text(settings: Drive, traced: Traced) -> str:
+    """The vehicle file that fits the simulated car and its start."""
+    car, sensors = settings.car, settings.sensors
+    compass = sensors.compass_2sigma_deg
+    x, y, heading = traced.first_belief
+    return VEHICLE.format(
+        lost_above_m=settings.navigation.lost_above_m,
+        wheelbase_m=car.wheelbase_m,
+        track_width_m=car.track_width_m,
+        slip=sensors.slip_per_sqrt_m / math.sqrt(2.0),
+        turn=math.sqrt(2.0) * sensors.slip_per_sqrt_m / car.track_width_m,
+        use_compass="false" if compass is None else "true",
+        compass_sd_rad=math.radians(180.0 if compass is None else compass) / 2.0,
+        compass_interval_m=sensors.compass_interval_m,
+        gate_nis=sensors.landmark_gate_nis,
+        x_m=x,
+        y_m=y,
+        position_sd_m=sensors.start_position_sd_m,
+        heading_rad=heading,
+        heading_sd_rad=math.radians(sensors.start_heading_sd_deg),
+    )
+
+
+def _times(settings: Drive, steps: int) -> Int64s:
+    """Log time at the end of each step."""
+    return START_NS + np.round(np.arange(1, steps + 1) * settings.car.step_s * 1e9).astype(np.int64)
+
+
+def _in_order(
+    settings: Drive, traced: Traced, t_ns: Int64s, passed: Floats, seed: int, folder: Path
+) -> list[Block]:
+    blocks = list(_batches(_can_block(settings, traced, t_ns, folder)))
+    if settings.sensors.compass_2sigma_deg is not None:
+        blocks += _batches(_compass_block(traced, t_ns))
+    blocks += [_frames_block(row, t_ns, i, seed) for i, row in enumerate(passed)]
+    return sorted(blocks, key=lambda block: int(block.log_ns[0]))
+
+
+def _batches(block: Block) -> Iterator[Block]:
+    for start in range(0, len(block), BATCH_ROWS):
+        yield block.take(slice(start, start + BATCH_ROWS))
+
+
+def _can_block(settings: Drive, traced: Traced, t_ns: Int64s, folder: Path) -> Block:
+    """Wheel speeds over each step, stamped at its middle."""
+    database = CanDatabase.load([folder / "study_car.dbc"])
+    kmh = np.round(traced.steps[:, 4:6] / settings.car.step_s * 3.6, 2)
+    payload = np.zeros((len(t_ns), 8), np.uint8)
+    coded = encode(database.named("REAR_WHEELS"), {"REAR_LEFT": kmh[:, 0], "REAR_RIGHT": kmh[:, 1]})
+    payload[:, : coded.shape[1]] = coded
+    n = len(t_ns)
+    frames = CanFrames(
+        np.full(n, WHEELS_ID, np.uint32), np.zeros(n, np.bool_), np.full(n, DATA, np.uint8),
+        np.full(n, coded.shape[1], np.uint8), payload, np.zeros(n, np.bool_),
+    )  # fmt: skip
+    return Block(BUS.name, t_ns - round(settings.car.step_s * 0.5e9), frames)
+
+
+def _compass_block(traced: Traced, t_ns: Int64s) -> Block:
+    """The field at every step; its error stays the same from one reading to the next."""
+    heading, read = traced.steps[:, 2], traced.steps[:, 6]
+    rows = np.flatnonzero(~np.isnan(read))
+    if not len(rows):
+        empty = np.empty(0)
+        return Block(
+            COMPASS.name, t_ns[:0], Table({f"mag_{a}_t": empty for a in "xyz"}), header_ns=t_ns[:0]
+        )
+    last = np.maximum(np.searchsorted(rows, np.arange(len(heading)), side="right") - 1, 0)
+    error = wrap_all(read[rows] - heading[rows])[last]
+    north = math.pi / 2.0 - (heading + error)
+    field = {
+        "mag_x_t": FIELD_T[0] * np.cos(north),
+        "mag_y_t": FIELD_T[0] * np.sin(north),
+        "mag_z_t": np.full(len(north), FIELD_T[1]),
+    }
+    table = Table({name: values[rows[0] :] for name, values in field.items()})
+    return Block(COMPASS.name, t_ns[rows[0] :], table, header_ns=t_ns[rows[0] :])
+
+
+def _frames_block(row: Floats, t_ns: Int64s, number: int, seed: int) -> Block:
+    """The wall as the car passes it, and what comes after: the replay weighs what it has passed."""
+    import cv2
+
+    first = int(row[0]) - 1
+    at_ns = t_ns[first : first + 2]
+    is_known = row[1] != LANDMARK_MISSED
+    walls = [number if is_known else -1 - 2 * number, -2 - 2 * number][: len(at_ns)]
+    coded: list[bytes] = []
+    for wall in walls:
+        picture = _seen(_wall(seed, wall), seed + number)
+        done, buffer = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])
+        assert done
+        coded.append(buffer.tobytes())
+    stop = np.cumsum([len(one) for one in coded], dtype=np.int64)
+    start = np.concatenate([[0], stop[:-1]]).astype(np.int64)
+    rows = Messages(np.frombuffer(b"".join(coded), np.uint8), start, stop)
+    return Block(CAMERA.name, at_ns, Images(rows, ("jpeg",) * len(coded)), header_ns=at_ns)
+
+
+def _wall(seed: int, number: int) -> Bytes:
+    """A made-up wall with enough corners; negative numbers are walls that nobody knows."""
+    import cv2
+
+    rng = np.random.default_rng(key_of(seed, number & 0xFFFF_FFFF, int(number < 0)))
+    picture = np.full((HEIGHT_PX, WIDTH_PX), 128, np.uint8)
+    for _ in range(300):
+        x, y = int(rng.integers(0, WIDTH_PX)), int(rng.integers(0, HEIGHT_PX))
+        w, h = (int(side) for side in rng.integers(4, 50, 2))
+        cv2.rectangle(picture, (x, y), (x + w, y + h), (int(rng.integers(0, 256)),), -1)
+    return picture
+
+
+def _seen(wall: Bytes, seed: int) -> Bytes:
+    """The wall from a little elsewhere, darker, with noise."""
+    import cv2
+
+    rng = np.random.default_rng(key_of(seed))
+    centre = (WIDTH_PX / 2.0, HEIGHT_PX / 2.0)
+    turn = cv2.getRotationMatrix2D(centre, rng.uniform(-4.0, 4.0), rng.uniform(0.9, 1.1))
+    moved = cv2.warpAffine(wall, turn, (WIDTH_PX, HEIGHT_PX), borderMode=cv2.BORDER_REFLECT)
+    noisy = 0.85 * moved + rng.normal(8.0, 4.0, moved.shape)
+    seen: Bytes = np.clip(noisy, 0, 255).astype(np.uint8)
+    return seen
+
+
+def _write_landmarks(path: Path, passed: Floats, sd_m: float, seed: int) -> None:
+    """One entry for each recognition: where its noise put the landmark, as the drive had it."""
+    from crosscue.localization.landmarks.database import LandmarkWriter, Place
+    from crosscue.localization.landmarks.features import make_matcher
+
+    matcher = make_matcher("orb")
+    with LandmarkWriter(path, matcher.kind) as writer:
+        for number, row in enumerate(passed):
+            if row[1] == LANDMARK_MISSED:
+                continue
+            place = Place(f"wall {number}", row[4:6].copy(), sd_m**2 * np.eye(2), None, "simulated")
+            writer.add(place, matcher.describe(_wall(seed, number)))
+
+
+def _write_truth(folder: Path, traced: Traced, t_ns: Int64s) -> Path:
+    kept = slice(None, None, TRUTH_EVERY)
+    x, y, heading = traced.steps[kept, :3].T
+    write_tum(folder / "pose.tum", planar(t_ns[kept], x, y, heading), SOURCE)
+    truth = Truth(
+        version=1, log="drive.mcap", start_ns=int(t_ns[0]), end_ns=int(t_ns[-1]) + 1,
+        pose="pose.tum", source=SOURCE,
+    )  # fmt: skip
+    return save_truth(truth, folder)

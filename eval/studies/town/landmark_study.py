@@ -1,0 +1,283 @@
+"""Who reaches the goal: success against distance, range at 80 % success, extra distance driven.
+
+Strategies that share density and rate share cities, starts, goals and sensor errors too, so that
+their differences are the strategies'.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from crosscue.eval.studies.intervals import (
+    Measured,
+    mean_of,
+    range_at,
+    ratio_of,
+    ratio_of_means,
+    share_of,
+)
+from crosscue.eval.studies.page import Table
+from crosscue.eval.studies.words import km, percent
+from crosscue.localization.town.settings import Drive
+from crosscue.localization.town.simulator import Outcome
+from crosscue.replay.columns import Floats
+
+from .range_study import split
+from .settings import LandmarkStudy
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+SUCCESS: Final = 0.8
+STRAIGHT: Final = "straight to goal"
+PUBLISHED_EXTRA: Final = {"landmark to landmark": 0.31, "hybrid": 0.15}
+PUBLISHED_POINT: Final = (0.55, 0.6, 6900.0)
+"""Landmarks per km2, detection rate, and the distance that 8 of 10 field tests reached."""
+DENSE_PER_KM2: Final = 10.0
+"""From here on the source makes no claim about strategies."""
+NOTES: Final = (
+    "Range: the distance from start to goal, as the crow flies, at which a logistic curve through "
+    "all drives of a cell has fallen to 80 % success; 'beyond': not within the farthest goal that "
+    "cities of at most 100 km2 gave. Intervals: 95 %, bootstrap over drives.",
+    "Extra distance: ratio of the ways driven by the same seeds where both strategies reached "
+    "the goal. The source does not say over which drives it averages; 'each its own' compares the "
+    "mean ways of all drives that reached the goal, which counts that a strategy reaches farther "
+    "goals as well, and 'all drives' counts lost ones as far as they came.",
+    "Gains are told only for cells where both ranges are within the farthest goal, which leaves "
+    "out those in which looking for landmarks helps most.",
+    "The source says nothing of the landmarks' own uncertainty, nor where in a city they stand "
+    "(here: at intersections, 5 m s.d.), nor when a landmark is given up as a target.",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One strategy, density and rate.
+
+    Attributes:
+        strategy: By name.
+        landmarks_per_km2: Density.
+        detection_rate: Of landmarks passed.
+        drives: How many.
+        lost: Of them.
+        given_up: Neither lost nor there after the longest distance.
+        success: Share that reached the goal.
+        range_m: At 80 % success; infinite beyond the farthest goal.
+        travelled_m: Mean way.
+        updates: Mean number of landmarks weighed in.
+    """
+
+    strategy: str
+    landmarks_per_km2: float
+    detection_rate: float
+    drives: int
+    lost: int
+    given_up: int
+    success: Measured
+    range_m: Measured
+    travelled_m: Measured
+    updates: float
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """A strategy against driving straight to the goal.
+
+    Attributes:
+        strategy: By name.
+        pairs: Drives of the same seeds in which both reached the goal.
+        extra: How much farther this one drove in these pairs: 0.31 is 31 %.
+        extra_reached: Means of all drives that reached the goal, each strategy's own; this one
+            reaches farther goals too.
+        extra_all: Means of all drives, lost ones as far as they came.
+        published_extra: NaN where there is none.
+        gains_m: Range less that of straight to goal, of cells below 10 per km2 where both are
+            known.
+        gain_m: Their mean.
+        beyond: Cells below 10 per km2 where this strategy's range is beyond the farthest goal.
+        more_success: Difference in share reached, over all pairs of drives.
+    """
+
+    strategy: str
+    pairs: int
+    extra: Measured
+    extra_reached: Measured
+    extra_all: Measured
+    published_extra: float
+    gains_m: tuple[float, ...]
+    gain_m: float
+    beyond: int
+    more_success: Measured
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkResult:
+    """The whole study.
+
+    Attributes:
+        cells: In the order of the study's cases.
+        comparisons: Of strategies other than straight to goal.
+    """
+
+    cells: tuple[Cell, ...]
+    comparisons: tuple[Comparison, ...]
+
+
+def summarise(study: LandmarkStudy, table: pa.Table) -> LandmarkResult:
+    """Results from ``drives.parquet``."""
+    cases = study.cases()
+    rows = list(split(table))
+    cells = tuple(_cell(case.settings, part) for case, part in zip(cases, rows, strict=True))
+    grid = len(cases) - len(study.points)
+    return LandmarkResult(cells, tuple(_comparisons(cells[:grid], rows[:grid])))
+
+
+def _cell(settings: Drive, rows: dict[str, Floats]) -> Cell:
+    outcome = rows["outcome"]
+    reached = outcome == Outcome.REACHED
+    return Cell(
+        strategy=settings.navigation.strategy,
+        landmarks_per_km2=settings.landmarks_per_km2,
+        detection_rate=settings.sensors.detection_rate,
+        drives=len(outcome),
+        lost=int((outcome == Outcome.LOST).sum()),
+        given_up=int((outcome == Outcome.GIVEN_UP).sum()),
+        success=share_of(int(reached.sum()), len(outcome)),
+        range_m=range_at(rows["straight_m"], reached.astype(np.float64), SUCCESS),
+        travelled_m=mean_of(rows["travelled_m"]),
+        updates=float(rows["detected"].mean()),
+    )
+
+
+def comparisons_of(study: LandmarkStudy, rows: Sequence[dict[str, Floats]]) -> list[Comparison]:
+    """Strategies against straight to goal.
+
+    Args:
+        study: Its grid only is compared.
+        rows: The columns of ``Result`` for each of the study's cases.
+    """
+    grid = len(study.cases()) - len(study.points)
+    cells = [_cell(case.settings, part) for case, part in zip(study.cases(), rows, strict=True)]
+    return _comparisons(cells[:grid], rows[:grid])
+
+
+def _comparisons(cells: Sequence[Cell], rows: Sequence[dict[str, Floats]]) -> list[Comparison]:
+    places = {(c.strategy, c.landmarks_per_km2, c.detection_rate): i for i, c in enumerate(cells)}
+    strategies = [s for s in dict.fromkeys(c.strategy for c in cells) if s != STRAIGHT]
+    if not any(c.strategy == STRAIGHT for c in cells):
+        return []
+    return [
+        _comparison(
+            strategy,
+            [
+                (i, places[(STRAIGHT, c.landmarks_per_km2, c.detection_rate)])
+                for i, c in enumerate(cells)
+                if c.strategy == strategy
+            ],
+            cells,
+            rows,
+        )
+        for strategy in strategies
+    ]
+
+
+def _comparison(
+    strategy: str,
+    pairs: Sequence[tuple[int, int]],
+    cells: Sequence[Cell],
+    rows: Sequence[dict[str, Floats]],
+) -> Comparison:
+    ours, theirs, better = [], [], []
+    ways, reached = [], []
+    for i, j in pairs:
+        mine, straight = (rows[k]["outcome"] == Outcome.REACHED for k in (i, j))
+        ours.append(rows[i]["travelled_m"][mine & straight])
+        theirs.append(rows[j]["travelled_m"][mine & straight])
+        better.append(mine.astype(np.float64) - straight)
+        ways.append(np.stack([rows[i]["travelled_m"], rows[j]["travelled_m"]]))
+        reached.append(np.stack([mine, straight]).astype(np.float64))
+    sparse = [(cells[i], cells[j]) for i, j in pairs if cells[i].landmarks_per_km2 < DENSE_PER_KM2]
+    gains = tuple(
+        mine.range_m.value - straight.range_m.value
+        for mine, straight in sparse
+        if math.isfinite(mine.range_m.value) and math.isfinite(straight.range_m.value)
+    )
+    way = np.concatenate(ours), np.concatenate(theirs)
+    ratio = ratio_of(*way) if len(way[0]) else Measured(math.nan, math.nan, math.nan)
+    driven, there = np.concatenate(ways, axis=1), np.concatenate(reached, axis=1)
+    own = ratio_of_means(driven[0], there[0], driven[1], there[1])
+    return Comparison(
+        strategy=strategy,
+        pairs=len(way[0]),
+        extra=_less_one(ratio),
+        extra_reached=_less_one(own),
+        extra_all=_less_one(ratio_of(*driven)),
+        published_extra=PUBLISHED_EXTRA.get(strategy, math.nan),
+        gains_m=gains,
+        gain_m=float(np.mean(gains)) if gains else math.nan,
+        beyond=sum(math.isinf(mine.range_m.value) for mine, _ in sparse),
+        more_success=mean_of(np.concatenate(better)),
+    )
+
+
+def _less_one(ratio: Measured) -> Measured:
+    return Measured(*(value - 1.0 for value in ratio))
+
+
+def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[Table, ...]:
+    """Results in words, beside the published ones."""
+    grid = result.cells[: len(result.cells) - len(study.points)]
+    by_strategy = [
+        Table(
+            f"Range at 80 % success, km: {strategy}",
+            ("landmarks per km2", *(f"rate {100 * rate:.0f} %" for rate in study.detection_rates)),
+            tuple(
+                (
+                    f"{density:g}",
+                    *(
+                        km(c.range_m, 1)
+                        for c in grid
+                        if c.strategy == strategy and c.landmarks_per_km2 == density
+                    ),
+                )
+                for density in study.densities_per_km2
+            ),
+        )
+        for strategy in study.strategies
+    ]
+    compared = Table(
+        "Against straight to goal",
+        ("strategy", "pairs", "drives farther by", "each its own", "all drives", "published",
+         "range gained, km", "published", "more drives succeed"),
+        tuple(
+            (
+                c.strategy, str(c.pairs), percent(c.extra), percent(c.extra_reached),
+                percent(c.extra_all),
+                "" if math.isnan(c.published_extra) else f"{100 * c.published_extra:.0f} %",
+                "" if math.isnan(c.gain_m) else
+                f"{c.gain_m / 1e3:.1f} ({len(c.gains_m)} cells; {c.beyond} beyond)",
+                "1 to 2", percent(c.more_success),
+            )
+            for c in result.comparisons
+        ),
+    )  # fmt: skip
+    points = Table(
+        "Landmark to landmark, single points",
+        ("landmarks per km2", "rate", "drives", "reached", "range at 80 %, km", "field test, km"),
+        tuple(
+            (
+                f"{c.landmarks_per_km2:g}", f"{100 * c.detection_rate:.0f} %", str(c.drives),
+                percent(c.success), km(c.range_m, 1),
+                "at least 6.9 (8 of 10)"
+                if (c.landmarks_per_km2, c.detection_rate) == PUBLISHED_POINT[:2] else "",
+            )
+            for c in result.cells[len(grid) :]
+        ),
+    )  # fmt: skip
+    return (*by_strategy, *((compared,) if result.comparisons else ()),
+            *((points,) if points.rows else ()))  # fmt: skip

@@ -1,0 +1,86 @@
+"""The range study as a picture: growth of the ellipse, and how many are not lost yet."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from crosscue.eval.studies.pictures import COLOURS, figure, save
+from crosscue.localization.town.simulator import Outcome
+from crosscue.replay.columns import Floats
+
+from .range_study import CompassResult, points
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+KM: Final = 1e-3
+FIRST_GOAL_KM: Final = 25.0
+NAME: Final = "range"
+
+
+def draw(
+    results: Sequence[CompassResult],
+    rows: Sequence[dict[str, Floats]],
+    limit_m: float,
+    folder: Path,
+) -> Path:
+    """Write ``range.png`` and ``range.svg``."""
+    made, (growth, survival) = figure(2, 12.0, 4.8)
+    for i, (result, columns) in enumerate(zip(results, rows, strict=True)):
+        colour = COLOURS[i % len(COLOURS)]
+        _growth(growth, result, columns, colour)
+        _survival(survival, result, columns, colour)
+    growth.axhline(limit_m, color="0.2", ls="--", lw=1.0)
+    growth.set_xlim(0.0, FIRST_GOAL_KM)
+    growth.set_ylim(0.0, 1.4 * limit_m)
+    growth.set_xlabel("distance driven along streets (km)")
+    growth.set_ylabel("2-sigma ellipse, full major axis (m)")
+    growth.set_title(
+        "One point a drive: at its first goal, or where it was lost before", fontsize=9
+    )
+    growth.legend(frameon=False, fontsize=8, loc="upper right", markerscale=4)
+    survival.set_xlim(0.0, 60.0)
+    survival.set_ylim(0.0, 1.02)
+    survival.set_xlabel("distance driven along streets, goal after goal (km)")
+    survival.set_ylabel("share of drives not lost yet")
+    survival.set_title("Crosses: mean distance at loss; dotted: published", fontsize=9)
+    made.suptitle("Range without landmarks, simulated", fontsize=11)
+    return save(made, folder, NAME)
+
+
+def name_of(result: CompassResult) -> str:
+    """The compass in words."""
+    degrees = result.compass_2sigma_deg
+    return "no compass" if degrees is None else f"compass ±{degrees:g}° (2 sigma)"
+
+
+def _growth(axes: Axes, result: CompassResult, columns: dict[str, Floats], colour: str) -> None:
+    distance_m, axis_m = points(columns)
+    axes.plot(distance_m * KM, axis_m, ".", ms=1.5, alpha=0.35, color=colour, rasterized=True)
+    curve_m = np.linspace(0.0, FIRST_GOAL_KM / KM, 400)
+    axes.plot(curve_m * KM, result.growth.axis_m(curve_m), color=colour, lw=1.6,
+              label=name_of(result))  # fmt: skip
+
+
+def _survival(axes: Axes, result: CompassResult, columns: dict[str, Floats], colour: str) -> None:
+    lost_m = np.sort(columns["travelled_m"][columns["outcome"] == Outcome.LOST])
+    left = 1.0 - np.arange(len(lost_m) + 1) / result.drives
+    end_m = max(60_000.0, float(lost_m[-1]) if len(lost_m) else 0.0)
+    axes.step(
+        np.concatenate([[0.0], lost_m, [end_m]]) * KM, np.concatenate([left, left[-1:]]),
+        where="post", color=colour, lw=1.6,
+    )  # fmt: skip
+    if result.lost:
+        mean = result.lost_after_m
+        axes.errorbar(
+            mean.value * KM, 0.5,
+            xerr=[[(mean.value - mean.low) * KM], [(mean.high - mean.value) * KM]],
+            fmt="x", color=colour, capsize=3,
+        )  # fmt: skip
+    if math.isfinite(result.published_m):
+        axes.axvline(result.published_m * KM, color=colour, ls=":", lw=1.4)

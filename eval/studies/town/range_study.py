@@ -1,0 +1,224 @@
+"""How far without landmarks: the major axis against distance, and the distance at loss.
+
+Each drive goes from goal to goal until its 2-sigma ellipse is longer than 100 m, or it is given up.
+The published figure shows one goal a drive; its point here is where the same drive reached its
+first goal, or was lost before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from crosscue.eval.scoring.consistency import mean_band
+from crosscue.eval.studies.intervals import Measured, mean_of, measured, share_of, weights_of
+from crosscue.localization.town.kernel import drive_many
+from crosscue.localization.town.random_stream import key_of
+from crosscue.localization.town.settings import Drive
+from crosscue.localization.town.simulator import Outcome, Result
+from crosscue.replay.columns import Floats
+
+from .settings import UNTIL_LOST, RangeStudy, changed
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+PUBLISHED_M: Final = {10.0: math.inf, 20.0: 20_800.0, 30.0: 9_300.0, None: 300.0}
+"""Mean distance at loss by compass 2-sigma in degrees; infinite: never lost."""
+CALIBRATED_DEG: Final = 30.0
+CALIBRATION_SEED: Final = 424_242
+CALIBRATION_DRIVES: Final = 2_000
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """``axis^2 = start + linear D + square D^2``: the start's, the compass's, the heading's share.
+
+    Attributes:
+        start_m2: At distance zero.
+        linear_m: Growth as of a random walk.
+        square: Growth as of a constant heading error.
+        crossing_m: Where the curve reaches the limit.
+    """
+
+    start_m2: float
+    linear_m: float
+    square: float
+    crossing_m: Measured
+
+    def axis_m(self, distance_m: Floats) -> Floats:
+        """The curve."""
+        axis: Floats = np.sqrt(
+            self.start_m2 + self.linear_m * distance_m + self.square * distance_m**2
+        )
+        return axis
+
+
+@dataclass(frozen=True, slots=True)
+class CompassResult:
+    """One compass.
+
+    Attributes:
+        compass_2sigma_deg: None: without.
+        drives: How many.
+        lost: Of them.
+        given_up: Not lost within the longest distance.
+        reached_first_goal: Reached at least one goal before.
+        lost_after_m: Mean distance at loss of those lost.
+        shortest_m: The soonest loss; NaN without.
+        longest_m: The latest.
+        share_lost: Of all drives.
+        law_m: Straight driving: 25^2 / (r ds); NaN without compass.
+        growth: Curve through the points of the published kind of figure.
+        nees_mean: Of x, y, heading at the end; 3 where the filter is honest.
+        nees_band: Where 95 % of such means lie.
+        published_m: Infinite: never lost; NaN: not published.
+        is_calibrated: The one figure that a parameter was calibrated to.
+    """
+
+    compass_2sigma_deg: float | None
+    drives: int
+    lost: int
+    given_up: int
+    reached_first_goal: int
+    lost_after_m: Measured
+    shortest_m: float
+    longest_m: float
+    share_lost: Measured
+    law_m: float
+    growth: Growth
+    nees_mean: float
+    nees_band: tuple[float, float]
+    published_m: float
+    is_calibrated: bool
+
+
+def summarise(study: RangeStudy, table: pa.Table) -> list[CompassResult]:
+    """Results by compass, in the order of the study's cases."""
+    return [
+        _of_case(case.settings, rows)
+        for case, rows in zip(study.cases(), split(table), strict=True)
+    ]
+
+
+def split(table: pa.Table) -> Iterator[dict[str, Floats]]:
+    """The columns of each case in turn, by name."""
+    names = list(Result._fields)
+    cases = table["case"].to_numpy()
+    columns = {name: table[name].to_numpy() for name in names}
+    for case in range(int(cases[-1]) + 1):
+        part = slice(*np.searchsorted(cases, [case, case + 1]).tolist())
+        yield {name: columns[name][part] for name in names}
+
+
+def points(rows: dict[str, Floats]) -> tuple[Floats, Floats]:
+    """Distance and major axis of each drive at its first goal, or where it was lost before."""
+    reached = ~np.isnan(rows["first_goal_m"])
+    distance = np.where(reached, rows["first_goal_m"], rows["travelled_m"])
+    axis = np.where(reached, rows["first_goal_axis_m"], rows["major_axis_m"])
+    is_point = reached | (rows["outcome"] == Outcome.LOST)
+    return distance[is_point], axis[is_point]
+
+
+def law_m(settings: Drive) -> float:
+    """Where a car that drives straight on is lost, by the law r ds D; NaN without a compass."""
+    compass = settings.sensors.compass_2sigma_deg
+    if compass is None:
+        return math.nan
+    variance = math.radians(compass / 2.0) ** 2
+    half_m = settings.navigation.lost_above_m / 4.0
+    return half_m**2 / (variance * settings.sensors.compass_interval_m)
+
+
+def calibrate(drive: Drive, workers: int, tolerance: float = 2e-3) -> float:
+    """The compass interval with which cars at 30 degrees are lost after the published mean.
+
+    On seeds of its own, which no study reports. The same seeds at each step, so that it converges.
+
+    Args:
+        drive: Everything else; its compass is replaced.
+        workers: Threads.
+        tolerance: Relative, of the mean distance.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
+    seeds = np.array(
+        [key_of(CALIBRATION_SEED, i) for i in range(CALIBRATION_DRIVES)], dtype=np.uint64
+    )
+    parts = np.array_split(seeds, 8 * workers)
+    wanted_m, interval_m = PUBLISHED_M[CALIBRATED_DEG], drive.sensors.compass_interval_m
+    with ThreadPoolExecutor(workers) as pool:
+        while True:
+            sensors = drive.sensors.model_copy(update={"compass_interval_m": interval_m})
+            settings = changed(
+                drive.model_copy(update={"sensors": sensors}),
+                compass_2sigma_deg=CALIBRATED_DEG, goals=UNTIL_LOST,
+            )  # fmt: skip
+            rows = np.concatenate(list(pool.map(lambda p: drive_many(settings, p), parts)))  # noqa: B023
+            lost = rows[:, 0] == Outcome.LOST
+            mean_m = float(rows[lost, Result._fields.index("travelled_m")].mean())
+            if abs(mean_m / wanted_m - 1.0) < tolerance:
+                return interval_m
+            interval_m *= mean_m / wanted_m
+
+
+def _of_case(settings: Drive, rows: dict[str, Floats]) -> CompassResult:
+    sensors = settings.sensors
+    n = len(rows["outcome"])
+    is_lost = rows["outcome"] == Outcome.LOST
+    lost_m = rows["travelled_m"][is_lost]
+    compass = sensors.compass_2sigma_deg
+    return CompassResult(
+        compass_2sigma_deg=compass,
+        drives=n,
+        lost=int(is_lost.sum()),
+        given_up=int((rows["outcome"] == Outcome.GIVEN_UP).sum()),
+        reached_first_goal=int((~np.isnan(rows["first_goal_m"])).sum()),
+        lost_after_m=mean_of(lost_m),
+        shortest_m=float(lost_m.min()) if len(lost_m) else math.nan,
+        longest_m=float(lost_m.max()) if len(lost_m) else math.nan,
+        share_lost=share_of(int(is_lost.sum()), n),
+        law_m=law_m(settings),
+        growth=fit_growth(
+            *points(rows), 4.0 * sensors.start_position_sd_m, settings.navigation.lost_above_m
+        ),
+        nees_mean=float(rows["nees"].mean()),
+        nees_band=mean_band(3, n),
+        published_m=PUBLISHED_M.get(compass, math.nan),
+        is_calibrated=compass == CALIBRATED_DEG,
+    )
+
+
+def fit_growth(distance_m: Floats, axis_m: Floats, start_m: float, limit_m: float) -> Growth:
+    """Least squares on relative errors of axis^2, coefficients not negative.
+
+    Args:
+        distance_m: Shape (N,).
+        axis_m: Shape (N,).
+        start_m: The axis at distance zero, which is known.
+        limit_m: Of the axis, for the crossing.
+    """
+    from scipy.optimize import nnls
+
+    scale, start_m2 = float(distance_m.max()), start_m**2
+    u = distance_m / scale
+    terms, wanted = np.column_stack([u, u * u]) / (axis_m**2)[:, None], 1.0 - start_m2 / axis_m**2
+    weights = np.sqrt(weights_of(len(u), replicates=200))
+    found = np.array([nnls(w[:, None] * terms, w * wanted)[0] for w in weights])
+    crossings = np.array([_crossing(start_m2, a, b, limit_m) for a, b in found]) * scale
+    linear, square = found[0]
+    return Growth(start_m2, float(linear / scale), float(square / scale**2), measured(crossings))
+
+
+def _crossing(start: float, linear: float, square: float, limit_m: float) -> float:
+    """Where start + linear x + square x^2 is the limit squared."""
+    short = limit_m**2 - start
+    if short <= 0.0:
+        return 0.0
+    if square > 0.0:
+        return (math.sqrt(linear**2 + 4.0 * square * short) - linear) / (2.0 * square)
+    return short / linear if linear > 0.0 else math.inf

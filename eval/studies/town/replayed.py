@@ -1,0 +1,60 @@
+"""A simulated drive through its log: written, replayed, scored as a real one would be."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from crosscue.eval.pipeline.landmarks import matcher_for, open_for
+from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.scoring.pose.score import PoseScore, score
+from crosscue.localization.town.kernel import Traced, drive_traced
+from crosscue.localization.town.settings import Drive
+from crosscue.replay.files.run_folder import RunFolder, create
+from crosscue.replay.log import EVERYTHING, open_log
+from crosscue.replay.vehicle.vehicle import load
+
+from .drive_files import StudyDriveFiles, write_drive_files
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replayed:
+    """One drive and what became of it.
+
+    Attributes:
+        traced: As simulated, with the filter that navigated.
+        files: Its log and truth.
+        run: The replay's folder.
+        score: The replay against truth.
+        is_whole: The replay lost nothing of the log.
+        landmark_counts: What became of camera frames.
+    """
+
+    traced: Traced
+    files: StudyDriveFiles
+    run: RunFolder
+    score: PoseScore
+    is_whole: bool
+    landmark_counts: dict[str, int]
+
+
+def through_log(folder: Path, settings: Drive, seed: int, *, overwrite: bool = False) -> Replayed:
+    """Drive, write the log, replay it into ``folder/run``, score that.
+
+    Raises:
+        OutputError: Files are there already, or cannot be written.
+        RunError: The run folder holds something else.
+    """
+    traced = drive_traced(settings, seed)
+    files = write_drive_files(folder, settings, traced, seed, overwrite=overwrite)
+    vehicle = load(files.vehicle)
+    run = create(folder / "run", overwrite=overwrite)
+    with ExitStack() as open_:
+        log = open_.enter_context(open_log(files.log))
+        landmarks = None
+        if files.landmarks is not None:
+            landmarks = open_.enter_context(open_for(files.landmarks, matcher_for(vehicle)))
+        outcome = replay_drive([log], vehicle, run, EVERYTHING, landmarks=landmarks)
+    scored = score(run, files.truth)
+    return Replayed(traced, files, run, scored, outcome.exit_status == 0, outcome.landmark_counts)

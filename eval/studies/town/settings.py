@@ -1,0 +1,232 @@
+"""What a study varies, how often it drives, and with which car: checked, from TOML or by default.
+
+A study file names its ``kind`` and whatever differs from the published study of that kind:
+
+    version = 1
+    kind = "range"
+    drives = 200
+    compass_2sigma_deg = [5.0, 15.0]
+    [drive.car]
+    cruise_mps = 14.0
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+from typing import Annotated, ClassVar, Final, Literal, NamedTuple, Self, TypeVar
+
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from crosscue.localization.town.settings import City, Drive, Share
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import toml_tree
+from crosscue.replay.vehicle.section import Section
+from crosscue.replay.vehicle.validation_errors import explain
+from crosscue.replay.vehicle.vehicle import tuples
+
+VERSION: Final = 1
+UNTIL_LOST: Final = 1_000_000
+VARIED: Final = "this study varies or fixes it itself, a file leaves it out"
+LARGEST_FILE: Final = 1 << 20
+
+StrategyName = Literal["straight to goal", "landmark to landmark", "hybrid"]
+Degrees = Annotated[float, Field(gt=0.0, le=180.0)]
+Density = Annotated[float, Field(ge=0.0, le=100.0)]
+Drives = Annotated[int, Field(ge=1, le=1_000_000)]
+Seed = Annotated[int, Field(ge=0, lt=1 << 63)]
+
+
+class StudyFileError(CrosscueError):
+    """A study file cannot be read or does not fit."""
+
+    exit_status = 2
+
+
+class Case(NamedTuple):
+    """One combination of conditions.
+
+    Attributes:
+        block: Cases of one block drive the same cities, starts, goals and sensor errors.
+        settings: Of each of its drives.
+    """
+
+    block: int
+    settings: Drive
+
+
+class _Study(Section):
+    version: Literal[1] = VERSION
+    seed: Seed = 1
+    drive: Drive = Drive()
+
+    varied: ClassVar[tuple[str, ...]] = ()
+    """Settings of the drive that belong to the study itself."""
+
+    @model_validator(mode="after")
+    def _leaves_the_varied_alone(self) -> Self:
+        for path in self.varied:
+            section: Section = self.drive
+            *outer, last = path.split(".")
+            for name in outer:
+                section = getattr(section, name)
+            if last in section.model_fields_set:
+                raise _misfit(VARIED, getattr(section, last), "drive", *outer, last)
+        return self
+
+
+class RangeStudy(_Study):
+    """How far without landmarks: drives from goal to goal until lost."""
+
+    kind: Literal["range"] = "range"
+    drives: Drives = 1000
+    """With each compass."""
+    compass_2sigma_deg: tuple[Degrees, ...] = (10.0, 20.0, 30.0)
+    without_compass: bool = True
+
+    varied: ClassVar[tuple[str, ...]] = ("sensors.compass_2sigma_deg", "goals", "landmarks_per_km2")
+
+    @model_validator(mode="after")
+    def _has_a_compass_or_none(self) -> Self:
+        if not self.compass_2sigma_deg and not self.without_compass:
+            raise _misfit("no compass and none without: nothing to drive", False, "without_compass")
+        return self
+
+    def cases(self) -> tuple[Case, ...]:
+        """One for each compass."""
+        compasses = (*self.compass_2sigma_deg, *((None,) if self.without_compass else ()))
+        return tuple(
+            Case(block, changed(self.drive, compass_2sigma_deg=compass, goals=UNTIL_LOST))
+            for block, compass in enumerate(compasses)
+        )
+
+
+class LandmarkStudy(_Study):
+    """Who reaches the goal: strategy by density by detection rate, one goal a drive."""
+
+    kind: Literal["landmarks"] = "landmarks"
+    drives: Drives = 700
+    """With each combination."""
+    strategies: Annotated[tuple[StrategyName, ...], Field(min_length=1)] = (
+        "straight to goal", "landmark to landmark", "hybrid",
+    )  # fmt: skip
+    densities_per_km2: Annotated[tuple[Density, ...], Field(min_length=1)] = (
+        0.1, 0.5, 1.0, 5.0, 10.0,
+    )  # fmt: skip
+    detection_rates: Annotated[tuple[Share, ...], Field(min_length=1)] = (0.2, 0.4, 0.6, 0.8, 1.0)
+    points: tuple[tuple[Density, Share], ...] = ((0.55, 0.6),)
+    """More pairs of density and rate, driven landmark to landmark only."""
+
+    varied: ClassVar[tuple[str, ...]] = (
+        "navigation.strategy", "sensors.detection_rate", "landmarks_per_km2", "goals",
+    )  # fmt: skip
+
+    def cases(self) -> tuple[Case, ...]:
+        """Strategies outermost; strategies of one density and rate share their cities."""
+        grid = tuple(product(self.densities_per_km2, self.detection_rates))
+        cases = [
+            Case(block, _landmarks(self.drive, strategy, *pair))
+            for strategy in self.strategies
+            for block, pair in enumerate(grid)
+        ]
+        extra = [
+            Case(len(grid) + i, _landmarks(self.drive, "landmark to landmark", *pair))
+            for i, pair in enumerate(self.points)
+        ]
+        return (*cases, *extra)
+
+
+class FieldStudy(_Study):
+    """The field protocol: drives from goal to goal in a small town, through logs and the replay."""
+
+    kind: Literal["field"] = "field"
+    range_runs: Annotated[int, Field(ge=0, le=10_000)] = 33
+    landmark_runs: Annotated[int, Field(ge=0, le=10_000)] = 10
+    town_km2: Annotated[float, Field(ge=0.25, le=25.0)] = 1.0
+    minutes: Annotated[float, Field(gt=0.0, le=600.0)] = 75.0
+    compass_2sigma_deg: Degrees = 25.0
+    landmarks_per_km2: Density = 0.55
+    detection_rate: Share = 0.6
+
+    varied: ClassVar[tuple[str, ...]] = (
+        "navigation.strategy", "sensors.detection_rate", "sensors.compass_2sigma_deg",
+        "landmarks_per_km2", "landmark_per_goal", "goals", "longest_s", "city.smallest_km2",
+        "city.largest_km2",
+    )  # fmt: skip
+
+    def settings(self, *, has_landmarks: bool) -> Drive:
+        """Of one kind of run."""
+        town = self.drive.city.model_dump(exclude={"smallest_km2", "largest_km2"})
+        base = self.drive.model_copy(update={
+            "city": City(smallest_km2=self.town_km2, largest_km2=self.town_km2, **town),
+            "landmark_per_goal": True, "longest_s": 60.0 * self.minutes, "longest_m": 1e6,
+        })  # fmt: skip
+        return changed(
+            base,
+            compass_2sigma_deg=self.compass_2sigma_deg,
+            detection_rate=self.detection_rate,
+            landmarks_per_km2=self.landmarks_per_km2 if has_landmarks else 0.0,
+            strategy="landmark to landmark" if has_landmarks else "straight to goal",
+            goals=UNTIL_LOST,
+        )
+
+
+Study = TypeVar("Study", RangeStudy, LandmarkStudy, FieldStudy)
+_Sensors = ("compass_2sigma_deg", "detection_rate")
+
+
+def changed(drive: Drive, **values: object) -> Drive:
+    """A drive's settings with some of them replaced, named without their sections."""
+    sensors = {name: values.pop(name) for name in _Sensors if name in values}
+    navigation = {"strategy": values.pop("strategy")} if "strategy" in values else {}
+    return drive.model_copy(update={
+        "sensors": drive.sensors.model_copy(update=sensors),
+        "navigation": drive.navigation.model_copy(update=navigation),
+        **values,
+    })  # fmt: skip
+
+
+def load_study(path: Path, kind: type[Study]) -> Study:
+    """Read and check a study file.
+
+    Raises:
+        StudyFileError: Not there, not TOML, of another kind, or a key or value that does not fit;
+            with the line.
+    """
+    try:
+        content = read_at_most(path, LARGEST_FILE)
+        if content is None:
+            raise StudyFileError(f"{path}: larger than {LARGEST_FILE} bytes; give a study file")
+        text = content.decode("utf-8")
+        tree = toml_tree(text)
+    except OSError as error:
+        raise StudyFileError(f"{path}: {error.strerror}; check the path") from None
+    except UnicodeDecodeError:
+        raise StudyFileError(f"{path}: not UTF-8 text; give a study file") from None
+    except ValueError as error:
+        raise StudyFileError(f"{path}: not TOML: {error}; mend that line") from None
+    wanted = kind.model_fields["kind"].default
+    if tree.get("kind") != wanted:
+        raise StudyFileError(f'{path}: kind: want "{wanted}" here, got {tree.get("kind")!r}')
+    if "version" not in tree:
+        raise StudyFileError(f"{path}:1: version: missing; add version = {VERSION}")
+    try:
+        return TypeAdapter(kind).validate_python(tuples(tree))
+    except ValidationError as error:
+        raise StudyFileError(explain(error, text, str(path), kind)) from None
+
+
+def _misfit(why: str, given: object, *keys: str) -> ValidationError:
+    """An error that names its key, which a model's validator cannot do by a ValueError."""
+    kind = PydanticCustomError("misfit", "{why}", {"why": why})
+    return ValidationError.from_exception_data(
+        why, [InitErrorDetails(type=kind, loc=keys, input=given)]
+    )
+
+
+def _landmarks(drive: Drive, strategy: str, per_km2: float, rate: float) -> Drive:
+    return changed(
+        drive, strategy=strategy, landmarks_per_km2=per_km2, detection_rate=rate, goals=1
+    )

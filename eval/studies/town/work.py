@@ -1,0 +1,270 @@
+"""Thousands of drives on many cores: in chunks that are kept, so that nothing is driven twice.
+
+A chunk is named after everything that its rows depend on: the compiled code, the settings and the
+seeds. It is written whole or not at all. What an interrupted study leaves behind, the next one
+finds; so does a larger study of the same conditions. Chunks are put together in order, whoever
+finished first: the result is the same, byte for byte, on any number of workers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from crosscue.eval.batch.ray_cluster import joined
+from crosscue.localization import angles
+from crosscue.localization.town import city, random_stream
+from crosscue.localization.town import kernel as drive_kernel
+from crosscue.localization.town import settings as drive_settings
+from crosscue.localization.town import simulator as drive_simulator
+from crosscue.localization.town.kernel import Keys, drive_many
+from crosscue.localization.town.random_stream import key_of
+from crosscue.localization.town.settings import Drive
+from crosscue.localization.town.simulator import Result
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import CrosscueError, RunError, UsageError
+from crosscue.replay.files.run_folder import RunFolder, TableSink
+
+from .settings import Case
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+CHUNK_DRIVES: Final = 100
+CHUNKS: Final = "chunks"
+DRIVES: Final = "drives"
+_COMPILED: Final = (angles, city, drive_kernel, drive_settings, drive_simulator, random_stream)
+"""The kernel and what it takes its constants from."""
+DriveMany = Callable[[Drive, Keys], Floats]
+
+
+class WorkerError(CrosscueError):
+    """A worker died; what was finished is kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Some drives of one case.
+
+    Attributes:
+        case: Its place in the list.
+        settings: Of each drive.
+        block: Of the case.
+        first: Number of the first drive.
+        count: How many.
+        study_seed: Everything random comes from it.
+    """
+
+    case: int
+    settings: Drive
+    block: int
+    first: int
+    count: int
+    study_seed: int
+
+    def seeds(self) -> Keys:
+        """Shape (count,): a drive's seed depends on study, block and number alone."""
+        numbers = range(self.first, self.first + self.count)
+        return np.array([key_of(self.study_seed, self.block, i) for i in numbers], np.uint64)
+
+    @property
+    def name(self) -> str:
+        """Of its file: a hash of all that its rows depend on."""
+        parts = hashlib.sha256(_code())
+        parts.update(self.settings.model_dump_json().encode())
+        parts.update(self.seeds().tobytes())
+        return parts.hexdigest()[:32]
+
+
+def chunks_of(cases: Sequence[Case], drives: int, study_seed: int) -> list[Chunk]:
+    """All the work, in the order of the result."""
+    return [
+        Chunk(i, case.settings, case.block, first, min(CHUNK_DRIVES, drives - first), study_seed)
+        for i, case in enumerate(cases)
+        for first in range(0, drives, CHUNK_DRIVES)
+    ]
+
+
+def default_workers() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def run(
+    chunks: Sequence[Chunk],
+    folder: Path,
+    workers: int,
+    ray_address: str | None = None,
+    drive: DriveMany = drive_many,
+) -> Iterator[int]:
+    """Drive whatever is not there yet; the number of finished chunks comes as it grows.
+
+    Args:
+        chunks: From ``chunks_of``.
+        folder: Of the study; finished chunks lie in its folder ``chunks``.
+        workers: Threads on this machine, or cores of a local Ray cluster.
+        ray_address: Of a Ray cluster that drives instead; ``local`` starts one here.
+        drive: What drives.
+
+    Raises:
+        WorkerError: A worker died; finished chunks are kept.
+        UsageError: Ray is wanted and not installed.
+        CrosscueError: The cluster cannot be reached or started.
+        OutputError: The disk is full.
+    """
+    kept = RunFolder(folder / CHUNKS)
+    kept.path.mkdir(parents=True, exist_ok=True)
+    missing = [chunk for chunk in chunks if _read(kept, chunk) is None]
+    done = len(chunks) - len(missing)
+    yield done
+    if not missing:
+        return
+    finished = (
+        _on_threads(missing, workers, drive)
+        if ray_address is None
+        else _on_ray(missing, workers, ray_address)
+    )
+    for chunk, rows in finished:
+        with TableSink(kept, chunk.name, _chunk_schema()) as sink:
+            sink.write(dict(zip(Result._fields, rows.T, strict=True)))
+        done += 1
+        yield done
+
+
+def assemble(chunks: Sequence[Chunk], folder: Path) -> None:
+    """Write ``drives.parquet``: every drive with its conditions, in order.
+
+    Raises:
+        RunError: A chunk is missing or damaged.
+    """
+    kept, run_folder = RunFolder(folder / CHUNKS), RunFolder(folder)
+    with TableSink(run_folder, DRIVES, drives_schema()) as sink:
+        for chunk in chunks:
+            rows = _read(kept, chunk)
+            if rows is None:
+                raise RunError(f"{kept.path}/{chunk.name}.parquet: damaged; run the study again")
+            sink.write(_with_conditions(chunk, rows))
+
+
+def drives_schema() -> pa.Schema:
+    """Columns of ``drives.parquet``."""
+    import pyarrow as pa
+
+    return pa.schema([
+        ("case", pa.int32()), ("drive", pa.int32()), ("seed", pa.uint64()),
+        ("compass_2sigma_deg", pa.float64()), ("strategy", pa.string()),
+        ("landmarks_per_km2", pa.float64()), ("detection_rate", pa.float64()),
+        *_chunk_schema(),
+    ])  # fmt: skip
+
+
+def _with_conditions(chunk: Chunk, rows: dict[str, Floats]) -> dict[str, object]:
+    n, settings = chunk.count, chunk.settings
+    return {
+        "case": [chunk.case] * n,
+        "drive": list(range(chunk.first, chunk.first + n)),
+        "seed": chunk.seeds(),
+        "compass_2sigma_deg": [settings.sensors.compass_2sigma_deg] * n,
+        "strategy": [settings.navigation.strategy] * n,
+        "landmarks_per_km2": [settings.landmarks_per_km2] * n,
+        "detection_rate": [settings.sensors.detection_rate] * n,
+        **rows,
+    }
+
+
+def _chunk_schema() -> pa.Schema:
+    import pyarrow as pa
+
+    return pa.schema([(name, pa.float64()) for name in Result._fields])
+
+
+@cache
+def _code() -> bytes:
+    return b"".join(Path(str(module.__file__)).read_bytes() for module in _COMPILED)
+
+
+def _read(kept: RunFolder, chunk: Chunk) -> dict[str, Floats] | None:
+    """A finished chunk, or None: not there, or damaged, which is as good as not there."""
+    if not kept.file(f"{chunk.name}.parquet").exists():
+        return None
+    try:
+        table = kept.table(chunk.name)
+    except RunError:
+        return None
+    if table.num_rows != chunk.count or table.column_names != list(Result._fields):
+        return None
+    return {name: table[name].to_numpy() for name in Result._fields}
+
+
+def _on_threads(
+    chunks: Sequence[Chunk], workers: int, drive: DriveMany
+) -> Iterator[tuple[Chunk, Floats]]:
+    waiting = deque(chunks)
+    pool = ThreadPoolExecutor(workers)
+    running: dict[Future[Floats], Chunk] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < 2 * workers:
+                chunk = waiting.popleft()
+                running[pool.submit(drive, chunk.settings, chunk.seeds())] = chunk
+            done = wait(running, return_when=FIRST_COMPLETED).done
+            # Failures last: what has been finished beside them is kept.
+            for future in sorted(done, key=lambda one: one.exception() is not None):
+                yield running.pop(future), _result(future.result)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _result(get: Callable[[], Floats]) -> Floats:
+    try:
+        return get()
+    except ValueError as error:
+        raise UsageError(f"study: {error}; change [drive.city] in the study file") from None
+    except MemoryError as error:
+        raise WorkerError(
+            f"study: a worker ran out of memory ({error}); finished chunks are kept: run again"
+        ) from None
+
+
+def _on_ray(chunks: Sequence[Chunk], workers: int, address: str) -> Iterator[tuple[Chunk, Floats]]:
+    with joined(address, workers) as ray:
+        drive = ray.remote(max_retries=2)(_drive_chunk)
+        most = 2 * max(int(ray.cluster_resources().get("CPU", 1)), 1)
+        waiting = deque(chunks)
+        running: dict[Any, Chunk] = {}
+        while waiting or running:
+            while waiting and len(running) < most:
+                chunk = waiting.popleft()
+                running[drive.remote(chunk)] = chunk
+            ready, _ = ray.wait(list(running), num_returns=1)
+            for reference in ready:
+                yield running.pop(reference), _from_ray(ray, reference)
+
+
+def _drive_chunk(chunk: Chunk) -> Floats:
+    return drive_many(chunk.settings, chunk.seeds())
+
+
+def _from_ray(ray: Any, reference: Any) -> Floats:
+    try:
+        rows: Floats = ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        cause = error.cause
+        if isinstance(cause, ValueError):
+            raise UsageError(f"study: {cause}; change [drive.city] in the study file") from None
+        raise WorkerError(f"study: a worker failed: {cause}; finished chunks are kept") from None
+    except ray.exceptions.RayError as error:
+        why = str(error).strip().splitlines()[0]
+        raise WorkerError(
+            f"study: a worker died more than twice: {why}; finished chunks are kept: run again"
+        ) from None
+    return rows

@@ -1,0 +1,1 @@
+"""The landmark database and its image matchers."""

@@ -1,0 +1,399 @@
+"""Landmarks in one SQLite file: pictures' features, where they were taken, and how surely.
+
+An R*Tree over positions makes the 2-sigma ellipse a query, so that a million landmarks cost disk
+and no memory. The file keeps SQLite's rollback journal: a process that dies while writing leaves
+the landmarks there were before, and no second file is needed for reading. Everything one writer
+adds is one transaction.
+
+Every landmark carries a CRC-32 over place and features, checked when its features are read.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import sqlite3
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Final, NamedTuple, Self, cast
+
+import numpy as np
+
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import LogError, OutputError, UsageError
+
+from .features import Features
+from .file import (
+    APPLICATION_ID,
+    TABLES,
+    VERSION,
+    check_length,
+    check_ours,
+    connect,
+    connect_reading,
+    damaged,
+    journal_of,
+    kind_of,
+    told,
+)
+
+REACH_SIGMAS: Final = 4.0
+"""Most sigmas that a search may ask for: the R*Tree's boxes hold each landmark's own so many."""
+MOST_POINTS: Final = 20_000
+MOST_TEXT: Final = 1024
+
+_COLUMNS: Final = (
+    "l.id, l.name, l.x_m, l.y_m, l.var_x_m2, l.cov_xy_m2, l.var_y_m2, l.heading_rad, l.source"
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where a picture was taken: the camera's position, in the map frame.
+
+    Attributes:
+        name: Unique in its database.
+        xy_m: Shape (2,).
+        cov_m2: Shape (2, 2), positive definite: how far ``xy_m`` may be off, and how far from it
+            the car may have been when its picture still matches.
+        heading_rad: Of the car, or None where unknown.
+        source: Who took it: a log, a folder.
+    """
+
+    name: str
+    xy_m: Floats
+    cov_m2: Floats
+    heading_rad: float | None = None
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be a landmark.
+
+        Raises:
+            ValueError: A name that is empty or too long, wrong shapes, a number that is not finite,
+                or a covariance that is not positive definite.
+        """
+        if not 0 < len(self.name) <= MOST_TEXT or len(self.source) > MOST_TEXT:
+            raise ValueError(f"name, source: want up to {MOST_TEXT} letters, got {self.name!r}")
+        if not _is_unicode(self.name + self.source):
+            raise ValueError(f"name, source: want Unicode, got {self.name!r}, {self.source!r}")
+        if self.xy_m.shape != (2,) or self.cov_m2.shape != (2, 2):
+            shapes = f"{self.xy_m.shape}, {self.cov_m2.shape}"
+            raise ValueError(f"landmark {self.name}: want xy_m (2,), cov_m2 (2, 2), got {shapes}")
+        numbers = (*self.xy_m, *self.cov_m2.ravel(), self.heading_rad or 0.0)
+        if not np.isfinite(numbers).all():
+            raise ValueError(
+                f"landmark {self.name}: want finite numbers, got {self.xy_m.tolist()}, "
+                f"{self.cov_m2.tolist()}, heading {self.heading_rad}"
+            )
+        if not is_positive(self.cov_m2):
+            raise ValueError(
+                f"landmark {self.name}: covariance: want symmetric and positive definite, "
+                f"got {self.cov_m2.tolist()}"
+            )
+
+
+def _is_unicode(text: str) -> bool:
+    """Surrogates, as in file names that are not UTF-8, cannot be stored."""
+    return not any("\ud800" <= c <= "\udfff" for c in text)
+
+
+def is_positive(cov_m2: Floats) -> bool:
+    """Is a finite 2x2 matrix symmetric and positive definite, by more than rounding?"""
+    (xx, xy), (yx, yy) = cov_m2
+    return bool(
+        math.isclose(xy, yx, rel_tol=1e-9, abs_tol=1e-300)
+        and xx > 0.0
+        and yy > 0.0
+        and xx * yy - xy * xy > 1e-12 * xx * yy
+    )
+
+
+class Nearby(NamedTuple):
+    """A landmark inside a search ellipse.
+
+    Attributes:
+        key: For ``LandmarkDatabase.features``.
+        place: Where it is.
+        sigmas: Its distance from the ellipse's centre in standard deviations.
+    """
+
+    key: int
+    place: Place
+    sigmas: float
+
+
+class LandmarkDatabase:
+    """A landmark database open for reading. Use it as a context manager.
+
+    Attributes:
+        path: The file.
+        kind: Name of the matcher whose features it holds.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open and check the file.
+
+        Raises:
+            LogError: Not there, or not to be read.
+            LogFormatError: Foreign, of another version, cut, or damaged.
+        """
+        self.path: Final = path
+        check_length(path)
+        self._sql: Final = connect_reading(path)
+        try:
+            with told(path):
+                check_ours(self._sql, path)
+                self.kind: Final = kind_of(self._sql, path)
+        except BaseException:
+            self._sql.close()
+            raise
+
+    def __len__(self) -> int:
+        with told(self.path):
+            return int(self._sql.execute("SELECT count(*) FROM landmark").fetchone()[0])
+
+    def near(
+        self, xy_m: Floats, cov_m2: Floats, sigmas: float = 2.0, most: int = 50
+    ) -> tuple[Nearby, ...]:
+        """Landmarks inside the ellipse around a position, nearest (in sigmas) first.
+
+        A landmark's own covariance widens the ellipse for it: the distance is that of Mahalanobis
+        under the sum of both covariances.
+
+        Args:
+            xy_m: Shape (2,): where the camera is believed to be.
+            cov_m2: Shape (2, 2): how surely; may be singular.
+            sigmas: Size of the ellipse, at most ``REACH_SIGMAS``.
+            most: Give no more than these.
+
+        Raises:
+            ValueError: ``sigmas`` out of range, or numbers that are not finite.
+            LogFormatError: The file is damaged.
+        """
+        if not 0.0 < sigmas <= REACH_SIGMAS:
+            raise ValueError(f"sigmas: want 0 to {REACH_SIGMAS}, got {sigmas}")
+        if not (np.isfinite(xy_m).all() and np.isfinite(cov_m2).all()):
+            raise ValueError(f"near: want finite numbers, got {xy_m}, {cov_m2}")
+        # An R*Tree keeps 32-bit floats, rounded outwards for what is stored: round the question
+        # outwards as well.
+        reach = sigmas * np.sqrt(np.maximum(np.diagonal(cov_m2), 0.0))
+        margin = 1e-6 * np.abs(xy_m) + 1e-6
+        low, high = (xy_m - reach - margin).tolist(), (xy_m + reach + margin).tolist()
+        with told(self.path):
+            rows = self._sql.execute(
+                f"SELECT {_COLUMNS} FROM place AS p JOIN landmark AS l ON l.id = p.id "  # noqa: S608
+                "WHERE p.max_x >= ? AND p.min_x <= ? AND p.max_y >= ? AND p.min_y <= ?",
+                (low[0], high[0], low[1], high[1]),
+            )
+            found = (self._nearby(row, xy_m, cov_m2) for row in rows)
+            inside = (one for one in found if one.sigmas <= sigmas)
+            return tuple(heapq.nsmallest(most, inside, key=lambda one: (one.sigmas, one.key)))
+
+    def within(self, xy_m: Floats, radius_m: float) -> Iterator[Nearby]:
+        """Landmarks no further than ``radius_m`` from a position, in the order of adding."""
+        low, high = (xy_m - radius_m).tolist(), (xy_m + radius_m).tolist()
+        with told(self.path):
+            rows = self._sql.execute(
+                f"SELECT {_COLUMNS} FROM landmark AS l WHERE "  # noqa: S608
+                "x_m BETWEEN ? AND ? AND y_m BETWEEN ? AND ? ORDER BY id",
+                (low[0], high[0], low[1], high[1]),
+            )
+            for row in rows:
+                one = self._nearby(row, xy_m, np.zeros((2, 2)))
+                if math.dist(one.place.xy_m, xy_m) <= radius_m:
+                    yield one
+
+    def __iter__(self) -> Iterator[Nearby]:
+        """All landmarks in the order of adding, one at a time; ``sigmas`` is 0."""
+        with told(self.path):
+            for row in self._sql.execute(f"SELECT {_COLUMNS} FROM landmark AS l ORDER BY id"):  # noqa: S608
+                yield Nearby(cast("int", row[0]), _place(row, self.path), 0.0)
+
+    def features(self, key: int) -> Features:
+        """The features of one landmark, their checksum verified.
+
+        Raises:
+            LogFormatError: Not there, or damaged.
+        """
+        with told(self.path):
+            row = self._sql.execute(
+                f"SELECT {_COLUMNS}, width_px, height_px, points, points_px, descriptors, crc "  # noqa: S608
+                "FROM landmark AS l JOIN picture AS f ON f.id = l.id WHERE l.id = ?",
+                (key,),
+            ).fetchone()
+        if row is None:
+            raise damaged(self.path, f"landmark {key} has no picture")
+        place = _place(row[:9], self.path)
+        width, height, points, points_px, descriptors, crc = row[9:]
+        if crc != _crc(place, width, height, points_px, descriptors):
+            raise damaged(self.path, f"landmark {place.name}: its checksum does not fit")
+        try:
+            at = np.frombuffer(points_px, "<f4").reshape(points, 2)
+            per = len(descriptors) // points if points else 0
+            table = np.frombuffer(descriptors, np.uint8).reshape(points, per)
+            return Features(width, height, at.astype(np.float32), table)
+        except (TypeError, ValueError) as error:
+            raise damaged(self.path, f"landmark {place.name}: {error}") from None
+
+    def close(self) -> None:
+        """Release the file."""
+        self._sql.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _nearby(self, row: tuple[object, ...], xy_m: Floats, cov_m2: Floats) -> Nearby:
+        place = _place(row, self.path)
+        (a, b), (_, d) = place.cov_m2 + cov_m2
+        dx, dy = place.xy_m - xy_m
+        squared = (d * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / (a * d - b * b)
+        return Nearby(cast("int", row[0]), place, math.sqrt(max(float(squared), 0.0)))
+
+
+class LandmarkWriter:
+    """Adds landmarks to a new or existing database, all or none. Use it as a context manager.
+
+    Leaving the block without an error commits; an error, or death, leaves the file as it was.
+    """
+
+    def __init__(self, path: Path, kind: str) -> None:
+        """Open, or make, the file.
+
+        Args:
+            path: The file.
+            kind: Name of the matcher that made the features.
+
+        Raises:
+            LogFormatError: A file is there that is not ours, is cut, or of another version.
+            UsageError: It holds another matcher's features.
+            OutputError: It cannot be written, or another process is writing it.
+        """
+        self._path: Final = path
+        self._is_new: Final = not path.exists() or path.stat().st_size == 0
+        self._is_ours_to_remove: Final = not path.exists()
+        if not self._is_new:
+            check_length(path)
+        try:
+            self._sql: Final = connect(path, "rwc")
+        except LogError as error:
+            raise OutputError(str(error)) from None
+        try:
+            with told(path, writing=True):
+                self._begin(kind)
+        except BaseException:
+            self._abandon()
+            raise
+
+    def add(self, place: Place, features: Features) -> None:
+        """Add one landmark.
+
+        Raises:
+            UsageError: Its name is there already.
+            OutputError: The disk is full.
+        """
+        if len(features) > MOST_POINTS:
+            raise ValueError(f"features: want up to {MOST_POINTS} points, got {len(features)}")
+        (xx, xy), (_, yy) = place.cov_m2.tolist()
+        x, y = place.xy_m.tolist()
+        points_px = features.points_px.astype("<f4").tobytes()
+        descriptors = features.descriptors.tobytes()
+        width, height = features.width_px, features.height_px
+        crc = _crc(place, width, height, points_px, descriptors)
+        reach_x, reach_y = REACH_SIGMAS * math.sqrt(xx), REACH_SIGMAS * math.sqrt(yy)
+        with told(self._path, writing=True):
+            try:
+                key = self._sql.execute(
+                    "INSERT INTO landmark VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?)",
+                    (place.name, x, y, xx, xy, yy, place.heading_rad, place.source),
+                ).lastrowid
+            except sqlite3.IntegrityError:
+                raise UsageError(
+                    f"{self._path}: a landmark {place.name!r} is there already; "
+                    "give another --source, or another database"
+                ) from None
+            self._sql.execute(
+                "INSERT INTO picture VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (key, width, height, len(features), points_px, descriptors, crc),
+            )
+            box = (key, x - reach_x, x + reach_x, y - reach_y, y + reach_y)
+            self._sql.execute("INSERT INTO place VALUES (?, ?, ?, ?, ?)", box)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is not None:
+            self._abandon()
+            return
+        try:
+            with told(self._path, writing=True):
+                self._sql.execute("COMMIT")
+        except BaseException:
+            self._abandon()
+            raise
+        self._sql.close()
+
+    def _begin(self, kind: str) -> None:
+        # EXTRA: the journal's disappearance, which is the commit, survives a power cut too.
+        self._sql.execute("PRAGMA synchronous = EXTRA")
+        self._sql.execute("BEGIN IMMEDIATE")
+        if self._is_new:
+            for sql in TABLES:
+                self._sql.execute(sql)
+            self._sql.execute("INSERT INTO setting VALUES ('matcher', ?)", (kind,))
+            self._sql.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            self._sql.execute(f"PRAGMA user_version = {VERSION}")
+        check_ours(self._sql, self._path)
+        there = kind_of(self._sql, self._path)
+        if there != kind:
+            raise UsageError(
+                f"{self._path}: holds features of matcher {there!r}, not {kind!r}; "
+                f"give --matcher {there} or another database"
+            )
+
+    def _abandon(self) -> None:
+        """Roll back; a file that was not there goes again."""
+        # Where even this fails, a journal stays, and the next to open the file rolls it back.
+        with suppress(sqlite3.Error):
+            self._sql.execute("ROLLBACK")
+        self._sql.close()
+        if self._is_ours_to_remove:
+            self._path.unlink(missing_ok=True)
+            journal_of(self._path).unlink(missing_ok=True)
+
+
+def _place(row: tuple[object, ...], path: Path) -> Place:
+    try:
+        _, name, x, y, xx, xy, yy, heading, source = row
+        cov = np.array([[xx, xy], [xy, yy]], np.float64)
+        turn = None if heading is None else float(str(heading))
+        return Place(str(name), np.array([x, y], np.float64), cov, turn, str(source))
+    except (TypeError, ValueError) as error:
+        raise damaged(path, str(error)) from None
+
+
+def _crc(place: Place, width: int, height: int, points_px: bytes, descriptors: bytes) -> int:
+    heading = math.nan if place.heading_rad is None else place.heading_rad
+    (xx, xy), (_, yy) = place.cov_m2
+    crc = zlib.crc32(place.name.encode("utf-8", "surrogatepass"))
+    crc = zlib.crc32(struct.pack("<6dqq", *place.xy_m, xx, xy, yy, heading, width, height), crc)
+    return zlib.crc32(descriptors, zlib.crc32(points_px, crc))

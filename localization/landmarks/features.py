@@ -1,0 +1,130 @@
+"""What is kept of a picture, and who makes and compares it: the door for other matchers.
+
+A matcher is named in ``MATCHERS`` or as ``module:factory`` and turns a grey picture into
+``Features``, and two ``Features`` into a score. ORB is one; a learned one can stand in: its
+descriptors are bytes too, whatever they mean to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Final, NamedTuple, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import UsageError
+
+MATCHERS: Final[Mapping[str, str]] = {
+    "orb": "crosscue.localization.landmarks.matcher:orb",
+    "orb-essential": "crosscue.localization.landmarks.matcher:orb_essential",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """N keypoints of one picture.
+
+    Attributes:
+        width_px: Of the picture.
+        height_px: Of the picture.
+        points_px: Shape (N, 2), float32: x right, y down, from the top-left pixel.
+        descriptors: Shape (N, B), uint8: B bytes a point, of meaning to their matcher only.
+    """
+
+    width_px: int
+    height_px: int
+    points_px: NDArray[np.float32]
+    descriptors: Bytes
+
+    def __post_init__(self) -> None:
+        """Refuse columns that do not line up.
+
+        Raises:
+            ValueError: Naming the column, the shape wanted and the shape given.
+        """
+        n = len(self.descriptors)
+        if self.descriptors.ndim != 2 or self.descriptors.dtype != np.uint8:
+            raise ValueError(f"descriptors: want uint8 (N, B), got {self.descriptors.shape}")
+        if self.points_px.shape != (n, 2):
+            raise ValueError(f"points_px: want ({n}, 2), got {self.points_px.shape}")
+        if not np.isfinite(self.points_px).all():
+            raise ValueError("points_px: want finite numbers")
+
+    def __len__(self) -> int:
+        return len(self.descriptors)
+
+
+class Match(NamedTuple):
+    """How alike two pictures are.
+
+    Attributes:
+        score: Larger is surer; what it is worth is for ``crosscue fit landmarks`` to say.
+        pairs: Points that look alike.
+        agreeing: Of those, the ones that move as one scene would.
+    """
+
+    score: float
+    pairs: int
+    agreeing: int
+
+
+class CameraGeometry(NamedTuple):
+    """The pinhole camera, as far as known.
+
+    Attributes:
+        focal_px: Focal length, or None.
+        center_px: Principal point (x, y), or None for the middle of the picture.
+    """
+
+    focal_px: float | None = None
+    center_px: tuple[float, float] | None = None
+
+
+class Matcher(Protocol):
+    """Makes and compares features."""
+
+    @property
+    def kind(self) -> str:
+        """Name kept in the database; features of other kinds cannot be compared."""
+        ...
+
+    def describe(self, grey: Bytes, /) -> Features:
+        """The features of a grey picture, shape (H, W), uint8; none is a valid result."""
+        ...
+
+    def match(self, seen: Features, known: Features, /) -> Match:
+        """Compare two pictures; the same answer every time."""
+        ...
+
+
+def make_matcher(name: str, camera: CameraGeometry = CameraGeometry()) -> Matcher:  # noqa: B008
+    """Build a matcher by its name in ``MATCHERS`` or as ``module:factory``.
+
+    Raises:
+        UsageError: No such name, module or factory; or it makes no matcher.
+    """
+    target = MATCHERS.get(name, name)
+    module, colon, factory = target.partition(":")
+    if not (colon and module and factory):
+        known = ", ".join(sorted(MATCHERS))
+        raise UsageError(f"matcher {name!r}: there are: {known}, or module:factory of your own")
+    try:
+        build = cast("Callable[[CameraGeometry], Matcher]", getattr(import_module(module), factory))
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"matcher {name!r}: {error}; check module and factory") from None
+    try:
+        made = build(camera)
+    except TypeError as error:
+        raise UsageError(
+            f"matcher {name!r}: {error}; a factory takes a CameraGeometry and gives a Matcher"
+        ) from error
+    lacks = [part for part in ("kind", "describe", "match") if not hasattr(made, part)]
+    if lacks:
+        raise UsageError(
+            f"matcher {name!r}: what the factory gives has no {lacks[0]}; want a Matcher"
+        )
+    return made

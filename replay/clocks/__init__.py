@@ -1,0 +1,1 @@
+"""Clocks of a log: their order, offsets and findings."""

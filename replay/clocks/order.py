@@ -1,0 +1,178 @@
+"""The order of one clock's stamps: duplicates, late rows, resets, periods.
+
+Rows arrive in stored order. A row is *late* when its stamp lies below one seen before; a run of
+late rows is a stretch. A step back is a *reset* (the clock was set back, or started again) when the
+stamps then go on from there: no later step within ``LOOK_AHEAD`` rows leaps back by half as much.
+Late rows do leap back. Two resets within ``LOOK_AHEAD`` rows count as one.
+
+Periods are taken from the sorted stamps between resets, so that late rows make no gaps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Int64s
+
+from .periods import PeriodSketch
+
+LOOK_AHEAD: Final = 128
+EVENTS_KEPT: Final = 32
+_ROWS_TO_BELIEVE: Final = 3
+"""A step back so close to the end cannot be told from a late row, and is called one."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClockStep:
+    """A clock that was set.
+
+    Attributes:
+        at_log_ns: Log time of the first row after it.
+        by_ns: How far the clock moved, negative when back.
+    """
+
+    at_log_ns: int
+    by_ns: int
+
+
+class OrderWatch:
+    """Takes stamps in stored order, a stretch at a time, and counts what is out of order."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.first_ns: int | None = None
+        self.last_ns: int | None = None
+        self.min_ns: int | None = None
+        self.max_ns: int | None = None
+        self.duplicates = 0
+        self.resets = 0
+        self.reset_steps: list[ClockStep] = []
+        self.late_rows = 0
+        self.late_stretches = 0
+        self.worst_late_ns = 0
+        self.periods = PeriodSketch()
+        self._undecided: Int64s = np.zeros(0, dtype=np.int64)
+        self._undecided_log: Int64s = np.zeros(0, dtype=np.int64)
+        self._before_ns: int | None = None
+        self._high_ns: int | None = None
+        self._in_stretch = False
+        self._rows_since_reset = LOOK_AHEAD
+        self._sorted: Int64s = np.zeros(0, dtype=np.int64)
+        self._emitted_ns: int | None = None
+
+    def add(self, stamps_ns: Int64s, log_ns: Int64s) -> None:
+        """Take in the next rows: their stamps and log times, shape (N,) each."""
+        if not len(stamps_ns):
+            return
+        self.count += len(stamps_ns)
+        low, high = int(stamps_ns.min()), int(stamps_ns.max())
+        self.min_ns = low if self.min_ns is None else min(self.min_ns, low)
+        self.max_ns = high if self.max_ns is None else max(self.max_ns, high)
+        self.first_ns = int(stamps_ns[0]) if self.first_ns is None else self.first_ns
+        self.last_ns = int(stamps_ns[-1])
+        rows = np.concatenate([self._undecided, stamps_ns])
+        log = np.concatenate([self._undecided_log, log_ns])
+        self._decide(rows, log, max(len(rows) - LOOK_AHEAD, 0))
+
+    def finish(self) -> None:
+        """Decide the last rows; none may follow."""
+        self._decide(self._undecided, self._undecided_log, len(self._undecided))
+        self._emit_periods(hold=0)
+
+    def _decide(self, rows: Int64s, log: Int64s, n: int) -> None:
+        """Judge the first ``n`` of ``rows``, looking ahead into the rest, which are kept."""
+        self._undecided, self._undecided_log = rows[n:].copy(), log[n:].copy()
+        if not n:
+            return
+        before = rows[0] if self._before_ns is None else np.int64(self._before_ns)
+        steps = np.diff(rows, prepend=before)
+        self.duplicates += int(np.count_nonzero(steps[:n] == 0)) - (self._before_ns is None)
+        self._before_ns = int(rows[n - 1])
+        start = 0
+        for stop in self._reset_rows(steps, n):
+            self._era(rows[start:stop])
+            self._reset(ClockStep(int(log[stop]), int(steps[stop])))
+            start = stop
+        self._era(rows[start:n])
+
+    def _reset_rows(self, steps: Int64s, n: int) -> Iterator[int]:
+        """Rows below ``n`` at which the clock was set back."""
+        back = np.flatnonzero(steps[:n] < 0)
+        if len(back):
+            leap = forward_max(np.append(steps[1:], 0), LOOK_AHEAD)[back]
+            # Halving the step back, not doubling the leap, cannot overflow.
+            back = back[(leap < -(steps[back] // 2)) & (back + _ROWS_TO_BELIEVE < len(steps))]
+        previous = -self._rows_since_reset
+        for row in back.tolist():
+            if row - previous >= LOOK_AHEAD:
+                previous = row
+                yield row
+        self._rows_since_reset = min(n - previous, LOOK_AHEAD)
+
+    def _reset(self, step: ClockStep) -> None:
+        self.resets += 1
+        if len(self.reset_steps) < EVENTS_KEPT:
+            self.reset_steps.append(step)
+        self._emit_periods(hold=0)
+        self._emitted_ns = None
+        self._high_ns = None
+        self._in_stretch = False
+
+    def _era(self, stamps: Int64s) -> None:
+        """Rows between two resets, or a part of them."""
+        if not len(stamps):
+            return
+        if self._high_ns is None:
+            self._high_ns = int(stamps[0])
+        high = np.maximum(np.maximum.accumulate(stamps), self._high_ns)
+        late = stamps < high
+        if late.any():
+            begins = late & ~np.concatenate([[self._in_stretch], late[:-1]])
+            self.late_rows += int(np.count_nonzero(late))
+            self.late_stretches += int(np.count_nonzero(begins))
+            self.worst_late_ns = max(self.worst_late_ns, int((high - stamps).max()))
+            stamps = np.sort(stamps)
+        self._in_stretch = bool(late[-1])
+        self._high_ns = int(high[-1])
+        if len(self._sorted) and len(stamps) and stamps[0] < self._sorted[-1]:
+            self._sorted = np.sort(np.concatenate([self._sorted, stamps]), kind="stable")
+        else:
+            self._sorted = np.concatenate([self._sorted, stamps])
+        self._emit_periods(hold=LOOK_AHEAD)
+
+    def _emit_periods(self, hold: int) -> None:
+        """Steps of the sorted stamps, save the last ``hold``, among which late rows may fall."""
+        ready = self._sorted[: max(len(self._sorted) - hold, 0)]
+        self._sorted = self._sorted[len(ready) :].copy()
+        if self._emitted_ns is not None:
+            ready = ready[ready >= self._emitted_ns]
+            ready = np.concatenate([[np.int64(self._emitted_ns)], ready])
+        if len(ready):
+            self.periods.add(np.diff(ready), ready[:-1])
+            self._emitted_ns = int(ready[-1])
+
+
+def forward_max(values: Int64s, width: int) -> Int64s:
+    """The largest of each value and the ``width - 1`` after it, in linear time.
+
+    Running maxima from both ends of stretches ``width`` long meet in every window (M. van Herk,
+    "A fast algorithm for local minimum and maximum filters", 1992).
+    """
+    n = len(values)
+    padding = np.full(-n % width + width, np.iinfo(np.int64).min, dtype=np.int64)
+    stretches = np.concatenate([values, padding]).reshape(-1, width)
+    to_here = np.maximum.accumulate(stretches, axis=1).ravel()
+    from_here = np.maximum.accumulate(stretches[:, ::-1], axis=1)[:, ::-1].ravel()
+    largest: NDArray[np.int64] = np.maximum(from_here[:n], to_here[width - 1 : width - 1 + n])
+    return largest
+
+
+def forward_min(values: Int64s, width: int) -> Int64s:
+    """The smallest of each value and the ``width - 1`` after it."""
+    # The complement turns order around without overflow.
+    return ~forward_max(~values, width)

@@ -1,0 +1,208 @@
+"""Which log is it? Names, sizes and a hash of enough of the bytes to tell any two apart.
+
+The identity of a log is a SHA-256 over its files, sorted by name: of each its name (a folder's with
+the folder's own in front), its size, and a hash of its content. A log of up to 4 MiB is hashed
+whole. Of a larger one, each file has an equal share of 4 MiB (64 KiB at least), and what is longer
+than its share is hashed in parts: a quarter of the share from the head, a quarter from the tail,
+the rest as 32 blocks spread evenly between them; and the index that MCAP files and ROS 1 bags have
+at their end, whole up to 64 MiB. So a log of 100 GB costs milliseconds, and the same log has the
+same identity wherever it lies and however old it looks.
+
+Files that readers consult beside a log belong to it: time files of pictures and videos, SQLite's
+journals. Hidden files and what other commands put beside a log (``vehicle.toml``, ``truth.json``,
+``.seal``) do not. Of a URL, the identity is that of the address and of what the store says of it
+(names, sizes, versions): nothing is fetched for it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from crosscue.replay.errors import LogError
+from crosscue.replay.limits import MIB
+from crosscue.replay.remote.logs import is_remote, version_of
+
+SHARE_BYTES: Final = 4 * MIB
+LEAST_BYTES: Final = 64 << 10
+BLOCKS: Final = 32
+INDEX_BYTES: Final = 64 * MIB
+SHORT: Final = 8
+"""Hex digits that stand in a run's name."""
+BESIDE: Final = frozenset({"vehicle.toml", "truth.json"})
+
+_MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
+_MCAP_FOOTER: Final = struct.Struct("<BQQQI8s")
+_BAG_MAGIC: Final = b"#ROSBAG V2.0\n"
+_BAG_INDEX: Final = re.compile(rb"index_pos=(.{8})", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Which log, or which logs of one drive.
+
+    Attributes:
+        name: Of the file or folder.
+        size: Bytes in all; None of a URL.
+        digest: 64 hex digits.
+    """
+
+    name: str
+    size: int | None
+    digest: str
+
+    @property
+    def short(self) -> str:
+        """Enough of it for a person."""
+        return self.digest[:SHORT]
+
+    def __str__(self) -> str:
+        size = "" if self.size is None else f", {self.size:,} bytes"
+        return f"{self.name} ({self.short}{size})"
+
+
+def as_row(identity: Identity) -> dict[str, object]:
+    """For a manifest."""
+    return {"name": identity.name, "size": identity.size, "digest": identity.digest}
+
+
+def of_row(row: Mapping[str, object]) -> Identity:
+    """From a manifest."""
+    size = row["size"]
+    return Identity(str(row["name"]), size if isinstance(size, int) else None, str(row["digest"]))
+
+
+def identity_of(place: Path | str) -> Identity:
+    """The identity of a log: a file, a folder or a URL; see the head of this file.
+
+    Raises:
+        LogError: It is not there or cannot be read.
+    """
+    if isinstance(place, str) and is_remote(place):
+        digest = hashlib.sha256(version_of(place).encode()).hexdigest()
+        return Identity(place.rstrip("/").rpartition("/")[2], None, digest)
+    path = Path(place)
+    if path.name in ("", ".."):
+        path = path.resolve()
+    total, digest_of_all = 0, hashlib.sha256()
+    try:
+        path.stat()
+        files = list(_files(path))
+        share = max(SHARE_BYTES // max(len(files), 1), LEAST_BYTES)
+        for name, file in files:
+            size, content = _hash(file, share)
+            digest_of_all.update(f"{len(name)}\0{size}\0".encode() + name + content)
+            total += size
+    except OSError as error:
+        raise LogError(f"{error.filename or path}: {error.strerror or error}; check it") from None
+    return Identity(path.name, total, digest_of_all.hexdigest())
+
+
+def identity_of_all(found: Sequence[Identity]) -> Identity:
+    """The identity of a drive's logs together, whatever their order.
+
+    Args:
+        found: Of each log; at least one.
+    """
+    if len(found) == 1:
+        return found[0]
+    ordered = sorted(found, key=lambda one: (one.name, one.digest))
+    sizes = [one.size for one in ordered]
+    known = [size for size in sizes if size is not None]
+    digest = hashlib.sha256("\0".join(one.digest for one in ordered).encode()).hexdigest()
+    names = " + ".join(one.name for one in ordered)
+    return Identity(names, sum(known) if len(known) == len(sizes) else None, digest)
+
+
+def _files(place: Path) -> Iterator[tuple[bytes, Path]]:
+    """A log's files and those that belong to it, with their names in it, sorted."""
+    found = {place.name: place} if place.is_file() else _below(place)
+    for beside in _beside(place):
+        found.setdefault(f"beside/{beside.name}", beside)
+    yield from sorted((os.fsencode(name), path) for name, path in found.items())
+
+
+def _below(folder: Path) -> dict[str, Path]:
+    found = {}
+    for place, folders, names in os.walk(folder, onerror=_raise):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in names:
+            path = Path(place, name)
+            is_log = not name.startswith(".") and name not in BESIDE and path.suffix != ".seal"
+            if is_log and path.is_file():
+                found[f"{folder.name}/{path.relative_to(folder).as_posix()}"] = path
+    return found
+
+
+def _raise(error: OSError) -> None:
+    raise error
+
+
+def _beside(place: Path) -> list[Path]:
+    from crosscue.replay.readers.time_file import find_time_file, time_file_of_video
+
+    if place.is_dir():
+        with suppress(LogError):
+            time_file = find_time_file(place)
+            if time_file is not None and place not in time_file.parents:
+                return [time_file]
+        return []
+    journals = [place.with_name(place.name + suffix) for suffix in ("-wal", "-journal")]
+    time_file = time_file_of_video(place) if place.suffix.lower() in _videos() else None
+    return [path for path in [*journals, time_file] if path is not None and path.is_file()]
+
+
+def _videos() -> tuple[str, ...]:
+    from crosscue.replay.log import FORMATS
+
+    return FORMATS["video"].suffixes
+
+
+def _hash(path: Path, share: int) -> tuple[int, bytes]:
+    """Size and hash of a file's content, or of parts of it if it is longer than ``share``."""
+    digest = hashlib.sha256()
+    with path.open("rb", buffering=0) as file:
+        size = os.fstat(file.fileno()).st_size
+        for at, end in _parts(file, size, share):
+            file.seek(at)
+            while at < end and (part := file.read(min(end - at, MIB))):
+                digest.update(part)
+                at += len(part)
+    return size, digest.digest()
+
+
+def _parts(file: BinaryIO, size: int, share: int) -> Iterator[tuple[int, int]]:
+    """Spans of the file to hash."""
+    if size <= share:
+        yield 0, size
+        return
+    edge, block = share // 4, share // 2 // BLOCKS
+    yield 0, edge
+    between = size - 2 * edge - block
+    for i in range(BLOCKS):
+        at = edge + between * i // (BLOCKS - 1)
+        yield at, at + block
+    yield size - edge, size
+    index = _index_at(file, size)
+    if index is not None and index < size - edge:
+        yield index, min(size - edge, index + INDEX_BYTES)
+
+
+def _index_at(file: BinaryIO, size: int) -> int | None:
+    """Where the index at a log's end begins, as the file itself says."""
+    file.seek(0)
+    head = file.read(4096)
+    if head.startswith(_MCAP_MAGIC):
+        file.seek(size - _MCAP_FOOTER.size)
+        opcode, length, start, *_ = _MCAP_FOOTER.unpack(file.read(_MCAP_FOOTER.size))
+        return int(start) if opcode == 2 and length == 20 and 0 < start < size else None
+    found = _BAG_INDEX.search(head) if head.startswith(_BAG_MAGIC) else None
+    start = int.from_bytes(found[1], "little") if found else 0
+    return start if 0 < start < size else None

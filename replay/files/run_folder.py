@@ -1,0 +1,475 @@
+"""The run folder: where stages meet on disk.
+
+Files get their final name only when whole: written under a temporary name in the same folder,
+flushed to the disk, renamed. One lock file names the process at work. Tables are Parquet with page
+checksums, verified when read.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import math
+import os
+import shutil
+import socket
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from crosscue.replay.errors import OutputError, RunError
+
+from .bounded import read_at_most
+from .parquet import opened
+from .partial_file import PartialFile, is_partial, is_still, lock, sweep
+from .tree_text import json_tree
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MANIFEST: Final = "manifest.json"
+LOCK: Final = ".lock"
+INPUT: Final = "input.json"
+"""What a run is made of, written before anything else: a run cut short has no manifest."""
+FORMAT_VERSION: Final = 2
+MAX_MANIFEST_BYTES: Final = 256 << 20
+GROUP_ROWS: Final = 8192
+"""Rows of a table held back before they are written."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """A run's folder; make one with ``create`` or ``open_run``.
+
+    Attributes:
+        path: Where it is.
+        logs: A folder that its logs have moved to, or None where they are as the manifest says.
+        without_pictures: Is it to be shown without the pictures in its logs?
+    """
+
+    path: Path
+    logs: Path | None = None
+    without_pictures: bool = False
+
+    def file(self, name: str) -> Path:
+        """Path of one of its files."""
+        return self.path / name
+
+    def manifest(self) -> dict[str, Any]:
+        """The manifest as read.
+
+        Raises:
+            RunError: Not there, damaged, or of another version of crosscue.
+        """
+        path = self.file(MANIFEST)
+        try:
+            content = read_at_most(path, MAX_MANIFEST_BYTES)
+            if content is None:
+                raise ValueError(f"over {MAX_MANIFEST_BYTES >> 20} MiB")
+            found = json_tree(content)
+        except FileNotFoundError:
+            raise RunError(
+                f"{self.path}: no {MANIFEST}: not a run folder, or its run was cut short; "
+                "run crosscue replay again"
+            ) from None
+        except (OSError, ValueError) as error:
+            raise RunError(f"{path}: unreadable ({error}); run crosscue replay again") from None
+        version = found.get("format_version") if isinstance(found, dict) else None
+        if version != FORMAT_VERSION:
+            raise RunError(
+                f"{path}: format {version!r}, this crosscue reads {FORMAT_VERSION}: replay again"
+            )
+        return dict(found)
+
+    def table(self, name: str, columns: list[str] | None = None) -> pa.Table:
+        """Rows of ``NAME.parquet``, its page checksums verified.
+
+        Raises:
+            RunError: Not there or damaged.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        path = self.file(f"{name}.parquet")
+        try:
+            with opened(path) as file:
+                return pq.read_table(file, columns=columns, page_checksum_verification=True)
+        except FileNotFoundError:
+            raise RunError(f"{path}: not there; run crosscue replay again") from None
+        except (OSError, pa.ArrowException) as error:
+            raise RunError(f"{path}: damaged ({error}); run crosscue replay again") from None
+
+    def schema(self, name: str) -> pa.Schema:
+        """Columns of ``NAME.parquet``.
+
+        Raises:
+            RunError: Not there or damaged.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        path = self.file(f"{name}.parquet")
+        try:
+            with opened(path) as file:
+                return pq.read_schema(file).remove_metadata()
+        except FileNotFoundError:
+            raise RunError(f"{path}: not there; run crosscue replay again") from None
+        except (OSError, pa.ArrowException) as error:
+            raise RunError(f"{path}: damaged ({error}); run crosscue replay again") from None
+
+    def batches(
+        self, name: str, columns: list[str] | None = None, rows: int = 16_384
+    ) -> Iterator[pa.RecordBatch]:
+        """Rows of ``NAME.parquet`` a batch at a time, its page checksums verified.
+
+        Raises:
+            RunError: Not there or damaged.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        path = self.file(f"{name}.parquet")
+        try:
+            with (
+                opened(path) as handle,
+                pq.ParquetFile(handle, page_checksum_verification=True) as file,
+            ):
+                yield from file.iter_batches(rows, columns=columns)
+        except FileNotFoundError:
+            raise RunError(f"{path}: not there; run crosscue replay again") from None
+        except (OSError, pa.ArrowException) as error:
+            raise RunError(f"{path}: damaged ({error}); run crosscue replay again") from None
+
+
+def create(path: Path, *, overwrite: bool) -> RunFolder:
+    """An empty run folder.
+
+    Raises:
+        RunError: It exists and is not empty, or is no folder, and ``overwrite`` is not given.
+        OutputError: It cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        leftovers = [entry for entry in path.iterdir() if entry.name != LOCK]
+    except FileExistsError:
+        raise RunError(f"{path}: is a file; give a folder for the run") from None
+    except OSError as error:
+        raise cannot_write(path, error) from None
+    if leftovers and not overwrite:
+        raise RunError(f"{path}: holds files already; give another folder or --overwrite")
+    if leftovers and not _looks_like_run(leftovers):
+        names = ", ".join(sorted(entry.name for entry in leftovers)[:3])
+        raise RunError(f"{path}: holds files that are no run's ({names}); give another folder")
+    return RunFolder(path)
+
+
+def clear(run: RunFolder, content: Mapping[str, object] | None = None) -> None:
+    """Delete an earlier run's files; the lock stays. Call it while holding the lock.
+
+    The manifest goes first: a folder that has one is a whole run, even if this is cut short.
+
+    Args:
+        run: The folder.
+        content: Of ``input.json``, which says from now on what is being made here.
+
+    Raises:
+        OutputError: One cannot be deleted.
+    """
+    try:
+        run.file(MANIFEST).unlink(missing_ok=True)
+        if content is not None:
+            write_input(run, content)
+        for entry in run.path.iterdir():
+            if entry.name == LOCK or (entry.name == INPUT and content is not None):
+                continue
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+            else:
+                entry.unlink()
+    except OSError as error:
+        place = Path(error.filename) if error.filename else run.path
+        raise cannot_write(place, error) from None
+
+
+def open_run(path: Path, logs: Path | None = None, *, without_pictures: bool = False) -> RunFolder:
+    """An existing run folder, its manifest checked.
+
+    Args:
+        path: The folder.
+        logs: Where its logs have moved to, if they have.
+        without_pictures: Show it without the pictures in its logs.
+
+    Raises:
+        RunError: As ``RunFolder.manifest``.
+    """
+    run = RunFolder(path, logs, without_pictures)
+    run.manifest()
+    return run
+
+
+def _looks_like_run(entries: list[Path]) -> bool:
+    ours = {MANIFEST, "score", "view", "pictures"}
+    return all(
+        e.name in ours or e.suffix in (".parquet", ".rrd", ".json") or is_partial(e.name)
+        for e in entries
+    )
+
+
+@contextmanager
+def locked(run: RunFolder) -> Iterator[None]:
+    """Hold the folder for this process.
+
+    The kernel keeps the lock and drops it when its holder dies, however that happens; the file's
+    text says who holds it, which is all there is where a network file system has no such locks.
+
+    Raises:
+        RunError: Another living process holds it; it is named.
+        OutputError: The folder cannot be written.
+    """
+    path = run.file(LOCK)
+    try:
+        handle = _lock_file(path)
+    except OSError as error:
+        raise cannot_write(path, error) from None
+    try:
+        sweep(run.path, again=True)
+        yield
+    finally:
+        # Gone from the folder before it is free, so that nobody waits for a file without a name.
+        path.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def _lock_file(path: Path) -> int:
+    """The folder's lock file, open, locked, and with our name in it."""
+    while True:
+        handle = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
+        try:
+            is_ours = lock(handle)
+            _refuse_if_held(path, os.read(handle, 4096), is_ours=is_ours)
+            if is_still(handle, path):
+                _sign(handle, path)
+                return handle
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)
+
+
+def _sign(handle: int, path: Path) -> None:
+    """Write into the lock who holds it; a lock that cannot be written is taken away."""
+    me = f"{os.getpid()} {socket.gethostname()} {_started(os.getpid())}"
+    try:
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, me.encode(), 0)
+    except OSError:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        raise
+
+
+def _refuse_if_held(path: Path, text: bytes, *, is_ours: bool | None) -> None:
+    """Refuse when the kernel knows of a holder, or, where it cannot, the lock's text names one.
+
+    Args:
+        path: The lock.
+        text: What it says.
+        is_ours: Did the kernel give it to us? None where it keeps no locks.
+    """
+    try:
+        pid, host, started = text.decode().split(" ", 2)
+    except ValueError:
+        # Nobody is named: taken this moment, or its holder died before writing.
+        pid = host = started = ""
+    if host not in ("", socket.gethostname()):
+        raise RunError(f"{path}: held by process {pid} on {host}; delete the file if that is over")
+    is_other = pid.isdigit() and int(pid) != os.getpid()
+    is_alive = is_other and started == _started(int(pid))
+    if is_ours is False or (is_ours is None and is_alive):
+        who = f"process {pid} on {host}" if pid else "another process"
+        raise RunError(f"{path.parent}: {who} is writing it; wait or stop that")
+
+
+def _started(pid: int) -> str:
+    """When a process began, boot included: its number alone is used again. Empty if it is gone."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        ticks = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    except (OSError, IndexError):
+        return ""
+    return f"{boot} {ticks}"
+
+
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Let ``write`` fill a temporary file, then give it its final name.
+
+    Raises:
+        OutputError: The disk is full or the folder cannot be written; nothing half is left.
+    """
+    partial: PartialFile | None = None
+    try:
+        if not path.parent.is_dir():
+            path.parent.mkdir(parents=True, exist_ok=True)
+        partial = PartialFile(path)
+        write(partial.path)
+        partial.keep()
+    except OSError as error:
+        if partial is not None:
+            partial.drop()
+        raise cannot_write(path, error) from None
+    except BaseException:
+        if partial is not None:
+            partial.drop()
+        raise
+
+
+def cannot_write(path: Path, error: OSError) -> OutputError:
+    """The error to raise when writing ``path`` failed with ``error``."""
+    if error.errno == errno.ENOSPC:
+        try:
+            free = shutil.disk_usage(path.parent).free // (1 << 20)
+        except OSError:
+            free = 0
+        return OutputError(f"{path}: the disk is full ({free} MiB free); make room and run again")
+    return OutputError(f"{path}: {error.strerror or error}; choose a place you may write to")
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all."""
+    write_whole(path, lambda partial: partial.write_bytes(content))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_manifest(run: RunFolder, content: Mapping[str, object]) -> None:
+    """Write the manifest, last of all: a folder that has one is a finished run."""
+    whole = {"format_version": FORMAT_VERSION, **content}
+    write_text(run.file(MANIFEST), strict_json(whole) + "\n")
+
+
+def write_input(run: RunFolder, content: Mapping[str, object]) -> None:
+    """Write what the run is made of."""
+    whole = {"format_version": FORMAT_VERSION, **content}
+    write_text(run.file(INPUT), strict_json(whole) + "\n")
+
+
+def strict_json(value: object) -> str:
+    """JSON text with sorted keys; NaN and infinities become null."""
+    return json.dumps(_finite(value), sort_keys=True, indent=2, allow_nan=False)
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value
+
+
+class TableSink:
+    """A Parquet file written a batch at a time and named when whole; a context manager.
+
+    Small batches are held back until they make a row group worth its header.
+    """
+
+    def __init__(self, run: RunFolder, name: str, schema: pa.Schema) -> None:
+        """Begin ``NAME.parquet``."""
+        import pyarrow.parquet as pq
+
+        self._path: Final = run.file(f"{name}.parquet")
+        self._schema: Final = schema
+        self._held: list[pa.Table] = []
+        self._rows = 0
+        try:
+            self._partial: Final = PartialFile(self._path)
+            self._file: Final = self._partial.open()
+        except OSError as error:
+            raise cannot_write(self._path, error) from None
+        try:
+            self._writer: Final = pq.ParquetWriter(
+                self._file, schema, compression="zstd", write_page_checksum=True
+            )
+        except OSError as error:
+            self._give_up()
+            raise cannot_write(self._path, error) from None
+
+    def write(self, columns: Mapping[str, object]) -> None:
+        """Append rows given as columns.
+
+        Raises:
+            OutputError: The disk is full.
+        """
+        import pyarrow as pa
+
+        table = pa.table(dict(columns), schema=self._schema)
+        self._held.append(table)
+        self._rows += table.num_rows
+        if self._rows < GROUP_ROWS:
+            return
+        try:
+            self._flush()
+        except OSError as error:
+            raise cannot_write(self._path, error) from None
+
+    def _flush(self) -> None:
+        import pyarrow as pa
+
+        held, self._held, self._rows = self._held, [], 0
+        if held:
+            self._writer.write_table(pa.concat_tables(held).combine_chunks())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is not None:
+            # The disk may be full: what matters is that nothing half stays and the cause is kept.
+            with suppress(OSError, ValueError):
+                self._writer.close()
+            self._give_up()
+            return
+        try:
+            self._flush()
+            self._writer.close()
+            self._file.close()
+            self._partial.keep()
+        except OSError as error:
+            self._give_up()
+            raise cannot_write(self._path, error) from None
+
+    def _give_up(self) -> None:
+        """Leave nothing half."""
+        with suppress(OSError):
+            self._file.close()
+        self._partial.drop()
+
+
+def sha256_of(path: Path) -> dict[str, str]:
+    """SHA-256 of a file, or of every file below a folder, by relative name.
+
+    Raises:
+        OSError: A file cannot be read.
+    """
+    if path.is_file():
+        return {path.name: _sha256(path)}
+    files = sorted(entry for entry in path.rglob("*") if entry.is_file())
+    return {entry.relative_to(path).as_posix(): _sha256(entry) for entry in files}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

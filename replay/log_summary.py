@@ -1,0 +1,385 @@
+"""What one log holds, in one pass: topics, clocks, account, findings.
+
+``summarise`` reads; ``LogSummary`` is what ``crosscue info --json`` prints, field for field.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from crosscue.replay.clocks.findings import (
+    ROWS_FOR_OFFSET,
+    apart,
+    duration_text,
+    findings,
+    instant_text,
+)
+from crosscue.replay.clocks.reports import ClockReport, ClockWatch
+from crosscue.replay.remote.logs import name_of
+from crosscue.replay.seal.log import sealed_sentence
+from crosscue.replay.vehicle.roles import Role, role_of
+
+from .columns import Block, CanFrames, Messages, Topic
+from .errors import SchemaError
+from .ledger import Detail, Ledger, TopicAccount
+from .log import Log
+
+if TYPE_CHECKING:
+    from .decode import Decoder
+
+CAN_IDS_SHOWN: Final = 10
+_CAN_IDS_COUNTED: Final = 100_000
+_EXTENDED: Final = 1 << 31
+_NEEDS_A_LINE: Final = (Role.CAMERA, Role.CAN)
+
+
+@dataclass(frozen=True, slots=True)
+class CanIdCount:
+    """How often one identifier was seen on a bus.
+
+    Attributes:
+        arbitration_id: The identifier.
+        is_extended: It has 29 bits.
+        count: Frames.
+        rate_hz: Frames a second over the bus's duration, or None where that is 0.
+    """
+
+    arbitration_id: int
+    is_extended: bool
+    count: int
+    rate_hz: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class TopicSummary:
+    """One topic of a log.
+
+    Attributes:
+        name: As the log spells it.
+        type_name: Its message type.
+        encoding: How its messages are coded.
+        used_as: What it would be used as without configuration, or None.
+        declared: Rows the format itself says there are, or None.
+        found: Rows met in the bytes; with ``--quick`` 0, as everything below.
+        used: Rows handed on and understood.
+        skipped: Rows found and not used, by reason.
+        dropped: Rows that were in the file and could not be read, by reason.
+        dropped_unknown: Reasons of losses whose extent nobody can know.
+        rate_hz: Mean rate on the clock that is used, or None.
+        clocks: Its clocks, or None where no row was read.
+        can_ids: For a CAN bus: its most frequent identifiers.
+        can_id_count: For a CAN bus: how many different identifiers there are.
+    """
+
+    name: str
+    type_name: str
+    encoding: str
+    used_as: str | None
+    declared: int | None
+    found: int
+    used: int
+    skipped: Mapping[str, int]
+    dropped: Mapping[str, int]
+    dropped_unknown: tuple[str, ...]
+    rate_hz: float | None
+    clocks: ClockReport | None
+    can_ids: tuple[CanIdCount, ...]
+    can_id_count: int
+
+
+@dataclass(frozen=True, slots=True)
+class LogSummary:
+    """One log.
+
+    Attributes:
+        path: As the user gave it.
+        format: Short name of its format.
+        is_quick: Only what the log declares was looked at; its body was not read.
+        is_whole: Nothing is known to be dropped; says nothing when quick.
+        integrity: Which checksums were verified, in words.
+        seal: Whether it is sealed, when and with which hash.
+        start_ns: Lowest log time of all topics, or None without rows.
+        end_ns: Highest log time.
+        topics: By name.
+        unattributed_dropped: Rows dropped that no topic can be named for, by reason.
+        unattributed_unknown: The same where their number is not known.
+        findings: What is wrong or odd, a sentence each.
+        notices: What the reader has to say, a sentence each.
+        drops: The first single drops.
+    """
+
+    path: str
+    format: str
+    is_quick: bool
+    is_whole: bool
+    integrity: str
+    seal: str
+    start_ns: int | None
+    end_ns: int | None
+    topics: tuple[TopicSummary, ...]
+    unattributed_dropped: Mapping[str, int]
+    unattributed_unknown: tuple[str, ...]
+    findings: tuple[str, ...]
+    notices: tuple[str, ...]
+    drops: tuple[Detail, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Together:
+    """Several logs taken as one drive.
+
+    Attributes:
+        start_ns: Where the time begins that all logs share, or None where there is none.
+        end_ns: Where it ends.
+        findings: What is wrong with the choice, a sentence each.
+    """
+
+    start_ns: int | None
+    end_ns: int | None
+    findings: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class _CanIds:
+    """Counts identifiers of one bus; those past ``_CAN_IDS_COUNTED`` different ones are dropped."""
+
+    counts: Counter[int] = field(default_factory=Counter)
+
+    def see(self, frames: CanFrames) -> None:
+        keys = frames.arbitration_id.astype(np.int64) + frames.is_extended * _EXTENDED
+        for key, count in zip(*np.unique(keys, return_counts=True), strict=True):
+            if key in self.counts or len(self.counts) < _CAN_IDS_COUNTED:
+                self.counts[int(key)] += int(count)
+
+    def top(self, duration_s: float) -> tuple[CanIdCount, ...]:
+        most = sorted(self.counts.items(), key=lambda item: (-item[1], item[0]))[:CAN_IDS_SHOWN]
+        return tuple(
+            CanIdCount(
+                key % _EXTENDED, key >= _EXTENDED, n, n / duration_s if duration_s > 0 else None
+            )
+            for key, n in most
+        )
+
+
+Progress = Callable[[Iterable[Block], Callable[[], float]], Iterable[Block]]
+"""Hands blocks through while showing how far the work is; the second argument tells the share."""
+
+
+def quick_summary(log: Log) -> LogSummary:
+    """What a log says of itself; its body is not read."""
+    ledger = Ledger(name_of(log))
+    for topic in log.topics:
+        ledger.declare(topic.name, topic.declared)
+    return _summary(log, ledger, ClockWatch(), {}, is_quick=True)
+
+
+def summarise(log: Log, progress: Progress | None = None) -> LogSummary:
+    """Read a whole log once, in bounded memory, and say what is in it."""
+    ledger, clocks, can_ids = Ledger(name_of(log)), ClockWatch(), dict[str, _CanIds]()
+    blocks: Iterable[Block] = ledger.handing_on(log.read(ledger))
+    if progress is not None:
+        blocks = progress(blocks, lambda: _share_done(log, ledger))
+    for block in _decoded(log, blocks, ledger):
+        clocks.see(block)
+        if isinstance(block.rows, CanFrames):
+            can_ids.setdefault(block.topic, _CanIds()).see(block.rows)
+    ledger.check()
+    return _summary(log, ledger, clocks, can_ids, is_quick=False)
+
+
+def together(summaries: Iterable[LogSummary]) -> Together:
+    """What several logs have in common."""
+    spans = {
+        s.path: (s.start_ns, s.end_ns)
+        for s in summaries
+        if s.start_ns is not None and s.end_ns is not None
+    }
+    starts, ends = zip(*spans.values(), strict=True) if spans else ((0,), (0,))
+    start_ns, end_ns = max(starts), min(ends)
+    if not spans or end_ns < start_ns:
+        told = apart(spans) or ("there is no time at which all of these logs have rows",)
+        return Together(None, None, told)
+    return Together(start_ns, end_ns, apart(spans))
+
+
+def _share_done(log: Log, ledger: Ledger) -> float:
+    declared = sum(topic.declared or 0 for topic in log.topics)
+    return sum(account.found for account in ledger.accounts.values()) / max(declared, 1)
+
+
+def _decoded(log: Log, blocks: Iterable[Block], ledger: Ledger) -> Iterator[Block]:
+    """Blocks with their header stamps; of what cannot be decoded, at least the log's own times."""
+    decoders: dict[str, Decoder] = {}
+    for block in blocks:
+        if not isinstance(block.rows, Messages):
+            yield block
+            continue
+        if block.topic not in decoders:
+            # A cut file names its topics only while being read, so they are asked for again.
+            decoders |= {t.name: _decoder_of(t) for t in log.topics if t.name not in decoders}
+        yield decoders[block.topic](block, ledger)
+
+
+def _decoder_of(topic: Topic) -> Decoder:
+    """The topic's decoder, or one that skips every row and says why."""
+    from crosscue.replay.decode.interfaces import why_not_decoded
+
+    from .decode import decoder_for
+
+    try:
+        decoder = decoder_for(topic)
+        reason, detail = f"no decoder for encoding {topic.encoding!r}", topic.type_name
+    except SchemaError as error:
+        decoder, reason, detail = None, "its definition cannot be understood", str(error)
+    if decoder is not None:
+        return decoder
+    reason = why_not_decoded(topic, reason)
+
+    def skip(block: Block, ledger: Ledger, /) -> Block:
+        if len(block):
+            ledger.skip(block.topic, reason, len(block), detail, int(block.log_ns[0]))
+        return block
+
+    return skip
+
+
+def _summary(
+    log: Log,
+    ledger: Ledger,
+    clocks: ClockWatch,
+    can_ids: Mapping[str, _CanIds],
+    *,
+    is_quick: bool,
+) -> LogSummary:
+    reports = clocks.reports()
+    topics = tuple(
+        _topic_summary(topic, ledger.topic(topic.name), reports.get(topic.name), can_ids)
+        for topic in sorted(log.topics, key=lambda t: t.name)
+    )
+    log_clocks = [r.log for r in reports.values() if r.log.rows]
+    nameless = ledger.accounts.get("", TopicAccount())
+    return LogSummary(
+        path=str(log.path),
+        format=log.format,
+        is_quick=is_quick,
+        is_whole=ledger.is_whole,
+        integrity="not looked at" if is_quick else ledger.integrity,
+        seal=sealed_sentence(log),
+        start_ns=min((c.min_ns for c in log_clocks if c.min_ns is not None), default=None),
+        end_ns=max((c.max_ns for c in log_clocks if c.max_ns is not None), default=None),
+        topics=topics,
+        unattributed_dropped=dict(nameless.dropped),
+        unattributed_unknown=tuple(nameless.dropped_unknown),
+        findings=(
+            *_of_nameless(nameless),
+            *_of_account(topics, is_quick=is_quick),
+            *findings(reports),
+            *_choices(topics),
+        ),
+        notices=tuple(ledger.notices),
+        drops=tuple(ledger.drops()),
+    )
+
+
+def _topic_summary(
+    topic: Topic,
+    account: TopicAccount,
+    report: ClockReport | None,
+    can_ids: Mapping[str, _CanIds],
+) -> TopicSummary:
+    role = role_of(topic)
+    seen = can_ids.get(topic.name, _CanIds())
+    return TopicSummary(
+        name=topic.name,
+        type_name=topic.type_name,
+        encoding=topic.encoding,
+        used_as=None if role is None else role.value,
+        declared=account.declared,
+        found=account.found,
+        used=account.used,
+        skipped=dict(account.skipped),
+        dropped=dict(account.dropped),
+        dropped_unknown=tuple(account.dropped_unknown),
+        rate_hz=None if report is None else report.rate_hz,
+        clocks=report,
+        can_ids=seen.top(0.0 if report is None else report.duration_ns * 1e-9),
+        can_id_count=len(seen.counts),
+    )
+
+
+def _of_nameless(account: TopicAccount) -> Iterator[str]:
+    """Losses that no topic can be named for."""
+    if not account.is_whole:
+        why = ", ".join(dict.fromkeys([*account.dropped, *account.dropped_unknown]))
+        at_least = "at least " if account.dropped_unknown else ""
+        yield f"{at_least}{account.dropped.total()} rows of unknown topics dropped: {why}"
+
+
+def _of_account(topics: Iterable[TopicSummary], *, is_quick: bool) -> Iterator[str]:
+    for topic in topics:
+        count = sum(topic.dropped.values())
+        if count or topic.dropped_unknown:
+            at_least = "at least " if topic.dropped_unknown else ""
+            why = ", ".join(dict.fromkeys([*topic.dropped, *topic.dropped_unknown]))
+            yield f"{topic.name}: {at_least}{count} of {topic.found + count} rows dropped: {why}"
+        if topic.used == 0 and topic.found:
+            why = ", ".join(topic.skipped)
+            yield f"{topic.name}: none of its {topic.found} rows can be used: {why}"
+    if not is_quick and not any(topic.found for topic in topics):
+        yield "not one row in it"
+
+
+def _choices(topics: Iterable[TopicSummary]) -> Iterator[str]:
+    by_role: dict[str, list[str]] = {}
+    for topic in topics:
+        if topic.used_as is not None:
+            by_role.setdefault(topic.used_as, []).append(topic.name)
+    for role in _NEEDS_A_LINE:
+        names = by_role.get(role.value, [])
+        if len(names) > 1:
+            listed = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+            yield (
+                f"{len(names)} topics could be the {role.value} ({listed}): "
+                "the vehicle file must say which to use"
+            )
+
+
+def rows_of_clocks(topics: Iterable[TopicSummary]) -> Iterator[tuple[str, ...]]:
+    """Cells of the table of clocks: topic, clock, period, gaps, longest, offset, drift.
+
+    Offset and drift are those of the clock that is used; where that is the log time, those of the
+    header stamp, else of the publish time.
+    """
+    for topic in topics:
+        report = topic.clocks
+        if report is None:
+            continue
+        stamps = report.of_used
+        other = next((s for s in (report.header, report.publish) if s and s.line), None)
+        line = (stamps.line or (other and other.line)) or None
+        line = line if report.count >= ROWS_FOR_OFFSET else None
+        drift = ""
+        if line is not None and line.drift_ppm is not None:
+            drift = f"{line.drift_ppm:+.1f} +-{line.drift_error_ppm:.1f}"
+        yield (
+            topic.name,
+            report.used.value,
+            "" if stamps.median_period_ns is None else duration_text(stamps.median_period_ns),
+            str(stamps.gaps),
+            "" if stamps.longest_step_ns is None else duration_text(stamps.longest_step_ns),
+            "" if line is None else duration_text(line.offset_ns),
+            drift,
+        )
+
+
+def span_sentence(start_ns: int | None, end_ns: int | None) -> str:
+    """From when to when, and how long."""
+    if start_ns is None or end_ns is None:
+        return "no rows"
+    span = f"{(end_ns - start_ns) * 1e-9:.2f} s"
+    return f"{instant_text(start_ns)} to {instant_text(end_ns)} ({span})"

@@ -1,0 +1,1 @@
+"""Mobileye messages as ROS topics."""

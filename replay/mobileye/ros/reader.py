@@ -1,0 +1,293 @@
+"""``mobileye_560_660_msgs`` from a bag to the very same tables that frames give.
+
+The messages carry the frames' fields one for one, named as in the layout table (``ros``), but say
+nothing of units, signs or codes for no value. What could be checked, and what is done:
+
+* Obstacles: users of the driver put ``obstacle_pos_x`` and ``obstacle_pos_y`` straight into a frame
+  with y to the left, which is how the wire has them. Taken as on the wire. Should place and angle
+  ever have the same sign, a notice says so.
+* Lanes: on the wire they are positive to the right, yet two public programs draw the messages'
+  polynomials unturned in a frame with y to the left. So ``ros_lane_sign = "auto"`` looks at which
+  side the left and the right lane lie on, and says what it found.
+* ``Lane`` (0x737), reference points and signs: nothing to check by; taken as on the wire.
+* Codes for no value are recognised by their value on the wire (length 31.5 m, radar 255.9375 m).
+* ``next_lka_lanes`` does not say which lane a message is: ``index`` is -1, ``side`` by its place.
+  ``Tsr`` does not say which sign: ``sign`` is -1. ``FixedFoe`` has no counterpart on CAN.
+
+Each obstacle message is whole, so none is dropped for want of a status message: it then has its own
+time and burst -1. Tables other than status and obstacles have burst -1 throughout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Block, Floats, Int64s, Table
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.mobileye.bursts import NO_BURST
+from crosscue.replay.mobileye.clock import CounterClock
+from crosscue.replay.mobileye.layout import Message, layout
+from crosscue.replay.mobileye.settings import DEFAULTS, MobileyeSettings, mounting_of
+from crosscue.replay.mobileye.tables import LEFT, RIGHT, table_block, to_vehicle
+from crosscue.replay.mobileye.wire import (
+    Columns,
+    blank_dependent,
+    columns_of,
+    from_given,
+    variant_number,
+)
+
+from .bursts import Obstacles, RosBursts
+from .sign import LaneSignVotes
+
+PACKAGE: Final = "mobileye_560_660_msgs"
+NO_COUNTERPART: Final = "message without a known counterpart on CAN"
+LACKS_FIELDS: Final = "message lacks fields of its type"
+NOT_COLUMNS: Final = "message was not decoded to columns"
+
+_SIDED: Final = (("LkaLane", "lanes"), ("AftermarketLane", "aftermarket lanes"))
+"""Messages whose sign is looked for, and what a notice calls them."""
+_VARIANT_OF: Final[Mapping[str, str]] = {
+    "status": "classic",
+    "lane_details": "classic",
+    "high_beam_area": "classic",
+    "warnings": "extended",
+    "sign": "basic",
+}
+"""The only variant whose fields the messages have."""
+
+
+def tables_from_ros(
+    blocks: Iterable[Block],
+    types: Mapping[str, str],
+    ledger: Ledger,
+    settings: MobileyeSettings = DEFAULTS,
+    bus: str = "ros",
+) -> Iterator[Block]:
+    """All tables of a bag; see ``RosMobileye``."""
+    reader = RosMobileye(bus, types, ledger, settings)
+    for block in blocks:
+        yield from reader(block)
+    yield from reader.flush()
+
+
+class RosMobileye:
+    """Turns decoded messages into tables, a block at a time; call ``flush`` once at the end."""
+
+    def __init__(
+        self,
+        bus: str,
+        types: Mapping[str, str],
+        ledger: Ledger,
+        settings: MobileyeSettings = DEFAULTS,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            bus: First part of the tables' names, ``BUS/mobileye/TABLE``.
+            types: From topic to message type, as the log spells it; other topics are left alone.
+            ledger: Told, under the topic's name, of messages not used.
+            settings: Mounting, slots and the lanes' sign.
+        """
+        self._bus = bus
+        self._ledger = ledger
+        self._types = {
+            topic: name.split("/")[-1]
+            for topic, name in types.items()
+            if name.startswith(f"{PACKAGE}/")
+        }
+        topics = {name: topic for topic, name in self._types.items()}
+        self._bursts = RosBursts(topics.get("ObstacleData", ""), ledger, settings)
+        self._bursts.has_status = "ObstacleStatus" in topics
+        self._clock = CounterClock(settings.least_latency_ns)
+        self._votes = {name: LaneSignVotes(says, settings.ros_lane_sign) for name, says in _SIDED}
+        self._waiting: dict[str, list[Block]] = {name: [] for name, _ in _SIDED}
+        self._mounting = mounting_of(settings, bus, ledger)
+
+    def __call__(self, block: Block) -> list[Block]:
+        """The tables that a block of decoded messages adds to."""
+        name = self._types.get(block.topic)
+        if name is None:
+            return []
+        if not isinstance(block.rows, Table):
+            return self._skip(block, NOT_COLUMNS, type(block.rows).__name__)
+        messages = [m for m in layout().messages if m.ros_type == name]
+        messages = [m for m in messages if not m.name.startswith("next_lane_")]
+        if not messages:
+            return self._skip(block, NO_COUNTERPART, name)
+        lacking = _lacking(messages, block.rows)
+        if lacking:
+            return self._skip(block, LACKS_FIELDS, ", ".join(lacking))
+        if name in self._votes:
+            return self._sided(block, block.rows, name)
+        if name == "ObstacleData":
+            return self._obstacles(self._bursts.hold(self._obstacles_in(block, messages)))
+        if name == "ObstacleStatus":
+            return self._statuses(block, block.rows)
+        return [self._plain(block, block.rows, message) for message in messages]
+
+    def flush(self) -> list[Block]:
+        """What waited for later messages."""
+        given = self._obstacles(self._bursts.release(is_last=True))
+        for name, votes in self._votes.items():
+            votes.close()
+            given += self._decided(name)
+        notices = [n for votes in self._votes.values() for n in votes.notices()]
+        for notice in (*self._clock.notices, *notices):
+            self._ledger.notice(f"{self._bus}: {notice}")
+        return given
+
+    def _skip(self, block: Block, reason: str, detail: str) -> list[Block]:
+        if len(block):
+            first_ns = int(block.log_ns[0])
+            self._ledger.skip(block.topic, reason, len(block), detail, first_ns)
+        return []
+
+    def _statuses(self, block: Block, rows: Table) -> list[Block]:
+        stamp_ns = stamps_of(block)
+        message = layout()["status"]
+        columns = columns_of(message, _values(message, rows))
+        image_ns = self._clock.feed(columns["counter_ms"].astype(np.int64), stamp_ns)
+        number = self._bursts.add_status(stamp_ns, image_ns, columns["count"].astype(np.int64))
+        leading: Columns = {
+            "t_ns": image_ns,
+            "burst": number,
+            "latency_ns": stamp_ns - image_ns,
+            "layout": np.full(len(rows), variant_number("classic"), dtype=np.int8),
+        }
+        block = table_block(self._bus, "status", block.log_ns, leading | columns, image_ns)
+        return [block, *self._obstacles(self._bursts.release())]
+
+    def _obstacles_in(self, block: Block, messages: Iterable[Message]) -> Obstacles:
+        columns: Columns = {}
+        assert isinstance(block.rows, Table)
+        for message in messages:
+            columns |= columns_of(message, _values(message, block.rows))
+        self._check_angle(columns)
+        return Obstacles(stamps_of(block), block.log_ns, columns)
+
+    def _check_angle(self, columns: Columns) -> None:
+        y_m, angle_rad = (columns[name].astype(np.float64) for name in ("y_m", "angle_rad"))
+        is_clear = (np.abs(y_m) > 1.0) & (np.abs(angle_rad) > 0.01)
+        is_same = y_m[is_clear] * angle_rad[is_clear] > 0  # both left-positive columns
+        if len(is_same) and is_same.mean() < 0.5:
+            self._ledger.notice(
+                f"{self._bus}: obstacle_pos_y and obstacle_angle have the same sign, which they "
+                "have not on the wire; check on a picture which side obstacles are on"
+            )
+
+    def _obstacles(self, ready: Obstacles | None) -> list[Block]:
+        if ready is None:
+            return []
+        columns = to_vehicle("obstacles", ready.columns, self._mounting)
+        image_ns = columns["t_ns"].astype(np.int64)
+        return [table_block(self._bus, "obstacles", ready.log_ns, columns, image_ns)]
+
+    def _plain(
+        self, block: Block, rows: Table, message: Message, is_mirrored: bool = False
+    ) -> Block:
+        values = _values(message, rows, is_mirrored)
+        columns = {**self._leading(block, message), **columns_of(message, values)}
+        columns = to_vehicle(message.table, columns, self._mounting)
+        return table_block(self._bus, message.table, block.log_ns, columns)
+
+    def _leading(self, block: Block, message: Message) -> Columns:
+        n = len(block)
+        leading: Columns = {"t_ns": stamps_of(block), "burst": np.full(n, NO_BURST, dtype=np.int64)}
+        if message.name == "sign":
+            leading["sign"] = np.full(n, -1, dtype=np.int8)
+        if message.variant:
+            number = variant_number(_VARIANT_OF[message.name])
+            leading["layout"] = np.full(n, number, dtype=np.int8)
+        return leading
+
+    def _sided(self, block: Block, rows: Table, name: str) -> list[Block]:
+        """Rows whose sign depends on which way the messages are positive; held until known."""
+        votes = self._votes[name]
+        side = _side_of_topic(block.topic)
+        if name == "AftermarketLane":
+            values = _values(layout()["aftermarket_lane"], rows)
+            votes.add(LEFT, values["y_left_m"], values["confidence_left"])
+            votes.add(RIGHT, values["y_right_m"], values["confidence_right"])
+        elif side is not None:
+            values = _values(layout()["lane_a"], rows)
+            votes.add(side, values["c0_m"], values["quality"])
+        self._waiting[name].append(block)
+        return self._decided(name) if votes.is_decided else []
+
+    def _decided(self, name: str) -> list[Block]:
+        waiting, self._waiting[name] = self._waiting[name], []
+        is_mirrored = self._votes[name].is_left_positive
+        given = []
+        for block in waiting:
+            assert isinstance(block.rows, Table)
+            if name == "LkaLane":
+                given.append(self._lane_rows(block, block.rows, is_mirrored))
+            else:
+                message = layout()["aftermarket_lane"]
+                given.append(self._plain(block, block.rows, message, is_mirrored))
+        return given
+
+    def _lane_rows(self, block: Block, rows: Table, is_mirrored: bool) -> Block:
+        side = _side_of_topic(block.topic)
+        columns: Columns = {}
+        for name in ("lane_a", "lane_b"):
+            columns |= columns_of(layout()[name], _values(layout()[name], rows, is_mirrored))
+        n = len(block)
+        table, places = "lanes", {"side": np.full(n, side or 0, dtype=np.int8)}
+        if side is None:
+            is_left = columns["c0_m"].astype(np.float64) > 0
+            table = "next_lanes"
+            places = {
+                "side": np.where(is_left, LEFT, RIGHT).astype(np.int8),
+                "index": np.full(n, -1, dtype=np.int8),
+            }
+        leading: Columns = {"t_ns": stamps_of(block), "burst": np.full(n, NO_BURST, dtype=np.int64)}
+        columns = to_vehicle(table, {**leading, **places, **columns}, self._mounting)
+        return table_block(self._bus, table, block.log_ns, columns)
+
+
+def stamps_of(block: Block) -> Int64s:
+    """The messages' own time, or the recorder's where they have none."""
+    if block.header_ns is None:
+        return block.log_ns
+    return np.where(block.header_ns > 0, block.header_ns, block.log_ns)
+
+
+def _side_of_topic(topic: str) -> int | None:
+    name = topic.rpartition("/")[2].lower()
+    if "next" in name:
+        return None
+    return LEFT if "left" in name else RIGHT if "right" in name else None
+
+
+def _lacking(messages: Iterable[Message], rows: Table) -> list[str]:
+    wanted = {f.ros for m in messages for f in m.fields if f.ros}
+    if any(m.name == "warnings" for m in messages):
+        wanted |= {"night_time", "dusk_time"}
+    return sorted(wanted - set(rows.columns))
+
+
+def _values(message: Message, rows: Table, is_mirrored: bool = False) -> dict[str, Floats]:
+    """Values on the wire, NaN where missing.
+
+    Args:
+        message: Whose fields.
+        rows: The messages.
+        is_mirrored: They are positive to the left where the wire is to the right.
+    """
+    values: dict[str, Floats] = {}
+    for f in message.fields:
+        if f.ros:
+            value = rows[f.ros].astype(np.float64)
+            values[f.name] = from_given(f, 0.0 - value if is_mirrored and f.flip else value)
+        elif f.name not in values:
+            values[f.name] = np.full(len(rows), np.nan)
+    if message.name == "warnings":
+        dusk, night = (rows[name].astype(np.float64) for name in ("dusk_time", "night_time"))
+        values["time_of_day"] = dusk + 2 * night
+    blank_dependent(message, values)
+    return values

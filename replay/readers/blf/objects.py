@@ -1,0 +1,410 @@
+"""The objects inside BLF containers as columns: found by their signature, checked as a chain.
+
+No official specification of the format is public; the layouts are those that Vector's tools and
+python-can write. Every object begins with ``LOBJ``, its header's size and version, its own size
+and its type; the next one follows at its end, after at most seven bytes of padding. All places
+where ``LOBJ`` stands are found at once, and only where they do not form a chain (a payload that
+holds ``LOBJ``, damage) are single objects looked at.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import DATA, ERROR, REMOTE, Bytes, CanFrames, Int64s
+from crosscue.replay.readers.can_rows import FD_LENGTHS, IS_FD_LENGTH, FrameRows, joined, widened
+from crosscue.replay.readers.can_text.dialect import NO_ROWS
+
+MAGIC: Final = b"LOBJ"
+PADDING_MAX: Final = 8
+BASE_BYTES: Final = 16
+CONTAINER: Final = 10
+RESTORE_POINT: Final = 115
+"""Not counted by the file header."""
+TYPE_MAX: Final = 255
+"""No type known is above 150."""
+_UNSEEN_MAX: Final = BASE_BYTES + PADDING_MAX
+"""Bytes after an object in which no other can be seen yet."""
+_PLACES_KEPT: Final = 5
+_SIGNATURE: Final = int.from_bytes(MAGIC, "little")
+_EXTENDED: Final = 0x80000000
+_ID_MASK: Final = 0x1FFFFFFF
+_TEN_MICROSECONDS: Final = 1
+_NANOS_MAX: Final = 1 << 60
+"""36 years from the start; a longer recording is damage."""
+
+
+@dataclass(slots=True)
+class Tally:
+    """What one pass met, to be held against the file header.
+
+    Attributes:
+        counted: Objects of the kinds that the header counts, used or not.
+        others: Objects that are no CAN frames, by reason.
+        reasons: How often each kind of damage was met.
+        places: The first damages, each with its place.
+        padded: Frames that store fewer bytes than their length.
+        last_tick_ns: The latest time met, from the start of the recording.
+    """
+
+    counted: int = 0
+    others: Counter[str] = field(default_factory=Counter)
+    reasons: Counter[str] = field(default_factory=Counter)
+    places: list[str] = field(default_factory=list)
+    padded: int = 0
+    last_tick_ns: int = 0
+
+    def damage(self, reason: str, place: str) -> None:
+        """Note something that cannot be read."""
+        self.reasons[reason] += 1
+        if len(self.places) < _PLACES_KEPT:
+            self.places.append(f"{reason}: {place}" if place else reason)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chain:
+    """Consecutive whole objects.
+
+    Attributes:
+        start: Shape (N,), int64: first byte of each object.
+        rest: Where the first incomplete object begins, to be kept for more bytes to come.
+    """
+
+    start: Int64s
+    rest: int
+
+
+def chain_of(
+    stream: Bytes, *, is_resumed: bool, is_end: bool, size_max: int, tally: Tally, place: str
+) -> Chain:
+    """Find the whole objects in ``stream``.
+
+    Args:
+        stream: Bytes of consecutive containers.
+        is_resumed: What came before is lost, so the first object may begin anywhere.
+        is_end: No more bytes follow.
+        size_max: Largest object to wait for.
+        tally: Told about damage.
+        place: Where the stream lies in the file, in words.
+    """
+    at = _signatures(stream)
+    words = _u32(stream)
+    size = words[at + 8].astype(np.int64)
+    header = words[at + 4] & 0xFFFF
+    is_sound = (header >= BASE_BYTES) & (size >= header) & (size <= size_max)
+    end = at + size
+    following = np.append(at[1:], len(stream))
+    links = is_sound & (following >= end) & (following - end < PADDING_MAX)
+    if not len(at):
+        return _without_objects(stream, is_resumed, is_end, tally, place)
+    if not is_resumed and at[0] >= PADDING_MAX:
+        tally.damage("bytes between objects", f"{place}, offset 0")
+        is_resumed = True
+    keep = np.ones(len(at), np.bool_)
+    if is_resumed:
+        first = int(np.argmax(links)) if bool(links.any()) else len(at)
+        keep[:first] = False
+    else:
+        first = 0
+    rest = len(stream)
+    for k in np.flatnonzero(~links[first:]) + first:
+        if not keep[k]:
+            continue
+        rest = _mend(int(k), at, end, is_sound, links, keep, len(stream), is_end)
+        if rest < 0:
+            tally.damage("object does not end where its size says", f"{place}, offset {at[k]}")
+            rest = len(stream)
+        elif rest < len(stream):
+            break
+    is_whole = keep & (at < rest)
+    last = int(end[is_whole][-1]) if bool(is_whole.any()) else rest
+    if not is_end and rest == len(stream) and last < rest <= last + _UNSEEN_MAX:
+        # Padding, or the next object's header, of which the rest is still to come.
+        rest = last
+    return Chain(at[is_whole], rest)
+
+
+def _mend(
+    k: int,
+    at: Int64s,
+    end: Int64s,
+    is_sound: NDArray[np.bool_],
+    links: NDArray[np.bool_],
+    keep: NDArray[np.bool_],
+    length: int,
+    is_end: bool,
+) -> int:
+    """Look at object ``k``, which the next signature does not follow.
+
+    Returns:
+        The stream's length when the chain goes on, where object ``k`` begins when it must wait
+        for more bytes, or -1 when it is damaged.
+    """
+    if is_sound[k] and end[k] <= length:
+        following = int(np.searchsorted(at, end[k]))
+        near = at[following] if following < len(at) else length
+        if near - end[k] < PADDING_MAX:
+            keep[k + 1 : following] = False
+            return length
+        if not is_end and following == len(at) and length - end[k] < _UNSEEN_MAX:
+            keep[k + 1 :] = False
+            return length
+    if is_sound[k] and end[k] > length and not is_end:
+        keep[k:] = False
+        return int(at[k])
+    sound_after = np.flatnonzero(links[k + 1 :])
+    following = k + 1 + int(sound_after[0]) if len(sound_after) else len(at)
+    keep[k:following] = False
+    return -1
+
+
+def _without_objects(
+    stream: Bytes, is_resumed: bool, is_end: bool, tally: Tally, place: str
+) -> Chain:
+    rest = max(len(stream) - len(MAGIC) - PADDING_MAX, 0) if not is_end else len(stream)
+    if len(stream) - rest != len(stream) and not is_resumed and bool(stream.any()):
+        tally.damage("bytes that are no object", f"{place}, {len(stream)} bytes")
+    return Chain(np.zeros(0, np.int64), rest)
+
+
+def _signatures(stream: Bytes) -> Int64s:
+    """Every place where a whole object header could begin."""
+    if len(stream) < BASE_BYTES:
+        return np.zeros(0, np.int64)
+    letter = np.flatnonzero(stream[: len(stream) - BASE_BYTES + 1] == MAGIC[0])
+    found: Int64s = letter[_u32(stream)[letter] == _SIGNATURE]
+    return found
+
+
+def _u32(stream: Bytes) -> NDArray[np.uint32]:
+    """Every four consecutive bytes as a number; not copied."""
+    numbers: NDArray[np.uint32] = np.ndarray(
+        (max(len(stream) - 3, 0),), np.dtype("<u4"), stream.data, strides=(1,)
+    )
+    return numbers
+
+
+_HEADER: Final = [
+    ("signature", "<u4"), ("header", "<u2"), ("version", "<u2"), ("size", "<u4"), ("type", "<u4"),
+    ("flags", "<u4"), ("skip", "<u4"), ("ticks", "<u8"),
+]  # fmt: skip
+_TIMED: Final = np.dtype(_HEADER)
+_CLASSIC: Final = np.dtype(
+    [("bus", "<u2"), ("flags", "u1"), ("code", "u1"), ("id", "<u4"), ("payload", "u1", 8)]
+)
+_FD: Final = np.dtype(
+    [
+        ("bus", "<u2"), ("flags", "u1"), ("code", "u1"), ("id", "<u4"), ("time", "<u4"),
+        ("bits", "u1"), ("fd", "u1"), ("count", "u1"), ("skip", "u1", 5), ("payload", "u1", 64),
+    ]
+)  # fmt: skip
+_FD64: Final = np.dtype(
+    [
+        ("bus", "u1"), ("code", "u1"), ("count", "u1"), ("tx", "u1"), ("id", "<u4"),
+        ("time", "<u4"), ("flags", "<u4"), ("skip", "<u4", 4), ("bits", "<u2"), ("way", "u1"),
+        ("extra", "u1"), ("crc", "<u4"),
+    ]
+)  # fmt: skip
+_ERROR_EXT: Final = np.dtype(
+    [
+        ("bus", "<u2"), ("length", "<u2"), ("flags", "<u4"), ("ecc", "u1"), ("position", "u1"),
+        ("code", "u1"), ("skip", "u1"), ("time", "<u4"), ("id", "<u4"), ("more", "<u2"),
+        ("pad", "<u2"), ("payload", "u1", 8),
+    ]
+)  # fmt: skip
+_ERROR_PLAIN: Final = np.dtype([("bus", "<u2"), ("length", "<u2")])
+_ERROR_FD64: Final = np.dtype([("bus", "u1"), ("code", "u1"), ("count", "u1"), ("ecc", "u1")])
+
+_KINDS: Final = (
+    ((1, 86), _CLASSIC),
+    ((100,), _FD),
+    ((101,), _FD64),
+    ((73,), _ERROR_EXT),
+    ((2,), _ERROR_PLAIN),
+    ((104,), _ERROR_FD64),
+)
+FRAME_TYPES: Final = frozenset(type_ for types, _ in _KINDS for type_ in types)
+
+
+def rows_of(stream: Bytes, start: Int64s, start_ns: int, tally: Tally, place: str) -> FrameRows:
+    """The CAN frames among the objects at ``start``; ``bus`` holds channel numbers.
+
+    Args:
+        stream: What ``start`` points into.
+        start: From ``chain_of``.
+        start_ns: Log time of the recording's start.
+        tally: Counts everything.
+        place: Where the stream lies in the file, in words.
+    """
+    if not len(start):
+        return NO_ROWS
+    padded = np.concatenate((stream, np.zeros(256, np.uint8)))
+    words = _u32(padded)
+    type_ = words[start + 12]
+    tally.counted += len(start) - int(np.count_nonzero(type_ == RESTORE_POINT))
+    rows = NO_ROWS
+    is_frame = np.zeros(len(start), np.bool_)
+    for types, body in _KINDS:
+        is_kind = np.isin(type_, types)
+        if bool(is_kind.any()):
+            is_frame |= is_kind
+            found = _kind_rows(padded, start[is_kind], body, types, start_ns, tally, place)
+            rows = joined(rows, found)
+    for kind, count in zip(*np.unique(type_[~is_frame], return_counts=True), strict=True):
+        if not 0 < kind <= TYPE_MAX:
+            tally.damage("object of impossible type", f"{place}, type {kind}")
+            tally.counted -= int(count)
+        elif kind != RESTORE_POINT:
+            tally.others[f"object of type {kind} is no CAN frame"] += int(count)
+    return rows
+
+
+def _kind_rows(
+    stream: Bytes,
+    start: Int64s,
+    body: np.dtype[np.void],
+    types: tuple[int, ...],
+    start_ns: int,
+    tally: Tally,
+    place: str,
+) -> FrameRows:
+    header = _records(stream, start, _TIMED)
+    is_known = ((header["version"] == 1) & (header["header"] == 32)) | (
+        (header["version"] == 2) & (header["header"] == 40)
+    )
+    inside = header["size"] >= header["header"].astype(np.int64) + body.itemsize
+    ticks, flags = header["ticks"], header["flags"]
+    step = np.where(flags == _TEN_MICROSECONDS, 10_000, 1)
+    is_timed = (flags <= 2) & (ticks < _NANOS_MAX // step)
+    ok = is_known & inside & is_timed
+    tick_ns = np.where(ok, ticks, 0).astype(np.int64) * step
+    record = _records(stream, np.where(ok, start + header["header"], 0), body)
+    frames, frame_ok = _FRAMES[types](stream, start, header, record, tally)
+    ok &= frame_ok & (record["bus"] > 0)
+    for k in np.flatnonzero(~ok).tolist():
+        tally.damage("object that cannot be a frame", f"{place}, offset {start[k]}")
+        tally.counted -= 1
+    if bool(ok.any()):
+        tally.last_tick_ns = max(tally.last_tick_ns, int(tick_ns[ok].max()))
+    rows = FrameRows(start, record["bus"].astype(np.int64), tick_ns + start_ns, frames)
+    return rows if bool(ok.all()) else rows.take(ok)
+
+
+def _records(stream: Bytes, start: Int64s, layout: np.dtype[np.void]) -> NDArray[np.void]:
+    """Copies of the structures at ``start``."""
+    rows = sliding_window_view(stream, layout.itemsize)[start]
+    return np.ascontiguousarray(rows).view(layout)[:, 0]
+
+
+def _classic(
+    stream: Bytes, start: Int64s, header: NDArray[np.void], record: NDArray[np.void], tally: Tally
+) -> tuple[CanFrames, NDArray[np.bool_]]:
+    del stream, start, header, tally
+    kind = np.where(record["flags"] & 0x80, REMOTE, DATA)
+    length = np.where(kind == REMOTE, 0, np.minimum(record["code"] & 15, 8)).astype(np.int64)
+    frames, ok = _frames(record["id"], kind, length, record["payload"], np.zeros(len(kind), bool))
+    return frames, ok & (record["code"] <= 15)
+
+
+def _fd(
+    stream: Bytes, start: Int64s, header: NDArray[np.void], record: NDArray[np.void], tally: Tally
+) -> tuple[CanFrames, NDArray[np.bool_]]:
+    del stream, start, header, tally
+    is_fd = (record["fd"] & 1) != 0
+    kind = np.where(record["flags"] & 0x80, REMOTE, DATA)
+    length = np.where(kind == REMOTE, 0, record["count"]).astype(np.int64)
+    frames, ok = _frames(record["id"], kind, length, record["payload"], is_fd)
+    return frames, ok & _fits_code(record["code"], length, is_fd, kind)
+
+
+def _fd64(
+    stream: Bytes, start: Int64s, header: NDArray[np.void], record: NDArray[np.void], tally: Tally
+) -> tuple[CanFrames, NDArray[np.bool_]]:
+    is_fd = (record["flags"] & 0x1000) != 0
+    kind = np.where(record["flags"] & 0x10, REMOTE, DATA)
+    length = np.where(kind == REMOTE, 0, record["count"]).astype(np.int64)
+    before = header["header"].astype(np.int64) + _FD64.itemsize
+    limit = np.where(record["extra"] > 0, record["extra"], header["size"]).astype(np.int64)
+    stored = np.clip(limit - before, 0, np.minimum(length, 64))
+    text = sliding_window_view(stream, 64)[np.minimum(start + before, len(stream) - 64)]
+    payload = np.where(np.arange(64) < stored[:, None], text, np.uint8(0))
+    frames, ok = _frames(record["id"], kind, length, payload, is_fd)
+    ok &= _fits_code(record["code"], length, is_fd, kind)
+    tally.padded += int(np.count_nonzero(ok & (stored < length)))
+    return frames, ok
+
+
+def _fits_code(
+    code: NDArray[np.uint8],
+    length: Int64s,
+    is_fd: NDArray[np.bool_],
+    kind: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Does the payload's length go with the length code?"""
+    promised = FD_LENGTHS[code & 15]
+    promised = np.where(is_fd, promised, np.minimum(promised, 8))
+    fits: NDArray[np.bool_] = (kind == REMOTE) | (length == promised)
+    fits &= code <= 15
+    return fits
+
+
+def _error_ext(
+    stream: Bytes, start: Int64s, header: NDArray[np.void], record: NDArray[np.void], tally: Tally
+) -> tuple[CanFrames, NDArray[np.bool_]]:
+    del stream, start, header, tally
+    kind = np.full(len(record), ERROR)
+    length = np.minimum(record["code"] & 15, 8).astype(np.int64)
+    return _frames(record["id"], kind, length, record["payload"], np.zeros(len(kind), bool))
+
+
+def _error(
+    stream: Bytes, start: Int64s, header: NDArray[np.void], record: NDArray[np.void], tally: Tally
+) -> tuple[CanFrames, NDArray[np.bool_]]:
+    del stream, start, header, tally
+    n = len(record)
+    nothing = np.zeros(n, np.int64)
+    payload = np.zeros((n, 8), np.uint8)
+    return _frames(nothing, np.full(n, ERROR), nothing, payload, np.zeros(n, bool))
+
+
+_FRAMES: Final = {
+    (1, 86): _classic,
+    (100,): _fd,
+    (101,): _fd64,
+    (73,): _error_ext,
+    (2,): _error,
+    (104,): _error,
+}
+
+
+def _frames(
+    identifier: NDArray[np.integer],
+    kind: NDArray[np.int64],
+    length: Int64s,
+    payload: Bytes,
+    is_fd: NDArray[np.bool_],
+) -> tuple[CanFrames, NDArray[np.bool_]]:
+    """Frames with bytes beyond their length cleared, and which of them are possible."""
+    is_extended = (identifier & _EXTENDED) != 0
+    number = identifier & _ID_MASK
+    width = 64 if payload.shape[1] > 8 else 8
+    payload = widened(payload, width)
+    if int(length.min(initial=width)) < width:
+        payload = np.where(np.arange(width) < length[:, None], payload, np.uint8(0))
+    ok = (length <= width) & ((kind == ERROR) | is_extended | (number <= 0x7FF))
+    ok &= np.where(is_fd, IS_FD_LENGTH[np.clip(length, 0, 64)], length <= 8)
+    frames = CanFrames(
+        number.astype(np.uint32),
+        is_extended,
+        kind.astype(np.uint8),
+        np.minimum(length, 64).astype(np.uint8),
+        payload,
+        is_fd,
+    )
+    return frames, ok

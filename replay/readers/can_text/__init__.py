@@ -1,0 +1,1 @@
+"""CAN logs as text: candump, ASC, TRC, BUSMASTER."""

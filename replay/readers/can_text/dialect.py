@@ -1,0 +1,495 @@
+"""Reading CAN logs that are text: whole chunks in columns, odd lines one by one, none dropped.
+
+A ``Dialect`` knows one format. Its ``fast`` takes the lines of a chunk that follow the common
+pattern, as columns; every other line that is not blank goes through ``slow``, which says what it
+is: a frame, a line that is no frame, a mark such as a header, or damage. So each line ends up
+used, skipped or lost.
+"""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Final, NamedTuple, TypeAlias
+
+import numpy as np
+
+from crosscue.replay.columns import Block, Bytes, CanFrames, Int64s, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.readers.can_rows import (
+    FrameRows,
+    blocks_by_bus,
+    bus_name,
+    bus_number,
+    bus_topic,
+    joined,
+    keep_memory,
+    widened,
+)
+
+from .digits import Bools, payload8, payload64, spaced8
+from .lines import Lines, Overlong, Tail, lines_of
+
+HEAD_BYTES: Final = 64 << 10
+LINE_MAX: Final = 8192
+"""Longest line that ``slow`` is asked about."""
+_CONTROL: Final = re.compile(rb"[\x00-\x08\x0e-\x1f]")
+_EXCERPT: Final = 60
+_DOS_END: Final = b"\x1a"
+
+
+class Frame(NamedTuple):
+    """One frame from an odd line; ``t_ns`` as the line spells it, before ``Dialect.clock``."""
+
+    bus: str
+    t_ns: int
+    arbitration_id: int
+    is_extended: bool
+    kind: int
+    length: int
+    payload: bytes = b""
+    is_fd: bool = False
+    number: int | None = None
+    """The message number that the writer gave it, in formats that have them."""
+
+
+class Other(NamedTuple):
+    """A good line that is no frame: counted under its reason, and under its bus if it has one."""
+
+    reason: str
+    t_ns: int | None = None
+    bus: str = ""
+    number: int | None = None
+
+
+class Damage(NamedTuple):
+    """A line that nobody can read.
+
+    ``taints`` says that the line before may have been cut off by the same damage.
+    """
+
+    reason: str
+    taints: bool = False
+
+
+class Mark(NamedTuple):
+    """A header or comment line; ``clock`` gets those that change the meaning of times.
+
+    A mark with ``stops`` ends the reading, for the reason it gives; ``tag`` is the dialect's own.
+    """
+
+    origin_ns: int | None = None
+    stops: str = ""
+    tag: str = ""
+
+
+Outcome: TypeAlias = Frame | Other | Damage | Mark | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fast:
+    """What ``Dialect.fast`` found: ``rows.bus`` indexes ``names``, ``rows.place`` is the line."""
+
+    rows: FrameRows
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Met:
+    """What a chunk came to, for the counters that a format has; lines count from the chunk's first.
+
+    Attributes:
+        rows: Its frames, by line.
+        odd: Frames that ``slow`` found, with their lines.
+        others: Lines that are no frame.
+        damaged: Lines that nobody can read, ascending.
+        marks: Header lines.
+        first_number: Number of the chunk's first line in the file.
+        done: The line after the chunk's last.
+    """
+
+    rows: FrameRows
+    odd: Sequence[tuple[int, int, Frame]]
+    others: Sequence[tuple[int, Other]]
+    damaged: Sequence[int]
+    marks: Sequence[tuple[int, Mark]]
+    first_number: int
+    done: int
+
+
+class Dialect(ABC):
+    """One text format; holds what a reading pass must remember, so each pass has its own."""
+
+    format: ClassVar[str]
+    says: ClassVar[str]
+    integrity: ClassVar[str]
+
+    @abstractmethod
+    def fast(self, lines: Lines) -> Fast:
+        """The lines that follow the common pattern."""
+
+    @abstractmethod
+    def slow(self, line: bytes) -> Outcome:
+        """One line that does not."""
+
+    @abstractmethod
+    def last(self, line: bytes) -> Outcome:
+        """The last line when it has no line end, so that it may be cut."""
+
+    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, Mark]]) -> Int64s:
+        """Log times from the times that lines spell.
+
+        Args:
+            place: Line of every time, ascending; all lines with a time, frames or not.
+            t_ns: The times.
+            marks: The marks of this chunk with their lines.
+        """
+        del place, marks
+        return t_ns
+
+    def check(self, met: Met) -> Int64s:
+        """Hold the format's own counters against a chunk.
+
+        Returns:
+            Lines, ascending, whose frames the counters contradict: they are not handed on, and
+            ``finish`` reports them.
+        """
+        del met
+        return _NO_INTS
+
+    def finish(self, ledger: Ledger) -> None:
+        """Say what the whole file showed, once it is read."""
+        del ledger
+
+
+_NO_INTS: Final = np.zeros(0, np.int64)
+NO_FRAMES: Final = CanFrames(
+    np.zeros(0, np.uint32),
+    np.zeros(0, np.bool_),
+    np.zeros(0, np.uint8),
+    np.zeros(0, np.uint8),
+    np.zeros((0, 8), np.uint8),
+    np.zeros(0, np.bool_),
+)
+NO_ROWS: Final = FrameRows(_NO_INTS, _NO_INTS, _NO_INTS, NO_FRAMES)
+
+
+class TextCanLog(Closing):
+    """An open CAN log in text form (``Log``)."""
+
+    def __init__(self, path: Path, limits: Limits, dialect: Callable[[], Dialect]) -> None:
+        """Look at the first chunk.
+
+        Raises:
+            LogFormatError: The file is empty, or its first chunk holds lines but no frame, no
+                header and nothing else of this format.
+        """
+        del limits  # the chunk size bounds everything here
+        self._path, self._dialect = path, dialect
+        self._names: dict[str, int] = {}
+        one = dialect()
+        self._format = one.format
+        self._peek(one)
+
+    @property
+    def path(self) -> Path:
+        """Where it lies."""
+        return self._path
+
+    @property
+    def format(self) -> str:
+        """Short name of the format."""
+        return self._format
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The buses seen so far: those of the first chunk, and after a pass all of them."""
+        return tuple(bus_topic(name) for name in self._names)
+
+    def close(self) -> None:
+        """Nothing stays open between passes."""
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """All frames, chunk by chunk; see ``Log.read``."""
+        keep_memory()
+        scribe = _Scribe(self._dialect(), self._names, ledger)
+        size = self._path.stat().st_size
+        try:
+            for piece in lines_of(self._path):
+                rows = scribe.rows(piece)
+                yield from blocks_by_bus(rows, tuple(self._names), ledger, selection)
+                if scribe.stopped:
+                    break
+        except OSError as error:
+            ledger.drop("", "file cannot be read on", None, error.strerror or str(error))
+        for name in self._names:
+            ledger.topic(name)
+        if self._path.stat().st_size != size:
+            ledger.drop("", "file changed while it was read", None, f"had {size} bytes before")
+        scribe.dialect.finish(ledger)
+        ledger.integrity = scribe.dialect.integrity
+
+    def _peek(self, dialect: Dialect) -> None:
+        ledger = Ledger(str(self._path))
+        scribe = _Scribe(dialect, self._names, ledger)
+        for piece in lines_of(self._path, HEAD_BYTES):
+            found = len(scribe.rows(piece))
+            if isinstance(piece, Lines) or found or scribe.knows_it:
+                break
+        if not self._names and not scribe.knows_it:
+            why = next((d.detail for d in ledger.drops()), "it is empty")
+            raise LogFormatError(
+                f"{self._path}: no frame of a {dialect.says} in its beginning ({why}); "
+                "check that it is one, and whole"
+            )
+
+
+class _Scribe:
+    """Turns chunks into rows and writes the rest into the ledger."""
+
+    def __init__(self, dialect: Dialect, names: dict[str, int], ledger: Ledger) -> None:
+        self.dialect = dialect
+        self.stopped = False
+        self.knows_it = False
+        self._names, self._ledger = names, ledger
+
+    def rows(self, piece: Lines | Overlong | Tail) -> FrameRows:
+        """The frames of one piece of the file, with log times."""
+        if isinstance(piece, Lines):
+            return self._lines(piece)
+        if isinstance(piece, Tail):
+            return self._tail(piece)
+        detail = f"line {piece.number}: at least {piece.byte_count} bytes without a line end"
+        self._ledger.drop("", "stretch without line ends", None, detail)
+        return NO_ROWS
+
+    def _tail(self, tail: Tail) -> FrameRows:
+        if tail.text == _DOS_END:
+            return NO_ROWS
+        odd = _Odd()
+        outcome = self.dialect.last(tail.text) if len(tail.text) <= LINE_MAX else None
+        if outcome is None and tail.text.strip():
+            outcome = Damage("last line has no line end, may be cut")
+        if outcome is None or isinstance(outcome, Frame):
+            detail = f"line {tail.number} has no line end"
+            self._ledger.drop("", "file may be cut after its last frame", None, detail)
+        self._sort_in(odd, 0, tail.number, tail.text, outcome)
+        return self._checked(self._timed(NO_ROWS, odd), odd, tail.number, 1)
+
+    def _lines(self, lines: Lines) -> FrameRows:
+        fast = self.dialect.fast(lines)
+        rows = self._renamed(fast)
+        odd = _Odd()
+        for i in _left_over(lines, rows):
+            line = lines.text(i)
+            outcome = self._judged(line)
+            if isinstance(outcome, Damage) and outcome.taints and i > 0:
+                odd.tainted.append(i - 1)
+            if i >= lines.done:
+                break
+            self._sort_in(odd, i, lines.first_number + i, line, outcome)
+            if self.stopped:
+                rows = self._timed(rows.take(rows.place < i), odd)
+                return self._checked(rows, odd, lines.first_number, i)
+        if lines.done < len(lines):
+            rows = rows.take(slice(0, int(np.searchsorted(rows.place, lines.done))))
+        rows = self._checked(self._timed(rows, odd), odd, lines.first_number, lines.done)
+        return self._untainted(rows, odd.tainted, lines)
+
+    def _checked(self, rows: FrameRows, odd: _Odd, first_number: int, done: int) -> FrameRows:
+        """Without the rows that the format's own counters contradict."""
+        met = Met(rows, odd.frames, odd.plain, odd.damaged, odd.marks, first_number, done)
+        refused = self.dialect.check(met)
+        return rows.take(~np.isin(rows.place, refused)) if len(refused) else rows
+
+    def _judged(self, line: bytes) -> Outcome:
+        if len(line) > LINE_MAX:
+            return Damage("line too long")
+        outcome = self.dialect.slow(line)
+        if _CONTROL.search(line):
+            taints = isinstance(outcome, Damage) and outcome.taints
+            return Damage("control characters in a line", taints)
+        return outcome
+
+    def _sort_in(self, odd: _Odd, i: int, number: int, line: bytes, outcome: Outcome) -> None:
+        match outcome:
+            case Frame():
+                code = bus_number(outcome.bus, self._names)
+                if code < 0:
+                    odd.damaged.append(i)
+                    self._lost("", "more buses than a log can have", number, line)
+                else:
+                    odd.frames.append((i, code, outcome))
+            case Other():
+                self.knows_it = True
+                odd.others.setdefault((outcome.bus, outcome.reason), []).append(number)
+                odd.plain.append((i, outcome))
+                if outcome.t_ns is not None:
+                    odd.times.append((i, outcome.t_ns))
+            case Damage():
+                odd.damaged.append(i)
+                self._lost("", outcome.reason, number, line)
+            case Mark():
+                self.knows_it = True
+                odd.marks.append((i, outcome))
+                if outcome.stops:
+                    self.stopped = True
+                    self._ledger.drop("", outcome.stops, None, f"from line {number} on")
+            case None:
+                pass
+
+    def _lost(self, topic: str, reason: str, number: int, line: bytes) -> None:
+        excerpt = line[:_EXCERPT].decode("ascii", "backslashreplace")
+        dots = "..." if len(line) > _EXCERPT else ""
+        self._ledger.drop(topic, reason, 1, f"line {number}: {excerpt!r}{dots}")
+
+    def _untainted(self, rows: FrameRows, tainted: list[int], lines: Lines) -> FrameRows:
+        if not tainted:
+            return rows
+        is_bad = np.isin(rows.place, tainted)
+        names = tuple(self._names)
+        for k in np.flatnonzero(is_bad).tolist():
+            i = int(rows.place[k])
+            reason = "followed by a broken line, may be cut"
+            self._lost(names[rows.bus[k]], reason, lines.first_number + i, lines.text(i))
+        return rows.take(~is_bad)
+
+    def _timed(self, rows: FrameRows, odd: _Odd) -> FrameRows:
+        """Fast and odd rows together, with log times."""
+        for (bus, reason), numbers in odd.others.items():
+            topic = bus and bus_name(bus)
+            self._ledger.find(topic, len(numbers))
+            self._ledger.skip(topic, reason, len(numbers), f"from line {numbers[0]} on")
+        rows = joined(rows, odd.rows())
+        place, t_ns = rows.place, rows.log_ns
+        if odd.times:
+            at, values = (np.array(column, np.int64) for column in zip(*odd.times, strict=True))
+            place, t_ns = np.concatenate((place, at)), np.concatenate((t_ns, values))
+        order = np.argsort(place, kind="stable") if odd.times else slice(None)
+        log_ns = np.empty_like(t_ns)
+        log_ns[order] = self.dialect.clock(place[order], t_ns[order], odd.marks)
+        return FrameRows(rows.place, rows.bus, log_ns[: len(rows)], rows.frames)
+
+    def _renamed(self, fast: Fast) -> FrameRows:
+        rows = fast.rows
+        if not len(rows):
+            return rows
+        if len(fast.names) == 1 and bus_number(fast.names[0], self._names) == 0:
+            return rows
+        uses = np.bincount(rows.bus, minlength=len(fast.names)).tolist()
+        named = zip(fast.names, uses, strict=True)
+        codes = np.array(
+            [bus_number(name, self._names) if used else -1 for name, used in named], np.int64
+        )
+        bus = codes[rows.bus]
+        renamed = FrameRows(rows.place, bus, rows.log_ns, rows.frames)
+        return renamed.take(bus >= 0) if bool((bus < 0).any()) else renamed
+
+
+def _left_over(lines: Lines, rows: FrameRows) -> list[int]:
+    """The lines that are neither blank nor among ``rows``."""
+    if len(rows) == len(lines):
+        return []
+    is_odd = lines.stop > lines.start
+    is_odd[rows.place] = False
+    left: list[int] = np.flatnonzero(is_odd).tolist()
+    return left
+
+
+class _Odd:
+    """What the odd lines of one chunk came to."""
+
+    def __init__(self) -> None:
+        self.frames: list[tuple[int, int, Frame]] = []
+        self.times: list[tuple[int, int]] = []
+        self.marks: list[tuple[int, Mark]] = []
+        self.others: dict[tuple[str, str], list[int]] = {}
+        self.plain: list[tuple[int, Other]] = []
+        self.damaged: list[int] = []
+        self.tainted: list[int] = []
+
+    def rows(self) -> FrameRows:
+        if not self.frames:
+            return NO_ROWS
+        place, bus, frames = zip(*self.frames, strict=True)
+        width = 64 if any(f.is_fd or len(f.payload) > 8 for f in frames) else 8
+        payload = b"".join(f.payload.ljust(width, b"\0") for f in frames)
+        return FrameRows(
+            np.array(place, np.int64),
+            np.array(bus, np.int64),
+            np.array([f.t_ns for f in frames], np.int64),
+            CanFrames(
+                np.array([f.arbitration_id for f in frames], np.uint32),
+                np.array([f.is_extended for f in frames], np.bool_),
+                np.array([f.kind for f in frames], np.uint8),
+                np.array([f.length for f in frames], np.uint8),
+                np.frombuffer(payload, np.uint8).reshape(-1, width).copy(),
+                np.array([f.is_fd for f in frames], np.bool_),
+            ),
+        )
+
+
+_FRAME_LIKE: Final = re.compile(
+    r"\d[.,]\d+\s+(?:.*\s)?(?:[RT]x|DT|F[BDE]|BI|RR)\s|\d\)\s+\d+[.,]?\d*\s+[0-9A-Fa-f]{4,8}\s"
+)
+
+
+def comment(text: str) -> Outcome:
+    """A comment line, unless damage may have joined a frame's line to it."""
+    if _FRAME_LIKE.search(text):
+        return Other("comment that holds a frame")
+    return None
+
+
+def head_of(path: Path) -> bytes:
+    """The first 64 KiB, as a format's header needs them.
+
+    Raises:
+        LogFormatError: It is empty, compressed or UTF-16, with what to do about it.
+    """
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    if not head:
+        raise LogFormatError(f"{path}: empty file; expected a CAN log, check how it was copied")
+    for magic, what, todo in (
+        (b"\x1f\x8b", "compressed with gzip", "unpack it first (gzip -d)"),
+        (b"\xff\xfe", "UTF-16 text", "save it as UTF-8"),
+        (b"\xfe\xff", "UTF-16 text", "save it as UTF-8"),
+        (b"PK\x03\x04", "a zip archive", "unpack it first"),
+    ):
+        if head.startswith(magic):
+            raise LogFormatError(f"{path}: {what}, expected plain text; {todo}")
+    return head
+
+
+def payloads(
+    lines: Lines, start: Int64s, length: Int64s, is_fd: Bools, gap: int | None
+) -> tuple[Bytes, Bools]:
+    """Payload bytes of frames written as hexadecimal pairs, with ``gap`` between them or nothing.
+
+    Returns:
+        Bytes of shape (N, 8), or (N, 64) when a frame is CAN FD, and whether all were readable.
+    """
+    if gap is None:
+        payload, ok = payload8(lines.words, start, length)
+    else:
+        payload, ok = spaced8(lines.words, start, length, gap)
+    if not bool(is_fd.any()):
+        return payload, ok
+    payload = widened(payload, 64)
+    long = np.flatnonzero(length > 8)
+    payload[long], ok[long] = payload64(lines.buffer, start[long], length[long], gap)
+    return payload, ok
+
+
+def picked(keep: Bools, place: Int64s, bus: Int64s, t_ns: Int64s, frames: CanFrames) -> FrameRows:
+    """The rows that passed every check of ``fast``."""
+    rows = FrameRows(place, bus, t_ns, frames)
+    return rows if bool(keep.all()) else rows.take(keep)

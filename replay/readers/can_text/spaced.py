@@ -1,0 +1,105 @@
+"""Frames whose bytes are words of their own, as ASC, TRC and BUSMASTER logs write them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import DATA, CanFrames, Int64s
+from crosscue.replay.readers.can_rows import joined
+
+from .dialect import NO_ROWS, Fast, payloads, picked
+from .digits import LABEL_MAX, Bools, hexadecimal, labels
+from .lines import SPACE, Field, Lines
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spaced:
+    """Where the fields of N data frames lie; all arrays have shape (N,).
+
+    Attributes:
+        line: Which line.
+        bus: The word that names the bus; None when the format has one bus only.
+        identifier: The hexadecimal digits of the identifier.
+        is_extended: 29-bit identifier.
+        length: Payload bytes, 0 to 64.
+        payload: First character of the payload; means nothing for a length of 0.
+        is_fd: CAN FD.
+    """
+
+    line: Int64s
+    bus: Field | None
+    identifier: Field
+    is_extended: Bools
+    length: Int64s
+    payload: Int64s
+    is_fd: Bools
+
+
+NOTHING_FAST: Final = Fast(NO_ROWS, ())
+
+
+def spaced_frames(lines: Lines, at: Spaced, t_ns: Int64s, ok: Bools) -> Fast:
+    """The frames at these places that hold up: digits, gaps, ranges, names.
+
+    Args:
+        lines: The chunk.
+        at: Where the fields lie.
+        t_ns: Shape (N,): times.
+        ok: Shape (N,): what is known to be right so far.
+    """
+    if not len(at.line):
+        return NOTHING_FAST
+    identifier, id_ok = hexadecimal(lines.words, at.identifier.stop, at.identifier.size)
+    ok = ok & id_ok & (identifier <= np.where(at.is_extended, 0x1FFFFFFF, 0x7FF))
+    payload, payload_ok = payloads(lines, at.payload, at.length, at.is_fd, SPACE)
+    stop = payload_stop(at)
+    ok &= payload_ok & (lines.buffer[stop] <= SPACE) & (stop <= lines.stop[at.line])
+    spelled: tuple[bytes, ...]
+    if at.bus is None:
+        bus, spelled = np.zeros(len(at.line), np.int64), (b"1",)
+    else:
+        bus, spelled = labels(lines.words, at.bus.start, at.bus.size)
+        is_name = np.array([is_bus_name(one) for one in spelled] + [False])
+        ok &= (at.bus.size <= LABEL_MAX) & is_name[bus]
+    frames = CanFrames(
+        identifier.astype(np.uint32),
+        at.is_extended,
+        np.full(len(at.line), DATA, np.uint8),
+        at.length.astype(np.uint8),
+        payload,
+        at.is_fd,
+    )
+    names = tuple(one.decode("ascii", "replace") for one in spelled)
+    return Fast(picked(ok, at.line, bus, t_ns, frames), names)
+
+
+def payload_stop(at: Spaced) -> Int64s:
+    """One past the last payload digit, where a gap must be."""
+    return at.payload + np.maximum(3 * at.length - 1, 0)
+
+
+def is_bus_name(spelled: bytes) -> bool:
+    """Printable ASCII, as all bus names are."""
+    return bool(spelled) and all(SPACE < c < 127 for c in spelled)
+
+
+def is_way(lines: Lines, word: Field) -> Bools:
+    """``Rx`` or ``Tx``."""
+    letter = lines.buffer[word.start]
+    found: Bools = (letter == ord("R")) | (letter == ord("T"))
+    found &= (lines.buffer[word.start + 1] == ord("x")) & (word.size == 2)
+    return found
+
+
+def joined_fast(parts: Sequence[Fast]) -> Fast:
+    """All frames of one chunk by line; each part has its own bus names."""
+    rows = NO_ROWS
+    names: tuple[str, ...] = ()
+    for part in parts:
+        shifted = replace(part.rows, bus=part.rows.bus + len(names))
+        rows, names = joined(rows, shifted), (*names, *part.names)
+    return Fast(rows, names)

@@ -1,0 +1,150 @@
+"""One camera as files in a folder: their bytes in blocks, accounted for."""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import BLOCK_BYTES, Block, Images, Messages, Topic
+from crosscue.replay.decode.coding import MAGIC_BYTES, coding_of
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import Selection
+from crosscue.replay.readers.timed_files import TimedFiles, is_inside
+
+from .damage import CHECKED, damage_of
+
+SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp")
+_DETAILS_TOLD: Final = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PictureFiles:
+    """Pictures of one camera and their times.
+
+    Attributes:
+        topic: The camera.
+        files: Its pictures.
+    """
+
+    topic: Topic
+    files: TimedFiles
+
+    def read(self, ledger: Ledger, selection: Selection, limits: Limits) -> Iterator[Block]:
+        """The pictures in blocks, accounted for; codings met are added to ``ledger.integrity``."""
+        name = self.topic.name
+        ledger.declare(name, self.topic.declared)
+        if not selection.wants(name):
+            ledger.find(name, len(self.files.paths))
+            ledger.skip(name, NOT_ASKED_TOPIC, len(self.files.paths))
+        else:
+            for sentence in self.files.notices:
+                ledger.notice(sentence)
+            yield from self._blocks(ledger, selection, limits)
+        missing = self.files.missing_ns[is_inside(self.files.missing_ns, selection)]
+        first_ns = int(missing[0]) if len(missing) else None
+        ledger.drop(name, "a time without its picture", len(missing), "", first_ns)
+        if selection.start_ns is None and selection.end_ns is None:
+            ledger.settle(name)
+
+    def _blocks(self, ledger: Ledger, selection: Selection, limits: Limits) -> Iterator[Block]:
+        name = self.topic.name
+        without = [p.name for p, t in zip(self.files.paths, self.files.t_ns, strict=True) if t < 0]
+        ledger.find(name, len(without))
+        ledger.skip(name, "a picture without its time", len(without), _few(without))
+        wanted = is_inside(self.files.t_ns, selection) & (self.files.t_ns >= 0)
+        outside = len(self.files.paths) - len(without) - int(np.count_nonzero(wanted))
+        ledger.find(name, outside)
+        ledger.skip(name, NOT_ASKED_TIME, outside)
+        batch = _Batch(name)
+        for i in np.flatnonzero(wanted):
+            t_ns = int(self.files.t_ns[i])
+            picture = _read_picture(self.files.paths[i], name, t_ns, ledger, limits)
+            if picture is None:
+                continue
+            if batch.size and batch.size + len(picture[0]) > BLOCK_BYTES:
+                yield batch.block()
+                batch = _Batch(name)
+            batch.add(t_ns, *picture)
+        if batch.size:
+            yield batch.block()
+
+
+class _Batch:
+    """Pictures waiting to become a block."""
+
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+        self._t_ns: list[int] = []
+        self._pictures: list[bytes] = []
+        self._codings: list[str] = []
+        self.size = 0
+
+    def add(self, t_ns: int, picture: bytes, coding: str) -> None:
+        self._t_ns.append(t_ns)
+        self._pictures.append(picture)
+        self._codings.append(coding)
+        self.size += len(picture)
+
+    def block(self) -> Block:
+        return image_block(self._topic, self._t_ns, self._pictures, self._codings)
+
+
+def image_block(
+    topic: str, t_ns: Sequence[int], pictures: Sequence[bytes], codings: Sequence[str]
+) -> Block:
+    """A block of encoded pictures, copied into one buffer."""
+    stop = np.cumsum([len(picture) for picture in pictures], dtype=np.int64)
+    start = np.concatenate([np.zeros(1, dtype=np.int64), stop[:-1]])
+    buffer = np.frombuffer(b"".join(pictures), dtype=np.uint8)
+    rows = Images(Messages(buffer, start, stop), tuple(codings))
+    return Block(topic, np.array(t_ns, dtype=np.int64), rows)
+
+
+def _read_picture(
+    path: Path, topic: str, t_ns: int, ledger: Ledger, limits: Limits
+) -> tuple[bytes, str] | None:
+    """A whole picture and its coding; else None, and the ledger knows why."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise OSError("not a regular file")
+        with path.open("rb") as file:
+            picture = file.read(limits.message_bytes + 1)
+    except OSError as error:
+        why = error.strerror or str(error)
+        ledger.drop(topic, "picture cannot be opened", 1, f"{path.name}: {why}", t_ns)
+        return None
+    coding = coding_of(picture[:MAGIC_BYTES], "")
+    reason = None
+    if not picture:
+        reason = "empty file"
+    elif len(picture) > limits.message_bytes:
+        reason = "picture over the size limit"
+    elif coding not in CHECKED:
+        reason = "not a JPEG, PNG or WebP picture"
+    if coding is None or reason is not None:
+        ledger.find(topic, 1)
+        ledger.skip(topic, reason or "", 1, f"{path.name}: {len(picture)} bytes", t_ns)
+        return None
+    if damage := damage_of(picture, coding):
+        ledger.drop(topic, damage, 1, path.name, t_ns)
+        return None
+    ledger.find(topic, 1)
+    _note_check(ledger, CHECKED[coding])
+    return picture, coding
+
+
+def _note_check(ledger: Ledger, check: str) -> None:
+    if ledger.integrity == "not checked":
+        ledger.integrity = check
+    elif check not in ledger.integrity:
+        ledger.integrity += f"; {check}"
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:_DETAILS_TOLD]) + (", ..." if len(names) > _DETAILS_TOLD else "")

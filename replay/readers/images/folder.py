@@ -1,0 +1,70 @@
+"""A folder of pictures and a time file: one camera.
+
+Which files are time files and how they are read: ``time_file``; how pictures get their times:
+``timed_files``. The topic is called after the folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.readers.time_file import find_time_file, read_time_file
+from crosscue.replay.readers.timed_files import list_files, pair
+
+from .files import SUFFIXES, PictureFiles
+
+
+class ImageFolder(Closing):
+    """A folder of pictures as a ``Log``."""
+
+    format: Final = "images"
+
+    def __init__(self, path: Path, pictures: PictureFiles, limits: Limits) -> None:
+        """Read ``pictures`` from ``path`` within ``limits``."""
+        self.path: Final = path
+        self._pictures: Final = pictures
+        self._limits: Final = limits
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The one camera."""
+        return (self._pictures.topic,)
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """The pictures in natural order of their names; see ``Log.read``."""
+        yield from self._pictures.read(ledger, selection, self._limits)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def open_images(path: Path, limits: Limits) -> ImageFolder:
+    """Open a folder of pictures; see ``crosscue.replay.log.FORMATS``.
+
+    Raises:
+        LogFormatError: No picture, no time file, or a time file that cannot be understood.
+    """
+    paths = list_files(path, SUFFIXES)
+    if not paths:
+        raise LogFormatError(f"{path}: no picture in it; want .png, .jpg or .webp files")
+    time_file = find_time_file(path)
+    if time_file is None:
+        raise LogFormatError(
+            f"{path}: {len(paths)} pictures but no time file; write timestamps.txt into it with "
+            "one time a line (seconds with a decimal point), or with the one line 'rate_hz: 15' "
+            "if their times were not kept"
+        )
+    times = read_time_file(time_file, limits)
+    name = path.resolve()
+    camera = name.parent.name if name.name == "data" else name.name
+    files = pair(paths, times)
+    topic = Topic(camera or "images", "crosscue/Images", "columns", declared=files.declared)
+    return ImageFolder(path, PictureFiles(topic, files), limits)

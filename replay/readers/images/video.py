@@ -1,0 +1,389 @@
+"""A video file and a time file: one camera, as the stream's packets.
+
+A row is one packet of the first video stream, in stored order (which is decoding order): H.264 and
+H.265 in Annex B form with parameter sets before key frames, AV1 as stored, Motion JPEG as pictures.
+Other codecs are decoded here into ``raw`` pictures (``rgb8``). A row's time is the time of the
+picture that the packet becomes, so times of packets go back and forth where pictures are coded out
+of order. A decoder can only begin at a key frame: ask for a little more than is needed.
+
+Times come from the time file next to the video (``time_file``), whose lines count pictures in the
+order in which they are shown; without one from the container's own presentation times, which begin
+at 0. A raw ``.h264`` or ``.hevc`` stream has none and needs the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, Final, cast
+
+import numpy as np
+
+from crosscue.replay.columns import BLOCK_BYTES, Block, Images, Int64s, Messages, Topic
+from crosscue.replay.errors import LogError, LogFormatError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.readers.time_file import (
+    SECOND_NS,
+    TimeFile,
+    read_time_file,
+    time_file_of_video,
+)
+from crosscue.replay.readers.timed_files import is_inside
+
+from .files import image_block
+
+if TYPE_CHECKING:
+    from av import Packet, VideoFrame, VideoStream
+    from av.bitstream import BitStreamFilterContext
+    from av.container import InputContainer
+
+DEMUXERS: Final = {
+    ".mp4": "mov",
+    ".mov": "mov",
+    ".avi": "avi",
+    ".mkv": "matroska",
+    ".hevc": "hevc",
+    ".h264": "h264",
+}
+"""Which of FFmpeg's demuxers reads which suffix; none is guessed, since some open other files."""
+WITHOUT_TIMES: Final = frozenset({".hevc", ".h264"})
+CODINGS: Final = {"h264": "h264", "hevc": "h265", "av1": "av1", "mjpeg": "jpeg", "png": "png"}
+TO_ANNEX_B: Final = {"h264": "h264_mp4toannexb", "hevc": "hevc_mp4toannexb"}
+NO_TIME: Final = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Index:
+    """What a first pass over the packets tells.
+
+    Attributes:
+        t_ns: Shape (N,), int64: time of each packet's picture, or ``NO_TIME``.
+        is_damaged: N flags.
+        stopped: Why the pass ended before the file did, or empty.
+        notices: Sentences on the times.
+        missing: How many lines of the time file have no packet.
+    """
+
+    t_ns: Int64s
+    is_damaged: tuple[bool, ...]
+    stopped: str
+    notices: tuple[str, ...]
+    missing: int
+
+
+class Video(Closing):
+    """A video file as a ``Log``."""
+
+    format: Final = "video"
+
+    def __init__(self, path: Path, file: BinaryIO, times: TimeFile | None, limits: Limits) -> None:
+        """Read the header.
+
+        Raises:
+            LogFormatError: It is cut or damaged, or has no video stream.
+        """
+        self.path: Final = path
+        self._file: Final = file
+        self._times: Final = times
+        self._limits: Final = limits
+        with self._container() as container:
+            stream = _video_stream(container, path)
+            self._codec: Final = stream.codec_context.name
+            declared = stream.frames or None
+            self._duration_s: Final = _duration_s(container)
+            self._streams: Final = len(container.streams.video)
+            self._has_reordering: Final = bool(stream.codec_context.has_b_frames)
+            try:
+                _annex_b(stream)
+            except _failures() as error:
+                raise LogFormatError(
+                    f"{path}: the stream's parameter sets are damaged ({_words(error)}); no "
+                    "picture can be decoded; copy it again from the recorder"
+                ) from None
+        if declared is None and times is not None and times.period is None:
+            declared = len(times.t_ns)
+        self.topics: Final = (Topic(path.stem, "crosscue/Images", "columns", declared=declared),)
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """The packets in stored order; see ``Log.read`` and the module's text."""
+        (topic,) = self.topics
+        ledger.integrity = "video packets carry no checksum: a changed picture cannot be seen"
+        if self.path.suffix.lower() in WITHOUT_TIMES:
+            ledger.integrity += ", nor a missing end except by the time file's lines"
+        ledger.declare(topic.name, topic.declared)
+        index = self._index()
+        if not selection.wants(topic.name):
+            ledger.find(topic.name, len(index.t_ns))
+            ledger.skip(topic.name, NOT_ASKED_TOPIC, len(index.t_ns))
+        else:
+            for sentence in index.notices:
+                ledger.notice(sentence)
+            wanted = (index.t_ns != NO_TIME) & is_inside(index.t_ns, selection)
+            if self._codec in CODINGS:
+                yield from self._packets(index, wanted.tolist(), ledger)
+            else:
+                yield from self._decoded(index, wanted.tolist(), ledger)
+        ledger.drop(topic.name, "a time without its picture", index.missing)
+        self._settle(index, ledger)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _container(self) -> InputContainer:
+        import av
+
+        self._file.seek(0)
+        try:
+            return av.open(self._file, mode="r", format=DEMUXERS[self.path.suffix.lower()])
+        except _failures() as error:
+            raise LogFormatError(
+                f"{self.path}: cut or damaged, no video can be found in it "
+                f"({_words(error)}); copy it again from the recorder"
+            ) from None
+
+    def _index(self) -> _Index:
+        """Go over all packets once, for their number, times and damage."""
+        pts: list[int | None] = []
+        is_damaged: list[bool] = []
+        stopped = ""
+        with self._container() as container:
+            stream = _video_stream(container, self.path)
+            base = stream.time_base
+            try:
+                for packet in container.demux(stream):
+                    if packet.size:
+                        pts.append(packet.pts)
+                        is_damaged.append(packet.is_corrupt)
+            except _failures() as error:
+                stopped = _words(error)
+        unit_ns = SECOND_NS * base if base else None
+        notices = []
+        if self._streams > 1:
+            notices.append(f"{self._streams} video streams; only the first is read")
+        if self._times is None:
+            notices.append("times are the video's own, starting at 0: they share no clock with CAN")
+            known = [p for p in pts if p is not None]
+            first = min(known, default=0)
+            own = [
+                NO_TIME if p is None or unit_ns is None else round((p - first) * unit_ns)
+                for p in pts
+            ]
+            t_ns = np.array(own, dtype=np.int64)
+            self._shown_order(pts, notices)
+            return _Index(t_ns, tuple(is_damaged), stopped, tuple(notices), 0)
+        shown = self._shown_order(pts, notices)
+        lines = len(self._times.t_ns) if self._times.period is None else len(pts)
+        if self._times.period is not None:
+            rate_hz = float(SECOND_NS / self._times.period)
+            notices.append(f"times are made up from a constant rate of {rate_hz:g} Hz, from 0 on")
+        elif lines != len(pts):
+            notices.append(
+                f"{len(pts)} pictures and {lines} times ({self._times.path.name}): paired in order "
+                "from the first"
+            )
+        t_ns = np.full(len(pts), NO_TIME, dtype=np.int64)
+        timed = shown < lines
+        t_ns[timed] = self._times.times_at(shown[timed])
+        missing = max(lines - len(pts), 0)
+        return _Index(t_ns, tuple(is_damaged), stopped, tuple(notices), missing)
+
+    def _shown_order(self, pts: list[int | None], notices: list[str]) -> Int64s:
+        """Each packet's place in the order in which pictures are shown."""
+        known = [p for p in pts if p is not None]
+        if len(known) == len(pts):
+            shown = np.empty(len(pts), dtype=np.int64)
+            shown[np.argsort(np.array(known, dtype=np.int64), kind="stable")] = np.arange(len(pts))
+            if (np.diff(shown) < 0).any():
+                notices.append("pictures are stored in another order than they are shown")
+            return shown
+        if self._has_reordering:
+            notices.append(
+                "the stream may store pictures in another order than they are shown and does not "
+                "say which: times go by stored order"
+            )
+        return np.arange(len(pts), dtype=np.int64)
+
+    def _packets(self, index: _Index, wanted: list[bool], ledger: Ledger) -> Iterator[Block]:
+        """Blocks of packets as they are stored."""
+        name, coding = self.topics[0].name, CODINGS[self._codec]
+        t_ns: list[int] = []
+        payloads: list[bytes] = []
+        size = 0
+        with self._container() as container:
+            stream = _video_stream(container, self.path)
+            convert = _annex_b(stream)
+            packets = (packet for packet in _demuxed(container, stream) if packet.size)
+            for i, packet in enumerate(packets):
+                if i >= len(wanted) or not self._usable(index, i, packet.size, wanted[i], ledger):
+                    continue
+                try:
+                    payload = b"".join(map(bytes, convert.filter(packet) if convert else [packet]))
+                except _failures() as error:
+                    ledger.drop(name, "packet damaged", 1, _words(error), int(index.t_ns[i]))
+                    continue
+                ledger.find(name, 1)
+                if payloads and size + len(payload) > BLOCK_BYTES:
+                    yield image_block(name, t_ns, payloads, [coding] * len(payloads))
+                    t_ns, payloads, size = [], [], 0
+                t_ns.append(int(index.t_ns[i]))
+                payloads.append(payload)
+                size += len(payload)
+        if payloads:
+            yield image_block(name, t_ns, payloads, [coding] * len(payloads))
+
+    def _usable(self, index: _Index, i: int, size: int, wanted: bool, ledger: Ledger) -> bool:
+        """Book a packet that is not to be given."""
+        name, t_ns = self.topics[0].name, int(index.t_ns[i])
+        if index.is_damaged[i]:
+            ledger.drop(name, "packet damaged", 1, f"packet {i}", t_ns)
+            return False
+        reason = None
+        if t_ns == NO_TIME:
+            reason = "a picture without its time"
+        elif not wanted:
+            reason = NOT_ASKED_TIME
+        elif size > self._limits.message_bytes:
+            reason = "picture over the size limit"
+        if reason is not None:
+            ledger.find(name, 1)
+            ledger.skip(name, reason, 1, f"packet {i}: {size} bytes", t_ns)
+        return reason is None
+
+    def _decoded(self, index: _Index, wanted: list[bool], ledger: Ledger) -> Iterator[Block]:
+        """Blocks of one decoded picture each, for codecs that nobody downstream knows."""
+        name = self.topics[0].name
+        ledger.notice(f"codec {self._codec}: decoded by the reader")
+        # Pictures come in the order in which they are shown, so they take the sorted times.
+        order = np.argsort(index.t_ns, kind="stable").tolist()
+        given = 0
+        with self._container() as container:
+            for frame, i in zip(self._frames(container), order, strict=False):
+                given += 1
+                size = frame.width * frame.height * 3
+                if self._usable(index, i, size, wanted[i], ledger):
+                    ledger.find(name, 1)
+                    yield _raw_block(name, int(index.t_ns[i]), frame)
+        ledger.drop(name, "picture cannot be decoded", len(order) - given)
+
+    def _frames(self, container: InputContainer) -> Iterator[VideoFrame]:
+        """Pictures that can be decoded."""
+        stream = _video_stream(container, self.path)
+        for packet in _demuxed(container, stream):
+            try:
+                yield from packet.decode()
+            except _failures():
+                # The picture is missing from the count at the end, which tells the loss.
+                continue
+
+    def _settle(self, index: _Index, ledger: Ledger) -> None:
+        (topic,) = self.topics
+        if index.stopped:
+            ledger.drop(topic.name, "file is cut or damaged", None, index.stopped)
+        elif topic.declared is None and self._times is None and self._duration_s is not None:
+            last_s = float(index.t_ns.max(initial=0)) / SECOND_NS
+            period_s = last_s / max(len(index.t_ns) - 1, 1)
+            # A whole file ends one period after its last picture's time.
+            if self._duration_s - last_s > 1.6 * period_s:
+                says = f"the container says {self._duration_s:.2f} s, packets end at {last_s:.2f} s"
+                ledger.drop(topic.name, "file is cut or damaged", None, says)
+        ledger.settle(topic.name, "declared by the container, not in its bytes")
+
+
+def open_video(path: Path, limits: Limits) -> Video:
+    """Open a video file; see ``crosscue.replay.log.FORMATS``.
+
+    Raises:
+        LogFormatError: It is cut or damaged, has no video, or no times.
+        LogError: It cannot be opened, or the extra ``video`` is not installed.
+    """
+    if find_spec("av") is None:
+        raise LogError(f"{path}: reading video needs PyAV; install it with: pip install av")
+    time_file = time_file_of_video(path)
+    times = None if time_file is None else read_time_file(time_file, limits)
+    if times is None and path.suffix.lower() in WITHOUT_TIMES:
+        raise LogFormatError(
+            f"{path}: a raw stream has no times; write {path.name}.txt with one time for each "
+            "picture (seconds with a decimal point), or the line 'rate_hz: 20'"
+        )
+    if times is not None and times.names is not None:
+        raise LogFormatError(
+            f"{times.path}: names files; want one time for each picture of {path.name}"
+        )
+    file = path.open("rb")
+    try:
+        return Video(path, file, times, limits)
+    except BaseException:
+        file.close()
+        raise
+
+
+def _video_stream(container: InputContainer, path: Path) -> VideoStream:
+    for stream in container.streams.video:
+        # None where FFmpeg knows no decoder, against its type.
+        if cast("object", stream.codec_context) is not None:
+            return stream
+    raise LogFormatError(
+        f"{path}: no video stream of a known codec in it; give the camera's file, undamaged"
+    )
+
+
+def _duration_s(container: InputContainer) -> float | None:
+    """How long the container says it is, where that speaks of the video alone."""
+    import av
+
+    if container.duration is None or len(container.streams) != 1:
+        return None
+    return container.duration / av.time_base
+
+
+def _demuxed(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
+    """Packets until the end or the damage; the first pass has already told the latter."""
+    try:
+        yield from container.demux(stream)
+    except _failures():
+        return
+
+
+def _annex_b(stream: VideoStream) -> BitStreamFilterContext | None:
+    """A filter to Annex B, where the stream is stored with lengths (``avcC``, ``hvcC``)."""
+    from av.bitstream import BitStreamFilterContext
+
+    extra = stream.codec_context.extradata
+    name = TO_ANNEX_B.get(stream.codec_context.name)
+    if name is None or not extra or extra[0] != 1:
+        return None
+    return BitStreamFilterContext(name, stream)
+
+
+def _raw_block(topic: str, t_ns: int, frame: VideoFrame) -> Block:
+    rgb = np.ascontiguousarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
+    height, width = rgb.shape[:2]
+    zero, size = np.zeros(1, dtype=np.int64), np.array([rgb.size], dtype=np.int64)
+    pictures = Images(
+        Messages(rgb.reshape(-1), zero, size),
+        ("raw",),
+        width_px=np.array([width], dtype=np.int32),
+        height_px=np.array([height], dtype=np.int32),
+        step_bytes=np.array([3 * width], dtype=np.int32),
+        pixel_format=("rgb8",),
+    )
+    return Block(topic, np.array([t_ns], dtype=np.int64), pictures)
+
+
+def _failures() -> tuple[type[Exception], ...]:
+    """What FFmpeg's binding raises on damaged input; an empty file is an ``OSError``."""
+    import av
+
+    return av.FFmpegError, ValueError, OSError
+
+
+def _words(error: BaseException) -> str:
+    """FFmpeg's reason without its error number and our file object."""
+    text = getattr(error, "strerror", None) or str(error)
+    return str(text).replace("\n", " ")[:200]

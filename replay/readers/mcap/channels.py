@@ -1,0 +1,166 @@
+"""From channels to topics.
+
+Channels of one name, message type and encoding are one topic, whatever their numbers. Where one
+name is used with different types or encodings, the first seen keeps the name and the others become
+topics of their own, called ``name#2``, ``name#3`` and so on, with a notice.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import Final
+
+from crosscue.replay.columns import Topic
+from crosscue.replay.limits import Limits
+
+from .records import CHANNEL, Channel, Schema, read_channel, read_schema
+from .rows import Definition
+
+UNKNOWN: Final = ""
+"""The topic of messages whose channel nobody declares."""
+UNNAMED: Final = "(unnamed)"
+"""What a topic with an empty name is called."""
+
+
+class TopicBook:
+    """All topics of a log, in the order in which they came to light; it only grows."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.topics: list[Topic] = []
+        self.notices: dict[str, None] = {}
+        self._limits = limits
+        self._names: dict[Topic, str] = {}
+        self._used: set[str] = set()
+        self._variants: Counter[str] = Counter()
+
+    def name(self, channel: Channel, schema: Schema | None) -> str:
+        """The name of the topic that ``channel`` belongs to; a new one is entered."""
+        topic = self._topic(channel, schema)
+        if topic not in self._names:
+            self._names[topic] = name = self._free_name(topic)
+            self._used.add(name)
+            self.topics.append(replace(topic, name=name))
+        return self._names[topic]
+
+    def _topic(self, channel: Channel, schema: Schema | None) -> Topic:
+        called = channel.topic or UNNAMED
+        if schema is None:
+            if channel.schema_id:
+                self._tell(f"{called}: its schema {channel.schema_id} is not in the file")
+            return Topic(called, "", channel.message_encoding)
+        text = schema.text
+        if len(text) > self._limits.schema_bytes:
+            self._tell(
+                f"{called}: its schema has {len(text)} bytes, the limit is "
+                f"{self._limits.schema_bytes}; messages are given without it"
+            )
+            text = b""
+        return Topic(called, schema.name, channel.message_encoding, text, schema.encoding)
+
+    def _free_name(self, topic: Topic) -> str:
+        name = topic.name
+        while name in self._used:
+            self._variants[topic.name] += 1
+            name = f"{topic.name}#{self._variants[topic.name] + 1}"
+        if name != topic.name:
+            what = topic.type_name or topic.encoding or "no type"
+            self._tell(f"{topic.name} has several message types; {what} is given as {name}")
+        return name
+
+    def _tell(self, sentence: str) -> None:
+        self.notices[sentence] = None
+
+
+class Declarations:
+    """The schemas and channels in force at one place of one file."""
+
+    def __init__(
+        self, book: TopicBook, schemas: Iterable[Schema] = (), channels: Iterable[Channel] = ()
+    ) -> None:
+        self._book = book
+        self._schemas = {schema.id: schema for schema in schemas}
+        self._channels = {channel.id: channel for channel in channels}
+        self._seen: set[tuple[int, bytes]] = set()
+        self._names: dict[int, str] = {}
+        self.redefined: set[int] = set()
+
+    @property
+    def schemas(self) -> tuple[Schema, ...]:
+        """The schemas in force."""
+        return tuple(self._schemas.values())
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """The channels in force."""
+        return tuple(self._channels.values())
+
+    @property
+    def complete(self) -> frozenset[int]:
+        """Numbers of the channels declared together with their schema."""
+        known = self._schemas.keys() | {0}
+        return frozenset(c.id for c in self._channels.values() if c.schema_id in known)
+
+    def changed_by(self, found: Definition) -> bool:
+        """Would ``found`` give another meaning to a number that already has one?
+
+        Raises:
+            BrokenRecordError: It is no schema or channel.
+        """
+        if (found.opcode, found.content) in self._seen:
+            return False
+        if found.opcode == CHANNEL:
+            channel = read_channel(found.content)
+            return self._channels.get(channel.id, channel) != channel
+        schema = read_schema(found.content)
+        return self._schemas.get(schema.id, schema) != schema
+
+    def declare(self, found: Definition) -> None:
+        """From here on ``found`` holds.
+
+        Raises:
+            BrokenRecordError: It is no schema or channel.
+        """
+        key = (found.opcode, found.content)
+        if key in self._seen:
+            return
+        self._names.clear()
+        if found.opcode == CHANNEL:
+            channel = read_channel(found.content)
+            if self._channels.get(channel.id, channel) != channel:
+                self.redefined.add(channel.id)
+                self._seen.clear()
+            self._channels[channel.id] = channel
+        else:
+            schema = read_schema(found.content)
+            if self._schemas.get(schema.id, schema) != schema:
+                self.redefined |= {
+                    c.id for c in self._channels.values() if c.schema_id == schema.id
+                }
+                self._seen.clear()
+            if schema.id:  # the format has readers ignore number 0
+                self._schemas[schema.id] = schema
+        self._seen.add(key)
+
+    def declare_missing(self, channel: Channel, schema: Schema | None) -> None:
+        """Take a channel and its schema from a summary, unless the data section had them."""
+        self._names.clear()
+        self._channels.setdefault(channel.id, channel)
+        if schema is not None:
+            self._schemas.setdefault(schema.id, schema)
+
+    def topic(self, channel_id: int) -> str:
+        """The topic of a channel, ``UNKNOWN`` if nobody declares it."""
+        if channel_id not in self._names:
+            channel = self._channels.get(channel_id)
+            if channel is None:
+                return UNKNOWN
+            schema = self._schemas.get(channel.schema_id)
+            self._names[channel_id] = self._book.name(channel, schema)
+        return self._names[channel_id]
+
+    def topics(self) -> Iterator[tuple[int, str]]:
+        """Every declared channel by number, with its topic."""
+        for channel_id in sorted(self._channels):
+            yield channel_id, self.topic(channel_id)

@@ -1,0 +1,218 @@
+"""The summary's index of chunks in columns: a log of an hour has thousands of them.
+
+Nothing is made per chunk unless it is asked for, so that opening a log and finding a window in it
+cost the same however long the log is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Bytes, Int64s
+
+from .records import CHUNK_FIXED, PREFIX, BrokenRecordError, ChunkIndex
+
+SMALLEST_CHUNK: Final = PREFIX.size + CHUNK_FIXED
+FARTHEST: Final = 1 << 62
+"""No file is as long as this; entries that point beyond it are left out."""
+_FIXED: Final = 36
+_PAIR: Final = 10
+_AFTER_MAP: Final = 12
+_SIZES: Final = 16
+_LONGEST_NAME: Final = 32
+_RUN: Final = 8
+
+
+@dataclass(frozen=True, eq=False)
+class ChunkTable(Mapping[int, ChunkIndex]):
+    """What the summary says of N chunks, sorted by offset; also a mapping from the offset.
+
+    Attributes:
+        at: Shape (N,), int64: where each chunk record begins, counted from the file's start.
+        length: Shape (N,), int64: of the chunk record.
+        index_length: Shape (N,), int64: of the message indexes behind it.
+        start: Shape (N,), uint64: earliest log time.
+        end: Shape (N,), uint64: latest log time.
+        sizes: Shape (N, 2), uint64: stored and decompressed bytes of the records.
+        compression: N names.
+        edges: Shape (N + 1,), int64: where in ``channel`` the numbers of each chunk are.
+        channel: Shape (M,), uint16: channels that have a message index, chunk by chunk.
+    """
+
+    at: Int64s
+    length: Int64s
+    index_length: Int64s
+    start: NDArray[np.uint64]
+    end: NDArray[np.uint64]
+    sizes: NDArray[np.uint64]
+    compression: NDArray[np.bytes_]
+    edges: Int64s
+    channel: NDArray[np.uint16]
+
+    @property
+    def after(self) -> Int64s:
+        """Shape (N,): where whatever follows a chunk and its message indexes begins."""
+        return self.at + self.length + self.index_length
+
+    @property
+    def is_tiled(self) -> bool:
+        """Do the chunks with their message indexes not overlap?"""
+        return bool((self.after[:-1] <= self.at[1:]).all())
+
+    def naming(self, channels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which chunks have a message index for any of these channels.
+
+        Args:
+            channels: Shape (65536,), by channel number.
+        """
+        rows = np.repeat(np.arange(len(self)), np.diff(self.edges))
+        named = np.zeros(len(self), dtype=np.bool_)
+        named[rows[channels[self.channel]]] = True
+        return named
+
+    @property
+    def is_unnamed(self) -> NDArray[np.bool_]:
+        """Shape (N,): no message index says which channels are in the chunk."""
+        return np.equal(self.edges[1:], self.edges[:-1])
+
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Self:
+        """Some of the chunks."""
+        picked = np.arange(len(self))[rows]
+        edges = np.concatenate(([0], np.cumsum(np.diff(self.edges)[picked]))).astype(np.int64)
+        pairs = np.repeat(self.edges[picked] - edges[:-1], np.diff(edges)) + np.arange(edges[-1])
+        return type(self)(
+            self.at[rows], self.length[rows], self.index_length[rows], self.start[rows],
+            self.end[rows], self.sizes[rows], self.compression[rows],
+            edges, self.channel[pairs],
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.at)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.at.tolist())
+
+    def __contains__(self, at: object) -> bool:
+        return at in self._row
+
+    def __getitem__(self, at: int) -> ChunkIndex:
+        i = self._row[at]
+        first, last, *numbers = (column[i] for column in self._numbers)
+        return ChunkIndex(
+            first, last, at, numbers[0],
+            frozenset(self.channel[self.edges[i] : self.edges[i + 1]].tolist()),
+            numbers[1], self.compression[i].decode("utf-8", "backslashreplace"),
+            numbers[2], numbers[3],
+        )  # fmt: skip
+
+    @cached_property
+    def _row(self) -> dict[int, int]:
+        return {at: i for i, at in enumerate(self.at.tolist())}
+
+    @cached_property
+    def _numbers(self) -> tuple[list[int], ...]:
+        columns = (
+            self.start, self.end, self.length, self.index_length,
+            self.sizes[:, 0], self.sizes[:, 1],
+        )  # fmt: skip
+        return tuple(column.tolist() for column in columns)
+
+
+def run_of(records: bytes, at: int, size: int) -> int:
+    """How many records of one kind and size stand one after the other from ``at`` on."""
+    prefix, count = records[at : at + PREFIX.size], 1
+    ahead = at + (_RUN - 1) * size
+    if records[ahead : ahead + PREFIX.size] != prefix:
+        return count
+    view = np.frombuffer(records, dtype=np.uint8)[at:]
+    most = (len(records) - at) // size
+    first = np.frombuffer(prefix, dtype=np.uint8)
+    while count < most:
+        step = min(_RUN * count, most)
+        rows = view[: step * size].reshape(step, size)[:, : PREFIX.size]
+        same = (rows == first).all(axis=1)
+        if not same.all():
+            return int(same.argmin())
+        count = step
+    return count
+
+
+def table_of(records: bytes, begins: Sequence[int], sizes: Sequence[int], base: int) -> ChunkTable:
+    """The table of the ChunkIndex contents at ``begins``, each of ``sizes`` bytes.
+
+    Args:
+        records: The summary.
+        begins: N offsets in it.
+        sizes: N lengths.
+        base: Where the recording begins within a concatenated file.
+
+    Raises:
+        BrokenRecordError: A record is shorter than its fields.
+    """
+    view = np.frombuffer(records, dtype=np.uint8)
+    begin, size = np.array(begins, dtype=np.int64), np.array(sizes, dtype=np.int64)
+    _need(size, _FIXED)
+    fixed = _gathered(view, begin, _FIXED)
+    times = fixed[:, :32].copy().view("<u8")
+    map_size = fixed[:, 32:].copy().view("<u4")[:, 0].astype(np.int64)
+    if (map_size % _PAIR).any():
+        raise BrokenRecordError("a map of channels is no whole number of entries")
+    _need(size, _FIXED + map_size + _AFTER_MAP)
+    behind = _gathered(view, begin + _FIXED + map_size, _AFTER_MAP)
+    name_size = behind[:, 8:].copy().view("<u4")[:, 0].astype(np.int64)
+    name_at = begin + _FIXED + map_size + _AFTER_MAP
+    _need(size, name_at - begin + name_size + _SIZES)
+    if len(name_size) and name_size.max() > _LONGEST_NAME:
+        raise BrokenRecordError(f"a compression name of {name_size.max()} bytes")
+    edges = np.concatenate(([0], np.cumsum(map_size // _PAIR))).astype(np.int64)
+    pair_at = np.repeat(begin + _FIXED - _PAIR * edges[:-1], map_size // _PAIR)
+    pair_at += _PAIR * np.arange(edges[-1])
+    index_length = behind[:, :8].copy().view("<u8")[:, 0]
+    table = ChunkTable(
+        times[:, 2].astype(np.int64) + base,
+        times[:, 3].astype(np.int64),
+        index_length.astype(np.int64),
+        times[:, 0].copy(),
+        times[:, 1].copy(),
+        _gathered(view, name_at + name_size, _SIZES).view("<u8"),
+        _names(view, name_at, name_size),
+        edges,
+        _gathered(view, pair_at, 2).view("<u2")[:, 0],
+    )
+    far = np.uint64(FARTHEST)
+    sane = (times[:, 2] < far) & (times[:, 3] < far) & (index_length < far)
+    return _sorted(table, sane & (times[:, 3] >= SMALLEST_CHUNK))
+
+
+def _sorted(table: ChunkTable, sane: NDArray[np.bool_]) -> ChunkTable:
+    """By offset, one entry each: the last."""
+    at = table.at
+    if sane.all() and (at[1:] > at[:-1]).all():
+        return table
+    rows = {int(at[i]): i for i in np.flatnonzero(sane).tolist()}
+    return table.take(np.array([rows[place] for place in sorted(rows)], dtype=np.intp))
+
+
+def _gathered(view: Bytes, at: Int64s, size: int) -> Bytes:
+    """Shape (N, size): the bytes from each place on."""
+    return np.take(view, at[:, None] + np.arange(size))
+
+
+def _names(view: Bytes, at: Int64s, size: Int64s) -> NDArray[np.bytes_]:
+    """The compression names; shorter ones are filled with zeros, which the dtype leaves out."""
+    padded = np.zeros((len(at), _LONGEST_NAME), dtype=np.uint8)
+    for width in np.unique(size).tolist():
+        rows = size == width
+        padded[rows, :width] = _gathered(view, at[rows], width)
+    return padded.view(f"S{_LONGEST_NAME}")[:, 0]
+
+
+def _need(size: Int64s, wanted: Int64s | int) -> None:
+    if (size < wanted).any():
+        raise BrokenRecordError("a chunk index is shorter than its fields")

@@ -1,0 +1,130 @@
+"""Where a recording goes on after a place where its records cannot be followed.
+
+A chunk is taken for one only if it proves itself: its lengths agree with each other and its records
+match their checksum or, without one, fill it and lie in the time that it declares. Chunks within
+another recording's bytes are not taken: the search ends where another recording begins.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Bytes
+from crosscue.replay.limits import Limits
+
+from .bytes import PIECE, ByteFile
+from .inflate import inflate
+from .records import (
+    CHUNK,
+    CHUNK_FIXED,
+    COMPRESSIONS,
+    HEADER,
+    MAGIC,
+    PREFIX,
+    BrokenRecordError,
+    ChunkHead,
+    read_chunk_head,
+)
+from .rows import NEVER_IN_A_CHUNK, rows_by_scan
+from .scan import Scanner
+
+HEAD_MOST: Final = PREFIX.size + CHUNK_FIXED + 32
+FIRST_PIECE: Final = 4 << 10
+"""Searched first; doubled as long as nothing is found."""
+TRIES: Final = 16
+"""Candidates decompressed at most, so that a search stays linear in the bytes it looks at."""
+
+
+def find_bytes(file: ByteFile, at: int, end: int, wanted: bytes) -> int | None:
+    """Where these bytes stand next, from ``at`` on and wholly before ``end``."""
+    while at + len(wanted) <= end:
+        window = bytes(file.read(at, min(PIECE, end - at)))
+        found = window.find(wanted)
+        if found >= 0:
+            return at + found
+        at += max(len(window) - len(wanted) + 1, 1)
+    return None
+
+
+def find_chunk(
+    file: ByteFile, since: int, at: int, until: int, end: int, limits: Limits
+) -> tuple[int, bool] | None:
+    """The next place from which to go on.
+
+    Args:
+        file: The bytes.
+        since: Where another recording may begin at the earliest; before ``at`` if the record before
+            the damaged place may have swallowed its beginning.
+        at: Where a chunk may begin at the earliest.
+        until: Where to give up.
+        end: Where a chunk must end.
+        limits: Chunks over these are not tried.
+
+    Returns:
+        The place, and whether it is a chunk (else another recording); None if there is neither.
+    """
+    begins = MAGIC + bytes([HEADER])
+    other = find_bytes(file, since, min(at + len(begins), until), begins)
+    tries, piece = 0, FIRST_PIECE
+    while other is None and at < until:
+        behind = min(at + piece, until)
+        other = find_bytes(file, at, min(behind + len(begins), end), begins)
+        stop = end if other is None else other
+        window = file.read(at, min(piece + HEAD_MOST, stop - at))
+        for offset in _candidates(window, min(piece, behind - at)):
+            if tries < TRIES and _agrees(file, at + offset, end, limits):
+                tries += 1
+                if _proves_itself(file, at + offset, limits):
+                    return at + offset, True
+        at, piece = behind, min(2 * piece, PIECE)
+    return None if other is None else (other, False)
+
+
+def _candidates(window: Bytes, most: int) -> list[int]:
+    """Offsets, up to ``most``, where a chunk of a sane length may begin."""
+    first = window[: max(min(most, len(window) - PREFIX.size - CHUNK_FIXED), 0)]
+    at = np.flatnonzero(first == CHUNK)
+    for byte in (6, 7, 8):  # no chunk has a length of 2^40 bytes
+        at = at[window[at + byte] == 0]
+    for byte in (1, 2, 3):  # nor a compression name of 256 characters
+        at = at[window[at + PREFIX.size + 28 + byte] == 0]
+    found: list[int] = at.tolist()
+    return found
+
+
+def _agrees(file: ByteFile, at: int, end: int, limits: Limits) -> bool:
+    """Do the lengths of what stands at ``at``, taken for a chunk, agree with each other?"""
+    raw = file.peek(at, HEAD_MOST)
+    length = PREFIX.unpack_from(raw)[1]
+    try:
+        head = read_chunk_head(raw[PREFIX.size :])
+    except BrokenRecordError:
+        return False
+    return (
+        head.compression in COMPRESSIONS
+        and bool(head.size)
+        and length == head.body_at + head.body_size
+        and at + PREFIX.size + length <= end
+        and max(head.size, head.body_size) <= limits.chunk_bytes
+    )
+
+
+def _proves_itself(file: ByteFile, at: int, limits: Limits) -> bool:
+    head = read_chunk_head(file.peek(at, HEAD_MOST)[PREFIX.size :])
+    body_at = at + PREFIX.size + head.body_at
+    try:
+        room = file.buffers.take(head.size + 1)
+        records = inflate(file.read(body_at, head.body_size), head, room)
+        return bool(head.crc) or _is_filled(records, head, limits)
+    except BrokenRecordError:
+        return False
+
+
+def _is_filled(records: Bytes, head: ChunkHead, limits: Limits) -> bool:
+    """Without a checksum: do records fill the chunk, with messages of the time it declares?"""
+    rows = rows_by_scan(records, Scanner(), NEVER_IN_A_CHUNK, limits.records_per_chunk)
+    if rows.end != len(records) or not len(rows):
+        return False
+    return bool(rows.log.min() == head.start and rows.log.max() == head.end)

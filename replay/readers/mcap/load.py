@@ -1,0 +1,239 @@
+"""Chunks read, decompressed and verified, small ones several at a time, handed back in order.
+
+Those that compression made much smaller are loaded ahead of their use on another thread; others
+(plain ones, pictures) when they are used, which takes less time than handing them over.
+Consecutive small chunks are loaded next to each other into one buffer, so that their messages can
+be given together.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from threading import Event
+from typing import Final, Self
+
+from crosscue.replay.columns import Bytes
+from crosscue.replay.limits import Limits
+
+from .bytes import ByteFile
+from .inflate import inflate, inflate_prefix
+from .records import BrokenRecordError
+from .segments import Segment
+from .walk import Chunk, Item
+
+WORKERS: Final = 1
+"""One hides most of the work; each more costs more in handing over the interpreter."""
+AHEAD: Final = 2
+"""Groups of chunks, or other items, under way at once ..."""
+AHEAD_BYTES: Final = 32 << 20
+"""... unless they are larger than this together."""
+GROUP_BYTES: Final = 4 << 20
+"""Chunks are grouped up to this size together."""
+GROUP_CHUNKS: Final = 64
+WORTHWHILE: Final = 1.5
+"""Times as large as stored, from which on decompression takes longer than the handing over."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretch:
+    """The records of one chunk within a buffer: bytes ``begin`` to ``end`` of ``whole``."""
+
+    whole: Bytes
+    begin: int
+    end: int
+
+    @property
+    def records(self) -> Bytes:
+        """The records alone."""
+        return self.whole[self.begin : self.end]
+
+
+@dataclass(slots=True, eq=False)
+class Group:
+    """Chunks that are loaded together.
+
+    Attributes:
+        chunks: Them.
+        begins: Where the records of each begin in ``whole``.
+        size: Bytes of all records.
+        whole: Where they lie, from the moment when the first is loaded.
+        future: The records of each, or what is wrong with them, if another thread loads them.
+    """
+
+    chunks: list[Chunk] = field(default_factory=list)
+    begins: list[int] = field(default_factory=list)
+    size: int = 0
+    whole: Bytes | None = None
+    future: Future[list[Stretch | BrokenRecordError]] | None = None
+
+    def add(self, chunk: Chunk) -> None:
+        """One more."""
+        self.chunks.append(chunk)
+        self.begins.append(self.size)
+        self.size += _size(chunk)
+
+    def has_room_for(self, chunk: Chunk) -> bool:
+        """May ``chunk`` be loaded next to the others?"""
+        if not self.chunks:
+            return True
+        if not _is_plain_case(chunk) or not _is_plain_case(self.chunks[-1]):
+            return False
+        return len(self.chunks) < GROUP_CHUNKS and self.size + _size(chunk) <= GROUP_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """One chunk of a group; ``is_last`` of it."""
+
+    loader: Loader
+    group: Group
+    number: int
+
+    @property
+    def is_last(self) -> bool:
+        """Is no other chunk of the group to follow?"""
+        return self.number + 1 == len(self.group.chunks)
+
+    def stretch(self) -> Stretch:
+        """The chunk's records.
+
+        Raises:
+            BrokenRecordError: Not as declared, or over the limits.
+        """
+        group = self.group
+        future = group.future
+        if self.is_last:
+            group.future = None
+        if future is None:
+            return self.loader.load_of(group, self.number)
+        found = future.result()[self.number]
+        if isinstance(found, BrokenRecordError):
+            raise found
+        return found
+
+
+class Loader:
+    """Loads chunks; results do not depend on timing."""
+
+    def __init__(self, file: ByteFile, limits: Limits) -> None:
+        self._file = file
+        self._limits = limits
+        self._pool = ThreadPoolExecutor(WORKERS, thread_name_prefix="mcap")
+        self._stop = Event()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def ahead(
+        self, items: Iterator[Item], wanted: Callable[[Chunk], bool]
+    ) -> Iterator[tuple[Item, Load | None]]:
+        """The items in order, each wanted chunk with its records to come."""
+        queue: deque[tuple[list[tuple[Item, Load | None]], Group]] = deque()
+        entries: list[tuple[Item, Load | None]] = []
+        group = Group()
+        under_way = 0
+        for item in items:
+            is_wanted = isinstance(item, Chunk) and wanted(item)
+            joins = isinstance(item, Chunk) and is_wanted and group.has_room_for(item)
+            if entries and not (joins and group.chunks):
+                self._start(group)
+                queue.append((entries, group))
+                under_way += group.size
+                entries, group = [], Group()
+            if isinstance(item, Chunk) and is_wanted:
+                entries.append((item, Load(self, group, len(group.chunks))))
+                group.add(item)
+            else:
+                entries.append((item, None))
+            while len(queue) > AHEAD or (queue and under_way > AHEAD_BYTES):
+                first, done = queue.popleft()
+                under_way -= done.size
+                yield from first
+        self._start(group)
+        for first, _ in queue:
+            yield from first
+        yield from entries
+
+    def _start(self, group: Group) -> None:
+        stored = sum(c.head.body_size for c in group.chunks if c.head is not None)
+        if group.size > WORTHWHILE * stored:
+            group.future = self._pool.submit(self.load_group, group)
+
+    def section_crc(self, segment: Segment) -> Future[int | None]:
+        """The checksum of a segment's data section, computed from its bytes."""
+        return self.crc(segment.base, segment.end)
+
+    def crc(self, begin: int, end: int) -> Future[int | None]:
+        """The checksum of the bytes from ``begin`` to ``end``."""
+        return self._pool.submit(self._file.crc, begin, end, self._stop)
+
+    def load_group(self, group: Group) -> list[Stretch | BrokenRecordError]:
+        """The records of each chunk of a group, or what is wrong with it."""
+        loaded: list[Stretch | BrokenRecordError] = []
+        for number in range(len(group.chunks)):
+            try:
+                loaded.append(self.load_of(group, number))
+            except BrokenRecordError as error:
+                loaded.append(error)
+        return loaded
+
+    def load_of(self, group: Group, number: int) -> Stretch:
+        """The records of one chunk of a group; to be called in the order of the chunks.
+
+        Raises:
+            BrokenRecordError: Not as declared, or over the limits.
+        """
+        chunk = group.chunks[number]
+        if len(group.chunks) == 1:
+            records = self.load(chunk)
+            return Stretch(records, 0, len(records))
+        if group.whole is None:
+            group.whole = self._file.buffers.take(group.size + 1)
+        whole, begin = group.whole, group.begins[number]
+        if number + 1 == len(group.chunks):
+            group.whole = None  # free for use again once its messages are
+        end = begin + _size(chunk)
+        self.load(chunk, whole[begin : end + 1])
+        return Stretch(whole, begin, end)
+
+    def load(self, chunk: Chunk, room: Bytes | None = None) -> Bytes:
+        """The records of a chunk: all of them verified, or what a cut one begins with.
+
+        Args:
+            chunk: Which one.
+            room: Where they shall lie, one byte more than it declares; None for anywhere.
+
+        Raises:
+            BrokenRecordError: Not as declared, or over the limits.
+        """
+        head = chunk.head
+        if chunk.fault or head is None:
+            raise BrokenRecordError(chunk.fault or "its fields cannot be read")
+        most = self._limits.chunk_bytes
+        if max(head.size, min(head.body_size, self._file.size)) > most:
+            size = max(head.size, head.body_size)
+            raise BrokenRecordError(f"declares {size} bytes, the limit is {most} (--max-chunk)")
+        if room is not None and not head.compression and head.body_size == head.size:
+            return inflate(self._file.read_into(chunk.body_at, room[: head.size]), head, room)
+        body = self._file.read(chunk.body_at, head.body_size)
+        if chunk.is_cut:
+            return inflate_prefix(body, head)
+        if room is None:
+            room = self._file.buffers.take(head.size + 1) if head.compression else body
+        return inflate(body, head, room)
+
+
+def _size(chunk: Chunk) -> int:
+    return 0 if chunk.head is None else chunk.head.size
+
+
+def _is_plain_case(chunk: Chunk) -> bool:
+    """Does everything said of the chunk agree, so that it can be loaded next to others?"""
+    return chunk.head is not None and not (chunk.fault or chunk.differs or chunk.is_cut)

@@ -1,0 +1,566 @@
+"""One pass over a recording: blocks out, and the account of every message."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from itertools import chain, pairwise
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Block, Bytes
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import EVERYTHING, Selection
+
+from .blocks import Giver
+from .bytes import ByteFile
+from .channels import TopicBook
+from .checks import Checks
+from .load import Load, Loader, Stretch
+from .records import PREFIX, BrokenRecordError
+from .resync import Plausible, Resync
+from .rows import NEVER_IN_A_CHUNK, Rows, contradicts, join, rows_by_index, rows_by_scan
+from .scan import Scanner
+from .segments import Segment, Summary
+from .walk import (
+    STOPS_A_RUN,
+    Attachment,
+    Chunk,
+    End,
+    Gap,
+    How,
+    Ignored,
+    Item,
+    Oversized,
+    Run,
+    Stray,
+    Walk,
+)
+from .window import Window, find_window
+
+DAMAGED_CHUNK: Final = "damaged chunk"
+DAMAGED_RECORD: Final = "damaged record"
+DAMAGED_SECTION: Final = "the data section does not match its checksum"
+MISSING: Final = "declared by the format, not in its bytes"
+INCOMPLETE: Final = "the file does not end as it should"
+CUT: Final = "the file is cut"
+BEFORE_A_GAP: Final = "leads into damaged bytes"
+DETAILS_JOINED: Final = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """Something that may have held messages.
+
+    Attributes:
+        reason: Short, as in the ledger.
+        detail: Where and why.
+        t_ns: When, if known.
+        counts: By channel number, what it held if only its index can be believed.
+    """
+
+    reason: str
+    detail: str
+    t_ns: int | None = None
+    counts: Mapping[int, int] = field(default_factory=dict)
+
+
+def read_segments(
+    file: ByteFile,
+    segments: Sequence[Segment],
+    book: TopicBook,
+    limits: Limits,
+    ledger: Ledger,
+    selection: Selection,
+) -> Iterator[Block]:
+    """All blocks of a file; afterwards the ledger is settled."""
+    checks, scanner = Checks(), Scanner()
+    if len(segments) > 1:
+        ledger.notice(f"the file holds {len(segments)} recordings in a row; all are read")
+    declared: Counter[str] | None = Counter()
+    for segment in segments:
+        where = "" if len(segments) == 1 else f"recording at byte {segment.base}: "
+        with Loader(file, limits) as loader:
+            part = SegmentPass(
+                file, segment, book, limits, ledger, selection, checks, scanner, loader, where
+            )
+            yield from part.blocks()
+            counts = part.settle()
+        declared = None if declared is None or counts is None else declared + counts
+    for sentence in book.notices:
+        ledger.notice(sentence)
+    for topic in book.topics:
+        if declared is not None:
+            ledger.declare(topic.name, declared[topic.name])
+            ledger.settle(topic.name)
+        else:
+            ledger.declare(topic.name, None)
+    checks.report(ledger)
+
+
+class SegmentPass:
+    """Reads one recording of a file once."""
+
+    def __init__(
+        self,
+        file: ByteFile,
+        segment: Segment,
+        book: TopicBook,
+        limits: Limits,
+        ledger: Ledger,
+        selection: Selection,
+        checks: Checks,
+        scanner: Scanner,
+        loader: Loader,
+        where: str,
+    ) -> None:
+        self._file = file
+        self._segment = segment
+        self._summary = segment.summary or Summary()
+        self._limits = limits
+        self._ledger = ledger
+        self._selection = selection
+        self._may_skip = selection != EVERYTHING
+        self._inside: Window | None = None
+        self._doubt = ""
+        self._checks = checks
+        self._scanner = scanner
+        self._loader = loader
+        self._where = where
+        self._damages: list[Damage] = []
+        self._rows_doubted = 0
+        self._is_short: bool | None = None
+        self._section: Future[int | None] | None = None
+        self._attachments: list[tuple[int, int, Future[int | None]]] = []
+        self._waiting: list[tuple[Stretch, Rows]] = []
+        self._declarations = segment.declarations(book)
+        self._giver = Giver(ledger, selection, limits, self._declarations)
+        self._search = Resync(file, segment.end, segment.has_end, (), self._plausible())
+
+    def blocks(self) -> Iterator[Block]:
+        """Its blocks."""
+        segment = self._segment
+        for notice in segment.notices:
+            self._notice(notice)
+        if segment.has_end and segment.summary is None:
+            self._notice("it has no summary that can be used; topics were found by reading")
+        self._checks.summaries_right += self._summary.is_verified
+        window = self._window()
+        if window is not None:
+            yield from self._windowed(window)
+        else:
+            if segment.data_crc and not self._may_skip:
+                self._section = self._loader.section_crc(segment)
+            yield from self._walked(iter(self._walk()))
+        if segment.after:
+            self._ledger.drop("", INCOMPLETE, None, self._where + segment.after)
+        self._finish_checks()
+
+    def _window(self) -> Window | None:
+        """Where what was asked for lies, if the index can be trusted; else the reason is told."""
+        if not self._may_skip or not self._segment.has_end:
+            return None
+        found = find_window(self._segment, self._declarations, self._selection)
+        if isinstance(found, Window):
+            return found
+        self._notice(f"the part asked for was found by walking through the file: {found}")
+        return None
+
+    def _windowed(self, window: Window) -> Iterator[Block]:
+        """Blocks of the chunks that the index names, and of whatever lies outside chunks."""
+        if self._segment.data_crc:
+            # Only all bytes together have this checksum.
+            self._checks.sections_unread += 1
+            self._segment = replace(self._segment, data_crc=0)
+        self._inside = window
+        self._file.expect(window.ranges())
+        yield from self._walked(window.items(self._file, self._limits, self._scanner))
+        self._inside = None
+        held = self._giver.met + self._giver.dropped
+        doubt = self._doubt or ("it has damage" if self._damages else "")
+        rest = window.rest(self._summary, held)
+        if doubt or rest is None:
+            doubt = doubt or "it does not add up with the statistics"
+            self._notice(
+                f"the index was not trusted after all ({doubt}); every chunk was looked at"
+            )
+            yield from self._walked(window.others(self._file, self._limits, self._scanner))
+            return
+        self._checks.chunks += window.left
+        self._checks.chunks_unread += window.left
+        for channel_id, count in rest.items():
+            self._giver.pass_over_counted(channel_id, count)
+
+    def _walked(self, walk: Iterator[Item]) -> Iterator[Block]:
+        items = self._loader.ahead(walk, self._is_wanted)
+        for (item, load), (following, _) in pairwise(chain(items, [(None, None)])):
+            if isinstance(item, Chunk):
+                yield from self._chunk(item, load)
+            elif isinstance(item, Run):
+                yield from self._run(item, following if isinstance(following, Gap) else None)
+            else:
+                self._note(item)
+
+    def _walk(self) -> Walk:
+        segment = self._segment
+        rail = segment.rail(self._file)
+        return Walk(
+            self._file,
+            segment.begin,
+            segment.end,
+            rail,
+            self._limits,
+            self._scanner,
+            self._plausible(),
+        )
+
+    def _plausible(self) -> Plausible:
+        """What messages must look like to be believed behind damaged bytes."""
+        statistics = self._summary.statistics
+        channels = [channel.id for channel in self._segment.channels]
+        if statistics is None or not statistics.message_count:
+            return Plausible(channels)
+        return Plausible(channels, (statistics.start, statistics.end))
+
+    def _is_wanted(self, chunk: Chunk) -> bool:
+        """Must the chunk be read? Only a chunk whose indexes all agree may be passed over."""
+        index, head = chunk.index, chunk.head
+        if not self._may_skip or index is None or head is None or not chunk.messages:
+            return True
+        if chunk.fault or chunk.differs or chunk.index_fault or chunk.is_cut:
+            return True
+        filled = [m for m in chunk.messages if len(m.entries)]
+        ids = {m.channel_id for m in filled}
+        if ids != index.channels or not ids <= self._declarations.complete:
+            return True
+        if not filled or min(int(m.entries["log"].min()) for m in filled) != head.start:
+            return True
+        if max(int(m.entries["log"].max()) for m in filled) != head.end:
+            return True
+        return any(self._giver.wants(m) for m in filled)
+
+    def _chunk(self, chunk: Chunk, load: Load | None) -> Iterator[Block]:
+        self._checks.chunks += 1
+        if self._inside is not None and not _is_as_indexed(chunk):
+            self._doubt = self._doubt or f"it does not fit the chunk at byte {chunk.at}"
+        if load is None and not any(self._giver.wants(m) for m in chunk.messages):
+            self._checks.chunks_unread += 1
+            for index in chunk.messages:
+                self._giver.pass_over(index)
+            return
+        try:
+            stretch = self._stretch(chunk, load)
+            records = stretch.records
+            rows = self._cut_rows(chunk, records) if chunk.is_cut else self._rows(chunk, records)
+        except BrokenRecordError as error:
+            yield from self._give_waiting()
+            self._lose_chunk(chunk, str(error))
+            return
+        if rows.groups and not rows.definitions and load is not None:
+            self._waiting.append((stretch, rows))
+            if load.is_last:
+                yield from self._give_waiting()
+            return
+        yield from self._give_waiting()
+        yield from self._giver.give(rows, self._checks, chunk.at)
+
+    def _stretch(self, chunk: Chunk, load: Load | None) -> Stretch:
+        if load is not None:
+            return load.stretch()
+        # Not wanted when looked at first, wanted now: a channel was given another meaning.
+        records = self._loader.load(chunk)
+        return Stretch(records, 0, len(records))
+
+    def _give_waiting(self) -> Iterator[Block]:
+        """The messages of chunks of one group, which are given together."""
+        if not self._waiting:
+            return
+        whole = self._waiting[0][0].whole
+        rows = join(whole, [(rows, stretch.begin) for stretch, rows in self._waiting])
+        self._waiting.clear()
+        yield from self._giver.give(rows, self._checks, 0)
+
+    def _rows(self, chunk: Chunk, buffer: Bytes) -> Rows:
+        """The messages of a chunk, all that can be checked being checked.
+
+        Raises:
+            BrokenRecordError: Something is wrong, or there are too many.
+        """
+        most = self._limits.records_per_chunk
+        if sum(len(index.entries) for index in chunk.messages) > most:
+            raise BrokenRecordError(f"its index names more than {most} messages")
+        rows = rows_by_index(buffer, chunk.messages) if chunk.messages else None
+        if rows is None:
+            if chunk.messages or chunk.index_fault:
+                self._checks.bad_indexes.add(f"that of the chunk at byte {chunk.at}")
+            rows = rows_by_scan(buffer, self._scanner, NEVER_IN_A_CHUNK, most)
+            if rows.end != len(buffer):
+                raise BrokenRecordError(f"its records break off at {rows.end} of {len(buffer)}")
+        self._vouch(chunk, rows)
+        return rows
+
+    def _vouch(self, chunk: Chunk, rows: Rows) -> None:
+        """Count who vouches for a chunk's bytes.
+
+        Raises:
+            BrokenRecordError: Nobody does, and something speaks against them.
+        """
+        head = chunk.head
+        assert head is not None, "a chunk with rows has a head"
+        doubt = chunk.differs
+        if not doubt and (head.start or head.end):
+            if not len(rows):
+                doubt = "it declares a time span and holds no message"
+            elif np.minimum.reduce(rows.log) < head.start or np.maximum.reduce(rows.log) > head.end:
+                doubt = "its messages lie outside the time span it declares"
+        if head.crc or (self._segment.data_crc and self._section_is_right()):
+            self._checks.chunks_right += 1
+            if doubt:
+                self._checks.bad_heads.add(f"the chunk at byte {chunk.at}: {doubt}")
+            return
+        if self._segment.data_crc:
+            self._rows_doubted += len(rows)
+        self._checks.chunks_bare += 1 if head.size else 0
+        self._checks.chunks_right += 0 if head.size else 1
+        if doubt or contradicts(rows, chunk.messages):
+            doubt = doubt or "its message index names other messages"
+            raise BrokenRecordError(f"has no checksum, and {doubt}")
+
+    def _cut_rows(self, chunk: Chunk, buffer: Bytes) -> Rows:
+        rows = rows_by_scan(buffer, self._scanner, NEVER_IN_A_CHUNK, self._limits.records_per_chunk)
+        head = chunk.head
+        assert head is not None, "a chunk with rows has a head"
+        has = self._file.size - chunk.body_at
+        self._damages.append(
+            Damage(
+                CUT,
+                f"the chunk at byte {chunk.at} ends after {has} of {head.body_size} bytes; of its "
+                f"beginning {len(rows)} messages are given, which no checksum covers",
+                head.start if head.start < 1 << 63 else None,
+            )
+        )
+        self._checks.rows_bare += len(rows)
+        return rows
+
+    def _lose_chunk(self, chunk: Chunk, why: str) -> None:
+        source = chunk.index or chunk.head
+        t_ns = None if source is None or source.start >= 1 << 63 else source.start
+        span = "" if source is None else f"; log times {source.start} to {source.end}"
+        detail = f"{self._where}chunk at byte {chunk.at}: {why}{span}"
+        reason = CUT if chunk.is_cut else DAMAGED_CHUNK
+        counts = {m.channel_id: len(m.entries) for m in chunk.messages if len(m.entries)}
+        for channel_id, count in counts.items():
+            self._giver.lose_of_channel(channel_id, reason, count, detail, t_ns)
+        held = chunk.index.channels if chunk.index is not None else frozenset[int]()
+        if not counts or chunk.index_fault or not held <= counts.keys():
+            self._damages.append(Damage(reason, detail, t_ns))
+
+    def _run(self, run: Run, gap: Gap | None) -> Iterator[Block]:
+        """Messages, schemas and channels outside chunks, up to a gap that may reach into them."""
+        rows = run.rows
+        if gap is not None:
+            rows = self._before_gap(run, gap)
+        if self._segment.data_crc and self._section_is_right():
+            yield from self._giver.give(rows, self._checks, run.at)
+            return
+        for at, part in self._parts(run.at, rows):
+            sound = self._plausible_rows(part, at)
+            if self._segment.data_crc:
+                self._rows_doubted += len(sound)
+            else:
+                self._checks.rows_bare += len(sound)
+            yield from self._giver.give(sound, self._checks, at)
+
+    def _parts(self, at: int, rows: Rows) -> Iterator[tuple[int, Rows]]:
+        """A run in parts, without messages whose damaged lengths take in those behind them."""
+        self._search.plausible.learn(rows)
+        while (found := self._search.swallowed(at, rows)) is not None:
+            i, begin = found
+            place = f"{self._where}bytes {at + int(rows.offset[i])} to {at + begin}"
+            if not self._is_some_missing():
+                self._report_suspicion(place)
+                break
+            detail = f"{place}: its length takes in the records behind it"
+            self._giver.drop(rows.take(slice(i, i + 1)), DAMAGED_RECORD, detail)
+            definitions = [one for one in rows.definitions if one.at < begin]
+            yield at, replace(rows.take(slice(i)), definitions=definitions)
+            at, buffer = at + begin, rows.buffer[begin : rows.end]
+            rows = rows_by_scan(buffer, self._scanner, STOPS_A_RUN, len(buffer))
+        yield at, rows
+
+    def _is_some_missing(self) -> bool:
+        """Are fewer messages outside chunks than there must be? Walks once more to know."""
+        statistics = self._summary.statistics
+        if statistics is None:
+            return bool(self._segment.data_crc)  # which is wrong: something is damaged
+        if self._is_short is None:
+            count, has_chunks = 0, False
+            for item in self._walk():
+                has_chunks |= isinstance(item, Chunk)
+                count += len(item.rows) if isinstance(item, Run) else 0
+            self._is_short = count < statistics.message_count and not has_chunks
+        return self._is_short
+
+    def _report_suspicion(self, place: str) -> None:
+        if self._summary.statistics is None and not self._segment.data_crc:
+            detail = f"{place}: it ends in what look like other records of this recording"
+            self._damages.append(Damage(DAMAGED_RECORD, detail))
+
+    def _plausible_rows(self, rows: Rows, at: int) -> Rows:
+        """Of messages that no right checksum covers, those that agree with the statistics.
+
+        Statistics that do not fit most of them are wrong themselves.
+        """
+        plausible = self._plausible()
+        if not plausible.is_declared:
+            return rows
+        good = plausible.messages(rows)
+        if 2 * np.count_nonzero(good) < len(good):
+            return rows
+        for i in np.flatnonzero(~good).tolist():
+            detail = (
+                f"{self._where}bytes {at + int(rows.offset[i])} to {at + int(rows.stop[i])}: log "
+                f"time {int(rows.log[i])} or channel {int(rows.channel[i])} contradicts the summary"
+            )
+            self._giver.drop(rows.take(slice(i, i + 1)), DAMAGED_RECORD, detail)
+        return rows if good.all() else rows.take(np.flatnonzero(good))
+
+    def _before_gap(self, run: Run, gap: Gap) -> Rows:
+        """The messages of a run that lie before a gap; the others are dropped."""
+        end = min(gap.at - run.at, run.rows.end)
+        count = int(np.searchsorted(run.rows.offset, end))
+        detail = f"{self._where}bytes {gap.at} to {gap.to}: {gap.why}"
+        self._giver.drop(run.rows.take(slice(count, None)), BEFORE_A_GAP, detail)
+        definitions = [found for found in run.rows.definitions if found.at < end]
+        return replace(run.rows.take(slice(count)), definitions=definitions, end=end)
+
+    def _section_is_right(self) -> bool:
+        """Does the data section match its checksum? Waits until that is known."""
+        if self._section is None:
+            self._section = self._loader.section_crc(self._segment)
+        return self._section.result() == self._segment.data_crc
+
+    def _note(self, item: Item | None) -> None:
+        """Account for what holds no messages that could be given."""
+        match item:
+            case Attachment() if self._inside is not None:
+                self._checks.attachments += 1
+                self._checks.attachments_unread += 1
+            case Gap(at, to, why):
+                self._damages.append(
+                    Damage(DAMAGED_RECORD, f"{self._where}bytes {at} to {to}: {why}")
+                )
+            case Stray(at, index):
+                detail = f"{self._where}message index at byte {at}: no chunk stands before it"
+                counts = {index.channel_id: len(index.entries)}
+                self._damages.append(Damage(DAMAGED_CHUNK, detail, None, counts))
+            case End(at, how):
+                self._end(at, how)
+            case Oversized(at, size, channel_id, log):
+                self._giver.pass_over_large(channel_id, log, size, at)
+            case Ignored(at, opcode):
+                self._checks.ignored.add(f"kind {opcode:#04x} at byte {at}")
+            case Attachment(at, crc_at, crc):
+                self._checks.attachments += 1
+                if crc:
+                    content_at = at + PREFIX.size
+                    self._attachments.append((at, crc, self._loader.crc(content_at, crc_at)))
+            case _:
+                raise AssertionError(f"{type(item).__name__} is read, not noted")
+
+    def _end(self, at: int, how: How) -> None:
+        if how is How.CUT:
+            detail = f"{self._where}the record at byte {at} goes beyond the end of the file"
+            self._damages.append(Damage(CUT, detail))
+        elif how is How.BARE:
+            detail = f"{self._where}it ends at byte {at} without a data end record and a footer"
+            self._damages.append(Damage(CUT, detail))
+        elif how is How.FOOTER:
+            self._notice("it has no data end record")
+
+    def _finish_checks(self) -> None:
+        for at, told, found in self._attachments:
+            if found.result() == told:
+                self._checks.attachments_right += 1
+            else:
+                self._checks.bad_attachments.add(f"at byte {at}")
+        if not self._segment.data_crc:
+            return
+        if self._section is None:
+            self._checks.sections_unread += 1
+        elif self._section_is_right():
+            self._checks.sections_right += 1
+        else:
+            self._checks.sections_wrong += 1
+            self._report_doubt()
+
+    def _report_doubt(self) -> None:
+        """The data section is damaged, and its checksum cannot say where."""
+        segment = self._segment
+        if not self._rows_doubted:
+            self._notice(
+                "its data section does not match its checksum; all messages in it are in chunks "
+                "that match theirs"
+            )
+            return
+        detail = (
+            f"{self._where}bytes {segment.base} to {segment.end} do not match their checksum; "
+            f"{self._rows_doubted} messages there are covered by no other and were read, and which "
+            "of them hold changed bytes cannot be known"
+        )
+        self._ledger.drop("", DAMAGED_SECTION, None, detail)
+
+    def settle(self) -> Counter[str] | None:
+        """Compare with the statistics, and tell what is lost; declared counts by topic."""
+        statistics = self._summary.statistics
+        if statistics is None:
+            for damage in self._damages:
+                self._tell(damage)
+            return None
+        met = self._giver.met + self._giver.dropped
+        if self._summary.counts_channels:
+            missing = Counter(statistics.by_channel) - met
+        else:
+            missing = Counter({-1: max(statistics.message_count - met.total(), 0)})
+        for damage in self._damages:
+            ending = "" if missing.total() else "; by the statistics no message is missing"
+            self._notice(f"{damage.reason}: {damage.detail}{ending}")
+        self._lose_missing(missing, statistics.message_count)
+        if self._declarations.redefined or not self._summary.counts_channels:
+            return None
+        declared: Counter[str] = Counter()
+        for channel_id, topic in self._declarations.topics():
+            declared[topic] += statistics.by_channel.get(channel_id, 0)
+        return declared
+
+    def _lose_missing(self, missing: Counter[int], declared: int) -> None:
+        reason = self._damages[0].reason if self._damages else MISSING
+        details = [damage.detail for damage in self._damages[:DETAILS_JOINED]]
+        detail = "; ".join(details) or f"the statistics declare {declared} messages in all"
+        t_ns = self._damages[0].t_ns if self._damages else None
+        for channel_id, count in sorted(missing.items()):
+            self._giver.lose_of_channel(channel_id, reason, count, detail, t_ns)
+
+    def _tell(self, damage: Damage) -> None:
+        if not damage.counts:
+            self._ledger.drop("", damage.reason, None, damage.detail, damage.t_ns)
+        for channel_id, count in damage.counts.items():
+            self._giver.lose_of_channel(
+                channel_id, damage.reason, count, damage.detail, damage.t_ns
+            )
+
+    def _notice(self, sentence: str) -> None:
+        self._ledger.notice(self._where + sentence)
+
+
+def _is_as_indexed(chunk: Chunk) -> bool:
+    """Does the summary say of the chunk what the chunk and its message indexes say?"""
+    index = chunk.index
+    if index is None or chunk.fault or chunk.differs:
+        return False
+    held = {m.channel_id for m in chunk.messages if len(m.entries)}
+    return held <= index.channels or not index.channels

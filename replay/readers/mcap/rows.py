@@ -1,0 +1,337 @@
+"""The messages in a stretch of records, as columns.
+
+A stretch is the content of a chunk, or a run of records outside chunks. Where the messages begin is
+taken from the chunk's message indexes if these are true, and found by scanning if not. True means:
+every entry points to a message of its channel and log time, and the messages together with the few
+other records between them cover the chunk exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Bytes, Int64s
+
+from .records import (
+    ATTACHMENT,
+    CHANNEL,
+    CHUNK,
+    DATA_END,
+    FOOTER,
+    HEADER,
+    MESSAGE,
+    MESSAGE_FIXED,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX,
+    PREFIX,
+    SCHEMA,
+    BrokenRecordError,
+    MessageIndex,
+    heads_at,
+)
+from .scan import Scan, Scanner
+
+GAPS_WORTH_A_LOOK: Final = 256
+"""Stretches between indexed messages beyond which scanning everything is as fast."""
+DEFINITIONS_MOST: Final = 1 << 17
+"""Schemas and channels together in one chunk; each has a 16-bit number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Definition:
+    """A Schema or Channel record met on the way.
+
+    Attributes:
+        at: Where its record begins.
+        opcode: ``SCHEMA`` or ``CHANNEL``.
+        content: The record's content.
+    """
+
+    at: int
+    opcode: int
+    content: bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """N messages of one buffer.
+
+    Attributes:
+        buffer: Shape (B,).
+        offset: Shape (N,), int64: where each message record begins.
+        stop: Shape (N,), int64: where it ends.
+        channel: Shape (N,), uint16.
+        sequence: Shape (N,), uint32.
+        log: Shape (N,), uint64.
+        publish: Shape (N,), uint64.
+        definitions: The schemas and channels between them.
+        ignored: Number of records of other kinds.
+        end: Where the last whole record ends.
+        groups: If filled, messages stand channel by channel, those of each channel in stored order:
+            channel numbers and where their messages are. If empty, all are in stored order.
+    """
+
+    buffer: Bytes
+    offset: Int64s
+    stop: Int64s
+    channel: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
+    log: NDArray[np.uint64]
+    publish: NDArray[np.uint64]
+    definitions: Sequence[Definition]
+    ignored: int
+    end: int
+    groups: tuple[tuple[int, slice], ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.offset)
+
+    def take(self, index: slice | NDArray[np.intp]) -> Rows:
+        """Some of the messages in the order of ``index``, with all definitions."""
+        return replace(
+            self,
+            offset=self.offset[index],
+            stop=self.stop[index],
+            channel=self.channel[index],
+            sequence=self.sequence[index],
+            log=self.log[index],
+            publish=self.publish[index],
+            groups=(),
+        )
+
+    def in_stored_order(self) -> Rows:
+        """The same messages, all channels in one order."""
+        return self.take(np.argsort(self.offset, kind="stable")) if self.groups else self
+
+
+def opcodes(*codes: int) -> NDArray[np.bool_]:
+    """A table of operation codes, true at ``codes``."""
+    table = np.zeros(256, dtype=np.bool_)
+    table[list(codes)] = True
+    return table
+
+
+NEVER_IN_A_CHUNK: Final = opcodes(
+    HEADER, FOOTER, CHUNK, MESSAGE_INDEX, ATTACHMENT, DATA_END, 0x08, 0x0A, 0x0B, 0x0C, 0x0D, 0x0E
+)
+
+
+def rows_by_index(buffer: Bytes, indexes: Sequence[MessageIndex]) -> Rows | None:
+    """The messages of a chunk, found through its message indexes; None if these are not true."""
+    filled = [index for index in indexes if len(index.entries)]
+    if not filled:
+        return None
+    entries = np.concatenate([index.entries.view("<u8") for index in filled]).reshape(-1, 2)
+    log, offset = entries[:, 0].copy(), entries[:, 1].astype(np.int64)
+    if np.minimum.reduce(offset) < 0:
+        return None
+    if np.maximum.reduce(offset) > len(buffer) - MESSAGE_HEAD.itemsize:
+        return None
+    head = heads_at(buffer, offset)
+    ids = np.array([index.channel_id for index in filled], dtype=np.uint32)
+    number = np.repeat(ids << 16, [len(index.entries) for index in filled])
+    stop = offset + head.size
+    stop += PREFIX.size
+    if (
+        np.count_nonzero(head.opcode != MESSAGE)
+        or np.count_nonzero(head.number != number)
+        or np.count_nonzero(head.log != log)
+        or np.minimum.reduce(head.size) < MESSAGE_FIXED
+    ):
+        return None
+    others = _between_messages(buffer, offset, stop)
+    if others is None:
+        return None
+    rows = Rows(
+        buffer,
+        offset,
+        stop,
+        head.channel,
+        head.sequence.copy(),
+        log,
+        head.publish.copy(),
+        *others,
+        len(buffer),
+    )
+    groups = _groups(offset, filled)
+    return replace(rows, groups=groups) if groups else rows.take(np.argsort(offset, kind="stable"))
+
+
+def _groups(offset: Int64s, filled: Sequence[MessageIndex]) -> tuple[tuple[int, slice], ...]:
+    """The messages of each channel; empty if some channel's are not in stored order."""
+    edges = [0, *accumulate(len(index.entries) for index in filled)]
+    inner = edges[1:-1]
+    turns = sum(bool(offset[edge] < offset[edge - 1]) for edge in inner)
+    if np.count_nonzero(offset[1:] < offset[:-1]) != turns:
+        return ()
+    groups = {
+        index.channel_id: slice(begin, end)
+        for index, (begin, end) in zip(filled, pairwise(edges), strict=True)
+    }
+    return tuple(groups.items()) if len(groups) == len(filled) else ()
+
+
+def _between_messages(
+    buffer: Bytes, offset: Int64s, stop: Int64s
+) -> tuple[list[Definition], int] | None:
+    """Definitions and number of other records, if with the messages they cover the buffer.
+
+    The k-th end is at most the (k+1)-th begin, for all k, exactly if no two messages overlap; so
+    begins and ends may be sorted each for itself.
+    """
+    begin, end = np.empty(len(offset) + 1, np.int64), np.empty(len(offset) + 1, np.int64)
+    begin[:-1], begin[-1] = offset, len(buffer)
+    end[1:], end[0] = stop, 0
+    begin.sort(kind="stable")
+    end.sort(kind="stable")
+    gaps = (end != begin).nonzero()[0]
+    if len(gaps) > GAPS_WORTH_A_LOOK or np.count_nonzero(end > begin):
+        return None
+    definitions: list[Definition] = []
+    ignored = 0
+    for gap in gaps.tolist():
+        others = _others(buffer, int(end[gap]), int(begin[gap]))
+        if others is None:
+            return None
+        definitions += others[0]
+        ignored += others[1]
+        if len(definitions) + ignored > DEFINITIONS_MOST:
+            return None
+    return definitions, ignored
+
+
+def join(whole: Bytes, parts: Sequence[tuple[Rows, int]]) -> Rows:
+    """Messages of consecutive chunks as those of one.
+
+    Args:
+        whole: Shape (B,): the buffer in which the chunks lie one after the other.
+        parts: The messages of each, in groups and without definitions, and where in ``whole`` the
+            chunk begins.
+    """
+    if len(parts) == 1:
+        rows, begin = parts[0]
+        if not begin and len(rows.buffer) == len(whole):
+            return rows
+    pieces: dict[int, list[tuple[Rows, int, slice]]] = {}
+    for rows, begin in parts:
+        for channel_id, piece in rows.groups:
+            pieces.setdefault(channel_id, []).append((rows, begin, piece))
+    every = [piece for of_channel in pieces.values() for piece in of_channel]
+    edges = [0]
+    for of_channel in pieces.values():
+        edges.append(edges[-1] + sum(piece.stop - piece.start for _, _, piece in of_channel))
+    return Rows(
+        whole,
+        np.concatenate([rows.offset[piece] + begin for rows, begin, piece in every]),
+        np.concatenate([rows.stop[piece] + begin for rows, begin, piece in every]),
+        np.concatenate([rows.channel[piece] for rows, _, piece in every]),
+        np.concatenate([rows.sequence[piece] for rows, _, piece in every]),
+        np.concatenate([rows.log[piece] for rows, _, piece in every]),
+        np.concatenate([rows.publish[piece] for rows, _, piece in every]),
+        (),
+        sum(rows.ignored for rows, _ in parts),
+        parts[-1][1] + parts[-1][0].end,
+        tuple(zip(pieces, (slice(*edge) for edge in pairwise(edges)), strict=True)),
+    )
+
+
+def rows_by_scan(buffer: Bytes, scanner: Scanner, stop_at: NDArray[np.bool_], most: int) -> Rows:
+    """The messages of a stretch up to where it cannot be followed any further (``Rows.end``).
+
+    Args:
+        buffer: Shape (B,).
+        scanner: Does the stepping.
+        stop_at: Operation codes before which to stop.
+        most: Records allowed.
+
+    Raises:
+        BrokenRecordError: More than ``most`` records, or too many definitions.
+    """
+    scan = scanner(buffer, stop_at, most + 1)
+    if len(scan.offset) > most:
+        raise BrokenRecordError(f"holds more than {most} records")
+    is_message = scan.opcode == MESSAGE
+    offset = scan.offset[is_message]
+    end = scan.end
+    after = np.append(scan.offset, end)[1:][is_message]
+    short = np.flatnonzero(after - offset < MESSAGE_HEAD.itemsize)
+    if len(short):  # a message that cannot hold its own fields: nothing is trusted from there on
+        end = int(offset[short[0]])
+        offset = offset[: short[0]]
+        after = after[: short[0]]
+    head = heads_at(buffer, offset)
+    return Rows(
+        buffer,
+        offset,
+        after,
+        head.channel,
+        head.sequence.copy(),
+        head.log.copy(),
+        head.publish.copy(),
+        *_definitions(buffer, scan, end),
+        end,
+    )
+
+
+def _definitions(buffer: Bytes, scan: Scan, end: int) -> tuple[list[Definition], int]:
+    begins, ends = scan.offset, np.append(scan.offset, scan.end)[1:]
+    wanted = ((scan.opcode == SCHEMA) | (scan.opcode == CHANNEL)) & (begins < end)
+    at = np.flatnonzero(wanted)
+    if len(at) > DEFINITIONS_MOST:
+        raise BrokenRecordError(f"holds more than {DEFINITIONS_MOST} schemas and channels")
+    definitions = [
+        Definition(b, code, buffer[b + PREFIX.size : e].tobytes())
+        for b, e, code in zip(
+            begins[at].tolist(), ends[at].tolist(), scan.opcode[at].tolist(), strict=True
+        )
+    ]
+    messages = int(((scan.opcode == MESSAGE) & (begins < end)).sum())
+    return definitions, int((begins < end).sum()) - messages - len(definitions)
+
+
+def _others(buffer: Bytes, begin: int, end: int) -> tuple[list[Definition], int] | None:
+    """What lies between two indexed messages; None if a message is there or it does not fit."""
+    view, at, ignored = buffer.data, begin, 0
+    found: list[Definition] = []
+    while at < end:
+        if at + PREFIX.size > end:
+            return None
+        opcode, length = PREFIX.unpack_from(view, at)
+        after = at + PREFIX.size + length
+        if after > end or opcode in (0, MESSAGE) or NEVER_IN_A_CHUNK[opcode]:
+            return None
+        if opcode in (SCHEMA, CHANNEL):
+            found.append(Definition(at, opcode, bytes(view[at + PREFIX.size : after])))
+        else:
+            ignored += 1
+        if len(found) + ignored > DEFINITIONS_MOST:
+            return None
+        at = after
+    return found, ignored
+
+
+def contradicts(rows: Rows, indexes: Sequence[MessageIndex]) -> bool:
+    """Does an index name a message that is not among ``rows``?"""
+    rows = rows.in_stored_order()
+    for index in indexes:
+        offsets = index.entries["offset"]
+        if not len(offsets):
+            continue
+        if not len(rows):
+            return True
+        where = np.searchsorted(rows.offset, offsets.astype(np.int64))
+        where = np.minimum(where, len(rows) - 1)
+        same = (
+            (rows.offset[where].astype(np.uint64) == offsets)
+            & (rows.channel[where] == index.channel_id)
+            & (rows.log[where] == index.entries["log"])
+        )
+        if not same.all():
+            return True
+    return False

@@ -1,0 +1,496 @@
+"""From record to record through one data section, without looking into chunks.
+
+The bytes lead; a chunk index from the summary serves as a rail: where a record's length cannot be
+right, the walk goes on at the next chunk that the summary knows; without a rail, at the next chunk
+that proves itself by its checksum (``mcap_find``). Where records stand outside chunks, it goes on
+at the next of them that are plausible in a row (``mcap_resync``).
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Final, TypeAlias
+
+import numpy as np
+
+from crosscue.replay.columns import Bytes
+from crosscue.replay.limits import Limits
+
+from .bytes import ByteFile
+from .find import find_chunk
+from .records import (
+    ATTACHMENT,
+    CHANNEL,
+    CHUNK,
+    CHUNK_FIXED,
+    COMPRESSIONS,
+    DATA_END,
+    DATA_END_SIZE,
+    FOOTER,
+    FOOTER_SIZE,
+    HEADER,
+    INDEX_ENTRY,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_FIXED,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX,
+    METADATA,
+    PREFIX,
+    SCHEMA,
+    BrokenRecordError,
+    ChunkHead,
+    ChunkIndex,
+    MessageIndex,
+    check_metadata,
+    read_chunk_head,
+    read_message_index,
+)
+from .resync import Plausible, Resync, is_exact
+from .rows import Rows, opcodes, rows_by_scan
+from .scan import Scanner
+
+RUN_BYTES: Final = 4 << 20
+"""Most bytes outside chunks taken at once, unless one record is larger."""
+STOPS_A_RUN: Final = ~opcodes(SCHEMA, CHANNEL, MESSAGE)
+SMALL: Final = 1 << 20
+"""Records that are checked whole (metadata and the like) are not read beyond this."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chunk:
+    """A chunk, not yet read, and the message indexes that follow it.
+
+    Attributes:
+        at: Where its record begins.
+        body_at: Where its (compressed) records begin.
+        head: What it says of itself; None if that cannot be read.
+        index: What the summary says of it; None if it says nothing.
+        fault: Why it cannot be read; empty if it may be tried.
+        differs: How head and summary disagree; empty if they do not.
+        is_cut: The file ends within it.
+        messages: Its message indexes, as far as they can be read.
+        index_fault: What is wrong with its message indexes; empty if nothing.
+    """
+
+    at: int
+    body_at: int
+    head: ChunkHead | None
+    index: ChunkIndex | None
+    fault: str = ""
+    differs: str = ""
+    is_cut: bool = False
+    messages: tuple[MessageIndex, ...] = ()
+    index_fault: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """Messages, schemas and channels outside chunks, from byte ``at`` on."""
+
+    at: int
+    rows: Rows
+
+
+@dataclass(frozen=True, slots=True)
+class Oversized:
+    """A message outside chunks that is over the limit and was not read."""
+
+    at: int
+    size: int
+    channel_id: int
+    log: int
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """An attachment; ``crc`` (0 for none) stands at ``crc_at``, covering the content before it."""
+
+    at: int
+    crc_at: int
+    crc: int
+
+
+@dataclass(frozen=True, slots=True)
+class Ignored:
+    """A record of a kind that a reader must pass over."""
+
+    at: int
+    opcode: int
+
+
+@dataclass(frozen=True, slots=True)
+class Stray:
+    """A message index that follows no chunk: the chunk before it cannot be recognised."""
+
+    at: int
+    index: MessageIndex
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Bytes from ``at`` to ``to`` that cannot be read as records.
+
+    A run before it may reach beyond ``at``: what of it begins there or later is not to be believed.
+    """
+
+    at: int
+    to: int
+    why: str
+
+
+class How(Enum):
+    """How a data section ends."""
+
+    DATA_END = "as it should"
+    FOOTER = "with a footer, without a data end record"
+    CUT = "in the middle of a record"
+    BARE = "without a data end record"
+    TOLD = "within the chunk or gap just given"
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """The data section ends here."""
+
+    at: int
+    how: How
+
+
+Item: TypeAlias = Chunk | Run | Oversized | Attachment | Ignored | Stray | Gap | End
+
+
+class Walk:
+    """One pass over a data section; iterate over it once. The last item is an ``End``."""
+
+    def __init__(
+        self,
+        file: ByteFile,
+        begin: int,
+        end: int,
+        chunks: Mapping[int, ChunkIndex] | None,
+        limits: Limits,
+        scanner: Scanner,
+        plausible: Plausible | None = None,
+    ) -> None:
+        """A walk from ``begin``.
+
+        Args:
+            file: The bytes.
+            begin: First record after the header.
+            end: Where the data end record stands; if ``chunks`` is None, where the file ends or
+                another recording begins.
+            chunks: By offset, what a trusted summary says; None where no end is known.
+            limits: Sizes above which nothing is read.
+            scanner: Does the stepping within runs.
+            plausible: What is known of messages outside chunks before the walk.
+        """
+        self._file = file
+        self._at = begin
+        self._end = end
+        self._has_end = chunks is not None
+        self._chunks = chunks or {}
+        self._known = sorted(self._chunks)
+        self._limits = limits
+        self._scanner = scanner
+        self._run_bytes = 0
+        self._is_over = False
+        self._last_at = begin
+        self._resync = Resync(file, end, self._has_end, self._known, plausible or Plausible())
+        self._before: Run | None = None
+        self._has_bare = not self._known
+
+    def __iter__(self) -> Iterator[Item]:
+        """The items in the order of the file."""
+        while self._at < self._end:
+            before = self._at
+            try:
+                item = self._next()
+            except BrokenRecordError as error:
+                item = self._gap(str(error))
+            self._last_at = before
+            if item is not None:
+                yield item
+            if isinstance(item, End):
+                return
+            since = item.at if isinstance(item, Gap) else before
+            assert self._at > since or self._is_over, "a walk must go forward"
+        how = How.DATA_END if self._has_end else How.TOLD if self._is_over else How.BARE
+        yield End(self._end, how)
+
+    def _bound(self, at: int) -> int:
+        """First place after ``at`` where something else is known to begin."""
+        after = bisect_right(self._known, at)
+        return self._known[after] if after < len(self._known) else self._end
+
+    def _next(self) -> Item | None:
+        at = self._at
+        if at in self._chunks:
+            return self._chunk(self._chunks[at])
+        head = self._file.peek(at, PREFIX.size)
+        if len(head) < PREFIX.size:
+            return self._cut("its prefix")
+        opcode, length = PREFIX.unpack(head)
+        after, bound = at + PREFIX.size + length, self._bound(at)
+        if not self._has_end and self._is_end(opcode, length):
+            return End(at, How.DATA_END if opcode == DATA_END else How.FOOTER)
+        if opcode == CHUNK:
+            return self._chunk(None)
+        if after > bound:
+            return self._overlong(opcode, length, bound)
+        if opcode in (SCHEMA, CHANNEL, MESSAGE):
+            return self._run(opcode, length, bound)
+        return self._other(opcode, length)
+
+    def _is_end(self, opcode: int, length: int) -> bool:
+        if opcode == DATA_END:
+            return length == DATA_END_SIZE - PREFIX.size
+        if opcode != FOOTER or length != FOOTER_SIZE - PREFIX.size:
+            return False
+        return bytes(self._file.peek(self._at + FOOTER_SIZE, len(MAGIC))) == MAGIC
+
+    def _gap(self, why: str) -> Item:
+        """What begins here is no record; go on where something is known to begin."""
+        at, bound = self._at, self._bound(self._at)
+        since, record = self._next_record(at, bound)
+        if bound < self._end:
+            self._at = bound if record is None else record
+            return Gap(since, self._at, why)
+        self._at = self._end if record is None else record
+        after = min(self._last_at, since) + 1
+        found = find_chunk(self._file, after, since + 1, self._at, self._end, self._limits)
+        place, is_chunk = found if found is not None else (self._at, record is not None)
+        if is_chunk:
+            self._at = place
+        elif not self._has_end:
+            self._at, self._end, self._is_over = max(place, since), place, True
+        return Gap(since, self._at, why)
+
+    def _next_record(self, at: int, bound: int) -> tuple[int, int | None]:
+        """From where on records outside chunks are not to be believed, and where they are again."""
+        if not self._has_bare:
+            return at, None
+        since = at
+        if self._before is not None and self._before.at + self._before.rows.end == at:
+            since = self._before.at + self._resync.last_trusted(self._before.rows)
+        head = self._file.peek(at, PREFIX.size)
+        if len(head) == PREFIX.size:
+            # Only its kind may be damaged: then its own length leads on.
+            after = at + PREFIX.size + PREFIX.unpack(head)[1]
+            if after < bound and self._resync.continues(after):
+                return since, after
+        return since, self._resync.find(since + 1, bound)
+
+    def _cut(self, what: str) -> Item:
+        if self._has_end or self._bound(self._at) != self._end:
+            return self._gap(f"a record ends before {what} does")
+        return End(self._at, How.CUT)
+
+    def _overlong(self, opcode: int, length: int, bound: int) -> Item:
+        is_cut = not self._has_end and bound == self._end and opcode in _KINDS
+        if not is_cut or self._next_record(self._at, bound)[1] is not None:
+            return self._gap(f"a record (kind {opcode:#04x}) of {length} bytes does not fit")
+        return End(self._at, How.CUT)
+
+    def _other(self, opcode: int, length: int) -> Item | None:
+        at, after = self._at, self._at + PREFIX.size + length
+        if opcode == ATTACHMENT:
+            crc_at = self._attachment_crc_at(after)
+            crc = int.from_bytes(self._file.peek(crc_at, 4), "little")
+            item: Item | None = Attachment(at, crc_at, crc)
+        elif opcode == MESSAGE_INDEX:
+            item = Stray(at, read_message_index(self._whole(length)))
+        elif opcode == METADATA:
+            if length <= SMALL:
+                check_metadata(self._whole(length))
+            item = None
+        elif opcode in (0, HEADER, FOOTER, DATA_END):
+            raise BrokenRecordError(f"a record of kind {opcode:#04x} has no place here")
+        elif (hidden := self._hidden_chunk(opcode, length)) is not None:
+            return hidden
+        else:
+            if self._has_bare and not self._is_unknown_kind(at, length):
+                raise BrokenRecordError(f"a record of the unknown kind {opcode:#04x}")
+            item = Ignored(at, opcode)
+        self._at = after
+        return item
+
+    def _is_unknown_kind(self, at: int, length: int) -> bool:
+        """Is a record of an unknown kind really one, and not a damaged message or its content?"""
+        if self._resync.is_message(at, length):
+            return False
+        return self._before is None or self._resync.continues(at + PREFIX.size + length, 1)
+
+    def _whole(self, length: int) -> memoryview:
+        if length > self._limits.records_per_chunk * INDEX_ENTRY.itemsize:
+            raise BrokenRecordError(f"a record of {length} bytes is over the limit")
+        content = self._file.peek(self._at + PREFIX.size, length)
+        if len(content) < length:
+            raise BrokenRecordError("the file became shorter while being read")
+        return content
+
+    def _attachment_crc_at(self, after: int) -> int:
+        """Where the checksum of the attachment that begins here stands."""
+        at = self._at + PREFIX.size + 16
+        for width in (4, 4, 8):
+            raw = self._file.peek(at, width)
+            at += width + int.from_bytes(raw, "little")
+            if len(raw) < width or at + 4 > after:
+                raise BrokenRecordError("an attachment does not fit its own length")
+        return at
+
+    def _hidden_chunk(self, opcode: int, length: int) -> Item | None:
+        """A record of an unknown kind that is built like a chunk is a chunk with a damaged kind."""
+        raw = self._file.peek(self._at + PREFIX.size, CHUNK_FIXED + 32)
+        try:
+            head = read_chunk_head(raw)
+        except BrokenRecordError:
+            return None
+        if head.body_at + head.body_size != length or head.compression not in COMPRESSIONS:
+            return None
+        return self._chunk(None)
+
+    def _run(self, opcode: int, length: int, bound: int) -> Item:
+        at, size = self._at, PREFIX.size + length
+        if opcode == MESSAGE and length < MESSAGE_FIXED:
+            raise BrokenRecordError(f"a message record of {length} bytes")
+        if size > max(self._limits.message_bytes, SMALL) + MESSAGE_HEAD.itemsize:
+            self._at = at + size
+            return self._oversized(at, opcode, length)
+        buffer = self._run_buffer(at, size, bound)
+        rows = rows_by_scan(buffer, self._scanner, STOPS_A_RUN, len(buffer))
+        if not rows.end:
+            raise BrokenRecordError("the file became shorter while being read")
+        rows = self._without_hidden(at, rows)
+        is_stopped = rows.end < len(buffer) and STOPS_A_RUN[buffer[rows.end]]
+        self._run_bytes = 0 if is_stopped else min(2 * len(buffer), RUN_BYTES)
+        self._at = at + rows.end
+        self._has_bare = True
+        self._before = Run(at, rows)
+        self._resync.plausible.learn(rows)
+        return self._before
+
+    def _without_hidden(self, at: int, rows: Rows) -> Rows:
+        """A run up to the first message in it whose kind was damaged to that of a definition.
+
+        Raises:
+            BrokenRecordError: It begins with one.
+        """
+        for found in rows.definitions:
+            if not self._resync.is_message(at + found.at, len(found.content)) or is_exact(found):
+                continue
+            if not found.at:
+                raise BrokenRecordError(f"a record of kind {found.opcode:#04x} cannot be read")
+            kept = rows.take(np.flatnonzero(rows.offset < found.at))
+            earlier = [one for one in rows.definitions if one.at < found.at]
+            return replace(kept, definitions=earlier, end=found.at)
+        return rows
+
+    def _run_buffer(self, at: int, size: int, bound: int) -> Bytes:
+        if self._run_bytes > size:
+            return self._file.read(at, min(self._run_bytes, bound - at))
+        near = self._file.window(at, min(size, bound - at))
+        return np.frombuffer(near, dtype=np.uint8)[: bound - at]
+
+    def _oversized(self, at: int, opcode: int, length: int) -> Item:
+        if opcode != MESSAGE:
+            return Ignored(at, opcode)
+        head = np.frombuffer(self._file.peek(at, MESSAGE_HEAD.itemsize), dtype=MESSAGE_HEAD)[0]
+        return Oversized(at, length - MESSAGE_FIXED, int(head["channel"]), int(head["log"]))
+
+    def _chunk(self, index: ChunkIndex | None) -> Item:
+        at, bound = self._at, self._bound(self._at)
+        raw = self._file.peek(at, PREFIX.size + CHUNK_FIXED + 32)
+        if len(raw) < PREFIX.size:
+            return self._cut("its prefix")
+        opcode, length = PREFIX.unpack_from(raw)
+        outer_end = at + PREFIX.size + length
+        try:
+            head = read_chunk_head(raw[PREFIX.size :])
+        except BrokenRecordError as error:
+            return self._chunk_without_head(index, outer_end, bound, str(error))
+        body_at = at + PREFIX.size + head.body_at
+        inner_end = body_at + head.body_size
+        fault = ""
+        if opcode != CHUNK:
+            fault = f"its record says kind {opcode:#04x}"
+        elif head.compression not in COMPRESSIONS:
+            fault = f"compression {head.compression!r} is unknown (known: none, lz4, zstd)"
+        if index is not None:
+            end = min(at + index.length, bound)
+            differs = _differences(head, index, outer_end - at)
+        elif outer_end <= bound:
+            end, differs = outer_end, ""
+        elif inner_end <= bound and head.crc:
+            end, differs = inner_end, f"its record says {length} bytes"
+        elif not self._has_end and bound == self._end and outer_end == inner_end:
+            self._at, self._is_over = self._end, True
+            return Chunk(at, body_at, head, None, fault, is_cut=True)
+        else:
+            raise BrokenRecordError(f"a chunk of {length} bytes does not fit")
+        if inner_end < end and not differs:
+            differs = f"{end - inner_end} bytes follow its records"
+        if inner_end > end and not fault:
+            fault = f"declares {head.body_size} bytes of records, has {max(0, end - body_at)}"
+        messages, index_fault = self._message_indexes(end, index)
+        # Records found by searching behind damage would be those of an uncompressed chunk.
+        self._has_bare &= self._before is not None
+        return Chunk(at, body_at, head, index, fault, differs, False, messages, index_fault)
+
+    def _chunk_without_head(
+        self, index: ChunkIndex | None, outer_end: int, bound: int, why: str
+    ) -> Item:
+        at = self._at
+        if index is None and outer_end > bound:
+            return self._cut("its fields") if bound == self._end else self._gap(why)
+        end = outer_end if index is None else min(at + index.length, bound)
+        messages, index_fault = self._message_indexes(end, index)
+        return Chunk(at, at, None, index, why, "", False, messages, index_fault)
+
+    def _message_indexes(
+        self, at: int, index: ChunkIndex | None
+    ) -> tuple[tuple[MessageIndex, ...], str]:
+        """The message indexes from ``at`` on; leaves the walk behind them."""
+        bound = self._bound(self._at)
+        told_end = min(at + index.index_length, bound) if index is not None else at
+        found: list[MessageIndex] = []
+        fault = ""
+        while at + PREFIX.size <= bound:
+            head = self._file.peek(at, PREFIX.size)
+            if len(head) < PREFIX.size:
+                break
+            opcode, length = PREFIX.unpack(head)
+            after = at + PREFIX.size + length
+            if opcode != MESSAGE_INDEX or after > bound:
+                break
+            self._at = at
+            try:
+                found.append(read_message_index(bytes(self._whole(length))))
+            except BrokenRecordError as error:
+                fault = str(error)
+            at = after
+        if at < told_end:
+            at, fault = told_end, fault or "a message index cannot be read"
+        self._at = at
+        return tuple(found), fault
+
+
+def _differences(head: ChunkHead, index: ChunkIndex, length: int) -> str:
+    """In which fields a chunk and the summary's index of it disagree; empty if in none."""
+    pairs = (
+        ("length", length, index.length),
+        ("start time", head.start, index.start),
+        ("end time", head.end, index.end),
+        ("size", head.size, index.size),
+        ("stored size", head.body_size, index.body_size),
+        ("compression", head.compression, index.compression),
+    )
+    return ", ".join(
+        f"{name} {said!r} (the summary says {told!r})" for name, said, told in pairs if said != told
+    )
+
+
+_KINDS: Final = frozenset(range(HEADER, DATA_END + 1))

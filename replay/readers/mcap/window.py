@@ -1,0 +1,174 @@
+"""Which bytes of a recording hold a part of it, by the summary's index of chunks alone.
+
+A summary with a checksum, whose counts add up and whose chunks lie side by side, is trusted: chunks
+outside the time asked for, or without a topic asked for, are not touched. What lies between the
+chunks it names is walked through, so that messages outside chunks are found. A summary without a
+checksum is trusted for times only, where its chunks follow each other in time: a wrong time then
+stands out, or is that of a chunk next to those asked for, which are looked at too.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import Selection
+
+from .bytes import ByteFile
+from .channels import Declarations
+from .chunk_table import ChunkTable
+from .scan import Scanner
+from .segments import Segment, Summary
+from .walk import End, Item, Walk
+
+LATEST: Final = np.uint64((1 << 63) - 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """Where a part of a recording lies.
+
+    Attributes:
+        chunks: All chunks there are.
+        is_read: Shape (N,), bool: of these, the ones that may hold what was asked for.
+        begin: Where the recording's first record stands.
+        end: Where its data section ends.
+    """
+
+    chunks: ChunkTable
+    is_read: NDArray[np.bool_]
+    begin: int
+    end: int
+
+    @property
+    def left(self) -> int:
+        """How many chunks are not read."""
+        return int(np.count_nonzero(~self.is_read))
+
+    def ranges(self) -> list[tuple[int, int]]:
+        """What must be walked through: everything but the chunks that are not read."""
+        out = ~self.is_read
+        begin = np.concatenate(([self.begin], self.chunks.after[out]))
+        end = np.concatenate((self.chunks.at[out], [self.end]))
+        filled = end > begin
+        return list(zip(begin[filled].tolist(), end[filled].tolist(), strict=True))
+
+    def items(self, file: ByteFile, limits: Limits, scanner: Scanner) -> Iterator[Item]:
+        """What lies in those ranges, in the order of the file."""
+        for begin, end in self.ranges():
+            yield from self._walk(begin, end, file, limits, scanner)
+
+    def others(self, file: ByteFile, limits: Limits, scanner: Scanner) -> Iterator[Item]:
+        """The chunks left out, in the order of the file."""
+        out = ~self.is_read
+        for begin, end in zip(
+            self.chunks.at[out].tolist(), self.chunks.after[out].tolist(), strict=True
+        ):
+            yield from self._walk(begin, end, file, limits, scanner)
+
+    def _walk(
+        self, begin: int, end: int, file: ByteFile, limits: Limits, scanner: Scanner
+    ) -> Iterator[Item]:
+        rows = slice(*np.searchsorted(self.chunks.at, (begin, end)).tolist())
+        rail = self.chunks.take(rows)
+        for item in Walk(file, begin, end, rail, limits, scanner):
+            if not isinstance(item, End):
+                yield item
+
+    def rest(self, summary: Summary, held: Mapping[int, int]) -> Counter[int] | None:
+        """Messages of each channel in the chunks left out; None if the counts cannot be right.
+
+        Args:
+            summary: Has statistics.
+            held: Messages of each channel met or known to be dropped in the chunks read.
+        """
+        statistics = summary.statistics
+        if statistics is None:
+            return None
+        out = self.chunks.take(~self.is_read)
+        named = np.bincount(out.channel, minlength=1)
+        is_open = bool(out.is_unnamed.any())
+        rest: Counter[int] = Counter()
+        for channel_id in statistics.by_channel.keys() | held.keys():
+            count = statistics.by_channel.get(channel_id, 0) - held.get(channel_id, 0)
+            least = int(named[channel_id]) if channel_id < len(named) else 0
+            if count < least or (count and not least and not is_open):
+                return None
+            rest[channel_id] = count
+        return +rest
+
+
+def find_window(segment: Segment, declarations: Declarations, selection: Selection) -> Window | str:
+    """Where what is asked for lies, or why the index cannot tell."""
+    summary = segment.summary
+    if summary is None or not len(summary.chunks):
+        return "it has no index of chunks"
+    doubt = _doubt(segment, summary)
+    if doubt:
+        return doubt
+    chunks = summary.chunks
+    is_asked = _in_time(chunks, selection)
+    if summary.is_verified:
+        is_asked &= chunks.is_unnamed | chunks.naming(_wanted(declarations, selection))
+    else:
+        if selection.start_ns is None and selection.end_ns is None:
+            return "its index of chunks carries no checksum"
+        if not (_is_rising(chunks.start) and _is_rising(chunks.end)):
+            return "its index of chunks carries no checksum, and is not in order of time"
+        is_asked = _with_neighbours(is_asked)
+    return Window(chunks, is_asked, segment.begin, segment.end)
+
+
+def _doubt(segment: Segment, summary: Summary) -> str:
+    """What is wrong with the index as a whole; empty if nothing is."""
+    statistics, chunks = summary.statistics, summary.chunks
+    if statistics is None or not summary.counts_channels:
+        return "it has no counts by topic"
+    if statistics.chunk_count != len(chunks):
+        return f"its index names {len(chunks)} chunks, its statistics {statistics.chunk_count}"
+    if sum(statistics.by_channel.values()) != statistics.message_count:
+        return "its counts by topic do not add up"
+    if not (chunks.is_tiled and chunks.at[0] >= segment.begin and chunks.after[-1] <= segment.end):
+        return "the chunks in its index overlap, or lie beyond its data section"
+    if not summary.is_verified and (chunks.after[:-1] < chunks.at[1:]).any():
+        return "its index of chunks carries no checksum, and leaves gaps"
+    return ""
+
+
+def _in_time(chunks: ChunkTable, selection: Selection) -> NDArray[np.bool_]:
+    """Which chunks may hold messages of the time asked for, or with times that are none."""
+    asked = np.ones(len(chunks), dtype=np.bool_)
+    if selection.start_ns is not None:
+        asked &= chunks.end >= np.uint64(min(max(selection.start_ns, 0), 1 << 63))
+    if selection.end_ns is not None:
+        asked &= chunks.start < np.uint64(min(max(selection.end_ns, 0), 1 << 63))
+    is_odd = (chunks.start > chunks.end) | (chunks.end > LATEST)
+    # Some writers leave the times of a chunk at 0.
+    is_odd |= (chunks.start == 0) & (chunks.end == 0)
+    return np.logical_or(asked, is_odd)
+
+
+def _wanted(declarations: Declarations, selection: Selection) -> NDArray[np.bool_]:
+    """Shape (65536,): which channel numbers are asked for."""
+    wanted = np.zeros(1 << 16, dtype=np.bool_)
+    for channel_id, topic in declarations.topics():
+        wanted[channel_id] = selection.wants(topic)
+    return wanted
+
+
+def _is_rising(times: NDArray[np.uint64]) -> bool:
+    return bool((times[1:] >= times[:-1]).all())
+
+
+def _with_neighbours(asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """And the chunk before the first, and the one after the last."""
+    wider = asked.copy()
+    wider[:-1] |= asked[1:]
+    wider[1:] |= asked[:-1]
+    return wider

@@ -1,0 +1,245 @@
+"""CAN frames out of the records of an MDF 4 bus logging group."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import DATA, ERROR, REMOTE, Bytes, CanFrames, Int64s
+from crosscue.replay.readers.can_rows import FD_LENGTHS, IS_FD_LENGTH, FrameRows
+
+from .blocks import VARIABLE, VARIABLE_COMPACT, Channel, Group
+from .records import Records
+from .values import Words, invalid, is_applied, is_numeric, is_plain, physical, raw
+from .variable import VariableValues
+
+_KINDS: Final = {
+    "CAN_DataFrame": DATA,
+    "CAN_RemoteFrame": REMOTE,
+    "CAN_ErrorFrame": ERROR,
+    "CAN_OverloadFrame": -1,
+}
+_CLASSIC, _FD = 8, 64
+_MASK: Final = np.array([(1 << 8 * k) - 1 for k in range(9)], np.uint64)
+_VALID_PARTS: Final = ("", "ID", "DataBytes", "DataLength")
+_NUMBER: Final = re.compile(r"CAN[ _-]*(\d+)", re.IGNORECASE)
+
+
+def can_layout(group: Group) -> CanLayout | None:
+    """How ``group`` holds CAN frames; None when it holds something else."""
+    for name, kind in _KINDS.items():
+        parts = {
+            one.name.removeprefix(name).removeprefix("."): one
+            for one in group.channels
+            if one.name == name or one.name.startswith(name + ".")
+        }
+        if parts:
+            return CanLayout(group, kind, parts)
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Frames of some records, and how many of those gave none.
+
+    Attributes:
+        rows: The frames; ``bus`` holds channel numbers.
+        impossible: Records that no frame can look like.
+        unreadable: Records whose payload is missing, cut or damaged.
+        invalid: Records that the logger itself marked as invalid.
+    """
+
+    rows: FrameRows
+    impossible: int
+    unreadable: int
+    invalid: int
+
+
+class CanLayout:
+    """Where the fields of one kind of frame lie in its records.
+
+    Attributes:
+        variable: Its payloads' channel, where they have variable length.
+    """
+
+    def __init__(self, group: Group, kind: int, parts: Mapping[str, Channel]) -> None:
+        self._group, self._kind, self._parts = group, kind, parts
+        self._numbers = {
+            name: one for name, one in parts.items() if is_numeric(one, group.value_bytes)
+        }
+        payload = parts.get("DataBytes")
+        is_variable = kind == DATA and payload is not None and payload.type == VARIABLE
+        self.variable = payload if is_variable else None
+        # Whatever type the values have, what the record holds is an offset.
+        self._key = replace(payload, data_type=0) if payload and is_variable else None
+        named = _NUMBER.search(group.name)
+        self._bus = int(named[1][:3]) if named else 1
+
+    @property
+    def is_needed(self) -> bool:
+        """Would somebody miss these records? Overload frames carry nothing."""
+        return self._kind >= 0
+
+    @property
+    def refusal(self) -> str:
+        """Why these frames cannot be read; empty when they can."""
+        if self._kind < 0:
+            return "overload frames, which carry nothing"
+        if self._kind == ERROR:
+            return ""
+        if "ID" not in self._numbers:
+            return "bus group without identifiers"
+        payload = self._parts.get("DataBytes")
+        if self._kind == DATA and payload is None:
+            return "bus group without payloads"
+        if payload is not None and payload.type == VARIABLE_COMPACT:
+            return "payloads stored as compact variable-length values (VLSC), not supported"
+        if self._key is not None and not is_numeric(self._key, self._group.value_bytes):
+            return "bus group whose payloads cannot be found"
+        return ""
+
+    def buses(self, records: Records) -> Int64s:
+        """Shape (N,): channel numbers."""
+        return self._values("BusChannel", Words(records.rows, records.first), self._bus)
+
+    def frames(
+        self, records: Records, words: Words, log_ns: Int64s, values: VariableValues | None
+    ) -> Found:
+        """The records that can be frames."""
+        identifier = self._values("ID", words, 0)
+        number = identifier & 0x1FFFFFFF
+        is_long = number > 0x7FF
+        if "IDE" in self._numbers:
+            is_extended = self._flags("IDE", words)
+        else:
+            is_extended = ((identifier >> 31) & 1 != 0) | is_long
+        ok = is_extended | ~is_long | np.bool_(self._kind == ERROR)
+        count = len(words)
+        length, is_fd = np.zeros(count, np.int64), np.zeros(count, np.bool_)
+        payload, whole = np.zeros((count, _CLASSIC), np.uint8), np.ones(count, np.bool_)
+        if self._kind == DATA:
+            length, is_fd = self._lengths(words)
+            if count and (length.min() < 0 or length.max() > _CLASSIC):
+                is_fd_length = IS_FD_LENGTH[np.clip(length, 0, _FD)]
+                possible = np.where(is_fd, is_fd_length, length <= _CLASSIC)
+                ok = ok & possible & (length >= 0) & (length <= _FD)
+                length = np.where(ok, length, 0)
+            payload, whole = self._payloads(words, length, values, bool(is_fd.any()))
+        frames = CanFrames(
+            number.astype(np.uint32),
+            is_extended,
+            np.full(count, self._kind, np.uint8),
+            length.astype(np.uint8),
+            payload,
+            is_fd,
+            self._flags("Dir", words) if "Dir" in self._numbers else None,
+        )
+        rows = FrameRows(
+            records.place, self._values("BusChannel", words, self._bus), log_ns, frames
+        )
+        return self._sound(rows, ok, whole, self._marked(words))
+
+    def _sound(
+        self,
+        rows: FrameRows,
+        ok: NDArray[np.bool_],
+        whole: NDArray[np.bool_],
+        marked: NDArray[np.bool_] | None,
+    ) -> Found:
+        is_valid = ok & whole if marked is None else ok & whole & ~marked
+        if bool(is_valid.all()):
+            return Found(rows, 0, 0, 0)
+        invalid_count = 0 if marked is None else int(np.count_nonzero(marked))
+        if marked is not None:
+            ok, whole = ok | marked, whole | marked
+        unreadable = int(np.count_nonzero(ok & ~whole))
+        return Found(rows.take(is_valid), int(np.count_nonzero(~ok)), unreadable, invalid_count)
+
+    def _marked(self, words: Words) -> NDArray[np.bool_] | None:
+        """Which records the logger marked as invalid; None for none."""
+        marked: NDArray[np.bool_] | None = None
+        for name in _VALID_PARTS:
+            if name in self._parts:
+                one = invalid(self._parts[name], words.records, self._group.value_bytes)
+                if one is not None:
+                    marked = one if marked is None else marked | one
+        return marked
+
+    def _lengths(self, words: Words) -> tuple[Int64s, NDArray[np.bool_]]:
+        """Payload bytes, and which frames are CAN FD."""
+        length = self._values("DataLength", words, -1)
+        if "DataLength" not in self._numbers and "DLC" in self._numbers:
+            length = FD_LENGTHS[np.clip(self._values("DLC", words, 0), 0, 15)]
+        is_long = length > _CLASSIC
+        stored = self._parts["DataBytes"].bit_count // 8
+        can_be_fd = self.variable is not None or stored > _CLASSIC
+        is_fd = is_long & can_be_fd
+        if "EDL" in self._numbers:
+            is_fd = self._flags("EDL", words)
+        if bool(is_long.any()):
+            # A classic frame may have the codes 9 to 15 for eight bytes.
+            is_long &= ~is_fd & (self._values("DLC", words, 0) > _CLASSIC)
+            length = np.where(is_long, _CLASSIC, length)
+        return length, is_fd
+
+    def _flags(self, name: str, words: Words) -> NDArray[np.bool_]:
+        is_set: NDArray[np.bool_] = self._values(name, words, 0) != 0
+        return is_set
+
+    def _values(self, name: str, words: Words, missing: int) -> Int64s:
+        channel = self._numbers.get(name)
+        if channel is None:
+            return np.full(len(words), missing, np.int64)
+        conversion = channel.conversion
+        if conversion.type == 1 and conversion.values[1:2] == (0.0,):
+            only = _whole(np.array(conversion.values[:1]))[0]
+            return np.full(len(words), only, np.int64)
+        if is_plain(channel) and channel.bit_count < 64:
+            bits = words.bits(channel.byte_offset, channel.bit_offset, channel.bit_count)
+            if not conversion.type or not is_applied(conversion):
+                return bits.view(np.int64)
+            if channel.bit_count <= 8:
+                # Few values are possible: each is converted once.
+                table = _whole(physical(conversion, np.arange(1 << channel.bit_count)))
+                return table[bits]
+        values = raw(channel, words)
+        return _whole(physical(conversion, values) if is_applied(conversion) else values)
+
+    def _payloads(
+        self, words: Words, length: Int64s, values: VariableValues | None, is_any_fd: bool
+    ) -> tuple[Bytes, NDArray[np.bool_]]:
+        """Payloads of 8 or 64 columns, zero from ``length`` on, and which of them are whole."""
+        width = _FD if is_any_fd else _CLASSIC
+        channel, rows = self._parts["DataBytes"], words.records
+        if values is None or self._key is None:
+            stored = min(channel.bit_count // 8, width)
+            part = rows[:, channel.byte_offset : channel.byte_offset + stored]
+            payload = np.zeros((len(rows), width), np.uint8)
+            payload[:, : part.shape[1]] = part
+            return _cut(payload, length), length <= part.shape[1]
+        key = raw(self._key, words).astype(np.int64)
+        payload, stored_length = values.fetch(key, words.first, width)
+        return _cut(payload, length), stored_length >= length
+
+
+def _whole(values: NDArray[np.generic]) -> Int64s:
+    """As whole numbers; -1 for what is none."""
+    if values.dtype.kind == "f":
+        values = np.rint(np.nan_to_num(values, nan=-1.0, posinf=-1.0, neginf=-1.0))
+    return values.astype(np.int64)
+
+
+def _cut(payload: Bytes, length: Int64s) -> Bytes:
+    """``payload`` with zeros from ``length`` on."""
+    width = payload.shape[1]
+    if bool((length == width).all()):
+        return payload
+    if width == _CLASSIC:
+        words = payload.view(np.uint64)[:, 0] & _MASK[length].astype(np.uint64)
+        return words.view(np.uint8).reshape(-1, _CLASSIC)
+    return np.where(np.arange(width) < length[:, None], payload, np.uint8(0))

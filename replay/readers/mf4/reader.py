@@ -1,0 +1,625 @@
+"""ASAM MDF 4 logs: bus logging groups as CAN frames, other channel groups as tables.
+
+Channels come out as physical values where their conversion is numeric (linear, rational, table);
+formulas and texts are not evaluated. A topic's rows come group by group, as the file holds them.
+Attachments are never opened. Compressed blocks carry a checksum, which is verified.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import BLOCK_ROWS, Block, Int64s, Table, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import EVERYTHING, Log, Selection
+from crosscue.replay.readers.can_rows import (
+    BUSES_MAX,
+    NO_ROWS,
+    FrameRows,
+    blocks_by_bus,
+    bus_number,
+    bus_topic,
+    in_time,
+    keep_memory,
+    merged,
+    merged_by_time,
+)
+
+from .blocks import (
+    CYCLE_COUNTERS,
+    MASTER,
+    REMOTE_MASTER,
+    TIME,
+    VARIABLE_OFFSETS,
+    VIRTUAL_MASTER,
+    VLSD_GROUP,
+    Blocks,
+    BrokenBlockError,
+    Channel,
+    DataGroup,
+    Group,
+)
+from .frames import CanLayout, can_layout
+from .records import LAST_CUT, Records, UnsortedData, Walked, sorted_records
+from .stream import Stream
+from .values import Words, invalid, is_applied, is_numeric, physical, raw, times_ns
+from .variable import GroupValues, StoredValues, VariableValues
+
+_NAMES_SHOWN: Final = 5
+_PEEK_ROWS: Final = 4096
+_CHUNK_BYTES: Final = 1 << 16
+"""Bytes of records that are read or left out together when a span of time is asked for."""
+_BUFFER_BYTES: Final = 1 << 16
+"""Loggers write the blocks that describe a file close together; they are read at once."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Source:
+    """One channel group that can be read, or the reason why not.
+
+    Attributes:
+        index: Its place among the groups of its data.
+        declared: Records that the file says it has, or None where nobody wrote that.
+    """
+
+    index: int
+    group: Group
+    master: Channel | None
+    can: CanLayout | None
+    topic: str
+    refusal: str
+    declared: int | None
+
+
+@dataclass(slots=True, eq=False)
+class _Account:
+    """What became of one group's records so far."""
+
+    met: int = 0
+    dropped: int = 0
+    unread: int = 0
+
+
+class _UnreadableError(Exception):
+    """A record's time cannot be read."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stored:
+    """Groups that share one stream of data.
+
+    Attributes:
+        unsorted: The records of all of them, where they are mixed.
+        sources: The groups, those left out that hold nothing but values of others.
+        values: Where the payloads of a source lie, by its index, if not in its records.
+    """
+
+    stream: Stream
+    unsorted: UnsortedData | None
+    sources: tuple[_Source, ...]
+    values: Mapping[int, VariableValues]
+
+
+def open_mf4(path: Path, limits: Limits) -> Log:
+    """Open an MDF 4 log.
+
+    Raises:
+        LogFormatError: It is no MDF 4 file, or its header or all of its groups are damaged.
+    """
+    return Mf4Log(path, limits)
+
+
+class Mf4Log(Closing):
+    """An open MDF 4 log (``Log``)."""
+
+    def __init__(self, path: Path, limits: Limits) -> None:
+        """Read the structure, and the first records of bus groups for the names of buses.
+
+        Raises:
+            LogFormatError: It is no MDF 4 file, or its header or all of its groups are damaged.
+        """
+        self._path, self._limits = path, limits
+        keep_memory()
+        self._file = path.open("rb", buffering=_BUFFER_BYTES)
+        self._blocks = Blocks(self._file, path.stat().st_size, limits)
+        self._buses: dict[str, int] = {}
+        self._broken = ""
+        try:
+            self._header = self._blocks.header(str(path))
+            self._stored = tuple(self._found())
+            if self._broken and not self._stored:
+                raise LogFormatError(f"{path}: no channel group can be read: {self._broken}")
+            self._peek()
+        except BaseException:
+            self._file.close()
+            raise
+
+    @property
+    def path(self) -> Path:
+        """Where it lies."""
+        return self._path
+
+    @property
+    def format(self) -> str:
+        """Short name of the format."""
+        return "mf4"
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """Tables, and the buses seen so far: those of first records, after a pass all of them."""
+        tables = tuple(
+            Topic(s.topic, "crosscue/Table", "columns", declared=s.declared)
+            for s in self._sources()
+            if s.topic
+        )
+        return tuple(bus_topic(name) for name in self._buses) + tables
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """All rows, group by group; see ``Log.read``."""
+        for topic in self.topics:
+            ledger.declare(topic.name, topic.declared)
+        self._say(ledger)
+        accounts = {source: _Account() for source in self._sources()}
+        for stored in self._stored:
+            if stored.unsorted:
+                yield from self._mixed(stored, stored.unsorted, accounts, ledger, selection)
+        yield from self._by_time(accounts, ledger, selection)
+        for stored in self._stored:
+            for source in () if stored.unsorted else stored.sources:
+                if source.can is None or source.refusal:
+                    yield from self._alone(stored, source, accounts[source], ledger, selection)
+        for source, account in accounts.items():
+            _settle(source, account, ledger)
+        self._close_account(accounts.values(), ledger)
+
+    def _sources(self) -> Iterator[_Source]:
+        return (source for stored in self._stored for source in stored.sources)
+
+    def _say(self, ledger: Ledger) -> None:
+        if self._header.is_local:
+            ledger.notice("the log states no time zone; its start time is read as UTC")
+
+    def _close_account(self, accounts: Collection[_Account], ledger: Ledger) -> None:
+        met = sum(account.met for account in accounts)
+        if not self._header.is_finalized:
+            ledger.notice(
+                f"not finalized by the logger; {met} records recovered from the data block"
+            )
+        if self._broken:
+            ledger.drop("", "structure damaged", None, self._broken)
+        for name in self._buses:
+            ledger.topic(name)
+        ledger.integrity = (
+            "checksums of compressed blocks verified; MDF has none for the rest of the file"
+        )
+        if unread := sum(account.unread for account in accounts):
+            ledger.integrity += f"; {unread} of {met} records, of other times, were not read"
+
+    def _mixed(
+        self,
+        stored: _Stored,
+        data: UnsortedData,
+        accounts: Mapping[_Source, _Account],
+        ledger: Ledger,
+        selection: Selection,
+    ) -> Iterator[Block]:
+        """The records of unsorted data: all groups piece by piece, frames in stored order."""
+        last = None
+        for k, piece in data.pieces():
+            last = piece
+            present = np.bincount(piece.group, minlength=len(data.data.groups))
+            frames = []
+            for source in stored.sources:
+                if not present[source.index]:
+                    continue
+                accounts[source].met += int(present[source.index])
+                if source.refusal or not source.can:
+                    records = data.rows(k, source.index)
+                    yield from self._other(source, records, ledger, selection)
+                else:
+                    frames.append(self._frames(stored, source, data.rows(k, source.index), ledger))
+            if frames:
+                yield from self._handed_on(merged(frames), ledger, selection)
+        if last is not None and last.damage:
+            self._drop_rest(stored, last, accounts, ledger)
+
+    def _drop_rest(
+        self,
+        stored: _Stored,
+        last: Walked,
+        accounts: Mapping[_Source, _Account],
+        ledger: Ledger,
+    ) -> None:
+        """Account for what a damaged end of unsorted data held."""
+        if all(source.declared is not None for source in stored.sources):
+            for source in stored.sources:
+                missing = max((source.declared or 0) - accounts[source].met, 0)
+                accounts[source].dropped += missing
+                ledger.drop(source.topic, "damaged data", missing, last.damage)
+        elif last.cut < 0:
+            is_cut = last.damage == LAST_CUT
+            ledger.drop("", "damaged data", 1 if is_cut else None, last.damage)
+        elif not self._is_missed(stored, last.cut):
+            ledger.drop("", "damaged data", 1, last.damage)
+
+    def _is_missed(self, stored: _Stored, group: int) -> bool:
+        """Was a frame dropped already because its payload is the value that the end cuts?"""
+        return any(
+            isinstance(one, GroupValues) and one.group == group and one.first_missed is not None
+            for one in stored.values.values()
+        )
+
+    def _by_time(
+        self, accounts: Mapping[_Source, _Account], ledger: Ledger, selection: Selection
+    ) -> Iterator[Block]:
+        """The frames of all groups that have their data to themselves, merged by time."""
+        streams = [
+            self._alone_frames(stored, source, accounts[source], ledger, selection)
+            for stored in self._stored
+            if not stored.unsorted
+            for source in stored.sources
+            if source.can and not source.refusal
+        ]
+        for rows in merged_by_time(streams):
+            yield from self._handed_on(rows, ledger, selection)
+
+    def _alone_frames(
+        self,
+        stored: _Stored,
+        source: _Source,
+        account: _Account,
+        ledger: Ledger,
+        selection: Selection,
+    ) -> Iterator[FrameRows]:
+        for records in self._records(stored, source, account, ledger, selection):
+            yield self._frames(stored, source, records, ledger)
+
+    def _alone(
+        self,
+        stored: _Stored,
+        source: _Source,
+        account: _Account,
+        ledger: Ledger,
+        selection: Selection,
+    ) -> Iterator[Block]:
+        """The rows of a group that has its data to itself and holds no frames."""
+        if source.refusal or not selection.wants(source.topic):
+            size = source.group.record_bytes
+            there = stored.stream.size // size if size else 0
+            count = there if source.declared is None else source.declared
+            account.met += count
+            self._leave_out(source, count, ledger)
+            return
+        for records in self._records(stored, source, account, ledger, selection):
+            yield from self._table(source, records, ledger, selection)
+
+    def _other(
+        self, source: _Source, records: Records, ledger: Ledger, selection: Selection
+    ) -> Iterator[Block]:
+        if source.refusal or not selection.wants(source.topic):
+            self._leave_out(source, len(records.rows), ledger)
+        else:
+            yield from self._table(source, records, ledger, selection)
+
+    def _leave_out(self, source: _Source, count: int, ledger: Ledger) -> None:
+        """Account for rows that are not read: of a kind that is not, or not asked for."""
+        if source.refusal and source.can and source.can.is_needed:
+            ledger.drop("", source.refusal, count, source.group.name)
+            return
+        ledger.find(source.topic, count)
+        reason = source.refusal or NOT_ASKED_TOPIC
+        ledger.skip(source.topic, reason, count, source.group.name)
+
+    def _records(
+        self,
+        stored: _Stored,
+        source: _Source,
+        account: _Account,
+        ledger: Ledger,
+        selection: Selection,
+    ) -> Iterator[Records]:
+        """Records of sorted data; those that cannot be read are accounted for here."""
+        first, stop = self._span(stored, source, selection)
+        if stop is not None:
+            unread = stored.stream.size // source.group.record_bytes - (stop - first)
+            account.met += unread
+            account.unread += unread
+            ledger.find(source.topic, unread)
+            ledger.skip(source.topic, NOT_ASKED_TIME, unread)
+        for records in sorted_records(stored.stream, source.group, first, stop):
+            if not records.damage:
+                account.met += len(records.rows)
+                yield records
+                continue
+            count = records.dropped
+            if source.declared is not None:
+                count = min(count, max(source.declared - account.met - account.dropped, 0))
+            account.dropped += count
+            if count or records.dropped == 0:
+                ledger.drop(source.topic, "damaged data", count or None, records.damage)
+
+    def _span(
+        self, stored: _Stored, source: _Source, selection: Selection
+    ) -> tuple[int, int | None]:
+        """The records that may lie in the span of time asked for; all of them without a stop.
+
+        The first records of chunks are looked at by bisection: MDF demands that times ascend.
+        """
+        size, start_ns, end_ns = source.group.record_bytes, selection.start_ns, selection.end_ns
+        if not size or (start_ns is None and end_ns is None) or stored.stream.broken:
+            return 0, None
+        total = stored.stream.size // size
+        rows = max(_CHUNK_BYTES // size, 1)
+
+        @cache
+        def time_ns(chunk: int) -> int:
+            content = stored.stream.read(chunk * rows * size, size)
+            if len(content) < size:
+                raise _UnreadableError
+            record = np.frombuffer(content, np.uint8).reshape(1, size)
+            times = self._times(source, Words(record, chunk * rows))
+            if times is None:
+                raise _UnreadableError
+            return int(times[0])
+
+        count = -(-total // rows)
+        try:
+            if count < 2 or time_ns(count - 1) < time_ns(0):
+                return 0, None
+            first = 0 if start_ns is None else max(_first_from(start_ns, count, time_ns) - 1, 0)
+            stop = count if end_ns is None else _first_from(end_ns, count, time_ns)
+        except _UnreadableError:
+            return 0, None
+        return first * rows, max(min(stop * rows, total), first * rows)
+
+    def _times(self, source: _Source, words: Words) -> Int64s | None:
+        assert source.master is not None
+        since = times_ns(source.master, raw(source.master, words))
+        return None if since is None else since + self._header.start_ns
+
+    def _frames(
+        self, stored: _Stored, source: _Source, records: Records, ledger: Ledger
+    ) -> FrameRows:
+        assert source.can is not None
+        words = Words(records.rows, records.first)
+        log_ns = self._times(source, words)
+        if log_ns is None:
+            ledger.drop("", "time out of range", len(words), source.group.name)
+            return NO_ROWS
+        found = source.can.frames(records, words, log_ns, stored.values.get(source.index))
+        detail = f"{source.group.name}, from record {records.first} on"
+        ledger.drop("", "record that cannot be a frame", found.impossible, detail)
+        ledger.drop("", "payload cut or damaged", found.unreadable, detail)
+        ledger.find("", found.invalid)
+        ledger.skip("", "marked as invalid by the logger", found.invalid, detail)
+        return self._named(found.rows, ledger)
+
+    def _handed_on(self, rows: FrameRows, ledger: Ledger, selection: Selection) -> Iterator[Block]:
+        yield from blocks_by_bus(rows, tuple(self._buses), ledger, selection)
+
+    def _named(self, rows: FrameRows, ledger: Ledger) -> FrameRows:
+        """With places among the names of buses instead of channel numbers."""
+        if not len(rows):
+            return rows
+        if rows.bus.min() >= 0 and rows.bus.max() < BUSES_MAX:
+            channels, codes = np.flatnonzero(np.bincount(rows.bus)), None
+        else:
+            channels, codes = np.unique(rows.bus, return_inverse=True)
+        numbers = np.array([bus_number(str(c), self._buses) for c in channels.tolist()], np.int64)
+        if codes is None:
+            table = np.zeros(BUSES_MAX, np.int64)
+            table[channels] = numbers
+            bus = table[rows.bus]
+        else:
+            bus = numbers[codes]
+        named = FrameRows(rows.place, bus, rows.log_ns, rows.frames)
+        if numbers.min() < 0:
+            is_known = named.bus >= 0
+            extra = len(rows) - int(np.count_nonzero(is_known))
+            ledger.drop("", "more buses than a log can have", extra)
+            return named.take(is_known)
+        return named
+
+    def _table(
+        self, source: _Source, records: Records, ledger: Ledger, selection: Selection
+    ) -> Iterator[Block]:
+        count = len(records.rows)
+        log_ns = self._times(source, Words(records.rows, records.first))
+        if log_ns is None:
+            ledger.drop(source.topic, "time out of range", count, f"from record {records.first} on")
+            return
+        ledger.find(source.topic, count)
+        inside = in_time(log_ns, selection)
+        rows = records.rows
+        if inside is not None:
+            ledger.skip(source.topic, NOT_ASKED_TIME, count - int(np.count_nonzero(inside)))
+            if not bool(inside.any()):
+                return
+        table = self._columns(source, Words(rows, records.first), ledger)
+        if inside is not None:
+            log_ns, table = log_ns[inside], table.take(inside)
+        for k in range(0, len(log_ns), BLOCK_ROWS):
+            part = slice(k, k + BLOCK_ROWS)
+            yield Block(source.topic, log_ns[part], table.take(part))
+
+    def _columns(self, source: _Source, words: Words, ledger: Ledger) -> Table:
+        columns: dict[str, NDArray[np.generic]] = {}
+        units: dict[str, str] = {}
+        left_out, unconverted = [], []
+        for channel in source.group.channels:
+            if channel is source.master:
+                continue
+            if not _is_column(channel, source.group):
+                left_out.append(channel.name)
+                continue
+            name = _free(channel.name or "channel", columns)
+            values = physical(channel.conversion, raw(channel, words))
+            bad = invalid(channel, words.records, source.group.value_bytes)
+            if bad is not None:
+                values = np.where(bad, np.nan, values.astype(np.float64))
+            columns[name] = values
+            if not is_applied(channel.conversion):
+                unconverted.append(name)
+            elif channel.unit:
+                units[name] = channel.unit
+        for names, what in (
+            (left_out, "are no single numbers and are left out"),
+            (unconverted, "have a conversion that is not evaluated; raw values are given"),
+        ):
+            if names:
+                some = ", ".join(names[:_NAMES_SHOWN]) + (
+                    ", ..." if len(names) > _NAMES_SHOWN else ""
+                )
+                ledger.notice(f"{source.topic}: {len(names)} channels {what}: {some}")
+        return Table(columns, units)
+
+    def _peek(self) -> None:
+        for stored in self._stored:
+            for source in stored.sources:
+                if source.can is None or source.refusal:
+                    continue
+                if stored.unsorted:
+                    piece = stored.unsorted.piece(0)
+                    some = stored.unsorted.rows(0, source.index) if piece else None
+                else:
+                    records = sorted_records(stored.stream, source.group, 0, _PEEK_ROWS)
+                    some = next(records, None)
+                if some is not None:
+                    for channel in np.unique(source.can.buses(some)).tolist():
+                        bus_number(str(channel), self._buses)
+
+    def _found(self) -> Iterator[_Stored]:
+        names: dict[str, NDArray[np.generic]] = {}
+        try:
+            for data in self._blocks.data_groups(self._header.first_group):
+                stream = Stream(self._blocks, data.data, self._header.unfinished)
+                unsorted = None
+                if data.id_bytes:
+                    unsorted = UnsortedData(stream, data, self._limits.message_bytes)
+                sources = tuple(self._sources_of(data, stream, names))
+                values = {
+                    source.index: self._values(source.can.variable, data, unsorted)
+                    for source in sources
+                    if source.can and source.can.variable
+                }
+                yield _Stored(stream, unsorted, sources, values)
+        except BrokenBlockError as broken:
+            self._broken = str(broken)
+
+    def _values(
+        self, channel: Channel, data: DataGroup, unsorted: UnsortedData | None
+    ) -> VariableValues:
+        for k, group in enumerate(data.groups):
+            if unsorted and group.flags & VLSD_GROUP and group.at == channel.data:
+                by_order = bool(self._header.unfinished & VARIABLE_OFFSETS)
+                return GroupValues(unsorted, k, by_order)
+        return StoredValues(Stream(self._blocks, channel.data, self._header.unfinished))
+
+    def _sources_of(
+        self, data: DataGroup, stream: Stream, names: dict[str, NDArray[np.generic]]
+    ) -> Iterator[_Source]:
+        for k, group in enumerate(data.groups):
+            is_empty = stream.size < group.record_bytes + data.id_bytes and not stream.broken
+            if not group.flags & VLSD_GROUP and (self._declared(group) or not is_empty):
+                yield self._source(k, data, group, names)
+
+    def _declared(self, group: Group) -> int | None:
+        return None if self._header.unfinished & CYCLE_COUNTERS else group.records
+
+    def _source(
+        self, index: int, data: DataGroup, group: Group, names: dict[str, NDArray[np.generic]]
+    ) -> _Source:
+        masters = [c for c in group.channels if c.type in (MASTER, VIRTUAL_MASTER)]
+        master = next((c for c in masters if c.sync == TIME), None)
+        can = can_layout(group)
+        refusal = _refusal(group, master, can)
+        topic = ""
+        # A group of mixed data that declares nothing may still turn out to hold something.
+        if can is None and not refusal:
+            topic = _free(group.name or "group", names)
+            names[topic] = np.zeros(0)
+        return _Source(index, group, master, can, topic, refusal, self._declared(group))
+
+
+def _first_from(t_ns: int, count: int, time_ns: Callable[[int], int]) -> int:
+    """The first of ``count`` chunks that begins at ``t_ns`` or later.
+
+    Guesses by interpolation, since a look into a chunk may cost to inflate it; every other step
+    halves what is left, so that a log with pauses costs no more than twice a bisection.
+    """
+    low, high = 0, count - 1
+    if time_ns(low) >= t_ns:
+        return low
+    if time_ns(high) < t_ns:
+        return count
+    is_guess = True
+    while high - low > 1:
+        middle = (low + high) // 2
+        if is_guess:
+            fraction = (t_ns - time_ns(low)) / max(time_ns(high) - time_ns(low), 1)
+            middle = low + round(fraction * (high - low))
+            middle = min(max(middle, low + 1), high - 1)
+        is_guess = not is_guess
+        if time_ns(middle) < t_ns:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def _settle(source: _Source, account: _Account, ledger: Ledger) -> None:
+    """Compare what was met with what the file declares."""
+    if source.declared is None:
+        return
+    missing = source.declared - account.met - account.dropped
+    name = source.group.name
+    if missing > 0:
+        detail = f"{name}: declared {source.declared}, found {account.met}"
+        ledger.drop(source.topic, "declared by the format, not in its bytes", missing, detail)
+    elif account.met > source.declared:
+        ledger.notice(f"{name}: {source.declared} records declared, {account.met} in the file")
+
+
+def _refusal(group: Group, master: Channel | None, can: CanLayout | None) -> str:
+    """Why a group cannot be read; empty when it can."""
+    if group.flags & REMOTE_MASTER:
+        return "column-oriented storage, not supported"
+    if master is None:
+        return "group without a time channel"
+    if master.type == MASTER and not is_numeric(master, group.value_bytes):
+        return "time channel is no number"
+    if can is None:
+        names = {channel.name for channel in group.channels}
+        if any(name.startswith(("LIN_", "ETH_", "FLX_", "MOST_", "K_LINE_")) for name in names):
+            return "bus that is no CAN"
+        has_numbers = any(_is_column(c, group) for c in group.channels if c is not master)
+        return "" if has_numbers else "group without numbers"
+    return can.refusal
+
+
+def _is_column(channel: Channel, group: Group) -> bool:
+    return not channel.is_array and is_numeric(channel, group.value_bytes)
+
+
+def _free(name: str, taken: dict[str, NDArray[np.generic]]) -> str:
+    """``name``, or with the first number that makes it new."""
+    if name not in taken:
+        return name
+    number = 2
+    while f"{name} ({number})" in taken:
+        number += 1
+    return f"{name} ({number})"

@@ -1,0 +1,158 @@
+"""Values of variable length, which MDF 4 stores away from the records that point at them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Bytes, Int64s
+
+from .records import UnsortedData
+from .stream import Stream
+
+_SPAN: Final = 4 << 20
+_WINDOWS_MAX: Final = 64
+"""Stretches of ``_SPAN`` bytes that the values of one block of records may lie in."""
+
+
+class VariableValues(Protocol):
+    """Values of one channel by what its records hold."""
+
+    def fetch(self, key: Int64s, first: int, width: int) -> tuple[Bytes, Int64s]:
+        """The values of N records.
+
+        Args:
+            key: Shape (N,): what the records hold, negative for impossible ones.
+            first: Index of the first record in its group.
+            width: Bytes wanted of each, 8 or 64.
+
+        Returns:
+            Shape (N, width): their first bytes, then anything; shape (N,): their lengths, -1 for
+            values that are not there or cannot be read.
+        """
+        ...
+
+
+class StoredValues:
+    """Values in a data block of their own, each behind its length, found by their offset."""
+
+    def __init__(self, stream: Stream) -> None:
+        self._stream = stream
+
+    def fetch(self, key: Int64s, first: int, width: int) -> tuple[Bytes, Int64s]:
+        """As ``VariableValues`` says."""
+        payload, length = _nothing(len(key), width)
+        for begin, end, rows in _windows(key):
+            near = key if len(rows) == len(key) else key[rows]
+            for base, content in self._readable(begin, end + 4 + width):
+                _take(content, near - base, rows, payload, length)
+        return payload, length
+
+    def _readable(self, begin: int, end: int) -> Iterator[tuple[int, bytes]]:
+        while begin < end:
+            content = self._stream.read(begin, end - begin)
+            if content:
+                yield begin, content
+            hole = self._stream.hole(begin + len(content), end)
+            if hole is None:
+                return
+            begin = hole.stop
+
+
+class GroupValues:
+    """Values that are records of a group of their own in the same unsorted data."""
+
+    def __init__(self, data: UnsortedData, group: int, by_order: bool) -> None:
+        """Nothing is read yet.
+
+        Args:
+            data: Where they lie.
+            group: Index of their group.
+            by_order: The records' offsets were never written: the n-th value is the n-th record's.
+        """
+        self._data, self.group, self._by_order = data, group, by_order
+        self.first_missed: int | None = None
+        """Offset or index of the first value beyond the last one there is, if any was wanted."""
+
+    def fetch(self, key: Int64s, first: int, width: int) -> tuple[Bytes, Int64s]:
+        """As ``VariableValues`` says."""
+        payload, length = _nothing(len(key), width)
+        if self._by_order:
+            key = np.arange(first, first + len(key))
+        left = np.flatnonzero(key >= 0)
+        while len(left):
+            k = self._data.piece_of(self.group, int(key[left].min()), self._by_order)
+            values = self._data.values(k, self.group)
+            known, end = values.offset, values.end
+            if self._by_order:
+                end = values.first + len(known)
+                known = np.arange(values.first, end)
+            mine = key[left]
+            at = np.minimum(np.searchsorted(known, mine), max(len(known) - 1, 0))
+            is_here = known[at] == mine if len(known) else np.zeros(len(mine), np.bool_)
+            rows, at = left[is_here], at[is_here]
+            start, found = values.start[at], values.length[at]
+            payload[rows] = windowed(values.content, width, start)
+            length[rows] = found
+            # What this piece should hold and does not is nowhere.
+            left = left[~is_here & (mine >= end)]
+            if len(left) and self._data.piece(k + 1) is None:
+                missed = int(key[left].min())
+                before = self.first_missed
+                self.first_missed = missed if before is None else min(before, missed)
+                break
+        return payload, length
+
+
+def _nothing(count: int, width: int) -> tuple[Bytes, Int64s]:
+    return np.zeros((count, width), np.uint8), np.full(count, -1, np.int64)
+
+
+def _windows(key: Int64s) -> Iterator[tuple[int, int, NDArray[np.intp]]]:
+    """First and last offset of the rows whose values lie near each other, and those rows."""
+    rows = np.flatnonzero(key >= 0)
+    if not len(rows):
+        return
+    low, high = int(key[rows].min()), int(key[rows].max())
+    if high - low <= _SPAN:
+        yield low, high, rows
+        return
+    window = key[rows] // _SPAN
+    found, count = np.unique(window, return_counts=True)
+    for one in np.sort(found[np.argsort(-count, kind="stable")][:_WINDOWS_MAX]):
+        some = rows[window == one]
+        yield int(key[some].min()), int(key[some].max()), some
+
+
+def _take(
+    content: bytes, place: Int64s, rows: NDArray[np.intp], payload: Bytes, length: Int64s
+) -> None:
+    """Fill in the values that lie whole in ``content``, at ``place``."""
+    size, width = len(content), payload.shape[1]
+    inside = (place >= 0) & (place + 4 <= size)
+    if not bool(inside.all()):
+        place, rows = place[inside], rows[inside]
+    buffer = np.frombuffer(content + bytes(4 + width), np.uint8)
+    numbers: NDArray[np.uint32] = np.ndarray((size,), np.dtype("<u4"), buffer.data, strides=(1,))
+    found = numbers[place].astype(np.int64)
+    is_whole = place + 4 + found <= size
+    if not bool(is_whole.all()):
+        place, rows, found = place[is_whole], rows[is_whole], found[is_whole]
+    if len(rows) == len(length):
+        np.copyto(payload, windowed(buffer, width, place + 4))
+        np.copyto(length, found)
+        return
+    payload[rows] = windowed(buffer, width, place + 4)
+    length[rows] = found
+
+
+def windowed(buffer: Bytes, width: int, place: Int64s) -> Bytes:
+    """Shape (N, width): the ``width`` bytes, 8 or 64, from each place on."""
+    if width == 8:
+        shape = (len(buffer) - 7,)
+        words: NDArray[np.uint64] = np.ndarray(shape, np.dtype("<u8"), buffer.data, strides=(1,))
+        return words[place].view(np.uint8).reshape(-1, 8)
+    return np.lib.stride_tricks.sliding_window_view(buffer, width)[place]

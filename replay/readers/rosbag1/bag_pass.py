@@ -1,0 +1,458 @@
+"""One pass over a ROS 1 bag: blocks out, every message accounted for."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Block, Bytes, Int64s, Topic
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.readers.mixed import MixedRows, blocks_of
+
+from .chunk import CUT, TOO_LARGE, ChunkRows, Inflated, inflate, read_chunk
+from .index import ChunkUnit, Contents, Gap, units
+from .records import (
+    CHUNK_INFO,
+    CONNECTION,
+    MESSAGE,
+    BagFile,
+    ChunkInfo,
+    Connection,
+    Record,
+    connection_of,
+    tally,
+)
+from .window import BagWindow, find_bag_window
+
+BATCH_BYTES: Final = BLOCK_BYTES // 2
+"""Chunks are copied into buffers of this size, unless one is larger.
+
+NumPy asks the kernel for huge pages from 4 MiB on; a buffer of its own for each chunk costs more in
+page faults than the copy.
+"""
+
+OTHER_TYPE: Final = "another message type on the same topic"
+NO_CONNECTION: Final = "message of an unknown connection"
+TWO_RECORDS: Final = "the records of a connection differ"
+
+
+class Roster:
+    """Which connection carries which topic; grows when a chunk brings a new one."""
+
+    def __init__(self, contents: Contents) -> None:
+        self._contents = contents
+        self._topics: dict[str, Topic] = {}
+        self._first: dict[str, Connection] = {}
+        for number in sorted(contents.connections):
+            self.add(contents.connections[number])
+
+    def add(self, connection: Connection) -> None:
+        """Take in a connection; the first one of a topic decides its type."""
+        self._contents.connections[connection.conn] = connection
+        if connection.topic in self._topics:
+            return
+        self._first[connection.topic] = connection
+        self._topics[connection.topic] = Topic(
+            connection.topic,
+            connection.type_name,
+            encoding="ros1",
+            schema=connection.definition,
+            schema_encoding="ros1msg",
+        )
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """All topics known so far, with the counts that the index section declares."""
+        counts = self._declared()
+        return tuple(
+            Topic(t.name, t.type_name, t.encoding, t.schema, t.schema_encoding, counts.get(t.name))
+            for t in self._topics.values()
+        )
+
+    def topic_of(self, conn: int) -> str:
+        """Topic of a connection; empty if unknown."""
+        connection = self._contents.connections.get(conn)
+        return connection.topic if connection is not None else ""
+
+    def fits_topic(self, conn: int) -> bool:
+        """Has the connection the type that its topic was first met with?"""
+        connection = self._contents.connections[conn]
+        first = self._first[connection.topic]
+        return (connection.type_name, connection.md5sum) == (first.type_name, first.md5sum)
+
+    def knows(self, conn: int) -> bool:
+        """Was there a record of this connection?"""
+        return conn in self._contents.connections
+
+    def _declared(self) -> dict[str, int]:
+        if not self._contents.is_complete:
+            return {}
+        counts: Counter[str] = Counter(dict.fromkeys(self._topics, 0))
+        for info in self._contents.infos.values():
+            for conn, count in info.counts.items():
+                counts[self.topic_of(conn)] += count
+        return dict(counts)
+
+
+@dataclass(slots=True)
+class _Checked:
+    """How many chunks could be checked, by how."""
+
+    bz2: int = 0
+    lz4: int = 0
+    unchecked: int = 0
+    left: int = 0
+
+    def words(self) -> str:
+        """The sentence for ``Ledger.integrity``."""
+        said = [
+            f"{name} checksums verified in {count} chunks"
+            for name, count in (("bz2", self.bz2), ("lz4", self.lz4))
+            if count
+        ]
+        if self.unchecked:
+            said.append(
+                f"{self.unchecked} chunks carry no checksum: a changed payload byte in them cannot "
+                "be seen"
+            )
+        if self.left:
+            read = self.bz2 + self.lz4 + self.unchecked
+            verb = "was" if read == 1 else "were"
+            verified = " and verified" if read and not self.unchecked else ""
+            said.append(
+                f"of {read + self.left} chunks {read} {verb} read{verified}; the rest was not"
+            )
+        return "; ".join(said) or "no chunk read, nothing to check"
+
+
+@dataclass(slots=True)
+class _Batch:
+    """Rows of several chunks waiting to become blocks."""
+
+    buffer: Bytes | None = None
+    conn: list[Int64s] = field(default_factory=list)
+    log_ns: list[Int64s] = field(default_factory=list)
+    start: list[Int64s] = field(default_factory=list)
+    stop: list[Int64s] = field(default_factory=list)
+    size: int = 0
+    count: int = 0
+
+    def has_room(self, raw: bytes) -> bool:
+        """Can ``raw`` be added? An empty batch takes any size."""
+        return not self.size or (self.size + len(raw) <= BATCH_BYTES and self.count < BLOCK_ROWS)
+
+    def add(self, raw: bytes, rows: ChunkRows) -> None:
+        """Add a chunk for which there is room."""
+        content = np.frombuffer(raw, dtype=np.uint8)
+        if self.buffer is None:
+            is_large = len(raw) > BATCH_BYTES
+            self.buffer = content if is_large else np.empty(BATCH_BYTES, dtype=np.uint8)
+        if self.buffer is not content:
+            self.buffer[self.size : self.size + len(raw)] = content
+        self.conn.append(rows.conn)
+        self.log_ns.append(rows.log_ns)
+        self.start.append(rows.start + self.size)
+        self.stop.append(rows.stop + self.size)
+        self.size += len(raw)
+        self.count += len(rows.conn)
+
+
+class Pass:
+    """The state of one ``read``."""
+
+    def __init__(
+        self,
+        file: BagFile,
+        first: int,
+        contents: Contents,
+        roster: Roster,
+        limits: Limits,
+        ledger: Ledger,
+        selection: Selection,
+        chunk_count: int,
+    ) -> None:
+        self._chunk_count = chunk_count
+        self._inside: BagWindow | None = None
+        self._doubt = ""
+        self._file = file
+        self._first = first
+        self._contents = contents
+        self._roster = roster
+        self._limits = limits
+        self._ledger = ledger
+        self._selection = selection
+        self._batch = _Batch()
+        self._checked = _Checked()
+
+    def blocks(self, index_at: int) -> Iterator[Block]:
+        """Everything, in stored order.
+
+        Args:
+            index_at: Where the bag header says that the index section begins, or 0.
+        """
+        for topic in self._roster.topics:
+            self._ledger.declare(topic.name, topic.declared)
+        for connection in self._contents.connections.values():
+            self._say_if_renamed(connection)
+        try:
+            window = self._window(index_at)
+            if window is None:
+                known = sorted(self._contents.infos)
+                yield from self._taken(
+                    units(self._file, self._first, known, self._limits), index_at
+                )
+            else:
+                yield from self._windowed(window, index_at)
+        except OSError as error:
+            self._ledger.drop("", "file cannot be read on", None, str(error.strerror or error))
+        yield from self._flush()
+        for name in [t.name for t in self._roster.topics]:
+            self._ledger.settle(name)
+        self._ledger.integrity = self._checked.words()
+
+    def _window(self, index_at: int) -> BagWindow | None:
+        """Where what was asked for lies, if the index can be trusted; else the reason is told."""
+        if self._selection == EVERYTHING:
+            return None
+        found = find_bag_window(
+            self._contents, self._first, index_at, self._chunk_count, self._selection
+        )
+        if isinstance(found, BagWindow):
+            return found
+        self._ledger.notice(f"the part asked for was found by walking through the bag: {found}")
+        return None
+
+    def _windowed(self, window: BagWindow, index_at: int) -> Iterator[Block]:
+        """Blocks of the chunks that the index names; the others are looked at if it is wrong."""
+        self._inside = window
+        self._file.expect(window.ranges())
+        yield from self._taken(window.units(self._file, self._limits), index_at)
+        self._inside = None
+        if self._doubt:
+            self._ledger.notice(
+                f"the index was not trusted after all ({self._doubt}); every chunk was looked at"
+            )
+            others = window.units(self._file, self._limits, is_read=False)
+            yield from self._taken(others, index_at)
+            return
+        for info in window.left:
+            self._checked.left += 1
+            self._pass_over(info, self._selection)
+
+    def _taken(self, found: Iterator[ChunkUnit | Record | Gap], index_at: int) -> Iterator[Block]:
+        for unit in found:
+            taken = None
+            if isinstance(unit, ChunkUnit):
+                taken = self._chunk(unit)
+            elif isinstance(unit, Gap):
+                self._doubt = self._doubt or f"bytes {unit.at} to {unit.stop} are damaged"
+                self._gap(unit, index_at)
+            else:
+                taken = self._record(unit)
+            if taken is not None:
+                if not self._batch.has_room(taken[0]):
+                    yield from self._flush()
+                self._batch.add(*taken)
+
+    def _pass_over(self, info: ChunkInfo, asked: Selection) -> None:
+        """Account for a chunk's messages, none of which is asked for, without reading them."""
+        for conn, count in info.counts.items():
+            name = self._roster.topic_of(conn)
+            self._ledger.find(name, count)
+            reason = NOT_ASKED_TIME if asked.wants(name) else NOT_ASKED_TOPIC
+            self._ledger.skip(name, reason, count)
+
+    def _record(self, record: Record) -> tuple[bytes, ChunkRows] | None:
+        """Take in a record outside chunks; a message as a chunk of its own."""
+        if record.op == MESSAGE:
+            if record.size > self._limits.message_bytes:
+                self._ledger.drop(
+                    self._roster.topic_of(record.u32(b"conn")),
+                    "message over the size limit",
+                    1,
+                    f"{record.size} bytes at byte {record.at}",
+                )
+                return None
+            raw = self._file.bytes_at(record.body, record.end)
+            conn, log_ns, start, stop = (
+                np.array([value], dtype=np.int64)
+                for value in (record.u32(b"conn"), record.time_ns(b"time"), 0, len(raw))
+            )
+            return raw, ChunkRows(conn, log_ns, start, stop)
+        if record.op == CONNECTION and record.size <= 2 * self._limits.schema_bytes:
+            body = self._file.bytes_at(record.body, record.end)
+            connection = connection_of(record, body, self._limits.schema_bytes)
+            if connection is not None:
+                self._meet(connection, is_checked=False)
+        elif record.op == CHUNK_INFO and record.u64(b"chunk_pos") not in self._contents.infos:
+            self._ledger.notice(f"damaged chunk info at byte {record.at}; it is only an index")
+        return None
+
+    def _meet(self, connection: Connection, is_checked: bool) -> None:
+        known = self._contents.connections.get(connection.conn)
+        if known is None:
+            self._roster.add(connection)
+            self._say_if_renamed(connection)
+        elif known != connection:
+            detail = (
+                f"connection {connection.conn}: {known.topic} ({known.type_name}) and "
+                f"{connection.topic} ({connection.type_name})"
+            )
+            if is_checked:
+                self._roster.add(connection)
+                self._ledger.notice(f"{TWO_RECORDS}, the one with a checksum was used: {detail}")
+            else:
+                self._ledger.drop(known.topic, TWO_RECORDS, None, detail)
+
+    def _say_if_renamed(self, connection: Connection) -> None:
+        if connection.topic != connection.published:
+            self._ledger.notice(
+                f"connection {connection.conn} is stored as {connection.topic}, but was published "
+                f"as {connection.published}: renamed, or damaged"
+            )
+
+    def _gap(self, gap: Gap, index_at: int) -> None:
+        where = f"bytes {gap.at} to {gap.stop}"
+        if self._contents.infos and self._contents.is_complete:
+            missing: Counter[int] = Counter()
+            for info in self._contents.infos.values():
+                if gap.at <= info.at < gap.stop:
+                    missing.update(info.counts)
+            self._lose(missing, "damaged record", where)
+        elif 0 < index_at <= gap.at:
+            self._ledger.notice(f"the index section is damaged: {where}")
+        else:
+            reason = CUT if gap.stop == self._file.size else "damaged record"
+            self._ledger.drop("", reason, None, where)
+
+    def _lose(self, missing: Counter[int], reason: str, detail: str) -> None:
+        """Account for a known number of rows by connection; none at all is only a notice."""
+        for conn, count in missing.items():
+            self._ledger.drop(self._roster.topic_of(conn), reason, max(count, 0), detail)
+        if not any(count > 0 for count in missing.values()):
+            self._ledger.notice(f"{reason}, no message lost: {detail}")
+
+    def _chunk(self, unit: ChunkUnit) -> tuple[bytes, ChunkRows] | None:
+        """The records of a chunk and the messages in them, accounted for."""
+        if self._inside is not None and not self._is_as_indexed(unit):
+            self._doubt = self._doubt or f"it does not fit the chunk at byte {unit.record.at}"
+        if self._is_skipped(unit):
+            return None
+        size = unit.record.u32(b"size")
+        where = f"chunk at byte {unit.record.at}"
+        if max(size, unit.stored_stop - unit.record.body) > self._limits.chunk_bytes and (
+            unit.is_framed or size > self._limits.chunk_bytes
+        ):
+            detail = f"{where}: {size} bytes, limit {self._limits.chunk_bytes} (--max-chunk)"
+            self._short(unit, Counter(), TOO_LARGE, detail)
+            return None
+        stop = min(unit.stored_stop, unit.record.body + self._limits.chunk_bytes)
+        stored = self._file.bytes_at(unit.record.body, stop)
+        inflated = inflate(unit.record.fields[b"compression"], stored, size, unit.is_framed)
+        limits = self._limits
+        rows = read_chunk(inflated, unit.entries, limits.schema_bytes, limits.records_per_chunk)
+        for connection in rows.connections:
+            self._meet(connection, inflated.is_checked)
+        self._count_check(unit, inflated)
+        self._compare(unit, inflated, rows, where)
+        return inflated.raw, rows
+
+    def _count_check(self, unit: ChunkUnit, inflated: Inflated) -> None:
+        if not inflated.is_checked:
+            self._checked.unchecked += 1
+        elif unit.record.fields[b"compression"] == b"bz2":
+            self._checked.bz2 += 1
+        else:
+            self._checked.lz4 += 1
+
+    def _compare(self, unit: ChunkUnit, inflated: Inflated, rows: ChunkRows, where: str) -> None:
+        found = Counter(rows.counts())
+        if rows.fault:
+            inside = f", byte {rows.fault_at} of it" if rows.fault_at >= 0 else ""
+            sizes = f": {inflated.sizes}" if inflated.sizes else ""
+            self._short(unit, found, rows.fault, where + inside + sizes)
+            return
+        if unit.entries is not None and unit.entries.counts() != found:
+            self._ledger.notice(f"the index behind the {where} is damaged; it was not used")
+            if not inflated.is_checked:
+                self._lose(Counter(unit.entries.counts()) - found, "listed in the index", where)
+
+    def _short(self, unit: ChunkUnit, found: Counter[int], reason: str, detail: str) -> None:
+        """Account for what a damaged chunk must have held beyond what was found in it."""
+        expected: Counter[int] = Counter()
+        info = self._contents.infos.get(unit.record.at)
+        if info is not None:
+            expected |= Counter(info.counts)
+        if unit.entries is not None:
+            expected |= Counter(unit.entries.counts())
+        if expected:
+            self._lose(expected - found, reason, detail)
+        else:
+            self._ledger.drop("", reason, None, detail)
+
+    def _is_as_indexed(self, unit: ChunkUnit) -> bool:
+        """Do the index section and the index records behind the chunk say the same of it?"""
+        info, entries = self._contents.infos.get(unit.record.at), unit.entries
+        if info is None or entries is None or not len(entries) or not unit.is_framed:
+            return False
+        span = int(entries.log_ns.min()), int(entries.log_ns.max())
+        return (*span, entries.counts()) == (info.start_ns, info.end_ns, info.counts)
+
+    def _is_skipped(self, unit: ChunkUnit) -> bool:
+        """Leave the chunk compressed if both of its indexes agree that nothing in it is wanted."""
+        asked = self._selection
+        info = self._contents.infos.get(unit.record.at)
+        if info is None or not self._is_as_indexed(unit):
+            return False
+        if not all(self._roster.knows(conn) for conn in info.counts):
+            return False
+        is_outside = (asked.start_ns is not None and info.end_ns < asked.start_ns) or (
+            asked.end_ns is not None and info.start_ns >= asked.end_ns
+        )
+        names = {conn: self._roster.topic_of(conn) for conn in info.counts}
+        if not is_outside and any(asked.wants(name) for name in names.values()):
+            return False
+        self._checked.left += 1
+        self._pass_over(info, asked)
+        return True
+
+    def _flush(self) -> Iterator[Block]:
+        batch, self._batch = self._batch, _Batch()
+        if batch.buffer is None or not batch.count:
+            return
+        conn = np.concatenate(batch.conn)
+        names: list[str] = []
+        place: dict[int, int] = {}
+        for number, count in tally(conn).items():
+            name = self._roster.topic_of(number)
+            if not self._roster.knows(number):
+                self._ledger.drop("", NO_CONNECTION, count, f"connection {number}")
+            elif not self._roster.fits_topic(number):
+                self._ledger.find(name, count)
+                self._ledger.skip(name, OTHER_TYPE, count, f"connection {number}")
+            else:
+                if name not in names:
+                    names.append(name)
+                place[number] = names.index(name)
+        topic = _looked_up(conn, place)
+        keep = topic >= 0
+        columns = (np.concatenate(c) for c in (batch.log_ns, batch.start, batch.stop))
+        log_ns, start, stop = (column[keep] for column in columns)
+        rows = MixedRows(batch.buffer[: batch.size], topic[keep], log_ns, start, stop)
+        yield from blocks_of(rows, names, self._selection, self._limits, self._ledger)
+
+
+def _looked_up(conn: Int64s, place: dict[int, int]) -> Int64s:
+    """``place`` of each connection number, -1 for those that have none."""
+    numbers = np.array(sorted(place), dtype=np.int64)
+    if not len(numbers):
+        return np.full(len(conn), -1, dtype=np.int64)
+    places = np.array([place[int(n)] for n in numbers], dtype=np.int64)
+    at = np.minimum(np.searchsorted(numbers, conn), len(numbers) - 1)
+    return np.where(numbers[at] == conn, places[at], -1)

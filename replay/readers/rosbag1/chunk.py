@@ -1,0 +1,467 @@
+"""One chunk of a ROS 1 bag: inflate it within bounds and find the messages in it, as columns.
+
+The chunk's own bytes decide. The index records behind a chunk serve to find its messages without a
+step per message, and are believed only if the messages then tile the chunk exactly and say the same
+connection and time themselves. Where the bytes are damaged, the index shows where to go on.
+"""
+
+from __future__ import annotations
+
+import bz2
+import struct
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Bytes, Int64s
+
+from .records import (
+    CONNECTION,
+    MESSAGE,
+    Connection,
+    Entries,
+    Record,
+    connection_of,
+    kind_of,
+    parse_fields,
+    record_at,
+    tally,
+    time_ns,
+)
+
+DAMAGED_BYTES: Final = "damaged bytes in a chunk"
+DISAGREES: Final = "record and index disagree"
+INFLATE: Final = "damaged compressed chunk"
+CUT: Final = "file is cut"
+TOO_LARGE: Final = "chunk over the size limit"
+TOO_MANY: Final = "more records in a chunk than the limit"
+
+_HEADER: Final = 38
+"""Length of a message record's header: op, conn and time, in any order."""
+_HEAD: Final = 4 + _HEADER + 4
+_U32 = struct.Struct("<I")
+_FIRST_RUN: Final = 16
+_IN_A_ROW: Final = 3
+"""Plausible messages in a row that are believed behind damaged bytes without an index."""
+_DAY_NS: Final = 86_400 * 10**9
+_LONGEST_RUN: Final = 65_536
+
+
+@dataclass(frozen=True, slots=True)
+class Inflated:
+    """What came out of a chunk's stored bytes.
+
+    Attributes:
+        raw: The records.
+        is_checked: A checksum over all of ``raw`` was verified.
+        fault: Why ``raw`` is not the whole chunk, or empty.
+        sizes: What was declared and what came out, where they differ; else empty.
+    """
+
+    raw: bytes
+    is_checked: bool
+    fault: str = ""
+    sizes: str = ""
+
+
+def inflate(compression: bytes, stored: bytes, size: int, is_framed: bool) -> Inflated:
+    """The records of a chunk, never more than ``size`` bytes of them.
+
+    Args:
+        compression: As the chunk's header says it.
+        stored: The chunk's body; runs on into later bytes where its length is not known.
+        size: Inflated size that the header declares; the caller has held it to the limit.
+        is_framed: ``stored`` is exactly the body.
+    """
+    if compression == b"none":
+        raw = stored if is_framed else stored[:size]
+        return Inflated(raw, is_checked=False, fault=CUT if len(raw) < size else "")
+    try:
+        if compression == b"bz2":
+            return _inflate_bz2(stored, size)
+        if compression == b"lz4":
+            return _inflate_lz4(stored, size)
+    except (OSError, ValueError, EOFError, RuntimeError, MemoryError):
+        return Inflated(b"", is_checked=False, fault=INFLATE)
+    return Inflated(b"", is_checked=False, fault="chunk with an unknown compression")
+
+
+def _inflate_bz2(stored: bytes, size: int) -> Inflated:
+    stream = bz2.BZ2Decompressor()
+    raw = stream.decompress(stored, max_length=size + 1)
+    return _ended(raw, size, stream.eof, is_checked=True)
+
+
+def _inflate_lz4(stored: bytes, size: int) -> Inflated:
+    from lz4.frame import LZ4FrameDecompressor
+
+    stream = LZ4FrameDecompressor()
+    raw = stream.decompress(stored, max_length=size + 1)
+    is_checked = len(stored) > 4 and bool(stored[4] & 0x14)
+    return _ended(raw, size, bool(stream.eof), is_checked)
+
+
+def _ended(raw: bytes, size: int, is_at_end: bool, is_checked: bool) -> Inflated:
+    if is_at_end and len(raw) == size:
+        return Inflated(raw, is_checked)
+    if is_at_end or len(raw) > size:
+        produced = "more" if len(raw) > size else f"{len(raw)} bytes"
+        sizes = f"inflates to {produced}, declares {size} bytes"
+        return Inflated(b"", is_checked=False, fault=INFLATE, sizes=sizes)
+    return Inflated(raw, is_checked=False, fault=CUT)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChunkRows:
+    """The messages of one chunk, in stored order.
+
+    Attributes:
+        conn: Shape (N,), int64: connection of each message.
+        log_ns: Shape (N,), int64.
+        start: Shape (N,), int64: first payload byte.
+        stop: Shape (N,), int64: one past the last.
+        connections: Connection records met.
+        fault: Why there may have been more, or empty.
+        fault_at: Where in the inflated chunk the fault was met, or -1.
+    """
+
+    conn: Int64s
+    log_ns: Int64s
+    start: Int64s
+    stop: Int64s
+    connections: tuple[Connection, ...] = ()
+    fault: str = ""
+    fault_at: int = -1
+
+    def counts(self) -> dict[int, int]:
+        """Messages by connection."""
+        return tally(self.conn)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Layout:
+    """Where one writer puts the fields of a message record's header.
+
+    Attributes:
+        head: Shape (46,), uint8: a head of that layout.
+        is_fixed: Shape (46,), bool: bytes equal in all heads of the layout.
+        conn: Offset of the connection number.
+        time: Offset of the time.
+    """
+
+    head: Bytes
+    is_fixed: NDArray[np.bool_]
+    conn: int
+    time: int
+
+
+def _layout_of(head: bytes) -> _Layout | None:
+    if len(head) < _HEAD or _U32.unpack_from(head, 0)[0] != _HEADER:
+        return None
+    header = head[4 : 4 + _HEADER]
+    if kind_of(parse_fields(header)) != MESSAGE:
+        return None
+    places: dict[bytes, int] = {}
+    at = 4
+    while at < 4 + _HEADER:
+        size = _U32.unpack_from(head, at)[0]
+        places[bytes(head[at + 4 : at + 4 + size].partition(b"=")[0])] = at
+        at += 4 + size
+    conn, time = places[b"conn"] + 9, places[b"time"] + 9
+    is_fixed = np.ones(_HEAD, dtype=np.bool_)
+    is_fixed[conn : conn + 4] = False
+    is_fixed[time : time + 8] = False
+    is_fixed[_HEAD - 4 :] = False
+    return _Layout(np.frombuffer(head, dtype=np.uint8, count=_HEAD), is_fixed, conn, time)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Heads:
+    """Columns read from message heads at given offsets; ``fits`` says where they are heads."""
+
+    fits: NDArray[np.bool_]
+    conn: Int64s
+    log_ns: Int64s
+    stop: Int64s
+
+
+def _heads(buffer: Bytes, at: Int64s, layout: _Layout) -> _Heads:
+    heads = sliding_window_view(buffer, _HEAD)[at]
+    fits = (heads[:, layout.is_fixed] == layout.head[layout.is_fixed]).all(axis=1)
+    conn = _u32(heads, layout.conn)
+    log_ns = _u32(heads, layout.time) * 1_000_000_000 + _u32(heads, layout.time + 4)
+    return _Heads(fits, conn, log_ns, at + _HEAD + _u32(heads, _HEAD - 4))
+
+
+def _u32(heads: Bytes, at: int) -> Int64s:
+    return heads[:, at : at + 4].copy().view("<u4")[:, 0].astype(np.int64)
+
+
+def read_chunk(
+    inflated: Inflated, entries: Entries | None, largest: int, most_records: int
+) -> ChunkRows:
+    """The messages of an inflated chunk.
+
+    Args:
+        inflated: Its records.
+        entries: What the index records behind it say, or None where there are none.
+        largest: Most bytes of a message definition.
+        most_records: Most records to take from one chunk.
+    """
+    if entries is not None and len(entries) and not inflated.fault:
+        rows = _by_index(inflated.raw, entries, largest)
+        if rows is not None and len(rows.conn) <= most_records:
+            return rows
+    return _by_steps(inflated, entries, largest, most_records)
+
+
+def _by_index(raw: bytes, entries: Entries, largest: int) -> ChunkRows | None:
+    """Rows at the index's offsets if they and connection records tile ``raw`` exactly."""
+    buffer = np.frombuffer(raw, dtype=np.uint8)
+    at = entries.offset
+    if at[-1] + _HEAD > len(raw):
+        return None
+    layout = _layout_of(raw[at[0] : at[0] + _HEAD])
+    if layout is None:
+        return None
+    heads = _heads(buffer, at, layout)
+    agrees = heads.fits & (heads.conn == entries.conn) & (heads.log_ns == entries.log_ns)
+    if not agrees.all():
+        return None
+    ends = np.concatenate(([0], heads.stop))
+    starts = np.concatenate((at, [len(raw)]))
+    connections: list[Connection] = []
+    for gap in np.flatnonzero(ends != starts):
+        found = _connections_between(raw, int(ends[gap]), int(starts[gap]), largest)
+        if found is None:
+            return None
+        connections += found
+    return ChunkRows(heads.conn, heads.log_ns, at + _HEAD, heads.stop, tuple(connections))
+
+
+def _connections_between(raw: bytes, at: int, stop: int, largest: int) -> list[Connection] | None:
+    found: list[Connection] = []
+    while at < stop:
+        record = record_at(memoryview(raw), at)
+        if record is None or record.op != CONNECTION or record.end > stop:
+            return None
+        connection = connection_of(record, raw[record.body : record.end], largest)
+        if connection is None:
+            return None
+        found.append(connection)
+        at = record.end
+    return found if at == stop else None
+
+
+@dataclass(slots=True)
+class _Steps:
+    """Rows gathered in stretches while stepping through a chunk."""
+
+    at: list[Int64s] = field(default_factory=list)
+    conn: list[Int64s] = field(default_factory=list)
+    log_ns: list[Int64s] = field(default_factory=list)
+    start: list[Int64s] = field(default_factory=list)
+    stop: list[Int64s] = field(default_factory=list)
+    connections: list[Connection] = field(default_factory=list)
+    count: int = 0
+
+    def add(self, at: Int64s, conn: Int64s, log_ns: Int64s, start: Int64s, stop: Int64s) -> None:
+        self.at.append(at)
+        self.conn.append(conn)
+        self.log_ns.append(log_ns)
+        self.start.append(start)
+        self.stop.append(stop)
+        self.count += len(at)
+
+    def drop_last(self, stop: int) -> None:
+        """Forget the last row if it ends at ``stop``: nothing confirms its length."""
+        if self.stop and len(self.stop[-1]) and self.stop[-1][-1] == stop:
+            for column in (self.at, self.conn, self.log_ns, self.start, self.stop):
+                column[-1] = column[-1][:-1]
+
+
+def _by_steps(
+    inflated: Inflated, entries: Entries | None, largest: int, most_records: int
+) -> ChunkRows:
+    """Rows found by stepping from record to record, over damage with the index's help."""
+    raw = inflated.raw
+    steps = _Steps()
+    at, records, run = 0, 0, _FIRST_RUN
+    fault, fault_at = inflated.fault, -1
+    while at < len(raw):
+        if records > most_records:
+            fault, fault_at = TOO_MANY, at
+            break
+        taken, at = _run_of_messages(raw, at, steps, run)
+        records += taken + 1
+        run = min(2 * run, _LONGEST_RUN) if taken == run else _FIRST_RUN
+        if taken == run or at >= len(raw):
+            continue
+        after = _one_record(raw, at, steps, largest)
+        if after is not None:
+            at = after
+            continue
+        onward = _next_plausible(raw, at, steps) if entries is None else None
+        onward = onward or _next_confirmed(raw, at, entries)
+        is_tail_of_cut = inflated.fault == CUT and onward is None
+        if fault_at < 0:
+            fault, fault_at = fault or DAMAGED_BYTES, at
+        if not is_tail_of_cut and (entries is None or at not in entries.offset):
+            steps.drop_last(at)
+        if onward is None:
+            break
+        at = onward
+    rows = _joined(steps, fault, fault_at)
+    if entries is None or inflated.is_checked:
+        return rows
+    return _without_disputed(raw, rows, _all(steps.at), entries)
+
+
+def _joined(steps: _Steps, fault: str, fault_at: int) -> ChunkRows:
+    return ChunkRows(
+        _all(steps.conn),
+        _all(steps.log_ns),
+        _all(steps.start),
+        _all(steps.stop),
+        tuple(steps.connections),
+        fault,
+        fault_at,
+    )
+
+
+def _all(parts: list[Int64s]) -> Int64s:
+    return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
+
+
+def _run_of_messages(raw: bytes, at: int, steps: _Steps, most: int) -> tuple[int, int]:
+    """Up to ``most`` message records of one layout from ``at`` on; their number and the end."""
+    layout = _layout_of(raw[at : at + _HEAD])
+    if layout is None:
+        return 0, at
+    places: list[int] = []
+    here, size = at, len(raw)
+    unpack = _U32.unpack_from
+    while len(places) < most and here + _HEAD <= size and unpack(raw, here)[0] == _HEADER:
+        after = here + _HEAD + unpack(raw, here + _HEAD - 4)[0]
+        if after > size:
+            break
+        places.append(here)
+        here = after
+    if not places:
+        return 0, at
+    offsets = np.array(places, dtype=np.int64)
+    heads = _heads(np.frombuffer(raw, dtype=np.uint8), offsets, layout)
+    good = len(places) if heads.fits.all() else int(np.argmin(heads.fits))
+    part = slice(0, good)
+    steps.add(
+        offsets[part],
+        heads.conn[part],
+        heads.log_ns[part],
+        offsets[part] + _HEAD,
+        heads.stop[part],
+    )
+    return good, int(heads.stop[good - 1])
+
+
+def _one_record(raw: bytes, at: int, steps: _Steps, largest: int) -> int | None:
+    """Take a connection record or an unusual message record; where it ends, or None if damaged."""
+    record = record_at(memoryview(raw), at)
+    if record is None or record.end > len(raw):
+        return None
+    if record.op == MESSAGE:
+        columns = (
+            at,
+            record.u32(b"conn"),
+            record.time_ns(b"time"),
+            record.body,
+            record.end,
+        )
+        steps.add(*(np.array([value], dtype=np.int64) for value in columns))
+        return record.end
+    if record.op != CONNECTION:
+        return None
+    connection = connection_of(record, raw[record.body : record.end], largest)
+    if connection is None:
+        return None
+    steps.connections.append(connection)
+    return record.end
+
+
+def _next_confirmed(raw: bytes, at: int, entries: Entries | None) -> int | None:
+    """The next offset the index names at which a message says what the index says."""
+    if entries is None:
+        return None
+    first = int(np.searchsorted(entries.offset, at, side="right"))
+    for i in range(first, len(entries)):
+        if _is_confirmed(raw, entries, i) is not None:
+            return int(entries.offset[i])
+    return None
+
+
+def _next_plausible(raw: bytes, at: int, steps: _Steps) -> int | None:
+    """Without an index: the next offset at which messages stand in a row.
+
+    The message that led to ``at`` may have a damaged length, so the search begins within it.
+    """
+    begin = at + 1
+    if steps.stop and len(steps.stop[-1]) and steps.stop[-1][-1] == at:
+        begin = int(steps.at[-1][-1]) + 1
+    known = {int(conn) for part in steps.conn for conn in np.unique(part)}
+    last_ns = next((int(part[-1]) for part in reversed(steps.log_ns) if len(part)), None)
+    found = raw.find(_U32.pack(_HEADER), begin)
+    while found >= 0:
+        if _stands_in_a_row(raw, found, known, last_ns):
+            return found
+        found = raw.find(_U32.pack(_HEADER), found + 1)
+    return None
+
+
+def _stands_in_a_row(raw: bytes, at: int, known: set[int], near_ns: int | None) -> bool:
+    """Do ``_IN_A_ROW`` messages of known connections and near times follow, or fewer to the end?"""
+    for _ in range(_IN_A_ROW):
+        if at == len(raw):
+            return True
+        record = record_at(memoryview(raw)[at : at + _HEAD], 0, at)
+        if record is None or record.op != MESSAGE or record.end > len(raw):
+            return False
+        if known and record.u32(b"conn") not in known:
+            return False
+        near_ns = record.time_ns(b"time") if near_ns is None else near_ns
+        if abs(record.time_ns(b"time") - near_ns) > _DAY_NS:
+            return False
+        at = record.end
+    return True
+
+
+def _is_confirmed(raw: bytes, entries: Entries, i: int) -> Record | None:
+    record = record_at(memoryview(raw), int(entries.offset[i]))
+    if record is None or record.op != MESSAGE or record.end > len(raw):
+        return None
+    same = record.u32(b"conn") == entries.conn[i] and (
+        time_ns(record.fields[b"time"]) == entries.log_ns[i]
+    )
+    return record if same else None
+
+
+def _without_disputed(raw: bytes, rows: ChunkRows, at: Int64s, entries: Entries) -> ChunkRows:
+    """Drop rows that the index contradicts; no checksum says which of the two is right."""
+    if not len(at) or not len(entries):
+        return rows
+    place = np.minimum(np.searchsorted(entries.offset, at), len(entries) - 1)
+    is_listed = entries.offset[place] == at
+    differs = (entries.conn[place] != rows.conn) | (entries.log_ns[place] != rows.log_ns)
+    is_bad = is_listed & differs
+    for i in np.flatnonzero(~np.isin(entries.offset, at)):
+        if _is_confirmed(raw, entries, int(i)) is not None:
+            covering = int(np.searchsorted(at, entries.offset[i])) - 1
+            if covering >= 0 and entries.offset[i] < rows.stop[covering]:
+                is_bad[covering] = True
+    if not is_bad.any():
+        return rows
+    keep = ~is_bad
+    fault_at = int(at[np.argmax(is_bad)]) if rows.fault_at < 0 else rows.fault_at
+    columns = (rows.conn[keep], rows.log_ns[keep], rows.start[keep], rows.stop[keep])
+    return ChunkRows(*columns, rows.connections, rows.fault or DISAGREES, fault_at)

@@ -1,0 +1,223 @@
+"""What a ROS 1 bag holds, learnt from its index section or, without one, by walking its records."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+from crosscue.replay.limits import Limits
+
+from .chunk import inflate, read_chunk
+from .records import (
+    CHUNK,
+    CHUNK_INFO,
+    CONNECTION,
+    INDEX,
+    BagFile,
+    ChunkInfo,
+    Connection,
+    Entries,
+    Record,
+    chunk_info_of,
+    connection_of,
+    entries_of,
+    record_at,
+)
+
+ENTRY_BYTES: Final = 12
+_SEARCHED_AT_ONCE: Final = 4 << 20
+_CHUNK_OP: Final = b"\x04\x00\x00\x00op=\x05"
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkUnit:
+    """A chunk with the index records behind it.
+
+    Attributes:
+        record: The chunk record.
+        stored_stop: One past the last byte that may belong to its body.
+        is_framed: Its length leads to another record or the file's end, so it is right.
+        end: Where the next unit begins.
+        entries: Index records, or None if there are none or they are damaged.
+    """
+
+    record: Record
+    stored_stop: int
+    is_framed: bool
+    end: int
+    entries: Entries | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Bytes that are no record.
+
+    Attributes:
+        at: First of them.
+        stop: Where the next chunk was found, or the file's end.
+    """
+
+    at: int
+    stop: int
+
+
+@dataclass(slots=True)
+class Contents:
+    """What is known about a bag before its chunks are inflated.
+
+    Attributes:
+        connections: By number; the first record met of each.
+        infos: By byte offset of the chunk.
+        is_complete: ``infos`` name every chunk of the file.
+    """
+
+    connections: dict[int, Connection] = field(default_factory=dict)
+    infos: dict[int, ChunkInfo] = field(default_factory=dict)
+    is_complete: bool = False
+
+
+def read_index(file: BagFile, index_at: int, largest: int) -> Contents | None:
+    """The index section at ``index_at``; None unless its records fill the file to its end."""
+    contents = Contents(is_complete=True)
+    at = index_at
+    while at < file.size:
+        record = file.whole_record(at)
+        if record is None or not learn(file, record, contents, largest):
+            return None
+        at = record.end
+    return contents if at == file.size else None
+
+
+def learn(file: BagFile, record: Record, contents: Contents, largest: int) -> bool:
+    """Take in a connection or chunk info record; False if it is another kind or damaged."""
+    if record.size > 2 * largest:
+        return False
+    body = file.bytes_at(record.body, record.end)
+    if record.op == CONNECTION and (connection := connection_of(record, body, largest)):
+        contents.connections.setdefault(connection.conn, connection)
+        return True
+    if record.op == CHUNK_INFO and (info := chunk_info_of(record, body)):
+        contents.infos[info.at] = info
+        return True
+    return False
+
+
+def units(
+    file: BagFile, first: int, known: list[int], limits: Limits
+) -> Iterator[ChunkUnit | Record | Gap]:
+    """Everything in the file in order: chunks with their index, other records, gaps.
+
+    Args:
+        file: The bag.
+        first: Byte offset of the first record.
+        known: Sorted byte offsets at which the index says that a chunk begins.
+        limits: Bounds on what an index may hold.
+    """
+    at = first
+    while at < file.size:
+        record = file.record(at)
+        if record is not None and record.op == CHUNK:
+            unit = _chunk_unit(file, record, known, limits)
+            yield unit
+            at = unit.end
+        elif record is not None and record.end <= file.size:
+            yield record
+            at = record.end
+        else:
+            onward = next_chunk(file, at + 1, known)
+            stop = file.size if onward is None else onward
+            yield Gap(at, stop)
+            at = stop
+
+
+def _chunk_unit(file: BagFile, record: Record, known: list[int], limits: Limits) -> ChunkUnit:
+    if record.end == file.size:
+        return ChunkUnit(record, record.end, is_framed=True, end=record.end)
+    if record.end < file.size and file.record(record.end) is not None:
+        entries, end = _index_records(file, record.end, limits)
+        return ChunkUnit(record, record.end, True, end, entries)
+    onward = next_chunk(file, record.body, known)
+    stop = file.size if onward is None else onward
+    if record.end <= stop and record.u32(b"size") == record.size:
+        return ChunkUnit(record, record.end, is_framed=True, end=record.end)
+    return ChunkUnit(record, stop, is_framed=False, end=stop)
+
+
+def _index_records(file: BagFile, at: int, limits: Limits) -> tuple[Entries | None, int]:
+    """What the index records from ``at`` on say (None if one is unsound), and their end."""
+    parts: list[tuple[int, bytes]] = []
+    listed = 0
+    is_sound = True
+    while (record := file.whole_record(at)) is not None and record.op == INDEX:
+        count = record.u32(b"count")
+        listed += count
+        if record.u32(b"ver") != 1 or record.size != count * ENTRY_BYTES:
+            is_sound = False
+        elif listed <= limits.records_per_chunk:
+            parts.append((record.u32(b"conn"), file.bytes_at(record.body, record.end)))
+        else:
+            is_sound = False
+        at = record.end
+    return (entries_of(parts) if is_sound and parts else None), at
+
+
+def next_chunk(file: BagFile, at: int, known: list[int]) -> int | None:
+    """Where the next chunk begins at or after ``at``: as the index says, else by search."""
+    for place in known:
+        if place >= at and (record := file.record(place)) is not None and record.op == CHUNK:
+            return place
+    return _searched_chunk(file, at)
+
+
+def _searched_chunk(file: BagFile, at: int) -> int | None:
+    """The first chunk header at or after ``at``, told by its operation field."""
+    while at < file.size:
+        window = file.bytes_at(at, at + _SEARCHED_AT_ONCE + 256)
+        found = -1
+        while (found := window.find(_CHUNK_OP, found + 1)) >= 0:
+            for start in range(max(0, found - 128), found):
+                if _heads_chunk(window, start, found) and file.whole_record(at + start):
+                    return at + start
+        at += _SEARCHED_AT_ONCE
+    return None
+
+
+def _heads_chunk(window: bytes, start: int, op_at: int) -> bool:
+    length = int.from_bytes(window[start : start + 4], "little")
+    if not op_at + len(_CHUNK_OP) <= start + 4 + length <= start + 256:
+        return False
+    record = record_at(window, start)
+    return record is not None and record.op == CHUNK
+
+
+def walk(file: BagFile, first: int, limits: Limits) -> Contents:
+    """What the records say where there is no index section; inflates only for new connections."""
+    contents = Contents()
+    chunks: set[int] = set()
+    is_whole = True
+    for unit in units(file, first, [], limits):
+        if isinstance(unit, ChunkUnit):
+            chunks.add(unit.record.at)
+            is_whole &= unit.is_framed
+            if unit.entries is None or not unit.entries.counts().keys() <= (
+                contents.connections.keys()
+            ):
+                _learn_from_chunk(file, unit, contents, limits)
+        elif isinstance(unit, Gap):
+            is_whole = False
+        elif unit.op in (CONNECTION, CHUNK_INFO):
+            is_whole &= learn(file, unit, contents, limits.schema_bytes)
+    contents.is_complete = is_whole and bool(chunks) and chunks == contents.infos.keys()
+    return contents
+
+
+def _learn_from_chunk(file: BagFile, unit: ChunkUnit, contents: Contents, limits: Limits) -> None:
+    size = unit.record.u32(b"size")
+    if size > limits.chunk_bytes or unit.record.size > limits.chunk_bytes:
+        return
+    stored = file.bytes_at(unit.record.body, unit.stored_stop)
+    inflated = inflate(unit.record.fields[b"compression"], stored, size, unit.is_framed)
+    rows = read_chunk(inflated, unit.entries, limits.schema_bytes, limits.records_per_chunk)
+    for connection in rows.connections:
+        contents.connections.setdefault(connection.conn, connection)

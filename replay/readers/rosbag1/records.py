@@ -1,0 +1,315 @@
+"""Records of the ROS 1 bag format 2.0: what frames everything else in the file.
+
+A record is ``<u32 header length> <header> <u32 body length> <body>``; a header is a row of
+``<u32 length> name=value``. Nothing here trusts a length: a record that does not fit, or that
+lacks a field its kind must have, is None.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Int64s
+from crosscue.replay.remote.ranges import RangedFile
+from crosscue.replay.seal.touched import Touched
+
+MAGIC: Final = b"#ROSBAG V2.0\n"
+MESSAGE: Final = 2
+BAG_HEADER: Final = 3
+INDEX: Final = 4
+CHUNK: Final = 5
+CHUNK_INFO: Final = 6
+CONNECTION: Final = 7
+
+HEADER_BYTES: Final = 1 << 20
+"""Longest record header taken for one; real ones stay below a kilobyte."""
+
+_U32 = struct.Struct("<I")
+_U64 = struct.Struct("<Q")
+_FIRST_LOOK: Final = 512
+_NEEDED: Final[dict[int, dict[bytes, int | None]]] = {
+    MESSAGE: {b"conn": 4, b"time": 8},
+    BAG_HEADER: {b"index_pos": 8, b"conn_count": 4, b"chunk_count": 4},
+    INDEX: {b"ver": 4, b"conn": 4, b"count": 4},
+    CHUNK: {b"compression": None, b"size": 4},
+    CHUNK_INFO: {b"ver": 4, b"chunk_pos": 8, b"start_time": 8, b"end_time": 8, b"count": 4},
+    CONNECTION: {b"conn": 4, b"topic": None},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One record's frame.
+
+    Attributes:
+        at: Byte offset of the record.
+        op: Its kind.
+        fields: Header fields as stored; those its kind must have are there and of the right size.
+        body: Byte offset of its body.
+        size: Body bytes declared.
+    """
+
+    at: int
+    op: int
+    fields: dict[bytes, bytes]
+    body: int
+    size: int
+
+    @property
+    def end(self) -> int:
+        """One past the record's last byte."""
+        return self.body + self.size
+
+    def u32(self, name: bytes) -> int:
+        """A four-byte field."""
+        return int(_U32.unpack(self.fields[name])[0])
+
+    def u64(self, name: bytes) -> int:
+        """An eight-byte field."""
+        return int(_U64.unpack(self.fields[name])[0])
+
+    def time_ns(self, name: bytes) -> int:
+        """A field of seconds and nanoseconds."""
+        return time_ns(self.fields[name])
+
+
+def time_ns(raw: bytes) -> int:
+    """Nanoseconds from a stored pair of u32 seconds and nanoseconds."""
+    return int(_U32.unpack_from(raw, 0)[0]) * 1_000_000_000 + int(_U32.unpack_from(raw, 4)[0])
+
+
+def parse_fields(header: bytes) -> dict[bytes, bytes] | None:
+    """The fields of a record header; None if they do not fill it exactly."""
+    fields: dict[bytes, bytes] = {}
+    at = 0
+    while at < len(header):
+        if at + 4 > len(header):
+            return None
+        stop = at + 4 + _U32.unpack_from(header, at)[0]
+        name, equals, value = header[at + 4 : stop].partition(b"=")
+        if stop > len(header) or not equals:
+            return None
+        fields[name] = value
+        at = stop
+    return fields
+
+
+def kind_of(fields: dict[bytes, bytes] | None) -> int | None:
+    """The kind of record that ``fields`` head; None if they head none."""
+    if fields is None or len(fields.get(b"op", b"")) != 1:
+        return None
+    op = fields[b"op"][0]
+    needed = _NEEDED.get(op)
+    if needed is None:
+        return None
+    for name, size in needed.items():
+        if name not in fields or (size is not None and len(fields[name]) != size):
+            return None
+    return op
+
+
+def record_at(source: bytes | memoryview, at: int, base: int = 0) -> Record | None:
+    """The record at ``at`` of ``source``; None if its header is none. The body may overrun.
+
+    Args:
+        source: Bytes that hold at least the record's header.
+        at: Where in ``source``.
+        base: Added to every offset of the result.
+    """
+    if at + 4 > len(source):
+        return None
+    body = at + 8 + int(_U32.unpack_from(source, at)[0])
+    if body > len(source) or body - at > HEADER_BYTES:
+        return None
+    fields = parse_fields(bytes(source[at + 4 : body - 4]))
+    op = kind_of(fields)
+    if op is None or fields is None:
+        return None
+    size = int(_U32.unpack_from(source, body - 4)[0])
+    return Record(base + at, op, fields, base + body, size)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BagFile:
+    """Positioned reads of an open file; never mapped, since a shrinking map kills the process.
+
+    Attributes:
+        fd: Open file descriptor.
+        size: File size in bytes when it was opened.
+        path: What it is called in ``touched``.
+        touched: Takes note of what is read, for a seal.
+    """
+
+    fd: int
+    size: int
+    path: Path = field(default=Path(), kw_only=True)
+    touched: Touched = field(default_factory=Touched, kw_only=True)
+
+    def bytes_at(self, start: int, stop: int) -> bytes:
+        """Bytes of the file from ``start`` to ``stop``, fewer at its end."""
+        parts: list[bytes] = []
+        while start < stop and (part := os.pread(self.fd, stop - start, start)):
+            parts.append(part)
+            self.touched.add(self.path, start, len(part))
+            start += len(part)
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
+        """These ranges, sorted, are going to be read: nothing to do for a file on a disk."""
+
+    def record(self, at: int) -> Record | None:
+        """The record at byte ``at``; None if there is none or it does not fit into the file."""
+        look = self.bytes_at(at, at + _FIRST_LOOK)
+        if len(look) >= 4:
+            header = int(_U32.unpack_from(look, 0)[0])
+            if _FIRST_LOOK < header + 8 <= HEADER_BYTES:
+                look = self.bytes_at(at, at + header + 8)
+        return record_at(look, 0, at)
+
+    def whole_record(self, at: int) -> Record | None:
+        """The record at byte ``at`` if all of its body is in the file."""
+        record = self.record(at)
+        return record if record is not None and record.end <= self.size else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangedBagFile(BagFile):
+    """The same of a remote object, of which only what is read is fetched."""
+
+    ranged: RangedFile
+
+    def bytes_at(self, start: int, stop: int) -> bytes:
+        """Bytes of the object from ``start`` to ``stop``, fewer at its end."""
+        size = max(0, stop - start)
+        return bytes(self.ranged.at_least(start, size)[:size])
+
+    def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
+        """These ranges, sorted, are going to be read, and may be fetched in larger pieces."""
+        self.ranged.expect(ranges)
+
+
+@dataclass(frozen=True, slots=True)
+class Connection:
+    """One publisher's stream.
+
+    Attributes:
+        conn: Its number in the bag.
+        topic: Topic under which the messages are stored.
+        type_name: ROS 1 message type.
+        definition: Full message definition, as stored.
+        md5sum: Hash of the definition, as stored.
+        published: Topic under which they were published; another one only if renamed or damaged.
+    """
+
+    conn: int
+    topic: str
+    type_name: str
+    definition: bytes
+    md5sum: bytes
+    published: str
+
+
+def connection_of(record: Record, body: bytes, largest: int) -> Connection | None:
+    """What a connection record says; None if its body is damaged or over ``largest`` bytes."""
+    fields = parse_fields(body)
+    if fields is None or not {b"type", b"message_definition"} <= fields.keys():
+        return None
+    if len(fields[b"message_definition"]) > largest:
+        return None
+    topic = record.fields[b"topic"]
+    return Connection(
+        record.u32(b"conn"),
+        _text(topic),
+        _text(fields[b"type"]),
+        fields[b"message_definition"],
+        fields.get(b"md5sum", b""),
+        _text(fields.get(b"topic", topic)),
+    )
+
+
+def _text(raw: bytes) -> str:
+    return raw.decode("utf-8", "backslashreplace")
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkInfo:
+    """What the index section says about one chunk.
+
+    Attributes:
+        at: Byte offset of the chunk record.
+        start_ns: First log time in it.
+        end_ns: Last log time in it.
+        counts: Messages by connection.
+    """
+
+    at: int
+    start_ns: int
+    end_ns: int
+    counts: dict[int, int]
+
+
+def chunk_info_of(record: Record, body: bytes) -> ChunkInfo | None:
+    """What a chunk info record says; None if its body is not what its header says."""
+    if record.u32(b"ver") != 1 or len(body) != 8 * record.u32(b"count"):
+        return None
+    pairs = np.frombuffer(body, dtype="<u4").reshape(-1, 2)
+    counts = {int(conn): int(count) for conn, count in pairs}
+    start, end = record.time_ns(b"start_time"), record.time_ns(b"end_time")
+    return ChunkInfo(record.u64(b"chunk_pos"), start, end, counts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Entries:
+    """What the index records behind one chunk say, sorted by offset.
+
+    Attributes:
+        offset: Shape (N,), int64: of each message record, from the start of the inflated chunk.
+        conn: Shape (N,), int64.
+        log_ns: Shape (N,), int64.
+    """
+
+    offset: Int64s
+    conn: Int64s
+    log_ns: Int64s
+
+    def __len__(self) -> int:
+        return len(self.offset)
+
+    def counts(self) -> dict[int, int]:
+        """Messages by connection."""
+        return tally(self.conn)
+
+
+_FEW_NUMBERS: Final = 65_536
+
+
+def tally(conn: Int64s) -> dict[int, int]:
+    """How often each connection number occurs; real ones are small, damaged ones need not be."""
+    if len(conn) and conn.max() < _FEW_NUMBERS:
+        counts = np.bincount(conn)
+        return {int(c): int(counts[c]) for c in np.flatnonzero(counts)}
+    conns, counts = np.unique(conn, return_counts=True)
+    return {int(c): int(n) for c, n in zip(conns, counts, strict=True)}
+
+
+_ENTRY: Final = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
+
+
+def entries_of(parts: list[tuple[int, bytes]]) -> Entries:
+    """Join index records, given as connection and body."""
+    tables: list[NDArray[np.void]] = [np.frombuffer(body, dtype=_ENTRY) for _, body in parts]
+    joined = np.concatenate(tables) if tables else np.empty(0, dtype=_ENTRY)
+    lengths = [len(table) for table in tables]
+    conn = np.repeat(np.array([c for c, _ in parts], dtype=np.int64), lengths)
+    offset = joined["offset"].astype(np.int64)
+    log_ns = joined["sec"].astype(np.int64) * 1_000_000_000 + joined["nsec"]
+    order = np.argsort(offset, kind="stable")
+    return Entries(offset[order], conn[order], log_ns[order])

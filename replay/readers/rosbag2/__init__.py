@@ -1,0 +1,1 @@
+"""ROS 2 bags: folders and sqlite3 files."""

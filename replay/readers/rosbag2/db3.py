@@ -1,0 +1,343 @@
+"""ROS 2 bags in SQLite (.db3): all rows that SQLite can still reach, the rest told.
+
+SQLite has no checksums. What can be known is checked instead: SQLite's own integrity check, the
+time index against the rows, the types and the order of the rows, the file's length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Block, Int64s, Messages, Topic
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.readers.can_rows import keep_memory
+from crosscue.replay.readers.mixed import MixedRows, blocks_of
+from crosscue.replay.readers.timed_files import is_inside
+
+from .inflate import DAMAGED, inflated
+from .rows import FIRST_ROWID, LAST_ROWID, Row, RowColumns, RowScan, index_times
+from .sqlite import FAULTS, Database, open_database
+from .tables import Tables, fetched, read_tables
+
+DAMAGED_PAGE: Final = "damaged page in the database"
+DISORDER: Final = "row out of order in a damaged page"
+UNSOUND: Final = "SQLite's integrity check finds damage"
+NO_TOPIC: Final = "message without a topic"
+NOT_A_TIME: Final = "timestamp is not an integer"
+NOT_BYTES: Final = "payload is not a blob"
+OTHER_TYPE: Final = "another message type on the same topic"
+_SMALL: Final = 1 << 16
+INDEX_DIFFERS: Final = "row and time index disagree"
+
+
+class Db3Log(Closing):
+    """An open ROS 2 SQLite bag; see ``crosscue.replay.log.Log``."""
+
+    def __init__(self, path: Path, limits: Limits) -> None:
+        """Open it and learn its topics.
+
+        Raises:
+            LogFormatError: No SQLite file, or none with the tables of a ROS 2 bag.
+            LogError: SQLite cannot open it.
+            OSError: It cannot be read.
+        """
+        self._path = path
+        self._limits = limits
+        self._stamp = _stamp(path)
+        self._database = open_database(path, limits)
+        try:
+            self._tables = read_tables(self._database, path, limits)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def path(self) -> Path:
+        """Where it lies."""
+        return self._path
+
+    @property
+    def format(self) -> str:
+        """``rosbag2-sqlite3``."""
+        return "rosbag2-sqlite3"
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """Topics by their number in the file; the format declares no counts."""
+        return tuple(self._tables.topics.values())
+
+    @property
+    def time_range_ns(self) -> tuple[int, int] | None:
+        """First and last timestamp, or None if there is none or SQLite cannot say."""
+        try:
+            query = "SELECT MIN(timestamp), MAX(timestamp) FROM messages"
+            first, last = fetched(self._database, query)[0]
+        except FAULTS:
+            return None
+        return (first, last) if isinstance(first, int) and isinstance(last, int) else None
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """Blocks of messages in the order of their row ids; see ``Log.read``."""
+        one = _Pass(self._database, self._tables, self._limits, ledger, selection)
+        yield from one.blocks()
+        if _stamp(self._path) != self._stamp:
+            ledger.drop("", "file changed while it was read", None, "read it again")
+
+    def close(self) -> None:
+        """Release the file and any temporary copy."""
+        self._database.close()
+
+
+class _Pass:
+    """The state of one ``read``."""
+
+    def __init__(
+        self,
+        database: Database,
+        tables: Tables,
+        limits: Limits,
+        ledger: Ledger,
+        selection: Selection,
+    ) -> None:
+        self._database = database
+        self._tables = tables
+        self._limits = limits
+        self._ledger = ledger
+        self._selection = selection
+        self._names = list(tables.topics)
+        self._place = tables.places()
+        self._places = _place_table(self._place)
+        self._fetched = self._numbers_asked()
+        self._scan = RowScan(database, FIRST_ROWID, LAST_ROWID, self._fetched)
+        self._counts: dict[str, int] | None = None
+        self._indexed: tuple[Int64s, Int64s] | None = None
+        self._in_time_by_index: int | None = None
+        self._in_time = 0
+        self._met = 0
+
+    def _numbers_asked(self) -> frozenset[int] | None:
+        """Numbers of the topics asked for, or None for all."""
+        if self._selection.topics is None:
+            return None
+        return frozenset(
+            n for n, at in self._place.items() if self._selection.wants(self._names[at])
+        )
+
+    def blocks(self) -> Iterator[Block]:
+        """Everything asked for, and the account of it."""
+        keep_memory()
+        for sentence in (*self._database.notices, *self._tables.notices):
+            self._ledger.notice(sentence)
+        for topic in self._tables.topics.values():
+            self._ledger.declare(topic.name, topic.declared)
+        self._narrow()
+        problems = self._problems() if self._in_time_by_index is None else ""
+        for rows in self._scan.batches():
+            yield from self._blocks_of(rows)
+        self._finish(problems)
+
+    def _narrow(self) -> None:
+        """Scan only the row ids between which the times asked for lie, if the index is complete."""
+        asked, index = self._selection, self._tables.index
+        if index is None or (asked.start_ns is None and asked.end_ns is None):
+            return
+        counts = self._tables.counts(self._database)
+        if counts is None:
+            return
+        start = FIRST_ROWID if asked.start_ns is None else asked.start_ns
+        end = LAST_ROWID if asked.end_ns is None else asked.end_ns
+        try:
+            total = fetched(self._database, f"SELECT COUNT(*) FROM messages INDEXED BY {index}")  # noqa: S608
+            query = (
+                f"SELECT MIN(rowid), MAX(rowid), COUNT(*) FROM messages INDEXED BY {index} "  # noqa: S608
+                "WHERE timestamp >= ? AND timestamp < ?"
+            )
+            first, last, count = fetched(self._database, query, (start, end))[0]
+        except FAULTS:
+            return
+        if total[0][0] == sum(counts.values()):
+            self._in_time_by_index, self._counts = count, counts
+            first, last = (0, -1) if first is None else (first, last)
+            self._scan = RowScan(self._database, first, last, self._fetched)
+
+    def _problems(self) -> str:
+        """What SQLite's integrity check says against the file; empty if nothing."""
+        try:
+            said = [str(row[0]) for row in fetched(self._database, "PRAGMA integrity_check(5)")]
+        except FAULTS as error:
+            said = [str(error)]
+        if said == ["ok"]:
+            return ""
+        if self._tables.index is not None:
+            self._indexed = index_times(self._database, self._tables.index)
+        return "; ".join(said).replace("\n", " ")
+
+    def _blocks_of(self, rows: RowColumns) -> Iterator[Block]:
+        self._met += len(rows)
+        for row in rows.odd:
+            self._skip_odd(row)
+        if not len(rows.ids):
+            return
+        stop = np.cumsum(rows.length)
+        messages = Messages(np.frombuffer(rows.payloads, np.uint8), stop - rows.length, stop)
+        place = self._placed(rows.topics)
+        if self._indexed is not None:
+            self._drop_disputed(rows.ids, rows.times, place)
+        if self._in_time_by_index is not None:
+            self._in_time += int(is_inside(rows.times, self._selection).sum())
+        yield from self._grouped(messages, place, rows.times)
+
+    def _grouped(self, messages: Messages, place: Int64s, log_ns: Int64s) -> Iterator[Block]:
+        for part, plain, damaged in inflated(messages, self._limits):
+            topic, times = place[part].copy(), log_ns[part]
+            for i in damaged[topic[damaged] >= 0]:
+                name = self._names[int(topic[i])]
+                self._ledger.drop(name, DAMAGED, 1, "zstd cannot decompress it", int(times[i]))
+            topic[damaged] = -1
+            keep = topic >= 0
+            start, stop = plain.start[keep], plain.stop[keep]
+            rows = MixedRows(plain.buffer, topic[keep], times[keep], start, stop)
+            yield from blocks_of(rows, self._names, self._selection, self._limits, self._ledger)
+
+    def _skip_odd(self, row: Row) -> None:
+        """Skip a row that has not the types it must have, by reason."""
+        number, topic, time, payload = row
+        if not isinstance(topic, int):
+            reason = NO_TOPIC
+        elif not isinstance(time, int):
+            reason = NOT_A_TIME
+        else:
+            reason = NOT_BYTES
+        place = self._place.get(topic, -1) if isinstance(topic, int) else -1
+        name = self._names[place] if place >= 0 else ""
+        detail = (
+            f"row {number}: topic {topic!r:.40}, timestamp {time!r:.40}, "
+            f"payload {type(payload).__name__}"
+        )
+        self._ledger.find(name, 1)
+        self._ledger.skip(name, reason, 1, detail)
+
+    def _placed(self, numbers: Int64s) -> Int64s:
+        """Place of each row's topic among the names; -1 for rows not to be handed on."""
+        if numbers.min() >= 0 and numbers.max() < len(self._places):
+            known = self._places[numbers]
+            if known.min() >= 0:
+                return known
+        distinct, which, counts = np.unique(numbers, return_inverse=True, return_counts=True)
+        place = np.array([self._place.get(int(n), -1) for n in distinct], dtype=np.int64)
+        for i in np.flatnonzero(place < 0):
+            number, count = int(distinct[i]), int(counts[i])
+            name = next((s.name for s in self._tables.stored if s.number == number), "")
+            self._ledger.find(name, count)
+            reason = OTHER_TYPE if name else NO_TOPIC
+            self._ledger.skip(name, reason, count, f"topic number {number}")
+        return place[which]
+
+    def _drop_disputed(self, ids: Int64s, log_ns: Int64s, place: Int64s) -> None:
+        """Give no row whose time the index has otherwise: no checksum says which is right."""
+        if self._indexed is None or not len(self._indexed[0]):
+            return
+        listed, times = self._indexed
+        at = np.minimum(np.searchsorted(listed, ids), len(listed) - 1)
+        for i in np.flatnonzero((listed[at] == ids) & (times[at] != log_ns) & (place >= 0)):
+            detail = f"row {ids[i]}: row {log_ns[i]}, index {times[at[i]]}"
+            self._ledger.drop(self._names[int(place[i])], INDEX_DIFFERS, 1, detail)
+            place[i] = -1
+
+    def _finish(self, problems: str) -> None:
+        """Settle with what SQLite counted, and say what was checked."""
+        ledger, scan = self._ledger, self._scan
+        is_part = self._in_time_by_index is not None
+        ledger.integrity = (
+            "SQLite has no checksums: a changed payload byte, length or topic number cannot be seen"
+        )
+        self._declare(is_doubtful=bool(problems or scan.holes or scan.disordered))
+        if is_part and self._in_time_by_index != self._in_time:
+            detail = f"index {self._in_time_by_index}, rows {self._in_time}"
+            ledger.drop("", INDEX_DIFFERS, None, detail)
+        if is_part and not scan.holes:
+            self._skip_rest()
+        for name in self._names:
+            ledger.settle(name, DAMAGED_PAGE)
+        if scan.disordered and ledger.is_whole:
+            ledger.drop("", DISORDER, scan.disordered)
+        if scan.holes and ledger.is_whole:
+            ledger.drop("", DAMAGED_PAGE, self._missing(), "; ".join(scan.holes[:3]))
+        if self._database.damage and ledger.is_whole:
+            ledger.drop("", DAMAGED_PAGE, None, self._database.damage)
+        if is_part:
+            ledger.integrity += "; a part was read, the file's structure was not checked"
+        elif not problems:
+            ledger.integrity += "; SQLite's check of its structure finds no fault"
+        else:
+            ledger.integrity += "; SQLite's check finds damage"
+            if ledger.is_whole:
+                ledger.drop("", UNSOUND, None, problems)
+            else:
+                ledger.notice(f"{UNSOUND}: {problems}")
+
+    def _missing(self) -> int | None:
+        """Rows that the time index lists beyond those met, or None if it cannot say."""
+        if self._indexed is None or len(self._indexed[0]) <= self._met:
+            return None
+        return len(self._indexed[0]) - self._met
+
+    def _declare(self, *, is_doubtful: bool) -> None:
+        """Say how many rows SQLite counts where that can differ from those met.
+
+        Counting by topic goes through the whole table again, so that after a full pass it is only
+        done if something is wrong, or if the time index has another number of rows.
+        """
+        if self._counts is None and (is_doubtful or self._total() != self._met):
+            self._counts = self._tables.counts(self._database)
+        for name, count in (self._counts or {}).items():
+            if name:
+                self._ledger.declare(name, count)
+
+    def _total(self) -> int | None:
+        """Rows that SQLite counts, in the smallest index there is."""
+        try:
+            return int(fetched(self._database, "SELECT COUNT(*) FROM messages")[0][0])
+        except FAULTS:
+            return None
+
+    def _skip_rest(self) -> None:
+        """Count the rows outside the scan, never fetched, as skipped."""
+        for name, declared in (self._counts or {}).items():
+            if not name:
+                continue
+            rest = declared - self._ledger.topic(name).in_file
+            if rest > 0:
+                reason = NOT_ASKED_TIME if self._selection.wants(name) else NOT_ASKED_TOPIC
+                self._ledger.find(name, rest)
+                self._ledger.skip(name, reason, rest)
+
+
+def _place_table(places: Mapping[int, int]) -> Int64s:
+    """Places by topic number, -1 where there is none; for small numbers, as recorders give them."""
+    small = {number: at for number, at in places.items() if 0 <= number < _SMALL}
+    table = np.full(max(small, default=-1) + 1, -1, dtype=np.int64)
+    table[list(small)] = list(small.values())
+    return table
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    at = path.stat()
+    return at.st_size, at.st_mtime_ns
+
+
+def open_db3(path: Path, limits: Limits = DEFAULT) -> Db3Log:
+    """Open a ROS 2 SQLite bag.
+
+    Raises:
+        LogError: No ROS 2 bag, damaged in its first pages, or locked.
+        OSError: It cannot be read.
+    """
+    return Db3Log(path, limits)

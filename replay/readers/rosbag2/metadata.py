@@ -1,0 +1,108 @@
+"""What ``metadata.yaml`` says of a ROS 2 bag folder: a hint, never believed against the files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+from crosscue.replay.files.bounded import read_at_most
+
+METADATA_BYTES: Final = 1 << 20
+_BRACKETS: Final = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class SplitHint:
+    """What is said of one storage file.
+
+    Attributes:
+        name: File name without any folder.
+        count: Messages in it, or None.
+        range_ns: First and last log time, or None.
+    """
+
+    name: str
+    count: int | None = None
+    range_ns: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """What is said of the folder.
+
+    Attributes:
+        splits: Storage files in the order listed.
+        counts: Messages by topic.
+        fault: Why it could not be read, or empty.
+    """
+
+    splits: tuple[SplitHint, ...] = ()
+    counts: Mapping[str, int] = field(default_factory=dict)
+    fault: str = ""
+
+
+def read_metadata(path: Path) -> Metadata:
+    """Read ``metadata.yaml``; one that is missing or unreadable says nothing but why."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        raw = read_at_most(path, METADATA_BYTES)
+        if raw is None or raw.count(b"[") + raw.count(b"{") > _BRACKETS:
+            return Metadata(fault="larger or deeper than any real one")
+        said = YAML(typ="base", pure=True).load(raw.decode("utf-8", "backslashreplace"))
+    except FileNotFoundError:
+        return Metadata(fault="missing")
+    except (OSError, YAMLError, RecursionError, ValueError, TypeError, LookupError) as error:
+        return Metadata(fault=f"unreadable ({type(error).__name__})")
+    about = _mapping(_mapping(said).get("rosbag2_bagfile_information"))
+    if not about:
+        return Metadata(fault="without rosbag2_bagfile_information")
+    return Metadata(_splits(about), _counts(about))
+
+
+def _splits(about: Mapping[str, Any]) -> tuple[SplitHint, ...]:
+    hints = {name: SplitHint(name) for name in map(_name, _sequence(about, "relative_file_paths"))}
+    for line in map(_mapping, _sequence(about, "files")):
+        name = _name(line.get("path"))
+        start = _number(_mapping(line.get("starting_time")).get("nanoseconds_since_epoch"))
+        length = _number(_mapping(line.get("duration")).get("nanoseconds"))
+        known = start is not None and length is not None
+        range_ns = (start or 0, (start or 0) + (length or 0)) if known else None
+        hints[name] = SplitHint(name, _number(line.get("message_count")), range_ns)
+    hints.pop("", None)
+    return tuple(hints.values())
+
+
+def _counts(about: Mapping[str, Any]) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for line in map(_mapping, _sequence(about, "topics_with_message_count")):
+        name = _mapping(line.get("topic_metadata")).get("name")
+        count = _number(line.get("message_count"))
+        if isinstance(name, str) and name and count is not None:
+            counts[name] = counts.get(name, 0) + count
+    return counts
+
+
+def _mapping(value: object) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _sequence(about: Mapping[str, Any], name: str) -> list[Any]:
+    value = about.get(name)
+    return value if isinstance(value, list) else []
+
+
+def _name(value: object) -> str:
+    """The last part of a path; a folder in it (old bags write one) is never followed."""
+    return PurePosixPath(value).name if isinstance(value, str) else ""
+
+
+def _number(value: object) -> int | None:
+    """A count or time as an integer in the range of int64, or None."""
+    if not isinstance(value, str) or not value.lstrip("-").isdecimal() or len(value) > 20:
+        return None
+    number = int(value)
+    return number if -(2**63) <= number < 2**63 else None

@@ -1,0 +1,159 @@
+"""The storage files of a ROS 2 bag folder: found, opened, decompressed where they are packed."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import CrosscueError, LogError
+from crosscue.replay.files.partial_file import Scratch
+from crosscue.replay.limits import MIB, Limits
+from crosscue.replay.log import Log, open_log, open_unsealed
+
+from .db3 import Db3Log
+from .metadata import Metadata
+
+STORED: Final = (".db3", ".mcap")
+PACKED: Final = ".zstd"
+INFLATE_RATIO: Final = 1000
+"""A packed file may grow to this many times its size, or to ``Limits.chunk_bytes`` if larger."""
+
+_READ_BYTES: Final = MIB
+_FED_BYTES: Final = 1024
+_WINDOW_BYTES: Final = 1 << 27
+_ROOM_BYTES: Final = 64 * MIB
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """One storage file.
+
+    Attributes:
+        path: Where it lies.
+        topics: What it holds.
+        range_ns: First and last log time where known.
+        fault: Why it cannot be opened, or empty.
+    """
+
+    path: Path
+    topics: tuple[Topic, ...] = ()
+    range_ns: tuple[int, int] | None = None
+    fault: str = ""
+
+
+def stored_files(folder: Path, metadata: Metadata, notices: list[str]) -> list[Path]:
+    """Storage files in the folder, listed or not; of a file and its packed twin only one."""
+    listed = [hint.name for hint in metadata.splits]
+    found = {path.name: path for path in sorted(folder.iterdir()) if _is_stored(path)}
+    for name in list(found):
+        twin = name.removesuffix(PACKED)
+        if name != twin and twin in found:
+            left_out = name if twin in listed and name not in listed else twin
+            found.pop(left_out)
+            notices.append(f"{left_out} is the same file packed or unpacked; it was not read")
+    stems = {name.split(".")[0]: name for name in found if name in listed}
+    for name in [name for name in found if name not in listed]:
+        original = stems.get(name.split(".")[0])
+        if original is not None and original.split(".")[1] != name.split(".")[1]:
+            found.pop(name)
+            notices.append(f"{name} has the name of {original} in another format; it was not read")
+        elif listed:
+            notices.append(f"{name} is not listed in metadata.yaml; it was read")
+    order = {name: i for i, name in enumerate(listed)}
+    return sorted(found.values(), key=lambda path: (order.get(path.name, len(order)), path.name))
+
+
+def _is_stored(path: Path) -> bool:
+    return path.is_file() and path.name.lower().removesuffix(PACKED).endswith(STORED)
+
+
+def look_into(path: Path, metadata: Metadata, limits: Limits) -> Split:
+    """Open a storage file for a moment to learn what it holds."""
+    hint = next((hint for hint in metadata.splits if hint.name == path.name), None)
+    try:
+        with opened(path, limits, open_unsealed) as (log, _):
+            range_ns = log.time_range_ns if isinstance(log, Db3Log) else None
+            return Split(path, log.topics, range_ns or (hint.range_ns if hint else None))
+    except (CrosscueError, OSError) as error:
+        return Split(path, fault=str(error))
+
+
+@contextmanager
+def opened(
+    path: Path, limits: Limits, open_one: Callable[[Path, Limits], Log] = open_log
+) -> Iterator[tuple[Log, str]]:
+    """The log in a storage file, and what went wrong when it was unpacked (or nothing)."""
+    if not path.name.endswith(PACKED):
+        with open_one(path, limits) as log:
+            yield log, ""
+        return
+    with Scratch() as folder:
+        plain = folder / path.name.removesuffix(PACKED)
+        fault = unpack(path, plain, limits)
+        try:
+            log = open_log(plain, limits)
+        except CrosscueError as error:
+            said = str(error).replace(str(plain), "unpacked")
+            raise LogError(f"{path}: {fault + '; ' if fault else ''}{said}") from None
+        with log:
+            yield log, fault
+
+
+def unpack(packed: Path, plain: Path, limits: Limits) -> str:
+    """Decompress to ``plain`` as far as possible; why it ended early, or empty.
+
+    Raises:
+        LogError: The disk for temporary files is too small for it.
+        OSError: It cannot be read or written.
+    """
+    import zstandard
+
+    most = max(limits.chunk_bytes, INFLATE_RATIO * packed.stat().st_size)
+    written = 0
+    unpacking = _Unpacking()
+    with packed.open("rb") as source, plain.open("wb") as target:
+        while part := source.read(_READ_BYTES):
+            if shutil.disk_usage(plain.parent).free < _ROOM_BYTES:
+                raise LogError(
+                    f"{packed}: no room to unpack it in {plain.parent.parent} after {written} "
+                    "bytes; set TMPDIR to a larger disk"
+                )
+            try:
+                for out in unpacking.feed(part):
+                    written += target.write(out)
+                    if written > most:
+                        return f"grows to over {most} bytes when unpacked"
+            except zstandard.ZstdError as error:
+                return f"compressed file is damaged after {written} bytes ({error})"
+    return "" if unpacking.is_at_end else f"compressed file is cut after {written} bytes"
+
+
+class _Unpacking:
+    """Frames of zstd, fed a little at a time since a kilobyte can hold thirty megabytes."""
+
+    def __init__(self) -> None:
+        import zstandard
+
+        self._tool = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
+        self._frame = self._tool.decompressobj()
+
+    @property
+    def is_at_end(self) -> bool:
+        """Did the last frame end?"""
+        return bool(self._frame.eof)
+
+    def feed(self, part: bytes) -> Iterator[bytes]:
+        """What comes out of ``part``."""
+        view = memoryview(part)
+        for first in range(0, len(view), _FED_BYTES):
+            piece = bytes(view[first : first + _FED_BYTES])
+            while piece:
+                if self._frame.eof:
+                    self._frame = self._tool.decompressobj()
+                yield self._frame.decompress(piece)
+                piece = self._frame.unused_data if self._frame.eof else b""

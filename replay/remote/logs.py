@@ -1,0 +1,627 @@
+"""Logs on object stores: a part is read by ranges, a whole is fetched into a bounded store.
+
+Of an MCAP file or ROS 1 bag whose index leads to the part asked for, only the index and that part
+are fetched (``RangedLog``). A log that is read to its end is often read twice, and some readers
+need a real file (SQLite, videos), so one download beats many ranged reads there. What was fetched
+is kept under a name made of its address and version, so a changed object is fetched again; the
+least recently used go when the store grows over its limit, never one that is open. Protocols and
+credentials are fsspec's.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path, PurePosixPath
+from types import TracebackType
+from typing import Any, BinaryIO, Final, Protocol, Self, TypeVar, cast
+
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.errors import (
+    CrosscueError,
+    LogError,
+    LogTooLargeError,
+    OutputError,
+    UsageError,
+    one_line,
+)
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.files.partial_file import is_still
+from crosscue.replay.files.run_folder import cannot_write
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import EVERYTHING, FORMATS, Log, Selection
+
+from .ranges import RangedFile
+
+URL: Final = re.compile(r"^[a-z][a-z0-9+.-]+://")
+CHUNK_BYTES: Final = 8 << 20
+VERSION_KEYS: Final = (
+    "ETag", "etag", "version_id", "generation", "md5Hash", "LastModified", "Last-Modified",
+    "last_modified", "mtime", "updated", "created",
+)  # fmt: skip
+"""What stores call the version of an object; the first that is there is taken."""
+LOCK: Final = ".lock"
+SIZE: Final = ".size"
+STORE_VARIABLE: Final = "CROSSCUE_STORE"
+LIMIT_VARIABLE: Final = "CROSSCUE_STORE_GIB"
+LIMIT_GIB: Final = 50.0
+
+T = TypeVar("T")
+
+
+def is_remote(path: Path | str) -> bool:
+    """Is it a URL? A ``Path`` never is: it would have lost one of the slashes."""
+    return isinstance(path, str) and URL.match(path) is not None
+
+
+class _System(Protocol):
+    """What is used of fsspec's file systems."""
+
+    @property
+    def protocol(self) -> str | tuple[str, ...]: ...
+    def isdir(self, path: str) -> bool: ...
+    def info(self, path: str) -> dict[str, Any]: ...
+    def ls(self, path: str, *, detail: bool) -> list[dict[str, Any]]: ...
+    def find(self, path: str, *, detail: bool) -> dict[str, dict[str, Any]]: ...
+    def glob(self, path: str) -> list[str]: ...
+    def open(self, path: str, mode: str, **how: str) -> BinaryIO: ...
+    def invalidate_cache(self) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Store:
+    """Where fetched logs are kept.
+
+    Attributes:
+        folder: One folder inside for each log.
+        max_bytes: Of all logs in it; one that alone is larger is refused.
+    """
+
+    folder: Path
+    max_bytes: int
+
+
+def default_store() -> Store:
+    """As the environment says: ``CROSSCUE_STORE`` and ``CROSSCUE_STORE_GIB``.
+
+    Raises:
+        UsageError: The limit is no positive number.
+    """
+    home = os.environ.get("XDG_CACHE_HOME") or str(Path("~/.cache").expanduser())
+    folder = os.environ.get(STORE_VARIABLE) or str(Path(home, "crosscue", "logs"))
+    text = os.environ.get(LIMIT_VARIABLE) or str(LIMIT_GIB)
+    try:
+        limit = round(float(text) * (1 << 30))
+    except (ValueError, OverflowError):
+        limit = 0
+    if limit <= 0:
+        raise UsageError(f"{LIMIT_VARIABLE}={text}: want a number of GiB above 0")
+    return Store(Path(folder), limit)
+
+
+@dataclass(frozen=True, slots=True)
+class _Object:
+    """One object of a remote log: its address in the store, its name in ours, and its version."""
+
+    address: str
+    name: str
+    size: int
+    version: str
+
+
+class Fetched(Closing):
+    """A log on this machine, held against removal until closed; a context manager."""
+
+    def __init__(self, path: Path, hold: int | None) -> None:
+        """Take over the open and locked file ``hold``, if there is one."""
+        self.path: Final = path
+        self._hold: int | None = hold
+
+    @property
+    def is_in_place(self) -> bool:
+        """Is it a file of this machine, which did not have to be fetched?"""
+        return self._hold is None
+
+    def close(self) -> None:
+        """Let it go; it stays in the store until the room is needed."""
+        if self._hold is not None:
+            os.close(self._hold)
+            self._hold = None
+
+
+def fetch(url: str, store: Store | None = None) -> Fetched:
+    """A remote log's file or folder on this machine, fetched unless it is there already.
+
+    Raises:
+        LogError: Not there, no permission, no such protocol, changed meanwhile, or unreachable.
+        LogTooLargeError: Larger than the whole store may be.
+        OutputError: The store cannot be written, or the disk is full.
+    """
+    system, address = _opened(url)
+    if _is_local(system):
+        return Fetched(Path(address), None)
+    store = store or default_store()
+    objects = _guarded(url, lambda: _objects(system, address))
+    size = sum(one.size for one in objects)
+    if size > store.max_bytes:
+        raise LogTooLargeError(
+            f"{url}: {size / 2**30:.1f} GiB, the store may hold {store.max_bytes / 2**30:.1f}; "
+            f"set {LIMIT_VARIABLE}"
+        )
+    entry = store.folder / _key(url, objects)
+    path = entry / "log" / PurePosixPath(address.rstrip("/")).name
+    try:
+        while True:
+            hold = _locked(entry)
+            try:
+                if not path.exists():
+                    _make_room(store, entry, size)
+                    _download(url, system, address, objects, entry)
+                os.utime(entry)
+                # From alone to among others; another process may slip in between and remove it.
+                fcntl.flock(hold, fcntl.LOCK_SH)
+                if path.exists():
+                    return Fetched(path, hold)
+            except BaseException:
+                os.close(hold)
+                raise
+            os.close(hold)
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
+def version_of(path: str) -> str:
+    """Size and version of a log without reading it: of a file, of all files of a folder, of a URL.
+
+    Raises:
+        LogError: It is not there or cannot be looked at.
+    """
+    if is_remote(path):
+        system, address = _opened(path)
+        if _is_local(system):
+            return version_of(address)
+        return _key(path, _guarded(path, lambda: _objects(system, address)))
+    place = Path(path)
+    try:
+        if place.is_file():
+            found = place.stat()
+            return f"{found.st_size} {found.st_mtime_ns}"
+        digest = hashlib.sha256()
+        for entry in sorted(one for one in place.rglob("*") if one.is_file()):
+            found = entry.stat()
+            name = entry.relative_to(place).as_posix().encode(errors="surrogateescape")
+            digest.update(name + f"\0{found.st_size} {found.st_mtime_ns}\0".encode())
+        place.stat()
+    except OSError as error:
+        raise LogError(f"{path}: {error.strerror or error}; check the path") from None
+    return digest.hexdigest()
+
+
+def matches(pattern: str) -> tuple[str, ...]:
+    """URLs that a pattern such as ``s3://bucket/drives/*.mcap`` stands for, sorted.
+
+    Raises:
+        LogError: The store cannot be asked.
+    """
+    system, address = _opened(pattern)
+    found = _guarded(pattern, lambda: sorted(map(str, system.glob(address))))
+    if _is_local(system):
+        return tuple(found)
+    scheme = pattern.partition("://")[0]
+    return tuple(one if "://" in one else f"{scheme}://{one.lstrip('/')}" for one in found)
+
+
+class RemoteLog:
+    """A log that was fetched; closing it lets go of the fetched file."""
+
+    def __init__(
+        self, url: str, log: Log, fetched: Fetched, why: str = "its format needs a local file"
+    ) -> None:
+        """Stand for ``log``, which was fetched whole for a reason."""
+        self._why: Final = why
+        self.url: Final = url
+        self._log: Final = log
+        self._fetched: Final = fetched
+
+    @property
+    def path(self) -> Path:
+        """Where it lies on this machine."""
+        return self._log.path
+
+    @property
+    def format(self) -> str:
+        """As of the log."""
+        return self._log.format
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """As of the log."""
+        return self._log.topics
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """As of the log."""
+        if not self._fetched.is_in_place:
+            ledger.notice(f"fetched whole: {self._why}")
+        return self._log.read(ledger, selection)
+
+    def close(self) -> None:
+        """Close the log, then let its file go."""
+        try:
+            self._log.close()
+        finally:
+            self._fetched.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class _Partial(Protocol):
+    """A log that can tell whether a part of it can be read alone."""
+
+    @property
+    def format(self) -> str: ...
+    @property
+    def topics(self) -> tuple[Topic, ...]: ...
+    @property
+    def beginning(self) -> Selection: ...
+    def needs_whole(self, selection: Selection) -> str: ...
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]: ...
+    def close(self) -> None: ...
+
+
+RANGED: Final = {
+    ".mcap": "crosscue.replay.readers.mcap.reader:open_ranged",
+    ".bag": "crosscue.replay.readers.rosbag1.reader:open_ranged",
+}
+"""Formats of which a part can be read by ranges."""
+
+
+class RangedLog:
+    """A remote log of which only what is asked for is fetched; all of it once all is asked for."""
+
+    def __init__(
+        self, url: str, log: _Partial, ranged: RangedFile, whole: Callable[[str], RemoteLog]
+    ) -> None:
+        """Stand for ``log``, read by ranges, or for what ``whole`` fetches."""
+        self.url: Final = url
+        self.ranged: Final = ranged
+        self._log: Final = log
+        self._fetch: Final = whole
+        self._whole: RemoteLog | None = None
+
+    @property
+    def path(self) -> Path:
+        """Where it lies on this machine: all of it is fetched for this."""
+        return self._fetched("its file was asked for").path
+
+    @property
+    def format(self) -> str:
+        """As of the log."""
+        return self._log.format
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """As of the log."""
+        return self._log.topics if self._whole is None else self._whole.topics
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """As of the log; the object must be the same at the end as when it was opened.
+
+        Raises:
+            LogError: It has changed meanwhile, or cannot be reached.
+        """
+        why = self._log.needs_whole(selection)
+        if why or self._whole is not None:
+            yield from self._fetched(why).read(ledger, selection)
+            return
+        before = self.ranged.transferred
+        yield from self._log.read(ledger, selection)
+        self.ranged.verify()
+        took = self.ranged.transferred - before
+        ledger.notice(f"{took} of {self.ranged.size} bytes were fetched")
+
+    def first_blocks(self, ledger: Ledger) -> Iterator[Block]:
+        """What the first chunk holds, for whoever looks at the beginning only."""
+        return self.read(ledger, self._log.beginning)
+
+    def close(self) -> None:
+        """Release the connection, and what was fetched."""
+        try:
+            self._log.close()
+            self.ranged.close()
+        finally:
+            if self._whole is not None:
+                self._whole.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _fetched(self, why: str) -> RemoteLog:
+        if self._whole is None:
+            self._whole = self._fetch(why)
+        return self._whole
+
+
+def name_of(log: Log) -> str:
+    """What a log is called in accounts: its URL, else its path."""
+    return log.url if isinstance(log, RemoteLog | RangedLog) else str(log.path)
+
+
+def open_remote(
+    url: str, opener: Callable[[Path], Log], limits: Limits, store: Store | None = None
+) -> RemoteLog | RangedLog:
+    """Open a log by ranges where its format and index allow it; else fetch it, then ``opener``.
+
+    Raises:
+        CrosscueError: As ``fetch`` and ``opener``.
+    """
+
+    def whole(why: str) -> RemoteLog:
+        fetched = fetch(url, store)
+        try:
+            return RemoteLog(url, opener(fetched.path), fetched, why)
+        except BaseException:
+            fetched.close()
+            raise
+
+    system, address = _opened(url)
+    suffix = PurePosixPath(address).suffix.lower()
+    if _is_local(system) or suffix not in RANGED:
+        return whole("its format is read from a local file")
+    ranged = _ranged(url, system, address)
+    if ranged is None:
+        return whole("its store gives no ranges")
+    module, _, function = RANGED[suffix].partition(":")
+    open_ranged = cast(
+        "Callable[[Path, RangedFile, Limits], _Partial | None]",
+        getattr(import_module(module), function),
+    )
+    try:
+        log = open_ranged(Path(PurePosixPath(address).name), ranged, limits)
+    except BaseException:
+        ranged.close()
+        raise
+    if log is None:
+        ranged.close()
+        return whole("it has no index that can be used")
+    return RangedLog(url, log, ranged, whole)
+
+
+def _ranged(url: str, system: _System, address: str) -> RangedFile | None:
+    """The object by ranges; None if it is no single object of known size."""
+    info = _guarded(url, lambda: system.info(address))
+    if info.get("type") == "directory" or not info.get("size") or info.get("partial") is False:
+        return None
+    name = PurePosixPath(address.rstrip("/")).name
+    told = _object(name, info)
+
+    def changed() -> bool:
+        system.invalidate_cache()
+        return _object(name, system.info(address)) != told
+
+    def opened() -> BinaryIO:
+        return system.open(address, "rb", cache_type="none")
+
+    return RangedFile(url, told.size, opened, changed)
+
+
+def _opened(url: str) -> tuple[_System, str]:
+    try:
+        url_to_fs = import_module("fsspec.core").url_to_fs
+    except ImportError:
+        raise LogError(
+            f"{url}: reading from object stores needs fsspec; pip install fsspec"
+        ) from None
+    try:
+        system, address = url_to_fs(url)
+    except (ImportError, ValueError) as error:
+        raise LogError(f"{url}: {one_line(error)}") from None
+    return cast("_System", system), str(address)
+
+
+def _is_local(system: _System) -> bool:
+    return "file" in ([system.protocol] if isinstance(system.protocol, str) else system.protocol)
+
+
+def _guarded(url: str, ask: Callable[[], T]) -> T:
+    """What a store answers; each store's library has errors of its own."""
+    try:
+        return ask()
+    except CrosscueError:
+        raise
+    except FileNotFoundError:
+        raise LogError(f"{url}: no such object; check the address") from None
+    except PermissionError as error:
+        raise LogError(f"{url}: no permission ({one_line(error)}); check credentials") from None
+    except Exception as error:
+        kind = type(error).__name__
+        raise LogError(f"{url}: cannot be read ({kind}: {one_line(error)}); try again") from None
+
+
+def _objects(system: _System, address: str) -> list[_Object]:
+    """All objects of a log: of a folder all below it, of a file those that share its stem."""
+    address = address.rstrip("/")
+    name = PurePosixPath(address).name
+    if _is_folder(system, address):
+        found = system.find(address, detail=True).values()
+        start = len(address) + 1
+        named = [(f"{name}/{str(info['name'])[start:]}", info) for info in found]
+    else:
+        alone = system.info(address)
+        try:
+            around = system.ls(address[: len(address) - len(name)] or address, detail=True)
+        except (OSError, ValueError):  # a plain web server need not list anything
+            around = [alone | {"name": address}]
+        around = [one for one in around if _belongs(PurePosixPath(str(one["name"])).name, name)]
+        # A web server's list says no sizes.
+        around = [
+            one if one.get("size") is not None else system.info(str(one["name"])) for one in around
+        ] or [alone | {"name": address}]
+        named = [(PurePosixPath(str(info["name"])).name, info) for info in around]
+        named = [(other, info) for other, info in named if _belongs(other, name)]
+    return sorted((_object(other, info) for other, info in named), key=lambda one: one.name)
+
+
+def _is_folder(system: _System, address: str) -> bool:
+    """Is it a folder? To a web server every address is both, and asking costs the whole file."""
+    suffix = PurePosixPath(address).suffix.lower()
+    if any(suffix in known.suffixes for known in FORMATS.values()):
+        try:
+            return system.info(address).get("type") == "directory"
+        except FileNotFoundError:
+            return system.isdir(address)
+    return system.isdir(address)
+
+
+def _belongs(other: str, name: str) -> bool:
+    """Is ``other`` the log itself, its time file, index, or write-ahead log?"""
+    stem = PurePosixPath(name).stem
+    return other == name or other.startswith((f"{stem}.", f"{name}-"))
+
+
+def _object(name: str, info: dict[str, Any]) -> _Object:
+    if any(part in ("", ".", "..") for part in name.split("/")) or "\0" in name:
+        raise LogError(f"{info['name']}: no name for a file; rename the object")
+    version = next((str(info[key]) for key in VERSION_KEYS if info.get(key) is not None), "")
+    return _Object(str(info["name"]), name, int(info["size"]), version)
+
+
+def _key(url: str, objects: Sequence[_Object]) -> str:
+    """A name for this version of a log."""
+    digest = hashlib.sha256(url.encode())
+    for one in objects:
+        digest.update(f"\0{one.name}\0{one.size}\0{one.version}".encode())
+    return digest.hexdigest()[:32]
+
+
+def _locked(entry: Path) -> int:
+    """The entry's lock file, open and locked for us alone, however long that takes."""
+    while True:
+        entry.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):
+            hold = os.open(entry / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
+            fcntl.flock(hold, fcntl.LOCK_EX)
+            if is_still(hold, entry / LOCK):
+                return hold
+            os.close(hold)
+
+
+def _make_room(store: Store, entry: Path, size: int) -> None:
+    """Reserve ``size`` for an entry, removing others, the longest unused first.
+
+    Raises:
+        OutputError: What must stay leaves too little room.
+    """
+    gate = os.open(store.folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
+    try:
+        fcntl.flock(gate, fcntl.LOCK_EX)
+        others = [one for one in store.folder.iterdir() if one.is_dir() and one != entry]
+        held = {one: _reserved(one) for one in others}
+        for one in sorted(others, key=_last_used):
+            if sum(held.values()) + size <= store.max_bytes:
+                break
+            if _removed(one):
+                del held[one]
+        if sum(held.values()) + size > store.max_bytes:
+            raise OutputError(
+                f"{store.folder}: full of logs in use ({sum(held.values()) >> 20} MiB); use fewer "
+                f"workers or set {LIMIT_VARIABLE}"
+            )
+        entry.joinpath(SIZE).write_text(str(size))
+    finally:
+        os.close(gate)
+
+
+def _reserved(entry: Path) -> int:
+    try:
+        return int(entry.joinpath(SIZE).read_text())
+    except (OSError, ValueError):
+        return 0
+
+
+def _last_used(entry: Path) -> int:
+    try:
+        return entry.stat().st_mtime_ns
+    except FileNotFoundError:
+        return 0
+
+
+def _removed(entry: Path) -> bool:
+    """Remove an entry, unless somebody holds it."""
+    try:
+        hold = os.open(entry / LOCK, os.O_RDWR)
+    except FileNotFoundError:
+        shutil.rmtree(entry, ignore_errors=True)
+        return not entry.exists()
+    try:
+        fcntl.flock(hold, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # Renamed first: whoever comes now begins anew instead of finding half of it.
+        gone = entry.with_name(f".{entry.name}.{os.getpid()}")
+        entry.replace(gone)
+        shutil.rmtree(gone)
+    except BlockingIOError:
+        return False
+    finally:
+        os.close(hold)
+    return True
+
+
+def _download(
+    url: str, system: _System, address: str, objects: Sequence[_Object], entry: Path
+) -> None:
+    partial = entry / "partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        for one in objects:
+            target = partial / one.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with target.open("wb") as file:
+                for chunk in _chunks(url, system, one):
+                    file.write(chunk)
+                file.flush()
+                os.fsync(file.fileno())
+        system.invalidate_cache()
+        if _guarded(url, lambda: _objects(system, address)) != list(objects):
+            raise LogError(f"{url}: changed while it was fetched; run again when it is written")
+        partial.replace(entry / "log")
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def _chunks(url: str, system: _System, one: _Object) -> Iterator[bytes]:
+    """An object's bytes, exactly as many as were told."""
+    source = _guarded(url, lambda: system.open(one.address, "rb"))
+    left = one.size
+    with source:
+        while chunk := _guarded(url, lambda: bytes(source.read(CHUNK_BYTES))):
+            left -= len(chunk)
+            if left < 0:
+                break
+            yield chunk
+    if left:
+        raise LogError(f"{url}: {one.name} is not as long as its store says; run again")

@@ -1,0 +1,1 @@
+"""Block checksums beside logs whose format has none."""

@@ -1,0 +1,159 @@
+"""A log with a seal beside it: what is read of it is held against the seal.
+
+A block of a seal is one MiB; which of its rows a changed byte belongs to cannot be known. The rows
+are therefore delivered, the block is reported as damaged (file, first byte, one past the last), and
+the log is not whole. Withholding them would turn one wrong byte into the loss of thousands of right
+rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final, Protocol, runtime_checkable
+
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.errors import LogError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import EVERYTHING, Log, Selection
+
+from .seal import HASH, Check, Seal, read_seal, seal_path
+from .touched import Blocks, Touched
+
+DIFFERS: Final = "bytes differ from the seal"
+CHANGED: Final = "files differ from the seal"
+_SPANS_SHOWN: Final = 3
+
+
+@runtime_checkable
+class Touching(Protocol):
+    """A log that says which bytes of its files it has read; of others, all are checked."""
+
+    @property
+    def touched(self) -> Touched:
+        """What was read since it was opened."""
+        ...
+
+
+def with_seal(path: Path, opened: Callable[[], Log]) -> Log:
+    """Open a log, and hold it against its seal if there is one.
+
+    Raises:
+        LogError: The seal is damaged, or the log cannot be opened: then its seal says where it is
+            damaged.
+        OSError: As ``opened``.
+    """
+    at = seal_path(path)
+    if not _is_there(at):
+        return opened()
+    seal = read_seal(at)
+    try:
+        return SealedLog(opened(), seal)
+    except LogError as error:
+        check = Check(path, seal)
+        _exhaust(check.everything())
+        spans = [f"{s.name}: bytes {s.start} to {s.stop}" for s in check.damaged()]
+        found = [*check.oddities, *spans[:_SPANS_SHOWN]]
+        if not found:
+            raise
+        raise type(error)(f"{error}; its seal differs: {'; '.join(found)}") from None
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:
+        # A log's name may be too long to have a seal.
+        return False
+
+
+class SealedLog(Closing):
+    """Stands for a log; see ``crosscue.replay.log.Log`` and the module's text."""
+
+    def __init__(self, log: Log, seal: Seal) -> None:
+        """Stand for ``log``."""
+        self.seal: Final = seal
+        self._log: Final = log
+        self._touched: Final = log.touched if isinstance(log, Touching) else None
+        self._opening: Final = {} if self._touched is None else self._touched.of_opening()
+
+    @property
+    def path(self) -> Path:
+        """As of the log."""
+        return self._log.path
+
+    @property
+    def format(self) -> str:
+        """As of the log."""
+        return self._log.format
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """As of the log."""
+        return self._log.topics
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """The log's blocks; where it says what it reads, that is checked before each of them."""
+        check = Check(self.path, self.seal)
+        for sentence in check.oddities:
+            ledger.drop("", CHANGED, None, sentence)
+        try:
+            if self._touched is None:
+                yield from self._log.read(ledger, selection)
+                _exhaust(check.everything())
+            else:
+                yield from self._checked(self._touched, check, ledger, selection)
+                if selection == EVERYTHING:
+                    # What no reader needs, such as indexes, belongs to the log, too.
+                    _exhaust(check.everything())
+        finally:
+            _report(check, ledger)
+
+    def _checked(
+        self, touched: Touched, check: Check, ledger: Ledger, selection: Selection
+    ) -> Iterator[Block]:
+        _check_blocks(check, self._opening)
+        with touched.listened() as heard:
+            for block in self._log.read(ledger, selection):
+                _check_blocks(check, touched.taken(heard))
+                yield block
+            _check_blocks(check, touched.taken(heard))
+
+    def close(self) -> None:
+        """Close the log."""
+        self._log.close()
+
+
+def _check_blocks(check: Check, blocks: Blocks) -> None:
+    for path, numbers in blocks.items():
+        if (name := check.named(path)) is not None:
+            _exhaust(check.blocks(name, sorted(numbers)))
+
+
+def _exhaust(steps: Iterator[int]) -> None:
+    for _ in steps:
+        pass
+
+
+def _report(check: Check, ledger: Ledger) -> None:
+    """Put what differs into the account, and say how much was checked."""
+    seal = check.seal
+    spans = list(check.damaged())
+    for span in spans:
+        ledger.drop("", DIFFERS, None, f"{span.name}: bytes {span.start} to {span.stop}")
+    said = f"sealed at {seal.sealed_at} ({HASH})"
+    if check.checked < seal.blocks:
+        said += f": {check.checked} of {seal.blocks} blocks of 1 MiB were read and checked"
+    else:
+        said += f": all {seal.blocks} blocks of 1 MiB were checked"
+    bad = "some differ" if spans else "none differs"
+    ledger.integrity = f"{ledger.integrity}; {said}, {bad}"
+
+
+def sealed_sentence(log: Log) -> str:
+    """Whether a log is sealed, when and how."""
+    if not isinstance(log, SealedLog):
+        return "not sealed"
+    seal = log.seal
+    return f"sealed at {seal.sealed_at} ({HASH}, {seal.blocks} blocks of 1 MiB)"

@@ -1,0 +1,1 @@
+"""A drive as time segments: jumps of the clock and silent odometry."""

@@ -1,0 +1,366 @@
+"""The pass over a drive's stamps that finds its time segments.
+
+It reads the topics that will be used, decodes none but the wheel speeds, and keeps what does not
+grow with the log: set-backs, strays, and where wheel speeds were silent.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from operator import attrgetter, itemgetter
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.clocks.reports import Clock
+from crosscue.replay.columns import Block
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.signals import Extractor, Plan, Samples, Signal, Source
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .segments import BEGINNING, Cause, Epoch, LogClock, Marks, Segment, Timeline
+from .stamp_watch import StampWatch
+
+SAME_NS: Final = 2_000_000_000
+"""Set-backs of two topics or logs that differ by no more are one and the same."""
+
+
+@dataclass(slots=True)
+class _Run:
+    """Wheel speeds without a silence: the era of their topic, first and last time."""
+
+    era: int
+    first_ns: int
+    last_ns: int
+
+
+@dataclass(slots=True)
+class _WheelRuns:
+    """Follows the wheel speeds' times."""
+
+    extractor: Extractor
+    max_silence_ns: int
+    watch: StampWatch
+    runs: list[_Run] = field(default_factory=list)
+    _waiting: list[tuple[int, Block]] = field(default_factory=list)
+    _set_backs: int = 0
+    _strays: int = 0
+
+    def add(self, block: Block) -> None:
+        """Take a block whose stamps the watch has been given."""
+        self._waiting.append((self.watch.rows - len(block), block))
+        self.settle()
+
+    def settle(self) -> None:
+        """Work through the blocks of whose rows all is known."""
+        while self._waiting:
+            first, block = self._waiting[0]
+            if self.watch.decided < first + len(block):
+                return
+            del self._waiting[0]
+            self._settle(first, block)
+
+    def _settle(self, first: int, block: Block) -> None:
+        stop = first + len(block)
+        cuts = {first, stop}
+        while self._set_backs < len(self.watch.set_backs):
+            row = self.watch.set_backs[self._set_backs].row
+            if row >= stop:
+                break
+            cuts.add(row)
+            self._set_backs += 1
+        while self._strays < len(self.watch.strays):
+            begin, end = self.watch.strays[self._strays]
+            if begin >= stop:
+                break
+            cuts |= {begin, min(end, stop)}
+            if end > stop:
+                break
+            self._strays += 1
+        for begin, end in pairwise(sorted(cut for cut in cuts if first <= cut <= stop)):
+            if self._is_stray(begin):
+                continue
+            era = bisect_right(self.watch.set_backs, begin, key=attrgetter("row"))
+            part = block if (begin, end) == (first, stop) else block.take(
+                slice(begin - first, end - first)
+            )  # fmt: skip
+            for samples in self.extractor(part):
+                self._see(samples, era)
+
+    def _is_stray(self, row: int) -> bool:
+        at = bisect_right(self.watch.strays, row, key=itemgetter(0))
+        return at > 0 and row < self.watch.strays[at - 1][1]
+
+    def _see(self, samples: Samples, era: int) -> None:
+        if samples.signal is not Signal.WHEEL_SPEEDS:
+            return
+        rear = np.isfinite(samples.values[:, 2:]).all(axis=1)
+        front = np.isfinite(samples.values[:, :2]).all(axis=1)
+        times = np.sort(samples.t_ns[rear | front])
+        if not len(times):
+            return
+        if not self.runs or self.runs[-1].era != era:
+            self.runs.append(_Run(era, int(times[0]), int(times[0])))
+        high_ns = self.runs[-1].last_ns
+        times = times[times > high_ns]
+        steps = np.diff(times, prepend=high_ns)
+        for at in np.flatnonzero(steps > self.max_silence_ns).tolist():
+            if at:
+                self.runs[-1].last_ns = int(times[at - 1])
+            self.runs.append(_Run(era, int(times[at]), int(times[at])))
+        if len(times):
+            self.runs[-1].last_ns = int(times[-1])
+
+
+def scan(
+    logs: Sequence[Log],
+    planned: Plan,
+    vehicle: Vehicle,
+    selections: Sequence[Selection],
+    clocks: Sequence[Mapping[str, Clock]],
+    known: Timeline | None = None,
+) -> Timeline:
+    """Find a drive's time segments.
+
+    Args:
+        logs: All logs of the drive, open.
+        planned: Which topics will be used.
+        vehicle: Limits stand under ``[time]``.
+        selections: What will be read of each log.
+        clocks: Which clock each topic will use, for each log.
+        known: An earlier timeline of these logs: its shifts are kept, so that tables of both go
+            together.
+    """
+    limit_ns = round(vehicle.time.max_silence_s * 1e9)
+    wheels = planned.source_of(Signal.WHEEL_SPEEDS)
+    watches: list[dict[str, StampWatch]] = []
+    runs: list[_Run] = []
+    for number, (log, selection) in enumerate(zip(logs, selections, strict=True)):
+        source = wheels if wheels is not None and wheels.log == number else None
+        found, of_wheels = _watched(log, selection, source, vehicle, clocks[number], limit_ns)
+        watches.append(found)
+        runs += of_wheels
+    aligned = [_Aligned(found) for found in watches]
+    log_clocks = _clocks(aligned, round(vehicle.time.unknown_gap_s * 1e9), known)
+    segments = _segments(aligned, log_clocks, runs, wheels, limit_ns)
+    return Timeline(segments, log_clocks)
+
+
+def _watched(
+    log: Log,
+    selection: Selection,
+    wheels: Source | None,
+    vehicle: Vehicle,
+    clocks: Mapping[str, Clock],
+    limit_ns: int,
+) -> tuple[dict[str, StampWatch], list[_Run]]:
+    """The stamps of one log, and its runs of wheel speeds where it has them."""
+    watches: dict[str, StampWatch] = {}
+    following: _WheelRuns | None = None
+    if selection.topics is not None and not selection.topics:
+        return {}, []
+    for block in log.read(Ledger(""), selection):
+        if not len(block):
+            continue
+        watch = watches.setdefault(block.topic, StampWatch())
+        watch.add(block.log_ns)
+        if wheels is not None and block.topic == wheels.topic.name:
+            if following is None:
+                extractor = _wheels_only(wheels, vehicle, clocks)
+                following = _WheelRuns(extractor, limit_ns, watch)
+            following.add(block)
+    for watch in watches.values():
+        watch.finish()
+    if following is None:
+        return watches, []
+    following.settle()
+    return watches, following.runs
+
+
+def _wheels_only(source: Source, vehicle: Vehicle, clocks: Mapping[str, Clock]) -> Extractor:
+    can = vehicle.can.model_copy(update={"yaw_rate": None, "steering": None})
+    only = Plan((replace(source, signals=(Signal.WHEEL_SPEEDS,)),), {})
+    lean = vehicle.model_copy(update={"can": can})
+    return Extractor(only, lean, source.log, Ledger(""), clocks)
+
+
+class _Aligned:
+    """One log's topics, their set-backs matched with those of the topic that shows most."""
+
+    def __init__(self, watches: Mapping[str, StampWatch]) -> None:
+        self.watches: Final = watches
+        first = max(
+            watches.values(), key=lambda one: (len(one.set_backs), one.rows), default=StampWatch()
+        )
+        self.events: Final = tuple(first.set_backs)
+        self.entries: Final = {name: self._entries(one) for name, one in watches.items()}
+        n = len(self.events) + 1
+        lows: list[list[int]] = [[] for _ in range(n)]
+        highs: list[list[int]] = [[] for _ in range(n)]
+        for name, watch in watches.items():
+            if None in self.entries[name] or not watch.eras:
+                continue
+            for epoch, era in enumerate(watch.eras[:n]):
+                lows[epoch].append(era.first_ns)
+                highs[epoch].append(era.last_ns)
+        self.first_ns: Final = [min(some, default=0) for some in lows]
+        self.last_ns: Final = [max(some, default=0) for some in highs]
+
+    def _entries(self, watch: StampWatch) -> tuple[int | None, ...]:
+        """The topic's row at which each event happens to it."""
+        span_ns = sum(era.last_ns - era.first_ns for era in watch.eras)
+        reach_ns = max(SAME_NS, 3 * span_ns // max(watch.rows, 1))
+        entries: list[int | None] = [None] * len(self.events)
+        at = 0
+        for own in watch.set_backs:
+            for number in range(at, len(self.events)):
+                event = self.events[number]
+                if (
+                    abs(own.before_ns - event.before_ns) <= reach_ns
+                    and abs(own.after_ns - event.after_ns) <= reach_ns
+                ):
+                    entries[number] = own.row
+                    at = number + 1
+                    break
+        return tuple(entries)
+
+    def marks(self) -> dict[str, Marks]:
+        """For ``LogClock``; empty where rows can stay as they are."""
+        return {
+            name: Marks(self.entries[name], tuple(self.last_ns[:-1]), tuple(watch.strays))
+            for name, watch in self.watches.items()
+            if self.events or watch.strays
+        }
+
+    def epoch_of(self, topic: str, era: int) -> int:
+        """The epoch in which one of a topic's eras begins."""
+        if era == 0:
+            return 0
+        row = self.watches[topic].set_backs[era - 1].row
+        entries = self.entries[topic]
+        matched = [i + 1 for i, entry in enumerate(entries) if entry is not None and entry <= row]
+        return max(matched, default=0)
+
+
+def _clocks(
+    aligned: Sequence[_Aligned], gap_ns: int, known: Timeline | None
+) -> tuple[LogClock, ...]:
+    shifts: list[list[int]] = [[0] for _ in aligned]
+    most = max((len(one.events) for one in aligned), default=0)
+    for number in range(1, most + 1):
+        for i, one in enumerate(aligned):
+            if len(one.events) < number:
+                continue
+            if known is not None and number < len(known.clock(i).epochs):
+                shifts[i].append(known.clock(i).epochs[number].shift_ns)
+                continue
+            together = [
+                (other, shifts[j][number - 1])
+                for j, other in enumerate(aligned)
+                if len(other.events) >= number and _is_same(one, other, number - 1)
+            ]
+            end_ns = max(other.last_ns[number - 1] + shift for other, shift in together)
+            start_ns = min(other.first_ns[number] for other, _ in together)
+            shifts[i].append(end_ns + gap_ns - start_ns)
+    return tuple(
+        LogClock(tuple(_epochs(one, of_log)), one.marks())
+        for one, of_log in zip(aligned, shifts, strict=True)
+    )
+
+
+def _is_same(one: _Aligned, other: _Aligned, number: int) -> bool:
+    """Were two logs' clocks set back together?"""
+    first, second = one.events[number], other.events[number]
+    steps_ns = (first.after_ns - first.before_ns) - (second.after_ns - second.before_ns)
+    return abs(steps_ns) <= SAME_NS and abs(first.before_ns - second.before_ns) <= SAME_NS
+
+
+def _epochs(one: _Aligned, shifts: Sequence[int]) -> list[Epoch]:
+    epochs = [Epoch(BEGINNING, 0)]
+    for number in range(1, len(shifts)):
+        end_ns = one.last_ns[number - 1] + shifts[number - 1]
+        start_ns = one.first_ns[number] + shifts[number]
+        epochs.append(Epoch((end_ns + start_ns) // 2, shifts[number]))
+    return epochs
+
+
+def _segments(
+    aligned: Sequence[_Aligned],
+    clocks: Sequence[LogClock],
+    runs: Sequence[_Run],
+    wheels: Source | None,
+    limit_ns: int,
+) -> tuple[Segment, ...]:
+    found: list[Segment] = []
+    if wheels is not None and runs:
+        one, clock = aligned[wheels.log], clocks[wheels.log]
+        found = _of_wheels(one, clock, wheels, runs, limit_ns)
+    else:
+        start_ns = min((one.first_ns[0] for one in aligned if one.watches), default=0)
+        end_ns = max((one.last_ns[0] for one in aligned if one.watches), default=0)
+        found = [Segment(0, BEGINNING, start_ns, end_ns, start_ns, end_ns, Cause.START)]
+    for one, clock in zip(aligned, clocks, strict=True):
+        for number, epoch in enumerate(clock.epochs[1:], start=1):
+            if any(abs(other.begins_ns - epoch.begins_ns) <= SAME_NS for other in found[1:]):
+                continue
+            first_ns, last_ns = one.first_ns[number], one.last_ns[number]
+            event = one.events[number - 1]
+            found.append(Segment(
+                0, epoch.begins_ns, first_ns + epoch.shift_ns, last_ns + epoch.shift_ns, first_ns,
+                last_ns, Cause.SET_BACK, by_ns=event.after_ns - event.before_ns,
+                breaks_odometry=False,
+            ))  # fmt: skip
+    found.sort(key=lambda segment: segment.begins_ns)
+    return tuple(replace(segment, number=number) for number, segment in enumerate(found))
+
+
+def _in_epochs(one: _Aligned, topic: str, runs: Sequence[_Run]) -> Iterator[tuple[int, _Run]]:
+    """Each run with its epoch, cut where a set-back does not show in the topic itself."""
+    entries, reached = one.entries[topic], 0
+    for run in runs:
+        number = max(one.epoch_of(topic, run.era), reached)
+        first_ns = run.first_ns
+        while number < len(entries) and entries[number] is None:
+            ends_ns = one.last_ns[number]
+            if not first_ns <= ends_ns < run.last_ns:
+                break
+            yield number, _Run(run.era, first_ns, ends_ns)
+            number, first_ns = number + 1, ends_ns + 1
+        yield number, _Run(run.era, first_ns, run.last_ns)
+        reached = number
+
+
+def _of_wheels(
+    one: _Aligned, clock: LogClock, wheels: Source, runs: Sequence[_Run], limit_ns: int
+) -> list[Segment]:
+    found: list[Segment] = []
+    epoch_before = 0
+    for number, run in _in_epochs(one, wheels.topic.name, runs):
+        epoch = clock.epochs[number]
+        first_ns, last_ns = run.first_ns + epoch.shift_ns, run.last_ns + epoch.shift_ns
+        if not found:
+            found.append(Segment(
+                0, BEGINNING, first_ns, last_ns, run.first_ns, run.last_ns, Cause.START
+            ))  # fmt: skip
+        elif number != epoch_before:
+            event = one.events[number - 1]
+            found.append(Segment(
+                0, epoch.begins_ns, first_ns, last_ns, run.first_ns, run.last_ns, Cause.SET_BACK,
+                by_ns=event.after_ns - event.before_ns,
+            ))  # fmt: skip
+        elif first_ns - found[-1].end_ns <= limit_ns:
+            end_ns = max(found[-1].end_ns, last_ns)
+            found[-1] = replace(found[-1], end_ns=end_ns, log_end_ns=end_ns - epoch.shift_ns)
+        else:
+            end_ns = found[-1].end_ns
+            begins_ns = max(end_ns + 1, first_ns - limit_ns)
+            found.append(Segment(
+                0, begins_ns, first_ns, last_ns, run.first_ns, run.last_ns, Cause.SILENCE,
+                gap_ns=first_ns - end_ns,
+            ))  # fmt: skip
+        epoch_before = number
+    return found

@@ -1,0 +1,290 @@
+"""A drive as a list of time segments, on one time that never runs back.
+
+A segment ends where a log's clock was set back, or where the wheel speeds were silent for longer
+than the vehicle file allows. *Drive time* (``t_ns`` everywhere) is the log's own clock as long as
+that runs forward. After a set-back it is the log's clock plus a shift that puts the rows
+``unknown_gap_s`` behind all that came before, so order is kept and nothing overlaps;
+``log_t_ns`` beside it is the stamp as recorded. A clock that jumps forward cannot be told from a
+pause: its stamps stay, and the time between them is a gap.
+
+``TimedLog`` gives a log's blocks in drive time, so that nobody downstream sees a clock run back.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from enum import StrEnum
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Block, Int64s
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import EVERYTHING, Log, Selection
+
+STRAY_STAMP: Final = "stray time stamp"
+BEGINNING: Final = int(np.iinfo(np.int64).min)
+
+
+class Cause(StrEnum):
+    """Why a segment begins."""
+
+    START = "start"
+    SILENCE = "odometry silent"
+    SET_BACK = "clock set back"
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A stretch of a drive without a gap.
+
+    Attributes:
+        number: From 0.
+        begins_ns: Rows from this drive time on belong to it.
+        start_ns: Drive time of its first wheel speed, or where it begins if there is none.
+        end_ns: Drive time of its last wheel speed.
+        log_start_ns: ``start_ns`` on the log's own clock.
+        log_end_ns: ``end_ns`` on the log's own clock.
+        cause: Why it begins.
+        gap_ns: From the last wheel speed before it to its first; None where nobody can know.
+        by_ns: How far the clock was set, negative; 0 for other causes.
+        breaks_odometry: Whether the wheel speeds are interrupted.
+    """
+
+    number: int
+    begins_ns: int
+    start_ns: int
+    end_ns: int
+    log_start_ns: int
+    log_end_ns: int
+    cause: Cause
+    gap_ns: int | None = None
+    by_ns: int = 0
+    breaks_odometry: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Epoch:
+    """A stretch of one log between two set-backs of its clock.
+
+    Attributes:
+        begins_ns: Drive time from which on the log's rows belong to it.
+        shift_ns: Drive time less log time.
+    """
+
+    begins_ns: int
+    shift_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """Where one topic's rows change epoch, and which of them are strays.
+
+    Attributes:
+        entries: For each epoch but the first, its first row of the topic; None where the topic
+            itself shows no step: its first row beyond ``ends_ns`` then.
+        ends_ns: For each epoch but the last, its last log time.
+        strays: Half-open ranges of rows.
+    """
+
+    entries: tuple[int | None, ...] = ()
+    ends_ns: tuple[int, ...] = ()
+    strays: tuple[tuple[int, int], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class LogClock:
+    """One log's clock against drive time."""
+
+    epochs: tuple[Epoch, ...] = (Epoch(BEGINNING, 0),)
+    topics: Mapping[str, Marks] = field(default_factory=dict)
+
+    def shift_at(self, drive_ns: Int64s) -> Int64s:
+        """Drive time less log time at each drive time, shape (N,)."""
+        begins = np.array([epoch.begins_ns for epoch in self.epochs], np.int64)
+        shifts = np.array([epoch.shift_ns for epoch in self.epochs], np.int64)
+        at: Int64s = shifts[np.searchsorted(begins, drive_ns, side="right") - 1]
+        return at
+
+    def log_times(self, drive_ns: Int64s) -> Int64s:
+        """The stamps as recorded."""
+        return drive_ns - self.shift_at(drive_ns)
+
+
+UNSHIFTED: Final = LogClock()
+WHOLE: Final = Segment(0, BEGINNING, 0, 0, 0, 0, Cause.START)
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """A drive's segments and the clock of each of its logs.
+
+    Attributes:
+        segments: In order, at least one.
+        clocks: One for each log.
+    """
+
+    segments: tuple[Segment, ...] = (WHOLE,)
+    clocks: tuple[LogClock, ...] = ()
+
+    def clock(self, log: int) -> LogClock:
+        """The clock of one log."""
+        return self.clocks[log] if log < len(self.clocks) else UNSHIFTED
+
+    def numbers(self, drive_ns: Int64s) -> NDArray[np.int32]:
+        """The segment of each drive time, shape (N,)."""
+        begins = np.array([one.begins_ns for one in self.segments], np.int64)
+        return (np.searchsorted(begins, drive_ns, side="right") - 1).astype(np.int32)
+
+    def segment_at(self, drive_ns: int) -> Segment:
+        """The segment of one drive time."""
+        return self.segments[int(self.numbers(np.array([drive_ns], np.int64))[0])]
+
+    def number_of_stamp(self, log_ns: int | None) -> int | None:
+        """The segment of a stamp as recorded; None where several or none could be meant."""
+        if len(self.segments) == 1:
+            return 0
+        if log_ns is None:
+            return None
+        fits = [one for one in self.segments if one.log_start_ns <= log_ns <= one.log_end_ns]
+        return fits[0].number if len(fits) == 1 else None
+
+    @property
+    def has_gaps(self) -> bool:
+        """Is there more than one segment?"""
+        return len(self.segments) > 1
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values, for a manifest."""
+        return {
+            "segments": [asdict(one) | {"cause": one.cause.value} for one in self.segments],
+            "clocks": [asdict(clock) for clock in self.clocks],
+        }
+
+
+ONE_SEGMENT: Final = Timeline()
+
+
+def shift_of(timeline: Timeline, log: int) -> Callable[[Int64s], Int64s] | None:
+    """``shift_at`` of a log's clock, or None where that was never set back."""
+    clock = timeline.clock(log)
+    return clock.shift_at if len(clock.epochs) > 1 else None
+
+
+def timeline_of(told: Mapping[str, Any] | None) -> Timeline:
+    """The timeline that a manifest keeps."""
+    if told is None:
+        return ONE_SEGMENT
+    return Timeline(
+        tuple(Segment(**(one | {"cause": Cause(one["cause"])})) for one in told["segments"]),
+        tuple(_clock_of(clock) for clock in told["clocks"]),
+    )  # fmt: skip
+
+
+def _clock_of(told: Mapping[str, Any]) -> LogClock:
+    return LogClock(
+        tuple(Epoch(**epoch) for epoch in told["epochs"]),
+        {
+            name: Marks(
+                tuple(marks["entries"]),
+                tuple(marks["ends_ns"]),
+                tuple((start, stop) for start, stop in marks["strays"]),
+            )
+            for name, marks in told["topics"].items()
+        },
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class TimedLog:
+    """A log read in drive time."""
+
+    log: Log
+    clock: LogClock
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """The log's blocks with drive time for log time; strays are skipped in the ledger.
+
+        ``selection`` is in the log's own time. Read with the selection that the timeline was made
+        with: rows are told apart by counting.
+        """
+        seen: Counter[str] = Counter()
+        epochs: Counter[str] = Counter()
+        for block in self.log.read(ledger, selection):
+            marks = self.clock.topics.get(block.topic)
+            first = seen[block.topic]
+            seen[block.topic] += len(block)
+            if marks is None or not len(block):
+                yield block
+                continue
+            epoch = _epochs(block.log_ns, first, epochs[block.topic], marks)
+            epochs[block.topic] = int(epoch[-1])
+            yield self._placed(block, epoch, _is_stray(first, len(block), marks), ledger)
+
+    def _placed(
+        self, block: Block, epoch: Int64s, is_stray: NDArray[np.bool_], ledger: Ledger
+    ) -> Block:
+        shifts = np.array([one.shift_ns for one in self.clock.epochs], np.int64)[epoch]
+        publish_ns = None if block.publish_ns is None else block.publish_ns + shifts
+        placed = replace(block, log_ns=block.log_ns + shifts, publish_ns=publish_ns)
+        if not is_stray.any():
+            return placed
+        ledger.skip(
+            block.topic, STRAY_STAMP, int(is_stray.sum()),
+            "far from the stamps of the rows before and after it",
+            int(block.log_ns[is_stray][0]),
+        )  # fmt: skip
+        ledger.notice(
+            f"{block.topic}: rows whose time stamp lies far from those around it were skipped"
+        )
+        return placed.take(~is_stray)
+
+
+def _epochs(log_ns: Int64s, first: int, epoch: int, marks: Marks) -> Int64s:
+    """The epoch of each row of a block whose first row is the topic's ``first``."""
+    found = np.full(len(log_ns), epoch, np.int64)
+    at = 0
+    for number in range(epoch, len(marks.entries)):
+        entry = marks.entries[number]
+        if entry is None:
+            later = np.flatnonzero(log_ns[at:] > marks.ends_ns[number])
+            at = at + int(later[0]) if len(later) else len(log_ns)
+        else:
+            at = max(at, entry - first)
+        if at >= len(log_ns):
+            break
+        found[at:] = number + 1
+    return found
+
+
+def _is_stray(first: int, rows: int, marks: Marks) -> NDArray[np.bool_]:
+    found = np.zeros(rows, np.bool_)
+    for start, stop in marks.strays:
+        if start < first + rows and stop > first:
+            found[max(start - first, 0) : stop - first] = True
+    return found
+
+
+def gaps_told(segments: Sequence[Segment]) -> list[str]:
+    """One sentence on the gaps of a drive; none for a drive without."""
+    later = segments[1:]
+    if not later:
+        return []
+    silent = [one.gap_ns for one in later if one.gap_ns is not None]
+    parts = []
+    if silent:
+        noun = "gap" if len(silent) == 1 else "gaps"
+        parts.append(
+            f"{len(silent)} {noun} without odometry, {sum(silent) * 1e-9:.1f} s in all"
+            + (f", the longest {max(silent) * 1e-9:.1f} s" if len(silent) > 1 else "")
+        )
+    back = [-one.by_ns * 1e-9 for one in later if one.cause is Cause.SET_BACK]
+    if back:
+        times = "once" if len(back) == 1 else f"{len(back)} times"
+        parts.append(f"the log's clock was set back {times}, by up to {max(back):.1f} s")
+    return [
+        f"{len(segments)} time segments: {'; '.join(parts)}; distance counts measured motion only"
+    ]

@@ -1,0 +1,159 @@
+"""Where a topic's log clock was set back, and which of its stamps are strays.
+
+Rows come in stored order. A step back of ``MIN_SET_BACK_NS`` or more is one of three things:
+
+* *late rows*: within ``LOOK_AHEAD`` rows the stamps leap back to where they were; nothing happened
+  to the clock, and whoever merges by time puts them in order;
+* a *stray*: at most ``MAX_STRAY_ROWS`` rows far from both neighbours, while those lie close
+  together: the rows are wrong, ahead or behind, not the clock;
+* a *set-back*: the stamps go on from there.
+
+Smaller steps back are disorder. The first rows after a set-back decide, so one within the last
+``ROWS_TO_BELIEVE`` rows of a log passes for late rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Int64s
+
+MIN_SET_BACK_NS: Final = 100_000_000
+STRAY_NS: Final = 1_000_000_000
+"""A stray lies further than this from both its neighbours."""
+MAX_STRAY_ROWS: Final = 8
+LOOK_AHEAD: Final = 128
+ROWS_TO_BELIEVE: Final = 3
+MAX_FINDINGS: Final = 10_000
+"""Set-backs and strays kept of one topic; later ones pass for late rows."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetBack:
+    """A clock that was set back.
+
+    Attributes:
+        row: The first row after it, counted from 0 in stored order.
+        before_ns: Stamp of the row before.
+        after_ns: Stamp of the row.
+    """
+
+    row: int
+    before_ns: int
+    after_ns: int
+
+
+@dataclass(slots=True)
+class Era:
+    """Rows between two set-backs: their lowest and highest stamp, strays left out."""
+
+    first_ns: int
+    last_ns: int
+
+
+class StampWatch:
+    """Takes one topic's stamps a stretch at a time; memory holds what looking ahead needs."""
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self.set_backs: list[SetBack] = []
+        self.strays: list[tuple[int, int]] = []
+        """Half-open ranges of rows."""
+        self.eras: list[Era] = []
+        self._held: Int64s = np.empty(0, np.int64)
+        self._decided = 0
+        self._before_ns: int | None = None
+        self._step_ns = 0
+
+    @property
+    def decided(self) -> int:
+        """Of how many rows all is known."""
+        return self._decided
+
+    def add(self, stamps_ns: Int64s) -> None:
+        """Take in the next rows, shape (N,)."""
+        self.rows += len(stamps_ns)
+        self._held = np.concatenate([self._held, stamps_ns])
+        self._decide(len(self._held) - LOOK_AHEAD)
+
+    def finish(self) -> None:
+        """Decide the last rows; none may follow."""
+        self._decide(len(self._held))
+
+    def _decide(self, n: int) -> None:
+        """Judge the first ``n`` rows held; the rest is looked at only."""
+        if n <= 0:
+            return
+        rows = self._held
+        if self._before_ns is None:
+            self._before_ns = int(rows[0])
+            self.eras.append(Era(self._before_ns, self._before_ns))
+        at = 0
+        steps = np.diff(rows, prepend=self._before_ns)
+        jumps = np.flatnonzero((steps < -MIN_SET_BACK_NS) | (steps > STRAY_NS))
+        for jump in jumps.tolist():
+            if jump < at:
+                continue
+            if jump >= n:
+                break
+            self._accept(rows[at:jump])
+            at = self._judge(rows, jump)
+        self._accept(rows[at : max(n, at)])
+        done = max(n, at)
+        self._held = rows[done:].copy()
+        self._decided += done
+
+    def _accept(self, rows: Int64s) -> None:
+        """Rows that belong to the era at hand."""
+        if not len(rows):
+            return
+        era = self.eras[-1]
+        era.first_ns = min(era.first_ns, int(rows.min()))
+        era.last_ns = max(era.last_ns, int(rows.max()))
+        before = int(rows[-2]) if len(rows) > 1 else self._before_ns
+        self._step_ns = abs(int(rows[-1]) - int(before or rows[-1]))
+        self._before_ns = int(rows[-1])
+
+    def _judge(self, rows: Int64s, jump: int) -> int:
+        """Say what the step before row ``jump`` is; where to go on."""
+        before_ns = self._before_ns
+        assert before_ns is not None
+        is_full = len(self.strays) + len(self.set_backs) >= MAX_FINDINGS
+        stop = self._stray_until(rows, jump, before_ns)
+        if stop is not None and not is_full:
+            self.strays.append((self._decided + jump, self._decided + stop))
+            return stop
+        step_ns = int(rows[jump]) - before_ns
+        if step_ns < -MIN_SET_BACK_NS and not is_full and _goes_on(rows, jump, before_ns, step_ns):
+            after_ns = int(rows[jump])
+            self.set_backs.append(SetBack(self._decided + jump, before_ns, after_ns))
+            self.eras.append(Era(after_ns, after_ns))
+            self._before_ns = after_ns
+        self._accept(rows[jump : jump + 1])
+        return jump + 1
+
+    def _stray_until(self, rows: Int64s, jump: int, before_ns: int) -> int | None:
+        """The row after a stray that begins at ``jump``, or None where none does."""
+        reach_ns = max(STRAY_NS, 5 * self._step_ns // 2)
+        ahead = rows[jump : jump + MAX_STRAY_ROWS + 1]
+        near = (ahead >= before_ns - MIN_SET_BACK_NS) & (ahead <= before_ns + reach_ns)
+        if not near.any() or near[0]:
+            return None
+        length = int(near.argmax())
+        low_ns, high_ns = before_ns - STRAY_NS, int(ahead[length]) + STRAY_NS
+        strays = ahead[:length]
+        is_far = bool(((strays < low_ns) | (strays > high_ns)).all())
+        return jump + length if is_far else None
+
+
+def _goes_on(rows: Int64s, jump: int, before_ns: int, step_ns: int) -> bool:
+    """Do the stamps go on from row ``jump``, without a leap back to where they were?"""
+    ahead = rows[jump : jump + LOOK_AHEAD]
+    if len(ahead) <= ROWS_TO_BELIEVE:
+        return False
+    leaps = np.diff(ahead)
+    returns = (leaps > -step_ns // 2) & (ahead[1:] >= before_ns - MIN_SET_BACK_NS)
+    return not bool(returns.any())

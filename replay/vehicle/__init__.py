@@ -1,0 +1,1 @@
+"""The vehicle file: sections, roles, validation, draft."""

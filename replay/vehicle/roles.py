@@ -1,0 +1,62 @@
+"""What each topic would be used as, by its type: the table of the contract."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Enum
+from typing import Final
+
+from crosscue.replay.columns import Topic
+
+
+class Role(Enum):
+    """What a stream is to the run."""
+
+    CAMERA = "camera"
+    CAMERA_INFO = "camera calibration"
+    CAN = "CAN bus"
+    MOBILEYE = "Mobileye"
+    IMU = "inertial unit"
+    MAGNETOMETER = "magnetometer"
+    GNSS = "GNSS"
+    ODOMETRY = "odometry"
+    POSE = "pose"
+    WHEELS = "wheel speeds"
+
+
+BY_TYPE: Final[Mapping[str, Role]] = {
+    "sensor_msgs/msg/CompressedImage": Role.CAMERA,
+    "sensor_msgs/msg/Image": Role.CAMERA,
+    "foxglove.CompressedImage": Role.CAMERA,
+    "foxglove.CompressedVideo": Role.CAMERA,
+    "foxglove.RawImage": Role.CAMERA,
+    "foxglove_msgs/msg/CompressedImage": Role.CAMERA,
+    "foxglove_msgs/msg/CompressedVideo": Role.CAMERA,
+    "crosscue/Images": Role.CAMERA,
+    "sensor_msgs/msg/CameraInfo": Role.CAMERA_INFO,
+    "foxglove.CameraCalibration": Role.CAMERA_INFO,
+    "can_msgs/msg/Frame": Role.CAN,
+    "crosscue/CanFrames": Role.CAN,
+    "sensor_msgs/msg/Imu": Role.IMU,
+    "sensor_msgs/msg/MagneticField": Role.MAGNETOMETER,
+    "sensor_msgs/msg/NavSatFix": Role.GNSS,
+    "foxglove.LocationFix": Role.GNSS,
+    "crosscue/WheelSpeeds": Role.WHEELS,
+    "nav_msgs/msg/Odometry": Role.ODOMETRY,
+    "geometry_msgs/msg/PoseStamped": Role.POSE,
+}
+"""Type names in ROS 2 spelling; ``ros2_spelling`` brings ROS 1 names here."""
+
+
+def ros2_spelling(type_name: str) -> str:
+    """``sensor_msgs/Imu`` as ``sensor_msgs/msg/Imu``; other names stay as they are."""
+    parts = type_name.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 and parts[0] != "crosscue" else type_name
+
+
+def role_of(topic: Topic) -> Role | None:
+    """What ``topic`` would be used as without configuration, or None."""
+    name = ros2_spelling(topic.type_name)
+    if name.startswith("mobileye_560_660_msgs/"):
+        return Role.MOBILEYE
+    return BY_TYPE.get(name)

@@ -1,0 +1,362 @@
+"""The vehicle file: which stream plays which role, how sensors are mounted, how noisy they are.
+
+TOML, versioned, checked with pydantic. Unknown keys, wrong units and missing roles are refused with
+the line in the file and a suggestion. Units stand last in every name (SI); frames are ISO 8855 /
+REP-103: x forward, y left, heading counter-clockwise. Every default is written to the manifest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import Field, ValidationError, field_validator
+
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import toml_tree
+from crosscue.replay.limits import MIB
+
+from .fusion import CUES, Fusion, Name, RangeFilter
+from .mobileye_cues import Past
+from .section import Finite, NotNegative, Positive, Section
+from .time import Time
+from .validation_errors import explain
+
+VERSION: Final = 1
+MOST_BYTES: Final = 1 * MIB
+DEGREE: Final = math.pi / 180.0
+
+Vector = tuple[Finite, Finite, Finite]
+Matrix = tuple[Vector, Vector, Vector]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Polygon = Annotated[tuple[tuple[Share, Share], ...], Field(min_length=3)]
+Signal = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
+"""``MESSAGE.SIGNAL`` as the DBC file spells them."""
+
+
+class Topics(Section):
+    """Which topic plays which role; a role left out goes to the only topic of a fitting type."""
+
+    camera: str | None = None
+    imu: str | None = None
+    magnetometer: str | None = None
+    heading: str | None = None
+    """Topic with a column ``heading_rad``, or an inertial unit whose orientation is trusted."""
+    gnss: str | None = None
+    odometry: str | None = None
+
+
+class WheelSpeeds(Section):
+    """Signals with the speed of each wheel; the rear two alone are enough."""
+
+    front_left: Signal | None = None
+    front_right: Signal | None = None
+    rear_left: Signal
+    rear_right: Signal
+    unit: Literal["km/h", "m/s", "mph", "rad/s"] | None = None
+    """Overrides the unit that the DBC file gives, or gives it where the file is silent."""
+    wheel_radius_m: Positive | None = None
+    """Rolling radius, for signals in rad/s."""
+
+
+class AngleSignal(Section):
+    """One signal with an angle or an angular rate, counter-clockwise positive."""
+
+    signal: Signal
+    unit: Literal["deg", "rad", "deg/s", "rad/s"] | None = None
+    sign: Literal[1, -1] = 1
+
+
+class Can(Section):
+    """The bus with the car's own signals and how to decode it."""
+
+    bus: str | None = None
+    """Topic of the bus; may be left out where the log has only one."""
+    dbc: tuple[str, ...] = ()
+    """Files, relative to the vehicle file's folder."""
+    wheel_speeds: WheelSpeeds | None = None
+    yaw_rate: AngleSignal | None = None
+    steering: AngleSignal | None = None
+
+
+class Mobileye(Section):
+    """The Mobileye's bus, protocol and mounting."""
+
+    bus: str | None = None
+    """Topic of its bus; left out, no Mobileye is read from CAN."""
+    revision: Literal["auto", "classic", "2.32"] = "auto"
+    family: Literal["auto", "extended", "tsr"] = "auto"
+    """Which of the two meanings message 0x700 has."""
+    slots: Literal[10, 13] = 13
+    x_m: Finite | None = None
+    """Reference point ahead of the rear axle; must be measured, so it has no default."""
+    y_m: Finite = 0.0
+    yaw_rad: Finite = 0.0
+
+
+class Odometry(Section):
+    """Wheels, gyro and steering; the terms are those of ``crosscue.localization.odometry``."""
+
+    track_width_m: Positive = 1.55
+    wheelbase_m: Positive = 2.7
+    wheel_scale: Positive = 1.0
+    right_wheel_scale: Positive = 1.0
+    use_front_wheels: bool = False
+    wheel_step_mps: NotNegative = 0.0028
+    slip_per_sqrt_m: NotNegative = 0.3
+    """A wheel radius off by one per cent, as an uncalibrated car's, is 10 m after 1 km: so much."""
+    heading_from: Literal["auto", "yaw_rate", "steering", "wheels"] = "auto"
+    """Which signal turns the pose; ``auto`` takes the first of these three that the log has."""
+    yaw_rate_scale: Positive = 1.0
+    gyro_bias_radps: Finite = 0.0
+    gyro_noise_rad_per_sqrt_s: NotNegative = 0.005
+    """A bias of 0.0006 rad/s, left in, is 2 degrees after a minute: so much."""
+    steering_ratio: Positive = 15.0
+    steering_offset_rad: Finite = 0.0
+    steering_noise_rad_sqrt_m: NotNegative = 0.01
+    wheel_turn_rad_per_sqrt_m: NotNegative = 0.03
+    """Tyres that differ by 0.3 % turn the pose 0.2 rad in 100 m: so much, where wheels turn it."""
+    turn_per_turn: NotNegative = 0.0
+    max_gap_s: Positive = 0.5
+    accel_var_m2ps3: NotNegative = 1.0
+
+
+class Compass(Section):
+    """From a magnetometer's reading to a heading; ``crosscue fit compass`` writes this section."""
+
+    use: bool = True
+    mounting_rotation: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    """Turns the sensor's axes into forward, left, up."""
+    mounting_yaw_rad: Finite = 0.0
+    hard_iron_t: Vector = (0.0, 0.0, 0.0)
+    soft_iron: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    declination_rad: Finite = 0.0
+    """East positive."""
+    heading_sd_rad: Positive = 15.0 * DEGREE
+    interval_m: NotNegative = 1.0
+    """A reading counts once the car has gone this far since the last that counted."""
+    interval_s: NotNegative = 2.0
+    """And this long: twice the time over which the compass's error persists."""
+    gate_nis: Positive | None = 10.8
+    """Refuse readings whose normalised innovation squared is larger."""
+
+
+class Start(Section):
+    """The pose at the log's first row, in the map frame (x east, y north)."""
+
+    x_m: Finite = 0.0
+    y_m: Finite = 0.0
+    position_sd_m: Positive = 1.0
+    heading_rad: Finite | None = None
+    """Left out: taken from the first compass readings."""
+    heading_sd_rad: Positive = 5.0 * DEGREE
+
+
+class Camera(Section):
+    """Pinhole camera and where it sits."""
+
+    x_m: Finite = 0.0
+    """Ahead of the rear axle."""
+    y_m: Finite = 0.0
+    z_m: Finite = 1.2
+    focal_px: Positive | None = None
+    center_px: tuple[Finite, Finite] | None = None
+    depth_bits: Annotated[int, Field(ge=8, le=16)] = 16
+    """How many bits of a 16-bit picture are in use; 12 for many cameras."""
+
+
+class Regions(Section):
+    """Where to look for road: polygons of (x, y) in shares of the picture's width and height."""
+
+    left: Polygon = ((0.0, 0.55), (0.2, 0.55), (0.2, 0.7), (0.0, 0.7))
+    straight: Polygon = ((0.44, 0.52), (0.56, 0.52), (0.6, 0.62), (0.4, 0.62))
+    right: Polygon = ((0.8, 0.55), (1.0, 0.55), (1.0, 0.7), (0.8, 0.7))
+
+
+class OwnCue(Section):
+    """A cue of one's own: so many detections with one of these labels and a higher score."""
+
+    labels: Annotated[tuple[str, ...], Field(min_length=1)]
+    score: Share = 0.5
+
+
+class Cues(Section):
+    """When a detection is a cue; the numbers are the source's for Mask R-CNN."""
+
+    stop_sign_labels: tuple[str, ...] = ("stop sign",)
+    stop_sign_score: Share = 0.9
+    traffic_light_labels: tuple[str, ...] = ("traffic light",)
+    traffic_light_score: Share = 0.9
+    road_share: Share = 0.2
+    """More road than this in a region is a cue (eq. 14)."""
+    own: dict[Name, OwnCue] = Field(default_factory=dict)
+    """By name; what each says of an intersection stands under [fusion.cues]."""
+
+    @field_validator("own")
+    @classmethod
+    def _new_names(cls, own: dict[str, OwnCue]) -> dict[str, OwnCue]:
+        for name in own:
+            if name in CUES:
+                raise ValueError(f"{name}: a cue of this name is there already; choose another")
+        return own
+
+
+class Cars(Section):
+    """Crossing and parked cars: shape, association and motion between two frames (eq. 15, 16)."""
+
+    labels: tuple[str, ...] = ("car",)
+    score: Share = 0.95
+    length_per_height: Positive = 2.0
+    """Only cars seen from the side: longer than so many times their height."""
+    area_change: Share = 0.03
+    """The same car in two frames: mask areas differ by less."""
+    position_change: Share = 0.05
+    """And positions by less than this share of the picture's width."""
+    still_change: Share = 0.002
+    """A car that moved by less than this share of the width, both ways, stood."""
+    slope: NotNegative = 0.25
+    """Horizontal motion: less than so many pixels down or up for one to the side."""
+    most_gap_s: Positive = 0.5
+    """Frames further apart are not compared."""
+
+
+class RangeCurve(Section):
+    """From an object's height in pixels to its range; ``crosscue fit ranges`` writes it."""
+
+    family: Literal["pinhole", "pinhole-offset", "power"] = "pinhole"
+    parameters: tuple[Finite, ...]
+    residual_sd_m: Positive
+
+
+class Ranges(Section):
+    """One curve for each kind of object that measures a distance."""
+
+    stop_sign: RangeCurve | None = None
+    traffic_light: RangeCurve | None = None
+
+
+class DetectorSection(Section):
+    """A detector of one's own naming."""
+
+    kind: str = "model"
+    """A detector's name, or ``module:factory``."""
+    card: str | None = None
+    """Model card, relative to the vehicle file's folder."""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    """For its factory, checked by it."""
+
+
+class Landmarks(Section):
+    """Camera pictures against a landmark database; ``crosscue fit landmarks`` writes min_score."""
+
+    matcher: str = "orb"
+    """``orb``, ``orb-essential``, or ``module:factory`` of one's own."""
+    min_score: NotNegative = 20.0
+    """Matches with a lower score are none."""
+    sigmas: Annotated[float, Field(gt=0.0, le=4.0)] = 2.0
+    """Compare with landmarks inside the ellipse of so many."""
+    most_candidates: Annotated[int, Field(ge=1)] = 50
+    gate_nis: Positive | None = 13.8
+    """Refuse matches whose normalised innovation squared is larger (one good one in a thousand)."""
+    interval_m: NotNegative = 1.0
+    """Look again once the car has gone this far."""
+    interval_s: NotNegative = 0.1
+    """And after this long."""
+    revisit_m: NotNegative = 100.0
+    """A landmark counts again once the car has gone this far: its error stays the same."""
+
+
+class Vehicle(Section):
+    """A whole vehicle file."""
+
+    version: Literal[1]
+    name: str = "unnamed"
+    topics: Topics = Topics()
+    can: Can = Can()
+    mobileye: Mobileye = Mobileye()
+    odometry: Odometry = Odometry()
+    time: Time = Time()
+    compass: Compass = Compass()
+    start: Start = Start()
+    camera: Camera = Camera()
+    landmarks: Landmarks = Landmarks()
+    regions: Regions = Regions()
+    cues: Cues = Cues()
+    cars: Cars = Cars()
+    ranges: Ranges = Ranges()
+    range_filter: RangeFilter = RangeFilter()
+    past: Past = Past()
+    fusion: Fusion = Fusion()
+    detectors: dict[str, DetectorSection] = Field(default_factory=dict)
+    lost_above_m: Positive = 100.0
+    """The pose counts as lost while the 2-sigma ellipse's full major axis exceeds this."""
+
+
+def load(path: Path) -> Vehicle:
+    """Read and check a vehicle file.
+
+    Raises:
+        VehicleError: Not there, not TOML, or a key or value that does not fit; with the line.
+    """
+    try:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
+            raise VehicleError(f"{path}: over {MOST_BYTES // MIB} MiB; this is no vehicle file")
+        text = content.decode("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise VehicleError(f"{path}: {why}; make one with: crosscue vehicle init LOG") from None
+    vehicle = parse(text, str(path))
+    can = vehicle.can
+    files = tuple(str((path.parent / name).resolve()) for name in can.dbc)
+    detectors = {
+        name: section
+        if section.card is None
+        else section.model_copy(update={"card": str((path.parent / section.card).resolve())})
+        for name, section in vehicle.detectors.items()
+    }
+    changed = {"can": can.model_copy(update={"dbc": files}), "detectors": detectors}
+    return vehicle.model_copy(update=changed)
+
+
+def parse(text: str, where: str) -> Vehicle:
+    """Check the text of a vehicle file; ``where`` names it in errors.
+
+    Raises:
+        VehicleError: As in ``load``.
+    """
+    try:
+        tree = toml_tree(text)
+    except ValueError as error:
+        raise VehicleError(f"{where}: not TOML: {error}; mend that line") from None
+    try:
+        return Vehicle.model_validate(tuples(tree))
+    except ValidationError as error:
+        raise VehicleError(explain(error, text, where, Vehicle)) from None
+
+
+def of_manifest(settings: Mapping[str, Any]) -> Vehicle:
+    """The vehicle settings as a run's manifest keeps them.
+
+    Raises:
+        VehicleError: They are of another version of crosscue.
+    """
+    try:
+        return Vehicle.model_validate(tuples(dict(settings)))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise VehicleError(
+            f"manifest.json: settings.{place}: {first['msg'].lower()}; the run was made by another "
+            "version of crosscue: replay again"
+        ) from None
+
+
+def tuples(value: Any) -> Any:
+    """TOML values with tuples for lists, which strict models want."""
+    if isinstance(value, dict):
+        return {key: tuples(item) for key, item in value.items()}
+    return tuple(tuples(item) for item in value) if isinstance(value, list) else value

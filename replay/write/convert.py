@@ -1,0 +1,146 @@
+"""Writes blocks of any log as one MCAP file with ROS 2 types, accounting for every row."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+import numpy as np
+
+from crosscue.replay.columns import Block, Messages, Topic
+from crosscue.replay.decode.interfaces import why_not_decoded
+from crosscue.replay.encode import Encoder, Encoders, Outgoing
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
+
+from .mcap import Compression, McapWriter
+from .mcap_chunks import Stretch
+
+NO_TYPE: Final = "type not known, so ROS 2 cannot hold it"
+BAD_SCHEMA: Final = "its definition is damaged"
+TOO_EARLY: Final = "time before 1970"
+
+
+class LogWriter:
+    """One log being written. Use it as a context manager.
+
+    ``add_topic`` for every topic, then ``write`` blocks in any order: they are merged by log time
+    within a window. ROS 2 messages are stored byte for byte; ROS 1 messages are transcribed;
+    everything else is written in the types that ``crosscue.replay.encode`` documents.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        ledger: Ledger,
+        *,
+        compression: Compression = "zstd",
+        overwrite: bool = False,
+    ) -> None:
+        """Begin a file; it has its name only once the writer is closed.
+
+        Args:
+            path: The final name.
+            ledger: Account of the log that is read; rows that cannot be written are skipped there.
+            compression: Of chunks.
+            overwrite: Replace a file that is there.
+
+        Raises:
+            OutputError: ``path`` exists, or cannot be written.
+        """
+        self.written: Counter[str] = Counter()
+        """Messages by topic as they are called in the file."""
+        self.kept: Counter[str] = Counter()
+        """Messages by topic as they are called in the log."""
+        self.types: dict[str, str] = {}
+        """From topic in the file to its type."""
+        self._ledger = ledger
+        self._encoders = Encoders()
+        self._known: dict[str, Encoder | str] = {}
+        self._details: dict[str, str] = {}
+        self._mcap = McapWriter(path, compression=compression, overwrite=overwrite)
+
+    def add_topic(self, topic: Topic) -> bool:
+        """Get ready for a topic; False if ROS 2 cannot hold it, and its rows will be skipped.
+
+        A topic without rows is not in the file.
+        """
+        if topic.name in self._known:
+            return not isinstance(self._known[topic.name], str)
+        try:
+            encoder: Encoder | str = self._encoders.encoder_for(topic) or why_not_decoded(
+                topic, NO_TYPE
+            )
+            self._details[topic.name] = f"{topic.type_name} ({topic.encoding})"
+        except SchemaError as error:
+            encoder = why_not_decoded(topic, BAD_SCHEMA)
+            self._details[topic.name] = str(error)
+        self._known[topic.name] = encoder
+        return not isinstance(encoder, str)
+
+    def write(self, block: Block) -> int:
+        """Write a block of a topic that was added; the number of messages written comes back.
+
+        Raises:
+            OutputError: The disk is full.
+        """
+        if not len(block):
+            return 0
+        encoder = self._known[block.topic]
+        if isinstance(encoder, str):
+            first = int(block.log_ns[0])
+            self._ledger.skip(block.topic, encoder, len(block), self._details[block.topic], first)
+            return 0
+        block = self._without_early(block)
+        count = 0
+        for outgoing in encoder(block, self._ledger):
+            self._put(outgoing)
+            count += len(outgoing.block)
+        self.kept[block.topic] += count
+        return count
+
+    def _without_early(self, block: Block) -> Block:
+        """MCAP times have no sign."""
+        early = block.log_ns < 0
+        if block.publish_ns is not None:
+            early |= block.publish_ns < 0
+        if not early.any():
+            return block
+        first = int(block.log_ns[early][0])
+        self._ledger.skip(block.topic, TOO_EARLY, int(early.sum()), "", first)
+        return block.take(~early)
+
+    def _put(self, outgoing: Outgoing) -> None:
+        block, kind = outgoing.block, outgoing.type
+        assert isinstance(block.rows, Messages)
+        channel = self._mcap.add_channel(block.topic, kind.name, kind.schema, kind.schema_encoding)
+        self.types[block.topic] = kind.name
+        sequence = block.sequence
+        if sequence is None:
+            sequence = np.zeros(len(block), np.uint32)
+        publish_ns = block.log_ns if block.publish_ns is None else block.publish_ns
+        self._mcap.write(Stretch(channel, block.log_ns, publish_ns, sequence, block.rows))
+        self.written[block.topic] += len(block)
+
+    def close(self) -> Mapping[str, int]:
+        """Finish the file; messages by topic in it come back.
+
+        Raises:
+            OutputError: The disk is full.
+        """
+        self._mcap.close()
+        return self.written
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._mcap.__exit__(kind, error, trace)

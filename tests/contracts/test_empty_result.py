@@ -1,0 +1,100 @@
+"""An empty result is never exit status 0 in silence, and leaves nothing that looks finished."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from crosscue.datasets.simulated.drive import DriveSettings
+from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
+from crosscue.eval import cli
+from crosscue.replay.files.run_folder import MANIFEST
+from support.every_format import EVERY_FORMAT
+from support.pictures import picture_folder
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
+    """A short simulated drive."""
+    folder = tmp_path_factory.mktemp("drive")
+    return write_drive(folder, DriveSettings(seed=3, blocks=1, block_m=60.0))
+
+
+def _fails(capsys: pytest.CaptureFixture[str], out: Path, *argv: object) -> str:
+    """The one line; nothing that looks finished is left."""
+    assert cli.run([str(one) for one in argv]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("crosscue: ")
+    assert captured.err.count("\n") == 1
+    assert not out.is_file()
+    assert not (out / MANIFEST).exists()
+    assert not out.exists() or not list(out.iterdir())
+    return captured.err
+
+
+@pytest.mark.parametrize("command", ["replay", "decode"])
+def test_a_part_past_the_end_names_what_found_no_rows(
+    drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    out = tmp_path / "out"
+
+    said = _fails(
+        capsys, out, command, drive.log, "--vehicle", drive.vehicle, "-o", out, "--from", "100000"
+    )
+
+    assert "wheel speeds" in said if command == "replay" else "no topic gave a row" in said
+    assert "/can (" in said
+    assert "--from" in said
+
+
+def test_convert_of_a_part_past_the_end_writes_no_file(
+    drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.mcap"
+
+    assert "no row to write" in _fails(
+        capsys, out, "convert", drive.log, "-o", out, "--from", "100000"
+    )
+
+
+def test_a_vehicle_file_of_another_car_is_no_empty_run(
+    drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dbc = next(drive.vehicle.parent.glob("*.dbc")).read_text()
+    (tmp_path / "other.dbc").write_text("\n".join(
+        f"BO_ {int(line.split()[1]) ^ 0x400} {line.split(maxsplit=2)[2]}"
+        if line.startswith("BO_ ") else line
+        for line in dbc.splitlines() if line.startswith(("VERSION", "BO_ ", " SG_", "BU_"))
+    ) + "\n")  # fmt: skip
+    text = drive.vehicle.read_text()
+    name = next(drive.vehicle.parent.glob("*.dbc")).name
+    (tmp_path / "car.toml").write_text(text.replace(name, "other.dbc"))
+    out = tmp_path / "out"
+
+    said = _fails(capsys, out, "replay", drive.log, "--vehicle", tmp_path / "car.toml", "-o", out)
+
+    assert "the wheel speeds, planned from /can, found no rows" in said
+
+
+def test_a_log_without_anything_to_estimate_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, out = EVERY_FORMAT["candump"](tmp_path), tmp_path / "out"
+
+    assert "no wheel speeds" in _fails(capsys, out, "replay", log, "-o", out)
+
+
+@pytest.mark.parametrize(
+    "spoil", [lambda path: path.write_bytes(b"\x89PNG"), lambda path: path.write_bytes(b"")]
+)
+def test_a_camera_without_one_usable_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[Path], object]
+) -> None:
+    log, out = picture_folder(tmp_path / "front", 3, "rate_hz: 10\n"), tmp_path / "out"
+    for picture in log.glob("*.png"):
+        spoil(picture)
+
+    said = _fails(capsys, out, "detect", log, "--detectors", "signs", "-o", out)
+
+    assert "found no frames" in said

@@ -1,0 +1,64 @@
+"""Road pixels of simulated pictures: what lies on the map's road and nothing stands before."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M
+from crosscue.datasets.scenes.rendering.render import Picture
+from support.scenes import renderer, when_at, world
+
+
+@cache
+def picture(layout: str, x_m: float) -> Picture:
+    of = world(layout)
+    return renderer(of).picture(when_at(of, x_m), with_road=True)
+
+
+@pytest.mark.parametrize(("layout", "x_m"), [("D", -30.0), ("D", -8.0), ("A", -15.0)])
+def test_a_point_of_the_ground_is_road_where_the_map_says_so(layout: str, x_m: float) -> None:
+    of, shown = world(layout), picture(layout, x_m)
+    assert shown.road is not None
+    rng = np.random.default_rng(3)
+    points = np.column_stack(
+        [rng.uniform(x_m + 6, x_m + 45, 4000), rng.uniform(-25, 25, 4000), np.zeros(4000)]
+    )
+    column, row, depth = shown.view.project(points).T
+    high, wide = shown.road.shape
+    inside = (depth > 0) & (column >= 0) & (column < wide - 1) & (row >= 0) & (row < high - 1)
+    column, row = column[inside].astype(int), row[inside].astype(int)
+    texel = ((points[inside, :2] - [X_M[0], Y_M[0]]) * TEXELS_PER_M).astype(int)
+    on_road = of.ground.road[texel[:, 1], texel[:, 0]]
+    # A pixel is over a metre long so far away: points that near to a kerb are left out.
+    kerb = int(1.5 * TEXELS_PER_M)
+    clear = np.ones_like(on_road)
+    for dx, dy in ((kerb, 0), (-kerb, 0), (0, kerb), (0, -kerb)):
+        clear &= of.ground.road[texel[:, 1] + dy, texel[:, 0] + dx] == on_road
+    clear &= depth[inside] < 20.0
+    seen = shown.road[row, column]
+
+    assert not seen[clear & ~on_road].any()
+    # Something may stand before the road.
+    assert seen[clear & on_road].mean() > 0.9
+    assert on_road.any()
+    assert not on_road.all()
+
+
+def test_objects_are_no_road_and_the_sky_is_none() -> None:
+    shown = picture("D", -20.0)
+    assert shown.road is not None
+
+    assert not (shown.road & (shown.owner >= 0)).any()
+    assert not shown.road[: shown.road.shape[0] // 3].any()
+    assert shown.road[-1, shown.road.shape[1] // 2]
+
+
+def test_asking_for_road_changes_no_pixel() -> None:
+    of = world("D")
+    plain = renderer(of).picture(when_at(of, -20.0))
+
+    assert plain.road is None
+    np.testing.assert_array_equal(plain.rgb, picture("D", -20.0).rgb)

@@ -1,0 +1,42 @@
+"""The simulated car's vehicle file: it parses, and its curves fit any size of picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.scenes.car_file import vehicle_text
+from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.detectors.ranging.height_to_range import range_of
+from crosscue.replay.vehicle.vehicle import Vehicle, parse
+from support.scenes import picture_at, world
+
+
+def vehicle(width_px: int) -> Vehicle:
+    camera = Camera(width_px=width_px, height_px=width_px * 9 // 16)
+    text = vehicle_text(camera, mounting_yaw_rad=0.1, declination_rad=0.0, heading_rad=0.5)
+    return parse(text, "vehicle.toml")
+
+
+def test_a_sign_half_as_high_in_half_the_picture_is_as_far_away() -> None:
+    large, small = vehicle(1280).ranges, vehicle(640).ranges
+    assert large.stop_sign is not None
+    assert small.stop_sign is not None
+    height = np.array([8.0, 20.0, 60.0])
+
+    far = range_of(height, large.stop_sign)
+
+    np.testing.assert_allclose(range_of(height / 2, small.stop_sign), far, rtol=1e-3)
+
+
+@pytest.mark.parametrize("x_m", [-12.0, -22.0, -35.0])
+def test_a_stop_sign_measures_the_way_to_the_start(x_m: float) -> None:
+    camera = Camera(width_px=1280, height_px=720)
+    picture = picture_at(world("L204"), x_m, camera)
+    curve = vehicle(1280).ranges.stop_sign
+    (sign,) = [one for one in picture.seen if one.thing.category == "stop_sign"]
+    assert curve is not None
+    height = np.array([float(sign.box_px[3] - sign.box_px[1])])
+
+    # The curve is one for what a network finds; a true outline may differ from that by its error.
+    assert range_of(height, curve)[0] == pytest.approx(-x_m, abs=2.0 * curve.residual_sd_m)

@@ -1,0 +1,266 @@
+"""A simulated drive as files: it passes through the same readers as a real one, and truth fits."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.scenes.drive import (
+    CALIBRATION,
+    CAR_BUS,
+    IMAGES,
+    MOBILEYE_BUS,
+    SceneFiles,
+    SceneSettings,
+    write_scene,
+)
+from crosscue.datasets.scenes.mobileye import SETTINGS, Faults
+from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.truth.truth import load
+from crosscue.datasets.truth.tum import heading_rad, read_tum
+from crosscue.detectors import rle
+from crosscue.eval.cli import run
+from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.can.decode import BusDecoder
+from crosscue.replay.columns import Block, CanFrames, Images, Table
+from crosscue.replay.decode import decoder_for
+from crosscue.replay.errors import OutputError, SchemaError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import open_log
+from crosscue.replay.mobileye.decode import MobileyeDecoder
+from crosscue.replay.vehicle.vehicle import load as load_vehicle
+
+TINY = Camera(width_px=192, height_px=108)
+
+
+def settings(layout: str = "C", run: int = 1, seed: int = 0) -> SceneSettings:
+    return SceneSettings(layout=layout, run=run, seed=seed, camera=TINY)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
+    return write_scene(tmp_path_factory.mktemp("drive"), settings())
+
+
+def blocks(path: Path, topic: str) -> Iterator[Block]:
+    """Decoded blocks of one topic."""
+    ledger = Ledger(str(path))
+    with open_log(path) as log:
+        (one,) = [t for t in log.topics if t.name == topic]
+        decoder = decoder_for(one)
+        assert decoder is not None
+        for block in log.read(ledger):
+            if block.topic == topic:
+                yield decoder(block, ledger)
+
+
+def truth_of(files: SceneFiles) -> Any:
+    return json.loads((files.log.parent / "objects.json").read_text())
+
+
+def test_the_same_seed_gives_the_same_bytes(files: SceneFiles, tmp_path: Path) -> None:
+    again = write_scene(tmp_path / "again", settings())
+
+    for one in ("drive.mcap", "truth.json", "objects.json", "pose.tum", "ranges.csv"):
+        assert (again.log.parent / one).read_bytes() == (files.log.parent / one).read_bytes()
+
+
+def test_every_row_is_read_back_and_pictures_have_their_size(files: SceneFiles) -> None:
+    import cv2
+
+    ledger = Ledger(str(files.log))
+    with open_log(files.log) as log:
+        for _ in log.read(ledger):
+            pass
+        declared = {topic.name: topic.declared for topic in log.topics}
+    assert declared[IMAGES] == declared[CALIBRATION] == files.pictures
+    count = 0
+    for block in blocks(files.log, IMAGES):
+        assert isinstance(block.rows, Images)
+        for i in range(len(block)):
+            raw = np.frombuffer(block.rows.bytes_.payload(i), np.uint8)
+            picture = cv2.imdecode(raw, cv2.IMREAD_COLOR)
+            assert picture is not None
+            assert picture.shape == (108, 192, 3)
+            count += 1
+    assert count == files.pictures
+
+
+def test_the_camera_is_the_one_that_the_vehicle_file_tells(files: SceneFiles) -> None:
+    vehicle = load_vehicle(files.vehicle)
+    (block, *_) = blocks(files.log, CALIBRATION)
+
+    assert vehicle.camera.focal_px == pytest.approx(0.55 * 192)
+    assert vehicle.camera.center_px == (96.0, 54.0)
+    assert isinstance(block.rows, Table)
+    k = next(column for name, column in block.rows.columns.items() if name in ("k", "K"))
+    assert np.allclose(k[0], [105.6, 0, 96, 0, 105.6, 54, 0, 0, 1])
+
+
+def test_range_falls_as_the_car_drives_and_is_zero_when_it_enters(files: SceneFiles) -> None:
+    rows = np.loadtxt(files.log.parent / "ranges.csv", delimiter=",", skiprows=1)
+    track = read_tum(files.log.parent / "pose.tum")
+    (approach,) = load(files.truth).approaches
+    travelled = np.hypot(*(track.xyz_m[:, :2] - track.xyz_m[0, :2]).T)
+    at = np.interp(rows[:, 0], track.t_ns.astype(float), travelled)
+
+    assert (np.diff(rows[:, 2]) <= 1e-9).all()
+    assert np.allclose(rows[0, 2] - rows[:, 2], at, atol=0.05)
+    assert np.allclose(rows[:, 3] - rows[:, 2], float(approach.length_m or 0.0), atol=1e-3)
+    speed_mps = (rows[-2, 2] - rows[-1, 2]) / 0.1
+    assert 0.0 < rows[-1, 2] < 0.11 * max(speed_mps, 1.0)
+
+
+def test_wheels_say_how_fast_the_trajectory_goes(files: SceneFiles) -> None:
+    database = CanDatabase.load([files.log.parent / "simulated_car.dbc"])
+    track = read_tum(files.log.parent / "pose.tum")
+    decoder = BusDecoder(database, CAR_BUS, Ledger("test"))
+    times, speeds = [], []
+    for block in blocks(files.log, CAR_BUS):
+        for table in decoder(block):
+            if table.topic.endswith("WHEEL_SPEEDS"):
+                assert isinstance(table.rows, Table)
+                times.append(table.log_ns)
+                speeds.append(table.rows["REAR_LEFT"].astype(np.float64) / 3.6)
+    step_m = np.hypot(*np.diff(track.xyz_m[:, :2], axis=0).T)
+    true_mps = step_m / (np.diff(track.t_ns) * 1e-9)
+    middle = (track.t_ns[1:] + track.t_ns[:-1]) / 2
+    wheel = np.interp(middle, np.concatenate(times).astype(float), np.concatenate(speeds))
+
+    straight = np.abs(np.diff(np.unwrap(heading_rad(track)))) < 1e-3
+    assert np.sqrt(np.mean((wheel - true_mps)[straight] ** 2)) < 0.25
+
+
+def test_the_mobileye_reports_vehicles_that_are_there(files: SceneFiles) -> None:
+    decoder = MobileyeDecoder(MOBILEYE_BUS, Ledger("test"), SETTINGS)
+    tables: list[Block] = []
+    for block in blocks(files.log, MOBILEYE_BUS):
+        assert isinstance(block.rows, CanFrames)
+        tables += decoder(block)
+    tables += decoder.flush()
+    objects = truth_of(files)
+    cars: dict[int, dict[int, float]] = {image["t_ns"]: {} for image in objects["images"]}
+    time_of = {image["id"]: image["t_ns"] for image in objects["images"]}
+    for one in objects["annotations"]:
+        if one["category_id"] == 3:
+            cars[time_of[one["image_id"]]][one["track_id"]] = one["distance_m"]
+    grabbed = np.array(sorted(cars))
+    names = ("t_ns", "obstacle_id", "x_m", "y_m", "length_m")
+    found = 0
+    for table in tables:
+        assert isinstance(table.rows, Table)
+        if not table.topic.endswith("/obstacles"):
+            continue
+        for t_ns, number, x_m, y_m, long_m in zip(
+            *(table.rows[name].tolist() for name in names), strict=True
+        ):
+            middle_m = x_m + long_m / 2
+            # The field of view holds for the vehicle's middle, the place for its near end.
+            assert abs(np.arctan2(y_m, middle_m - 3.75)) < Faults().half_view_rad + 0.15
+            true_m = cars[int(grabbed[np.argmin(np.abs(grabbed - t_ns))])].get(number - 1)
+            if true_m is not None:  # else too few pixels for an annotation at this size
+                assert abs(middle_m - true_m) < 1.5 + 0.12 * x_m
+                found += 1
+    assert found > 20
+
+
+def test_truth_is_whole_and_cues_are_there_only_while_they_can_be_seen(files: SceneFiles) -> None:
+    truth = load(files.truth)
+    (approach,) = truth.approaches
+    objects = truth_of(files)
+    seen = {
+        image["t_ns"]: {
+            one["category_id"] for one in objects["annotations"] if one["image_id"] == image["id"]
+        }
+        for image in objects["images"]
+    }
+    stops = [one for one in truth.cues if one.cue == "stop_sign"]
+
+    assert approach.intersection == "C"
+    assert approach.features.left
+    assert approach.features.right
+    assert approach.features.straight
+    assert approach.control == "stop_sign"
+    for t_ns, classes in seen.items():
+        if t_ns < approach.enter_ns:
+            (span,) = [one for one in stops if one.start_ns <= t_ns < one.end_ns]
+            assert span.present == (13 in classes)
+    present = [one for one in truth.cues if one.present]
+    assert {"stop_sign", "vehicles_past", "road_straight"} <= {one.cue for one in present}
+    assert not any(one.cue in ("traffic_light", "do_not_enter") for one in present)
+
+
+def test_annotations_lie_in_their_pictures_and_masks_in_their_boxes(files: SceneFiles) -> None:
+    objects = truth_of(files)
+    size = {image["id"]: (image["width"], image["height"]) for image in objects["images"]}
+
+    assert len(objects["images"]) == files.pictures
+    assert len({one["id"] for one in objects["annotations"]}) == len(objects["annotations"])
+    for one in objects["annotations"][::7]:
+        wide, high = size[one["image_id"]]
+        x, y, w, h = one["bbox"]
+        mask = rle.decode(one["segmentation"]["counts"].encode(), (wide, high))
+        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        assert [columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1] == [x, y, w, h]
+        assert mask.sum() == one["area"]
+
+
+def test_a_drive_is_not_overwritten_unasked(files: SceneFiles) -> None:
+    with pytest.raises(OutputError, match=r"drive\.mcap"):
+        write_scene(files.log.parent, settings())
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["simulate", "-o", "x"], "or --all"),
+        (["simulate", "J", "-o", "x"], "there are: A to H"),
+        (["simulate", "A", "--run", "0", "-o", "x"], "run 0"),
+        (["simulate", "A", "--run", "1", "--runs", "2", "-o", "x"], "--run"),
+        (["simulate", "A", "B", "A", "-o", "x"], "named twice"),
+        (["simulate", "A", "--rate", "7", "-o", "x"], "want 10, 20, 25 or 50"),
+        (["simulate", "A", "--width", "99", "-o", "x"], "multiple of 16"),
+        (["simulate", "A", "--seed", "-1", "-o", "x"], "seed -1"),
+    ],
+)
+def test_wrong_usage_is_told(
+    argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(argv) == 2
+    assert said in capsys.readouterr().err
+
+
+BASE: dict[str, Any] = {"version": 1, "start_ns": 0, "end_ns": 100}
+ONE: dict[str, Any] = {
+    "id": 0, "intersection": "A", "start_ns": 0, "enter_ns": 40, "control": "none",
+    "features": {"left": True, "right": False, "straight": True},
+}  # fmt: skip
+CUE: dict[str, Any] = {"cue": "stop_sign", "present": True}
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"approaches": [ONE, ONE | {"id": 1, "start_ns": 30, "enter_ns": 60}]}, "overlap"),
+        ({"approaches": [ONE, ONE | {"start_ns": 50, "enter_ns": 60}]}, "twice"),
+        ({"approaches": [ONE | {"enter_ns": 101}]}, "from 0 to 100"),
+        ({"approaches": [ONE | {"control": "yield"}]}, "approaches.0.control"),
+        ({"cues": [CUE | {"t_ns": 100}]}, "from 0 to 100"),
+        ({"cues": [CUE | {"cue": "zebra", "t_ns": 5}]}, "no such cue"),
+        ({"cues": [CUE]}, "either t_ns"),
+        ({"cues": [CUE | {"t_ns": 5, "start_ns": 5, "end_ns": 6}]}, "either t_ns"),
+        ({"cues": [CUE | {"start_ns": 5}]}, "either t_ns"),
+        ({"cues": [CUE | {"t_ns": 5, "approach": 3}]}, "no approach 3"),
+    ],
+)
+def test_truth_that_cannot_be_is_refused(tmp_path: Path, more: dict[str, Any], said: str) -> None:
+    path = tmp_path / "truth.json"
+    path.write_text(json.dumps(BASE | more))
+
+    with pytest.raises(SchemaError, match=said):
+        load(path)

@@ -1,0 +1,201 @@
+"""Laws of the simulated pictures: geometry, masks, visibility, symmetry, determinism."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from crosscue.datasets.scenes.cars import SHAPES, Look, car
+from crosscue.datasets.scenes.conditions import conditions_of
+from crosscue.datasets.scenes.layout import TABLE_6, any_layout, layout_named
+from crosscue.datasets.scenes.rendering.camera import Camera, view_at
+from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M
+from crosscue.datasets.scenes.rendering.kernels import compiled
+from crosscue.datasets.scenes.rendering.render import Picture, Seen
+from crosscue.datasets.scenes.world import build
+from support.scenes import SMALL, mirrored, picture_at, renderer, when_at, world
+
+
+def only(picture: Picture, category: str) -> Seen:
+    (found,) = [one for one in picture.seen if one.thing.category == category]
+    return found
+
+
+def test_the_same_seed_gives_the_same_pixels() -> None:
+    plan = layout_named("D")
+    again = build(plan, conditions_of(plan, 1))
+
+    one, other = picture_at(world("D"), -20.0), picture_at(again, -20.0)
+
+    assert np.array_equal(one.rgb, other.rgb)
+    assert np.array_equal(one.owner, other.owner)
+
+
+def test_pixels_do_not_depend_on_the_number_of_threads() -> None:
+    import cv2
+
+    before = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(1)
+        one = picture_at(world("D"), -20.0)
+        cv2.setNumThreads(4)
+        other = picture_at(world("D"), -20.0)
+    finally:
+        cv2.setNumThreads(before)
+
+    assert np.array_equal(one.rgb, other.rgb)
+
+
+def test_a_picture_does_not_depend_on_those_before_it() -> None:
+    draw = renderer(world("D"))
+    t_s = when_at(world("D"), -20.0)
+    alone = renderer(world("D")).picture(t_s, 7)
+
+    draw.picture(1.0, 3)
+
+    assert np.array_equal(draw.picture(t_s, 7).rgb, alone.rgb)
+
+
+def test_another_run_is_another_picture() -> None:
+    one, other = picture_at(world("D", 1), -20.0), picture_at(world("D", 1, seed=5), -20.0)
+
+    assert not np.array_equal(one.rgb, other.rgb)
+
+
+@pytest.mark.parametrize("x_m", [-45.0, -30.0, -15.0, -8.0])
+def test_a_sign_is_as_large_and_where_a_pinhole_camera_shows_it(x_m: float) -> None:
+    camera = Camera()
+    sign = only(picture_at(world("D"), x_m, camera), "stop_sign")
+    view = view_at(camera, world("D").approach, when_at(world("D"), x_m))
+    x0, y0, x1, y1 = sign.box_px
+    _, y_m, z_m = sign.thing.at
+    pitch = float(np.arcsin(-view.eye_axes[2, 2]))  # the body nods when it brakes
+    depth_m = -view.at_m[0] * np.cos(pitch) - (z_m - view.at_m[2]) * np.sin(pitch)
+
+    assert y1 - y0 == pytest.approx(camera.focal * 0.76 / depth_m, abs=1.6)
+    assert x1 - x0 == pytest.approx(camera.focal * 0.76 / depth_m, abs=1.6)
+    right_m = view.at_m[1] - y_m
+    assert (x0 + x1) / 2 == pytest.approx(640 + camera.focal * right_m / depth_m, abs=1.2)
+    assert sign.distance_m == pytest.approx(-view.rear_axle[0], abs=1e-6)
+
+
+@pytest.mark.parametrize("layout", ["D", "E", "F"])
+def test_masks_fill_their_boxes_and_say_who_owns_each_pixel(layout: str) -> None:
+    picture = picture_at(world(layout), -25.0)
+
+    assert picture.seen
+    for seen in picture.seen:
+        x0, y0, x1, y1 = seen.box_px
+        assert seen.mask.shape == (y1 - y0, x1 - x0)
+        assert all(edge.any() for edge in (seen.mask[0], seen.mask[-1]))
+        assert all(edge.any() for edge in (seen.mask[:, 0], seen.mask[:, -1]))
+        assert np.array_equal(picture.owner[y0:y1, x0:x1] == seen.thing.number, seen.mask)
+        assert seen.mask.sum() == (picture.owner == seen.thing.number).sum()
+        assert 0.0 < seen.visible <= 1.0
+        assert 0.0 < seen.in_picture <= 1.0
+
+
+def test_the_mirror_image_of_a_world_is_the_mirror_image_of_its_picture() -> None:
+    plain = world("F", 2)
+    one, other = picture_at(plain, -22.0), picture_at(mirrored(plain), -22.0)
+
+    same = (one.owner == other.owner[:, ::-1]).mean()
+    away = np.abs(one.rgb.astype(int) - other.rgb[:, ::-1]).mean()
+    not_mirrored = np.abs(one.rgb.astype(int) - other.rgb).mean()
+
+    assert same > 0.999
+    assert away < 4.0  # noise and the road's fine grain are not mirrored
+    assert not_mirrored > 3 * away
+
+
+def test_vegetation_hides_the_stop_sign_from_afar_and_not_from_near() -> None:
+    camera = Camera()
+    far = picture_at(world("G"), -55.0, camera)
+    hidden = max((s.visible for s in far.seen if s.thing.category == "stop_sign"), default=0.0)
+
+    assert hidden < 0.6
+    assert only(picture_at(world("D"), -55.0, camera), "stop_sign").visible > 0.9
+    assert only(picture_at(world("G"), -12.0, camera), "stop_sign").visible > 0.9
+
+
+def test_what_is_beside_the_camera_is_not_seen() -> None:
+    scene = world("D")
+    picture = picture_at(scene, 1.0)
+
+    assert all(one.thing.category != "stop_sign" for one in picture.seen)
+
+
+def test_dusk_is_darker_than_noon_and_glare_brighter_at_the_sun() -> None:
+    noon, dusk = picture_at(world("D", 1), -30.0), picture_at(world("D", 10), -30.0)
+    glare = picture_at(world("D", 4), -30.0)
+    top = glare.rgb[: SMALL.height_px // 3]
+
+    assert dusk.rgb.mean() < 0.75 * noon.rgb.mean()
+    assert (top.min(axis=2) > 245).mean() > 0.02
+
+
+@pytest.mark.parametrize("kind", sorted(SHAPES))
+@pytest.mark.parametrize("nose_left", [False, True])
+def test_the_nose_is_the_end_with_the_smaller_height(kind: str, nose_left: bool) -> None:
+    mask = _side_view(kind, nose_left=nose_left)
+    columns = np.flatnonzero(mask.any(axis=0))
+    width = len(columns)
+    ends = mask[:, columns[: width // 8]], mask[:, columns[-(width // 8) :]]
+    left, right = (float(end.any(axis=1).sum()) for end in ends)
+
+    assert (left < right) == nose_left
+    assert width / mask.any(axis=1).sum() > 2.0
+
+
+def _side_view(kind: str, *, nose_left: bool) -> NDArray[np.bool_]:
+    """A car 15 m ahead, seen side on."""
+    mesh = car(Look(kind, (0.5, 0.5, 0.5)), lamps_on=False, brakes_on=False)
+    placed = mesh.placed(15.0, 0.0, np.pi / 2 if nose_left else -np.pi / 2)
+    covered = np.zeros((216, 384), np.uint8)
+    axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    compiled().cover(
+        placed.corners, np.zeros(3, np.float32), axes, np.array([0.0, 0.0, 1.4]), 400.0, 192.0,
+        108.0, covered, 0, 0,
+    )  # fmt: skip
+    return covered.astype(np.bool_)
+
+
+def test_layouts_from_seeds_are_none_of_the_scored_ones() -> None:
+    others = [any_layout(seed) for seed in range(60)]
+
+    assert len({one.name for one in others}) == 60
+    assert not {one.seed for one in others} & {one.seed for one in TABLE_6.values()}
+    assert {one.control for one in others} == {"stop_sign", "traffic_light", "none"}
+    assert all(one.goes_left or one.goes_right or one.goes_ahead for one in others)
+    assert any(one.do_not_enter for one in others)
+    assert any(one.one_way == "left" for one in others)
+
+
+@pytest.mark.parametrize("name", ["I", "a", "L", "L-1", "", "L99999999999"])
+def test_unknown_layouts_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="there are: A to H"):
+        layout_named(name)
+
+
+@pytest.mark.parametrize("layout", ["D", "F", "L12"])
+def test_cars_that_drive_stay_on_the_road(layout: str) -> None:
+    scene = world(layout)
+    moving = [one for one in scene.things if one.velocity != (0.0, 0.0)]
+    for thing in moving:
+        for t_s in np.arange(0.0, 15.0, 0.5):
+            x, y = thing.at[0] + thing.shift(t_s)[0], thing.at[1] + thing.shift(t_s)[1]
+            if thing.is_there(t_s) and abs(x) < 105.0 and abs(y) < 60.0:
+                place = int((y - Y_M[0]) * TEXELS_PER_M), int((x - X_M[0]) * TEXELS_PER_M)
+                assert scene.ground.road[place], f"{thing.role} at {x:.1f}, {y:.1f}"
+
+
+def test_our_car_stays_on_the_road_and_turns_only_where_it_may() -> None:
+    for layout in ("D", "F"):
+        scene = world(layout)
+        motion, plan = scene.approach.motion, scene.layout
+        goes = {"left": plan.goes_left, "right": plan.goes_right, "ahead": plan.goes_ahead}
+        rows = ((motion.y_m - Y_M[0]) * TEXELS_PER_M).astype(int)
+        columns = ((motion.x_m - X_M[0]) * TEXELS_PER_M).astype(int)
+        assert goes[scene.approach.turn]
+        assert scene.ground.road[rows, columns].all()

@@ -1,0 +1,143 @@
+"""comma2k19 segments: the real one, and what becomes of damaged arrays."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from crosscue.datasets.adapters.npy import read_column
+from crosscue.replay.columns import CanFrames, Table
+from crosscue.replay.errors import LogFormatError, UnknownFormatError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Selection, open_log
+from support.data import shared
+
+SEGMENT = ("comma2k19", "Example_1", "b0c9d2329ad1606b_2018-08-02--08-34-47", "40")
+
+
+def _save(path: Path, rows: NDArray[np.generic]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file:
+        np.save(file, rows)
+    return path
+
+
+def test_every_row_of_the_real_segment_is_accounted_for() -> None:
+    with open_log(shared(*SEGMENT)) as log:
+        ledger = Ledger(str(log.path))
+        rows = sum(len(block) for block in log.read(ledger))
+
+    accounts = ledger.accounts
+    assert sum(accounts[f"can/{bus}"].used for bus in (0, 1, 128, 129)) == 135_468
+    assert rows == sum(account.found for account in accounts.values())
+    # One array of the published example is cut; the rest is whole.
+    damaged = {name: a.dropped.total() for name, a in accounts.items() if not a.is_whole}
+    assert damaged == {"imu/magnetometer_uncalibrated": 64}
+
+
+def test_axes_become_forward_left_up() -> None:
+    path = shared(*SEGMENT)
+    raw = np.load(path / "processed_log/IMU/gyro/value", allow_pickle=False)
+    with open_log(path) as log:
+        blocks = log.read(Ledger(""), Selection(frozenset({"imu/gyro"})))
+        tables = [block.rows for block in blocks]
+
+    assert all(isinstance(table, Table) for table in tables)
+    yaw = np.concatenate([t["gyro_z_radps"] for t in tables if isinstance(t, Table)])
+    np.testing.assert_array_equal(yaw, -raw[:, 2])
+
+
+def test_can_bytes_are_those_of_the_file_with_trailing_zeros() -> None:
+    path = shared(*SEGMENT)
+    raw = np.load(path / "processed_log/CAN/raw_can/data", allow_pickle=False)
+    source = np.load(path / "processed_log/CAN/raw_can/src", allow_pickle=False)
+    with open_log(path) as log:
+        blocks = log.read(Ledger(""), Selection(frozenset({"can/1"})))
+        frames = [block.rows for block in blocks]
+
+    payload = np.concatenate([f.data for f in frames if isinstance(f, CanFrames)])
+    np.testing.assert_array_equal(payload, raw.view(np.uint8).reshape(-1, 8)[source == 1])
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("cut_bytes", [0, 1, 8, 100, 700, 10_000])
+def test_a_cut_array_gives_exactly_its_whole_rows(
+    tmp_path: Path, order: str, cut_bytes: int
+) -> None:
+    rows = np.arange(90.0).reshape(30, 3)
+    path = _save(tmp_path / "value", np.asarray(rows, order="F" if order == "F" else "C"))
+    header = path.stat().st_size - rows.nbytes
+    keep = max(header, path.stat().st_size - cut_bytes)
+    path.write_bytes(path.read_bytes()[:keep])
+
+    column = read_column(path)
+
+    assert column.declared == 30
+    np.testing.assert_array_equal(column.rows, rows[: len(column.rows)])
+    cells = (keep - header) // 8
+    whole = cells // 3 if order == "C" else max(0, cells - 60)
+    assert len(column.rows) == whole
+
+
+def test_arrays_of_objects_are_refused(tmp_path: Path) -> None:
+    path = _save(tmp_path / "value", np.array([{"a": 1}], dtype=object))
+
+    with pytest.raises(LogFormatError, match="plain numbers"):
+        read_column(path)
+
+
+def test_one_unreadable_array_does_not_take_the_others_along(tmp_path: Path) -> None:
+    imu = tmp_path / "processed_log" / "IMU"
+    for name in ("gyro", "accelerometer"):
+        _save(imu / name / "t", np.arange(5.0))
+        _save(imu / name / "value", np.zeros((5, 3)))
+    (imu / "accelerometer" / "value").write_bytes(b"not an array")
+
+    with open_log(tmp_path) as log:
+        ledger = Ledger("")
+        topics = {block.topic for block in log.read(ledger)}
+
+    assert topics == {"imu/gyro"}
+    assert not ledger.is_whole
+    assert "accelerometer" in ledger.details[0].detail
+
+
+def test_a_folder_without_a_recording_is_no_log(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("nothing")
+
+    with pytest.raises(UnknownFormatError, match="comma2k19"):
+        open_log(tmp_path)
+
+
+def test_rows_outside_the_wanted_span_are_counted() -> None:
+    with open_log(shared(*SEGMENT)) as log:
+        ledger = Ledger("")
+        start_ns = 46_420_000_000_000
+        wanted = Selection(frozenset({"car/speed"}), start_ns, start_ns + 10**10)
+        times = np.concatenate([block.log_ns for block in log.read(ledger, wanted)])
+
+    account = ledger.topic("car/speed")
+    assert ((times >= start_ns) & (times < start_ns + 10**10)).all()
+    assert account.used == len(times)
+    assert account.found == account.used + account.skipped["outside --from/--to"] == 4974
+
+
+@pytest.mark.parametrize("damaged", [np.nan, np.inf, -1e300, 5e8, -5e8])
+def test_a_time_that_damage_made_impossible_or_far_costs_its_row_alone(
+    tmp_path: Path, damaged: float
+) -> None:
+    times = np.arange(50) * 0.01
+    times[0] = damaged
+    folder = tmp_path / "processed_log" / "IMU" / "gyro"
+    _save(folder / "t", times)
+    _save(folder / "value", np.ones((50, 3)))
+
+    with open_log(tmp_path) as log:
+        ledger = Ledger("")
+        rows = sum(len(block) for block in log.read(ledger))
+
+    is_time = abs(damaged) < 1e9
+    assert rows == ledger.accounts["imu/gyro"].used == (50 if is_time else 49)
+    skipped = ledger.accounts["imu/gyro"].skipped
+    assert skipped == ({} if is_time else {"a row without a possible time": 1})

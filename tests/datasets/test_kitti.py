@@ -1,0 +1,313 @@
+"""KITTI drives: streams, times and truth agree with what was driven; what is missing is told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from crosscue.datasets.adapters.kitti import TOPICS, open_drive, write_truth
+from crosscue.datasets.adapters.kitti_oxts import COLUMNS, Packets, parse
+from crosscue.datasets.truth.tum import heading_rad, read_tum
+from crosscue.eval.cli import run
+from crosscue.replay.columns import Block, Images, Table
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import DEFAULT
+from crosscue.replay.log import EVERYTHING, Selection, open_log
+from crosscue.replay.vehicle.roles import Role, role_of
+from support.data import shared
+from support.kitti_drive import (
+    FIRST_S,
+    SPEED_MPS,
+    YAW_RATE_RADPS,
+    packet_lines,
+    raw_drive,
+    tracking_drive,
+    true_path,
+)
+from support.pictures import picture
+
+S = 1_000_000_000
+FIRST_NS = FIRST_S * S + 964_389_445
+
+
+def read(path: Path, selection: Selection = EVERYTHING) -> tuple[dict[str, list[Block]], Ledger]:
+    ledger = Ledger(str(path))
+    by_topic: dict[str, list[Block]] = {}
+    with open_log(path) as log:
+        assert log.format == "kitti-raw"
+        for block in log.read(ledger, selection):
+            by_topic.setdefault(block.topic, []).append(block)
+    for name, account in ledger.accounts.items():
+        assert account.found == account.used + account.skipped.total()
+        assert sum(len(b) for b in by_topic.get(name, [])) == account.used
+        assert account.declared in (None, account.in_file) or not account.is_whole
+    return by_topic, ledger
+
+
+def column(blocks: list[Block], name: str) -> list[float]:
+    values: list[float] = []
+    for block in blocks:
+        assert isinstance(block.rows, Table)
+        values.extend(np.asarray(block.rows[name], np.float64).tolist())
+    return values
+
+
+def times(blocks: list[Block]) -> list[int]:
+    return [t for block in blocks for t in block.log_ns.tolist()]
+
+
+def test_a_raw_drive_gives_cameras_and_the_box_with_times_to_the_nanosecond(
+    tmp_path: Path,
+) -> None:
+    by_topic, ledger = read(raw_drive(tmp_path / "drive", 230, ("image_00", "image_02")))
+
+    assert set(by_topic) == {"image_00", "image_02", *TOPICS}
+    assert times(by_topic["oxts/imu"]) == [FIRST_NS + 100_000_000 * i for i in range(230)]
+    assert times(by_topic["image_00"])[0] == FIRST_S * S + 950_000_000
+    assert ledger.is_whole
+    assert "PNG: every chunk's CRC verified; OXTS text has no checksum" in ledger.integrity
+
+
+def test_columns_carry_what_was_driven(tmp_path: Path) -> None:
+    by_topic, _ = read(raw_drive(tmp_path / "drive", 60))
+
+    assert set(column(by_topic["oxts/imu"], "gyro_z_radps")) == {YAW_RATE_RADPS}
+    assert set(column(by_topic["oxts/imu"], "accel_y_mps2")) == {SPEED_MPS * YAW_RATE_RADPS}
+    assert set(column(by_topic["oxts/ins_speed"], "speed_mps")) == {SPEED_MPS}
+    np.testing.assert_allclose(column(by_topic["oxts/gnss"], "speed_mps"), SPEED_MPS)
+    yaw = true_path(60)[1]
+    course = np.array(column(by_topic["oxts/gnss"], "course_rad"))
+    np.testing.assert_allclose(np.cos(course - yaw), 1.0)
+
+
+def test_roles_are_known_and_the_ins_speed_is_no_wheel(tmp_path: Path) -> None:
+    with open_log(raw_drive(tmp_path / "drive", 3)) as log:
+        roles = {topic.name: role_of(topic) for topic in log.topics}
+
+    assert roles == {
+        "image_02": Role.CAMERA,
+        "oxts/imu": Role.IMU,
+        "oxts/gnss": Role.GNSS,
+        "oxts/ins_speed": None,
+    }
+
+
+def test_streams_come_side_by_side_in_time(tmp_path: Path) -> None:
+    with open_log(raw_drive(tmp_path / "drive", 350)) as log:
+        firsts = [int(b.log_ns[0]) for b in log.read(Ledger("drive"))]
+
+    assert firsts == sorted(firsts)
+
+
+def test_the_tracking_layout_gives_made_up_times_and_says_so(tmp_path: Path) -> None:
+    drive = tracking_drive(tmp_path / "drive")
+    (drive / "image_02" / "0003" / "000004.png").unlink()
+    (drive / "image_02" / "0003" / "cover.png").write_bytes(picture(1))
+
+    by_topic, ledger = read(drive)
+
+    assert times(by_topic["oxts/gnss"]) == [100_000_000 * i for i in range(30)]
+    assert times(by_topic["image_02"]) == [100_000_000 * i for i in range(30) if i != 4]
+    assert ledger.topic("image_02").skipped == {"a picture without its time": 1}
+    assert ledger.notices == [
+        "0003: the tracking set keeps no times; they are made from frame numbers at 10 Hz, "
+        "starting at 0 (distance over speed says 100.0 ms a frame)"
+    ]
+
+
+@pytest.mark.parametrize("make", [raw_drive, tracking_drive])
+def test_truth_is_the_path_that_was_driven(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    drive = make(tmp_path / "drive")
+
+    truth_file = write_truth(drive, tmp_path / "truth")
+
+    truth = json.loads(truth_file.read_text())
+    track = read_tum(truth_file.parent / truth["pose"])
+    east_north, yaw = true_path(30)
+    np.testing.assert_allclose(track.xyz_m[:, :2], east_north, atol=1e-6)
+    np.testing.assert_allclose(track.xyz_m[:, 2], 0.0, atol=1e-3)
+    np.testing.assert_allclose(heading_rad(track), yaw, atol=1e-12)
+    assert truth["start_ns"] == track.t_ns[0]
+    assert truth["origin"]["latitude_deg"] == pytest.approx(49.0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(roll=st.floats(-1.0, 1.0), pitch=st.floats(-1.0, 1.0), yaw=st.floats(-3.0, 3.0))
+def test_attitude_is_yaw_then_pitch_then_roll(roll: float, pitch: float, yaw: float) -> None:
+    numbers = np.zeros((1, len(COLUMNS)))
+    numbers[0, 3:6] = roll, pitch, yaw
+    w, x, y, z = Packets(np.zeros(1, np.int64), numbers).attitude_wxyz()[0]
+
+    def turn(angle: float, i: int, j: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+        matrix = np.eye(3)
+        matrix[[i, j], [i, j]] = np.cos(angle)
+        matrix[i, j], matrix[j, i] = -np.sin(angle), np.sin(angle)
+        return matrix
+
+    expected = turn(yaw, 0, 1) @ turn(pitch, 2, 0) @ turn(roll, 1, 2)
+    forward = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+    up = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
+    np.testing.assert_allclose(forward, expected[:, 0], atol=1e-12)
+    np.testing.assert_allclose(up, expected[:, 2], atol=1e-12)
+
+
+def test_only_the_part_asked_for_is_given(tmp_path: Path) -> None:
+    drive = raw_drive(tmp_path / "drive", 30)
+    part = Selection(frozenset({"oxts/imu"}), FIRST_NS + S, FIRST_NS + 2 * S)
+
+    by_topic, ledger = read(drive, part)
+
+    assert list(by_topic) == ["oxts/imu"]
+    assert times(by_topic["oxts/imu"]) == [FIRST_NS + S + 100_000_000 * i for i in range(10)]
+    assert ledger.topic("oxts/imu").skipped == {NOT_ASKED_TIME: 20}
+    assert ledger.topic("oxts/gnss").skipped == {NOT_ASKED_TOPIC: 30}
+    assert ledger.topic("image_02").skipped == {NOT_ASKED_TOPIC: 30}
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "0 numbers; want 30"),
+        (" ".join(packet_lines(1)[0].split()[:29]), "29 numbers; want 30"),
+        (packet_lines(1)[0].replace("9.81", "much", 1), "not all of it are numbers"),
+        (packet_lines(1)[0].replace("9.81", "nan", 1), "a number is not finite"),
+        (packet_lines(1)[0].replace("49", "149", 1), "not on the earth"),
+    ],
+)
+def test_a_damaged_packet_is_lost_with_place_and_reason(
+    tmp_path: Path, text: str, why: str
+) -> None:
+    drive = raw_drive(tmp_path / "drive", 5)
+    (drive / "oxts" / "data" / "0000000003.txt").write_text(text)
+
+    by_topic, ledger = read(drive)
+
+    assert len(times(by_topic["oxts/imu"])) == 4
+    assert ledger.topic("oxts/imu").dropped == {"not an OXTS packet": 1}
+    assert any(why in loss.detail and "0000000003" in loss.detail for loss in ledger.drops())
+
+
+def test_a_packet_that_is_missing_leaves_a_gap(tmp_path: Path) -> None:
+    drive = raw_drive(tmp_path / "drive", 5)
+    (drive / "oxts" / "data" / "0000000002.txt").unlink()
+    (drive / "image_02" / "data" / "0000000001.png").unlink()
+
+    by_topic, ledger = read(drive)
+
+    assert times(by_topic["oxts/imu"]) == [FIRST_NS + 100_000_000 * i for i in (0, 1, 3, 4)]
+    assert ledger.topic("oxts/imu").dropped == {"a time without its packet": 1}
+    assert ledger.topic("image_02").dropped == {"a time without its picture": 1}
+
+
+def test_a_stream_without_timestamps_is_lost_and_the_rest_is_read(tmp_path: Path) -> None:
+    drive = raw_drive(tmp_path / "drive", 5)
+    (drive / "image_02" / "timestamps.txt").unlink()
+
+    by_topic, ledger = read(drive)
+
+    assert set(by_topic) == set(TOPICS)
+    assert ledger.topic("image_02").dropped == {"rows without times": 5}
+    assert "image_02/timestamps.txt is missing" in next(ledger.drops()).detail
+    assert run(["info", str(drive)]) == 3
+
+
+def test_oxts_without_timestamps_is_lost_and_carries_no_truth(tmp_path: Path) -> None:
+    drive = raw_drive(tmp_path / "drive", 5)
+    (drive / "oxts" / "timestamps.txt").unlink()
+
+    by_topic, ledger = read(drive)
+
+    assert set(by_topic) == {"image_02"}
+    assert {name: sum(ledger.topic(name).dropped.values()) for name in TOPICS} == dict.fromkeys(
+        TOPICS, 5
+    )
+    with pytest.raises(LogFormatError, match="carries no truth"):
+        write_truth(drive, tmp_path / "truth")
+
+
+def test_a_bad_line_in_timestamps_is_named(tmp_path: Path) -> None:
+    drive = raw_drive(tmp_path / "drive", 5, cameras=())
+    (drive / "oxts" / "timestamps.txt").write_text("2011-09-26 13:02:00.5\nnoon\n")
+
+    with pytest.raises(LogFormatError, match=r"timestamps.txt: line 2: 'noon'"):
+        open_log(drive)
+
+
+def test_timestamps_alone_are_refused(tmp_path: Path) -> None:
+    drive = raw_drive(tmp_path / "drive", 2, cameras=())
+    for path in (drive / "oxts" / "data").iterdir():
+        path.unlink()
+
+    with pytest.raises(LogFormatError, match="no stream of a KITTI raw drive can be read"):
+        open_log(drive)
+
+
+def test_several_sequences_in_one_folder_are_refused(tmp_path: Path) -> None:
+    drive = tracking_drive(tmp_path / "drive", 2)
+    (drive / "oxts" / "0004.txt").write_text("")
+
+    with pytest.raises(LogFormatError, match="2 sequences; want a folder with one"):
+        open_log(drive)
+
+
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(share=st.floats(0.0, 1.0))
+def test_a_tracking_file_cut_anywhere_gives_whole_lines_only(tmp_path: Path, share: float) -> None:
+    text = "\n".join(packet_lines(6)) + "\n"
+    path = tmp_path / "oxts" / "0003.txt"
+    path.parent.mkdir(exist_ok=True)
+    cut = text[: int(share * len(text))]
+    path.write_text(cut)
+
+    ledger = Ledger("drive")
+    blocks = list(open_drive(tmp_path, DEFAULT).read(ledger, Selection(frozenset({"oxts/imu"}))))
+
+    account = ledger.topic("oxts/imu")
+    assert sum(len(b) for b in blocks) == account.used
+    assert account.in_file == len(cut.splitlines())
+    for block in blocks:
+        assert isinstance(block.rows, Table)
+        assert set(np.asarray(block.rows["gyro_z_radps"]).tolist()) <= {YAW_RATE_RADPS}
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.binary(max_size=400))
+def test_any_bytes_are_a_packet_or_a_reason(raw: bytes) -> None:
+    parsed = parse(raw)
+
+    assert isinstance(parsed, str) or (len(parsed) == 30 and np.isfinite(parsed).all())
+
+
+def test_the_real_sequence_turns_74_degrees_and_its_speeds_fit_its_positions(
+    tmp_path: Path,
+) -> None:
+    drive = shared("odometry", "kitti_tracking_0001")
+
+    by_topic, ledger = read(drive)
+    track = read_tum(write_truth(drive, tmp_path).parent / "pose.tum")
+
+    assert ledger.is_whole
+    assert len(times(by_topic["oxts/imu"])) == 447
+    assert isinstance(by_topic["image_02"][0].rows, Images)
+    heading = np.unwrap(heading_rad(track))
+    assert abs(np.degrees(heading[-1] - heading[0])) == pytest.approx(74.0, abs=0.1)
+    steps_m = np.diff(track.xyz_m[:, :2], axis=0)
+    speed_mps = np.array(column(by_topic["oxts/ins_speed"], "speed_mps"))
+    assert speed_mps.sum() * 0.1 == pytest.approx(321.0, abs=0.5)
+    # The true frame rate is 9.65 Hz: positions are 3.6 % further apart than speeds at 10 Hz say.
+    period_s = np.hypot(*steps_m.T).sum() / ((speed_mps[1:] + speed_mps[:-1]) / 2).sum()
+    assert period_s == pytest.approx(0.1036, abs=0.0003)
+    assert "103.7 ms a frame" in ledger.notices[0]
+    moving = speed_mps[1:] > 3.0
+    course = np.arctan2(steps_m[:, 1], steps_m[:, 0])
+    off = np.angle(np.exp(1j * (course - heading[1:])))[moving]
+    assert np.degrees(np.abs(np.median(off))) < 1.0

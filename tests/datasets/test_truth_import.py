@@ -1,0 +1,416 @@
+"""COCO and CVAT annotations as truth, and the check of a truth file against its log."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from crosscue.datasets.truth.annotations import LogPictures, place
+from crosscue.datasets.truth.coco import read_coco
+from crosscue.datasets.truth.cvat import read_cvat
+from crosscue.datasets.truth.truth import CUES, Truth, json_schema, load
+from crosscue.eval import cli
+from crosscue.replay.errors import SchemaError
+
+WIDE, HIGH = 64, 36
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 100_000_000
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six pictures, ten a second."""
+    folder = tmp_path_factory.mktemp("log")
+    for number in range(FRAMES):
+        cv2.imwrite(str(folder / f"{number:06d}.png"), np.zeros((HIGH, WIDE, 3), np.uint8))
+    times = [f"{(START_NS + i * STEP_NS) / 1e9:.1f}" for i in range(FRAMES)]
+    (folder / "timestamps.txt").write_text("\n".join(times) + "\n")
+    return folder
+
+
+def coco(**changes: Any) -> dict[str, Any]:
+    """Frames 1 and 3; a stop sign in 1, a car in each."""
+    tree: dict[str, Any] = {
+        "images": [{"id": n, "file_name": f"{n:06d}.png", "width": WIDE, "height": HIGH}
+                   for n in (1, 3)],
+        "categories": [{"id": 13, "name": "stop sign"}, {"id": 3, "name": "car"}],
+        "annotations": [
+            {"id": 1, "image_id": 1, "category_id": 13, "bbox": [5, 5, 10, 10], "visible": 0.5},
+            {"id": 2, "image_id": 1, "category_id": 3, "bbox": [20, 5, 30.5, 10]},
+            {"id": 3, "image_id": 3, "category_id": 3, "bbox": [20, 5, 30.5, 10]},
+        ],
+    }  # fmt: skip
+    return tree | changes
+
+
+def _write(path: Path, tree: object) -> Path:
+    path.write_text(json.dumps(tree))
+    return path
+
+
+def _import(source: Path, log: Path, output: Path, *more: str) -> int:
+    argv = ["truth", "import", str(source), "--log", str(log), "-o", str(output), *more, "-q"]
+    return cli.run(argv)
+
+
+def _refused(capsys: pytest.CaptureFixture[str]) -> str:
+    line = capsys.readouterr().err
+    assert line.startswith("crosscue: ")
+    assert line.count("\n") == 1
+    return line
+
+
+def test_a_coco_file_says_what_is_there_and_what_is_not(tmp_path: Path, log: Path) -> None:
+    assert _import(_write(tmp_path / "coco.json", coco()), log, tmp_path / "truth.json") == 0
+
+    truth = load(tmp_path / "truth.json")
+    assert [(one.cue, one.t_ns, one.present, one.count, one.visible) for one in truth.cues] == [
+        ("stop_sign", START_NS + STEP_NS, True, 1, 0.5),
+        ("stop_sign", START_NS + 3 * STEP_NS, False, 0, None),
+    ]
+    objects = json.loads((tmp_path / "objects.json").read_text())
+    assert [image["t_ns"] for image in objects["images"]] == [one.t_ns for one in truth.cues]
+    assert objects["annotations"][1]["bbox"] == [20, 5, 30.5, 10]
+    assert cli.run(["truth", "check", str(tmp_path), "--log", str(log), "-q"]) == 0
+
+
+def test_what_was_imported_can_be_imported_again(tmp_path: Path, log: Path) -> None:
+    assert _import(_write(tmp_path / "coco.json", coco()), log, tmp_path / "truth.json") == 0
+    (tmp_path / "again").mkdir()
+    assert _import(tmp_path / "objects.json", log, tmp_path / "again") == 0
+
+    first, second = load(tmp_path), load(tmp_path / "again")
+    assert first.cues == second.cues
+    before, after = (json.loads((folder / "objects.json").read_text())
+                     for folder in (tmp_path, tmp_path / "again"))  # fmt: skip
+    assert before["annotations"] == after["annotations"]
+
+
+def test_adding_keeps_approaches_and_replaces_cues(tmp_path: Path, log: Path) -> None:
+    path = tmp_path / "truth.json"
+    source = _write(tmp_path / "coco.json", coco())
+    assert _import(source, log, path) == 0
+    approach = {
+        "id": 4,
+        "intersection": "A",
+        "start_ns": START_NS,
+        "enter_ns": START_NS + STEP_NS,
+        "control": "none",
+        "features": {"left": True, "right": False, "straight": True},
+    }
+    tree = json.loads(path.read_text())
+    _write(path, tree | {"approaches": [approach], "cues": []})
+
+    assert _import(source, log, path) == 1
+    assert _import(source, log, path, "--add") == 0
+    assert [one.id for one in load(path).approaches] == [4]
+    assert len(load(path).cues) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            {
+                "images": [{"id": 1, "file_name": "a.png", "width": WIDE, "height": HIGH}],
+                "annotations": [],
+            },
+            "neither a time nor a frame",
+        ),
+        (
+            {
+                "images": [{"id": 1, "file_name": "9.png", "width": WIDE, "height": HIGH}],
+                "annotations": [],
+            },
+            "frame 9 of 6",
+        ),
+        (
+            {
+                "images": [
+                    {"id": n, "file_name": f"{n}_1.png", "width": WIDE, "height": HIGH}
+                    for n in (1, 3)
+                ]
+            },
+            "belong to one frame",
+        ),
+        (
+            {
+                "images": [{"id": 1, "file_name": "1.png", "width": WIDE, "height": 40}],
+                "annotations": [],
+            },
+            "64 x 40 pixels",
+        ),
+        (
+            {
+                "images": [
+                    {"id": 1, "file_name": "1.png", "width": WIDE, "height": HIGH, "t_ns": 5}
+                ],
+                "annotations": [],
+            },
+            "near 5 ns",
+        ),
+        (
+            {
+                "images": [
+                    {"id": 1, "file_name": "1.png", "width": WIDE, "height": HIGH, "t_ns": 1.5}
+                ],
+                "annotations": [],
+            },
+            "want whole nanoseconds",
+        ),
+        ({"images": []}, "no such image"),
+        ({"images": [], "annotations": []}, "no picture in it"),
+        (
+            {"annotations": [{"image_id": [1], "category_id": 3, "bbox": [1, 1, 1, 1]}]},
+            "no such image",
+        ),
+        (
+            {"annotations": [{"image_id": 1, "category_id": 4, "bbox": [1, 1, 1, 1]}]},
+            "no such category",
+        ),
+        (
+            {"annotations": [{"image_id": 1, "category_id": 3, "bbox": [60, 1, 9, 1]}]},
+            "outside the picture",
+        ),
+        ({"annotations": [{"image_id": 1, "category_id": 3, "bbox": [1, 1, 0, 1]}]}, "has no area"),
+        (
+            {"annotations": [{"image_id": 1, "category_id": 3, "bbox": [1, 1, None, 1]}]},
+            "four numbers",
+        ),
+        ({"annotations": {}}, "want a list"),
+        ({"categories": [{"id": 3, "name": "a"}, {"id": 3, "name": "b"}]}, "neither twice"),
+        (
+            {"categories": [{"id": 13, "name": "stop sing"}, {"id": 3, "name": "car"}]},
+            "--map 'stop sing=stop_sign'",
+        ),
+        (
+            {"categories": [{"id": 13, "name": "zebra"}, {"id": 3, "name": "car"}]},
+            "'zebra' is neither",
+        ),
+    ],
+)
+def test_annotations_that_do_not_fit_are_refused_in_one_line(
+    tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str], change: dict[str, Any], said: str
+) -> None:
+    if change.get("categories") and change["categories"][0]["name"] == "a":
+        change = change | {"annotations": []}
+    source = _write(tmp_path / "coco.json", coco(**change))
+
+    assert _import(source, log, tmp_path / "truth.json") in (1, 2)
+    assert said in _refused(capsys)
+    assert not (tmp_path / "truth.json").exists()
+
+
+def test_nan_in_a_box_is_refused(tmp_path: Path) -> None:
+    text = json.dumps(coco()).replace("30.5", "NaN")
+    (tmp_path / "coco.json").write_text(text)
+
+    with pytest.raises(SchemaError, match="want four numbers"):
+        read_coco(tmp_path / "coco.json")
+
+
+def test_labels_mean_what_the_user_says(
+    tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tree = coco(categories=[{"id": 13, "name": "halt = stop"}, {"id": 3, "name": "dog"}])
+    source = _write(tmp_path / "coco.json", tree)
+
+    assert _import(source, log, tmp_path / "t.json", "--map", "halt = stop=stop_sign", "dog=") == 0
+    assert {one.cue for one in load(tmp_path / "t.json").cues} == {"stop_sign"}
+    assert cli.run(["truth", "check", str(tmp_path / "t.json"), "--log", str(log), "-q"]) == 0
+    for own, said in (("cat=stop_sign", "no such label"), ("dog=sing", "no such cue"),
+                      ("dog", "want LABEL=CUE")):  # fmt: skip
+        assert _import(source, log, tmp_path / "u.json", "--map", own) == 2
+        assert said in _refused(capsys)
+
+
+def test_a_cue_of_ones_own_is_told_as_the_vehicle_file_names_it(
+    tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tree = coco(categories=[{"id": 13, "name": "zebra crossing"}, {"id": 3, "name": "car"}])
+    source = _write(tmp_path / "coco.json", tree)
+    vehicle = tmp_path / "car.toml"
+    vehicle.write_text('version = 1\n[cues.own.zebra_crossing]\nlabels = ["zebra"]\nscore = 0.5\n')
+    path = tmp_path / "t.json"
+
+    assert _import(source, log, path) in (1, 4)
+    assert "neither a cue" in _refused(capsys)
+    assert _import(source, log, path, "--vehicle", str(vehicle)) == 0
+    truth = load(path)
+    assert truth.own_cues == ("zebra_crossing",)
+    assert {(one.cue, one.present) for one in truth.cues} == {
+        ("zebra_crossing", True), ("zebra_crossing", False)
+    }  # fmt: skip
+    assert cli.run(["truth", "check", str(path), "--log", str(log), "-q"]) == 0
+
+
+IMAGES_XML = f"""<?xml version="1.0" encoding="utf-8"?>
+<annotations><version>1.1</version>
+<meta><task><name>t</name><size>2</size><labels>
+<label><name>stop sign</name>
+<attributes><attribute><name>worn</name></attribute></attributes></label>
+<label><name>road_left</name></label><label><name>car</name></label>
+</labels></task></meta>
+<image id="0" name="000001.png" width="{WIDE}" height="{HIGH}">
+<box label="stop sign" occluded="0" xtl="5.00" ytl="5.00" xbr="15.00" ybr="15.00" z_order="0">
+<attribute name="worn">false</attribute></box>
+<polygon label="car" occluded="0" points="20,5;50.5,5;50.5,15" z_order="0"></polygon>
+<polyline label="car" points="1,1;2,2"></polyline>
+<tag label="road_left" source="manual"></tag>
+</image>
+<image id="1" name="000003.png" width="{WIDE}" height="{HIGH}">
+<mask label="car" rle="3,5" left="2" top="3" width="4" height="2"></mask>
+</image>
+</annotations>"""
+
+
+def test_cvat_for_images(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.xml").write_text(IMAGES_XML)
+
+    argv = ["truth", "import", str(tmp_path / "a.xml"), "--log", str(log), "-o", str(tmp_path)]
+    assert cli.run(argv) == 0
+    assert "not taken  1 polyline" in capsys.readouterr().out
+    found = {(one.cue, one.t_ns): one.present for one in load(tmp_path).cues}
+    assert found == {
+        ("stop_sign", START_NS + STEP_NS): True, ("road_left", START_NS + STEP_NS): True,
+        ("stop_sign", START_NS + 3 * STEP_NS): False, ("road_left", START_NS + 3 * STEP_NS): False,
+    }  # fmt: skip
+    things = json.loads((tmp_path / "objects.json").read_text())["annotations"]
+    assert [thing["bbox"] for thing in things] == [
+        [5.0, 5.0, 10.0, 10.0], [20.0, 5.0, 30.5, 10.0], [2, 3, 4, 2]]  # fmt: skip
+    assert things[1]["segmentation"] == [[20.0, 5.0, 50.5, 5.0, 50.5, 15.0]]
+
+
+def _video(boxes: str, meta: str = "<start_frame>1</start_frame><stop_frame>5</stop_frame>") -> str:
+    return (
+        f"<annotations><version>1.1</version><meta><task><size>3</size>{meta}"
+        "<frame_filter>step=2</frame_filter><segments><segment><start>7</start></segment></segments>"
+        f"<labels><label><name>stop_sign</name></label></labels><original_size><width>{WIDE}</width>"
+        f"<height>{HIGH}</height></original_size></task></meta>"
+        f'<track id="9" label="stop_sign">{boxes}</track></annotations>'
+    )
+
+
+def _track_box(frame: int, outside: int = 0) -> str:
+    return (f'<box frame="{frame}" outside="{outside}" occluded="1" keyframe="1" xtl="1.5" '
+            'ytl="2" xbr="9" ybr="8"></box>')  # fmt: skip
+
+
+def test_cvat_for_video_counts_every_frame_of_its_task(tmp_path: Path, log: Path) -> None:
+    (tmp_path / "a.xml").write_text(_video(_track_box(1) + _track_box(3) + _track_box(5, 1)))
+
+    assert _import(tmp_path / "a.xml", log, tmp_path / "truth.json") == 0
+    # Frames 1, 3 and 5 of the video; in 5 the sign has left.
+    assert [(one.t_ns, one.present) for one in load(tmp_path / "truth.json").cues] == [
+        (START_NS + STEP_NS, True),
+        (START_NS + 3 * STEP_NS, True),
+        (START_NS + 5 * STEP_NS, False),
+    ]
+    things = json.loads((tmp_path / "objects.json").read_text())["annotations"]
+    assert [thing["track_id"] for thing in things] == [9, 9]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "not readable as XML"),
+        ("<annotations>", "not readable as XML"),
+        ("<svg></svg>", "want <annotations>"),
+        ("<annotations>" + "<a>" * 70 + "</a>" * 70 + "</annotations>", "over 64 deep"),
+        (IMAGES_XML.replace('xtl="5.00"', 'xtl="nan"'), "want a number"),
+        (IMAGES_XML.replace('width="64"', 'width="x"'), "want a whole number"),
+        (IMAGES_XML.replace('width="64"', 'width="0"'), "want pixels"),
+        (IMAGES_XML.replace('label="car"', ""), "has no label"),
+        (IMAGES_XML.replace("20,5;", "20;"), "want x,y"),
+        (_video(_track_box(2)), "frame 2: the task has 1 to 5 by 2"),
+        (_video(_track_box(1)).replace("original_size", "o"), "original_size/width"),
+        (_video(_track_box(1), "<stop_frame>999999999</stop_frame>"), "over 10000000"),
+    ],
+)
+def test_xml_that_is_not_cvats_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "a.xml").write_text(text)
+
+    with pytest.raises(SchemaError, match=said):
+        read_cvat(tmp_path / "a.xml")
+
+
+@pytest.mark.parametrize(
+    "doctype",
+    [
+        '<!DOCTYPE a [<!ENTITY x "y"><!ENTITY z "&x;&x;&x;&x;&x;&x;&x;&x;&x;&x;">]>',
+        '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]>',
+        '<!DOCTYPE a SYSTEM "http://127.0.0.1:9/a.dtd">',
+    ],
+)
+def test_entities_are_refused_before_they_are_read(tmp_path: Path, doctype: str) -> None:
+    body = IMAGES_XML.split("\n", 1)[1].replace("<name>t</name>", "<name>&z;&x;</name>")
+    (tmp_path / "a.xml").write_text(f"{doctype}\n{body}")
+
+    with pytest.raises(SchemaError, match="document type declaration"):
+        read_cvat(tmp_path / "a.xml")
+
+
+def test_pictures_go_to_the_frame_nearest_in_time(tmp_path: Path) -> None:
+    tree = coco(annotations=[])
+    for image, off in zip(tree["images"], (3_000_000, -7_000_000), strict=True):
+        image["t_ns"] = START_NS + STEP_NS * image["id"] + off
+    annotations = read_coco(_write(tmp_path / "coco.json", tree))
+    times = START_NS + STEP_NS * np.arange(FRAMES, dtype=np.int64)
+    placed = place(annotations, LogPictures("log", times, (WIDE, HIGH)))
+
+    assert placed.t_ns == (START_NS + STEP_NS, START_NS + 3 * STEP_NS)
+    assert placed.rule == "by time, at most 7.0 ms off"
+
+
+def _truth(**changes: Any) -> dict[str, Any]:
+    end_ns = START_NS + FRAMES * STEP_NS
+    return {"version": 1, "start_ns": START_NS, "end_ns": end_ns, **changes}
+
+
+def _approach(first_s: float, last_s: float, number: int = 0) -> dict[str, Any]:
+    return {"id": number, "intersection": "A", "control": "none",
+            "start_ns": START_NS + int(first_s * 1e9), "enter_ns": START_NS + int(last_s * 1e9),
+            "features": {"left": True, "right": True, "straight": True}}  # fmt: skip
+
+
+LATE = {"end_ns": START_NS + 10**12}
+
+
+@pytest.mark.parametrize(
+    ("tree", "said"),
+    [
+        (_truth(start_ns=5, end_ns=9), "give the truth of this log"),
+        (_truth(**LATE, approaches=[_approach(100, 200)]), "approach 0 from"),
+        (_truth(approaches=[_approach(0, 0.3), _approach(0.2, 0.4, 1)]), "0 and 1 overlap"),
+        (_truth(**LATE, cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 10**11}]),
+         "cues.0 \\(stop_sign\\)"),
+        (_truth(cues=[{"cue": "stop_sing", "present": True, "t_ns": START_NS}]), "meant: stop_s"),
+        (_truth(cues=[{"cue": "Zebra!", "present": True, "t_ns": START_NS}]), "cues.0.cue"),
+        (_truth(cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 7}]),
+         "at none of 1 moments"),
+        (_truth(log_sha256={"a": "b"}), "by its hash"),
+        (_truth(pose="../secret.tum"), "secret.tum"),
+        (_truth(objects="gone.json"), "gone.json"),
+    ],
+)  # fmt: skip
+def test_truth_that_does_not_fit_its_log_is_refused(
+    tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str], tree: dict[str, Any], said: str
+) -> None:
+    import re
+
+    path = _write(tmp_path / "truth.json", tree)
+
+    assert cli.run(["truth", "check", str(path), "--log", str(log)]) in (1, 4)
+    assert re.search(said, _refused(capsys))
+
+
+def test_the_schema_is_printed_and_names_every_cue(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["truth", "schema"]) == 0
+    schema = json.loads(capsys.readouterr().out)
+
+    assert schema == json_schema() == Truth.model_json_schema()
+    assert tuple(schema["$defs"]["CueTruth"]["properties"]["cue"]["examples"]) == CUES

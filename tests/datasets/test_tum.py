@@ -1,0 +1,170 @@
+"""TUM files: what is written is what is read, and what is no pose is refused by line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.datasets.truth.tum import (
+    Trajectory,
+    heading_rad,
+    nanoseconds,
+    planar,
+    read_tum,
+    seconds_text,
+    write_tum,
+)
+from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
+from crosscue.replay.limits import Limits
+
+POSE = "1.5 1 2 3 0 0 0 1"
+
+
+def some(seed: int, n: int) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    quat = rng.normal(size=(n, 4))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    t_ns = np.cumsum(rng.integers(1, 10**10, n)) + 1_533_000_000_000_000_000
+    return Trajectory(t_ns, rng.normal(0.0, 1e5, (n, 3)), quat)
+
+
+@given(t_ns=st.integers(-(10**18), 9 * 10**18))
+@settings(max_examples=200, deadline=None)
+def test_every_nanosecond_survives_the_text(t_ns: int) -> None:
+    assert nanoseconds(seconds_text(t_ns)) == t_ns
+
+
+@given(seed=st.integers(0, 10_000), n=st.integers(0, 20))
+@settings(max_examples=30, deadline=None)
+def test_written_is_read_number_for_number(
+    seed: int, n: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("tum") / "poses.tum"
+    trajectory = some(seed, n)
+    write_tum(path, trajectory, comment="two\nlines")
+    found = read_tum(path)
+
+    np.testing.assert_array_equal(found.t_ns, trajectory.t_ns)
+    np.testing.assert_array_equal(found.xyz_m, trajectory.xyz_m)
+    np.testing.assert_array_equal(found.quat_wxyz, trajectory.quat_wxyz)
+
+
+@pytest.mark.parametrize(
+    ("text", "t_ns"),
+    [
+        ("1305031102.175304", 1_305_031_102_175_304_000),
+        ("1.533323290123456789e+09", 1_533_323_290_123_456_789),
+        ("0", 0),
+        ("-0.000000001", -1),
+        ("0.0000000015", 2),
+        ("0.00000000249", 2),
+    ],
+)
+def test_other_spellings_of_a_time(text: str, t_ns: int) -> None:
+    assert nanoseconds(text) == t_ns
+
+
+def test_comments_blank_lines_commas_and_a_byte_order_mark_are_fine(tmp_path: Path) -> None:
+    path = tmp_path / "a.tum"
+    long_comment = "# " + "x" * 10_000
+    text = f"\ufeff# head\n\n{long_comment}\n1.5, 1, 2, 3, 0, 0, 0, 1\r\n  2.5 1 2 3 0 0 0 -1"
+    path.write_text(text, encoding="utf-8")
+
+    assert read_tum(path).t_ns.tolist() == [1_500_000_000, 2_500_000_000]
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("1.6 1 2 3 0 0 0", "line 3: 7 numbers instead of 8; want timestamp"),
+        ("1.6 1 2 3 0 0 0 1 9", "line 3: 9 numbers"),
+        ("now 1 2 3 0 0 0 1", "line 3: 'now' is no number of seconds"),
+        ("nan 1 2 3 0 0 0 1", "line 3: 'nan' is no time"),
+        ("1e30 1 2 3 0 0 0 1", "line 3: '1e30' is no time"),
+        ("1e999999999 1 2 3 0 0 0 1", "line 3: '1e999999999' is no time"),
+        ("1.6 1 two 3 0 0 0 1", "line 3: could not convert"),
+        ("1.6 1 inf 3 0 0 0 1", "line 3: a number that is not finite"),
+        ("1.6 1 2 3 0 0 0 0", "line 3: a quaternion of length 0"),
+        ("1.6 1 2 3 0 0 0 1.5", "line 3: a quaternion of length 1.5"),
+        ("1.5 1 2 3 0 0 0 1", "line 3: time 1.5 is not after"),
+        ("1.4 1 2 3 0 0 0 1", "line 3: time 1.4 is not after"),
+        ("1.6 1 2 3 0 0 0 1" * 1000, "line 3: "),
+    ],
+)
+def test_a_bad_line_is_refused_with_its_number(tmp_path: Path, line: str, says: str) -> None:
+    path = tmp_path / "bad.tum"
+    path.write_text(f"# head\n{POSE}\n{line}\n3 1 2 3 0 0 0 1\n")
+
+    with pytest.raises(LogFormatError, match=says):
+        read_tum(path)
+
+
+def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
+    binary = tmp_path / "binary"
+    binary.write_bytes(b"\xff\xfe\x00\x01" * 10)
+    with pytest.raises(LogFormatError, match="not text"):
+        read_tum(binary)
+    with pytest.raises(LogError, match="not a regular file"):
+        read_tum(tmp_path)
+    with pytest.raises(LogError, match="No such file"):
+        read_tum(tmp_path / "missing")
+    binary.write_text(f"{POSE}\n")
+    with pytest.raises(LogTooLargeError, match="18 bytes, more than the 10 allowed"):
+        read_tum(binary, Limits(chunk_bytes=10))
+
+
+def test_a_quaternion_rounded_by_others_is_made_whole(tmp_path: Path) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text("1 0 0 0 0.0 0.0 0.7071 0.7071\n")
+
+    assert np.linalg.norm(read_tum(path).quat_wxyz) == pytest.approx(1.0, abs=1e-12)
+
+
+@given(heading=st.floats(-3.14, 3.14))
+@settings(max_examples=30, deadline=None)
+def test_a_planar_pose_keeps_its_heading(heading: float) -> None:
+    one = planar(np.array([1]), np.array([2.0]), np.array([3.0]), np.array([heading]))
+
+    assert heading_rad(one)[0] == pytest.approx(heading)
+    np.testing.assert_array_equal(one.xyz_m, [[2.0, 3.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("t_ns", "xyz", "quat", "says"),
+    [
+        ([1, 2], np.zeros((1, 3)), np.eye(4)[[0, 0]], r"xyz_m: want \(2, 3\), got \(1, 3\)"),
+        ([1, 2], np.zeros((2, 3)), np.eye(4)[[0]], r"quat_wxyz: want \(2, 4\), got \(1, 4\)"),
+        ([2, 2], np.zeros((2, 3)), np.eye(4)[[0, 0]], "want increasing times"),
+        ([1, 2], np.full((2, 3), np.nan), np.eye(4)[[0, 0]], "want finite"),
+        ([1, 2], np.zeros((2, 3)), np.ones((2, 4)), "want unit quaternions"),
+    ],
+)
+def test_columns_that_are_no_poses_are_refused(
+    t_ns: list[int], xyz: np.ndarray, quat: np.ndarray, says: str
+) -> None:
+    with pytest.raises(ValueError, match=says):
+        Trajectory(np.array(t_ns), xyz, quat)
+
+
+def test_evo_reads_what_we_write(tmp_path: Path) -> None:
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from evo.tools import file_interface
+
+    path = tmp_path / "ours.tum"
+    trajectory = some(1, 12)
+    write_tum(path, trajectory)
+    theirs = file_interface.read_tum_trajectory_file(str(path))
+
+    np.testing.assert_allclose(theirs.positions_xyz, trajectory.xyz_m)
+    np.testing.assert_allclose(theirs.orientations_quat_wxyz, trajectory.quat_wxyz)
+    back = tmp_path / "theirs.tum"
+    file_interface.write_tum_trajectory_file(str(back), theirs)
+    np.testing.assert_allclose(read_tum(back).xyz_m, trajectory.xyz_m)
+    assert np.abs(read_tum(back).t_ns - trajectory.t_ns).max() < 1_000

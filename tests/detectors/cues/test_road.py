@@ -1,0 +1,73 @@
+"""Shares of road in regions: scaled with the picture, left for right in a mirror."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import RoadMask
+from crosscue.detectors.cues.road import RoadShares, region_mask, road_shares
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.vehicle.vehicle import Regions, parse
+
+
+def _mask(road: NDArray[np.bool_]) -> RoadMask:
+    size = (road.shape[1], road.shape[0])
+    return RoadMask(0, size, rle.encode(road, (0, 0), size), size)
+
+
+def test_a_picture_full_of_road_is_all_road_and_an_empty_one_none() -> None:
+    full = road_shares(_mask(np.ones((90, 160), np.bool_)), Regions())
+
+    assert full == RoadShares(1.0, 1.0, 1.0)
+    assert road_shares(_mask(np.zeros((90, 160), np.bool_)), Regions()) == RoadShares(0, 0, 0)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 999))
+def test_the_mirror_image_swaps_left_and_right(seed: int) -> None:
+    road = np.random.default_rng(seed).random((90, 160)) < 0.3
+
+    seen = road_shares(_mask(road), Regions())
+    mirrored = road_shares(_mask(road[:, ::-1]), Regions())
+
+    assert (mirrored.left, mirrored.right) == pytest.approx((seen.right, seen.left))
+    assert mirrored.straight == pytest.approx(seen.straight)
+
+
+@pytest.mark.parametrize("factor", [2, 3, 5])
+def test_a_finer_picture_of_the_same_road_gives_the_same_shares(factor: int) -> None:
+    road = np.zeros((100, 200), np.bool_)
+    road[55:70, 10:30] = True
+    finer = np.kron(road, np.ones((factor, factor), np.bool_)).astype(np.bool_)
+
+    coarse, fine = (road_shares(_mask(one), Regions()) for one in (road, finer))
+
+    assert fine.left == pytest.approx(coarse.left, abs=0.02)
+    assert coarse.left == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_share_of_exactly_the_limit_is_not_more() -> None:
+    assert RoadShares(0.2, 0.21, 0.19).positive(0.2) == (False, True, False)
+
+
+def test_a_square_region_holds_its_pixels_and_no_others() -> None:
+    inside = region_mask(((0.25, 0.5), (0.75, 0.5), (0.75, 1.0), (0.25, 1.0)), (4, 8))
+
+    assert inside.sum() == 8
+    assert inside[2:, 2:6].all()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("left = [[0.0, 0.5], [0.2, 0.5]]", "regions.left"),
+        ("left = [[0.0, 0.5], [0.2, 1.5], [0.2, 0.9]]", "less than or equal to 1"),
+        ("lefd = [[0.0, 0.5], [0.2, 0.5], [0.2, 0.9]]", "did you mean left?"),
+    ],
+)
+def test_a_region_that_is_none_is_refused(text: str, said: str) -> None:
+    with pytest.raises(VehicleError, match=said.replace("?", r"\?")):
+        parse(f"version = 1\n[regions]\n{text}\n", "v.toml")

@@ -1,0 +1,169 @@
+"""Crossing and parked cars: the source's rules of shape, association, motion and nose."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.cars import (
+    CarShapes,
+    Sides,
+    car_shapes,
+    cross_traffic,
+    nose_of,
+    pair_cars,
+    parked_cars,
+)
+from crosscue.replay.vehicle.vehicle import Cars
+
+SIZE = (400, 200)
+RULES = Cars()
+
+
+def _car(
+    x: int, nose: int, t_ns: int, y: int = 60, length: int = 90, score: float = 0.99
+) -> Detections:
+    """A car with a lower end (its nose) at the left (-1) or right (1)."""
+    height = 30
+    profile = np.full(length, height)
+    quarter = length // 3
+    profile[:quarter] = 18 if nose < 0 else height
+    profile[-quarter:] = 18 if nose > 0 else height
+    mask = np.arange(height)[:, None] >= height - profile[None, :]
+    box = np.array([[x, y, x + length, y + height]], np.float64)
+    text = rle.encode(mask, (x, y), SIZE)
+    return Detections(t_ns, SIZE, box, np.array([score]), ("car",), (text,))
+
+
+def _shapes(*cars: Detections) -> CarShapes:
+    return car_shapes(cars, RULES)
+
+
+def _mirrored(found: Detections) -> Detections:
+    width = SIZE[0]
+    x0, y0, x1, y1 = found.boxes_px[0]
+    mask = rle.decode(found.masks[0], SIZE)[:, ::-1]
+    box = np.array([[width - x1, y0, width - x0, y1]])
+    return replace(found, boxes_px=box, masks=(rle.encode(mask, (0, 0), SIZE),))
+
+
+def _sides(before: CarShapes, now: CarShapes) -> tuple[Sides, Sides]:
+    pairs = pair_cars(before, now, RULES)
+    return cross_traffic(pairs, RULES), parked_cars(pairs, RULES)
+
+
+def test_a_car_that_moves_left_is_cross_traffic_to_the_left() -> None:
+    before, now = _shapes(_car(200, 1, 0)), _shapes(_car(190, 1, 10**8))
+
+    assert _sides(before, now) == (Sides(1, 0), Sides(0, 0))
+
+
+@pytest.mark.parametrize(("nose", "want"), [(-1, Sides(1, 0)), (1, Sides(0, 1))])
+def test_a_car_that_stands_says_where_its_lower_end_points(nose: int, want: Sides) -> None:
+    before, now = _shapes(_car(200, nose, 0)), _shapes(_car(200, nose, 10**8))
+
+    assert _sides(before, now) == (Sides(0, 0), want)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    x=st.integers(60, 220), dx=st.integers(-25, 25), dy=st.integers(-8, 8),
+    nose=st.sampled_from([-1, 1]),
+)  # fmt: skip
+def test_the_mirror_image_says_the_other_side(x: int, dx: int, dy: int, nose: int) -> None:
+    before, now = _car(x, nose, 0), _car(x + dx, nose, 10**8, y=60 + dy)
+
+    seen = _sides(_shapes(before), _shapes(now))
+    mirrored = _sides(_shapes(_mirrored(before)), _shapes(_mirrored(now)))
+
+    assert [Sides(s.right, s.left) for s in seen] == list(mirrored)
+
+
+@pytest.mark.parametrize(
+    ("second", "why"),
+    [
+        (_car(221, 1, 10**8), "moved by more than 5 % of the width"),
+        (_car(190, 1, 10**8, length=100), "grew by more than 3 %"),
+        (_car(190, 1, 10**9), "seen too much later"),
+        (_car(190, 1, 0), "not later"),
+        (_car(190, 1, 10**8, score=0.95), "score not above 0.95"),
+        (_car(190, 1, 10**8, length=60), "not longer than twice its height"),
+    ],
+)
+def test_it_is_not_the_same_car_when(second: Detections, why: str) -> None:
+    assert len(pair_cars(_shapes(_car(200, 1, 0)), _shapes(second), RULES).nose) == 0, why
+
+
+def test_a_car_that_comes_down_the_picture_neither_crosses_nor_stands() -> None:
+    before, now = _shapes(_car(200, 1, 0)), _shapes(_car(202, 1, 10**8, y=68))
+
+    assert _sides(before, now) == (Sides(0, 0), Sides(0, 0))
+
+
+def test_each_car_is_paired_once() -> None:
+    before = _shapes(_car(200, 1, 0), _car(206, 1, 0))
+    now = _shapes(_car(203, 1, 10**8))
+
+    assert len(pair_cars(before, now, RULES).nose) == 1
+
+
+def test_a_car_without_a_mask_has_no_nose() -> None:
+    bare = replace(_car(200, 1, 0), masks=(b"",))
+    later = replace(bare, t_ns=10**8)
+
+    assert _shapes(bare).nose.tolist() == [0]
+    assert _sides(_shapes(bare), _shapes(later)) == (Sides(0, 0), Sides(0, 0))
+
+
+def test_a_box_has_no_nose() -> None:
+    assert nose_of(np.full(40, 12.0)) == 0
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    h=st.integers(1, 12), w=st.integers(1, 12), x=st.integers(0, 6), y=st.integers(0, 6),
+    seed=st.integers(0, 999),
+)  # fmt: skip
+def test_runs_come_back_as_they_went(h: int, w: int, x: int, y: int, seed: int) -> None:
+    mask = np.random.default_rng(seed).random((h, w)) < 0.6
+    size = (w + x + seed % 3, h + y + seed % 2)
+    whole = np.zeros((size[1], size[0]), np.bool_)
+    whole[y : y + h, x : x + w] = mask
+
+    text = rle.encode(mask, (x, y), size)
+
+    assert (rle.decode(text, size) == whole).all()
+    assert rle.area_px(text) == whole.sum()
+    np.testing.assert_allclose(rle.column_heights_px(text, size), whole.sum(axis=0))
+
+
+def test_runs_are_written_as_coco_writes_them() -> None:
+    corner = np.array([[True]])
+
+    assert rle.encode(corner, (0, 0), (2, 2)) == b"013"  # none, one, three
+    # 40 = 8 + 32: five bits "8" with the mark for more (8 + 32 + 48 = 'X'), then 1 ('1').
+    assert rle.encode(corner, (0, 40), (1, 41)) == b"X11"
+
+
+def test_a_mask_outside_its_picture_is_refused() -> None:
+    with pytest.raises(ValueError, match="not inside 4 x 4"):
+        rle.encode(np.ones((2, 2), np.bool_), (3, 0), (4, 4))
+
+
+@pytest.mark.parametrize("size", [(8, 9), (8, 7), (9, 8)])
+def test_a_mask_of_a_picture_of_another_size_is_refused(size: tuple[int, int]) -> None:
+    full = rle.encode(np.ones((8, 8), np.bool_), (0, 0), (8, 8))
+
+    for read in (rle.decode, rle.column_heights_px):
+        with pytest.raises(ValueError, match="mask of 64 pixels"):
+            read(full, size)
+
+
+@pytest.mark.parametrize("text", [b"", b"\x00", b"o", b"zzzz", b"0" * 3 + b"\xff"])
+def test_bytes_that_are_no_mask_are_refused(text: bytes) -> None:
+    with pytest.raises(ValueError, match="mask"):
+        rle.decode(text, (8, 8))

@@ -1,0 +1,64 @@
+"""Boxes cut out of a pyramid: as torchvision cuts them, wherever they lie."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torchvision.ops import MultiScaleRoIAlign
+
+from crosscue.detectors.networks.mask_rcnn.roi_align import Pooler
+
+HEIGHT_PX, WIDTH_PX = 128, 192
+
+
+def _levels(strides: tuple[int, ...], pictures: int, channels: int = 3) -> list[Tensor]:
+    torch.manual_seed(len(strides))
+    return [torch.randn(pictures, channels, HEIGHT_PX // s, WIDTH_PX // s) for s in strides]
+
+
+Side = st.floats(0.0, 400.0, width=32)
+Corner = st.tuples(st.floats(-60.0, 250.0, width=32), st.floats(-60.0, 250.0, width=32))
+Boxes = st.lists(st.tuples(Corner, Side, Side), max_size=6)
+
+
+def _tensor(boxes: list[tuple[tuple[float, float], float, float]]) -> Tensor:
+    corners = [(x, y, x + width, y + height) for (x, y), width, height in boxes]
+    return torch.tensor(corners, dtype=torch.float32).reshape(-1, 4)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.sampled_from([(4, 8, 16, 32), (8, 16, 32)]), st.sampled_from([7, 14]), Boxes, Boxes)
+def test_it_is_what_torchvision_gives(
+    strides: tuple[int, ...],
+    side: int,
+    first: list[tuple[tuple[float, float], float, float]],
+    second: list[tuple[tuple[float, float], float, float]],
+) -> None:
+    levels = _levels(strides, pictures=2)
+    names = [str(i) for i in range(len(strides))]
+    pool = MultiScaleRoIAlign(names, side, 2)
+    boxes = [_tensor(first), _tensor(second)]
+
+    theirs = pool(OrderedDict(zip(names, levels, strict=True)), boxes, [(HEIGHT_PX, WIDTH_PX)] * 2)
+    ours = Pooler(levels, HEIGHT_PX)(pool, boxes)
+
+    assert ours.shape == (len(first) + len(second), 3, side, side)
+    np.testing.assert_allclose(ours.numpy(), theirs.numpy(), atol=2e-6)
+
+
+def test_a_box_that_is_no_number_pools_nothing_and_harms_no_other() -> None:
+    levels = _levels((8, 16, 32), pictures=1)
+    pool = MultiScaleRoIAlign(["0", "1", "2"], 7, 2)
+    good = torch.tensor([[10.0, 20.0, 60.0, 70.0]])
+    bad = torch.full((1, 4), float("nan"))
+
+    alone = Pooler(levels, HEIGHT_PX)(pool, [good])
+    together = Pooler(levels, HEIGHT_PX)(pool, [torch.cat([bad, good])])
+
+    assert torch.equal(together[1:], alone)
+    assert torch.count_nonzero(together[0]) == 0

@@ -1,0 +1,82 @@
+"""Pictures for people: boxes where they belong, road tinted, the cues' line within the picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections, RoadMask
+from crosscue.detectors.cues.frame import FrameCues
+from crosscue.detectors.images import Encoded
+from crosscue.detectors.overlay import BLUE, GREEN, MARGIN_PX, Drawer, draw
+from crosscue.detectors.runner import FrameResult
+
+SIZE = (640, 360)
+GREY = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
+
+
+def _drawn(
+    found: tuple[Detections | RoadMask, ...], cues: dict[str, int], enlarge: float = 1.0
+) -> np.typing.NDArray[np.uint8]:
+    result = FrameResult(0, SIZE, Encoded("jpeg", memoryview(b"")), found)
+    return draw(GREY, result, FrameCues(cues, None), enlarge)
+
+
+def test_a_box_is_drawn_on_its_sides_and_nowhere_inside() -> None:
+    box = np.array([[100.0, 200.0, 180.0, 260.0]])
+    found = Detections(0, SIZE, box, np.ones(1), ("car",), (b"",))
+
+    drawn = _drawn((found,), {})
+
+    assert (drawn[230, [100, 180]] == GREEN).all()
+    assert (drawn[[200, 260], 140] == GREEN).all()
+    assert (drawn[205:255, 105:175] == 128).all()
+    assert (GREY == 128).all()
+
+
+def test_road_alone_is_tinted() -> None:
+    mask = np.zeros((36, 64), np.bool_)
+    mask[18:30, :32] = True
+    road = RoadMask(0, SIZE, rle.encode(mask, (0, 0), (64, 36)), (64, 36))
+
+    drawn = _drawn((road,), {})
+
+    assert (drawn[190:290, 5:315] == np.array(BLUE) // 2 + 64).all()
+    assert (drawn[30:330, 325:] == 128).all()
+
+
+@pytest.mark.parametrize("enlarge", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("count", [1, 5, 20])
+def test_the_line_of_cues_lies_within_the_picture(count: int, enlarge: float) -> None:
+    drawn = _drawn((), {f"cross_traffic_{i}": 1 for i in range(count)}, enlarge)
+
+    assert (drawn != 128).any()
+    assert (drawn[:, -MARGIN_PX // 2 :] == 128).all()
+
+
+def test_cues_that_are_not_there_are_not_named() -> None:
+    assert (_drawn((), {"stop_sign": 0}) == _drawn((), {})).all()
+    assert (_drawn((), {"stop_sign": 1}) != _drawn((), {})).any()
+
+
+@given(frames=st.integers(0, 40), most=st.integers(0, 9))
+@settings(max_examples=40, deadline=None)
+def test_pictures_are_spread_evenly_over_a_drive_of_any_length(frames: int, most: int) -> None:
+    _, coded = cv2.imencode(".jpg", GREY[:16, :16])
+    with TemporaryDirectory() as name:
+        drawer = Drawer(Path(name) / "pictures", most)
+        for t_ns in range(frames):
+            picture = Encoded("jpeg", memoryview(coded.tobytes()))
+            drawer(FrameResult(t_ns, (16, 16), picture, ()), FrameCues({}, None))
+        drawn = sorted(int(path.stem) for path in Path(name).glob("pictures/*"))
+
+    assert len(drawn) <= most
+    assert len(drawn) >= min(frames, (most + 1) // 2)
+    assert drawn == list(range(0, frames, drawn[1] if len(drawn) > 1 else max(frames, 1)))[:most]

@@ -1,0 +1,562 @@
+"""Mask R-CNN as a detector: as torchvision's own loop, whatever the batch, memory and picture."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from urllib.error import URLError
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors.torch import save
+from torch import Tensor, nn
+from torchvision.models.detection.roi_heads import paste_masks_in_image
+
+from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.detectors import rle, weights_file
+from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.devices import chosen_device
+from crosscue.detectors.networks.mask_rcnn.checkpoint import (
+    KEY,
+    Calibration,
+    Checkpoint,
+    Facts,
+    embedded_path,
+    load_checkpoint,
+    save_checkpoint,
+)
+from crosscue.detectors.networks.mask_rcnn.coco import COCO_NETWORKS, coco_checkpoint
+from crosscue.detectors.networks.mask_rcnn.detector import (
+    MaskRcnnDetector,
+    MaskRcnnSettings,
+    build,
+    calibrated,
+    detector_of,
+    laid_in,
+    place,
+    raw_score,
+)
+from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network, set_limits
+from crosscue.detectors.networks.mask_rcnn.parts import Body, Parts, as_input
+from crosscue.detectors.networks.model_detector import overlaps
+from crosscue.detectors.registry import Choice, make
+from crosscue.detectors.weights_file import SUM
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import CrosscueError, VehicleError
+from support.mask_rcnn import CLASSES, CPU, noise_frame, plan_of, random_checkpoint
+from support.scenes import picture_at, world
+
+
+def _detector(checkpoint: Checkpoint | None = None, **changes: Any) -> MaskRcnnDetector:
+    asked = MaskRcnnSettings.model_validate({"score": 0.4, **changes})
+    return detector_of(random_checkpoint() if checkpoint is None else checkpoint, asked, CPU)
+
+
+def _found(detector: MaskRcnnDetector, *frames: Frame) -> list[Detections]:
+    found = detector(frames)
+    assert all(isinstance(one, Detections) for one in found)
+    return [one for one in found if isinstance(one, Detections)]
+
+
+def _equal(one: Detections, other: Detections) -> bool:
+    return (
+        np.array_equal(one.boxes_px, other.boxes_px)
+        and np.array_equal(one.scores, other.scores)
+        and (one.labels, one.masks) == (other.labels, other.masks)
+    )
+
+
+def test_what_is_found_is_what_torchvision_finds_above_the_score() -> None:
+    detector = _detector(proposals=1000)
+    frame = noise_frame()
+    (ours,) = _found(detector, frame)
+    network = build_network(plan_of())
+    network.load_state_dict(random_checkpoint().network.state_dict())
+    set_limits(network, 1000, 0.05)
+    given = as_input(place(frame.pixels, plan_of()).pixels[None], CPU)
+    network.transform = _Bare()
+
+    with torch.inference_mode():
+        (theirs,) = network.eval()([given[0]])
+
+    keep = theirs["scores"] >= 0.4
+    assert len(ours) == int(keep.sum()) > 3
+    np.testing.assert_allclose(ours.boxes_px, theirs["boxes"][keep].numpy(), atol=1e-3)
+    np.testing.assert_allclose(ours.scores, theirs["scores"][keep].numpy(), atol=1e-5)
+    masks = theirs["masks"][keep][:, 0].numpy()
+    assert ours.masks == tuple(
+        laid_in(mask, box, frame.size_px) for mask, box in zip(masks, ours.boxes_px, strict=True)
+    )
+
+
+class _Bare(torch.nn.Module):
+    """Torchvision's transform without scaling: pictures and masks as they are."""
+
+    def forward(self, images: list[Tensor], targets: None) -> tuple[Any, None]:
+        from torchvision.models.detection.image_list import ImageList
+
+        return ImageList(torch.stack(images), [tuple(images[0].shape[1:])]), targets
+
+    def postprocess(
+        self, found: list[dict[str, Tensor]], sizes: Any, originals: Any
+    ) -> list[dict[str, Tensor]]:
+        return found
+
+
+def test_the_same_picture_gives_the_same_bytes_in_any_batch() -> None:
+    frames = [noise_frame(k, t_ns=k) for k in range(3)]
+    one, again = _detector(), _detector()
+
+    together = _found(one, *frames)
+    alone = [_found(again, frame)[0] for frame in frames]
+
+    assert [found.t_ns for found in together] == [0, 1, 2]
+    assert all(_equal(a, b) for a, b in zip(together, alone, strict=True))
+
+
+def test_a_camera_that_changes_size_midway_gets_results_in_its_own_pixels() -> None:
+    small, large = noise_frame(1), noise_frame(1, 256, 192)
+    found = _found(_detector(batch=4), small, small, large, small)
+
+    assert [one.size_px for one in found] == [(128, 96), (128, 96), (256, 192), (128, 96)]
+    for one in found:
+        width, height = one.size_px
+        assert (one.boxes_px >= 0).all()
+        assert (one.boxes_px <= [width, height, width, height]).all()
+        assert all(rle.decode(mask, one.size_px).shape == (height, width) for mask in one.masks)
+
+
+def test_a_grey_picture_is_as_good_as_one_whose_colours_are_equal() -> None:
+    frame = noise_frame()
+    grey = np.asarray(cv2.cvtColor(frame.pixels, cv2.COLOR_BGR2GRAY), np.uint8)
+    coloured = np.repeat(grey[:, :, None], 3, axis=2)
+
+    (one,) = _found(_detector(), replace(frame, pixels=grey))
+    (other,) = _found(_detector(), replace(frame, pixels=coloured))
+
+    assert _equal(one, other)
+
+
+def test_a_picture_decoded_at_half_size_is_answered_in_the_cameras_pixels() -> None:
+    frame = noise_frame()
+    (whole,) = _found(_detector(), frame)
+    (half,) = _found(_detector(), replace(frame, size_px=(256, 192)))
+
+    np.testing.assert_allclose(half.boxes_px, 2.0 * whole.boxes_px)
+
+
+def test_what_is_cut_off_does_not_shift_what_is_found() -> None:
+    plan = plan_of(256, top=0.25, bottom=0.25)
+    placed = place(np.zeros((96, 128, 3), np.uint8), plan)
+
+    assert placed.pixels.shape == (96, 256, 3)
+    assert placed.inner_px == (256, 96)
+    assert placed.corner_px == (0, 48)
+    assert placed.scale == (2.0, 2.0)
+
+
+@dataclass
+class _Small:
+    """A back end whose device holds so many pictures at a time."""
+
+    within: Parts
+    most: int
+    tried: list[int] = field(default_factory=list)
+
+    def body(self, pictures: Bytes, /) -> Body:
+        self.tried.append(len(pictures))
+        if len(pictures) > self.most:
+            raise torch.OutOfMemoryError("no memory")
+        return self.within.body(pictures)
+
+    def boxes(self, pooled: Tensor, /) -> tuple[Tensor, Tensor]:
+        return self.within.boxes(pooled)
+
+    def masks(self, pooled: Tensor, /) -> Tensor:
+        return self.within.masks(pooled)
+
+
+def _with_memory(most: int) -> tuple[MaskRcnnDetector, _Small]:
+    plenty = _detector(batch=8)
+    small = _Small(plenty.parts, most)
+    return replace(plenty, parts=small), small
+
+
+def test_when_memory_runs_out_the_batch_shrinks_and_nothing_is_lost() -> None:
+    frames = [noise_frame(k, t_ns=k) for k in range(9)]
+    detector, small = _with_memory(2)
+
+    found = _found(detector, *frames)
+
+    assert small.tried == [8, 4, 2, 2, 2, 2, 1]
+    assert [one.t_ns for one in found] == list(range(9))
+    np.testing.assert_allclose(
+        found[8].boxes_px, _found(_detector(), frames[8])[0].boxes_px, atol=1e-3
+    )
+
+
+def test_when_not_even_one_picture_fits_it_says_what_to_do() -> None:
+    detector, _ = _with_memory(0)
+
+    with pytest.raises(CrosscueError, match=r'no memory on cpu for one picture.*device = "cpu"'):
+        detector([noise_frame()])
+
+
+def test_identity_changes_with_all_that_changes_results() -> None:
+    base = _detector().identity
+    other = replace(random_checkpoint(), sha256="other")
+
+    assert _detector().identity == base
+    assert _detector(threads=2, batch=3).identity == base
+    assert _detector(score=0.41).identity != base
+    assert _detector(proposals=50).identity != base
+    assert _detector(objectness=0.01).identity != base
+    assert _detector(other).identity != base
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0.02, 0.98), st.floats(0.02, 0.98), st.floats(0.2, 4.0), st.floats(-4.0, 4.0))
+def test_calibration_keeps_the_order_of_scores_and_can_be_undone(
+    one: float, other: float, slope: float, offset: float
+) -> None:
+    by = Calibration(slope=slope, offset=offset)
+
+    assert raw_score(calibrated(one, by), by) == pytest.approx(one, abs=1e-4)
+    low, high = sorted((one, other))
+    assert calibrated(low, by) <= calibrated(high, by) + 1e-12
+    assert 0.0 <= calibrated(one, by) <= 1.0
+
+
+def test_calibrated_scores_reach_the_detections() -> None:
+    plain = random_checkpoint()
+    by = Calibration(slope=1.0, offset=-2.0)
+    facts = plain.facts.model_copy(update={"calibration": dict.fromkeys(CLASSES, by)})
+
+    (before,) = _found(_detector(score=0.01), noise_frame())
+    (after,) = _found(_detector(replace(plain, facts=facts), score=0.01), noise_frame())
+
+    assert len(after)
+    expected = sorted((calibrated(s, by) for s in before.scores.tolist()), reverse=True)
+    assert sorted(after.scores, reverse=True) == pytest.approx(expected[: len(after)])
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.integers(-20, 90), st.integers(-20, 60), st.integers(8, 120), st.integers(8, 90),
+    st.floats(0.5, 1.0),
+)  # fmt: skip
+def test_a_mask_laid_into_its_box_is_the_one_torchvision_pastes(
+    x: int, y: int, width: int, height: int, fullness: float
+) -> None:
+    box = np.clip(np.array([x, y, x + width, y + height], np.float64), 0, [128, 96, 128, 96])
+    if (box[2:] - box[:2] < 8).any():
+        return
+    at = (np.arange(28) + 0.5) / 14.0 - 1.0
+    mask = (np.hypot(at[:, None], at[None, :]) < fullness).astype(np.float32)
+
+    ours = rle.decode(laid_in(mask, box, (128, 96)), (128, 96))
+    pasted = paste_masks_in_image(
+        torch.from_numpy(mask)[None, None], torch.from_numpy(box).float()[None], (96, 128)
+    )
+    theirs = pasted[0, 0].numpy() > 0.5
+
+    # Torchvision rounds the widened box to whole pixels, so the outline may be a pixel elsewhere.
+    wide = cv2.dilate(theirs.astype(np.uint8), np.ones((3, 3), np.uint8))
+    narrow = cv2.erode(theirs.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1)
+    assert (np.asarray(wide)[ours] == 1).all()
+    assert ours[np.asarray(narrow) == 1].all()
+
+
+def test_a_full_mask_fills_its_box_and_nothing_else() -> None:
+    mask = rle.decode(
+        laid_in(np.ones((28, 28), np.float32), np.array([3.0, 4.0, 9.0, 8.0]), (16, 12)), (16, 12)
+    )
+
+    assert mask[4:8, 3:9].all()
+    assert mask.sum() == 24
+
+
+def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path) -> None:
+    plain = random_checkpoint()
+    facts = plain.facts.model_copy(update={"measured": {"box": 12.5}})
+    save_checkpoint(tmp_path / "one.safetensors", plain.network, facts, halve=False)
+
+    back = load_checkpoint(tmp_path / "one.safetensors")
+
+    assert back.facts == facts
+    assert all(
+        torch.equal(value, back.network.state_dict()[name])
+        for name, value in plain.network.state_dict().items()
+    )
+    assert len(back.sha256) == 64
+
+
+def _file(tmp_path: Path, facts: str | None, tensors: dict[str, Tensor] | None = None) -> Path:
+    path = tmp_path / "own.safetensors"
+    weights = {k: v.contiguous() for k, v in random_checkpoint().network.state_dict().items()}
+    header = {} if facts is None else {KEY: facts}
+    path.write_bytes(save(weights if tensors is None else tensors, header))
+    return path
+
+
+@cache
+def _written() -> bytes:
+    plain = random_checkpoint()
+    with TemporaryDirectory() as name:
+        path = Path(name) / "one.safetensors"
+        save_checkpoint(path, plain.network, plain.facts)
+        return path.read_bytes()
+
+
+def _json(**changes: Any) -> str:
+    return Facts(plan=plan_of(**changes)).model_dump_json()
+
+
+def test_a_checkpoint_with_other_classes_than_its_weights_is_refused(tmp_path: Path) -> None:
+    path = _file(tmp_path, _json(classes=("car", "boat")))
+
+    with pytest.raises(VehicleError, match=r"roi_heads.*want shape \(12,.*got \(16,"):
+        build(network=str(path))
+
+
+def test_a_checkpoint_of_another_network_is_refused(tmp_path: Path) -> None:
+    path = _file(tmp_path, _json(), {"backbone.body.conv1.weight": torch.zeros(2)})
+
+    with pytest.raises(VehicleError, match=r"backbone\.body\.conv1\.weight .*only one of them"):
+        build(network=str(path))
+
+
+def test_weights_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    tensors = {
+        k: v.contiguous().clone() for k, v in random_checkpoint().network.state_dict().items()
+    }
+    tensors["rpn.head.cls_logits.bias"][0] = float("nan")
+
+    with pytest.raises(VehicleError, match=r"cls_logits\.bias: holds numbers that are none"):
+        load_checkpoint(_file(tmp_path, _json(), tensors))
+
+
+@pytest.mark.parametrize(
+    ("facts", "why"),
+    [
+        (None, "says nothing of its classes"),
+        ("{}", "plan: field required"),
+        ("no json", "does not fit"),
+        (_json().replace("compact", "alexnet"), "plan.architecture"),
+        (_json().replace("128", "999999"), "plan.width_px"),
+        ('{"version": 99, "plan": ' + plan_of().model_dump_json() + "}", "version"),
+    ],
+)
+def test_a_checkpoint_that_describes_itself_badly_is_refused(
+    tmp_path: Path, facts: str | None, why: str
+) -> None:
+    with pytest.raises(VehicleError, match=why):
+        load_checkpoint(_file(tmp_path, facts))
+
+
+class _Hostile:
+    """Unpickling it makes a folder."""
+
+    def __init__(self, where: Path) -> None:
+        self.where = where
+
+    def __reduce__(self) -> Any:
+        return Path.mkdir, (self.where,)
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".pt", ".pkl", ".bin", ".ckpt", ".safetensors"])
+def test_a_hostile_pickle_is_refused_and_never_run(tmp_path: Path, suffix: str) -> None:
+    trap = tmp_path / "sprung"
+    content = pickle.dumps(_Hostile(trap))
+    if suffix == ".pt":
+        buffer = io.BytesIO()
+        torch.save(_Hostile(trap), buffer)
+        content = buffer.getvalue()
+    path = tmp_path / f"weights{suffix}"
+    path.write_bytes(content)
+
+    with pytest.raises(VehicleError, match=r"want \.safetensors|no safetensors file"):
+        build(network=str(path))
+
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"\x08", b"\xff" * 64, b"\x10" + b"\0" * 7 + b"{" * 16])
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "cut.safetensors"
+    path.write_bytes(content)
+
+    with pytest.raises(VehicleError, match="no safetensors file"):
+        build(network=str(path))
+
+
+@given(at=st.floats(0.0, 1.0), bit=st.integers(0, 7))
+@settings(max_examples=60, deadline=None)
+def test_a_flipped_bit_is_never_another_network(at: float, bit: int) -> None:
+    content = bytearray(_written())
+    place = round(at * (len(content) - 1))
+    content[place] ^= 1 << bit
+    with TemporaryDirectory() as name:
+        path = Path(name) / "flipped.safetensors"
+        path.write_bytes(content)
+        # A bit of the sum's own name leaves a file without a sum, as older ones are: whole.
+        if SUM.encode() in content:
+            with pytest.raises(VehicleError, match="flipped"):
+                load_checkpoint(path)
+
+
+def test_the_embedded_networks_are_those_that_were_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = bytearray(embedded_path().read_bytes())
+    content[-1000] ^= 1
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / embedded_path().name).write_bytes(content)
+    monkeypatch.setattr(weights_file, "__file__", str(tmp_path / "weights_file.py"))
+
+    with pytest.raises(VehicleError, match="damaged: want sha256 270a84"):
+        build(network="embedded")
+
+
+def test_coco_weights_that_were_damaged_on_the_disk_are_not_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    folder = tmp_path / "hub" / "checkpoints"
+    folder.mkdir(parents=True)
+    (folder / "maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth").write_bytes(b"half of it")
+
+    with pytest.raises(VehicleError, match=r"damaged: sha256 .*, want bf2d0c1e.*delete it"):
+        build(network="resnet50")
+
+
+def test_a_wrong_name_or_setting_says_what_there_is(tmp_path: Path) -> None:
+    with pytest.raises(VehicleError, match="'resnet' is none of embedded, resnet50, resnet50-v2"):
+        build(network="resnet")
+    with pytest.raises(VehicleError, match="No such file"):
+        build(network=str(tmp_path / "none.safetensors"))
+    with pytest.raises(VehicleError, match="did you mean score"):
+        build(scor=0.5)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
+def test_a_device_that_is_not_there_is_named() -> None:
+    with pytest.raises(VehicleError, match="device cuda: not there"):
+        chosen_device("cuda", "detector road")
+    assert chosen_device("cpu", "detector road").type == "cpu"
+
+
+def test_without_a_network_it_says_where_coco_weights_go(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked: dict[str, Any] = {}
+
+    def offline(url: str, *args: Any, **given: Any) -> None:
+        asked.update(given)
+        raise URLError("no route")
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", offline)
+
+    with pytest.raises(VehicleError, match=rf"cannot fetch https://.* put it at {tmp_path}"):
+        build(network="resnet50")
+    assert asked["weights_only"] is True
+    assert asked["check_hash"] is True
+
+
+def test_coco_weights_come_with_the_names_of_their_classes() -> None:
+    from torchvision.models.detection import MaskRCNN_ResNet50_FPN_Weights as Weights
+
+    plan = Plan(architecture="resnet50", classes=("x",) * 90, width_px=1333)
+    checkpoint = coco_checkpoint("resnet50", Weights.DEFAULT, build_network(plan).state_dict())
+
+    names = checkpoint.facts.plan.classes
+    assert [names[i - 1] for i in (3, 10, 13)] == ["car", "traffic light", "stop sign"]
+    assert names[11] is None
+
+
+@pytest.mark.parametrize("name", ["resnet50", "resnet50-v2"])
+def test_coco_weights_give_the_levels_that_torchvisions_own_network_gives(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from torchvision.models import detection
+
+    weights = getattr(detection, COCO_NETWORKS[name]).DEFAULT
+    make = {"resnet50": detection.maskrcnn_resnet50_fpn,
+            "resnet50-v2": detection.maskrcnn_resnet50_fpn_v2}[name]  # fmt: skip
+    with torch.device("meta"):
+        empty = make(weights=None, weights_backbone=None).state_dict()
+    torch.manual_seed(0)
+    # Variances so small that an epsilon of 1e-5 is seen.
+    state = {
+        key: torch.full(value.shape, 1e-4) if key.endswith("running_var")
+        else torch.zeros(value.shape, dtype=value.dtype) if "tracked" in key
+        else torch.randn(value.shape) * 0.03
+        for key, value in empty.items()
+    }  # fmt: skip
+    monkeypatch.setattr(
+        "torchvision.models._api.load_state_dict_from_url", lambda *args, **given: dict(state)
+    )
+    monkeypatch.setattr(nn.init, "kaiming_uniform_", lambda tensor, **given: tensor)
+    picture = torch.randn(1, 3, 64, 64)
+
+    with torch.inference_mode():
+        theirs = make(weights=weights, progress=False).eval().backbone(picture)
+        ours = coco_checkpoint(name, weights, state).network.backbone(picture)
+
+    for level, value in theirs.items():
+        largest = float(value.abs().max())
+        assert largest > 0.0
+        assert float((ours[level] - value).abs().max()) < 1e-3 * largest
+
+
+def test_the_registry_knows_it() -> None:
+    assert isinstance(make(Choice("mine", "mask-rcnn", {"device": "cpu"})), MaskRcnnDetector)
+    with pytest.raises(VehicleError, match="proposals"):
+        make(Choice("mine", "mask-rcnn", {"proposals": 0}))
+
+
+def test_the_checkpoint_in_the_package_is_small_and_says_what_it_is() -> None:
+    facts = load_checkpoint(embedded_path()).facts
+
+    assert embedded_path().stat().st_size < 25e6
+    assert facts.plan.classes == CLASSES
+    assert set(facts.calibration) == set(CLASSES)
+    assert {"box", "mask", "box car", "mask stop sign"} <= set(facts.measured)
+    assert facts.recipe["held_out_pictures"] == 600
+
+
+@pytest.mark.parametrize(
+    ("layout", "x_m", "category", "label"),
+    [("A", -20.0, "stop_sign", "stop sign"), ("E", -25.0, "traffic_light", "traffic light"),
+     ("C", -15.0, "car", "car")],
+)  # fmt: skip
+def test_the_checkpoint_in_the_package_sees_what_stands_at_intersections_it_never_saw(
+    layout: str, x_m: float, category: str, label: str
+) -> None:
+    picture = picture_at(world(layout), x_m, Camera())
+    largest = max(
+        (one for one in picture.seen if one.thing.category == category),
+        key=lambda one: int(one.mask.sum()),
+    )
+    frame = Frame(0, "", np.ascontiguousarray(picture.rgb[:, :, ::-1]), (1280, 720))
+
+    (found,) = build(device="cpu")([frame])
+
+    assert isinstance(found, Detections)
+    kept = [i for i, name in enumerate(found.labels) if name == label]
+    share = overlaps(np.array(largest.box_px, np.float64), found.boxes_px[kept])
+    assert share.max() > 0.5
+    best = kept[int(share.argmax())]
+    x0, y0, x1, y1 = largest.box_px
+    mask = rle.decode(found.masks[best], (1280, 720))[y0:y1, x0:x1]
+    assert (mask & largest.mask).sum() > 0.6 * (mask | largest.mask).sum()

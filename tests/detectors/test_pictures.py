@@ -1,0 +1,151 @@
+"""Encoded pictures to pixels: every camera's, at the smallest scale that serves."""
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from crosscue.detectors.base import View
+from crosscue.detectors.images import MOST_PIXELS, Encoded, decode, reduction, size_of
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
+
+COLOUR, GREY = View(), View(is_grey=True)
+
+
+def _encode(pixels: NDArray[np.uint8] | NDArray[np.uint16], suffix: str) -> Encoded:
+    ok, encoded = cv2.imencode(suffix, pixels)
+    assert ok
+    return Encoded({".jpg": "jpeg"}.get(suffix, suffix[1:]), memoryview(encoded.tobytes()))
+
+
+def _ramp(height: int = 48, width: int = 64) -> Bytes:
+    ramp = np.linspace(20, 230, width)[None, :].repeat(height, axis=0)
+    return np.dstack([ramp, ramp * 0.5, ramp * 0.25]).astype(np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".webp", ".jpg", ".bmp"])
+@pytest.mark.parametrize("view", [COLOUR, GREY])
+def test_every_coding_gives_the_size_and_channels_asked_for(suffix: str, view: View) -> None:
+    pixels, size = decode(_encode(_ramp(), suffix), view)
+
+    assert size == (64, 48)
+    assert pixels.shape == ((48, 64) if view.is_grey else (48, 64, 3))
+
+
+@pytest.mark.parametrize(("least", "by"), [(None, 1), (64, 1), (33, 1), (32, 2), (10, 4), (8, 8)])
+def test_a_jpeg_is_decoded_at_the_smallest_scale_that_serves(least: int | None, by: int) -> None:
+    view = View(least_width_px=least)
+
+    pixels, size = decode(_encode(_ramp(), ".jpg"), view)
+
+    assert reduction(64, view) == by
+    assert pixels.shape == (48 // by, 64 // by, 3)
+    assert size == (64, 48)
+
+
+@pytest.mark.parametrize(("bits", "top"), [(16, 65535), (12, 4095), (10, 1023)])
+def test_a_16_bit_camera_uses_the_whole_range_of_8(bits: int, top: int) -> None:
+    ramp = np.linspace(0, top, 64)[None, :].repeat(48, axis=0).astype(np.uint16)
+
+    pixels, _ = decode(_encode(ramp, ".png"), GREY, depth_bits=bits)
+
+    assert pixels.min() == 0
+    assert pixels.max() == 255
+
+
+@pytest.mark.parametrize(
+    ("name", "channels", "depth"),
+    [("mono8", 1, 1), ("mono16", 1, 2), ("bgr8", 3, 1), ("rgb8", 3, 1), ("rgba8", 4, 1),
+     ("bayer_rggb8", 1, 1)],
+)  # fmt: skip
+@pytest.mark.parametrize("view", [COLOUR, GREY])
+def test_raw_pictures_with_padded_rows(name: str, channels: int, depth: int, view: View) -> None:
+    step = 16 * channels * depth + 5
+    content = memoryview(bytes([128]) * (step * 10))
+
+    pixels, size = decode(Encoded("raw", content, (16, 10, step, name)), view)
+
+    assert size == (16, 10)
+    assert pixels.shape == ((10, 16) if view.is_grey else (10, 16, 3))
+    assert np.abs(pixels.astype(int) - 128).max() <= 1
+
+
+def test_red_is_red_whatever_the_order_in_the_log() -> None:
+    rgb = Encoded("raw", memoryview(bytes([200, 10, 20]) * 4), (2, 2, 6, "rgb8"))
+    bgr = Encoded("raw", memoryview(bytes([20, 10, 200]) * 4), (2, 2, 6, "bgr8"))
+
+    assert (decode(rgb, COLOUR)[0] == decode(bgr, COLOUR)[0]).all()
+
+
+def test_exif_does_not_turn_a_picture() -> None:
+    jpeg = bytes(_encode(_ramp(), ".jpg").content)
+    tiff = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
+    exif = b"Exif\0\0" + tiff
+    turned = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
+
+    pixels, size = decode(Encoded("jpeg", memoryview(turned)), COLOUR)
+
+    assert size == (64, 48)
+    assert pixels.shape == (48, 64, 3)
+
+
+def test_a_bomb_is_refused_by_its_header() -> None:
+    png = bytearray(_encode(_ramp(), ".png").content)
+    png[16:24] = struct.pack(">II", 60_000, 60_000)
+    png[29:33] = struct.pack(">I", zlib.crc32(bytes(png[12:29])))
+
+    with pytest.raises(LogTooLargeError, match=f"60000 x 60000 pixels: more than {MOST_PIXELS:,}"):
+        decode(Encoded("png", memoryview(bytes(png))), COLOUR)
+    jpeg = bytearray(_encode(_ramp(), ".jpg").content)
+    frame = jpeg.index(b"\xff\xc0")
+    jpeg[frame + 5 : frame + 9] = struct.pack(">HH", 65_000, 65_000)
+    with pytest.raises(LogTooLargeError, match="65000 x 65000"):
+        decode(Encoded("jpeg", memoryview(bytes(jpeg))), COLOUR)
+    with pytest.raises(LogTooLargeError, match="100000 x 100000"):
+        decode(Encoded("raw", memoryview(b"0"), (100_000, 100_000, 100_000, "mono8")), GREY)
+
+
+@given(
+    where=st.integers(0, 100_000),
+    flip=st.integers(1, 255),
+    suffix=st.sampled_from([".png", ".jpg", ".webp"]),
+)
+@settings(max_examples=60, deadline=None)
+def test_a_damaged_picture_is_told_or_still_a_picture(where: int, flip: int, suffix: str) -> None:
+    whole = _encode(_ramp(), suffix)
+    damaged = bytearray(whole.content)
+    damaged[where % len(damaged)] ^= flip
+
+    try:
+        pixels, (width, height) = decode(Encoded(whole.coding, memoryview(bytes(damaged))), GREY)
+    except LogError:
+        return
+    assert pixels.dtype == np.uint8
+    assert pixels.shape == (height, width)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+def test_a_cut_picture_is_refused(suffix: str, share: float) -> None:
+    whole = _encode(np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8), suffix)
+    cut = whole.content[: int(len(whole.content) * share)]
+
+    with pytest.raises(LogFormatError):
+        decode(Encoded(whole.coding, cut), COLOUR)
+
+
+@pytest.mark.parametrize("coding", ["h264", "tiff", "png"])
+def test_what_is_not_decoded_says_so(coding: str) -> None:
+    with pytest.raises(LogError, match=f"{coding} picture without a size, or not decoded here"):
+        size_of(Encoded(coding, memoryview(b"\0" * 64)))
+
+
+def test_a_raw_picture_shorter_than_its_size_is_refused() -> None:
+    with pytest.raises(LogFormatError, match="fewer bytes than its size needs"):
+        decode(Encoded("raw", memoryview(bytes(20)), (16, 10, 16, "mono8")), GREY)

@@ -1,0 +1,53 @@
+"""Proposals are chosen as torchvision chooses them."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.detectors.networks.mask_rcnn.network import build_network, set_limits
+from crosscue.detectors.networks.mask_rcnn.nms import likeliest_apart
+from support.mask_rcnn import plan_of
+
+SIZE_PX = (96, 128)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.integers(0, 500), min_size=1, max_size=4), st.integers(1, 1000),
+    st.sampled_from([0.0, 0.3, 0.9]), st.integers(0, 1000), st.floats(5.0, 60.0),
+)  # fmt: skip
+def test_the_boxes_and_their_order_are_torchvisions(
+    counts: list[int], most: int, floor: float, seed: int, spread_px: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    total = sum(counts)
+    middles = rng.uniform(-20.0, 150.0, (total, 2))
+    halves = rng.exponential(spread_px / 2.0, (total, 2)) * (rng.random((total, 1)) > 0.1)
+    boxes = torch.from_numpy(np.hstack([middles - halves, middles + halves]).astype(np.float32))
+    logits = torch.from_numpy(rng.normal(0.0, 2.0, total).astype(np.float32))
+    rpn = build_network(plan_of()).eval().rpn
+    rpn._pre_nms_top_n["testing"], rpn._post_nms_top_n["testing"] = 1000, most
+    rpn.score_thresh = floor
+
+    ours = likeliest_apart(rpn, boxes, logits, np.repeat(np.arange(len(counts)), counts), SIZE_PX)
+    theirs, _ = rpn.filter_proposals(boxes[None], logits[None], [SIZE_PX], counts)
+
+    assert torch.equal(ours, theirs[0])
+
+
+def test_a_floor_leaves_the_first_of_those_there_are_without_it() -> None:
+    network = build_network(plan_of()).eval()
+    rng = np.random.default_rng(3)
+    corners = rng.uniform(0.0, 90.0, (80, 2)).astype(np.float32)
+    boxes = torch.from_numpy(np.hstack([corners, corners + 20.0]).astype(np.float32))
+    logits = torch.from_numpy(rng.normal(0.0, 2.0, 80).astype(np.float32))
+    kept = []
+    for floor in (0.0, 0.5):
+        set_limits(network, 1000, 0.5, floor)
+        kept.append(likeliest_apart(network.rpn, boxes, logits, np.zeros(80, np.int64), SIZE_PX))
+
+    assert 0 < len(kept[1]) < len(kept[0])
+    assert torch.equal(kept[1], kept[0][: len(kept[1])])

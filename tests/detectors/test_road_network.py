@@ -1,0 +1,241 @@
+"""The road network: learns, goes on after an interruption, and refuses files that are not its."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from crosscue.datasets.adapters.road_folder import load_folder
+from crosscue.detectors import rle
+from crosscue.detectors.base import Frame, RoadMask
+from crosscue.detectors.cues.road import road_shares
+from crosscue.detectors.networks.road.checkpoint import RoadFacts, load_road, save_road
+from crosscue.detectors.networks.road.detector import build
+from crosscue.detectors.networks.road.network import RoadNetwork, embedded_path
+from crosscue.detectors.training.road import RoadSchedule, RoadTraining, road_score
+from crosscue.eval.cli import run
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import SchemaError, VehicleError
+from crosscue.replay.vehicle.vehicle import Regions
+
+CPU = torch.device("cpu")
+
+
+def scenes(n: int, seed: int = 0) -> tuple[Bytes, Bytes]:
+    """Grey trapezoids on green: the simplest road there is."""
+    rng = np.random.default_rng(seed)
+    pixels = np.zeros((n, 48, 80, 3), np.uint8)
+    road = np.zeros((n, 48, 80), np.uint8)
+    for i in range(n):
+        pixels[i] = rng.normal((60, 120, 70), 12, (48, 80, 3)).clip(0, 255)
+        middle, top = rng.integers(30, 50), rng.integers(18, 26)
+        outline = np.array([[middle - 4, top], [middle + 4, top], [76, 47], [4, 47]])
+        cv2.fillPoly(road[i], [outline], 255)
+        pixels[i][road[i] > 0] = rng.normal(105, 12, ((road[i] > 0).sum(), 3)).clip(0, 255)
+    return pixels, road
+
+
+def test_it_learns_what_road_looks_like() -> None:
+    training = RoadTraining(RoadSchedule(steps=60, batch=6, warm_up=5), CPU)
+    held = scenes(6, seed=1)
+    before = road_score(training.network, *held, CPU)
+    for _ in training.steps(*scenes(24)):
+        pass
+
+    after = road_score(training.network, *held, CPU)
+
+    assert after.iou > max(0.8, before.iou)
+    assert after.pictures == 6
+
+
+def test_going_on_after_an_interruption_is_as_if_there_was_none(tmp_path: Path) -> None:
+    pixels, road = scenes(8)
+    whole = RoadTraining(RoadSchedule(steps=6, batch=2), CPU)
+    for _ in whole.steps(pixels, road):
+        pass
+    cut = RoadTraining(RoadSchedule(steps=6, batch=2), CPU)
+    for done, _ in cut.steps(pixels, road):
+        if done == 3:
+            cut.save(tmp_path / "state")
+            break
+    again = RoadTraining(RoadSchedule(steps=6, batch=2), CPU)
+    again.resume(tmp_path / "state")
+    for _ in again.steps(pixels, road):
+        pass
+
+    for name, value in whole.network.state_dict().items():
+        torch.testing.assert_close(again.network.state_dict()[name], value, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x80\x04K\x01.", b"\x10" + b"\0" * 7 + b'{"a":1}'])
+def test_a_file_that_is_no_state_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "state").write_bytes(content)
+
+    with pytest.raises(SchemaError, match="state: cannot go on"):
+        RoadTraining(RoadSchedule(), CPU).resume(tmp_path / "state")
+
+
+def test_a_state_of_another_seed_is_refused(tmp_path: Path) -> None:
+    RoadTraining(RoadSchedule(seed=1), CPU).save(tmp_path / "state")
+
+    with pytest.raises(SchemaError, match="of seed 1, not 2"):
+        RoadTraining(RoadSchedule(seed=2), CPU).resume(tmp_path / "state")
+
+
+def test_weights_come_back_as_they_were_written(tmp_path: Path) -> None:
+    network = RoadNetwork().eval()
+    save_road(tmp_path / "r.safetensors", network, RoadFacts(width_px=80, height_px=48))
+
+    again = load_road(tmp_path / "r.safetensors")
+
+    assert again.facts.width_px == 80
+    pictures = torch.rand(1, 3, 48, 80)
+    with torch.inference_mode():
+        torch.testing.assert_close(again.network(pictures), network(pictures), atol=0.02, rtol=0.02)
+
+
+def test_files_that_are_no_road_networks_are_refused(tmp_path: Path) -> None:
+    whole = tmp_path / "r.safetensors"
+    save_road(whole, RoadNetwork(), RoadFacts(width_px=80, height_px=48))
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes(whole.read_bytes()[:-100])
+    from safetensors.torch import save_file
+
+    other = tmp_path / "other.safetensors"
+    save_file({"a": torch.zeros(1)}, other)
+
+    with pytest.raises(VehicleError, match=r"cut.safetensors: no safetensors file"):
+        load_road(cut)
+    flipped = tmp_path / "flipped.safetensors"
+    flipped.write_bytes(whole.read_bytes()[:-1] + bytes([whole.read_bytes()[-1] ^ 1]))
+
+    with pytest.raises(VehicleError, match=r"flipped.safetensors: damaged"):
+        load_road(flipped)
+    with pytest.raises(VehicleError, match=r"other.safetensors: not what crosscue train road"):
+        load_road(other)
+    with pytest.raises(VehicleError, match=r"r.pth: want .safetensors"):
+        load_road(tmp_path / "r.pth")
+    with pytest.raises(VehicleError, match=r"none.safetensors: No such file"):
+        build(checkpoint=str(tmp_path / "none.safetensors"))
+    with pytest.raises(VehicleError, match=r"probability"):
+        build(probability=1.0)
+
+
+def masks(frames: list[Frame]) -> list[RoadMask]:
+    found = build(device="cpu")(frames)
+    given = [one for one in found if isinstance(one, RoadMask)]
+    assert len(given) == len(frames)
+    return given
+
+
+def test_any_picture_gives_a_mask_of_the_networks_size() -> None:
+    rng = np.random.default_rng(0)
+    frames = [
+        Frame(1, "a", rng.integers(0, 255, (360, 640, 3), dtype=np.uint8), (1280, 720)),
+        Frame(2, "a", np.zeros((48, 64), np.uint8), (64, 48)),
+        Frame(3, "b", np.full((720, 1280, 3), 255, np.uint8), (1280, 720)),
+    ]
+
+    for mask, frame in zip(masks(frames), frames, strict=True):
+        assert (mask.t_ns, mask.size_px) == (frame.t_ns, frame.size_px)
+        assert rle.decode(mask.mask, mask.mask_size_px).shape == mask.mask_size_px[::-1]
+        shares = road_shares(mask, Regions())
+        assert min(shares.left, shares.straight, shares.right) >= 0.0
+
+
+def test_the_embedded_network_is_small_and_says_how_it_was_made() -> None:
+    facts = load_road(embedded_path()).facts
+
+    assert embedded_path().stat().st_size < 2_000_000
+    assert str(facts.recipe["layouts"]).startswith("L")
+    assert float(facts.recipe["held_out_iou"]) > 0.9
+
+
+def folder(at: Path, n: int) -> Path:
+    for name in ("images", "masks"):
+        (at / name).mkdir(parents=True)
+    pixels, road = scenes(n)
+    for i in range(n):
+        cv2.imwrite(str(at / "images" / f"{i:02d}.png"), pixels[i])
+        cv2.imwrite(str(at / "masks" / f"{i:02d}.png"), road[i])
+    return at
+
+
+def test_own_pictures_with_masks_train_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = folder(tmp_path / "own", 11)
+    out = tmp_path / "own.safetensors"
+    argv = ["train", "road", "--data", str(data), "-o", str(out), "--steps", "4",
+            "--stop-at", "2", "--batch", "2", "--width", "128", "--device", "cpu",
+            "--json"]  # fmt: skip
+
+    assert run(argv) == 0
+
+    assert '"held_out_pictures": 2' in capsys.readouterr().out
+    recipe = load_road(out).facts.recipe
+    assert (recipe["pictures"], recipe["steps"], recipe["stopped_at"]) == (9, 4, 2)
+    assert not out.with_suffix(".state").exists()
+    assert run(argv) == 1  # it is there already
+
+
+def test_a_picture_without_its_mask_or_of_another_size_is_told(tmp_path: Path) -> None:
+    data = folder(tmp_path / "own", 2)
+    cv2.imwrite(str(data / "masks" / "01.png"), np.zeros((4, 4), np.uint8))
+    with pytest.raises(Exception, match=r"01.png: 80 x 48 pixels, but its mask has 4 x 4"):
+        load_folder(data, (80, 48))
+
+    (data / "masks" / "00.png").unlink()
+    with pytest.raises(Exception, match=r"masks/00.png: No such file"):
+        load_folder(data, (80, 48))
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (["--layouts", "A"], "only for scoring"),
+        (["--layouts", "L1", "--held", "L1"], "also trained on"),
+        (["--layouts", "Q"], "is no layout"),
+        (["--layouts", "L2-L1"], "want the lower one first"),
+        (["--layouts", "L1", "--score", "Z"], "is no layout"),
+        (["--layouts", "L1", "L0-L3"], "L1: named twice"),
+        (["--layouts", "L1", "--seed", "-1"], "want 0 or more"),
+        (["--layouts", "L1", "--threads", "-1"], "want 0 or more"),
+        (["--measure", "embedded", "--score", "A"], "not with -o"),
+        ([], "give --layouts"),
+    ],
+)
+def test_wrong_usage_is_told(
+    flags: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["train", "road", *flags, "-o", str(tmp_path / "o.safetensors")]) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_a_network_is_measured_without_training(capsys: pytest.CaptureFixture[str]) -> None:
+    measure = ["train", "road", "--measure", "embedded"]
+
+    assert run([*measure, "--score", "L640", "--each", "2", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["measured_pictures"] == 2
+    assert told["measured_iou"] > 0.95
+    assert run(measure) == 2
+    assert "give --score with layouts" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+def test_a_device_that_is_not_there_is_told() -> None:
+    with pytest.raises(VehicleError, match="detector road: device cuda: not there"):
+        build(device="cuda")
+
+
+def test_a_place_that_cannot_be_written_to_is_told_before_any_work(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(["train", "road", "--layouts", "L1", "-o", "/proc/nowhere/o.safetensors"]) == 1
+    assert "choose a place you may write to" in capsys.readouterr().err

@@ -1,0 +1,343 @@
+"""Signs against our own drawings: found, told apart, nothing seen twice; thresholds by labels."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.networks.model_detector import overlaps
+from crosscue.detectors.signs.detector import build, orb_points
+from crosscue.detectors.signs.matching import nearest, window_counts
+from crosscue.detectors.signs.templates import AMERICAN, Kind
+from crosscue.detectors.training.operating_point import Judged, judge, rates_at, threshold_for
+from crosscue.eval.cli import run
+from crosscue.replay.columns import Block, Bytes, Images, Messages, Topic
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.write.convert import LogWriter
+from support.data import shared
+from support.sign_scenes import clutter, scene
+
+
+def _signs(grey: Bytes, **changes: object) -> Detections:
+    size = (grey.shape[1], grey.shape[0])
+    found = build(**changes)([Frame(7, "cam", grey, size)])[0]
+    assert isinstance(found, Detections)
+    return found
+
+
+@pytest.mark.parametrize("kind", AMERICAN)
+def test_each_american_sign_is_found_where_it_is_and_called_what_it_is(kind: Kind) -> None:
+    hits = 0
+    for seed in range(8):
+        grey, box = scene(kind, seed)
+        found = _signs(grey)
+        over = overlaps(box, found.boxes_px) if len(found) else np.empty(0)
+        hits += any(
+            label == kind and share > 0.4 for label, share in zip(found.labels, over, strict=True)
+        )
+
+    assert hits >= 7
+
+
+@pytest.mark.parametrize(
+    ("kind", "other"), [("one way left", "one way right"), ("one way right", "one way left")]
+)
+def test_a_left_arrow_is_never_a_right_one(kind: Kind, other: Kind) -> None:
+    for seed in range(8):
+        grey, box = scene(kind, seed)
+        found = _signs(grey)
+        for label, candidate in zip(found.labels, found.boxes_px, strict=True):
+            assert not (label == other and overlaps(box, candidate[None])[0] > 0.4)
+
+
+def test_clutter_without_signs_has_no_arrows() -> None:
+    labels = [label for seed in range(10) for label in _signs(clutter(9000 + seed)).labels]
+
+    assert not [label for label in labels if label.startswith("one way")]
+
+
+def test_nothing_is_found_in_the_cropped_part() -> None:
+    grey, box = scene("do not enter", 3, height_px=80)
+    bottom = 1.0 - (box[1] + 5) / grey.shape[0]
+
+    assert len(_signs(grey, crop_bottom=0.0))
+    found = _signs(grey, crop_bottom=float(bottom))
+    assert all(overlaps(box, b[None])[0] < 0.4 for b in found.boxes_px)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (20, 20), (40, 300)])
+def test_pictures_too_small_or_flat_give_nothing(shape: tuple[int, int]) -> None:
+    assert len(_signs(np.full(shape, 90, np.uint8))) == 0
+
+
+def test_a_setting_that_is_none_is_refused() -> None:
+    with pytest.raises(VehicleError, match="detector signs: ratoi: no such setting; did you mean"):
+        build(ratoi=0.8)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 10_000))
+def test_the_ratio_test_agrees_with_opencv(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.integers(0, 256, (7, 32), np.uint8)
+    drawn = rng.integers(0, 256, (9, 32), np.uint8)
+    drawn[2] = points[4] ^ np.uint8(1)
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(points, drawn, k=2)
+    want = [a.trainIdx if a.distance < 0.8 * b.distance else -1 for a, b in pairs]
+
+    got = nearest(points.view(np.uint64), drawn.view(np.uint64), np.array([0, 9]), 0.8, 256)
+
+    assert got[0].tolist() == want
+    assert got[0, 4] == 2
+
+
+@pytest.mark.parametrize("most", [100, 20_000])
+def test_points_are_those_of_upright_orb_whether_or_not_it_must_choose(most: int) -> None:
+    grey = clutter(5)
+    orb = cv2.ORB.create(nfeatures=most, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=6)
+    keypoints = orb.detect(grey, None)
+    for keypoint in keypoints:
+        keypoint.angle = 0.0
+    keypoints, descriptors = orb.compute(grey, keypoints)
+
+    points = orb_points(grey, most, 6)
+
+    assert len(keypoints) == most if most == 100 else 100 < len(keypoints) < most
+    np.testing.assert_array_equal(points.at_px, [keypoint.pt for keypoint in keypoints])
+    np.testing.assert_array_equal(points.words.view(np.uint8), descriptors)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 10_000), reach=st.integers(0, 3))
+def test_a_window_counts_each_drawn_point_once(seed: int, reach: int) -> None:
+    rng = np.random.default_rng(seed)
+    cells, drawn = rng.integers(-2, 9, (40, 2)), np.sort(rng.integers(0, 6, 40))
+
+    counts = window_counts(cells, drawn, 7, 6, reach)
+
+    for row in range(7):
+        for column in range(6):
+            near = (np.abs(cells - [column, row]) <= reach).all(axis=1)
+            assert counts[row, column] == len(set(drawn[near].tolist()))
+
+
+def test_a_true_sign_counts_once_and_the_best_takes_it() -> None:
+    boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10], [50, 50, 60, 60]], np.float64)
+
+    judged = judge(boxes, np.array([0.5, 0.9, 0.7]), boxes[:1], 0.4)
+
+    assert judged.is_right.tolist() == [False, True, False]
+    assert judged.signs == 1
+
+
+def test_the_threshold_is_the_lowest_that_keeps_the_precision() -> None:
+    judged = Judged(np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, True, False, True]), 4)
+
+    assert threshold_for(judged, 0.95) == 0.8
+    assert threshold_for(judged, 0.6) == 0.6
+    assert rates_at(judged, 0.8).precision == 1.0
+    assert rates_at(judged, 0.8).recall == 0.5
+    assert threshold_for(Judged(np.array([0.9]), np.array([False]), 1), 0.95) is None
+
+
+def test_fit_signs_chooses_on_some_frames_and_measures_on_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = ["picture,label,x0,y0,x1,y1"]
+    for seed in range(8):
+        grey, box = scene("one way left", seed)
+        ok, encoded = cv2.imencode(".png", grey)
+        assert ok
+        (tmp_path / f"{seed}.png").write_bytes(encoded.tobytes())
+        rows.append(f"{seed}.png,one way left," + ",".join(map(str, box.tolist())))
+    labels = tmp_path / "labels.csv"
+    labels.write_text("\n".join(rows) + "\n")
+
+    assert run(["fit", "signs", str(labels), "--label", "one way left"]) == 0
+
+    told = capsys.readouterr().out
+    assert "least_score = " in told
+    assert "precision 1.00 (4 of 4; 95 % interval 0.51 to 1.00)" in told
+    printed = told.split()[2]
+    assert run(["fit", "signs", str(labels), "--label", "one way left", "--score", printed]) == 0
+    assert capsys.readouterr().out == told
+
+
+def coco(folder: Path, seeds: range) -> Path:
+    """Left and right one-way signs in turn, as a COCO file with its folder of pictures."""
+    kinds: tuple[Kind, Kind] = ("one way left", "one way right")
+    (folder / "images").mkdir(parents=True)
+    images, annotations = [], []
+    for seed in seeds:
+        grey, (x0, y0, x1, y1) = scene(kinds[seed % 2], seed)
+        ok, encoded = cv2.imencode(".png", grey)
+        assert ok
+        (folder / "images" / f"{seed}.png").write_bytes(encoded.tobytes())
+        images.append({"id": seed, "file_name": f"{seed}.png"})
+        annotations.append({"id": seed, "image_id": seed, "category_id": seed % 2,
+                            "bbox": [x0, y0, x1 - x0, y1 - y0]})  # fmt: skip
+    names = [{"id": i, "name": name} for i, name in enumerate(kinds)]
+    tree = {"images": images, "annotations": annotations, "categories": names}
+    (folder / "coco.json").write_text(json.dumps(tree))
+    return folder / "coco.json"
+
+
+def test_several_labels_share_a_threshold_and_coco_files_serve_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fitted, other = coco(tmp_path / "a", range(4)), coco(tmp_path / "b", range(4, 8))
+    both = ["--label", "one way left", "one way right"]
+
+    assert run(["fit", "signs", str(fitted), "--test", str(other), *both, "--json"]) == 0
+
+    told = json.loads(capsys.readouterr().out)
+    assert (told["chosen_on"]["signs"], told["other_frames"]["signs"]) == (4, 4)
+    assert told["other_frames"]["precision"] == 1.0
+
+
+def drive(folder: Path, seeds: range) -> Path:
+    """A drive with a sign in every second picture, and its truth."""
+    folder.mkdir()
+    times = [1_700_000_000_000_000_000 + 10**8 * i for i in range(len(seeds))]
+    pictures, images, annotations = [], [], []
+    for number, (t_ns, seed) in enumerate(zip(times, seeds, strict=True)):
+        grey, (x0, y0, x1, y1) = scene("one way left", seed)
+        has_sign = number % 2 == 0
+        pictures.append(cv2.imencode(".png", grey if has_sign else clutter(seed))[1].ravel())
+        images.append({"id": number, "t_ns": t_ns, "file_name": f"{t_ns}.jpg"})
+        if has_sign:
+            annotations.append({"id": number, "image_id": number, "category_id": 101,
+                                "bbox": [x0, y0, x1 - x0, y1 - y0]})  # fmt: skip
+    edges = np.cumsum([0, *map(len, pictures)])
+    rows = Images(
+        Messages(np.concatenate(pictures), edges[:-1], edges[1:]), ("png",) * len(pictures)
+    )
+    with LogWriter(folder / "drive.mcap", Ledger("drive.mcap")) as writer:
+        writer.add_topic(Topic("/camera", "crosscue/Images", "columns"))
+        writer.write(Block("/camera", np.array(times), rows))
+    tree = {"images": images, "annotations": annotations,
+            "categories": [{"id": 101, "name": "one way left"}]}  # fmt: skip
+    (folder / "objects.json").write_text(json.dumps(tree))
+    return folder
+
+
+def test_drives_measure_a_threshold_with_an_interval_by_drive(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fitted = coco(tmp_path / "a", range(4))
+    drives = [str(drive(tmp_path / f"d{i}", range(10 * i, 10 * i + 2))) for i in range(5)]
+    left = ["--label", "one way left", "--json"]
+
+    assert run(["fit", "signs", str(fitted), "--test", *drives, *left]) == 0
+    whole = json.loads(capsys.readouterr().out)["other_frames"]
+    assert run(["fit", "signs", drives[0], "--test", *drives, *left, "--every", "2"]) == 0
+    half = json.loads(capsys.readouterr().out)
+
+    assert whole["signs"] == half["other_frames"]["signs"] == 5
+    assert half["chosen_on"]["signs"] == 1
+    low, high = whole["recall_interval_by_drive"]
+    assert 0.0 <= low <= whole["recall"] <= high <= 1.0
+
+
+def test_a_drive_without_objects_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = drive(tmp_path / "d", range(2))
+    (folder / "objects.json").unlink()
+
+    assert run(["fit", "signs", str(folder), "--label", "stop"]) == 1
+    assert "objects.json: " in capsys.readouterr().err
+
+
+def test_a_given_threshold_is_measured_not_chosen(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fitted = str(coco(tmp_path / "a", range(4)))
+
+    assert run(["fit", "signs", fitted, "--label", "one way left", "--score", "0.99"]) == 0
+
+    told = capsys.readouterr().out
+    assert "least_score = 0.99\n" in told
+    assert "recall    0.00 (0 of 2; " in told
+
+
+def test_signs_too_low_to_matter_are_neither_found_nor_missed() -> None:
+    truth = np.array([[0, 0, 10, 8], [50, 50, 60, 70]], np.float64)
+    boxes = np.vstack([truth, [[90, 90, 99, 99]]])
+
+    judged = judge(boxes, np.array([0.9, 0.8, 0.7]), truth, 0.4, 12.0)
+
+    assert judged.scores.tolist() == [0.8, 0.7]
+    assert judged.is_right.tolist() == [True, False]
+    assert judged.signs == 1
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"images": [], "annotations": [], "categories": []}'])
+def test_a_file_that_is_no_coco_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
+) -> None:
+    (tmp_path / "coco.json").write_text(text)
+
+    assert run(["fit", "signs", str(tmp_path / "coco.json"), "--label", "stop"]) == 2
+    assert "coco.json: no " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("a.png,stop,1,2,x,4", "labels.csv:2: want four numbers"),
+        ("a.png,stop,9,2,3,4", "want x0 < x1"),
+        ("a.png,stop,1,2,3,4", "check the picture column"),
+        ("labels.csv,stop,1,2,3,4", "not a JPEG, PNG or WebP picture"),
+    ],
+)
+def test_labels_that_do_not_fit_are_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], row: str, said: str
+) -> None:
+    labels = tmp_path / "labels.csv"
+    labels.write_text(f"picture,label,x0,y0,x1,y1\n{row}\n")
+
+    assert run(["fit", "signs", str(labels), "--label", "stop"]) == 2
+
+    assert said in capsys.readouterr().err
+
+
+def test_a_picture_cut_short_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, coded = cv2.imencode(".jpg", scene(AMERICAN[0], 3).grey)
+    (tmp_path / "cut.jpg").write_bytes(coded.tobytes()[:2000])
+    labels = tmp_path / "labels.csv"
+    labels.write_text("picture,label,x0,y0,x1,y1\ncut.jpg,stop,1,2,30,40\n")
+
+    assert run(["fit", "signs", str(labels), "--label", "stop"]) == 2
+    assert "cut.jpg: jpeg picture cut short; mend the picture" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("none.csv", "none.csv: No such file"), ("wild.csv", "wild.csv: is no text")]
+)
+def test_a_file_of_labels_that_is_none_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, said: str
+) -> None:
+    (tmp_path / "wild.csv").write_bytes(b"\xff\xd8\xff")
+
+    assert run(["fit", "signs", str(tmp_path / name), "--label", "stop"]) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count(str(tmp_path)) == 1
+
+
+def test_a_real_no_entry_sign_is_found_in_a_photo() -> None:
+    path = shared("signs", "no_entry", "images", "NoEntry10.png")
+    grey = np.asarray(cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), 0), np.uint8)
+
+    found = _signs(grey, kinds=("no entry",), crop_bottom=0.0)
+
+    true_sign = np.array([504, 155, 593, 243], np.float64)
+    assert "do not enter" in found.labels
+    assert overlaps(true_sign, found.boxes_px).max() > 0.4

@@ -1,0 +1,453 @@
+"""Training on COCO annotations: what is read, what is learnt from, and going on after a kill."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections
+from crosscue.detectors.networks.mask_rcnn.checkpoint import Facts, load_checkpoint, save_checkpoint
+from crosscue.detectors.networks.mask_rcnn.network import build_network
+from crosscue.detectors.training.annotations import LabelledSet, mask_of, read_coco
+from crosscue.detectors.training.calibration import fitted, judged
+from crosscue.detectors.training.loop import Schedule, Training
+from crosscue.detectors.training.operating_point import Judged
+from crosscue.detectors.training.samples import Sampler, Window, read_picture
+from crosscue.detectors.training.scores import average_precisions
+from crosscue.eval.cli import run
+from crosscue.replay.errors import CrosscueError, SchemaError
+from support.mask_rcnn import CPU, plan_of, write_bars
+
+WINDOW = Window(96, 64)
+CARS = ("car",)
+
+
+def _bars(folder: Path, count: int = 4) -> LabelledSet:
+    return read_coco(write_bars(folder / "set", count), folder / "set" / "images", CARS)
+
+
+def _changed(folder: Path, **rows: Any) -> LabelledSet:
+    """A set of bars, with other top-level entries."""
+    path = write_bars(folder / "set", 2)
+    tree = json.loads(path.read_text())
+    for name, value in rows.items():
+        tree[name] = value(tree[name]) if callable(value) else value
+    path.write_text(json.dumps(tree))
+    return read_coco(path, folder / "set" / "images", CARS)
+
+
+def _with(row: dict[str, Any]) -> Any:
+    """A change that lays ``row`` over the first annotation."""
+    return lambda rows: [{**rows[0], **row}, *rows[1:]]
+
+
+@pytest.mark.parametrize(
+    ("row", "reason"),
+    [
+        ({"bbox": [500, 10, 20, 20]}, "boxes outside the picture, or empty"),
+        ({"bbox": [10, 10, 0, 20]}, "boxes outside the picture, or empty"),
+        ({"bbox": [10, 10, -5, -5]}, "boxes outside the picture, or empty"),
+        ({"bbox": [10, 10, 20]}, "annotations without a box"),
+        ({"bbox": None}, "annotations without a box"),
+        ({"bbox": [10, 10, "wide", 20]}, "annotations without a box"),
+        ({"category_id": 77}, "annotations of unknown classes"),
+        ({"category_id": [3]}, "annotations of unknown classes"),
+        ({"category_id": 9}, "annotations of other classes"),
+        ({"image_id": 99}, "annotations of other pictures"),
+        ({"segmentation": []}, "annotations without a mask of the picture's size"),
+        ({"segmentation": [[1, 2, 3]]}, "annotations without a mask of the picture's size"),
+        (
+            {"segmentation": {"size": [9, 9], "counts": "0"}},
+            "annotations without a mask of the picture's size",
+        ),
+        (
+            {"segmentation": {"size": [96, 128], "counts": "~~~~~~~~~~~~"}},
+            "annotations without a mask of the picture's size",
+        ),
+        (
+            {"segmentation": {"size": [96, 128], "counts": [5, -5, 9]}},
+            "annotations without a mask of the picture's size",
+        ),
+    ],
+)
+def test_an_annotation_that_cannot_be_used_is_left_out_and_counted(
+    tmp_path: Path, row: dict[str, Any], reason: str
+) -> None:
+    labelled = _changed(tmp_path, annotations=_with(row))
+
+    assert labelled.left_out == {reason: 1}
+    assert sum(len(picture.objects) for picture in labelled.pictures) == 3
+
+
+def test_a_box_that_sticks_out_is_cut_off_at_the_edge(tmp_path: Path) -> None:
+    labelled = _changed(tmp_path, annotations=_with({"bbox": [-10, -5, 30, 300]}))
+
+    assert labelled.pictures[0].objects[0].box_px == (0.0, 0.0, 20.0, 96.0)
+    assert labelled.left_out == {"boxes cut off at the picture's edge": 1}
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"annotations": []}, "no usable annotation of car"),
+        ({"images": []}, "none of its pictures"),
+        ({"categories": []}, "no class of car; it has: none"),
+        ({"annotations": {}}, "annotations: want a list"),
+        ({"images": [7]}, "images: want a list"),
+    ],
+)
+def test_a_set_without_anything_to_learn_from_is_refused(
+    tmp_path: Path, change: dict[str, Any], why: str
+) -> None:
+    with pytest.raises(SchemaError, match=why):
+        _changed(tmp_path, **change)
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"no json", b"[" * 100_000, b"\xff\xfe"])
+def test_a_file_that_is_no_coco_file_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "coco.json"
+    path.write_bytes(content)
+
+    with pytest.raises(SchemaError, match="want a COCO file"):
+        read_coco(path, tmp_path, CARS)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("gone.png", "pictures not there"),
+        ("../images/0.png", "pictures outside the folder"),
+        ("/etc/passwd", "pictures outside the folder"),
+        (7, "pictures without a name or size"),
+    ],
+)
+def test_a_picture_that_is_not_in_the_folder_is_left_out(
+    tmp_path: Path, name: object, reason: str
+) -> None:
+    labelled = _changed(tmp_path, images=_with({"file_name": name}))
+
+    assert len(labelled.pictures) == 1
+    assert labelled.left_out == {reason: 1, "annotations of other pictures": 2}
+
+
+def test_a_picture_of_another_size_than_annotated_is_refused(tmp_path: Path) -> None:
+    labelled = _changed(tmp_path, images=_with({"width": 130, "height": 97}))
+    sampler = Sampler(labelled, plan_of(), WINDOW, 0)
+
+    with pytest.raises(SchemaError, match=r"0\.png: want a picture of 130 x 97"):
+        [sampler(number) for number in range(20)]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.98])
+def test_a_picture_cut_short_is_not_learnt_from(tmp_path: Path, share: float) -> None:
+    labelled = _bars(tmp_path)
+    path = labelled.pictures[0].path
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+
+    with pytest.raises(SchemaError, match=rf"{path.name}: .*leave it out of the annotations"):
+        read_picture(labelled.pictures[0])
+
+
+def test_all_spellings_of_a_mask_mean_the_same_pixels(tmp_path: Path) -> None:
+    mask = np.zeros((96, 128), np.bool_)
+    mask[20:50, 30:90] = True
+    text = rle.encode(mask, (0, 0), (128, 96))
+    spellings = (
+        [[30, 20, 90, 20, 90, 50, 30, 50]],
+        {"size": [96, 128], "counts": text.decode()},
+        {"size": [96, 128], "counts": rle.runs(text).tolist()},
+    )
+    for number, spelling in enumerate(spellings):
+        labelled = _changed(
+            tmp_path / str(number),
+            annotations=_with({"segmentation": spelling, "bbox": [30, 20, 60, 30]}),
+        )
+        got = mask_of(labelled.pictures[0].objects[0], (128, 96))
+        assert not labelled.left_out
+        assert (got ^ mask).sum() <= (0 if number else 2 * (30 + 60) + 4)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000))
+def test_in_a_sample_every_box_encloses_its_mask_and_shows_its_object(
+    tmp_path_factory: pytest.TempPathFactory, number: int
+) -> None:
+    labelled = _bars(tmp_path_factory.mktemp("bars"), 1)
+    sampler = Sampler(labelled, plan_of(), WINDOW, 3)
+    sample, again = sampler(number), sampler(number)
+
+    assert np.array_equal(sample.pixels, again.pixels)
+    assert sample.pixels.shape == (3, 64, 96)
+    for box, mask in zip(sample.boxes_px, sample.masks, strict=True):
+        rows, columns = np.nonzero(mask)
+        assert box.tolist() == [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+        inside, outside = sample.pixels[0][mask > 0], sample.pixels[0][sample.masks.max(0) == 0]
+        assert inside.mean() > outside.mean()
+
+
+def _training(folder: Path, schedule: Schedule) -> tuple[Training, Sampler]:
+    plan = plan_of()
+    training = Training(lambda: build_network(plan), schedule, CPU)
+    return training, Sampler(_bars(folder), plan, WINDOW, schedule.seed)
+
+
+def test_a_network_learns(tmp_path: Path) -> None:
+    training, sampler = _training(tmp_path, Schedule(16, batch=2, rate=2e-3, warm_up=4))
+
+    losses = [loss for _, loss in training.steps(sampler)]
+
+    assert np.mean(losses[-4:]) < 0.85 * np.mean(losses[:3])
+
+
+def test_going_on_after_a_kill_ends_as_if_none_had_come(tmp_path: Path) -> None:
+    schedule = Schedule(4, batch=2, warm_up=1)
+    whole, sampler = _training(tmp_path / "a", schedule)
+    expected = [loss for _, loss in whole.steps(sampler)]
+    cut, sampler = _training(tmp_path / "b", schedule)
+    losses = []
+    for step, loss in cut.steps(sampler):
+        losses.append(loss)
+        if step == 2:
+            cut.save(tmp_path / "state.safetensors", {"word": 1})
+            break
+    later, sampler = _training(tmp_path / "c", schedule)
+
+    assert later.resume(tmp_path / "state.safetensors") == {"word": 1}
+    losses += [loss for _, loss in later.steps(sampler)]
+
+    assert losses == expected
+    for name, value in whole.averaged.state_dict().items():
+        assert torch.equal(value, later.averaged.state_dict()[name])
+
+
+def test_a_state_of_another_training_or_none_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "state.safetensors"
+    one, _ = _training(tmp_path / "a", Schedule(4, batch=2))
+    one.save(path, {})
+    other, _ = _training(tmp_path / "b", Schedule(5, batch=2))
+
+    with pytest.raises(SchemaError, match="training with other settings"):
+        other.resume(path)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(SchemaError, match="damaged"):
+        one.resume(path)
+
+
+def test_losses_that_are_no_numbers_end_the_training(tmp_path: Path) -> None:
+    training, sampler = _training(tmp_path, Schedule(40, batch=1))
+    with torch.no_grad():
+        training.network.rpn.head.cls_logits.bias.fill_(float("nan"))
+
+    with pytest.raises(CrosscueError, match="lower --rate"):
+        list(training.steps(sampler))
+
+
+def _perfect(labelled: LabelledSet) -> list[Detections]:
+    found = []
+    for number, picture in enumerate(labelled.pictures):
+        boxes = np.array([one.box_px for one in picture.objects], np.float64).reshape(-1, 4)
+        masks = tuple(
+            rle.encode(mask_of(one, picture.size_px), (0, 0), picture.size_px)
+            for one in picture.objects
+        )
+        labels = tuple(labelled.classes[one.label] for one in picture.objects)
+        scores = np.linspace(0.9, 0.5, len(labels))
+        found.append(Detections(number, picture.size_px, boxes, scores, labels, masks))
+    return found
+
+
+def test_average_precision_is_all_for_the_truth_itself_and_nothing_for_nothing(
+    tmp_path: Path,
+) -> None:
+    labelled = _bars(tmp_path)
+    perfect = _perfect(labelled)
+
+    whole, none = (
+        average_precisions(labelled, found)
+        for found in (perfect, [one.above(2.0) for one in perfect])
+    )
+
+    assert whole["box"] == whole["mask"] == whole["box car"] == 100.0
+    assert whole["box large"] is None
+    assert none["box"] == none["mask"] == 0.0
+
+
+def test_a_second_detection_of_the_same_object_is_wrong(tmp_path: Path) -> None:
+    labelled = _bars(tmp_path)
+    one = _perfect(labelled)[0]
+    doubled = Detections(
+        0, one.size_px, np.tile(one.boxes_px, (2, 1)), np.tile(one.scores, 2), one.labels * 2,
+        one.masks * 2,
+    )  # fmt: skip
+    others = [found.above(2.0) for found in _perfect(labelled)[1:]]
+
+    rows = judged(labelled, [doubled, *others])["car"]
+
+    assert (len(rows.scores), int(rows.is_right.sum()), rows.signs) == (4, 2, 8)
+
+
+def test_calibration_finds_the_law_that_scores_follow() -> None:
+    rng = np.random.default_rng(0)
+    scores = rng.uniform(0.02, 0.98, 20_000)
+    logit = np.log(scores / (1.0 - scores))
+    is_right = rng.random(20_000) < 1.0 / (1.0 + np.exp(-(0.7 * logit - 1.0)))
+
+    by = fitted(Judged(scores, is_right, 1))
+
+    assert by.slope == pytest.approx(0.7, abs=0.05)
+    assert by.offset == pytest.approx(-1.0, abs=0.06)
+
+
+def test_too_few_detections_leave_scores_as_they_are() -> None:
+    rows = Judged(np.linspace(0.1, 0.9, 25), np.ones(25, np.bool_), 25)
+
+    assert (fitted(rows).slope, fitted(rows).offset) == (1.0, 0.0)
+
+
+def test_from_simulated_pictures_to_a_checkpoint_by_commands_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames, out = tmp_path / "frames", tmp_path / "mine.safetensors"
+    assert run(["train", "frames", "L3", "--each", "4", "--width", "320", "-o", str(frames)]) == 0
+    learn = [
+        "train", "mask-rcnn", "--data", str(frames / "coco.json"),
+        "--images", str(frames / "images"), "-o", str(out), "--width", "320", "--steps", "2",
+        "--batch", "1", "--window", "128", "64", "--check-every", "1", "--check-pictures", "1",
+    ]  # fmt: skip
+
+    assert run(learn) == 0
+
+    told = capsys.readouterr().out
+    assert "step 2 of 2" in told
+    checkpoint = load_checkpoint(out)
+    assert checkpoint.facts.plan.classes == ("car", "stop sign", "traffic light")
+    assert checkpoint.facts.recipe["schedule.steps"] == 2
+    assert [row["step"] for row in json.loads(out.with_suffix(".curve.json").read_text())] == [1, 2]
+    assert cv2.imread(str(out.with_suffix(".curve.png"))) is not None
+    assert not out.with_suffix(".state.safetensors").exists()
+    assert run(learn) == 1
+    assert "--overwrite begins anew" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("layout", ["A", "H", "A-C", "L", "L9-L3", "L1-A", "L-1", "L0-L999999999"])
+def test_nothing_is_rendered_for_training_of_what_is_scored(
+    tmp_path: Path, layout: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["train", "frames", layout, "-o", str(tmp_path / "x")]) == 2
+    assert "train frames: " in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "why"),
+    [
+        (["-o", "x.pth"], "ends in .safetensors"),
+        (["--steps", "0"], "--steps: want 1 or more"),
+        (["--rate", "nan"], "--rate"),
+        (["--window", "100", "64"], "multiples of 32"),
+        (["--window", "64", "1000000000"], "multiples of 32 from 64 to 4096"),
+        (["--classes", "car", "car"], "named twice"),
+        (["--classes", ""], "empty or named twice"),
+        (["--width", "10"], "width_px: input should be greater than or equal to 64"),
+        (["--measure", "embedded"], "not with -o"),
+        (["--val-data", "x.json"], "give both or none"),
+        (["--top", "0.6", "--bottom", "0.6"], "less than a tenth"),
+    ],
+)
+def test_wrong_flags_are_told_before_any_work(
+    tmp_path: Path, flags: list[str], why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_bars(tmp_path / "set", 11)
+    base = ["train", "mask-rcnn", "--data", str(path), "--images", str(path.parent / "images"),
+            "-o", str(tmp_path / "out.safetensors")]  # fmt: skip
+
+    assert run([*base, *flags]) == 2
+    assert why in capsys.readouterr().err
+
+
+def test_a_place_that_cannot_be_written_to_is_told_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_bars(tmp_path / "set", 11)
+    base = ["train", "mask-rcnn", "--data", str(path), "--images", str(path.parent / "images")]
+
+    assert run([*base, "-o", "/proc/nowhere/out.safetensors"]) == 1
+    told = capsys.readouterr()
+    assert "choose a place you may write to" in told.err
+    assert "training" not in told.out
+
+
+def test_a_network_is_measured_without_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = tmp_path / "frames"
+    run(["train", "frames", "L901", "--each", "3", "-o", str(frames), "-q"])
+    base = ["train", "mask-rcnn", "--measure", "embedded", "--data", str(frames / "coco.json"),
+            "--images", str(frames / "images")]  # fmt: skip
+
+    assert run([*base, "--pictures", "1:", "--proposals", "100", "200", "--json"]) == 0
+    tree = json.loads(capsys.readouterr().out)
+    assert tree["pictures"] == 2
+    assert [row["proposals"] for row in tree["measured"]] == [100, 200]
+    first = tree["measured"][0]
+    assert 0.0 < first["ap"]["box"] <= 100.0
+    by_score = [row for row in first["rates"] if row["label"] == "car"]
+    assert [row["score"] for row in by_score] == [0.5, 0.9, 0.95]
+    assert [row["found"] for row in by_score] == sorted(
+        (row["found"] for row in by_score), reverse=True
+    )
+
+    assert run(base) == 0
+    told = capsys.readouterr().out
+    assert "embedded on 3 pictures, 100 proposals" in told
+    assert "score from 0.95" in told
+
+
+@pytest.mark.parametrize(
+    ("flags", "why"),
+    [
+        (["--pictures", "9"], "want A:B:N"),
+        (["--pictures", "::0"], "want A:B:N"),
+        (["--pictures", "90:"], "none of 4 pictures"),
+        (["--proposals", "0"], "want 1 to 2000"),
+    ],
+)
+def test_a_measurement_of_nothing_is_refused(
+    tmp_path: Path, flags: list[str], why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_bars(tmp_path / "set", 4)
+    torch_file = tmp_path / "bars.safetensors"
+    save_checkpoint(torch_file, build_network(plan_of(256)), Facts(plan=plan_of(256)))
+    base = ["train", "mask-rcnn", "--measure", str(torch_file), "--data", str(path),
+            "--images", str(path.parent / "images")]  # fmt: skip
+
+    assert run([*base, *flags]) == 2
+    assert why in capsys.readouterr().err
+
+
+def test_what_is_of_no_wanted_class_is_looked_at_too_but_not_learnt_as_one(tmp_path: Path) -> None:
+    labelled = _changed(
+        tmp_path,
+        images=lambda rows: rows[:1],
+        annotations=lambda rows: [rows[0], {**rows[1], "category_id": 9}],
+    )
+    sampler = Sampler(labelled, plan_of(256), Window(64, 64, zoom=(1.0, 1.0), mirror=0.0), 0)
+
+    samples = [sampler(number) for number in range(40)]
+
+    # The two bars lie in the left and the right half, too far apart for one window.
+    assert len(labelled.pictures[0].decoys_px) == 1
+    is_bright = [bool((one.pixels[0] > 1.0).sum() > 200) for one in samples]
+    has_car = [len(one.labels) > 0 for one in samples]
+    assert sum(has_car) >= 8
+    assert sum(bright and not car for bright, car in zip(is_bright, has_car, strict=True)) >= 8

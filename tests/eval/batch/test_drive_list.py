@@ -1,0 +1,244 @@
+"""Which drives a command line means."""
+
+import re
+import uuid
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.eval.batch.drive_list import DriveInput, drives_of
+from crosscue.replay.errors import CrosscueError, LogError, UsageError
+
+
+def _touch(folder: Path, *names: str) -> Path:
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(str(path))
+    return folder
+
+
+def _simulated(folder: Path, *names: str) -> Path:
+    """As ``crosscue simulate`` writes."""
+    for name in names:
+        _touch(folder / name, "drive.mcap", "vehicle.toml", "truth.json", "objects.json", "car.dbc")
+    return folder
+
+
+def _names(drives: tuple[DriveInput, ...]) -> list[str]:
+    """What a person reads of the names."""
+    assert all(re.fullmatch(r".*-[0-9a-f]{8}", one.name, re.DOTALL) for one in drives)
+    return [one.name[:-9] for one in drives]
+
+
+def test_logs_named_one_by_one_are_one_drive(tmp_path: Path) -> None:
+    _touch(tmp_path, "monday.mcap", "tuesday.blf", "vehicle.toml")
+    logs = (str(tmp_path / "monday.mcap"), str(tmp_path / "tuesday.blf"))
+
+    found = drives_of(logs)
+
+    assert not found.is_many
+    assert found.drives == (DriveInput(found.drives[0].name, logs),)
+    assert drives_of(logs[::-1]) == found
+
+
+def test_one_log_is_one_drive(tmp_path: Path) -> None:
+    _touch(tmp_path, "a.b.mcap")
+    log = str(tmp_path / "a.b.mcap")
+
+    assert _names(drives_of([log]).drives) == ["a.b"]
+    assert drives_of([log]).drives[0].logs == (log,)
+    assert drives_of([log], each=True).drives == drives_of([log]).drives
+    assert not drives_of([log]).is_many
+    assert drives_of([log], each=True).is_many
+
+
+def test_a_drive_folder_brings_its_vehicle_and_truth(tmp_path: Path) -> None:
+    folder = _simulated(tmp_path, "A-01") / "A-01"
+
+    found = drives_of([str(folder)])
+
+    assert not found.is_many
+    (one,) = found.drives
+    assert _names(found.drives) == ["A-01"]
+    assert one.logs == (str(folder / "drive.mcap"),)
+    assert (one.vehicle, one.truth) == (folder / "vehicle.toml", folder / "truth.json")
+
+
+def test_a_folder_of_drives_is_many(tmp_path: Path) -> None:
+    _simulated(tmp_path, "B-02", "A-01")
+    _touch(tmp_path, "notes.txt", "runs/A-01/manifest.json", "runs/A-01/pictures/1.jpg")
+
+    found = drives_of([str(tmp_path)])
+
+    assert found.is_many
+    assert _names(found.drives) == ["A-01", "B-02"]
+    assert found.drives[0].vehicle == tmp_path / "A-01" / "vehicle.toml"
+
+
+def test_bags_side_by_side_are_drives_of_their_own(tmp_path: Path) -> None:
+    _touch(tmp_path, "mon.bag", "tue.bag")
+
+    assert _names(drives_of([str(tmp_path)]).drives) == ["mon", "tue"]
+
+
+def test_a_folder_that_may_be_one_drive_or_many_is_refused(tmp_path: Path) -> None:
+    _touch(tmp_path, "camera.bag", "can.blf")
+
+    with pytest.raises(UsageError, match=r"several formats \(blf, rosbag1\): one drive or many"):
+        drives_of([str(tmp_path)])
+
+    _touch(tmp_path, "vehicle.toml")
+    assert len(drives_of([str(tmp_path)]).drives[0].logs) == 2
+
+
+def test_splits_of_one_bag_are_one_drive_unless_each(tmp_path: Path) -> None:
+    _touch(tmp_path, "bag_0.mcap", "bag_1.mcap")
+
+    assert drives_of([str(tmp_path)]).drives[0].logs == (str(tmp_path),)
+    assert _names(drives_of([str(tmp_path)], each=True).drives) == ["bag_0", "bag_1"]
+
+
+def test_data_sets_in_folders_of_folders(tmp_path: Path) -> None:
+    for route, segment in (("one", "40"), ("one", "41"), ("two", "40")):
+        (tmp_path / route / segment / "processed_log").mkdir(parents=True)
+
+    found = drives_of([str(tmp_path)])
+
+    assert _names(found.drives) == ["one__40", "one__41", "two__40"]
+
+
+def test_a_pattern_that_the_shell_left_alone(tmp_path: Path) -> None:
+    _simulated(tmp_path, "A-01", "A-02", "B-01")
+
+    files = drives_of([f"{tmp_path}/A-*/drive.mcap"])
+    folders = drives_of([f"{tmp_path}/A-*"])
+    deep = drives_of([f"{tmp_path}/**/drive.mcap"])
+
+    assert files.is_many
+    assert _names(files.drives) == ["A-01", "A-02"]
+    assert [one.name for one in files.drives] == [one.name for one in folders.drives]
+    assert files.drives[0].truth == tmp_path / "A-01" / "truth.json"
+    assert _names(folders.drives) == ["A-01", "A-02"]
+    assert [one.logs for one in folders.drives] == [one.logs for one in files.drives]
+    assert len(deep.drives) == 3
+
+
+def test_a_list_names_drives_line_by_line(tmp_path: Path) -> None:
+    _touch(tmp_path, "a b.mcap", "can.blf", "c.bag")
+    _simulated(tmp_path / "sim", "A-01", "A-02")
+    text = "# day one\n'a b.mcap' can.blf\n\nc.bag  # alone\nsim\nmemory://bucket/x.mcap\n"
+    (tmp_path / "drives.txt").write_text(text)
+
+    found = drives_of([f"@{tmp_path / 'drives.txt'}"])
+
+    assert found.is_many
+    assert _names(found.drives) == ["a_b", "c", "A-01", "A-02", "x"]
+    assert found.drives[0].logs == (str(tmp_path / "a b.mcap"), str(tmp_path / "can.blf"))
+    assert found.drives[4].logs == ("memory://bucket/x.mcap",)
+
+
+def test_each_makes_every_argument_a_drive_and_names_differ(tmp_path: Path) -> None:
+    _touch(tmp_path, "x/drive.mcap", "y/drive.mcap", "z/x/drive.mcap")
+    logs = [str(tmp_path / place / "drive.mcap") for place in ("x", "y", "z/x")]
+
+    names = _names(drives_of(logs, each=True).drives)
+
+    assert names == ["x", "y", "x"]
+    assert len({one.name for one in drives_of(logs, each=True).drives}) == 3
+
+
+def test_remote_patterns(tmp_path: Path) -> None:
+    bucket = f"bucket-{uuid.uuid4().hex}"
+    system = import_module("fsspec").filesystem("memory")
+    for name in ("a/drive.mcap", "b/drive.mcap"):
+        system.pipe(f"/{bucket}/{name}", b"")
+
+    found = drives_of([f"memory://{bucket}/*/drive.mcap"])
+    system.rm(f"/{bucket}", recursive=True)
+
+    assert _names(found.drives) == ["a", "b"]
+    assert found.drives[0].logs == (f"memory://{bucket}/a/drive.mcap",)
+    assert not drives_of([f"memory://{bucket}/a/drive.mcap"]).is_many
+
+
+def test_a_name_depends_on_the_logs_alone(tmp_path: Path) -> None:
+    _touch(tmp_path, "x/drive.mcap", "y/drive.mcap", "route/40/drive.mcap", "mon.bag", "tue.bag")
+    logs = [str(path) for path in sorted(tmp_path.rglob("*.*"))]
+    together = {one.logs: one.name for one in drives_of(logs, each=True).drives}
+
+    assert len(together) == len(logs)
+    for log in logs:
+        (alone,) = drives_of([log]).drives
+        assert together[alone.logs] == alone.name
+    before = drives_of([logs[0]]).drives[0].name
+    Path(logs[0]).write_text("recorded anew")
+    assert drives_of([logs[0]]).drives[0].name != before
+
+
+def test_a_copy_of_a_drive_is_not_taken_for_another(tmp_path: Path) -> None:
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "monday.bag").write_text("the same")
+
+    with pytest.raises(UsageError, match="the same recording as"):
+        drives_of([str(tmp_path)])
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("{}/nothing-*.mcap", "nothing matches"),
+        ("@{}/gone.txt", "No such file"),
+        ("@{}/empty.txt", "names no drive"),
+        ("@{}/torn.txt", "line 2: No closing quotation"),
+        ("@{}/twice.txt", "named twice"),
+        ("{}/bare", "no drive in it"),
+    ],
+)
+def test_errors_are_one_line(tmp_path: Path, argument: str, said: str) -> None:
+    _touch(tmp_path, "a.mcap", "bare/readme.md")
+    tmp_path.joinpath("empty.txt").write_text("# none\n")
+    tmp_path.joinpath("torn.txt").write_text("a.mcap\n'b\n")
+    tmp_path.joinpath("twice.txt").write_text("a.mcap\na.mcap\n")
+
+    with pytest.raises(CrosscueError, match=said) as caught:
+        drives_of([argument.format(tmp_path)])
+
+    assert "\n" not in str(caught.value)
+
+
+def test_a_link_that_leads_back_is_not_followed_for_ever(tmp_path: Path) -> None:
+    _simulated(tmp_path, "A-01")
+    (tmp_path / "again").symlink_to(tmp_path)
+
+    assert _names(drives_of([str(tmp_path)]).drives) == ["A-01"]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.text(min_size=1, max_size=300), min_size=1, max_size=6, unique=True))
+def test_names_are_safe_and_apart_whatever_the_logs_are_called(texts: list[str]) -> None:
+    logs = [f"memory://bucket/{text.replace('*', '').replace('?', '').replace('[', '')}.mcap"
+            for text in texts]  # fmt: skip
+    logs = list(dict.fromkeys(logs))
+
+    names = [one.name for one in drives_of(logs, each=True).drives]
+
+    assert len(set(names)) == len(logs)
+    for name in names:
+        assert name == Path(name).name
+        assert name not in (".", "..")
+        assert len(name.encode()) < 200
+
+
+def test_an_unreadable_folder_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+
+    with pytest.raises(LogError, match="Permission denied"):
+        drives_of([str(tmp_path)])

@@ -1,0 +1,246 @@
+"""Many drives side by side: each costs only itself, and nothing is done twice."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from crosscue.eval.batch.jobs import (
+    Done,
+    Engine,
+    Job,
+    Progress,
+    State,
+    exit_status_of,
+    fingerprint_of,
+    in_turn,
+    is_done,
+    run_many,
+    state_of,
+)
+from crosscue.eval.batch.processes import Processes
+from crosscue.replay.errors import UsageError
+from support.drive_work import Letters, letters, made_jobs
+from support.trees import tree
+
+TWO = Processes(2)
+
+
+def test_one_failing_drive_does_not_stop_the_rest(tmp_path: Path) -> None:
+    words = ["plain", "damaged", "dies", "bug", "loss", "memory", "leaves", "dies once", "last"]
+    jobs = made_jobs(tmp_path, words)
+
+    results = run_many(jobs, letters, TWO)
+
+    assert [done.job for done in results] == jobs
+    errors = {word: done.error for word, done in zip(words, results, strict=True)}
+    assert [word for word, error in errors.items() if error is None] == [
+        "plain", "loss", "dies once", "last",
+    ]  # fmt: skip
+    assert errors["damaged"] == f"{jobs[1].logs[0]}: cut; copy it again"
+    assert "killed by SIGKILL (out of memory?), 2 times" in str(errors["dies"])
+    assert "ended with status 7, 2 times" in str(errors["leaves"])
+    assert str(errors["bug"]).startswith("ZeroDivisionError: a bug; a bug in crosscue")
+    assert "out of memory" in str(errors["memory"])
+    attempts = {word: done.attempts for word, done in zip(words, results, strict=True)}
+    assert (attempts["dies once"], attempts["plain"]) == (2, 1)
+    assert results[1].exit_status == 4
+    assert exit_status_of(results) == 3
+
+
+def test_a_second_start_does_only_what_is_missing(tmp_path: Path) -> None:
+    jobs = made_jobs(tmp_path, ["plain", "damaged", "loss", "last"])
+    first = run_many(jobs, letters, in_turn)
+    before = {job.name: tree(job.run) for job in jobs}
+    Path(jobs[1].logs[0]).write_text("healed")
+
+    second = run_many(jobs, letters, in_turn)
+
+    assert [done.error is None for done in first] == [True, False, True, True]
+    assert [done.is_earlier for done in second] == [True, False, True, True]
+    assert [done.exit_status for done in second] == [0, 0, 3, 0]
+    assert all(is_done(job) for job in jobs)
+    for i in (0, 2, 3):
+        assert tree(jobs[i].run) == before[jobs[i].name]
+
+
+def test_a_changed_log_or_setting_is_not_taken_for_done(tmp_path: Path) -> None:
+    jobs = made_jobs(tmp_path, ["plain", "other"])
+    run_many(jobs, letters, in_turn)
+    Path(jobs[0].logs[0]).write_text("longer")
+    changed = [jobs[0], Job("drive1", jobs[1].logs, jobs[1].run, "settings 2")]
+
+    refused = run_many(changed, letters, in_turn)
+    replaced = run_many(changed, letters, in_turn, overwrite=True)
+
+    assert all("give another folder or --overwrite" in str(done.error) for done in refused)
+    assert exit_status_of(refused) == 1
+    assert [done.attempts for done in replaced] == [1, 1]
+    assert [state_of(job) for job in changed] == [State.DONE, State.DONE]
+
+
+def test_a_run_folder_cut_short_is_done_again(tmp_path: Path) -> None:
+    jobs = made_jobs(tmp_path, ["plain"])
+    run_many(jobs, letters, in_turn)
+    whole = tree(jobs[0].run)
+    (jobs[0].run / "manifest.json").unlink()
+    assert state_of(jobs[0]) is State.CUT_SHORT
+
+    results = run_many(jobs, letters, in_turn)
+
+    assert results[0].attempts == 1
+    assert tree(jobs[0].run) == whole
+
+
+def test_a_run_that_was_replaced_by_hand_is_noticed(tmp_path: Path) -> None:
+    jobs = made_jobs(tmp_path, ["plain"])
+    run_many(jobs, letters, in_turn)
+    manifest = jobs[0].run / "manifest.json"
+    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "settings": "by hand"}))
+
+    assert state_of(jobs[0]) is State.OTHER
+
+
+@pytest.mark.parametrize("torn", ["", "{", "[]", '{"format_version": 1}', '{"format_version": 9}'])
+def test_a_torn_journal_is_believed_in_nothing(tmp_path: Path, torn: str) -> None:
+    jobs = made_jobs(tmp_path, ["plain"])
+    run_many(jobs, letters, in_turn)
+    (tmp_path / "runs" / ".drives" / "drive0.json").write_text(torn)
+
+    assert state_of(jobs[0]) is State.OTHER
+
+
+def test_a_log_that_is_not_there_fails_alone(tmp_path: Path) -> None:
+    jobs = made_jobs(tmp_path, ["plain", "gone"])
+    Path(jobs[1].logs[0]).unlink()
+
+    results = run_many(jobs, letters, in_turn)
+
+    assert results[0].error is None
+    assert "No such file" in str(results[1].error)
+
+
+def test_the_same_bytes_on_one_and_on_two_workers(tmp_path: Path) -> None:
+    words = ["plain", "loss", "some", "more"]
+    engines: dict[str, Engine] = {"one": in_turn, "two": Processes(2, threads=1)}
+    found = [
+        run_many(made_jobs(tmp_path, words, name), letters, engine)
+        for name, engine in engines.items()
+    ]
+
+    assert tree(tmp_path / "one") == tree(tmp_path / "two") != {}
+    workers = [done.result for done in found[1] if done.result is not None]
+    assert {one.threads for one in workers} == {"1"}
+    assert len({one.pid for one in workers} - {os.getpid()}) in (1, 2)
+
+
+def test_two_jobs_of_one_name_are_refused(tmp_path: Path) -> None:
+    job = made_jobs(tmp_path, ["plain"])[0]
+
+    with pytest.raises(UsageError, match="drive0: two drives of this name"):
+        run_many([job, job], letters, TWO)
+    with pytest.raises(ValueError, match="counts of 1 or more"):
+        Processes(0)
+
+
+def test_progress_tells_what_is_left(tmp_path: Path) -> None:
+    seen: list[Progress] = []
+    jobs = made_jobs(tmp_path, ["plain", "damaged", "more"])
+    run_many(jobs[:1], letters, in_turn)
+
+    run_many(jobs, letters, in_turn, on_progress=seen.append)
+
+    last = seen[-1]
+    assert (last.total, last.earlier, last.done, last.failed) == (3, 1, 2, 1)
+    assert last.seconds_left == 0.0
+    assert Progress(4, 0, 2, 0, 10.0).seconds_left == pytest.approx(10.0)
+    assert Progress(4, 0, 0, 0, 10.0).seconds_left is None
+
+
+def test_the_exit_status_of_many() -> None:
+    def done(status: int, error: str | None = None) -> Done[Letters]:
+        return Done(Job("a", (), Path(), ""), status, error)
+
+    assert exit_status_of([done(0), done(0)]) == 0
+    assert exit_status_of([done(0), done(3)]) == 3
+    assert exit_status_of([done(0), done(4, "cut")]) == 3
+    assert exit_status_of([done(4, "cut"), done(4, "cut")]) == 4
+    assert exit_status_of([done(4, "cut"), done(2, "wrong")]) == 1
+
+
+def test_a_fingerprint_changes_with_any_setting() -> None:
+    one = fingerprint_of({"a": 1, "b": [2.5, None]}, "1.0")
+
+    assert one == fingerprint_of({"b": [2.5, None], "a": 1}, "1.0")
+    assert (
+        len({one, fingerprint_of({"a": 2, "b": [2.5, None]}, "1.0"), fingerprint_of({}, "")}) == 3
+    )
+
+
+RUNNER = """
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from crosscue.eval.cli import _guarded
+from crosscue.eval.batch.jobs import run_many
+from crosscue.eval.batch.processes import Processes
+from support.drive_work import letters, made_jobs
+import argparse, types
+
+def run(args):
+    run_many(made_jobs(Path(sys.argv[1]), ["slow", "slow", "slow"]), letters, Processes(2))
+    return 0
+
+if __name__ == "__main__":
+    # Whoever started the tests in a shell's background has made them deaf to this signal.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.exit(_guarded(types.SimpleNamespace(run=run), argparse.Namespace(verbose=False)))
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)],
+)
+def test_a_signal_stops_all_workers(tmp_path: Path, number: signal.Signals, status: int) -> None:
+    script = tmp_path / "runner.py"
+    script.write_text(RUNNER)
+    here = os.pathsep.join(sys.path)
+    parent = subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path / "drives")],
+        env={**os.environ, "PYTHONPATH": here}, stderr=subprocess.PIPE, start_new_session=True,
+    )  # fmt: skip
+    with parent:
+        pids = _wait_for_two(tmp_path / "drives")
+        parent.send_signal(number)
+        said = parent.communicate(timeout=20)[1].decode()
+
+    assert parent.returncode == status, said
+    _wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
+    assert not list(tmp_path.rglob("*.partial"))
+    assert not list(tmp_path.rglob(".lock"))
+    assert "Traceback" not in said
+
+    for log in (tmp_path / "drives").glob("*.txt"):
+        log.write_text("healed")
+    again = run_many(made_jobs(tmp_path / "drives", ["healed"] * 3), letters, in_turn)
+    assert [(done.error, done.attempts) for done in again] == [(None, 1)] * 3
+
+
+def _wait_for_two(folder: Path) -> list[int]:
+    _wait_until(lambda: len([p for p in folder.glob("*.begun") if p.read_text()]) == 2)
+    return [int(path.read_text()) for path in folder.glob("*.begun")]
+
+
+def _wait_until(holds: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20.0
+    while not holds():
+        assert time.monotonic() < end, "waited 20 s"
+        time.sleep(0.02)

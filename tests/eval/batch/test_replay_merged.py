@@ -1,0 +1,88 @@
+"""What many drives leave behind: a table of all, and a failure for a drive's own vehicle file."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import uuid
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from crosscue.datasets.simulated.drive import DriveSettings
+from crosscue.datasets.simulated.log_files import write_drive
+from crosscue.eval.catalog.find_runs import runs_of
+from crosscue.eval.cli import run
+from crosscue.replay.files.run_folder import open_run
+
+
+@pytest.fixture
+def drives(tmp_path: Path) -> Path:
+    for name, seed in (("monday", 1), ("tuesday", 2)):
+        write_drive(tmp_path / "drives" / name, DriveSettings(seed=seed))
+    return tmp_path / "drives"
+
+
+def test_a_broken_vehicle_file_costs_its_own_drive_and_an_edited_dbc_is_seen(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (drives / "tuesday" / "vehicle.toml").write_text("version = ")
+    argv = ["replay", str(drives), "-o", str(tmp_path / "runs"), "--json"]
+
+    assert run(argv) == 3
+
+    told = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
+    assert told["monday"]["error"] is None
+    assert "not TOML" in told["tuesday"]["error"]
+    assert runs_of([str(tmp_path / "runs")]) == (tmp_path / "runs" / told["monday"]["name"],)
+    merged = open_run(tmp_path / "runs" / "merged")
+    assert set(merged.table("pose")["drive"].to_pylist()) == {told["monday"]["name"]}
+    assert list(merged.manifest()["failures"]) == [told["tuesday"]["name"]]
+    accounts = merged.manifest()["account"]["reading"].values()
+    assert sum(one["used"] for one in accounts) > 1000
+    for one in accounts:
+        assert one["in"] == one["used"] + sum(one["skipped"].values())
+
+    (dbc,) = drives.joinpath("monday").glob("*.dbc")
+    dbc.write_text(dbc.read_text() + "\n")
+    assert run([*argv, "-q"]) == 1
+    told = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
+    assert "other logs, settings or versions" in told["monday"]["error"]
+
+
+def test_a_log_on_an_object_store_is_replayed_and_fetched_again_for_an_estimate(
+    drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = tmp_path / "store"
+    monkeypatch.setenv("CROSSCUE_STORE", str(store))
+    bucket = f"bucket-{uuid.uuid4().hex}"
+    system = import_module("fsspec").filesystem("memory")
+    system.pipe(f"/{bucket}/drive.mcap", (drives / "monday" / "drive.mcap").read_bytes())
+    url, vehicle = f"memory://{bucket}/drive.mcap", drives / "monday" / "vehicle.toml"
+    run_path = tmp_path / "run"
+
+    assert run(["replay", url, "--vehicle", str(vehicle), "-o", str(run_path), "-q"]) == 0
+    before = (run_path / "pose.parquet").read_bytes()
+    (said,) = open_run(run_path).manifest()["logs"]
+    assert said["path"] == url
+    shutil.rmtree(store)
+    assert run(["estimate", str(run_path), "-q"]) == 0
+
+    assert (run_path / "pose.parquet").read_bytes() == before
+    assert run(["info", url, "--json"]) == 0
+    system.rm(f"/{bucket}", recursive=True)
+
+
+def test_a_log_put_in_place_of_another_is_noticed_whatever_its_time(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, run_path = drives / "monday" / "drive.mcap", tmp_path / "run"
+    assert run(["replay", str(drives / "monday"), "-o", str(run_path), "-q"]) == 0
+    shutil.copy(drives / "tuesday" / "drive.mcap", log)
+    os.utime(log, (1_000_000_000, 1_000_000_000))
+
+    assert run(["estimate", str(run_path)]) == 1
+
+    assert "has changed since" in capsys.readouterr().err

@@ -1,0 +1,73 @@
+"""Which runs a command line means."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from crosscue.eval.catalog.find_runs import runs_of
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.files.run_folder import FORMAT_VERSION
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    for name, stage in (("a", "estimate"), ("b", "estimate"), ("deep/c", "estimate"),
+                        ("merged", "merged")):  # fmt: skip
+        folder = tmp_path / "runs" / name
+        folder.mkdir(parents=True)
+        text = json.dumps({"format_version": FORMAT_VERSION, "stage": stage})
+        folder.joinpath("manifest.json").write_text(text)
+    (tmp_path / "runs" / "empty").mkdir()
+    (tmp_path / "runs" / ".drives").mkdir()
+    return tmp_path / "runs"
+
+
+def test_a_folder_stands_for_the_runs_in_it_but_not_their_merger(runs: Path) -> None:
+    assert runs_of([str(runs)]) == (runs / "a", runs / "b", runs / "deep" / "c")
+
+
+def test_a_run_is_itself_even_a_merged_one(runs: Path) -> None:
+    assert runs_of([str(runs / "b"), str(runs / "merged")]) == (runs / "b", runs / "merged")
+
+
+def test_a_run_cut_short_is_not_passed_over(runs: Path) -> None:
+    (runs / "b" / "manifest.json").unlink()
+    (runs / "b" / "pose.parquet").touch()
+
+    assert runs / "b" in runs_of([str(runs)])
+
+
+def test_a_run_named_twice_is_refused(runs: Path) -> None:
+    with pytest.raises(CrosscueError, match="named twice"):
+        runs_of([str(runs / "b"), str(runs)])
+
+
+def test_patterns_and_lists(runs: Path) -> None:
+    runs.parent.joinpath("runs.txt").write_text("# two\nruns/b\n\nruns/a\n")
+
+    assert runs_of([f"{runs}/[ab]"]) == (runs / "a", runs / "b")
+    assert runs_of([f"@{runs.parent}/runs.txt"]) == (runs / "b", runs / "a")
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("{}/empty", "neither a run folder nor a folder of some"),
+        ("{}/z*", "nothing matches"),
+        ("@{}/gone", "No such file"),
+        ("@{}/a/manifest.json", "neither|names no run|no run folder"),
+    ],
+)
+def test_errors_are_one_line(runs: Path, argument: str, said: str) -> None:
+    if "manifest" in argument:
+        (runs / "a" / "manifest.json").write_text("# nothing\n")
+
+    with pytest.raises(CrosscueError, match=said) as caught:
+        runs_of([argument.format(runs)])
+
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_not_there_is_left_to_be_told_when_opened(tmp_path: Path) -> None:
+    assert runs_of([str(tmp_path / "gone")]) == (tmp_path / "gone",)

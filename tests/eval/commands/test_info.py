@@ -1,0 +1,336 @@
+"""``crosscue info``: what it prints is what the log holds, on any terminal, and as strict JSON."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.eval.cli import run
+from crosscue.eval.commands.info import lines_of, plain
+from crosscue.replay.columns import DATA, Block, CanFrames, Messages, Topic
+from crosscue.replay.files.run_folder import strict_json
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.log_summary import quick_summary, summarise, together
+from crosscue.replay.safe_text import cells, table, visible, wrapped
+from support.clock_streams import SECOND_NS, START_NS, Stream, table_of
+from support.data import shared
+
+MS = 1_000_000
+NASTY = "/cam\x1b[31m\n\u202e\udcff\x00<b>"
+
+
+@dataclass(slots=True)
+class MadeLog:
+    """A log made of blocks, with losses as told."""
+
+    blocks: tuple[Block, ...]
+    topics: tuple[Topic, ...]
+    dropped: int = 0
+    unknown: bool = False
+    path: Path = Path("made.mcap")
+    format: str = "made"
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """The blocks, accounted for."""
+        for block in self.blocks:
+            ledger.find(block.topic, len(block))
+            yield block
+        if self.dropped:
+            ledger.drop(self.topics[0].name, "chunk CRC", self.dropped, "at byte 7", START_NS)
+        if self.unknown:
+            ledger.drop("", "file is cut", None, "at byte 9")
+        for topic in self.topics:
+            ledger.declare(topic.name, topic.declared)
+            ledger.settle(topic.name)
+        ledger.integrity = "every chunk's CRC verified"
+
+    def close(self) -> None:
+        """Drop the blocks."""
+        self.blocks = ()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def columns(name: str, type_name: str = "crosscue/Table", declared: int | None = None) -> Topic:
+    return Topic(name, type_name, "columns", declared=declared)
+
+
+def can_block(bus: str, ids: list[int], extended: list[bool]) -> Block:
+    n = len(ids)
+    frames = CanFrames(
+        np.array(ids, dtype=np.uint32),
+        np.array(extended, dtype=np.bool_),
+        np.full(n, DATA, dtype=np.uint8),
+        np.full(n, 8, dtype=np.uint8),
+        np.zeros((n, 8), dtype=np.uint8),
+        np.zeros(n, dtype=np.bool_),
+    )
+    return Block(bus, START_NS + MS * np.arange(n, dtype=np.int64), frames)
+
+
+def made(**changes: Any) -> MadeLog:
+    stream = Stream(300, 50 * MS, wait_ns=MS)
+    blocks = (
+        table_of("/imu", stream.log_ns(), stream.header_ns()),
+        can_block("can0", [0x100, 0x100, 0x100, 0x200] * 5, [False, True, False, False] * 5),
+    )
+    topics = (
+        columns("/imu", "sensor_msgs/msg/Imu", 300 + changes.get("dropped", 0)),
+        columns("can0", "crosscue/CanFrames"),
+    )
+    return replace(MadeLog(blocks, topics), **changes)
+
+
+def shown(log: MadeLog, width: int = 80) -> str:
+    return "\n".join(lines_of(summarise(log), width))
+
+
+def test_a_whole_log_shows_topics_roles_rates_clock_account_and_no_finding() -> None:
+    text = shown(made())
+
+    assert re.search(r"^/imu +sensor_msgs/msg/Imu +inertial unit +300 +20$", text, re.M)
+    assert re.search(r"^/imu +header stamp +50 ms +0 +50 ms", text, re.M)
+    assert re.search(r"^/imu +300 +300 +300 +0 +0$", text, re.M)
+    assert "every chunk's CRC verified" in text
+    assert "findings" not in text
+    assert "losses" not in text
+
+
+def test_identifiers_are_counted_apart_by_length_and_most_frequent_first() -> None:
+    summary = summarise(made())
+    bus = next(t for t in summary.topics if t.name == "can0")
+
+    assert bus.can_id_count == 3
+    assert [(i.arbitration_id, i.is_extended, i.count) for i in bus.can_ids] == [
+        (0x100, False, 10),
+        (0x200, False, 5),
+        (0x100, True, 5),
+    ]
+    assert "can0: 3 ids; 0x100 526 Hz, 0x200 263 Hz, 0x100x 263 Hz" in shown(made())
+
+
+def test_losses_are_told_by_topic_reason_and_place() -> None:
+    summary = summarise(made(dropped=31, unknown=True))
+    text = "\n".join(lines_of(summary, 100))
+
+    assert not summary.is_whole
+    assert "- /imu: 31 of 331 rows dropped: chunk CRC" in text
+    assert "- 31 of /imu at 0.00 s: chunk CRC (at byte 7)" in text
+    assert "- an unknown number of unknown topics: file is cut (at byte 9)" in text
+    assert "- at least 0 rows of unknown topics dropped: file is cut" in text
+    assert re.search(r"^\(topic not known\) .*>= 0$", text, re.M)
+
+
+@pytest.mark.parametrize("dropped", [0, 1, 40])
+def test_the_account_adds_up(dropped: int) -> None:
+    summary = summarise(made(dropped=dropped))
+
+    for topic in summary.topics:
+        assert topic.found == topic.used + sum(topic.skipped.values())
+        if topic.declared is not None:
+            assert topic.declared == topic.found + sum(topic.dropped.values())
+
+
+def test_what_cannot_be_decoded_is_skipped_with_a_reason_and_still_timed() -> None:
+    n = 40
+    zeros = np.zeros(n, dtype=np.int64)
+    rows = Messages(np.zeros(4, dtype=np.uint8), zeros, zeros + 4)
+    block = Block("/odd", START_NS + 100 * MS * np.arange(n, dtype=np.int64), rows)
+    log = MadeLog((block,), (Topic("/odd", "odd_msgs/msg/Odd", "bson"),))
+
+    summary = summarise(log)
+
+    (topic,) = summary.topics
+    assert topic.skipped == {"no decoder for encoding 'bson'": n}
+    assert topic.used == 0
+    assert topic.rate_hz == pytest.approx(10.0)
+    assert "/odd: none of its 40 rows can be used: no decoder for encoding 'bson'" in (
+        summary.findings
+    )
+
+
+def test_two_cameras_or_buses_ask_for_a_line_in_the_vehicle_file() -> None:
+    log = made()
+    two = replace(log, topics=(*log.topics, columns("can1", "crosscue/CanFrames")))
+
+    assert "2 topics could be the CAN bus (can0, can1): the vehicle file must say which to use" in (
+        summarise(two).findings
+    )
+
+
+def test_a_log_whose_topics_share_no_clock_says_so() -> None:
+    stream = Stream(300, 50 * MS)
+    log = MadeLog(
+        (table_of("/a", stream.log_ns()), table_of("/b", stream.log_ns() - START_NS)),
+        (columns("/a"), columns("/b")),
+    )
+
+    assert any(f.startswith("no two share a clock") for f in summarise(log).findings)
+
+
+def test_logs_shown_together_tell_their_common_time_or_that_there_is_none() -> None:
+    early = summarise(made(path=Path("a.mcap")))
+    late_stream = Stream(300, 50 * MS)
+    late = summarise(
+        MadeLog(
+            (table_of("/x", late_stream.log_ns() + 10 * SECOND_NS),),
+            (columns("/x"),),
+            path=Path("b.mcap"),
+        )
+    )
+    boot = summarise(
+        MadeLog(
+            (table_of("/x", late_stream.log_ns() - START_NS),), (columns("/x"),), path=Path("c.log")
+        )
+    )
+
+    common = together([early, late])
+    assert common.start_ns == START_NS + 10 * SECOND_NS
+    assert common.end_ns == early.end_ns
+    assert common.findings == ()
+    assert together([early, boot]).start_ns is None
+    assert together([early, boot]).findings[0].startswith("no two share a clock")
+    assert together([]).start_ns is None
+
+
+def test_an_empty_log_is_no_error_and_says_that_it_is_empty() -> None:
+    text = shown(MadeLog((), (columns("/imu"),)))
+
+    assert "- not one row in it" in text
+    assert "no rows" in text
+
+
+def test_quick_reads_no_body() -> None:
+    class Unreadable(MadeLog):
+        def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+            raise AssertionError("the body was read")
+
+    log = made()
+    text = "\n".join(lines_of(quick_summary(Unreadable(log.blocks, log.topics)), 80))
+
+    assert re.search(r"^/imu +sensor_msgs/msg/Imu +inertial unit +300$", text, re.M)
+    assert "not one row" not in text
+
+
+def test_nothing_in_a_name_reaches_the_terminal_or_breaks_json() -> None:
+    stream = Stream(40, 50 * MS)
+    log = MadeLog(
+        (table_of(NASTY, stream.log_ns() * 0),), (Topic(NASTY, NASTY, "columns"),), dropped=1,
+        path=Path(NASTY),
+    )  # fmt: skip
+
+    summary = summarise(log)
+
+    for part in lines_of(summary, 80):
+        for line in part.split("\n"):
+            assert line.isprintable(), line
+    text = strict_json(plain(summary))
+    text.encode("utf-8")
+    assert "\\\\x1b[31m" in text
+
+
+def test_json_is_strict_sorted_and_holds_every_field() -> None:
+    text = strict_json(plain(summarise(made())))
+
+    tree = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert list(tree) == sorted(tree)
+    imu = next(t for t in tree["topics"] if t["name"] == "/imu")
+    assert imu["clocks"]["used"] == "header stamp"
+    assert imu["clocks"]["header"]["line"]["rows"] == 300
+    assert imu["clocks"]["log"]["line"] is None
+    assert imu["clocks"]["publish"] is None
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(st.text(max_size=90), st.text(max_size=60)), max_size=4),
+    st.integers(40, 120),
+)
+def test_tables_and_sentences_fit_the_terminal(rows: list[tuple[str, str]], width: int) -> None:
+    cut = list(table(("topic", "type", "count"), [(*r, "123456") for r in rows], width, (0, 1)))
+
+    assert len(cut) == len(rows) + 1
+    for line in [*cut, *(part for r in rows for part in wrapped(r[0], width).split("\n"))]:
+        assert cells(line) <= width
+        assert "\x1b" not in line
+
+
+def test_eighty_columns_are_enough_for_a_usual_log() -> None:
+    long = "/vehicle/sensors/front_left/camera_driver/image_rect_color/compressed"
+    stream = Stream(300, 50 * MS, wait_ns=MS)
+    log = MadeLog(
+        (table_of(long, stream.log_ns(), stream.header_ns()),),
+        (columns(long, "sensor_msgs/msg/CompressedImage"),),
+        dropped=12,
+    )
+
+    assert max(cells(line) for line in shown(log, 80).split("\n")) <= 80
+
+
+@pytest.mark.parametrize(
+    ("raw", "safe"),
+    [
+        ("plain /topic", "plain /topic"),
+        ("grün 日本", "grün 日本"),
+        ("\x1b[2J", "\\x1b[2J"),
+        ("a\nb", "a\\nb"),
+        ("\u202egnp", "\\u202egnp"),
+        ("\udcff", "\\udcff"),
+    ],
+)
+def test_visible_text_keeps_letters_and_shows_the_rest(raw: str, safe: str) -> None:
+    assert visible(raw) == safe
+
+
+def test_the_command_on_a_real_minute(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    segment = next(shared("comma2k19", "Example_1").glob("*/*"))
+    monkeypatch.setenv("COLUMNS", "80")
+
+    status = run(["info", str(segment)])
+
+    out = capsys.readouterr().out
+    assert status == 3
+    assert re.search(r"^can/0 +crosscue/CanFrames +CAN bus +53800 ", out, re.M)
+    assert "64 of 592 rows dropped: array file is cut" in out
+    assert max(cells(line) for line in out.split("\n")) <= 80
+
+
+def test_the_command_with_json_on_two_logs(capsys: pytest.CaptureFixture[str]) -> None:
+    segment = next(shared("comma2k19", "Example_1").glob("*/*"))
+
+    status = run(["info", "--json", str(segment), str(segment)])
+
+    tree = json.loads(capsys.readouterr().out)
+    assert status == 3
+    assert [log["format"] for log in tree["logs"]] == ["comma2k19", "comma2k19"]
+    assert tree["together"]["findings"] == []
+    assert tree["together"]["start_ns"] == tree["logs"][0]["start_ns"]
+
+
+def test_the_command_on_nothing_readable_ends_with_four(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert run(["info", str(tmp_path)]) == 4
+    assert "a folder without any known recording in it" in capsys.readouterr().err

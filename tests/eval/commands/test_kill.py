@@ -1,0 +1,303 @@
+"""Killed, starved and disturbed at any place: a run folder is whole, or says that it is not."""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from crosscue.datasets.scenes.drive import SceneSettings, write_scene
+from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.eval import cli
+from crosscue.replay.errors import RunError
+from crosscue.replay.files.run_folder import create, locked, open_run
+from support import faults
+from support.trees import tree
+
+DETECTORS = """
+[detectors.oracle]
+kind = "support.oracle:build"
+[detectors.oracle.settings]
+objects = "{}"
+"""
+
+
+class Drive:
+    """A small simulated drive and its run."""
+
+    def __init__(self, folder: Path) -> None:
+        camera = Camera(width_px=192, height_px=108)
+        write_scene(folder, SceneSettings("C", camera=camera))
+        self.folder = folder
+        self.vehicle = folder / "vehicle.toml"
+        self.vehicle.write_text(
+            self.vehicle.read_text() + DETECTORS.format(folder / "objects.json")
+        )
+        # Twice: the manifest tells how many results came from the cache, which is all from now on.
+        assert cli.run(self.replay(folder / "whole", "-q")) == 0
+        assert cli.run(self.replay(folder / "whole", "-q", "--overwrite")) == 0
+        self.whole = tree(folder / "whole")
+        assert {"manifest.json", "pose.parquet", "belief.parquet"} <= set(self.whole)
+
+    def replay(self, run: Path, *more: str) -> list[str]:
+        """The command line: three seconds of the drive."""
+        return [
+            "replay", str(self.folder / "drive.mcap"), "--vehicle", str(self.vehicle), "-o",
+            str(run), "--cache", str(self.folder / "cache.sqlite"), "--from", "4", "--to", "7",
+            *more,
+        ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def drive() -> Iterator[Drive]:
+    # Not below pytest's own folder, which only its owner may look into.
+    folder = Path(tempfile.mkdtemp(prefix="crosscue-kill-"))
+    folder.chmod(0o755)
+    try:
+        yield Drive(folder)
+    finally:
+        shutil.rmtree(folder)
+
+
+def _some(count: int, of: int, seed: int) -> list[int]:
+    """The first, the last, and others by chance."""
+    between = random.Random(seed).sample(range(1, of - 1), min(count, of - 2))
+    return [0, *sorted(between), of - 1]
+
+
+def _is_told(ended: faults.Ended) -> None:
+    assert ended.status == 1, ended
+    assert ended.said.startswith("crosscue: ")
+    assert ended.said.count("\n") == 1, ended.said
+    assert "bug" not in ended.said
+
+
+def _is_whole_or_says_so(run: Path, *wholes: dict[str, str]) -> None:
+    """Either the run's manifest is missing or one of the detect stage, or every byte is right."""
+    try:
+        manifest = open_run(run).manifest()
+    except RunError:
+        return
+    if manifest["stage"] == "estimate":
+        there = {name: of for name, of in tree(run).items() if not name.startswith(".")}
+        assert there in wholes
+
+
+def test_killed_anywhere_a_second_start_gives_the_same_bytes(drive: Drive, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    argv = drive.replay(run)
+    count = len(faults.operations(run, faults.CHANGES, argv))
+    assert count > 30
+
+    for operation in _some(8, count, seed=1):
+        shutil.rmtree(run)
+        ended = faults.killed_before(run, operation, argv)
+        assert ended.status == -signal.SIGKILL
+        if run.exists():
+            _is_whole_or_says_so(run, drive.whole)
+        again = "--resume" if operation % 2 else "--overwrite"
+        assert cli.run(drive.replay(run, again, "-q")) == 0
+        assert tree(run) == drive.whole
+
+
+def test_killed_while_it_replaces_another_run(drive: Drive, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    argv = drive.replay(run, "--overwrite")
+    shutil.copytree(drive.folder / "whole", run)
+    text = run.joinpath("manifest.json").read_text()
+    run.joinpath("manifest.json").write_text(text.replace("crosscue simulated car", "earlier"))
+    count = len(faults.operations(run, faults.CHANGES, argv))
+
+    for operation in _some(4, count, seed=2):
+        shutil.rmtree(run)
+        shutil.copytree(drive.folder / "whole", run)
+        run.joinpath("manifest.json").write_text(text.replace("simulated car", "earlier car"))
+        assert faults.killed_before(run, operation, argv).status == -signal.SIGKILL
+        manifest = run / "manifest.json"
+        if operation > 1 and manifest.exists():
+            assert "earlier car" not in manifest.read_text()
+            _is_whole_or_says_so(run, drive.whole)
+        assert cli.run([*argv, "-q"]) == 0
+        assert tree(run) == drive.whole
+
+
+def test_an_estimate_killed_midway_is_never_taken_for_whole(drive: Drive, tmp_path: Path) -> None:
+    run, other = tmp_path / "run", tmp_path / "other.toml"
+    shutil.copytree(drive.folder / "whole", run)
+    text = drive.vehicle.read_text().replace("x_m = 1.7", "x_m = 1.2")
+    other.write_text(text.replace('"simulated_car.dbc"', f'"{drive.folder}/simulated_car.dbc"'))
+    argv = ["estimate", str(run), "--vehicle", str(other), "--logs", str(drive.folder)]
+    count = len(faults.operations(run, faults.CHANGES, argv))
+    replaced = tree(run)
+    assert replaced != drive.whole
+
+    for operation in _some(5, count, seed=3):
+        shutil.rmtree(run)
+        shutil.copytree(drive.folder / "whole", run)
+        assert faults.killed_before(run, operation, argv).status == -signal.SIGKILL
+        _is_whole_or_says_so(run, drive.whole, replaced)
+        assert cli.run([*argv, "-q"]) == 0
+        assert tree(run) == replaced
+
+
+@pytest.mark.parametrize("once", [True, False])
+def test_a_write_that_fails_anywhere_leaves_nothing_half(
+    drive: Drive, tmp_path: Path, once: bool
+) -> None:
+    run = tmp_path / "run"
+    argv = drive.replay(run)
+    count = len(faults.operations(run, faults.WRITES, argv))
+
+    for operation in _some(6, count, seed=4):
+        shutil.rmtree(run, ignore_errors=True)
+        ended = faults.failing_from(run, operation, argv, once=once)
+        _is_told(ended)
+        assert "the disk is full" in ended.said
+        _left_clean(run, drive)
+
+
+def test_a_disk_that_fails_to_flush_is_told(drive: Drive, tmp_path: Path) -> None:
+    for call in (0, 3, 9):
+        ended = faults.with_failing_fsync(call, drive.replay(tmp_path / f"run{call}"))
+        _is_told(ended)
+        assert "Input/output error" in ended.said
+        _left_clean(tmp_path / f"run{call}", drive)
+
+
+def test_a_file_that_cannot_grow_is_told(drive: Drive, tmp_path: Path) -> None:
+    # The manifest's timings make it a few bytes longer or shorter from run to run.
+    sizes = sorted(p.stat().st_size for p in (drive.folder / "whole").glob("*.parquet"))
+
+    for size in (0, 100, sizes[len(sizes) // 2], sizes[-1] - 1):
+        ended = faults.with_files_up_to(size, drive.replay(tmp_path / f"run{size}"))
+        _is_told(ended)
+        _left_clean(tmp_path / f"run{size}", drive)
+
+
+def _left_clean(run: Path, drive: Drive) -> None:
+    if run.exists():
+        assert not [p.name for p in run.iterdir() if p.suffix == ".partial" or p.name == ".lock"]
+        _is_whole_or_says_so(run, drive.whole)
+
+
+def test_of_two_at_once_the_second_is_refused_and_told_whose_it_is(
+    drive: Drive, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with locked(create(run, overwrite=False)):
+            os.write(write, b"!")
+            time.sleep(60)
+    os.read(read, 1)
+
+    ended = faults.forked(lambda: None, drive.replay(run, "--overwrite"))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+
+    assert ended.status == 1
+    assert f"process {child} on " in ended.said
+    assert cli.run(drive.replay(run, "--overwrite", "-q")) == 0
+
+
+def test_of_many_that_find_a_dead_lock_one_at_a_time_gets_it(tmp_path: Path) -> None:
+    run = create(tmp_path / "run", overwrite=False)
+    children = []
+    for _ in range(8):
+        child = os.fork()
+        if child == 0:
+            os._exit(_takes_turns(run.path, 40))
+        children.append(child)
+
+    statuses = {os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children}
+
+    assert statuses == {0}
+
+
+def _takes_turns(path: Path, rounds: int) -> int:
+    """0 if nobody else was ever inside, or 1; every third time it leaves without a word."""
+    run, inside = create(path, overwrite=True), path.parent / "inside"
+    for number in range(rounds):
+        try:
+            with locked(run):
+                try:
+                    os.close(os.open(inside, os.O_CREAT | os.O_EXCL))
+                except FileExistsError:
+                    return 1
+                time.sleep(0.0005)
+                inside.unlink()
+                if number % 3 == 0:
+                    # As a killed process would leave it: the file stays, naming one long dead.
+                    dead = path / ".lock.dead"
+                    dead.write_text("4194305 elsewhere gone")
+                    dead.unlink()
+        except RunError:
+            continue
+    return 0
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become nobody")
+def test_what_may_not_be_read_or_written_is_told(drive: Drive, tmp_path: Path) -> None:
+    def as_nobody() -> None:
+        os.setgid(65534)
+        os.setuid(65534)
+
+    secret = drive.folder / "secret.mcap"
+    shutil.copy(drive.folder / "drive.mcap", secret)
+    secret.chmod(0o600)
+
+    output = faults.forked(as_nobody, drive.replay(drive.folder / "theirs"))
+    there = faults.forked(as_nobody, drive.replay(drive.folder / "whole", "--overwrite"))
+    estimate = faults.forked(as_nobody, ["estimate", str(drive.folder / "whole")])
+    log = faults.forked(as_nobody, ["replay", str(secret), "-o", str(drive.folder / "theirs")])
+
+    for ended in (output, there, estimate):
+        _is_told(ended)
+        assert "Permission denied" in ended.said
+    assert log.status == 4
+    assert "no permission to read it" in log.said
+    assert tree(drive.folder / "whole") == drive.whole
+
+
+def test_zone_locale_and_hash_seed_change_no_byte(drive: Drive, tmp_path: Path) -> None:
+    variants = (
+        {"TZ": "America/Los_Angeles", "LC_ALL": "C", "PYTHONHASHSEED": "1", "COLUMNS": "20"},
+        {"TZ": "Asia/Kolkata", "LC_ALL": "tr_TR.UTF-8", "PYTHONHASHSEED": "2", "HOME": "/nowhere"},
+    )
+    code = "import sys; from crosscue.eval.cli import main; main(sys.argv[1:])"
+    commands = [
+        subprocess.Popen(
+            [sys.executable, "-c", code, *drive.replay(tmp_path / f"run{i}", "-q")],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **variant},
+            stderr=subprocess.PIPE,
+        )
+        for i, variant in enumerate(variants)
+    ]
+    said = [command.communicate(timeout=60)[1] for command in commands]
+
+    assert said == [b"", b""]
+    assert [tree(tmp_path / f"run{i}") == drive.whole for i in (0, 1)] == [True, True]
+
+
+def test_a_replay_opens_no_socket(drive: Drive, tmp_path: Path) -> None:
+    def prepare() -> None:
+        def hook(event: str, args: tuple[object, ...]) -> None:
+            if event.startswith("socket.") and event != "socket.gethostname":
+                raise OSError(errno.EACCES, f"{event} {args}")
+
+        sys.addaudithook(hook)
+
+    ended = faults.forked(prepare, drive.replay(tmp_path / "run"))
+
+    assert ended.status == 0, ended.said

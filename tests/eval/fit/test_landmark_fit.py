@@ -1,0 +1,194 @@
+"""The threshold's fit: rates as wanted, intervals that hold, pairs from tables and drives."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.datasets.truth.truth import Truth, save
+from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.eval import cli
+from crosscue.localization.landmarks.fit import (
+    Rate,
+    ScoredPairs,
+    clopper_pearson,
+    fit_landmarks,
+    wilson,
+)
+from crosscue.replay.vehicle.vehicle import load
+from support.data import shared
+from support.landmark_files import encoded, seen_from, wall
+
+
+def made(seed: int, false: int = 4000, same: int = 400) -> ScoredPairs:
+    """Two-place scores exponential around 5, same-place ones around 40; twenty pairs a query."""
+    rng = np.random.default_rng(seed)
+    score = np.concatenate([rng.exponential(5.0, false), rng.normal(40.0, 12.0, same)])
+    is_same = np.arange(false + same) >= false
+    return ScoredPairs(score, is_same, rng.integers(0, (false + same) // 20, false + same))
+
+
+@pytest.mark.parametrize("wanted", [0.0, 0.002, 0.05])
+def test_the_fitted_half_keeps_the_wanted_rate_and_no_lower_threshold_would(wanted: float) -> None:
+    pairs = made(1)
+    fitted = fit_landmarks(pairs, wanted)
+
+    assert fitted.fitted_false.hits <= wanted * fitted.fitted_false.of
+    assert fitted.fitted_false.hits + 1 > wanted * fitted.fitted_false.of - 1
+    assert fitted.fitted_false.of + fitted.held_out_false.of == 4000
+    assert fitted.fitted_found.of + fitted.held_out_found.of == 400
+
+
+def test_held_out_pairs_keep_about_the_wanted_rate() -> None:
+    """Over 40 simulated fits the true rate at the threshold is the wanted one, on average."""
+    true_rates = [np.exp(-fit_landmarks(made(seed), 0.02).min_score / 5.0) for seed in range(40)]
+
+    assert np.mean(true_rates) == pytest.approx(0.02, rel=0.1)
+
+
+def test_the_interval_of_false_matches_holds_the_true_rate() -> None:
+    inside = 0
+    for seed in range(60):
+        fitted = fit_landmarks(made(seed), 0.01)
+        true = float(np.exp(-fitted.min_score / 5.0))
+        inside += fitted.held_out_false.low <= true <= fitted.held_out_false.high
+
+    assert inside >= 52
+
+
+def test_queries_are_never_in_both_halves() -> None:
+    pairs = ScoredPairs(
+        np.array([1.0, 50.0, 2.0, 60.0]),
+        np.array([False, True, False, True]),
+        np.array([0, 0, 1, 1]),
+    )
+    fitted = fit_landmarks(pairs, 0.0)
+
+    assert fitted.fitted_false.of == fitted.held_out_false.of == 1
+    assert fitted.fitted_found.of == fitted.held_out_found.of == 1
+    assert not fitted.is_shown
+
+
+def test_too_few_pairs_and_odd_rates_are_refused() -> None:
+    one = ScoredPairs(np.array([1.0]), np.array([False]), np.array([0]))
+    with pytest.raises(ValueError, match="two-place pairs of at least two queries"):
+        fit_landmarks(one, 0.01)
+    with pytest.raises(ValueError, match=r"wanted_rate: want 0 to 1, got 1\.5"):
+        fit_landmarks(made(1), 1.5)
+    with pytest.raises(ValueError, match=r"is_same: want \(2,\), got \(1,\)"):
+        ScoredPairs(np.zeros(2), np.zeros(1, np.bool_), np.zeros(2, np.int64))
+
+
+def test_intervals_are_those_of_the_books() -> None:
+    """Clopper-Pearson 0 of 100: 1 - 0.025^(1/100); 10 of 100 and Wilson from published tables."""
+
+    def ends(rate: Rate) -> tuple[float, float]:
+        return rate.low, rate.high
+
+    none_of_100 = (0.0, 1.0 - 0.025 ** (1 / 100))
+    assert ends(clopper_pearson(0, 100)) == pytest.approx(none_of_100, abs=1e-9)
+    assert ends(clopper_pearson(10, 100)) == pytest.approx((0.0490047, 0.1762226), abs=1e-6)
+    assert ends(clopper_pearson(5, 5)) == pytest.approx((0.025 ** (1 / 5), 1.0), abs=1e-9)
+    assert ends(wilson(10, 100)) == pytest.approx((0.0552291, 0.1743657), abs=1e-6)
+    assert ends(clopper_pearson(0, 0)) == ends(wilson(0, 0)) == (0.0, 1.0)
+
+
+@given(st.integers(1, 3000), st.data())
+@settings(max_examples=60, deadline=None)
+def test_intervals_hold_their_share_and_mirror(of: int, data: st.DataObject) -> None:
+    count = data.draw(st.integers(0, of))
+    for interval in (clopper_pearson, wilson):
+        rate, mirror = interval(count, of), interval(of - count, of)
+        assert 0.0 <= rate.low <= count / of <= rate.high <= 1.0
+        assert rate.low == pytest.approx(1.0 - mirror.high, abs=1e-9)
+
+
+def test_pairs_from_a_table_fit_a_threshold_and_write_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Eight simulated walls, each seen again, against all eight."""
+    for i in range(8):
+        (tmp_path / f"a{i}.png").write_bytes(encoded(wall(i, 320, 240)))
+        again = seen_from(wall(i, 320, 240), 6.0, 1.1, 5.0, i)
+        (tmp_path / f"b{i}.png").write_bytes(encoded(again))
+    rows = [f"b{i}.png,a{j}.png,{int(i == j)}" for i in range(8) for j in range(8)]
+    (tmp_path / "pairs.csv").write_text("query,known,same\n" + "\n".join(rows) + "\n")
+    car = tmp_path / "car.toml"
+    car.write_text("version = 1 # mine\n")
+    command = ["fit", "landmarks", "--pairs", str(tmp_path / "pairs.csv"), "--vehicle", str(car)]
+    assert cli.run([*command, "--write", "--json"]) == 0
+
+    fitted = json.loads(capsys.readouterr().out)
+    assert (fitted["held_out_found"]["hits"], fitted["held_out_found"]["of"]) == (4, 4)
+    assert (fitted["held_out_false"]["hits"], fitted["held_out_false"]["of"]) == (0, 28)
+    assert not fitted["is_shown"]
+    assert load(car).landmarks.min_score == fitted["min_score"]
+    assert "# mine" in car.read_text()
+    assert cli.run(command) == 0
+    assert "28 held-out pairs cannot show a rate of 0.001" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("table", "why"),
+    [
+        ("a,b\n", "want columns query,known,same"),
+        ("query,known,same\nx.png,y.png,maybe\n", "pairs.csv:2: same: want 1 or 0"),
+        ("query,known,same\nx.png,y.png,1\n", "x.png: No such file"),
+        ("query,known,same\n", "give more labelled pictures"),
+    ],
+)
+def test_bad_tables_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, why: str
+) -> None:
+    (tmp_path / "pairs.csv").write_text(table)
+
+    assert cli.run(["fit", "landmarks", "--pairs", str(tmp_path / "pairs.csv")]) in (1, 4)
+    assert why in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "why"), [(["--most", "0"], "--most 0"), (["--near", "60"], "--near 60: want less")]
+)
+def test_flags_that_leave_no_pairs_are_refused(
+    capsys: pytest.CaptureFixture[str], flags: list[str], why: str
+) -> None:
+    assert cli.run(["fit", "landmarks", "--pairs", "pairs.csv", *flags]) == 2
+    assert why in capsys.readouterr().err
+
+
+def test_a_real_drive_with_poses_fits_a_threshold(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """KITTI, 51 frames: even ones as landmarks, odd ones as the drive; far means 25 m here."""
+    folder = shared("sequences", "kitti_seq2_right_turn_98deg")
+    pose = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
+    heading = np.arctan2(-pose[:, 0, 2], pose[:, 2, 2])
+    t_ns = np.arange(51, dtype=np.int64) * 100_000_000
+    write_tum(tmp_path / "pose.tum", planar(t_ns, pose[:, 2, 3], -pose[:, 0, 3], heading))
+    truth = Truth(version=1, start_ns=0, end_ns=10**10, pose="pose.tum", pose_point="camera")
+    save(truth, tmp_path)
+    for name, first in (("even", 0), ("odd", 1)):
+        (tmp_path / name).mkdir()
+        for i in range(first, 51, 2):
+            picture = (folder / "image_l" / f"{i:06d}.png").read_bytes()
+            (tmp_path / name / f"{i:06d}.png").write_bytes(picture)
+        times = "\n".join(f"{t * 1e-9:.3f}" for t in t_ns[first::2])
+        (tmp_path / name / "timestamps.txt").write_text(times + "\n")
+    poses = ["--poses", str(tmp_path / "truth.json")]
+    database = str(tmp_path / "even.sqlite")
+    add = ["landmarks", "add", database, str(tmp_path / "even"), *poses, "--every", "1"]
+    assert cli.run(add) == 0
+    fit = ["fit", "landmarks", str(tmp_path / "odd"), "--database", database, *poses]
+    near = ["--every", "0.5", "--near", "3", "--far", "25", "--false-match-rate", "0.05"]
+    capsys.readouterr()
+    assert cli.run([*fit, *near, "--json"]) == 0
+
+    fitted = json.loads(capsys.readouterr().out)
+    found = fitted["held_out_found"]
+    assert found["hits"] == found["of"] > 20
+    assert 4 < fitted["min_score"] < 100

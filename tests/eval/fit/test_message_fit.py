@@ -1,0 +1,163 @@
+"""The fit of messages from run folders and truth files, up to the command line."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.truth.truth import load
+from crosscue.eval.cli import run as crosscue
+from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs
+from crosscue.replay.errors import RunError, UsageError
+from crosscue.replay.files.run_folder import RunFolder, open_run
+from crosscue.replay.vehicle.vehicle import Vehicle, parse
+from support.fusion_runs import (
+    made_up_drive,
+    write_empty_truth,
+    write_run,
+    write_truth,
+)
+
+DRIVES = 16
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], list[Path]]:
+    """Run folders and truth files, half with a road to the left."""
+    folder = tmp_path_factory.mktemp("drives")
+    rng = np.random.default_rng(4)
+    runs, truths = [], []
+    for i in range(DRIVES):
+        left = i % 2 == 0
+        evidence = made_up_drive(rng, left=left, signed=True)
+        runs.append(write_run(folder / f"run{i}", evidence).path)
+        truths.append(write_truth(folder / f"truth{i}", left=left))
+    return runs, truths
+
+
+def annotated(run: RunFolder, truth: Path) -> Annotated:
+    found = Annotated([], Counter())
+    annotate(run, load(truth), Vehicle(version=1), found)
+    return found
+
+
+def test_a_runs_approach_takes_its_features_from_the_truth_and_ends_at_the_intersection(
+    drives: tuple[list[Path], list[Path]],
+) -> None:
+    found = annotated(open_run(drives[0][0]), drives[1][0])
+
+    (one,) = found.approaches
+    assert one.features == {"intersection": True, "left": True, "right": True, "straight": True}
+    assert len(one.way_m) == 59
+    assert one.way_m.tolist() == pytest.approx(list(range(59)))
+    assert not one.is_established[0]
+    assert one.is_established[1:].all()
+    assert not one.is_near[:36].any()
+    assert one.is_near[-15:].all()
+    assert one.counts["stop_sign"].tolist() == [1] * 59
+    assert (one.counts["parked_left"] == 0).all()
+    assert found.used == {"to an intersection": 1}
+
+
+def test_an_approach_to_nothing_lacks_intersection_left_and_right(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    run = write_run(tmp_path / "run", made_up_drive(rng, left=False, signed=False))
+
+    found = annotated(run, write_empty_truth(tmp_path / "truth"))
+
+    assert {tuple(one.features.items()) for one in found.approaches} == {
+        (("intersection", False), ("left", False), ("right", False))
+    }
+    assert not found.approaches[0].is_near.any()
+
+
+def test_an_approach_that_begins_in_an_intersection_is_left_out(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    late = [one for one in made_up_drive(rng, left=True, signed=True) if one.t_ns >= 3_000_000_000]
+    run = write_run(tmp_path / "run", late)
+
+    found = annotated(run, write_truth(tmp_path / "truth", left=True, enter_ns=2_000_000_000))
+
+    assert not found.approaches
+    assert found.used == {"in an intersection, left out": 1}
+
+
+def test_another_drives_truth_is_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    late = [one for one in made_up_drive(rng, left=True, signed=True) if one.t_ns >= 3_000_000_000]
+    run = write_run(tmp_path / "run", late)
+
+    with pytest.raises(RunError, match="give the truth of this drive"):
+        annotated(run, write_empty_truth(tmp_path / "truth", end_ns=2_000_000_000))
+
+
+def test_a_run_without_a_single_approach_gives_none(tmp_path: Path) -> None:
+    found = annotated(write_run(tmp_path / "run", []), write_empty_truth(tmp_path / "truth"))
+
+    assert not found.approaches
+
+
+def test_runs_with_different_graphs_are_refused(
+    tmp_path: Path, drives: tuple[list[Path], list[Path]]
+) -> None:
+    other = parse("version = 1\n[fusion.cues]\nlanes_past = { use = false }", "car.toml")
+    run = write_run(tmp_path / "run", [], other)
+
+    with pytest.raises(UsageError, match="other cues or features"):
+        graph_of_runs([open_run(drives[0][0]), run])
+
+
+def test_the_command_writes_a_section_that_a_vehicle_file_takes(
+    drives: tuple[list[Path], list[Path]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs, truths = drives
+    section = tmp_path / "calibrated.toml"
+    command = ["fit", "messages", *map(str, runs), "--truth", *map(str, truths)]
+
+    assert crosscue([*command, "-o", str(section)]) == 0
+
+    told = capsys.readouterr().out
+    assert f"{DRIVES} approaches to learn from" in told
+    assert "road_left -> left, near" in told
+    assert "stop_sign -> intersection, far: 16 places with it, 0 without, 16 positive" in told
+    text = "version = 1\n[fusion]\nkind = 'calibrated'\n" + section.read_text()
+    learned = parse(text, "car.toml").fusion.calibrated
+    assert learned is not None
+    by_place = {(one.cue, one.feature, one.near): one for one in learned.rates}
+    for near in (False, True):
+        rates = by_place["road_left", "left", near]
+        assert rates.if_there > 0.4 > 0.25 > rates.if_not
+    assert set(by_place) == {("road_left", "left", near) for near in (False, True)}
+
+
+def test_the_section_is_printed_where_no_file_is_named(
+    drives: tuple[list[Path], list[Path]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs, truths = drives
+    command = ["fit", "messages", *map(str, runs), "--truth", *map(str, truths)]
+
+    assert crosscue(command) == 0
+    assert "\n[fusion.calibrated]\nrates = [\n" in capsys.readouterr().out
+    assert crosscue([*command, "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["approaches"] == DRIVES
+    (rate,) = [
+        one for one in printed["rates"]
+        if (one["cue"], one["feature"], one["near"]) == ("road_left", "left", True)
+    ]  # fmt: skip
+    for interval in ("wilson", "by_places"):
+        low, high = rate["there"][interval]
+        assert low < rate["there"]["rate"] < high
+
+
+def test_each_run_needs_its_truth(
+    drives: tuple[list[Path], list[Path]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs, truths = drives
+
+    assert crosscue(["fit", "messages", *map(str, runs), "--truth", str(truths[0])]) == 2
+    assert "16 runs, 1 truth files; give one" in capsys.readouterr().err

@@ -1,0 +1,277 @@
+"""From a camera log to a run folder of detections and cues, by the command line."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from crosscue.eval.cli import run
+from crosscue.replay.files.run_folder import open_run
+from support.data import shared
+from support.detecting import yolox_card
+from support.pictures import picture_folder
+
+BRIGHT = "support.detecting:build"
+CITY = (
+    "road,sidewalk,building,wall,fence,pole,traffic light,traffic sign,vegetation,terrain,sky,"
+    "person,rider,car,truck,bus,train,motorcycle,bicycle"
+)
+ROAD_CARDS = {
+    "twinlitenet": (
+        "twinlitenet",
+        "cv2",
+        """weights = "FOLDER/twinlitenet_best.onnx"
+sha256 = "f505b56bd7c9e4e38b2928373aa4daa191a9a398e07e1fb340024b9ce84d4285"
+[input]
+width_px = 640
+height_px = 360
+colour = "rgb"
+scale = [0.00392156862745098, 0.00392156862745098, 0.00392156862745098]
+[output]
+kind = "segmentation"
+name = "da"
+classes = ["other", "road"]
+""",
+    ),
+    "road-segmentation-adas-0001": (
+        "road-segmentation-adas-0001",
+        "openvino",
+        """weights = "FOLDER/road-segmentation-adas-0001.xml"
+sha256 = "51d457ec677cb921c1003f6447671fdfba5acec5df6ecc0a236b613062ea852f"
+sha256_bin = "2a1d09b6aab18e145f14d92f5f425af92ad5338a04b0670205759d8c5b075111"
+[input]
+width_px = 896
+height_px = 512
+[output]
+kind = "segmentation"
+classes = ["background", "road", "curb", "mark"]
+road = ["road", "mark"]
+""",
+    ),
+    "deeplab": (
+        "deeplab_cityscapes_slim",
+        "ai_edge_litert",
+        f"""weights = "FOLDER/deeplab_mobilenet_edgetpu_slim_cityscapes_quant.tflite"
+sha256 = "322fe29945cb1693f426952f2a330ab67ea5678545ddee6f2548e0cfd0ca03e5"
+[input]
+width_px = 513
+height_px = 513
+colour = "rgb"
+layout = "nhwc"
+dtype = "uint8"
+[output]
+kind = "segmentation"
+classes = {json.dumps(CITY.split(","))}
+""",
+    ),
+}
+
+
+def _folder(tmp_path: Path, count: int = 5) -> Path:
+    folder = picture_folder(tmp_path / "cam", count, "rate_hz: 10\n", ".jpg")
+    for i in range(count):
+        grey = np.zeros((48, 64), np.uint8)
+        grey[10:20, 8 + i : 24 + i] = 255
+        ok, encoded = cv2.imencode(".png", grey)
+        assert ok
+        (folder / f"frame_{i}.jpg").unlink()
+        (folder / f"frame_{i}.png").write_bytes(encoded.tobytes())
+    return folder
+
+
+def test_a_detector_of_ones_own_writes_tables(tmp_path: Path) -> None:
+    log, out = _folder(tmp_path), tmp_path / "run"
+
+    status = run(["detect", str(log), "-o", str(out), "--detectors", BRIGHT, "--no-cache", "-q"])
+
+    assert status == 0
+    found = open_run(out).table("detections")
+    assert found["x0"].to_pylist() == [8.0, 9.0, 10.0, 11.0, 12.0]
+    assert set(found["height_px"].to_pylist()) == {10.0}
+    assert set(found["label"].to_pylist()) == {"bright"}
+
+
+def test_a_detector_of_an_installed_package_is_asked_for_by_its_entry_points_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    info = tmp_path / "packages" / "own_pack-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own-pack\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[crosscue.detectors]\nown = support.detecting:build\n")
+    monkeypatch.syspath_prepend(str(info.parent))
+    log = str(_folder(tmp_path))
+
+    args = ["-o", str(tmp_path / "run"), "--no-cache", "-q"]
+    assert run(["detect", log, "--detectors", "own", *args]) == 0
+    assert open_run(tmp_path / "run").table("detections")["detector"].to_pylist() == ["own"] * 5
+
+    assert run(["detect", log, "--detectors", "owm", "--overwrite", *args]) == 2
+    assert "detector 'owm': no such name; did you mean own?" in capsys.readouterr().err
+
+
+def test_a_second_run_takes_all_from_the_cache_and_gives_the_same(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, cache = _folder(tmp_path), str(tmp_path / "cache.sqlite")
+    told = []
+    for name in ("a", "b"):
+        args = ["-o", str(tmp_path / name), "--detectors", BRIGHT, "--cache", cache, "--json"]
+        assert run(["detect", str(log), *args]) == 0
+        told.append(json.loads(capsys.readouterr().out))
+
+    assert told[0]["ran"] == {BRIGHT: 5}
+    assert told[1]["ran"] == {BRIGHT: 0}
+    assert told[1]["from_cache"] == {BRIGHT: 5}
+    first, second = (open_run(tmp_path / name) for name in ("a", "b"))
+    assert first.table("detections").equals(second.table("detections"))
+
+
+def test_broken_empty_and_huge_pictures_are_skipped_and_told(tmp_path: Path) -> None:
+    log = _folder(tmp_path)
+    ok, png = cv2.imencode(".png", np.zeros((4, 4), np.uint8))
+    assert ok
+    bomb = bytearray(png.tobytes())
+    bomb[16:24] = (60_000).to_bytes(4, "big") * 2
+    bomb[29:33] = __import__("zlib").crc32(bytes(bomb[12:29])).to_bytes(4, "big")
+    (log / "frame_1.png").write_bytes(b"")
+    (log / "frame_2.png").write_bytes(bytes(bomb))
+    out = tmp_path / "run"
+
+    status = run(["detect", str(log), "-o", str(out), "--detectors", BRIGHT, "--no-cache", "-q"])
+
+    assert status == 3
+    assert len(open_run(out).table("detections")) == 3
+    reasons = open_run(out).table("skipped")["reason"].to_pylist()
+    assert sorted(reasons) == ["empty file", "picture not decoded"]
+    account = open_run(out).manifest()["account"]["reading"][0]["topics"]["cam"]
+    assert account["used"] == 3
+    assert account["in"] == 5
+    assert account["dropped"]["picture not decoded"] == 1
+
+
+def test_a_camera_that_changes_size_is_followed_and_told(tmp_path: Path) -> None:
+    log = _folder(tmp_path)
+    wide = np.zeros((96, 128), np.uint8)
+    wide[50:60, 10:20] = 255
+    ok, encoded = cv2.imencode(".png", wide)
+    assert ok
+    (log / "frame_4.png").write_bytes(encoded.tobytes())
+    out = tmp_path / "run"
+
+    assert run(["detect", str(log), "-o", str(out), "--detectors", BRIGHT, "--no-cache", "-q"]) == 0
+
+    found = open_run(out).table("detections")
+    assert found["picture_width_px"].to_pylist() == [64, 64, 64, 64, 128]
+    assert "(64, 48) became (128, 96)" in open_run(out).manifest()["notices"][0]
+
+
+@pytest.mark.parametrize(
+    ("detector", "said"),
+    [
+        ("nonsense", "detector 'nonsense': no such name"),
+        ("no.such.module:make", "detector no.such.module:make: No module named"),
+        ("support.detecting:nothing", "has no attribute 'nothing'"),
+        ("support.detecting:too_few", "gave 0 results for"),
+        (f"{BRIGHT},{BRIGHT}", "one is named twice"),
+        ("", "none named; there are:"),
+    ],
+)
+def test_a_detector_that_cannot_be_is_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], detector: str, said: str
+) -> None:
+    log = _folder(tmp_path)
+    args = ["-o", str(tmp_path / "run"), "--detectors", detector, "--no-cache"]
+
+    assert run(["detect", str(log), *args]) in (1, 2)
+
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
+
+
+def test_an_unknown_setting_is_refused_with_a_suggestion(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    vehicle = tmp_path / "v.toml"
+    vehicle.write_text(
+        f'version = 1\n[detectors.b]\nkind = "{BRIGHT}"\nsettings = {{ treshold = 3 }}\n'
+    )
+    args = ["-o", str(tmp_path / "run"), "--vehicle", str(vehicle), "--no-cache"]
+
+    assert run(["detect", str(_folder(tmp_path)), *args]) == 2
+
+    assert "treshold: no such setting; did you mean threshold?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"sha256": '"' + "0" * 64 + '"'}, "the card's sha256 says 0000"),
+        ({"classes": '["car"]'}, "want (1, 3549, 6) for 1 classes, got (1, 3549, 85)"),
+        ({"width_px": "320"}, "the network does not run on input 320 x 416"),
+        ({"weights": '"gone.onnx"'}, "put the weights next to the card"),
+    ],
+)
+def test_a_card_that_does_not_fit_is_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, str], said: str
+) -> None:
+    card = yolox_card(tmp_path, **changes)
+    args = ["-o", str(tmp_path / "run"), "--detectors", str(card), "--no-cache"]
+
+    assert run(["detect", str(_folder(tmp_path)), *args]) == 2
+
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
+
+
+def test_yolox_finds_the_cars_and_lights_of_a_real_approach(tmp_path: Path) -> None:
+    source = shared("sequences", "us_signalized_intersection_dashcam")
+    log = tmp_path / "us"
+    log.mkdir()
+    for path in sorted(source.glob("*.jpg"))[-24::6]:
+        (log / path.name).symlink_to(path)
+    (log / "timestamps.txt").write_text("rate_hz: 15\n")
+    args = ["--detectors", str(yolox_card(tmp_path)), "--no-cache", "--draw", "1", "-q"]
+
+    assert run(["detect", str(log), "-o", str(tmp_path / "run"), *args]) == 0
+
+    found = open_run(tmp_path / "run").table("detections")
+    labels = found["label"].to_pylist()
+    assert labels.count("car") >= 8
+    assert labels.count("traffic light") >= 4
+    assert len(list((tmp_path / "run" / "pictures").glob("*.jpg"))) == 1
+
+
+@pytest.mark.parametrize("name", sorted(ROAD_CARDS))
+def test_each_real_segmentation_sees_the_road_ahead_and_none_in_the_sky(
+    name: str, tmp_path: Path
+) -> None:
+    folder, package, text = ROAD_CARDS[name]
+    pytest.importorskip(package, reason=f"{package} is an optional back end")
+    picture = shared("sequences", "us_signalized_intersection_dashcam", "frame_5050.jpg")
+    card = tmp_path / "road.toml"
+    card.write_text("version = 1\n" + text.replace("FOLDER", str(shared("weights", folder))))
+    vehicle = tmp_path / "v.toml"
+    vehicle.write_text(
+        "version = 1\n[regions]\nstraight = [[0.5, 0.7], [0.65, 0.7], [0.75, 0.85], [0.5, 0.85]]\n"
+        "left = [[0.0, 0.0], [0.3, 0.0], [0.3, 0.3], [0.0, 0.3]]\n"
+    )
+    log = tmp_path / "us"
+    log.mkdir()
+    (log / picture.name).symlink_to(picture)
+    (log / "timestamps.txt").write_text("rate_hz: 15\n")
+    args = ["--detectors", str(card), "--vehicle", str(vehicle), "--no-cache", "-q"]
+
+    assert run(["detect", str(log), "-o", str(tmp_path / "run"), *args]) == 0
+
+    shares = open_run(tmp_path / "run").table("road").to_pylist()[0]
+    assert shares["share_straight"] > 0.8
+    assert shares["share_left"] < 0.02
+    cues = {
+        row["cue"]: row["count"] for row in open_run(tmp_path / "run").table("cues").to_pylist()
+    }
+    assert cues["road_straight"] == 1
+    assert cues["road_left"] == 0

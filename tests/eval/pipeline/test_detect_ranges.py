@@ -1,0 +1,182 @@
+"""Heights in pixels to ranges: the curve that made the pairs comes back, with its scatter."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from crosscue.datasets.truth.truth import Truth, save
+from crosscue.detectors.ranging.height_to_range import FAMILIES, fit_range, range_of
+from crosscue.eval.cli import run
+from crosscue.eval.fit.range_pairs import pairs_of_run, pairs_of_truth
+from crosscue.replay.errors import SchemaError, UsageError
+from crosscue.replay.vehicle.vehicle import RangeCurve, parse
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_curve_that_made_the_pairs_comes_back(family: str) -> None:
+    parameters = {"pinhole": (750.0,), "pinhole-offset": (700.0, 2.5), "power": (600.0, -0.9)}
+    curve = RangeCurve(
+        family=family,  # type: ignore[arg-type]
+        parameters=parameters[family], residual_sd_m=1.0,
+    )  # fmt: skip
+    height = np.linspace(9.0, 90.0, 80)
+    noise = np.random.default_rng(3).normal(0.0, 1.7, 80)
+
+    fitted = fit_range(height, range_of(height, curve) + noise, curve.family)
+
+    truth = range_of(height, curve)
+    assert np.abs(range_of(height, fitted.curve) - truth).max() < 2.0
+    assert fitted.curve.residual_sd_m == pytest.approx(1.7, rel=0.2)
+    assert sum(b.pairs for b in fitted.bins) == 80
+
+
+@pytest.mark.parametrize(
+    ("heights", "ranges", "said"),
+    [([10.0, 20.0, -1.0], [5.0, 4.0, 3.0], "row 3"), ([10.0] * 3, [5.0] * 3, "different heights")],
+)
+def test_pairs_that_cannot_be_fitted_are_refused(
+    heights: list[float], ranges: list[float], said: str
+) -> None:
+    with pytest.raises(UsageError, match=said):
+        fit_range(np.array(heights), np.array(ranges), "pinhole")
+
+
+def test_fit_ranges_writes_a_section_that_the_vehicle_file_takes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = tmp_path / "pairs.csv"
+    rows = [f"{h},{750 / h + (0.5 if h % 2 else -0.5)}" for h in range(10, 80)]
+    table.write_text("height_px,range_m\n" + "\n".join(rows) + "\n")
+
+    assert run(["fit", "ranges", str(table), "--cue", "stop_sign", "--family", "pinhole"]) == 0
+
+    section = capsys.readouterr().out.split("\n\n")[-1]
+    curve = parse("version = 1\n" + section, "v.toml").ranges.stop_sign
+    assert curve is not None
+    assert curve.parameters[0] == pytest.approx(750.0, rel=0.01)
+    assert curve.residual_sd_m == pytest.approx(0.5, rel=0.05)
+
+
+def test_a_table_without_its_columns_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = tmp_path / "pairs.csv"
+    table.write_text("a,b\n1,2\n")
+
+    assert run(["fit", "ranges", str(table), "--cue", "stop_sign"]) == 2
+
+    assert "want the columns height_px and range_m" in capsys.readouterr().err
+
+
+def test_a_table_that_is_none_is_told_with_its_path_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "wild.csv").write_bytes(b"\xff\xd8\xff")
+
+    for name, said in (("none.csv", "No such file"), ("wild.csv", "is no text")):
+        path = tmp_path / name
+        assert run(["fit", "ranges", str(path), "--cue", "stop_sign"]) == 2
+        told = capsys.readouterr().err
+        assert f"{path}: {said}" in told
+        assert told.count(name) == 1
+
+
+HEIGHTS = {"stop_sign": 750.0, "traffic_light": 1000.0}
+
+
+def drive(folder: Path, noise_m: float = 0.0) -> Path:
+    """A drive with a stop sign at the start and a light at the end of its intersection."""
+    folder.mkdir()
+    rng = np.random.default_rng(2)
+    images, objects, ranges = [], [], ["t_ns,approach,start_m,end_m"]
+    for k in range(60):
+        t_ns, start = 1_700_000_000_000_000_000 + k * 100_000_000, 70.0 - k
+        ranges.append(f"{t_ns},0,{start},{start + 15.0}")
+        images.append({"id": k, "t_ns": t_ns})
+        for number, (cue, size) in enumerate(HEIGHTS.items()):
+            true_m = start if cue == "stop_sign" else start + 15.0
+            height = size / (true_m + rng.normal(0.0, noise_m))
+            objects.append({"image_id": k, "category_id": number, "visible": 1.0,
+                            "bbox": [5, 5, 9, height]})  # fmt: skip
+            objects.append({"image_id": k, "category_id": number, "visible": 0.5,
+                            "bbox": [5, 5, 9, 3.0]})  # fmt: skip
+    names = [cue.replace("_", " ") for cue in HEIGHTS]
+    tree = {"images": images, "annotations": objects,
+            "categories": [{"id": i, "name": name} for i, name in enumerate(names)]}  # fmt: skip
+    (folder / "objects.json").write_text(json.dumps(tree))
+    (folder / "ranges.csv").write_text("\n".join(ranges))
+    save(
+        Truth(version=1, start_ns=1_700_000_000_000_000_000, end_ns=1_700_000_007_000_000_000,
+              objects="objects.json", ranges="ranges.csv"), folder,
+    )  # fmt: skip
+    return folder
+
+
+@pytest.mark.parametrize("cue", HEIGHTS)
+def test_a_sign_measures_the_start_and_a_light_the_end_and_hidden_ones_nothing(
+    cue: str, tmp_path: Path
+) -> None:
+    pairs = pairs_of_truth(drive(tmp_path / "a"), cue)
+
+    assert len(pairs.range_m) == 60
+    np.testing.assert_allclose(pairs.height_px * pairs.range_m, HEIGHTS[cue])
+
+
+def test_a_curve_is_measured_on_drives_it_was_not_fitted_to(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fitted, other = drive(tmp_path / "a"), drive(tmp_path / "b", noise_m=1.0)
+    figure = tmp_path / "f.png"
+    argv = ["fit", "ranges", "--cue", "stop_sign", "--truth", str(fitted), "--test", str(other),
+            "--figure", str(figure), "--family", "pinhole"]  # fmt: skip
+
+    assert run([*argv, "--json"]) == 0
+
+    told = json.loads(capsys.readouterr().out)
+    assert told["fits"][0]["residual_sd_m"] < 0.01
+    assert told["tested"]["residual_sd_m"] == pytest.approx(1.0, rel=0.3)
+    assert told["tested"]["pairs"] == 60
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    assert run(argv) == 1  # the figure is there already
+    assert run([*argv, "--overwrite"]) == 0
+    assert "on other drives, 60 pairs" in capsys.readouterr().out
+
+
+def test_a_runs_detections_are_paired_with_the_truth_of_its_drive(tmp_path: Path) -> None:
+    truth = drive(tmp_path / "a")
+    t_ns = [1_700_000_000_000_000_000 + k * 100_000_000 for k in (3, 4, 5)] + [9]
+    table = pa.table(
+        {"t_ns": t_ns, "label": ["stop sign", "stop sign", "car", "stop sign"],
+         "score": [0.95, 0.5, 0.99, 0.99], "height_px": [20.0] * 4}
+    )  # fmt: skip
+    pq.write_table(table, tmp_path / "detections.parquet")
+
+    pairs = pairs_of_run(tmp_path, truth, "stop_sign", 0.9)
+
+    assert pairs.range_m.tolist() == [67.0]
+
+
+def test_truth_without_objects_or_ranges_is_told(tmp_path: Path) -> None:
+    save(Truth(version=1, start_ns=0, end_ns=9), tmp_path)
+
+    with pytest.raises(SchemaError, match="has no ranges"):
+        pairs_of_truth(tmp_path, "stop_sign")
+    whole = drive(tmp_path / "a")
+    (whole / "objects.json").write_text('{"images": 3}')
+    with pytest.raises(SchemaError, match="no COCO file"):
+        pairs_of_truth(whole, "stop_sign")
+    with pytest.raises(UsageError, match=r"detections.parquet: not there"):
+        pairs_of_run(tmp_path, whole, "stop_sign", 0.9)
+
+
+def test_runs_and_drives_come_in_pairs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    here = str(drive(tmp_path / "a"))
+
+    assert run(["fit", "ranges", "--cue", "stop_sign", "--truth", here, here, "--run", here]) == 2
+    assert "1 runs for 2 drives" in capsys.readouterr().err
+    assert run(["fit", "ranges", "--cue", "stop_sign"]) == 2
+    assert "give a TABLE, or --truth" in capsys.readouterr().err

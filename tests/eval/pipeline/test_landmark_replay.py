@@ -1,0 +1,451 @@
+"""From pictures to a better pose, through the command line: simulated drive, simulated walls.
+
+The car drives past textured walls. A survey at another time of day gives the database; the replay
+starts metres off and meets the walls again.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.simulated.drive import DriveSettings
+from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
+from crosscue.datasets.truth.tum import read_tum
+from crosscue.detectors.images import Encoded
+from crosscue.eval import cli
+from crosscue.eval.pipeline.landmarks import LandmarkStage, looking
+from crosscue.eval.pipeline.measurements import read_measured
+from crosscue.localization.ekf import PoseBelief
+from crosscue.localization.landmarks.database import LandmarkDatabase
+from crosscue.localization.landmarks.images import grey_of
+from crosscue.localization.landmarks.update import best_of
+from crosscue.replay.columns import Block, Bytes, Floats, Images, Messages
+from crosscue.replay.files.run_folder import RunFolder
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.vehicle.vehicle import Vehicle, load
+from support.data import shared
+from support.landmark_files import database_of, encoded, seen_from, wall
+
+WALL_M = 40.0
+
+
+def view(way_m: float, noise: float, seed: int) -> Bytes:
+    """What the camera sees after so much way: the next wall, the larger the nearer."""
+    number, into_m = divmod(way_m, WALL_M)
+    scale = 0.6 * (WALL_M + 15.0) / (WALL_M + 15.0 - into_m)
+    return seen_from(_wall(int(number) + 100), 0.0, scale, noise, seed)
+
+
+@lru_cache(maxsize=2)
+def _wall(seed: int) -> Bytes:
+    return wall(seed, 320, 240)
+
+
+def frames(folder: Path, drive: DriveFiles, every_ns: int, noise: float, seed: int) -> Path:
+    """A folder of the camera's pictures."""
+    track = read_tum(drive.truth.parent / "pose.tum")
+    way_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(track.xyz_m[:, :2], axis=0).T))])
+    folder.mkdir()
+    times = np.arange(track.t_ns[0] + seed * 1_000_000, track.t_ns[-1], every_ns)
+    at_m = np.interp(times - track.t_ns[0], track.t_ns - track.t_ns[0], way_m)
+    for i, metres in enumerate(at_m):
+        (folder / f"frame_{i:05d}.png").write_bytes(encoded(view(metres, noise, seed + i)))
+    (folder / "timestamps.txt").write_text("\n".join(map(str, times)) + "\n")
+    return folder
+
+
+@dataclass(frozen=True, slots=True)
+class Town:
+    """What all tests here share."""
+
+    drive: DriveFiles
+    vehicle: Path
+    survey: Path
+    camera: Path
+    database: Path
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Town:
+    folder = tmp_path_factory.mktemp("town")
+    drive = write_drive(folder / "drive", DriveSettings(seed=3, blocks=3, block_m=100.0))
+    survey = frames(folder / "survey", drive, 300_000_000, 2.0, seed=1)
+    camera = frames(folder / "camera", drive, 150_000_000, 6.0, seed=50)
+    database = folder / "town.sqlite"
+    add = ["landmarks", "add", str(database), str(survey), "--poses", str(drive.truth)]
+    assert cli.run([*add, "--every", "15", "--sd", "2"]) == 0
+    vehicle = drive.vehicle.parent / "off.toml"
+    text = drive.vehicle.read_text()
+    assert "[start]" in text
+    head, _, tail = text.partition("[start]")
+    _, bracket, rest = tail.partition("\n[")
+    vehicle.write_text(
+        f"{head}[start]\nx_m = 6.0\ny_m = -5.0\nposition_sd_m = 6.0\nheading_rad = 0.35\n"
+        f"heading_sd_rad = 0.1\n{bracket}{rest}"
+    )
+    return Town(drive, vehicle, survey, camera, database)
+
+
+def replay(town: Town, run: Path, *more: str) -> RunFolder:
+    command = ["replay", str(town.drive.log), str(town.camera), "--vehicle", str(town.vehicle)]
+    assert cli.run([*command, "-o", str(run), *more]) == 0
+    return RunFolder(run)
+
+
+@pytest.fixture(scope="module")
+def found(town: Town, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """The drive replayed with the landmarks."""
+    run = tmp_path_factory.mktemp("found") / "run"
+    return replay(town, run, "--landmarks", str(town.database))
+
+
+@pytest.fixture(scope="module")
+def without(town: Town, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """The drive replayed without any."""
+    return replay(town, tmp_path_factory.mktemp("without") / "run")
+
+
+def errors_m(town: Town, run: RunFolder) -> Floats:
+    track = read_tum(town.drive.truth.parent / "pose.tum")
+    table = run.table("pose")
+    t_ns = table["t_ns"].to_numpy()
+    apart = [
+        table[name].to_numpy() - np.interp(t_ns, track.t_ns, track.xyz_m[:, i])
+        for i, name in enumerate(("x_m", "y_m"))
+    ]
+    return np.asarray(np.hypot(*apart), np.float64)
+
+
+def test_landmarks_correct_a_drifting_pose(
+    town: Town, found: RunFolder, without: RunFolder
+) -> None:
+    counts = found.manifest()["counts"]["landmarks"]
+    assert counts["accepted"] >= 10
+    assert counts["gated"] <= 2
+    late = slice(-500, None)
+    assert np.median(errors_m(town, without)[late]) > 4.0
+    assert np.median(errors_m(town, found)[late]) < 2.0
+    axis = found.table("pose")["major_axis_m"].to_numpy()
+    assert axis[-1] < 0.7 * without.table("pose")["major_axis_m"].to_numpy()[-1]
+
+
+def test_rows_name_the_landmark_and_the_manifest_accounts_for_every_frame(
+    town: Town, found: RunFolder
+) -> None:
+    manifest = found.manifest()
+    counts = manifest["counts"]["landmarks"]
+    named = [name for name in found.table("pose")["landmark"].to_pylist() if name is not None]
+
+    assert len(named) == counts["accepted"]
+    assert all(name.startswith("survey/") for name in named)
+    camera = manifest["account"]["reading"][1]["topics"]["camera"]
+    assert counts["frames"] == camera["used"] == len(list(town.camera.glob("*.png")))
+    with LandmarkDatabase(town.database) as database:
+        assert manifest["landmarks"]["landmarks"] == len(database)
+    times = found.table("pose")["t_ns"].to_numpy()
+    assert (np.diff(times) > 0).all()
+
+
+def test_the_same_drive_gives_the_same_bytes(town: Town, found: RunFolder, tmp_path: Path) -> None:
+    again = replay(town, tmp_path / "again", "--landmarks", str(town.database))
+
+    for name in ("pose.parquet", "measurements.parquet"):
+        assert again.file(name).read_bytes() == found.file(name).read_bytes()
+
+
+def test_zero_landmarks_leave_the_pose_as_it_was(
+    town: Town, without: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = database_of(tmp_path / "none.sqlite", np.empty((0, 2)))
+    with_none = replay(town, tmp_path / "with", "--landmarks", str(empty)).table("pose")
+
+    np.testing.assert_allclose(with_none["x_m"], without.table("pose")["x_m"], rtol=0, atol=1e-6)
+    assert with_none["landmark"].null_count == len(with_none)
+    assert "0 landmarks weighed in, 0 refused by the gate" in capsys.readouterr().out
+
+
+def test_a_log_without_a_camera_says_so(town: Town, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    command = ["replay", str(town.drive.log), "--vehicle", str(town.vehicle), "-o", str(run)]
+    assert cli.run([*command, "--landmarks", str(town.database)]) == 0
+
+    notices = RunFolder(run).manifest()["notices"]
+    assert "landmarks were given, but the logs have no camera: none is looked for" in notices
+
+
+def refused(capsys: pytest.CaptureFixture[str], *command: str) -> tuple[int, str]:
+    status = cli.run(list(command))
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    return status, captured.err
+
+
+def test_bad_databases_are_refused_in_one_line(
+    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut = tmp_path / "cut.sqlite"
+    cut.write_bytes(town.database.read_bytes()[:20_000])
+    other = database_of(tmp_path / "other.sqlite", np.zeros((1, 2)), kind="learned")
+    replaying = ["replay", str(town.drive.log), "-o", str(tmp_path / "run"), "--landmarks"]
+
+    status, text = refused(capsys, *replaying, str(cut))
+    assert (status, "cut short" in text) == (4, True)
+    status, text = refused(capsys, *replaying, str(other))
+    assert (status, "matcher 'learned', not 'orb'" in text) == (2, True)
+    status, text = refused(capsys, "landmarks", "list", str(tmp_path / "missing.sqlite"))
+    assert (status, "crosscue landmarks add" in text) == (4, True)
+    assert not (tmp_path / "run" / "manifest.json").exists()
+
+
+def test_list_and_match_show_what_is_there(
+    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    assert cli.run(["landmarks", "list", str(town.database), "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    first = listed["listed"][0]
+    x, y = first["xy_m"]
+    assert listed["landmarks"] == len(listed["listed"]) > 10
+    assert np.array(first["cov_m2"]) == pytest.approx(4.0 * np.eye(2))
+
+    near = f"--near={x},{y},1"
+    assert cli.run(["landmarks", "list", str(town.database), near]) == 0
+    assert first["name"] in capsys.readouterr().out
+
+    picture = sorted(town.survey.glob("*.png"))[0]
+    assert cli.run(["landmarks", "match", str(town.database), str(picture), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["compared"] == listed["landmarks"]
+    assert (found["best"][0]["name"], found["best"][0]["is_match"]) == (first["name"], True)
+    assert not found["best"][3]["is_match"]
+    assert cli.run(["landmarks", "match", str(town.database), str(picture), near]) == 0
+    assert "1 landmarks compared" in capsys.readouterr().out
+
+
+def test_a_near_that_is_none_is_refused(town: Town, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    for text in ("1,2", "1,2,-3", "nan,0,1", "a,b,c"):
+        status, err = refused(capsys, "landmarks", "list", str(town.database), f"--near={text}")
+        assert (status, "want x,y,radius in metres" in err) == (2, True)
+
+
+def test_fewer_than_none_cannot_be_shown(town: Town, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    database = str(town.database)
+
+    for command in (("list", database, "--limit=-1"), ("match", database, "x.png", "--best=0")):
+        status, err = refused(capsys, "landmarks", *command)
+        assert (status, "want" in err) == (2, True)
+
+
+def photos(folder: Path, table: str) -> tuple[Path, Path]:
+    folder.mkdir()
+    for i in range(2):
+        (folder / f"{i}.png").write_bytes(encoded(wall(i)))
+    (folder / "bad.png").write_text("no picture")
+    (folder / "blank.png").write_bytes(encoded(np.zeros((50, 50), np.uint8)))
+    (folder / "at.csv").write_text(table)
+    return folder, folder / "at.csv"
+
+
+def test_pictures_with_coordinates_become_landmarks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = "image,x_m,y_m,var_x_m2,cov_xy_m2,var_y_m2,heading_rad\n"
+    table += "0.png,1.5,-2,4,1,9,0.5\n1.png,5e6,4e5,1,0,1,\nblank.png,0,0,1,0,1,\n"
+    folder, csv = photos(tmp_path / "photos", table)
+    add = ["landmarks", "add", str(tmp_path / "lm.sqlite"), "--images", str(folder)]
+    assert cli.run([*add, "--coordinates", str(csv), "--json"]) == 0
+
+    counts = json.loads(capsys.readouterr().out)
+    assert (counts["pictures"], counts["added"], counts["blank"]) == (3, 2, 1)
+    with LandmarkDatabase(tmp_path / "lm.sqlite") as database:
+        first, second = (one.place for one in database)
+    assert (first.name, first.heading_rad) == ("photos/0.png", 0.5)
+    np.testing.assert_array_equal(first.cov_m2, [[4.0, 1.0], [1.0, 9.0]])
+    assert (second.xy_m.tolist(), second.heading_rad) == ([5e6, 4e5], None)
+
+
+@pytest.mark.parametrize(
+    ("table", "status", "why"),
+    [
+        ("image,x_m,y_m\n0.png,1,2\n", 1, "at.csv:1: want columns image,x_m,y_m,sd_m"),
+        ("image,x_m,y_m,sd_m\n0.png,nan,2,1\n", 1, "at.csv:2: x_m: want a finite number"),
+        ("image,x_m,y_m,sd_m\n0.png,1,2,1\n1.png,1,inf,1\n", 1, "at.csv:3: y_m"),
+        ("image,x_m,y_m,sd_m\n0.png,1,2,-1\n", 1, "at.csv:2: sd_m: want > 0, got -1"),
+        ("image,x_m,y_m,sd_m\n0.png,1\n", 1, "at.csv:2: y_m: want a finite number, got None"),
+        ("image,x_m,y_m,var_x_m2,cov_xy_m2,var_y_m2\n0.png,1,2,1,2,1\n", 1, "positive definite"),
+        ("image,x_m,y_m,sd_m\nbad.png,1,2,1\n", 4, "bad.png: not a JPEG, PNG or WebP picture"),
+        ("image,x_m,y_m,sd_m\nmissing.png,1,2,1\n", 4, "missing.png: No such file"),
+        ("image,x_m,y_m,sd_m\n0.png,1,2,1\n0.png,1,2,1\n", 2, "'photos/0.png' is there already"),
+    ],
+)
+def test_bad_coordinates_are_refused_and_nothing_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, status: int, why: str
+) -> None:
+    folder, csv = photos(tmp_path / "photos", table)
+    add = ["landmarks", "add", str(tmp_path / "lm.sqlite"), "--images", str(folder)]
+    got, text = refused(capsys, *add, "--coordinates", str(csv))
+
+    assert got == status
+    assert why in text
+    assert not (tmp_path / "lm.sqlite").exists()
+
+
+def test_add_wants_a_log_with_poses_or_pictures_with_coordinates(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for more in ([], ["--images", "x"], ["log"], ["log", "--poses", "p", "--images", "x"]):
+        status, text = refused(capsys, "landmarks", "add", str(tmp_path / "lm.sqlite"), *more)
+        assert (status, "give LOG... with --poses" in text) == (2, True)
+
+
+def block(payloads: list[bytes], first_ns: int = 0, step_ns: int = 500_000_000) -> Block:
+    joined = np.frombuffer(b"".join(payloads), np.uint8)
+    stop = np.cumsum([len(p) for p in payloads]).astype(np.int64)
+    start = np.concatenate([[0], stop[:-1]]).astype(np.int64)
+    t_ns = first_ns + step_ns * np.arange(len(payloads), dtype=np.int64)
+    return Block("cam", t_ns, Images(Messages(joined, start, stop), ("png",) * len(payloads)))
+
+
+def stage_at(path: Path, ledger: Ledger, **section: float) -> LandmarkStage:
+    vehicle = Vehicle.model_validate({"version": 1, "landmarks": section})
+    return looking(LandmarkDatabase(path), vehicle, ledger)
+
+
+def belief_at(t_ns: int) -> PoseBelief:
+    return PoseBelief(t_ns, np.zeros(4), np.eye(4))
+
+
+def test_a_picture_that_does_not_decode_is_dropped_in_the_account(tmp_path: Path) -> None:
+    ledger = Ledger("cam")
+    stage = stage_at(database_of(tmp_path / "lm.sqlite", np.zeros((1, 2))), ledger)
+    ledger.find("cam", 2)
+    stage.see(block([b"no picture at all", encoded(wall(1))]))
+
+    assert list(stage.times_ns()) == [0, 500_000_000]
+    assert stage.weigh(belief_at(0), 0.0) is None
+    assert stage.weigh(belief_at(500_000_000), 5.0) is None
+    assert ledger.accounts["cam"].dropped == {"picture does not decode": 1}
+    assert ledger.accounts["cam"].used == 1
+    assert stage.counts()["undecodable"] == 1
+    assert stage.counts()["candidates"] == 1
+
+
+def test_frames_too_close_or_without_odometry_are_counted_and_let_go(tmp_path: Path) -> None:
+    stage = stage_at(database_of(tmp_path / "lm.sqlite", np.zeros((1, 2))), Ledger("cam"))
+    stage.see(block([b"x"] * 10, step_ns=50_000_000))
+    assert len(stage.times_ns()) == 5
+    stage.let_go(200_000_000)
+    assert len(stage.times_ns()) == 3
+    stage.let_go(1 << 62)
+
+    assert len(stage.times_ns()) == 0
+    assert (stage.counts()["frames"], stage.counts()["thinned"]) == (10, 5)
+    assert stage.counts()["late"] == 5
+
+
+def test_real_frames_find_the_landmarks_of_their_own_street(tmp_path: Path) -> None:
+    """KITTI: every fourth metre of a turn as landmarks; the frames between find the nearest."""
+    folder = shared("sequences", "kitti_seq2_right_turn_98deg")
+    pose = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
+    east_north = np.column_stack([pose[:, 2, 3], -pose[:, 0, 3]])
+    rows = [f"{i:06d}.png,{x},{y},2" for i, (x, y) in enumerate(east_north)][::4]
+    csv = tmp_path / "at.csv"
+    csv.write_text("image,x_m,y_m,sd_m\n" + "\n".join(rows) + "\n")
+    database = tmp_path / "turn.sqlite"
+    add = ["landmarks", "add", str(database), "--images", str(folder / "image_l")]
+    assert cli.run([*add, "--coordinates", str(csv)]) == 0
+
+    stage = stage_at(database, Ledger("kitti"))
+    apart = []
+    for i in range(2, 51, 4):
+        picture = (folder / "image_l" / f"{i:06d}.png").read_bytes()
+        seen = stage.search.matcher.describe(grey_of(Encoded("png", memoryview(picture))))
+        everything = tuple(stage.search.database)
+        best = best_of(seen, everything, stage.search.database, stage.search.matcher)
+        assert best is not None
+        assert best.match.score > 50
+        apart.append(float(np.hypot(*(best.place.xy_m - east_north[i]))))
+    assert max(apart) < 4.5
+
+
+def test_a_vehicle_file_with_a_landmark_section_is_checked(tmp_path: Path) -> None:
+    path = tmp_path / "car.toml"
+    path.write_text("version = 1\n[landmarks]\nmin_score = 33\nmatcher = 'orb'\n")
+    assert load(path).landmarks.min_score == 33.0
+
+
+def test_the_score_shows_filter_and_batch_smoother_side_by_side(
+    town: Town, found: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
+    command = ["score", str(found.path), "--truth", str(town.drive.truth), "--smoother", "gtsam"]
+    capsys.readouterr()
+    assert cli.run([*command, "--json"]) == 0
+
+    smoother = json.loads(capsys.readouterr().out)["metrics"]["smoother"]
+    assert smoother["poses"] > 20
+    assert smoother["smoother_rmse_m"] < smoother["filter_rmse_m"]
+    assert abs(smoother["smoother_end_m"] - smoother["filter_end_m"]) < 0.5
+    assert json.loads((found.path / "score" / "smoother.json").read_text()) == smoother
+    assert cli.run(command) == 0
+    assert "filter against batch smoother" in capsys.readouterr().out
+
+
+def test_the_measurements_are_those_that_the_filter_used(found: RunFolder) -> None:
+    counts = found.manifest()["counts"]
+    kinds = found.table("measurements")["kind"].to_pylist()
+
+    assert kinds.count("start") == 1
+    assert kinds.count("odometry") == counts["odometry"]["intervals"]
+    assert kinds.count("heading") == counts["track"]["headings_accepted"] > 0
+    assert kinds.count("landmark") == counts["landmarks"]["accepted"] > 0
+    read = read_measured(found)
+    table = found.table("pose")
+    ends = np.isin(read.increments.stop_ns, table["t_ns"].to_numpy())
+    assert ends.mean() > 0.99
+
+
+def test_a_matcher_of_ones_own_makes_and_asks_a_database(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for shade in (50, 150):
+        (folder / f"{shade}.png").write_bytes(encoded(np.full((40, 40), shade, np.uint8)))
+    (folder / "at.csv").write_text("image,x_m,y_m,sd_m\n50.png,0,0,1\n150.png,9,0,1\n")
+    own = ["--matcher", "support.landmark_files:shade"]
+    database, picture = str(tmp_path / "lm.sqlite"), tmp_path / "dark.png"
+    picture.write_bytes(encoded(np.full((60, 60), 60, np.uint8)))
+    add = ["landmarks", "add", database, "--images", str(folder)]
+    assert cli.run([*add, "--coordinates", str(folder / "at.csv"), *own, "-q"]) == 0
+    assert cli.run(["landmarks", "match", database, str(picture), *own, "--json"]) == 0
+
+    best = json.loads(capsys.readouterr().out)["best"]
+    assert [(one["name"], one["score"]) for one in best] == [
+        ("photos/50.png", 90.0), ("photos/150.png", 10.0),
+    ]  # fmt: skip
+    status, text = refused(capsys, "landmarks", "match", database, str(picture))
+    assert (status, "matcher 'shade', not 'orb'" in text) == (2, True)
+
+
+def test_a_picture_bomb_is_refused_in_one_line(
+    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    jpeg = bytearray(encoded(wall(1, 64, 64), ".jpg"))
+    frame = jpeg.index(b"\xff\xc0")
+    jpeg[frame + 5 : frame + 9] = b"\xfd\xe8\xfd\xe8"
+    (tmp_path / "bomb.jpg").write_bytes(jpeg)
+    capsys.readouterr()
+
+    match = ["landmarks", "match", str(town.database), str(tmp_path / "bomb.jpg")]
+    status, text = refused(capsys, *match)
+    assert (status, "65000 x 65000 pixels: more than" in text) == (4, True)

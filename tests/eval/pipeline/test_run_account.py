@@ -1,0 +1,195 @@
+"""One account per run: it adds up, it is printed once, and every place shows the same numbers."""
+
+import json
+from collections import Counter
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.simulated.drive import DriveSettings
+from crosscue.datasets.simulated.log_files import write_drive
+from crosscue.eval import cli
+from crosscue.eval.pipeline.accounts import account_of, write_skipped
+from crosscue.eval.pipeline.run_account import account, account_lines, check, line, lines, summed
+from crosscue.replay.errors import AccountError
+from crosscue.replay.files.run_folder import create, open_run
+from crosscue.replay.ledger import DETAILS_KEPT, Ledger
+from support.pictures import picture_folder
+
+BRIGHT = "support.detecting:build"
+
+
+@pytest.fixture(scope="module")
+def damaged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    """A drive whose log is cut: its folder, its log, its vehicle file."""
+    folder = tmp_path_factory.mktemp("drive")
+    files = write_drive(folder / "drive", DriveSettings(seed=3, blocks=1, block_m=60.0))
+    content = files.log.read_bytes()
+    files.log.write_bytes(content[: len(content) * 4 // 5])
+    return folder, files.log, files.vehicle
+
+
+def _agrees(run: Path, printed: dict[str, Any]) -> dict[str, Any]:
+    """The run's account, after every place that shows it was held against it."""
+    folder = open_run(run)
+    found: dict[str, Any] = folder.manifest()["account"]
+    check(found)
+    assert printed["account"] == found
+    told: Counter[tuple[str, str, bool]] = Counter()
+    unknown = set()
+    for row in folder.table("skipped").to_pylist():
+        told[row["topic"], row["reason"], row["is_dropped"]] += row["count"] or 0
+        if row["count"] is None:
+            unknown.add((row["topic"], row["reason"]))
+    wanted: Counter[tuple[str, str, bool]] = Counter()
+    for log in found["reading"]:
+        for topic, one in log["topics"].items():
+            wanted.update({(topic, why, False): n for why, n in one["skipped"].items()})
+            wanted.update({(topic, why, True): n for why, n in one["dropped"].items()})
+            assert {(topic, why) for why in one["dropped_unknown"]} <= unknown
+    assert +told == +wanted
+    return found
+
+
+def test_replay_and_estimate_of_a_damaged_log(
+    damaged: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, log, vehicle = damaged
+    run = tmp_path / "run"
+    for argv in (
+        ["replay", str(log), "--vehicle", str(vehicle), "-o", str(run), "--json"],
+        ["replay", str(log), "--vehicle", str(vehicle), "-o", str(run), "--json", "--overwrite",
+         "--from", "1", "--to", "8"],
+        ["estimate", str(run), "--json"],
+    ):  # fmt: skip
+        assert cli.run(argv) == 3
+        found = _agrees(run, json.loads(capsys.readouterr().out))
+        assert {stage for stage, _, _ in lines(found)} == {"reading", "estimating"}
+        assert not found["is_whole"]
+        assert found["estimating"]["wheel speeds"]["used"] > 0
+
+    assert cli.run(["view", str(run), "--save", str(tmp_path / "x.rrd"), "-q"]) == 3
+    assert cli.run(["compare", str(run), str(run), "-q"]) == 3
+    assert cli.run(["estimate", str(run)]) == 3
+    text = capsys.readouterr().out
+    assert text.count("account  ") == 1
+    assert sum(one["used"] for at, _, one in lines(found) if at == "reading") > 0
+
+
+def test_detect_over_pictures_that_do_not_decode(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, run = picture_folder(tmp_path / "cam", 6, "rate_hz: 10\n"), tmp_path / "run"
+    pictures = sorted(log.glob("*.png"))
+    content = bytearray(pictures[2].read_bytes())
+    content[16:24] = (60_000).to_bytes(4, "big") * 2
+    content[29:33] = __import__("zlib").crc32(bytes(content[12:29])).to_bytes(4, "big")
+    pictures[2].write_bytes(content)
+    pictures[4].write_bytes(b"")
+
+    argv = ["detect", str(log), "-o", str(run), "--detectors", BRIGHT, "--no-cache", "--json"]
+    assert cli.run(argv) == 3
+
+    found = _agrees(run, json.loads(capsys.readouterr().out))
+    ((name, frames),) = found["detecting"].items()
+    topics = found["reading"][0]["topics"]
+    assert (frames["in"], frames["used"]) == (6, 4)
+    assert frames["used"] == topics[name]["used"]
+    assert frames["dropped"] == topics[name]["dropped"]
+    assert sum(frames["dropped"].values()) + sum(frames["skipped"].values()) == 2
+
+
+def test_single_rows_beyond_those_kept_are_added_up(tmp_path: Path) -> None:
+    ledger = Ledger("log")
+    ledger.find("/t", 3 * DETAILS_KEPT)
+    for _ in range(DETAILS_KEPT + 7):
+        ledger.skip("/t", "bad")
+    ledger.drop("/t", "cut", 3)
+    ledger.drop("", "who knows", None)
+    run = create(tmp_path / "run", overwrite=False)
+    write_skipped(run, [ledger], [account_of(ledger)])
+
+    rows = run.table("skipped").to_pylist()
+    assert sum(row["count"] for row in rows if row["reason"] == "bad") == DETAILS_KEPT + 7
+    assert [row["count"] for row in rows if row["reason"] == "cut"] == [3]
+    assert [row["count"] for row in rows if row["reason"] == "who knows"] == [None]
+
+
+def _made() -> dict[str, Any]:
+    topic = {**line(10, 7, {"dull": 2}, {"cut": 1})}
+    return account([{"log": "a", "is_whole": False, "topics": {"/t": topic}}],
+                   {"/cam": line(5, 4, {}, {"not decoded": 1})},
+                   {"headings": line(9, 6, {"refused by the gate": 3})})  # fmt: skip
+
+
+@pytest.mark.parametrize("stage", ["reading", "detecting", "estimating"])
+@pytest.mark.parametrize("by", [-1, 1])
+@pytest.mark.parametrize("what", ["in", "used", "skipped", "dropped"])
+def test_one_row_more_or_less_anywhere_is_a_bug_and_loud(stage: str, by: int, what: str) -> None:
+    wrong = deepcopy(_made())
+    ((_, one),) = [(name, one) for at, name, one in lines(wrong) if at == stage]
+    if what in ("in", "used"):
+        one[what] += by
+    else:
+        one[what]["another"] = by
+
+    with pytest.raises(AccountError, match=f"{stage} .*please report"):
+        check(wrong)
+
+
+def test_runs_add_up_and_stay_damaged() -> None:
+    both = summed([_made(), _made()])
+
+    assert both["reading"]["/t"]["in"] == 20
+    assert both["reading"]["/t"]["dropped"] == {"cut": 2}
+    assert both["detecting"]["/cam"]["runs"] == 2
+    assert both["estimating"]["headings"]["skipped"] == {"refused by the gate": 6}
+    assert not both["is_whole"]
+
+
+def test_a_person_reads_every_stage_and_every_reason_once() -> None:
+    text = "\n".join(account_lines(_made()))
+
+    for words in ("10 rows: 7 used, 2 skipped, 1 dropped", "5 frames: 4 used, 0 skipped, 1 dropped",
+                  "9 readings: 6 used, 3 skipped, 0 dropped", "dropped 1 of reading /t: cut",
+                  "skipped 3 of estimating headings: refused by the gate"):  # fmt: skip
+        assert text.count(words) == 1
+    assert np.all([len(part) <= 100 for part in text.splitlines()])
+
+
+def test_one_row_beyond_those_kept_and_one_of_unknown_number_are_not_lost(tmp_path: Path) -> None:
+    ledger = Ledger("log")
+    ledger.find("/t", 3 * DETAILS_KEPT)
+    ledger.drop("/t", "cut", 3)
+    ledger.drop("/t", "cut", None)
+    for _ in range(DETAILS_KEPT - 1):
+        ledger.skip("/t", "bad")
+    run = create(tmp_path / "run", overwrite=False)
+
+    write_skipped(run, [ledger], [account_of(ledger)])
+
+    rows = run.table("skipped").to_pylist()
+    assert sum(row["count"] for row in rows if row["reason"] == "bad") == DETAILS_KEPT - 1
+    assert [row["count"] for row in rows if row["reason"] == "cut"] == [3, None]
+
+
+def test_headings_that_the_first_belief_is_made_of_are_used(
+    damaged: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, log, vehicle = damaged
+    text = "\n".join(row for row in vehicle.read_text().splitlines() if "heading_rad" not in row)
+    for dbc in vehicle.parent.glob("*.dbc"):
+        (tmp_path / dbc.name).write_bytes(dbc.read_bytes())
+    (tmp_path / "car.toml").write_text(text)
+    run = tmp_path / "run"
+
+    assert cli.run(["replay", str(log), "--vehicle", str(tmp_path / "car.toml"), "-o", str(run),
+                    "--json"]) == 3  # fmt: skip
+
+    printed = json.loads(capsys.readouterr().out)
+    assert any("start heading" in sentence for sentence in printed["notices"])
+    headings = _agrees(run, printed)["estimating"]["headings"]
+    assert headings["in"] == headings["used"] + sum(headings["skipped"].values())

@@ -1,0 +1,245 @@
+"""A drive whose clock jumps, pauses or is set back is a list of time segments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from crosscue.eval.pipeline.estimate import Outcome
+from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.localization.ekf import PoseBelief
+from crosscue.localization.gap import GapSettings, cross_gap
+from crosscue.localization.pose_track import start_belief
+from crosscue.replay.columns import Block, Int64s
+from crosscue.replay.files.run_folder import create
+from crosscue.replay.log import EVERYTHING
+from crosscue.replay.time.stamp_watch import StampWatch
+from crosscue.replay.vehicle.time import Time
+from crosscue.replay.vehicle.vehicle import Start, Vehicle
+from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
+
+SECOND = 1_000_000_000
+BEGIN = 1_000 * SECOND
+ROW = SECOND // 10
+"""Ten wheel rows a second."""
+
+
+def _drive(seconds: int = 20, rows_a_block: int = 7) -> list[Block]:
+    """Ten wheel rows and twenty gyro rows a second, of a car that speeds up and turns."""
+    wheel_t = np.arange(seconds * 10) * ROW + BEGIN
+    gyro_t = np.arange(seconds * 20) * (ROW // 2) + BEGIN
+    wheels = [
+        wheel_block(part.tolist(), (5.0 + (part - BEGIN) * 1e-10).tolist())
+        for part in np.array_split(wheel_t, max(len(wheel_t) // rows_a_block, 1))
+    ]
+    gyros = [
+        gyro_block(part.tolist(), [0.05] * len(part))
+        for part in np.array_split(gyro_t, max(len(gyro_t) // (2 * rows_a_block), 1))
+    ]
+    return [block for pair in zip(wheels, gyros, strict=True) for block in pair]
+
+
+def _moved(blocks: Sequence[Block], at_ns: int, by_ns: int) -> list[Block]:
+    """The clock of a log is set by so much at a time."""
+    return [
+        Block(b.topic, np.where(b.log_ns >= at_ns, b.log_ns + by_ns, b.log_ns), b.rows)
+        for b in blocks
+    ]
+
+
+def _part(blocks: Sequence[Block], first: int = 0, last: int = 1 << 62) -> list[Block]:
+    return [b.take((b.log_ns >= first) & (b.log_ns < last)) for b in blocks]
+
+
+def _replay(path: Path, blocks: Sequence[Block], vehicle: Vehicle | None = None) -> Outcome:
+    log = MemoryLog((WHEELS, GYRO), [b for b in blocks if len(b)], path=Path(__file__))
+    vehicle = vehicle or Vehicle(version=1, start=Start(heading_rad=0.0))
+    return replay_drive([log], vehicle, create(path, overwrite=True), EVERYTHING)
+
+
+def _distance(outcome: Outcome, segment: int = 0) -> float:
+    """Travelled in one segment, from its odometry."""
+    table = outcome.run.table("measurements")
+    rows = zip(*(table[n].to_pylist() for n in ("kind", "segment", "distance_m")), strict=True)
+    return sum(abs(float(d)) for kind, n, d in rows if kind == "odometry" and n == segment)
+
+
+@pytest.mark.parametrize("by_s", [1200, 3600, -10, -3600, -1])
+def test_a_clock_that_is_set_makes_no_distance_and_loses_none(tmp_path: Path, by_s: int) -> None:
+    blocks = _drive()
+    cut_ns = BEGIN + 8 * SECOND
+    first, second = (
+        _replay(tmp_path / "first", _part(blocks, last=cut_ns)),
+        _replay(tmp_path / "second", _part(blocks, first=cut_ns)),
+    )
+
+    whole = _replay(tmp_path / "whole", _moved(blocks, cut_ns, by_s * SECOND))
+
+    assert whole.exit_status == 3
+    assert len(whole.segments) == 2
+    assert whole.travelled_m == pytest.approx(first.travelled_m + second.travelled_m, abs=1e-9)
+    assert _distance(whole, 0) == _distance(first)
+    assert _distance(whole, 1) == _distance(second)
+    pose = whole.run.table("pose")
+    assert np.all(np.diff(pose["t_ns"].to_numpy()) > 0)
+    original = pose["log_t_ns"].to_numpy()
+    expected = np.concatenate([
+        first.run.table("pose")["t_ns"].to_numpy(),
+        second.run.table("pose")["t_ns"].to_numpy() + by_s * SECOND,
+    ])  # fmt: skip
+    np.testing.assert_array_equal(original, expected)
+
+
+@settings(
+    max_examples=10,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],
+)
+@given(
+    cut=st.integers(25, 175),
+    offset_ns=st.integers(0, ROW - 1),
+    by_ms=st.one_of(st.integers(-4_000_000, -350), st.integers(1_100, 4_000_000)),
+    rows_a_block=st.sampled_from([3, 7, 50, 200]),
+)
+def test_both_sides_of_a_cut_are_the_two_halves_alone(
+    tmp_path: Path, cut: int, offset_ns: int, by_ms: int, rows_a_block: int
+) -> None:
+    blocks = _drive(rows_a_block=rows_a_block)
+    cut_ns = BEGIN + cut * ROW + offset_ns
+    halves = [
+        _replay(tmp_path / "half", part)
+        for part in (_part(blocks, last=cut_ns), _part(blocks, first=cut_ns))
+    ]
+    alone = [half.travelled_m for half in halves]
+
+    whole = _replay(tmp_path / "whole", _moved(blocks, cut_ns, by_ms * 1_000_000))
+
+    assert len(whole.segments) == 2
+    assert whole.travelled_m == pytest.approx(sum(alone), abs=1e-9)
+
+
+def test_a_pause_is_a_gap_with_its_length(tmp_path: Path) -> None:
+    blocks = _drive()
+    paused = _part(blocks, last=BEGIN + 5 * SECOND) + _part(blocks, first=BEGIN + 9 * SECOND)
+
+    outcome = _replay(tmp_path / "run", paused)
+
+    assert [one.gap_ns for one in outcome.segments[1:]] == [4 * SECOND + ROW]
+    assert "1 gap without odometry, 4.1 s in all" in outcome.notices[0]
+    assert set(outcome.run.table("pose")["segment"].to_pylist()) == {0, 1}
+    told = outcome.run.manifest()["time"]["segments"]
+    assert [one["cause"] for one in told] == ["start", "odometry silent"]
+
+
+def test_a_gap_shorter_than_the_limit_changes_nothing(tmp_path: Path) -> None:
+    blocks = _drive()
+    paused = _part(blocks, last=BEGIN + 5 * SECOND) + _part(
+        blocks, first=BEGIN + 5 * SECOND + 9 * ROW
+    )
+    vehicle = Vehicle(version=1, start=Start(heading_rad=0.0), time=Time(max_silence_s=1e6))
+
+    strict, lax = (
+        _replay(tmp_path / name, paused, one) for name, one in (("a", None), ("b", vehicle))
+    )
+
+    assert strict.exit_status == 0
+    assert len(strict.segments) == 1
+    for name in ("pose", "measurements"):
+        assert strict.run.file(f"{name}.parquet").read_bytes() == (
+            lax.run.file(f"{name}.parquet").read_bytes()
+        )
+
+
+@pytest.mark.parametrize("by_s", [1000, -900])
+def test_one_stray_stamp_is_skipped_and_reported(tmp_path: Path, by_s: int) -> None:
+    blocks = _drive(rows_a_block=50)
+    stray = blocks[2].log_ns.copy()
+    stray[20] += by_s * SECOND
+    kept = np.arange(len(stray)) != 20
+
+    outcome = _replay(tmp_path / "run", [
+        *blocks[:2], Block("wheels", stray, blocks[2].rows), *blocks[3:]
+    ])  # fmt: skip
+    without = _replay(tmp_path / "without", [*blocks[:2], blocks[2].take(kept), *blocks[3:]])
+
+    assert len(outcome.segments) == 1
+    assert outcome.travelled_m == without.travelled_m
+    assert outcome.ledgers[0].topic("wheels").skipped == {"stray time stamp": 1}
+    assert any("lies far" in sentence for sentence in outcome.ledgers[0].notices)
+
+
+def test_late_rows_are_no_set_back() -> None:
+    stamps = np.arange(1000) * ROW
+    stamps[[500, 501, 502]] -= 4 * SECOND
+    watch = StampWatch()
+    for part in np.array_split(stamps, 9):
+        watch.add(part)
+    watch.finish()
+
+    assert not watch.set_backs
+    assert watch.strays == [(500, 503)]
+
+
+@pytest.mark.parametrize("pieces", [1, 3, 100, 700])
+def test_a_watch_finds_the_same_in_any_pieces(pieces: int) -> None:
+    stamps: Int64s = np.arange(700) * ROW
+    stamps[300:] -= 20 * SECOND
+    stamps[450] += 5000 * SECOND
+    stamps[600:] += 100 * SECOND
+    watch = StampWatch()
+    for part in np.array_split(stamps, pieces):
+        watch.add(part)
+    watch.finish()
+
+    assert [one.row for one in watch.set_backs] == [300]
+    assert watch.strays == [(450, 451)]
+    assert [(era.first_ns, era.last_ns) for era in watch.eras] == [
+        (0, 299 * ROW), (100 * ROW, 699 * ROW + 80 * SECOND),
+    ]  # fmt: skip
+
+
+def _belief(speed_mps: float) -> PoseBelief:
+    return start_belief(0, 0.0, 0.0, 0.0, speed_mps, 1.0, 0.01, 0.1)
+
+
+@pytest.mark.parametrize("gap_s", [1.5, 4.0, 20.0, 1200.0])
+def test_whatever_a_car_may_do_in_a_gap_is_within_three_sigma(gap_s: float) -> None:
+    limits = GapSettings()
+    rng = np.random.default_rng(3)
+    crossed = cross_gap(_belief(15.0), round(gap_s * 1e9), limits).belief
+    for _ in range(200):
+        accel = rng.uniform(-limits.max_accel_mps2, limits.max_accel_mps2)
+        turn = rng.uniform(-limits.max_turn_rate_radps, limits.max_turn_rate_radps)
+        time_s = np.linspace(0.0, gap_s, 2000)
+        speed = np.clip(15.0 + accel * time_s, 0.0, limits.max_speed_mps)
+        way = speed * gap_s / 2000
+        xy = np.array([(way * np.cos(turn * time_s)).sum(), (way * np.sin(turn * time_s)).sum()])
+        error = xy - crossed.mean[:2]
+        assert error @ np.linalg.solve(crossed.cov[:2, :2], error) < 9.0
+
+
+@pytest.mark.parametrize("by_ms", [-120, -150, -200, -250, -300])
+def test_a_clock_set_back_by_hardly_a_row_invents_no_distance(tmp_path: Path, by_ms: int) -> None:
+    blocks = _drive()
+    straight = _replay(tmp_path / "straight", blocks).travelled_m
+
+    moved = _moved(blocks, BEGIN + 8 * SECOND, by_ms * 1_000_000)
+    set_back = _replay(tmp_path / "moved", moved)
+
+    # Wheel speeds of 5.9 m/s that overlap for up to 0.3 s cannot all be put in their place.
+    assert straight - 3.0 < set_back.travelled_m <= straight
+
+
+def test_a_longer_gap_is_never_surer() -> None:
+    spread = [
+        float(np.trace(cross_gap(_belief(15.0), round(s * 1e9), GapSettings()).belief.cov))
+        for s in np.linspace(0.0, 60.0, 121)
+    ]
+
+    assert np.all(np.diff(spread) > 0)

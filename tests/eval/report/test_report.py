@@ -1,0 +1,255 @@
+"""The report page: nothing in it is active, coverage comes first, what was wrong is shown."""
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from markupsafe import Markup
+
+from crosscue.eval import cli
+from crosscue.eval.report.page import told_time, write_report
+from crosscue.eval.report.scene_figures import (
+    draw_belief,
+    draw_distances,
+    draw_range,
+    draw_reliability,
+)
+from crosscue.eval.report.svg_plot import Drawing, Panel, ticks
+from crosscue.eval.report.worst_frames import worst_frames
+from crosscue.eval.scoring.runs import FOLDER, RunScored, judge_run, metrics_of, scores_of
+from crosscue.replay.files.run_folder import RunFolder
+from support.scene_run import SIZE, scene_run
+from support.scoring import approach, at, good_truth, span, truth, truth_folder
+
+HOSTILE = '<script>alert(1)</script>"onload="x'
+
+
+class _Page(HTMLParser):
+    """Elements, what they load, and their handlers."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.loads: list[str] = []
+        self.handlers: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.loads += [value or "" for name, value in attrs if name in ("src", "href")]
+        self.handlers += [name for name, _ in attrs if name.startswith("on")]
+
+
+def _scored(folder: Path, name: str = "A", **more: Any) -> RunScored:
+    """A run in which a car is said to cross that does not, from frame 21 on."""
+    run = scene_run(folder, **more)
+    told = truth(
+        [*good_truth().truth.cues, span("cross_traffic_right", 0, 40, present=False, count=0)],
+        approaches=[approach(intersection=name)],
+    )
+    return judge_run(run, truth_folder(folder, told))
+
+
+def _written(folder: Path, *scored: RunScored, **more: Any) -> str:
+    scores = scores_of(scored)
+    path = write_report(folder, scored, scores, {**metrics_of(scored, scores), **more})
+    return path.read_text(encoding="utf-8")
+
+
+def test_nothing_that_logs_or_truth_say_becomes_active(tmp_path: Path) -> None:
+    page = _written(tmp_path, _scored(tmp_path / HOSTILE.replace("/", ""), HOSTILE))
+
+    seen = _Page(page)
+    assert not {"script", "iframe", "object", "embed", "link", "b onload"} & set(seen.tags)
+    assert seen.handlers == []
+    assert all(re.match(r"data:image/(jpeg|png);base64,", one) for one in seen.loads)
+    assert "default-src 'none'" in page
+    assert "<b>cut</b>" not in page
+    assert "&lt;b&gt;cut&lt;/b&gt;" in page
+    assert "/camera/[red]&lt;script&gt;" in page
+
+
+def test_coverage_comes_first_and_losses_are_told(tmp_path: Path) -> None:
+    page = _written(tmp_path, _scored(tmp_path / "drive"))
+
+    order = [page.index(f"<h2>{name}</h2>") for name in
+             ("Coverage", "Intersections", "Cues", "Belief", "Range", "How")]  # fmt: skip
+    assert order == sorted(order)
+    assert "<b>50 of 50</b>" in page
+    assert "rows were dropped." in page
+    assert "1 &lt;b&gt;not decoded&lt;/b&gt;" in page
+    assert "Not scored:</b> pose (the truth tells no track (pose: missing))" in page
+
+
+def test_tables_tell_the_metrics_and_what_was_published(tmp_path: Path) -> None:
+    one = _scored(tmp_path / "drive")
+    metrics = metrics_of([one], scores_of([one]))
+    page = _written(tmp_path, one)
+
+    precision = metrics["cues"]["cross_traffic_right"]["precision"]
+    assert (precision["right"], precision["of"]) == (0, 19)
+    rows = re.findall(r"<tr><td>cross traffic right</td>(.*?)</tr>", page)
+    cells = re.findall(r"<td>(?:<b>)?(.*?)(?:</b>)?</td>", rows[0])
+    assert cells[:4] == ["39", "19", "0", "0.000"]
+    assert cells[6] == "0.86"
+    assert "<b>15.0 m</b>" in page
+
+
+def test_simulated_drives_are_called_so(tmp_path: Path) -> None:
+    made_up = _scored(tmp_path / "drive")
+    assert "Simulated" not in _written(tmp_path, made_up)
+
+    told = json.loads((tmp_path / "drive" / "truth.json").read_text())
+    told["source"] = "simulated by crosscue"
+    (tmp_path / "drive" / "truth.json").write_text(json.dumps(told))
+    page = _written(tmp_path, judge_run(made_up.run, tmp_path / "drive" / "truth.json"))
+
+    assert "<b>Simulated</b>: this drive and the truth were computed" in page
+
+
+def test_the_worst_frame_is_shown_with_its_box_and_time(tmp_path: Path) -> None:
+    one = _scored(tmp_path / "drive")
+
+    (worst,) = worst_frames([one])
+
+    assert (worst.cue, worst.t_ns, worst.frames) == ("cross_traffic_right", at(21), 19)
+    assert (worst.count, worst.true_count, worst.confidence) == (1, 0, 0.97)
+    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(worst.picture), np.uint8), 1)
+    assert pixels is not None
+    assert pixels.shape == (SIZE[1], SIZE[0], 3)
+    page = _written(tmp_path, one)
+    assert f"({at(21)} ns): <code>crosscue view {one.run.path}</code>" in page
+
+
+def test_a_log_that_is_gone_leaves_a_page_that_says_so(tmp_path: Path) -> None:
+    one = _scored(tmp_path / "drive")
+    (tmp_path / "drive" / "drive.mcap").unlink()
+
+    assert "Its picture is no longer at hand." in _written(tmp_path, one)
+
+
+def test_the_same_scores_give_the_same_bytes(tmp_path: Path) -> None:
+    one = _scored(tmp_path / "drive")
+
+    first = _written(tmp_path / "a", one)
+    again = judge_run(RunFolder(one.run.path), tmp_path / "drive" / "truth.json")
+
+    assert _written(tmp_path / "b", again) == first
+
+
+def test_what_a_cue_was_worth_is_told_beside_the_others(tmp_path: Path) -> None:
+    nothing = {"value": 0.0, "low": None, "high": None}
+    worth = {
+        "stop_sign": {
+            "detected_m": nothing | {"value": 12.34}, "full_m": nothing | {"value": None},
+            "detected_only_with": 3, "full_only_with": 2, "full_only_without": 1,
+            "belief": {"left": {"log_score": nothing | {"value": -0.5}}},
+        }
+    }  # fmt: skip
+    one = _scored(tmp_path / "drive")
+
+    page = _written(tmp_path, one, attribution=worth)
+
+    row = re.findall(r"<tr><td>stop sign</td><td>([+].*?)</tr>", page)[0]
+    cells = re.split(r"</?td>+", row)
+    assert [cell for cell in cells if cell] == [
+        "+12.3",
+        "3",
+        "-",
+        "2",
+        "1",
+        "-",
+        "-0.500",
+        "-",
+        "-",
+    ]
+    assert "crosscue score --attribution" not in page
+    assert "crosscue score --attribution" in _written(tmp_path, one)
+
+
+def test_several_drives_make_one_page(tmp_path: Path) -> None:
+    drives = [_scored(tmp_path / name, name) for name in ("one", "two", "three")]
+    failed = {"runs/<four>": "runs/<four>: no manifest.json"}
+    scores = scores_of(drives)
+    metrics = metrics_of(drives, scores)
+    metrics["coverage"]["failed"] = failed
+
+    page = write_report(tmp_path, drives, scores, metrics).read_text()
+
+    assert "<h1>3 drives</h1>" in page
+    assert "<b>150 of 150</b>" in page
+    assert "runs/&lt;four&gt;: no manifest.json" in page
+    assert page.count("Probability against distance") == 3
+
+
+def test_a_run_without_a_scene_has_a_page(tmp_path: Path) -> None:
+    gone = frozenset({"belief", "range"})
+    page = _written(tmp_path, _scored(tmp_path / "drive", without=gone))
+
+    assert "<h2>Cues</h2>" in page
+    assert "<h2>Belief</h2>" not in page
+    assert "belief (the run has no belief)" in page
+
+
+def test_score_writes_the_page_and_names_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [str(_scored(tmp_path / name, name).run.path) for name in ("one", "two")]
+
+    assert cli.run(["score", runs[0]]) == 3
+    told = capsys.readouterr().out
+    assert f"written to {Path(runs[0]) / FOLDER / 'report.html'}" in told
+    assert cli.run(["score", *runs, "-o", str(tmp_path / "all"), "-q"]) == 3
+    assert "<h1>2 drives</h1>" in (tmp_path / "all" / "report.html").read_text()
+
+
+def test_charts_say_in_words_what_they_show(tmp_path: Path) -> None:
+    one = _scored(tmp_path / "drive")
+    scores = scores_of([one])
+    assert scores.approaches is not None
+    assert one.judged.approaches is not None
+    (curve,) = one.judged.approaches.curves
+    charts = [
+        draw_distances(scores.approaches.results),
+        draw_belief(curve, one.judged.cues),
+        draw_range(one.judged.ranges, scores.range),
+        draw_reliability(scores.belief),
+    ]
+    for chart in charts:
+        assert isinstance(chart, Markup)
+        assert re.match(r'<svg viewBox="[\d .]+" role="img"', chart)
+        assert re.search(r"<title>.+?</title><desc>.+?</desc>", chart)
+    assert "intersection exceeds 0.9 from 30 m on; left exceeds 0.9 from 20 m on" in charts[1]
+    assert "bias 0.50 m, rms error 0.50 m" in charts[2]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6), st.integers(2, 9))
+def test_ticks_are_few_round_and_inside(low: float, width: float, most: int) -> None:
+    found = ticks(low, low + width, most)
+
+    assert len(found) <= most + 1
+    assert all(low - 1e-6 * width <= one <= low + width * (1 + 1e-6) for one in found)
+    assert found == sorted(found)
+
+
+def test_a_curve_breaks_where_a_value_is_missing() -> None:
+    drawing = Drawing(100, 100, "title", "description")
+    panel = Panel(0, 0, 100, 100, (0.0, 4.0), (0.0, 1.0))
+
+    drawing.curve(panel, np.arange(5.0), np.array([0.0, 1.0, np.nan, 1.0, 0.0]), "line")
+
+    assert drawing.svg().count("<polyline") == 2
+
+
+def test_times_are_told_as_the_viewer_shows_them() -> None:
+    assert told_time(1_700_000_014_250_999_999) == "2023-11-14 22:13:34.250 UTC"
+    assert told_time(2_500_000_000) == "2.500 s"

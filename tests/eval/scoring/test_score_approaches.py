@@ -1,0 +1,299 @@
+"""Approaches, belief and range against truth, on drives small enough to check by hand."""
+
+import math
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from crosscue.eval.scoring.approaches import associate, judge_approaches, score_approaches
+from crosscue.eval.scoring.belief import (
+    CLIP,
+    brier,
+    compare_belief,
+    judge_belief,
+    log_score,
+    reliability,
+    score_belief,
+)
+from crosscue.eval.scoring.ranges import judge_range, score_range
+from crosscue.eval.scoring.run_tables import run_tables
+from support.scoring import (
+    BELIEF,
+    approach,
+    at,
+    belief_table,
+    good_tables,
+    good_truth,
+    range_table,
+    tables,
+    true_ranges,
+    truth,
+)
+
+
+def test_distances_are_those_at_the_first_step_above_the_threshold() -> None:
+    judged = judge_approaches(good_tables(), good_truth())
+    assert judged is not None
+    (one,) = judged.results
+
+    # p(intersection) 0.95 from frame 10 on (30 m), ranges from frame 8 on; right last, at 15 m.
+    assert one.detected_m == pytest.approx(30.0)
+    assert one.full_m == pytest.approx(15.0)
+    assert one.features_m["left"] == pytest.approx(20.0)
+    assert one.false_features == ()
+    assert one.at_entering["straight"] == 0.2
+    assert one.run_approach == 7
+    assert len(judged.curves[0].t_ns) == 40
+
+
+def test_a_probable_intersection_is_not_detected_before_it_has_a_range() -> None:
+    late = tables(belief=belief_table(BELIEF), ranges=range_table(22, 45))
+    never = tables(belief=belief_table(BELIEF))
+
+    for run, distance_m, why in ((late, 18.0, ""), (never, None, "no range")):
+        judged = judge_approaches(run, truth())
+        assert judged is not None
+        assert judged.results[0].detected_m == distance_m
+        assert judged.results[0].why_not_detected == why
+        # The full detection needs no range, as in the source's intersection H.
+        assert judged.results[0].full_m == 15.0
+
+
+@pytest.mark.parametrize(("control", "full_m"), [("none", 15.0), ("stop_sign", None)])
+def test_only_without_sign_or_light_established_presence_stands_for_the_intersection(
+    control: Literal["none", "stop_sign"], full_m: float | None
+) -> None:
+    roads_only = {name: changes for name, changes in BELIEF.items() if name != "intersection"}
+    unsaid = belief_table({"intersection": {}, **roads_only})
+    told = truth()
+    (one,) = told.truth.approaches
+    approaches = (one.model_copy(update={"control": control}),)
+    told = replace(told, truth=told.truth.model_copy(update={"approaches": approaches}))
+
+    judged = judge_approaches(tables(belief=unsaid, ranges=range_table(8, 45)), told)
+
+    assert judged is not None
+    (result,) = judged.results
+    assert result.detected_m is None
+    assert result.full_m == full_m
+
+
+def test_exactly_the_threshold_is_not_above_it() -> None:
+    run = tables(belief=belief_table({"intersection": {0: 0.9}}), ranges=range_table(0, 40))
+    judged = judge_approaches(run, truth())
+
+    assert judged is not None
+    assert judged.results[0].detected_m is None
+    assert judged.results[0].why_not_detected == "never probable enough"
+
+
+def test_absent_features_that_were_believed_are_counted() -> None:
+    features = {**BELIEF, "straight": {12: 0.95, 14: 0.1}}
+    judged = judge_approaches(tables(belief=belief_table(features)), truth())
+    assert judged is not None
+    score = score_approaches([judged])
+
+    assert score is not None
+    assert score.false_by_feature == {"straight": 1}
+    assert score.false_features.value == 1.0
+
+
+def test_failures_have_no_part_in_means_but_are_named() -> None:
+    good = judge_approaches(good_tables(), good_truth())
+    bad = judge_approaches(tables(belief=belief_table({"intersection": {5: 0.95}})), truth())
+    assert good is not None
+    assert bad is not None
+    score = score_approaches([good, bad])
+
+    assert score is not None
+    assert score.full_m.value == 15.0
+    assert (score.full_m.of, score.full.right, score.full.of) == (1, 1, 2)
+    assert score.failures == {
+        "detected": {"no range": 1},
+        "full": {"never probable enough: left, right": 1},
+    }
+    assert score.by_intersection["A"].approaches == 2
+    assert score.by_condition["rain"].full == 1
+
+
+def test_every_approach_belongs_to_one_at_most_by_largest_shared_time() -> None:
+    first = approach(id=1, start_ns=at(0), enter_ns=at(10))
+    second = approach(id=2, start_ns=at(10), enter_ns=at(30))
+    spans = {5: (at(2), at(25)), 6: (at(8), at(12)), 9: (at(40), at(50))}
+
+    # 5 shares 8 frames with the first and 15 with the second; 6 shares 2 and 2.
+    assert associate([first, second], spans) == {2: 5, 1: 6}
+    assert associate([first, second], {}) == {}
+
+
+def test_shifting_all_times_changes_no_association() -> None:
+    ones = [approach(id=i, start_ns=at(20 * i), enter_ns=at(20 * i + 15)) for i in range(3)]
+    spans = {i: (at(20 * i + 3), at(20 * i + 17)) for i in range(3)}
+    later = [one.model_copy(update={"start_ns": one.start_ns + 77, "enter_ns": one.enter_ns + 77})
+             for one in ones]  # fmt: skip
+
+    moved = {number: (a + 77, b + 77) for number, (a, b) in spans.items()}
+    assert associate(ones, spans) == associate(later, moved) == {0: 0, 1: 1, 2: 2}
+
+
+def test_approaches_where_there_is_none_are_counted_and_pieces_too() -> None:
+    import pyarrow as pa
+
+    far = approach(start_ns=at(20), enter_ns=at(40))
+    pieces = [
+        belief_table({"intersection": {2: 0.95}}, 1, range(10)),
+        belief_table(BELIEF, 2, range(20, 30)),
+        belief_table(BELIEF, 3, range(30, 45)),
+        belief_table({**BELIEF, "intersection": {70: 0.95}}, 4, range(70, 75)),
+    ]
+    whole = pa.concat_tables([p.select(["t_ns", "approach", "intersection"]) for p in pieces])
+    judged = judge_approaches(run_tables("made up", belief_table=whole), truth([], [far]))
+
+    assert judged is not None
+    assert (judged.extra, judged.extra_detected, judged.not_judged) == (1, 1, 1)
+    assert judged.results[0].splits == 1
+
+
+def test_without_true_ranges_detection_counts_but_no_distance_is_made_up() -> None:
+    drive = good_truth()
+    blind = type(drive)(drive.drive, drive.truth, None)
+    judged = judge_approaches(good_tables(), blind)
+    assert judged is not None
+    score = score_approaches([judged])
+
+    assert score is not None
+    assert score.detected.value == 1.0
+    assert math.isnan(score.detected_m.value)
+    assert score.without_range == 1
+    assert score.full_from_8_m.of == 0
+
+
+def test_brier_and_log_score_by_hand() -> None:
+    p, there = np.array([0.5, 0.9, 1.0, 0.0]), np.array([True, True, True, True])
+
+    assert brier(p, there) == pytest.approx([0.25, 0.01, 0.0, 1.0])
+    assert log_score(p, there) == pytest.approx(
+        [math.log(2), -math.log(0.9), 1e-6, -math.log(CLIP)]
+    )
+    assert log_score(1.0 - p, ~there) == pytest.approx(log_score(p, there), rel=1e-6)
+
+
+def test_a_perfectly_calibrated_belief_lies_on_the_diagonal() -> None:
+    rng = np.random.default_rng(5)
+    p = rng.uniform(0.0, 1.0, 20000)
+    bins = reliability(p, rng.uniform(0.0, 1.0, 20000) < p, np.arange(20000) % 20)
+
+    assert len(bins) == 10
+    assert sum(one.steps for one in bins) == 20000
+    inside = [one.there.low <= one.mean_probability <= one.there.high for one in bins]
+    assert sum(inside) >= 8
+
+
+def test_belief_is_judged_until_the_car_enters_and_the_rest_is_told() -> None:
+    scores = score_belief(judge_belief(good_tables(), good_truth()))
+
+    # Ten steps at 0.5, thirty at 0.95; the last ten lie in the intersection.
+    one = scores["intersection"]
+    assert (one.steps, one.scored, one.left_out) == (50, 40, {"in the intersection": 10})
+    assert one.brier.value == pytest.approx((10 * 0.25 + 30 * 0.05**2) / 40)
+    assert scores["straight"].share_there == 0.0
+    assert scores["straight"].brier.value == pytest.approx((30 * 0.25 + 10 * 0.04) / 40)
+
+
+def test_frames_for_which_the_run_believes_nothing_are_told() -> None:
+    run = tables(belief=belief_table(BELIEF, frames=range(15, 50)), frames=50)
+    score = score_belief(judge_belief(run, truth()))["left"]
+
+    silent = "frames ahead of an intersection without any belief"
+    assert score.left_out == {"in the intersection": 10, silent: 15}
+    assert (score.steps, score.scored) == (50, 25)
+
+
+def test_where_no_intersection_is_ahead_only_its_absence_is_judged() -> None:
+    far = approach(start_ns=at(20), enter_ns=at(40))
+    scores = score_belief(judge_belief(good_tables(), truth([], [far])))
+
+    assert scores["intersection"].share_there == 0.5
+    assert scores["left"].left_out == {"in the intersection": 10, "no intersection ahead": 20}
+
+
+def test_a_feature_of_the_users_own_is_not_judged_and_told() -> None:
+    run = tables(belief=belief_table({"intersection": {}, "roundabout": {3: 0.99}}))
+    score = score_belief(judge_belief(run, truth()))["roundabout"]
+
+    assert score.scored == 0
+    assert score.left_out["the truth does not know this feature"] == 40
+    assert math.isnan(score.brier.value)
+
+
+def test_missing_numbers_are_left_out_and_counted_everywhere() -> None:
+    broken = tables(
+        belief=belief_table({"intersection": {10: 0.95, 12: math.nan, 13: 0.95}, "left": {}}),
+        ranges=range_table(8, 45, math.nan),
+    )
+    judged = judge_approaches(broken, truth())
+    assert judged is not None
+
+    assert judged.rows_not_numbers == 1
+    assert score_belief(judge_belief(broken, truth()))["intersection"].left_out["not a number"] == 1
+    assert score_range(judge_range(broken, truth()))["start"].left_out == {"not a number": 37}
+    # A range that is not a number is no range.
+    assert judged.results[0].why_not_detected == "no range"
+
+
+def test_the_better_of_two_beliefs_is_named_only_where_drives_agree() -> None:
+    good, poor = {"intersection": {5: 0.95}}, {"intersection": {5: 0.6}}
+    drives = [truth(drive=f"drive {i}") for i in range(8)]
+    first = [
+        one for drive in drives for one in judge_belief(tables(belief=belief_table(poor)), drive)
+    ]
+    second = [
+        one for drive in drives for one in judge_belief(tables(belief=belief_table(good)), drive)
+    ]
+
+    found = compare_belief(first, second)["intersection"]
+    assert (found.verdict, found.steps, found.only_first) == ("second", 8 * 40, 0)
+    assert found.brier.value == pytest.approx(35 * (0.05**2 - 0.4**2) / 40)
+    assert compare_belief(second, first)["intersection"].verdict == "first"
+    assert compare_belief(first[:1], second[:1])["intersection"].verdict == "undecided"
+
+
+def test_range_errors_by_reference_and_what_the_filter_claims() -> None:
+    import pyarrow as pa
+
+    both = pa.concat_tables(
+        [range_table(0, 40, 0.5, 0.25), range_table(20, 45, -2.0, 1.0, reference="end")]
+    )
+    scores = score_range(judge_range(tables(ranges=both), truth()))
+
+    assert scores["start"].rmse_m == pytest.approx(0.5)
+    assert scores["start"].nees.mean == pytest.approx(1.0)
+    assert scores["end"].bias_m.value == pytest.approx(-2.0)
+    assert scores["end"].left_out == {"in the intersection": 5}
+    assert scores["end"].nees.share_inside_95 == 0.0
+    assert scores["start"].by_distance["0-10"].rows == 9
+
+
+def test_ranges_are_told_apart_by_what_stands_at_the_intersection() -> None:
+    lit = truth([], [approach(control="traffic_light")], drive="lit")
+    found = tables(ranges=range_table(0, 40, 1.0, reference="end"))
+    phantom = tables(ranges=range_table(0, 20, 9.0, reference="end"))
+    score = score_range([*judge_range(found, lit), *judge_range(phantom, truth())])["end"]
+
+    assert {name: part.rows for name, part in score.by_control.items()} == {
+        "stop_sign": 20, "traffic_light": 40
+    }  # fmt: skip
+    assert score.by_control["traffic_light"].nees == pytest.approx(1.0)
+    assert score.by_control["stop_sign"].bias_m == pytest.approx(9.0)
+
+
+def test_true_ranges_hold_between_rows_but_not_far_from_any() -> None:
+    ranges = true_ranges([approach()])
+    times = np.array([at(10) + 50_000_000, at(39) + 50_000_000, at(39) + 600_000_000], np.int64)
+    start, end = ranges.at(times, np.zeros(3, np.int64))
+
+    assert start[:2] == pytest.approx([29.5, 0.5])
+    assert end[0] == pytest.approx(39.5)
+    assert math.isnan(start[2])

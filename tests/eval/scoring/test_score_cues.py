@@ -1,0 +1,228 @@
+"""Cues against truth: hand-counted precision, recall and coverage; intervals against scipy."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.eval.scoring.cues import CLAIMS, judge_cues, score_cues
+from crosscue.eval.scoring.intervals import mean, resampled, share, wilson
+from support.scoring import (
+    ENTER,
+    approach,
+    at,
+    cue_table,
+    good_tables,
+    good_truth,
+    span,
+    tables,
+    truth,
+)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 400), st.integers(1, 400), st.sampled_from([0.8, 0.95, 0.99]))
+def test_wilson_is_scipys(right: int, more: int, confidence: float) -> None:
+    from scipy.stats import binomtest
+
+    theirs = binomtest(right, right + more).proportion_ci(confidence, "wilson")
+    ours = wilson(right, right + more, confidence)
+
+    assert ours.low == pytest.approx(theirs.low, abs=1e-12)
+    assert ours.high == pytest.approx(theirs.high, abs=1e-12)
+
+
+def test_wilson_of_nothing_is_unknown_and_of_impossible_counts_refused() -> None:
+    assert np.isnan(wilson(0, 0)).all()
+    with pytest.raises(ValueError, match="want 0 to 3, got 4"):
+        wilson(4, 3)
+
+
+def test_frames_of_one_drive_say_nothing_about_the_next() -> None:
+    one = mean(np.array([0.2, 0.4]), np.array([5, 5]))
+
+    assert one.value == pytest.approx(0.3)
+    assert np.isnan(one.low)
+    assert np.isnan(one.high)
+
+
+def test_repeated_frames_narrow_wilsons_interval_but_not_that_over_drives() -> None:
+    right = np.array([True, True, False, True, False])
+    drives = np.arange(5)
+    few = share(right, drives)
+    many = share(np.repeat(right, 100), np.repeat(drives, 100))
+
+    assert many.high - many.low < 0.2 * (few.high - few.low)
+    assert many.clusters_high - many.clusters_low == few.clusters_high - few.clusters_low > 0.3
+
+
+def test_resampling_agrees_with_the_central_limit_where_clusters_are_single_rows() -> None:
+    values = np.random.default_rng(3).normal(5.0, 2.0, 400)
+    low, high = resampled(values, np.arange(400), seed=1)
+
+    assert high - low == pytest.approx(2 * 1.96 * values.std() / 20.0, rel=0.1)
+    assert resampled(values, np.arange(400), seed=1) == (low, high)
+
+
+def test_many_clusters_are_resampled_in_parts_with_the_same_spread() -> None:
+    values = np.random.default_rng(3).normal(5.0, 2.0, 3000)
+    low, high = resampled(values, np.arange(3000))
+
+    assert high - low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(3000.0), rel=0.1)
+    assert low < values.mean() < high
+
+
+def test_a_hand_counted_drive() -> None:
+    score = score_cues(judge_cues(good_tables(), good_truth()))["stop_sign"]
+    objects = score.readings["object"]
+
+    # The sign is there in frames 5 to 39, found in 10 to 39; frames 40 to 49 are past it.
+    assert (objects.frames, objects.scored, objects.with_truth) == (50, 40, 40)
+    assert objects.left_out == {"in the intersection": 10}
+    assert (score.precision.right, score.precision.of) == (30, 30)
+    assert score.recall is not None
+    assert (score.recall.right, score.recall.of) == (30, 35)
+    assert (score.things.reported, score.things.true, score.things.matched) == (30, 35, 30)
+    assert objects.by_distance["0-10"].precision.of == 9
+    assert objects.by_distance["30-40"].precision.of == 1
+    assert objects.by_condition["rain"].frames == 40
+    assert score.reading == "object"
+    assert score.is_sources_reading
+
+
+def test_frames_sum_up_to_scored_and_reasons_in_every_reading() -> None:
+    found = {"stop_sign": {3: 1, 7: 0, 45: 1, 80: 2}, "do_not_enter": {0: 1}}
+    scores = score_cues(judge_cues(tables(found, frames=50), good_truth()))
+
+    assert len(scores) == len(CLAIMS)
+    for score in scores.values():
+        for reading in score.readings.values():
+            assert reading.scored + sum(reading.left_out.values()) == reading.frames == 51
+    assert scores["road_left"].readings["object"].left_out["not looked for"] == 40
+    # Frame 80 lies behind the end of the truth.
+    assert scores["stop_sign"].readings["object"].left_out["outside the truth's time"] == 1
+
+
+def test_the_two_readings_differ_where_a_way_is_there_but_closed() -> None:
+    one = approach(features={"left": False, "right": True, "straight": False}, one_way="right")
+    drive = truth([span("road_left", 0, 40), span("one_way_right", 0, 40, present=False)], [one])
+    scores = score_cues(
+        judge_cues(tables({"road_left": {5: 1, 6: 1}, "one_way_right": {7: 1}}), drive)
+    )
+
+    road, sign = scores["road_left"].readings, scores["one_way_right"].readings
+    assert road["object"].precision.value == 1.0
+    assert road["feature"].precision.value == 0.0
+    # No such sign hangs there, yet what it says is so.
+    assert sign["object"].precision.value == 0.0
+    assert sign["feature"].precision.value == 1.0
+
+
+def test_a_cue_of_an_intersection_where_none_is_ahead_is_wrong() -> None:
+    far = approach(start_ns=at(20), enter_ns=at(40))
+    judged = judge_cues(tables({"traffic_light": {5: 1, 25: 1}}), truth([], [far]))
+    score = score_cues(judged)["traffic_light"]
+
+    # Without truth of lights themselves, the other reading leads and the score says so.
+    assert score.reading == "feature"
+    assert not score.is_sources_reading
+    assert (score.precision.right, score.precision.of) == (1, 2)
+
+
+def test_things_hidden_do_not_count_in_the_recall_of_what_can_be_seen() -> None:
+    drive = truth([span("parked_left", 0, 10, visible=0.2, count=2),
+                   span("parked_left", 10, 20, visible=0.8, count=2)])  # fmt: skip
+    found = {"parked_left": {frame: int(frame >= 10) for frame in range(20)}}
+    score = score_cues(judge_cues(tables(found), drive))["parked_left"].readings["object"]
+
+    assert score.recall is not None
+    assert score.recall_seen is not None
+    assert (score.recall.value, score.recall_seen.value) == (0.5, 1.0)
+
+
+def test_a_cue_of_ones_own_is_scored_and_told_where_nothing_looked_for_it() -> None:
+    drive = truth([span("zebra", 0, 10), span("zebra", 10, 40, present=False), span("gate", 0, 40)])
+    scores = score_cues(judge_cues(tables({"zebra": dict.fromkeys(range(5, 15), 1)}), drive))
+
+    zebra, gate = scores["zebra"], scores["gate"]
+    assert (zebra.precision.right, zebra.precision.of) == (5, 10)
+    assert zebra.reading == "object"
+    assert gate.scored == 0
+    assert gate.readings["object"].left_out["not looked for"] == 10
+
+
+def test_moments_without_a_frame_are_told() -> None:
+    moment = span("stop_sign", 0, 1).model_copy(
+        update={"start_ns": None, "end_ns": None, "t_ns": at(3) + 1}
+    )
+    judged = judge_cues(tables({"stop_sign": {3: 1}}), truth([moment]))
+
+    assert score_cues(judged)["stop_sign"].moments_unmatched == 1
+
+
+def test_merged_drives_count_as_the_sum_and_know_their_clusters() -> None:
+    judged = [one for name in ("a", "b") for one in judge_cues(good_tables(), good_truth(name))]
+    score = score_cues(judged)["stop_sign"]
+
+    assert (score.precision.right, score.precision.of, score.precision.clusters) == (60, 60, 2)
+    assert score.readings["object"].frames == 100
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.dictionaries(st.integers(0, 55), st.integers(0, 3), min_size=1))
+def test_the_order_of_rows_does_not_matter(frames: dict[int, int]) -> None:
+    from crosscue.eval.scoring.run_tables import run_tables
+
+    table = cue_table({"stop_sign": frames, "road_left": frames})
+    order = np.random.default_rng(len(frames)).permutation(table.num_rows)
+    shuffled = run_tables("made up", cues_table=table.take(order))
+
+    first = score_cues(judge_cues(run_tables("made up", cues_table=table), good_truth()))
+    second = score_cues(judge_cues(shuffled, good_truth()))
+    assert repr(first) == repr(second)
+
+
+SPANS = st.lists(
+    st.tuples(st.integers(0, 39), st.integers(1, 15), st.booleans()), min_size=1, max_size=4
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(SPANS, st.dictionaries(st.integers(0, 59), st.integers(0, 2), min_size=1))
+def test_counting_frame_by_frame_gives_the_same(
+    spans: list[tuple[int, int, bool]], found: dict[int, int]
+) -> None:
+    told = [span("stop_sign", first, first + length, there) for first, length, there in spans]
+    score = score_cues(judge_cues(tables({"stop_sign": found}), truth(told)))["stop_sign"]
+
+    positives = rights = theres = hits = 0
+    for frame, count in found.items():
+        said = [there for first, length, there in spans if first <= frame < first + length]
+        if said:
+            positives += count > 0
+            rights += count > 0 and any(said)
+            theres += any(said)
+            hits += any(said) and count > 0
+    objects = score.readings["object"]
+    assert objects.recall is not None
+    assert (objects.positives, objects.precision.right) == (positives, rights)
+    assert (objects.recall.of, objects.recall.right) == (theres, hits)
+    features = score.readings["feature"]
+    assert features.precision.right == sum(n > 0 for frame, n in found.items() if frame < ENTER)
+    assert features.precision.of == features.precision.right
+
+
+def test_parts_by_distance_sum_up_and_tags_belong_to_their_approach() -> None:
+    wet = approach(id=1, conditions=("rain", "dusk"), start_ns=at(0), enter_ns=at(20))
+    dry = approach(id=2, conditions=(), start_ns=at(130), enter_ns=at(150))
+    drive = truth(
+        [span("stop_sign", 0, 20), span("stop_sign", 130, 150, False)], [wet, dry], end=160
+    )
+    found = {"stop_sign": dict.fromkeys(range(160), 1)}
+    score = score_cues(judge_cues(tables(found), drive))["stop_sign"].readings["object"]
+
+    assert sum(part.frames for part in score.by_distance.values()) == score.scored == 40
+    assert {
+        tag: (part.frames, part.precision.value) for tag, part in score.by_condition.items()
+    } == {"rain": (20, 1.0), "dusk": (20, 1.0), "no tag": (20, 0.0)}
+    assert set(score.by_distance) == {"0-10", "10-20", "20-30"}

@@ -1,0 +1,243 @@
+"""A run's pose against truth: what a perfect run scores, and what is refused."""
+
+import json
+import warnings
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from crosscue.datasets.truth.truth import Truth, save
+from crosscue.datasets.truth.tum import Trajectory, planar, write_tum
+from crosscue.eval import cli
+from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.recording import save as save_recording
+from crosscue.eval.report.page import write_report
+from crosscue.eval.scoring.pose.score import PoseScore, load_truth, score, truth_track
+from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of
+from crosscue.replay.columns import Block, Images, Messages, Topic
+from crosscue.replay.errors import RunError, SchemaError
+from crosscue.replay.files.run_folder import RunFolder, create
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import EVERYTHING, open_log
+from crosscue.replay.vehicle.vehicle import Camera, Start, Vehicle
+from crosscue.replay.write.convert import LogWriter
+from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
+
+SECOND = 1_000_000_000
+SPEED_MPS = 10.0
+YAW_RATE_RADPS = 0.1
+
+
+def _blocks(seconds: int = 30) -> list[Block]:
+    blocks: list[Block] = []
+    for second in range(seconds):
+        t = [second * SECOND + i * SECOND // 10 for i in range(10)]
+        blocks.append(gyro_block(t, [YAW_RATE_RADPS] * 10))
+        blocks.append(wheel_block(t, [SPEED_MPS] * 10))
+    return blocks
+
+
+def _circle(t_s: np.ndarray[tuple[int], np.dtype[np.float64]], ahead_m: float = 0.0) -> Trajectory:
+    heading = YAW_RATE_RADPS * t_s
+    radius = SPEED_MPS / YAW_RATE_RADPS
+    x = radius * np.sin(heading) + ahead_m * np.cos(heading)
+    y = radius * (1.0 - np.cos(heading)) + ahead_m * np.sin(heading)
+    return planar(np.rint(t_s * 1e9).astype(np.int64), x, y, np.angle(np.exp(1j * heading)))
+
+
+def _run(folder: Path, vehicle: Vehicle | None = None) -> RunFolder:
+    log = MemoryLog((WHEELS, GYRO), _blocks(), path=Path(__file__))
+    vehicle = vehicle or Vehicle(version=1, start=Start(heading_rad=0.0))
+    return replay_drive([log], vehicle, create(folder, overwrite=False), EVERYTHING).run
+
+
+def _truth(folder: Path, track: Trajectory, **more: object) -> Path:
+    folder.mkdir(exist_ok=True)
+    write_tum(folder / "pose.tum", track)
+    content = {"start_ns": int(track.t_ns[0]), "end_ns": int(track.t_ns[-1]) + 1, **more}
+    return save(Truth.model_validate({"version": 1, "pose": "pose.tum", **content}), folder)
+
+
+def _scored(tmp_path: Path) -> tuple[RunFolder, Path, PoseScore]:
+    run = _run(tmp_path / "run")
+    path = _truth(tmp_path / "truth", _circle(np.arange(-1.0, 33.0, 0.05)))
+    return run, path, score(run, path)
+
+
+def test_a_perfect_run_has_no_error_and_says_what_was_left_out(tmp_path: Path) -> None:
+    _, _, result = _scored(tmp_path)
+
+    assert result.ape["none"].translation_m.max < 1e-2
+    assert result.rpe["100 m"].translation_m.max < 1e-2
+    # Chi-square scores of no error at all lie below their band: claims were too modest.
+    assert result.nees_xyh.mean < 0.01
+    covered = result.coverage
+    # The first row stands at the end of the first interval, 0.1 s in.
+    assert covered.before_estimate == 22
+    assert covered.scored + covered.before_estimate + covered.after_estimate == covered.truth_poses
+
+
+def test_a_shifted_truth_is_an_error_that_alignment_takes_away(tmp_path: Path) -> None:
+    track = _circle(np.arange(0.5, 29.0, 0.05))
+    moved = Trajectory(track.t_ns, track.xyz_m + np.array([3.0, 4.0, 7.0]), track.quat_wxyz)
+
+    result = score(_run(tmp_path / "run"), _truth(tmp_path / "truth", moved))
+
+    # Height is no part of a pose in the plane.
+    assert result.ape["none"].translation_m.rmse == pytest.approx(5.0, abs=1e-2)
+    assert result.ape["origin"].translation_m.rmse < 1e-2
+    assert result.ape["yaw"].translation_m.rmse < 1e-2
+
+
+def test_truth_of_the_camera_is_compared_at_the_camera(tmp_path: Path) -> None:
+    vehicle = Vehicle(version=1, start=Start(heading_rad=0.0), camera=Camera(x_m=2.0))
+    path = _truth(tmp_path / "truth", _circle(np.arange(0.5, 29.0, 0.05), 2.0), pose_point="camera")
+
+    assert score(_run(tmp_path / "run", vehicle), path).ape["none"].translation_m.max < 1e-2
+
+
+def test_evo_gives_the_same_numbers_from_the_files_written(tmp_path: Path) -> None:
+    run, _, result = _scored(tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from evo.core.metrics import APE, PoseRelation
+        from evo.tools.file_interface import read_tum_trajectory_file
+
+        estimate, truth = (
+            read_tum_trajectory_file(str(run.file("score") / f"{name}.tum"))
+            for name in ("estimate", "truth")
+        )
+        metric = APE(PoseRelation.translation_part)
+        metric.process_data((truth, estimate))
+
+    ours = result.ape["none"].translation_m
+    for name, value in metric.get_all_statistics().items():
+        assert getattr(ours, name) == pytest.approx(value, rel=1e-6), name
+
+
+def test_truth_on_another_clock_is_refused(tmp_path: Path) -> None:
+    path = _truth(tmp_path / "truth", _circle(np.arange(1000.0, 1030.0)))
+
+    with pytest.raises(SchemaError, match="another log or clock"):
+        score(_run(tmp_path / "run"), path)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{", "not readable as JSON"),
+        ('{"version": 1, "version": 1}', "stands twice"),
+        ('{"version": 1, "start_ns": 5, "end_ns": 5}', "not after start_ns"),
+        ('{"version": 1, "start_ns": 5, "end_ns": 9, "pose_file": "x"}', "pose_file"),
+        ('{"version": 1, "start_ns": 5, "end_ns": 9}', "pose: missing"),
+    ],
+)
+def test_truth_that_does_not_fit_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "truth.json").write_text(text)
+
+    with pytest.raises(SchemaError, match=said):
+        load_truth(tmp_path / "truth.json")
+
+
+class _Elements(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.links: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.links += [value or "" for name, value in attrs if name in ("src", "href")]
+
+
+def _reported(run: RunFolder, path: Path) -> Path:
+    one = judge_run(run, path)
+    scores = scores_of([one])
+    return write_report(run.file(FOLDER), [one], scores, metrics_of([one], scores))
+
+
+def test_the_report_needs_no_network_and_hostile_names_stay_text(tmp_path: Path) -> None:
+    run, path, _ = _scored(tmp_path)
+    manifest = json.loads(run.file("manifest.json").read_text())
+    manifest["logs"][0]["name"] = "</td><script>alert(1)</script>"
+    manifest["notices"] = ["{{ 7 * 7 }} <img src=x onerror=alert(1)>"]
+    run.file("manifest.json").write_text(json.dumps(manifest))
+
+    page = _reported(run, path).read_text()
+
+    seen = _Elements()
+    seen.feed(page)
+    assert "script" not in seen.tags
+    assert seen.tags.count("img") == 5
+    assert all(link.startswith("data:image/png;base64,") for link in seen.links)
+    assert "{{ 7 * 7 }} &lt;img" in page
+
+
+def test_the_same_run_gives_the_same_report_and_figures(tmp_path: Path) -> None:
+    pages = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        run, path, _ = _scored(tmp_path / name)
+        page = _reported(run, path).read_text().replace(f"{name}/run", "run")
+        pages.append(((run.file("score") / "pose_plan.png").read_bytes(), page))
+
+    assert pages[0][0] == pages[1][0]
+    assert pages[0][1] == pages[1][1]
+
+
+def test_a_recording_is_written_with_and_without_truth(tmp_path: Path) -> None:
+    run, path, _ = _scored(tmp_path)
+    save_recording(run, tmp_path / "plain.rrd")
+    save_recording(run, tmp_path / "truth.rrd", truth_track(path, run))
+
+    sizes = [(tmp_path / f"{name}.rrd").stat().st_size for name in ("plain", "truth")]
+    assert 10_000 < sizes[0] < sizes[1]
+
+
+def test_the_score_command_prints_json_and_refuses_a_foreign_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, path, _ = _scored(tmp_path)
+
+    assert cli.run(["score", str(run.path), "--truth", str(path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["metrics"]["pose"]["coverage"]["truth_poses"] == 680
+    assert found["runs"] == {str(run.path): found["metrics"]}
+    assert cli.run(["score", str(path.parent), "--truth", str(path)]) == 1
+    assert "neither a run folder" in capsys.readouterr().err
+
+
+def test_pictures_pass_into_the_recording_as_stored(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    noise = rng.integers(0, 255, (3, 240, 320, 3), np.uint8)
+    jpegs = [cv2.imencode(".jpg", picture)[1].ravel() for picture in noise]
+    edges = np.cumsum([0, *map(len, jpegs)])
+    times = np.array([1, 2, 3], np.int64) * SECOND
+    ranges = Messages(np.concatenate(jpegs), edges[:-1], edges[1:])
+    images = Images(ranges, ("jpeg",) * 3)
+    camera = Topic("/camera", "crosscue/Images", "columns")
+    log = tmp_path / "drive.mcap"
+    with LogWriter(log, Ledger(str(log))) as writer:
+        writer.add_topic(camera)
+        writer.add_topic(WHEELS)
+        writer.write(Block("/camera", times, images))
+        for block in _blocks(5):
+            if block.topic == "wheels":
+                writer.write(block)
+    with open_log(log) as opened:
+        vehicle = Vehicle(version=1)
+        folder = create(tmp_path / "run", overwrite=False)
+        run = replay_drive([opened], vehicle, folder, EVERYTHING).run
+
+    save_recording(run, tmp_path / "drive.rrd")
+    log.unlink()
+    with pytest.raises(RunError, match="is gone; say where it is with --logs DIR"):
+        save_recording(run, tmp_path / "without.rrd")
+    save_recording(replace(run, without_pictures=True), tmp_path / "without.rrd")
+
+    sizes = [(tmp_path / f"{name}.rrd").stat().st_size for name in ("drive", "without")]
+    assert edges[-1] <= sizes[0] - sizes[1] < 1.02 * edges[-1] + 20_000

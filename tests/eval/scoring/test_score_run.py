@@ -1,0 +1,444 @@
+"""``crosscue score`` on run folders: files, gates, exit status, and what is refused."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.eval import cli
+from crosscue.eval.report.junit import junit_text
+from crosscue.eval.scoring.gates import Gate, check_gates, load_gates
+from crosscue.eval.scoring.metric_values import MetricValue, metric_values
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.run_folder import RunFolder
+from support.scoring import (
+    BELIEF,
+    CUES,
+    approach,
+    at,
+    belief_table,
+    cue_table,
+    frame_table,
+    log_row,
+    range_table,
+    run_folder,
+    truth,
+    truth_folder,
+)
+
+
+def _one(tmp_path: Path, name: str = "one") -> Path:
+    """A run whose truth lies beside its log."""
+    truth_folder(tmp_path / name)
+    run_folder(tmp_path / name / "run")
+    return tmp_path / name / "run"
+
+
+def _fails(capsys: pytest.CaptureFixture[str], *argv: object) -> str:
+    """The one line that a command fails with."""
+    capsys.readouterr()
+    assert cli.run([str(one) for one in argv]) in (1, 2)
+    line = capsys.readouterr().err
+    assert line.startswith("crosscue: ")
+    assert line.count("\n") == 1
+    return line
+
+
+def test_a_run_finds_the_truth_beside_its_log_and_leaves_its_scores(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = _one(tmp_path)
+
+    assert cli.run(["score", str(run), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert json.loads((run / "score" / "metrics.json").read_text()) == found["metrics"]
+    assert found["metrics"]["cues"]["stop_sign"]["precision"]["value"] == 1.0
+    assert found["metrics"]["approaches"]["full_m"]["value"] == 15.0
+    assert found["metrics"]["range"]["start"]["rmse_m"] == pytest.approx(0.5)
+    assert "no track" in found["metrics"]["coverage"]["not_scored"]["pose"]
+    curves = pq.read_table(run / "score" / "curves.parquet")
+    assert curves.num_rows == 40
+    frames = pq.read_table(run / "score" / "cue_frames.parquet")
+    assert frames.filter(frames["cue"].to_numpy(zero_copy_only=False) == "road_left").num_rows == 50
+
+
+def test_the_summary_tells_coverage_first_and_fits_a_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [str(_one(tmp_path, name)) for name in ("one", "two")]
+
+    assert cli.run(["score", *runs]) == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines()[2:])) <= 80
+    assert text.index("the truth speaks of") < text.index("precision") < text.index("approaches")
+    assert "20 in the intersection" in text
+    assert "2 of 2, 15.0 m away on average" in text
+
+
+def test_several_runs_pool_into_the_folder_asked_for(tmp_path: Path) -> None:
+    runs = [str(_one(tmp_path, name)) for name in ("one", "two")]
+
+    assert cli.run(["score", *runs, "-o", str(tmp_path / "all"), "-q"]) == 0
+    pooled = json.loads((tmp_path / "all" / "metrics.json").read_text())
+    assert pooled["coverage"]["drives"] == 2
+    assert pooled["cues"]["stop_sign"]["precision"]["of"] == 60
+    assert pooled["cues"]["stop_sign"]["precision"]["clusters"] == 2
+    assert pooled["approaches"]["approaches"] == 2
+
+
+def test_the_same_runs_give_the_same_bytes(tmp_path: Path) -> None:
+    run = _one(tmp_path)
+    seen = []
+    for _ in range(2):
+        assert cli.run(["score", str(run), "-q"]) == 0
+        seen.append([path.read_bytes() for path in sorted((run / "score").iterdir())])
+    assert seen[0] == seen[1]
+
+
+def _gates(tmp_path: Path, *gates: str) -> str:
+    path = tmp_path / "gates.toml"
+    path.write_text("version = 1\n" + "\n".join(f"[[gate]]\n{gate}" for gate in gates))
+    return str(path)
+
+
+def test_gates_decide_the_exit_status_and_leave_a_junit_file(tmp_path: Path) -> None:
+    run = _one(tmp_path)
+    passing = 'metric = "cues.stop_sign.precision"\nmin = 0.99'
+    failing = 'metric = "cues.stop_sign.precision"\nmin = 0.99\nuse = "low"'
+
+    assert cli.run(["score", str(run), "-q", "--gate", _gates(tmp_path, passing)]) == 0
+    assert cli.run(["score", str(run), "-q", "--gate", _gates(tmp_path, passing, failing)]) == 1
+    suite = ET.parse(run / "score" / "junit.xml").getroot()
+    assert (suite.get("tests"), suite.get("failures")) == ("2", "1")
+    (failure,) = suite.iter("failure")
+    # 30 of 30 right: Wilson's lower end is 0.886.
+    assert "0.88" in str(failure.get("message"))
+
+
+@pytest.mark.parametrize(
+    ("gate", "said"),
+    [
+        ('metric = "cues.stop_sing.precision"\nmin = 0.9', "close ones: cues.stop_sign.precision"),
+        ('metric = "cues.stop_sign.precision"', "want min, max or both"),
+        ('metric = "cues.stop_sign.precision"\nmin = nan', "finite number"),
+        ('metric = "a"\nmin = 2\nmax = 1', "min 2 is above max 1"),
+        (
+            'metric = "a"\nmin = 0.9\nleest = 5',
+            "gates.toml:5: gate.0.leest: no such key; did you mean least?",
+        ),
+        (
+            'metric = "a"\nmin = 0.9\n[[gate]]\nmetric = "b"\nmin = 1\nwarn = true',
+            "gates.toml:8: gate.1.warn: no such key; there are: least, max, metric, min, use",
+        ),
+        ("metric = [", "not readable as TOML"),
+    ],
+)
+def test_a_gate_that_means_nothing_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], gate: str, said: str
+) -> None:
+    line = _fails(capsys, "score", _one(tmp_path), "--gate", _gates(tmp_path, gate))
+
+    assert said in line
+
+
+def test_a_gate_on_what_was_not_scored_fails(tmp_path: Path) -> None:
+    run = _one(tmp_path)
+    gates = [
+        'metric = "pose.ape.none.translation_m.rmse"\nmax = 1.0',
+        'metric = "cues.do_not_enter.precision"\nmin = 0.9',
+        'metric = "cues.stop_sign.precision"\nmin = 0.9\nleast = 1000',
+    ]
+
+    assert cli.run(["score", str(run), "-q", "--gate", _gates(tmp_path, *gates)]) == 1
+    messages = [one.get("message") or "" for one in
+                ET.parse(run / "score" / "junit.xml").getroot().iter("failure")]  # fmt: skip
+    assert len(messages) == 3
+    assert "no track" in messages[0]
+    assert "nothing to measure it by" in messages[1]
+    assert "stands on 30 rows" in messages[2]
+
+
+def test_gates_over_several_runs_need_a_place_for_their_results(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [_one(tmp_path, name) for name in ("one", "two")]
+    gate = _gates(tmp_path, 'metric = "approaches.full"\nmin = 1.0')
+
+    assert "-o DIR" in _fails(capsys, "score", *runs, "--gate", gate)
+    argv = ["score", *map(str, runs), "--gate", gate, "-o", str(tmp_path / "all"), "-q"]
+    assert cli.run(argv) == 0
+    assert (tmp_path / "all" / "junit.xml").exists()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.text(min_size=1), st.text())
+def test_hostile_names_stay_names_in_junit(metric: str, suite: str) -> None:
+    gate = Gate.model_construct(metric=metric, min=0.5, max=None, use="value", least=1)
+    results = check_gates([gate], {metric: MetricValue(0.1)}, {})
+    root = ET.fromstring(junit_text(results, suite))
+
+    assert [one.tag for one in root.iter()] == ["testsuites", "testsuite", "testcase", "failure"]
+    assert root[0].get("tests") == root.get("failures") == "1"
+
+
+def test_control_characters_and_markup_are_shown_in_junit() -> None:
+    name = 'a"]]><x>\x1b[31m\x00\ud800\n'
+    gate = Gate.model_construct(metric=name, min=0.5, max=None, use="value", least=1)
+    text = junit_text(check_gates([gate], {name: MetricValue(0.9)}, {}), "suite")
+
+    assert "\x1b" not in text
+    assert "<x>" not in text
+    case = ET.fromstring(text).find(".//testcase")
+    assert case is not None
+    assert case.get("name") == 'a"]]><x>\\x1b[31m\\x00\\ud800\\n >= 0.5'
+
+
+def test_the_wider_of_two_intervals_is_the_one_that_gates_use() -> None:
+    tree = {"precision": {"value": 0.9, "low": 0.85, "high": 0.95, "clusters_low": 0.6,
+                          "clusters_high": None, "of": 50}}  # fmt: skip
+    values = metric_values(tree)
+
+    assert values["precision"] == MetricValue(0.9, 0.6, 0.95, 50)
+    assert values["precision.low"].value == 0.85
+    assert list(metric_values(tree, parts=False)) == ["precision"]
+
+
+def test_a_gate_file_is_bounded(tmp_path: Path) -> None:
+    path = tmp_path / "gates.toml"
+    path.write_text("#" * (1 << 20) + "\n")
+
+    with pytest.raises(UsageError, match="over 1 MiB"):
+        load_gates(path)
+
+
+def test_truth_of_another_log_is_refused_by_time_and_by_hash(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = _one(tmp_path)
+    late = approach(start_ns=at(1000), enter_ns=at(1040))
+    other = truth_folder(tmp_path / "other", truth([], [late], end=2000))
+    other.write_text(other.read_text().replace(f'"start_ns": {at(0)}', f'"start_ns": {at(900)}'))
+    hashed = truth_folder(tmp_path / "hashed")
+    tree = json.loads(hashed.read_text())
+    hashed.write_text(json.dumps(tree | {"log": "b.mcap", "log_sha256": {"b.mcap": "11"}}))
+
+    assert "another log or clock" in _fails(capsys, "score", run, "--truth", other)
+    assert "by its hash it belongs to another b.mcap" in _fails(
+        capsys, "score", run, "--truth", hashed
+    )
+    assert cli.run(["score", str(run), "--truth", str(hashed), "-q", "--any-log"]) == 0
+    hashed.write_text(json.dumps(tree | {"log_sha256": {"drive.mcap": "00"}}))
+    assert cli.run(["score", str(run), "--truth", str(hashed), "-q"]) == 0
+
+
+def test_an_approach_outside_the_log_is_refused_unless_only_a_part_was_replayed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    late = approach(id=1, start_ns=at(1000), enter_ns=at(1040))
+    truth_folder(tmp_path, truth([], [approach(), late], end=2000))
+    whole = run_folder(tmp_path / "whole", selection={"start_ns": None, "end_ns": None})
+    part = run_folder(tmp_path / "part", selection={"start_ns": None, "end_ns": at(50)})
+
+    assert "approach 1 from" in _fails(capsys, "score", whole.path)
+    assert cli.run(["score", str(part.path), "-q"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"approaches": "twice"}, "overlap"),
+        ({"cues": [{"cue": "stop_sing", "present": True, "t_ns": at(3)}]}, "meant: stop_sign"),
+        ({"cues": [{"cue": "stop_sign", "present": True, "t_ns": at(3000)}]}, "want times from"),
+        ({"ranges": "missing.csv"}, "missing.csv"),
+        ({"ranges": "../run/manifest.json"}, "manifest.json"),
+    ],
+)
+def test_truth_that_does_not_fit_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict[str, Any], said: str
+) -> None:
+    run = _one(tmp_path)
+    path = tmp_path / "one" / "truth.json"
+    tree = json.loads(path.read_text())
+    if change.get("approaches") == "twice":
+        change = {"approaches": [*tree["approaches"], tree["approaches"][0] | {"id": 1}]}
+    path.write_text(json.dumps(tree | change))
+
+    assert said in _fails(capsys, "score", run)
+
+
+@pytest.mark.parametrize(
+    "line", ["x,0,1,2", "5,9,1,2", "5,0,nan,2", "5,0,inf,2", "99999999999999999999,0,1,2", "5"]
+)
+def test_a_range_that_is_none_is_refused_with_its_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str
+) -> None:
+    run = _one(tmp_path)
+    (tmp_path / "one" / "ranges.csv").write_text(f"t_ns,approach,start_m,end_m\n{line}\n")
+
+    assert "ranges.csv:2" in _fails(capsys, "score", run)
+
+
+def test_runs_that_cannot_be_scored_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = _one(tmp_path)
+    manifest = run / "manifest.json"
+    whole = manifest.read_text()
+
+    manifest.write_text(whole.replace('"format_version": 2', '"format_version": 99'))
+    assert "format 99" in _fails(capsys, "score", run)
+    manifest.write_text(whole[:50])
+    assert "manifest.json: unreadable" in _fails(capsys, "score", run)
+    manifest.unlink()
+    assert "was cut short" in _fails(capsys, "score", run)
+    manifest.write_text(whole)
+    (run / "cues.parquet").write_bytes((run / "cues.parquet").read_bytes()[:-9])
+    assert "cues.parquet: damaged" in _fails(capsys, "score", run)
+
+
+def test_a_place_that_cannot_be_written_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = _one(tmp_path)
+    (run / "score").write_text("a file where a folder must be")
+
+    assert "score" in _fails(capsys, "score", run)
+
+
+def test_tables_of_another_version_are_refused_by_column(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth_folder(tmp_path)
+    belief = belief_table(BELIEF)
+    broken = {
+        "no column count": {"cues": cue_table(CUES).drop_columns(["count"])},
+        "outside 0 to 1": {"belief": belief_table({"left": {3: 1.5}})},
+        "want start or end": {"range": range_table(3, 9, reference="middle")},
+        "want whole numbers": {"belief": belief.set_column(0, "t_ns", belief["intersection"])},
+        "count -1": {"cues": cue_table({"stop_sign": {3: -1}})},
+    }
+    for i, (said, tables) in enumerate(broken.items()):
+        run = run_folder(tmp_path / f"run{i}", tables)
+        assert said in _fails(capsys, "score", run.path)
+
+
+def test_a_run_without_anything_to_score_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth_folder(tmp_path)
+    bare = run_folder(tmp_path / "bare", {"frames": frame_table(5)})
+    only_cues = run_folder(tmp_path / "cues", {"cues": cue_table(CUES)})
+
+    line = _fails(capsys, "score", bare.path)
+    assert "the run has no cues; the run has no belief; the run has no range" in line
+    assert cli.run(["score", str(only_cues.path)]) == 0
+    assert "not scored belief: the run has no belief" in capsys.readouterr().out
+
+
+def test_no_truth_anywhere_is_told_with_the_places_looked_at(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = run_folder(tmp_path / "run")
+
+    assert "give --truth" in _fails(capsys, "score", run.path)
+
+
+def test_merged_drives_are_not_scored_as_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth_folder(tmp_path)
+    run = run_folder(tmp_path / "merged", stage="merged")
+
+    assert "many drives merged" in _fails(capsys, "score", run.path)
+
+
+def _log_of(folder: Path, run: Path) -> list[dict[str, Any]]:
+    return [log_row(folder / "drive.mcap", RunFolder(run), folder.name)]
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_a_run_that_cannot_be_scored_does_not_stop_the_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], workers: str
+) -> None:
+    for name in ("a", "b", "c"):
+        truth_folder(tmp_path / "drives" / name)
+        run = tmp_path / "runs" / name
+        run_folder(run, logs=_log_of(tmp_path / "drives" / name, run))
+    (tmp_path / "runs" / "b" / "manifest.json").unlink()
+    argv = ["score", str(tmp_path / "runs"), "-o", str(tmp_path / "all"), "--workers", workers]
+
+    assert cli.run(argv) == 3
+    told = capsys.readouterr()
+    assert "runs/b: no manifest.json" in told.err
+    assert "failed     1 of 3 runs" in told.out
+    pooled = json.loads((tmp_path / "all" / "metrics.json").read_text())
+    assert [one["drive"][-6:] for one in pooled["coverage"]["by_drive"]] == ["runs/a", "runs/c"]
+    assert list(pooled["coverage"]["failed"]) == [str(tmp_path / "runs" / "b")]
+
+
+def test_two_runs_of_one_log_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth_folder(tmp_path)
+    runs = [str(run_folder(tmp_path / name).path) for name in ("a", "b")]
+
+    assert cli.run(["score", *runs]) == 0
+    assert "are runs of one log" in " ".join(capsys.readouterr().out.split())
+
+
+def test_neither_hash_seed_nor_zone_nor_locale_changes_a_byte(tmp_path: Path) -> None:
+    run = _one(tmp_path)
+    seen = []
+    for seed, zone, locale in (("0", "UTC", "C"), ("7", "Asia/Tokyo", "C.UTF-8")):
+        environment = os.environ | {"PYTHONHASHSEED": seed, "TZ": zone, "LC_ALL": locale}
+        command = [sys.executable, "-c", "from crosscue.eval.cli import main; main()", "score"]
+        subprocess.run([*command, str(run), "-q"], env=environment, check=True)
+        seen.append([path.read_bytes() for path in sorted((run / "score").iterdir())])
+    assert seen[0] == seen[1]
+
+
+def test_a_disk_that_fills_up_at_any_place_leaves_no_half_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = _one(tmp_path)
+    gate = _gates(tmp_path, 'metric = "approaches.full"\nmin = 1.0')
+    whole = os.fsync
+    for fails_at in range(1, 60):
+        calls = 0
+
+        def fsync(handle: int, fails_at: int = fails_at) -> None:
+            nonlocal calls
+            calls += 1
+            if calls == fails_at:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            whole(handle)
+
+        monkeypatch.setattr(os, "fsync", fsync)
+        status = cli.run(["score", str(run), "-q", "--gate", gate])
+        assert not list(run.rglob("*.partial"))
+        if status == 0:
+            break
+        assert status == 1
+        line = capsys.readouterr().err
+        assert "the disk is full" in line
+        assert line.count("\n") == 1
+    assert calls == fails_at - 1 >= 8
+
+
+def test_one_run_is_written_to_the_folder_asked_for_as_well(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, out = _one(tmp_path), tmp_path / "scored"
+
+    assert cli.run(["score", str(run), "-o", str(out)]) == 0
+    assert f"written to {out}" in capsys.readouterr().out.replace("\n", " ")
+    for name in ("metrics.json", "curves.parquet", "cue_frames.parquet"):
+        assert (out / name).read_bytes() == (run / "score" / name).read_bytes()
+    assert (out / "report.html").exists()

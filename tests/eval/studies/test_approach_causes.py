@@ -1,0 +1,179 @@
+"""Why an approach failed is read off its frames; what a condition costs, off the same place's."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from crosscue.eval.scoring.approaches import ApproachResult
+from crosscue.eval.scoring.cues import CueJudged
+from crosscue.eval.studies.intersections.causes import (
+    Finding,
+    approach_findings,
+    by_cause,
+    condition_costs,
+)
+
+FRAMES = 40
+DISTANCE_M = np.linspace(90.0, 0.0, FRAMES)
+FAR = int((DISTANCE_M >= 8.0).sum())
+
+
+def _result(**changes: object) -> ApproachResult:
+    usual = ApproachResult(
+        drive="runs/X-01", approach=0, intersection="X", control="stop_sign", conditions=("dusk",),
+        present=("intersection", "left"), run_approach=1, overlap_s=4.0, splits=0, steps=FRAMES,
+        detected_m=40.0, full_m=30.0, why_not_detected="", why_not_full="",
+        features_m={"intersection": 40.0, "left": 30.0}, false_features=(), at_entering={},
+    )  # fmt: skip
+    return replace(usual, **changes)  # type: ignore[arg-type]
+
+
+def _cue(
+    cue: str, *, found: int = 0, there: int = 0, visible: float = 1.0, approach: int = 0
+) -> CueJudged:
+    """Things there, and positives, in the first so many frames."""
+    first = np.arange(FRAMES)
+    return CueJudged(
+        drive="runs/X-01", cue=cue, t_ns=first.astype(np.int64),
+        count=(first < found).astype(np.int64), approach=np.full(FRAMES, approach, np.int64),
+        distance_m=DISTANCE_M, is_object=(first < there).astype(np.int8),
+        is_feature=np.ones(FRAMES, np.int8), true_count=np.ones(FRAMES, np.int64),
+        visible=np.full(FRAMES, visible), frames=FRAMES, moments_unmatched=0,
+        left_out={"object": {}, "feature": {}}, conditions={0: ("dusk",)},
+    )  # fmt: skip
+
+
+def _found(result: ApproachResult, *cues: CueJudged) -> list[Finding]:
+    return approach_findings(result, cues)
+
+
+NO_LEFT = _result(features_m={"intersection": 40.0, "left": None}, full_m=None)
+
+
+def test_an_approach_believed_in_time_has_no_finding() -> None:
+    assert _found(_result(), _cue("road_left", there=40)) == []
+
+
+def test_believed_only_at_the_intersection_is_late() -> None:
+    (one,) = _found(_result(features_m={"intersection": 40.0, "left": 5.0}), _cue("road_left"))
+
+    assert (one.failing, one.at_m, one.feature) == ("late", 5.0, "left")
+    assert one.conditions == ("dusk",)
+
+
+def test_what_no_cue_could_show() -> None:
+    (one,) = _found(NO_LEFT, _cue("road_left"), _cue("parked_left"))
+
+    assert one.cause == "nothing shows it"
+
+
+def test_what_is_covered_is_hidden_whatever_detectors_did() -> None:
+    (one,) = _found(NO_LEFT, _cue("road_left", there=30, visible=0.4))
+
+    assert one.cause == "hidden"
+    assert "30 frames" in one.told
+
+
+def test_what_is_in_plain_view_and_missed_is_laid_to_the_detectors() -> None:
+    (one,) = _found(NO_LEFT, _cue("road_left", there=30, found=4), _cue("parked_left", there=10))
+
+    assert one.cause == "not found"
+    assert "4 of 40" in one.told
+    assert "road left 4/30" in one.told
+    assert "parked left 0/10" in one.told
+
+
+def test_a_positive_where_nothing_is_does_not_count_as_finding_it() -> None:
+    (one,) = _found(
+        NO_LEFT, _cue("road_left", there=30, visible=0.4, found=30), _cue("parked_left", there=8)
+    )
+
+    assert one.cause == "not found"
+    assert "0 of 8" in one.told
+
+
+def test_a_louder_cue_that_rules_it_out_denies_it() -> None:
+    (one,) = _found(NO_LEFT, _cue("road_left", there=30, found=4), _cue("one_way_right", found=9))
+
+    assert one.cause == "denied"
+    assert "one way right" in one.told
+
+
+def test_found_but_never_counted_waits_for_presence() -> None:
+    result = _result(features_m={"intersection": None, "left": None}, detected_m=None)
+    cues = _cue("road_left", there=30, found=25), _cue("stop_sign", there=30, found=2)
+    one, other = _found(result, *cues)
+
+    assert (one.feature, one.cause) == ("intersection", "not found")
+    assert (other.feature, other.cause) == ("left", "waited for presence")
+
+
+def test_found_and_counted_but_not_believed_was_too_little() -> None:
+    (one,) = _found(NO_LEFT, _cue("road_left", there=30, found=25))
+
+    assert one.cause == "too little"
+
+
+def test_an_invented_feature_names_who_claimed_it() -> None:
+    result = _result(false_features=("straight",))
+    (one,) = _found(result, _cue("road_straight", found=12), _cue("lanes_past", found=1))
+
+    assert (one.failing, one.cause) == ("invented", "claimed wrongly")
+    assert one.told == f"road straight in 12 of {FAR}, lanes past in 1 of {FAR}"
+    assert one.at_m == pytest.approx(90.0)
+
+
+def test_frames_of_another_approach_or_at_the_intersection_itself_say_nothing() -> None:
+    other = _cue("road_left", there=40, found=40, approach=1)
+    near = replace(_cue("parked_left", there=40), distance_m=np.full(FRAMES, 5.0))
+    (one,) = _found(NO_LEFT, other, near)
+
+    assert one.cause == "nothing shows it"
+
+
+def test_causes_count_drives_not_features() -> None:
+    result = _result(features_m={"intersection": None, "left": None}, detected_m=None)
+    found = _found(result, _cue("road_left"), _cue("stop_sign"))
+
+    assert {cause: dict(places) for cause, places in by_cause(found).items()} == {
+        "nothing shows it": {"X": 1}
+    }
+
+
+def test_a_condition_costs_what_good_runs_at_the_same_place_had_more() -> None:
+    good = [_result(drive=f"{i}", conditions=("clear",), detected_m=40.0 + i) for i in range(2)]
+    bad = [
+        _result(conditions=("glare",), detected_m=30.0),
+        _result(conditions=("glare",), detected_m=None),
+    ]
+    elsewhere = _result(intersection="Y", conditions=("glare",), detected_m=1.0)
+    (cost,) = condition_costs([*good, *bad, elsewhere])
+
+    assert (cost.condition, cost.approaches, cost.undetected) == ("glare", 2, 1)
+    assert cost.detected_m.value == pytest.approx(30.0 - 40.5)
+    assert cost.full_m.value == pytest.approx(0.0)
+
+
+def test_what_always_holds_somewhere_does_not_hide_its_good_runs() -> None:
+    runs = [
+        _result(conditions=("clear", "occluded"), detected_m=30.0),
+        _result(conditions=("dusk", "occluded"), detected_m=20.0),
+    ]
+    (cost,) = condition_costs(runs)
+
+    assert cost.condition == "dusk"
+    assert cost.detected_m.value == pytest.approx(-10.0)
+
+
+def test_with_nothing_to_compare_nothing_is_claimed() -> None:
+    here = _result(conditions=("clear",))
+    there = _result(intersection="Y", conditions=("clear",))
+    lost = _result(intersection="Y", conditions=("rain",), detected_m=None)
+    (cost,) = condition_costs([here, there, lost])
+
+    assert math.isnan(cost.detected_m.value)
+    assert cost.undetected == 1

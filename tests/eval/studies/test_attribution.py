@@ -1,0 +1,72 @@
+"""What a cue was worth: nothing where it said nothing, everything where all came from it."""
+
+import math
+from collections.abc import Mapping
+
+import pytest
+
+from crosscue.eval.scoring.drives import as_metrics, judge, score
+from crosscue.eval.scoring.run_tables import RunTables
+from crosscue.eval.studies.attribution import Drive, attribute, attribution_lines, attribution_tree
+from crosscue.replay.files.run_folder import strict_json
+from support.scoring import BELIEF, CUES, belief_table, good_truth, range_table, tables
+
+Beliefs = Mapping[str, Mapping[int, float]]
+LATE: Beliefs = {**BELIEF, "right": {33: 0.92}}
+NEVER: Beliefs = {"intersection": {}, "left": {}, "right": {}, "straight": {}}
+
+
+def _tables(belief: Beliefs) -> RunTables:
+    return tables(CUES, belief_table(belief), range_table(8, 45, 0.5), frames=50)
+
+
+def _drive(name: str, by_cue: Mapping[str, Beliefs]) -> Drive:
+    """A drive whose belief changes when the cues named are left out."""
+    truth = good_truth(name)
+
+    def estimate(cues: frozenset[str], /) -> RunTables:
+        changed = [belief for cue, belief in by_cue.items() if cue in cues]
+        return _tables(changed[0] if changed else BELIEF)
+
+    return Drive(judge(_tables(BELIEF), truth), truth, estimate)
+
+
+GROUPS = {
+    "parked": ("parked_left", "parked_right"),
+    "stop_sign": ("stop_sign",),
+    "road": ("road_left",),
+}
+
+
+def test_a_cue_is_worth_the_metres_that_are_lost_without_it() -> None:
+    drives = [_drive(f"d{i}", {"parked_right": LATE, "stop_sign": NEVER}) for i in range(6)]
+    found = attribute(drives, GROUPS)
+
+    # Right comes in frame 25 (15 m) with parked cars, in frame 33 (7 m) without.
+    assert found["parked"].full_m.value == pytest.approx(8.0)
+    assert found["parked"].full_m.low == pytest.approx(8.0)
+    assert found["parked"].measures["approaches.full_m"].without == pytest.approx(7.0)
+    assert found["parked"].measures["approaches.full_from_8_m"].without == 0.0
+    assert found["parked"].belief["right"].verdict == "first"
+    assert found["stop_sign"].detected_only_with == found["stop_sign"].full_only_with == 6
+    assert math.isnan(found["stop_sign"].full_m.value)
+
+
+def test_a_cue_that_says_nothing_changes_nothing() -> None:
+    found = attribute([_drive("d", {})], GROUPS)
+
+    for one in found.values():
+        assert one.measures == {}
+        assert one.full_m.value == 0.0
+        assert one.belief["left"].log_score.value == 0.0
+
+
+def test_attribution_is_told_in_metrics_and_in_a_terminal() -> None:
+    drive = _drive("d", {"stop_sign": NEVER})
+    found = attribute([drive], GROUPS)
+    metrics = as_metrics(score([drive.judged])) | {"attribution": attribution_tree(found)}
+
+    assert '"detected_only_with": 1' in strict_json(metrics)
+    lines = attribution_lines(found)
+    assert max(map(len, lines)) <= 80
+    assert len(lines) == len(GROUPS) + 2

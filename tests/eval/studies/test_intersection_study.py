@@ -1,0 +1,120 @@
+"""The published experiment on simulated drives, small: flow, resumption, tables, bad input."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from crosscue.eval.batch.jobs import in_turn
+from crosscue.eval.cli import run
+from crosscue.eval.commands.study import intersections as study_intersections
+from crosscue.eval.pipeline.variants import GROUPS
+from crosscue.eval.studies.intersections import study as intersection_study
+from crosscue.eval.studies.intersections.tables import PUBLISHED_CUES, cue_rows
+from crosscue.replay.vehicle.vehicle import DetectorSection, RangeCurve, Ranges, Vehicle
+from crosscue.replay.vehicle.vehicle import load as load_vehicle
+
+ARGUMENTS = ("--layouts", "A,E", "--runs", "1", "--width", "320", "--detectors", "oracle")
+
+
+def _with_oracle(path: Path) -> Vehicle:
+    """The drive's vehicle file with detectors that know its truth: no network is needed."""
+    vehicle = load_vehicle(path)
+    oracle = DetectorSection(
+        kind="support.oracle:build", settings={"objects": str(path.parent / "objects.json")}
+    )
+    focal_px = vehicle.camera.focal_px
+    assert focal_px is not None
+    ranges = Ranges(
+        stop_sign=RangeCurve(parameters=(0.75 * focal_px,), residual_sd_m=2.0),
+        traffic_light=RangeCurve(parameters=(1.0 * focal_px,), residual_sd_m=6.0),
+    )
+    return vehicle.model_copy(update={"detectors": {"oracle": oracle}, "ranges": ranges})
+
+
+def _stay_here(patch: pytest.MonkeyPatch) -> None:
+    """No process of its own for a drive: it would not know of the patched detectors."""
+    patch.setattr(intersection_study, "load", _with_oracle)
+    patch.setattr(study_intersections, "engine_of", lambda *_args: in_turn)
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("study")
+    with pytest.MonkeyPatch.context() as patch:
+        _stay_here(patch)
+        assert run(["study", "intersections", "-o", str(out), *ARGUMENTS, "-q"]) == 0
+    return out
+
+
+def _tables(out: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((out / "study.json").read_text())
+    return found
+
+
+def test_the_tables_say_that_they_are_simulated_and_stand_beside_the_published(study: Path) -> None:
+    tables = _tables(study)
+
+    assert tables["is_simulated"] is True
+    assert tables["done"] == tables["wanted"] == 2
+    assert tables["published"] == {"detected_m": 34.4, "full_m": 16.2}
+    assert [row["intersection"] for row in tables["intersections"]] == ["A", "E"]
+    assert {row["cue"] for row in tables["attribution"]} == set(GROUPS)
+    page = (study / "study.html").read_text()
+    assert "simulated" in page
+    assert "http" not in page.replace("http-equiv", "")
+    assert (study / "detections.jpg").stat().st_size > 10_000
+
+
+def test_truth_told_as_detections_gives_right_cues(study: Path) -> None:
+    rows = {row["cue"]: row for row in _tables(study)["cues"]}
+
+    assert rows["stop sign"]["precision"] == rows["traffic light"]["precision"] == 1.0
+    assert rows["stop sign"]["positives"] > 20
+    assert rows["road"]["positives"] == 0
+
+
+def test_without_stop_signs_an_intersection_with_one_is_lost(study: Path) -> None:
+    rows = {row["cue"]: row for row in _tables(study)["attribution"]}
+
+    assert rows["stop_sign"]["detected_lost"] == 1
+    assert rows["lanes_past"]["detected_lost"] == 0
+
+
+def test_a_second_start_does_nothing_again(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = (study / "study.json").read_bytes()
+    _stay_here(monkeypatch)
+    monkeypatch.setattr(
+        intersection_study, "replay_drive", lambda *_args, **_more: pytest.fail("ran again")
+    )
+
+    assert run(["study", "intersections", "-o", str(study), *ARGUMENTS, "-q"]) == 0
+
+    assert (study / "study.json").read_bytes() == before
+
+
+def test_every_published_cue_has_a_row_even_without_a_single_detection() -> None:
+    assert [row["positives"] for row in cue_rows({})] == [0] * len(PUBLISHED_CUES)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--layouts", "A,Z"], "want some of A to H, each once"),
+        (["--layouts", "A,A"], "each once"),
+        (["--runs", "0"], "want 1 or more"),
+        (["--width", "100"], "multiple of 16"),
+        (["--workers", "0"], "want 1 or more"),
+    ],
+)
+def test_wrong_settings_are_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert run(["study", "intersections", "-o", str(tmp_path), *arguments]) == 2
+
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1

@@ -1,0 +1,415 @@
+"""Studies: the same bytes however they are driven, nothing driven twice, bad input named."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from crosscue.eval import cli
+from crosscue.eval.studies.intervals import (
+    logistic,
+    mean_of,
+    range_at,
+    ratio_of,
+    ratio_of_means,
+    share_of,
+)
+from crosscue.eval.studies.page import Table, write_page
+from crosscue.eval.studies.town import work
+from crosscue.eval.studies.town.field_study import drive_field, finish_field
+from crosscue.eval.studies.town.landmark_study import comparisons_of
+from crosscue.eval.studies.town.range_study import CALIBRATION_SEED, calibrate, summarise
+from crosscue.eval.studies.town.replayed import through_log
+from crosscue.eval.studies.town.settings import (
+    FieldStudy,
+    LandmarkStudy,
+    RangeStudy,
+    StudyFileError,
+    load_study,
+)
+from crosscue.eval.studies.town.whole import drive_study, finish_landmarks, finish_range
+from crosscue.eval.studies.town.work import WorkerError, assemble, chunks_of, run
+from crosscue.localization.town.kernel import Keys, drive_many
+from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
+from crosscue.localization.town.simulator import Result
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import RunError, UsageError
+from crosscue.replay.files.run_folder import RunFolder
+
+TOWN = Drive(city=City(largest_km2=2.0))
+SMALL = LandmarkStudy(
+    drives=3, drive=TOWN, densities_per_km2=(0.5, 5.0), detection_rates=(0.6,), points=()
+)
+
+
+@pytest.fixture(autouse=True)
+def _small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work, "CHUNK_DRIVES", 2)
+
+
+def study_bytes(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def whole(study: LandmarkStudy, folder: Path, workers: int = 1) -> Path:
+    assert list(drive_study(study, folder, workers))[-1] == 1.0
+    finish_landmarks(study, folder)
+    return folder
+
+
+def driven(study: LandmarkStudy, folder: Path, workers: int = 1) -> Path:
+    """Drives only: summaries and figures take longer than these drives."""
+    assert list(drive_study(study, folder, workers))[-1] == 1.0
+    return folder
+
+
+def counting(calls: list[int], fail_at: int | None = None) -> Callable[[Drive, Keys], Floats]:
+    def drive(settings: Drive, seeds: Keys) -> Floats:
+        calls.append(len(seeds))
+        if fail_at is not None and len(calls) >= fail_at:
+            raise MemoryError("the worker died here")
+        return drive_many(settings, seeds)
+
+    return drive
+
+
+def test_any_number_of_workers_gives_the_same_bytes(tmp_path: Path) -> None:
+    one = study_bytes(whole(SMALL, tmp_path / "one", workers=1))
+    three = study_bytes(whole(SMALL, tmp_path / "three", workers=3))
+
+    assert {"drives.parquet", "summary.json", "study.html", "landmarks_range.svg"} <= set(one)
+    assert one == three
+
+
+def test_a_study_goes_on_where_a_worker_died(tmp_path: Path) -> None:
+    chunks = chunks_of(SMALL.cases(), SMALL.drives, SMALL.seed)
+    with pytest.raises(WorkerError, match="finished chunks are kept"):
+        list(run(chunks, tmp_path / "a", 1, drive=counting([], fail_at=5)))
+    kept = len(list((tmp_path / "a/chunks").glob("*.parquet")))
+    calls: list[int] = []
+    list(run(chunks, tmp_path / "a", 1, drive=counting(calls)))
+    assemble(chunks, tmp_path / "a")
+    clean = driven(SMALL, tmp_path / "b")
+
+    assert kept == 4
+    assert len(calls) == len(chunks) - kept
+    a, b = (folder / "drives.parquet" for folder in (tmp_path / "a", clean))
+    assert a.read_bytes() == b.read_bytes()
+
+
+def test_a_killed_study_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    settings = tmp_path / "s.toml"
+    settings.write_text(
+        'version = 1\nkind = "landmarks"\ndrives = 600\ndensities_per_km2 = [1.0]\n'
+        'detection_rates = [0.6]\nstrategies = ["hybrid"]\npoints = []\n'
+    )
+    command = [sys.executable, "-c", "from crosscue.eval.cli import main; main()"]
+    command += ["study", "landmarks"]
+    command += ["--settings", str(settings), "--workers", "1", "-o", str(tmp_path / "killed")]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    for _ in range(1200):
+        if len(list((tmp_path / "killed/chunks").glob("[!.]*.parquet"))) >= 2:
+            break
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    study = load_study(settings, LandmarkStudy)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(work, "CHUNK_DRIVES", 100)
+        left = driven(study, tmp_path / "killed")
+        clean = driven(study, tmp_path / "clean")
+
+    assert process.returncode == -signal.SIGKILL
+    assert study_bytes(left) == study_bytes(clean)
+
+
+def test_a_damaged_chunk_is_driven_again(tmp_path: Path) -> None:
+    chunks = chunks_of(SMALL.cases(), SMALL.drives, SMALL.seed)
+    list(run(chunks, tmp_path, 1))
+    victim = tmp_path / "chunks" / f"{chunks[1].name}.parquet"
+    damaged = bytearray(victim.read_bytes())
+    damaged[len(damaged) // 3] ^= 0xFF
+    victim.write_bytes(damaged)
+    calls: list[int] = []
+    list(run(chunks, tmp_path, 1, drive=counting(calls)))
+
+    assert calls == [chunks[1].count]
+
+
+def test_a_larger_study_reuses_what_a_smaller_one_drove(tmp_path: Path) -> None:
+    few, more = (chunks_of(SMALL.cases(), drives, SMALL.seed) for drives in (4, 8))
+    list(run(few, tmp_path, 1))
+    calls: list[int] = []
+    list(run(more, tmp_path, 1, drive=counting(calls)))
+
+    assert len(calls) == len(more) - len(few)
+
+
+def test_ways_are_averaged_over_pairs_over_each_ones_own_goals_and_over_all() -> None:
+    study = SMALL.model_copy(update={"strategies": ("straight to goal", "hybrid"),
+                                     "densities_per_km2": (0.5,)})  # fmt: skip
+    ways = np.array([[1000.0, 2000.0, 9000.0], [1100.0, 2200.0, 12_000.0]])
+    outcomes = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    assert math.isnan(ratio_of_means(ways[0], outcomes[1], ways[1], outcomes[1]).value)
+    rows = [
+        {**dict.fromkeys(Result._fields, np.ones(3)), "travelled_m": way, "outcome": outcome}
+        for way, outcome in zip(ways, outcomes, strict=True)
+    ]
+    (found,) = comparisons_of(study, rows)
+
+    assert found.pairs == 2
+    assert found.extra.value == pytest.approx(0.1)
+    assert found.extra_reached.value == pytest.approx((15_300.0 / 3.0) / (3000.0 / 2.0) - 1.0)
+    assert found.extra_all.value == pytest.approx(15_300.0 / 12_000.0 - 1.0)
+
+
+def test_strategies_share_their_cities_and_conditions_do_not(tmp_path: Path) -> None:
+    table = RunFolder(driven(SMALL, tmp_path)).table("drives")
+    area = table["area_km2"].to_numpy().reshape(3, 2, SMALL.drives)
+
+    np.testing.assert_array_equal(area[0], area[1])
+    np.testing.assert_array_equal(area[0], area[2])
+    assert (area[0, 0] != area[0, 1]).all()
+    assert len(np.unique(table["seed"].to_numpy())) == 2 * SMALL.drives
+
+
+def test_a_folder_with_another_study_is_refused(tmp_path: Path) -> None:
+    whole(SMALL, tmp_path)
+    other = SMALL.model_copy(update={"seed": 9})
+
+    with pytest.raises(RunError, match="other settings"):
+        list(drive_study(other, tmp_path, 1))
+    list(drive_study(other, tmp_path, 1, overwrite=True))
+
+
+def test_ray_gives_the_same_bytes_and_tells_of_dead_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    chunks = chunks_of(SMALL.cases(), SMALL.drives, SMALL.seed)
+    list(run(chunks, tmp_path / "ray", 1, ray_address="local"))
+    assemble(chunks, tmp_path / "ray")
+    clean = driven(SMALL, tmp_path / "threads")
+    rays, threads = (folder / "drives.parquet" for folder in (tmp_path / "ray", clean))
+    assert rays.read_bytes() == threads.read_bytes()
+
+    monkeypatch.setattr(work, "_drive_chunk", lambda chunk: os._exit(1))
+    with pytest.raises(WorkerError, match="worker died"):
+        list(run(chunks, tmp_path / "dead", 1, ray_address="local"))
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('version = 1\nkind = "range"\n[drive.car]\ncruize_mps = 9.0\n', r":4: .*cruise_mps"),
+        (
+            'version = 1\nkind = "range"\ndrivs = 3\n',
+            r":3: drivs: no such key; did you mean drives",
+        ),
+        ('version = 1\nkind = "landmarks"\n', "want \"range\" here, got 'landmarks'"),
+        ('kind = "range"\n', "version: missing"),
+        ('version = 2\nkind = "range"\n', "version"),
+        ('version = 1\nkind = "range"\ndrives = 0\n', ":3: drives"),
+        ('version = 1\nkind = "range"\ncompass_2sigma_deg = [500.0]\n', ":3: compass_2sigma_deg"),
+        (
+            'version = 1\nkind = "range"\n[drive]\ngoals = 3\n',
+            r":4: drive\.goals: this study varies or fixes it itself",
+        ),
+        (
+            'version = 1\nkind = "range"\ncompass_2sigma_deg = []\nwithout_compass = false\n',
+            ":4: without_compass: .*nothing to drive",
+        ),
+        ("version = 1\nkind = \n", "not TOML"),
+    ],
+)
+def test_a_study_file_that_does_not_fit_is_named_with_its_line(
+    tmp_path: Path, text: str, told: str
+) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(text)
+
+    with pytest.raises(StudyFileError, match=told):
+        load_study(path, RangeStudy)
+
+
+def test_a_study_file_that_is_not_there_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["study", "range", "--settings", str(tmp_path / "none.toml")]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+
+
+def test_a_study_file_that_never_ends_is_not_read() -> None:
+    with pytest.raises(StudyFileError, match="/dev/zero: larger than"):
+        load_study(Path("/dev/zero"), RangeStudy)
+
+
+@pytest.mark.parametrize(
+    ("flag", "value"), [("--compass", "-5"), ("--rate", "1.5"), ("--landmarks", "101")]
+)
+def test_a_drive_that_cannot_be_names_its_flag(
+    tmp_path: Path, flag: str, value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["study", "drive", "-o", str(tmp_path), f"{flag}={value}"]) == 2
+    assert f"{flag} {value}" in capsys.readouterr().err
+
+
+def test_the_page_is_one_for_light_dark_and_small_screens(tmp_path: Path) -> None:
+    table = Table("<heading>", ("what", "km"), (("<b>", "1.0"),))
+    write_page(tmp_path / "p.html", "Title", ["a & b"], [table, table], [])
+    page = (tmp_path / "p.html").read_text()
+
+    assert "prefers-color-scheme:dark" in page
+    assert 'name="viewport"' in page
+    assert page.count('<div class="scroll"><table>') == page.count("<table>") == 2
+    assert "<b>" not in page
+    assert "default-src 'none'" in page
+    assert "http" not in page.replace("http-equiv", "")
+
+
+@pytest.mark.parametrize("density", [-1.0, 101.0, math.nan])
+def test_densities_out_of_range_are_refused(density: float) -> None:
+    with pytest.raises(ValidationError, match="densities_per_km2"):
+        LandmarkStudy(densities_per_km2=(density,))
+
+
+def test_rates_out_of_range_are_refused() -> None:
+    with pytest.raises(ValidationError, match="detection_rates"):
+        LandmarkStudy(detection_rates=(1.5,))
+
+
+def test_a_city_without_intersections_ends_the_study_in_one_line(tmp_path: Path) -> None:
+    blocks = City(
+        smallest_km2=0.25, largest_km2=0.25, shortest_block_m=900.0, longest_block_m=950.0
+    )
+    study = SMALL.model_copy(update={"drive": Drive(city=blocks)})
+
+    with pytest.raises(UsageError, match=r"no intersection.*drive\.city"):
+        list(drive_study(study, tmp_path, 1))
+
+
+@pytest.mark.parametrize("flags", [["--drives", "0"], ["--workers", "0"], ["--seed", "-3"]])
+def test_flags_out_of_range_are_refused(
+    tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["study", "range", "-o", str(tmp_path), *flags]) == 2
+    assert flags[0] in capsys.readouterr().err
+
+
+def test_the_command_prints_strict_json_and_no_progress_into_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = tmp_path / "s.toml"
+    settings.write_text(
+        'version = 1\nkind = "range"\ncompass_2sigma_deg = [60.0]\n'
+        "[drive.city]\nlargest_km2 = 2.0\n"
+    )
+    command = ["study", "range", "--settings", str(settings), "--drives", "4"]
+
+    assert cli.run([*command, "-o", str(tmp_path / "out"), "--json"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    found = json.loads(captured.out)
+    assert [r["drives"] for r in found["results"]] == [4, 4]
+    assert found["study"]["drive"]["city"]["largest_km2"] == 2.0
+
+
+def test_reported_seeds_are_not_those_of_the_calibration() -> None:
+    assert CALIBRATION_SEED not in (RangeStudy().seed, LandmarkStudy().seed, FieldStudy().seed)
+
+
+def test_the_default_compass_interval_is_the_calibrated_one() -> None:
+    default = Drive()
+
+    assert calibrate(default, 2, tolerance=0.01) == default.sensors.compass_interval_m
+
+
+def test_twenty_degrees_is_predicted_from_thirty(tmp_path: Path) -> None:
+    """The law r ds D: distances at loss are as the inverse squares of the compass's errors."""
+    study = RangeStudy(drives=120, compass_2sigma_deg=(20.0, 30.0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(work, "CHUNK_DRIVES", 60)
+        list(drive_study(study, tmp_path, 2))
+    finish_range(study, tmp_path)
+    twenty, thirty, none = summarise(study, RunFolder(tmp_path).table("drives"))
+
+    ratio = twenty.lost_after_m.value / thirty.lost_after_m.value
+    assert ratio == pytest.approx(2.25, rel=0.12)
+    assert thirty.lost_after_m.value > thirty.law_m
+    assert none.lost_after_m.value < 500.0
+
+
+def test_a_simulated_drive_goes_through_its_log(tmp_path: Path) -> None:
+    settings = Drive(
+        city=City(largest_km2=1.5),
+        landmarks_per_km2=20.0,
+        navigation=Navigation(strategy="landmark to landmark"),
+        sensors=Sensors(detection_rate=0.7),
+    )
+    done = through_log(tmp_path, settings, seed=9)
+    result, score = done.traced.result, done.score
+
+    assert done.is_whole
+    assert result.detected > 0
+    assert done.landmark_counts["accepted"] == result.detected
+    assert done.landmark_counts["frames"] == 2 * result.passed
+    assert score.distance_m == pytest.approx(result.travelled_m, rel=0.02)
+    assert score.major_axis_m == pytest.approx(result.major_axis_m, rel=0.35)
+    assert score.nees_xyh.mean < 15.0
+
+
+def test_field_runs_are_kept_and_not_driven_twice(tmp_path: Path) -> None:
+    study = FieldStudy(range_runs=1, landmark_runs=1, minutes=2.0)
+    first = [run for _, run in drive_field(study, tmp_path, 1)]
+    logs = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/drive.mcap")}
+    again = [run for _, run in drive_field(study, tmp_path, 1)]
+    finish_field(study, again, tmp_path)
+
+    assert first == again
+    assert {path: path.stat().st_mtime_ns for path in logs} == logs
+    assert [run.has_landmarks for run in first] == [False, True]
+    assert all(run.is_whole and run.minutes == pytest.approx(2.0, abs=0.01) for run in first)
+    with pytest.raises(RunError, match="other settings"):
+        list(drive_field(FieldStudy(minutes=3.0), tmp_path, 1))
+
+
+def test_a_logistic_curve_finds_the_one_it_was_drawn_from() -> None:
+    rng = np.random.default_rng(3)
+    x = rng.uniform(0.0, 12_000.0, 4000)
+    success = (rng.uniform(size=4000) < 1.0 / (1.0 + np.exp(-(8.0 - 1e-3 * x)))).astype(float)
+    a, b = logistic(x, success, np.ones((1, 4000)))
+    at_80 = range_at(x, success, 0.8)
+
+    assert a[0] == pytest.approx(8.0, rel=0.15)
+    assert b[0] == pytest.approx(-1e-3, rel=0.15)
+    assert at_80.low < 8000.0 - 1000.0 * math.log(4.0) < at_80.high
+
+
+def test_a_range_that_nobody_reached_the_end_of_is_beyond() -> None:
+    x = np.linspace(0.0, 5000.0, 50)
+
+    assert math.isinf(range_at(x, np.ones(50), 0.8).value)
+    assert range_at(x, np.zeros(50), 0.8).value == 0.0
+
+
+def test_intervals_hold_what_they_should() -> None:
+    rng = np.random.default_rng(1)
+    held = [(m := mean_of(rng.normal(5.0, 2.0, 60))).low < 5.0 < m.high for _ in range(400)]
+    ratio = ratio_of(rng.normal(1.3, 0.1, 300), rng.normal(1.0, 0.1, 300))
+
+    assert 0.91 < np.mean(held) < 0.98
+    assert ratio.low < 1.3 < ratio.high
+    assert share_of(8, 10).value == 0.8
+    assert share_of(0, 0).low == 0.0

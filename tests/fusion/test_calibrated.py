@@ -1,0 +1,264 @@
+"""Messages that were learned: what a look says, what repeats say, and how well the fit recovers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.fusion.approaches import Approaches
+from crosscue.fusion.belief import Situation, source_speaker
+from crosscue.fusion.calibrated import CalibratedSpeaker, voices_of
+from crosscue.fusion.factor_graph import graph_of
+from crosscue.fusion.independence import independent_share
+from crosscue.fusion.message_fit import fit_messages, log_odds_of
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.vehicle.fusion import Calibrated, Fade, Fusion, RangeFilter, Rates
+from crosscue.replay.vehicle.vehicle import parse
+from support.fusion import FADE_M, RATES, annotated, drive, situation
+
+GRAPH = graph_of(Fusion())
+LEFT = GRAPH.feature_names.index("left")
+P, Q, FADE = 0.6, 0.1, 5.0
+LEARNED = Calibrated(
+    fades={"road_left": Fade(way_m=FADE), "cross_traffic_left": Fade(time_s=2.0)},
+    rates=tuple(
+        Rates(cue=cue, feature="left", near=near, if_there=P, if_not=Q)
+        for cue in ("road_left", "cross_traffic_left", "parked_left")
+        for near in (False, True)
+    ),
+)
+
+
+def said(*looks: Situation, learned: Calibrated = LEARNED) -> list[float]:
+    """What each look adds to the log odds of left."""
+    speaker = CalibratedSpeaker(len(GRAPH.features), voices_of(GRAPH, learned))
+    return [speaker(look)[LEFT] for look in looks]
+
+
+def road(count: int, moved_m: float = 1.0) -> Situation:
+    return situation({"road_left": count}, moved_m=moved_m)
+
+
+def test_the_first_look_says_the_whole_likelihood_ratio() -> None:
+    assert said(road(1)) == [pytest.approx(math.log(P / Q))]
+    assert said(road(0)) == [pytest.approx(math.log((1 - P) / (1 - Q)))]
+
+
+def test_a_look_that_stays_says_what_the_chain_says() -> None:
+    rho = math.exp(-1.0 / FADE)
+
+    _, stays = said(road(1), road(1))
+    _, stays_away = said(road(0), road(0))
+
+    assert stays == pytest.approx(math.log((P + (1 - P) * rho) / (Q + (1 - Q) * rho)))
+    assert stays_away == pytest.approx(math.log((1 - P * (1 - rho)) / (1 - Q * (1 - rho))))
+
+
+def test_a_cue_that_appears_says_the_whole_ratio_however_soon() -> None:
+    assert said(road(0), road(1, 0.1))[1] == pytest.approx(math.log(P / Q))
+
+
+def test_looks_far_apart_are_independent() -> None:
+    assert said(road(1), road(1, 500.0))[1] == pytest.approx(math.log(P / Q))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(0, 3), min_size=1, max_size=30))
+def test_a_car_that_stands_hears_each_change_once_and_nothing_else(counts: list[int]) -> None:
+    still = [situation({"road_left": min(count, 1)}, moved_m=0.0) for count in counts]
+
+    total = sum(said(road(1), *still))
+
+    gone = math.log((1 - P) / (1 - Q))
+    assert total == pytest.approx(math.log(P / Q) + (gone if 0 in counts else 0.0))
+
+
+def test_a_picture_seen_before_says_nothing() -> None:
+    same = situation({"road_left": 1}, new_picture=False)
+
+    assert said(road(1), same, same)[1:] == [0.0, 0.0]
+
+
+def test_a_new_thing_speaks_anew_and_one_seen_before_does_not() -> None:
+    def parked(*ids: int) -> Situation:
+        return situation({"parked_left": len(ids)}, objects={"parked_left": ids}, moved_m=0.0)
+
+    first, again, other, first_again = said(parked(1), parked(1), parked(1, 2), parked(1))
+
+    assert first == other == pytest.approx(math.log(P / Q))
+    assert again == first_again == 0.0
+
+
+def test_without_identities_more_things_than_ever_are_new_ones() -> None:
+    one, two, one_again, two_again = said(
+        *(situation({"parked_left": n}, moved_m=0.0) for n in (1, 2, 1, 2))
+    )
+
+    assert one == two == pytest.approx(math.log(P / Q))
+    assert one_again == two_again == 0.0
+
+
+def test_what_moves_by_itself_is_heard_again_after_a_time_though_the_car_stands() -> None:
+    def traffic(passed_s: float) -> Situation:
+        return situation({"cross_traffic_left": 1}, moved_m=0.0, passed_s=passed_s)
+
+    _, soon, late = said(traffic(0.0), traffic(0.1), traffic(60.0))
+
+    assert 0.0 < soon < 0.2
+    assert late == pytest.approx(math.log(P / Q))
+
+
+def test_an_edge_of_which_nothing_was_learned_sends_the_published_message_discounted() -> None:
+    speaker = CalibratedSpeaker(len(GRAPH.features), voices_of(GRAPH, LEARNED))
+    sign = situation({"stop_sign": 1}, moved_m=2.0)
+    published = math.log(0.97 / 0.03)
+
+    first, second = (speaker(sign)[0] for _ in range(2))
+
+    assert first == pytest.approx(published)
+    assert second == pytest.approx(published * independent_share(2.0 / 10.0))
+
+
+def test_a_features_exponent_scales_all_it_hears() -> None:
+    half = LEARNED.model_copy(update={"exponents": {"left": 0.5}})
+    looks = (road(1), road(1), situation({"one_way_right": 1}))
+
+    assert said(*looks, learned=half) == pytest.approx([0.5 * x for x in said(*looks)])
+
+
+def test_the_gate_holds_for_learned_messages_too() -> None:
+    shut = situation({"parked_left": 3, "road_left": 0}, established=False)
+
+    assert said(shut) == [pytest.approx(math.log((1 - P) / (1 - Q)))]
+
+
+def test_each_approach_begins_to_listen_anew() -> None:
+    fusion = Fusion(kind="calibrated", calibrated=LEARNED)
+    loop = Approaches(GRAPH, fusion, RangeFilter())
+    seen = {"stop_sign": (60.0, 1), "road_left": (25.0, 1)}
+
+    first = [loop(one).probabilities for one in drive(70.0, -20.0, seen)]
+    second = [loop(one).probabilities for one in drive(70.0, -20.0, seen, begin_ns=10**12)]
+
+    assert first == [pytest.approx(one) for one in second]
+    assert loop.counts["approaches opened"] == 2
+
+
+def test_probabilities_stay_inside_whatever_was_learned() -> None:
+    sure = Calibrated(
+        rates=(
+            Rates(cue="road_left", feature="left", near=False, if_there=1 - 1e-12, if_not=1e-12),
+        )
+    )
+    fusion = Fusion(kind="calibrated", calibrated=sure)
+    loop = Approaches(GRAPH, fusion, RangeFilter())
+
+    steps = [loop(one) for one in drive(90.0, -10.0, {"road_left": (80.0, 1)})]
+
+    assert all(0.0 < p < 1.0 for step in steps for p in step.probabilities.values())
+
+
+def test_the_fit_finds_the_rates_that_the_looks_were_drawn_with() -> None:
+    fit = fit_messages(annotated(1, 150), GRAPH)
+
+    for one in fit.rates:
+        if one.rates is not None:
+            wanted = RATES[one.cue]
+            found = (one.rates.if_there, one.rates.if_not)
+            for rate, side, share in zip(wanted, (one.there, one.missing), found, strict=True):
+                four_sd = 4 * math.sqrt(rate * (1 - rate) / side.looks)
+                assert share == pytest.approx(rate, abs=four_sd)
+    learned = {(one.cue, one.feature) for one in fit.calibrated.rates}
+    assert learned == {
+        ("road_left", "left"), ("parked_left", "left"), ("road_straight", "straight"),
+    }  # fmt: skip
+
+
+def test_the_fit_finds_the_fade_that_the_looks_were_drawn_with() -> None:
+    fit = fit_messages(annotated(2, 400), GRAPH)
+
+    for one in fit.fades:
+        if one.is_learned:
+            # ten metres a second, so way and time tell the same here
+            scale_m = one.fade.way_m or (one.fade.time_s or 0.0) * 10.0
+            assert scale_m == pytest.approx(FADE_M, rel=0.35)
+    assert sum(one.is_learned for one in fit.fades) == 3
+
+
+def test_independent_cues_need_no_exponent() -> None:
+    exponents = fit_messages(annotated(3, 200), GRAPH).calibrated.exponents
+
+    assert set(exponents) == {"left", "straight"}
+    assert all(0.7 <= value <= 1.0 for value in exponents.values())
+
+
+def test_cues_that_repeat_each_other_get_an_exponent() -> None:
+    twins = annotated(4, 200)
+    for one in twins:
+        assert isinstance(one.counts, dict)
+        one.counts["parked_left"] = one.counts["road_left"]
+        one.counts["cross_traffic_left"] = one.counts["road_left"]
+
+    assert fit_messages(twins, GRAPH).calibrated.exponents["left"] < 0.6
+
+
+def test_on_simulated_approaches_not_learned_from_it_scores_better_than_the_source() -> None:
+    learned = fit_messages(annotated(5, 100), GRAPH).calibrated
+    ours = theirs = 0.0
+    for one in annotated(6, 100):
+        is_left = one.features["left"]
+        odds = log_odds_of(one, GRAPH, learned)[:, LEFT]
+        ours += float(np.logaddexp(0.0, -odds if is_left else odds).mean())
+        speaker = source_speaker(GRAPH, 0.49)
+        frames = range(len(one.way_m))
+        looks = ({cue: int(n[i]) for cue, n in one.counts.items()} for i in frames)
+        messages = [
+            speaker(situation(look, near=bool(one.is_near[i]))) for i, look in enumerate(looks)
+        ]
+        source = np.cumsum(np.array(messages), axis=0)[:, LEFT]
+        theirs += float(np.logaddexp(0.0, -source if is_left else source).mean())
+
+    assert ours < 0.5 * theirs
+
+
+def test_without_approaches_that_lack_a_feature_nothing_is_learned_of_it() -> None:
+    always = [one for one in annotated(7, 60) if one.features["left"]]
+
+    fit = fit_messages(always, GRAPH)
+
+    assert "left" not in fit.calibrated.exponents
+    assert not any(one.feature == "left" for one in fit.calibrated.rates)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("kind = 'calibrated'", "needs .fusion.calibrated.; make it with: crosscue fit messages"),
+        ("calibrated.fades = { road_lft = { way_m = 3.0 } }", r"did you mean road_left\?"),
+        ("calibrated.fades = { road_left = { way_m = 3.0, time_s = 1.0 } }", "either way_m or"),
+        ("calibrated.fades = { road_left = {} }", "either way_m or"),
+        (
+            "calibrated.exponents = { lft = 0.5 }",
+            "no 'lft' .did you mean left",
+        ),
+        (
+            "calibrated.rates = [{ cue = 'road_left', feature = 'right', near = true, "
+            "if_there = 0.5, if_not = 0.5 }]",
+            "road_left and right are not joined",
+        ),
+        (
+            "calibrated.rates = ["
+            + "{ cue = 'road_left', feature = 'left', near = true, if_there = 0.5, if_not = 0.4 },"
+            * 2
+            + "]",
+            "road_left and left stand twice",
+        ),
+    ],
+)
+def test_what_cannot_have_been_learned_is_refused(text: str, match: str) -> None:
+    with pytest.raises(VehicleError, match=match):
+        parse(f"version = 1\n[fusion]\n{text}", "car.toml")

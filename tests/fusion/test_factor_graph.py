@@ -1,0 +1,284 @@
+"""Messages and marginals against the equation, enumeration of all cases, and a library."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from random import Random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.detectors.cues.names import Cue
+from crosscue.fusion.belief import Belief, begin, establish, multiply, probabilities, source_speaker
+from crosscue.fusion.factor_graph import (
+    CueNode,
+    Edge,
+    FactorGraph,
+    Feature,
+    graph_of,
+    log_odds,
+    probability,
+)
+from crosscue.replay.vehicle.fusion import CUES, Fusion
+from support.fusion import graphs, graphs_heard, other_side, situation
+
+FEW = settings(max_examples=60, deadline=None)
+USUAL = graph_of(Fusion())
+DISSENT = 0.49
+
+
+def heard(
+    graph: FactorGraph, frames: Iterable[Mapping[str, int]], *, near: bool = False
+) -> dict[str, float]:
+    """Probabilities of an established approach after some frames."""
+    speaker = source_speaker(graph, DISSENT)
+    belief = begin(graph)
+    for counts in frames:
+        belief = multiply(belief, speaker(situation(counts, near=near)))
+    return probabilities(belief, graph)
+
+
+def enumerated(graph: FactorGraph, frames: Sequence[Mapping[str, int]]) -> dict[str, float]:
+    """Marginals from the weight of every assignment of all features, in plain probabilities."""
+    names = graph.feature_names
+    weights: dict[tuple[bool, ...], float] = {}
+    for truth in itertools.product((False, True), repeat=len(names)):
+        is_there = dict(zip(names, truth, strict=True))
+        weight = math.prod(f.prior if is_there[f.name] else 1.0 - f.prior for f in graph.features)
+        for cue, edge, times in sent(graph, frames):
+            is_agreed = is_there[edge.feature] == edge.is_direct
+            weight *= (cue.precision if is_agreed else 1.0 - cue.precision) ** times
+        weights[truth] = weight
+    total = sum(weights.values())
+    return {
+        name: sum(w for truth, w in weights.items() if truth[i]) / total
+        for i, name in enumerate(names)
+    }
+
+
+def sent(
+    graph: FactorGraph, frames: Iterable[Mapping[str, int]]
+) -> Iterable[tuple[CueNode, Edge, int]]:
+    """Every cue's detections along every edge."""
+    cues = {cue.name: cue for cue in graph.cues}
+    for counts in frames:
+        for edge in graph.edges:
+            cue, count = cues[edge.cue], counts.get(edge.cue, 0)
+            if count:
+                yield cue, edge, count if cue.counted else 1
+
+
+@FEW
+@given(graphs_heard())
+def test_enumerating_all_cases_comes_to_the_same(
+    case: tuple[FactorGraph, list[dict[str, int]]],
+) -> None:
+    graph, frames = case
+
+    assert heard(graph, frames) == pytest.approx(enumerated(graph, frames), rel=1e-9, abs=1e-12)
+
+
+@FEW
+@given(graphs_heard())
+def test_gtsams_discrete_factor_graph_comes_to_the_same(
+    case: tuple[FactorGraph, list[dict[str, int]]],
+) -> None:
+    gtsam = pytest.importorskip("gtsam", reason="this check needs the optional package gtsam")
+    graph, frames = case
+    keys = {name: (gtsam.symbol("f", i), 2) for i, name in enumerate(graph.feature_names)}
+    theirs = gtsam.DiscreteFactorGraph()
+    for feature in graph.features:
+        theirs.add(keys[feature.name], [1.0 - feature.prior, feature.prior])
+    for cue, edge, times in sent(graph, frames):
+        yes = cue.precision if edge.is_direct else 1.0 - cue.precision
+        for _ in range(times):
+            theirs.add(keys[edge.feature], [1.0 - yes, yes])
+    marginals = gtsam.DiscreteMarginals(theirs)
+    expected = {name: marginals.marginalProbabilities(key)[1] for name, key in keys.items()}
+
+    assert heard(graph, frames) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+@FEW
+@given(graphs_heard(), st.randoms(use_true_random=False))
+def test_order_does_not_matter(
+    case: tuple[FactorGraph, list[dict[str, int]]],
+    random: Random,
+) -> None:
+    graph, frames = case
+    mixed = list(frames)
+    random.shuffle(mixed)
+
+    assert heard(graph, mixed) == pytest.approx(heard(graph, frames), rel=1e-9)
+
+
+def test_order_does_not_matter_even_beyond_the_limit_of_what_is_shown() -> None:
+    for_it, against = [{"stop_sign": 1}] * 500, [{"do_not_enter": 1}] * 500
+    graph = FactorGraph(
+        (Feature("intersection"),),
+        (CueNode("stop_sign", 0.97), CueNode("do_not_enter", 0.95)),
+        (Edge("stop_sign", "intersection"), Edge("do_not_enter", "intersection", False)),
+    )
+
+    there, back = heard(graph, for_it + against), heard(graph, against + for_it)
+
+    assert there["intersection"] == back["intersection"] > 0.5
+
+
+@FEW
+@given(graphs_heard(), st.integers(0, 5))
+def test_cues_not_looked_for_or_not_found_change_nothing_far_away(
+    case: tuple[FactorGraph, list[dict[str, int]]], idle: int
+) -> None:
+    graph, frames = case
+    nothing: list[dict[str, int]] = [{}, {cue.name: 0 for cue in graph.cues}]
+
+    assert heard(graph, [*frames, *nothing * idle]) == heard(graph, frames)
+
+
+@FEW
+@given(graphs(), st.integers(1, 100_000), st.booleans())
+def test_no_number_of_messages_makes_a_probability_leave_the_open_interval(
+    graph: FactorGraph, many: int, near: bool
+) -> None:
+    for counts in ({c.name: many for c in graph.cues}, {c.name: 0 for c in graph.cues}):
+        now = heard(graph, [counts] * 20, near=near)
+        assert all(0.0 < p < 1.0 for p in now.values())
+
+
+@given(st.floats(allow_nan=False))
+def test_log_odds_of_any_size_are_a_probability(odds: float) -> None:
+    assert 0.0 < probability(odds) < 1.0
+
+
+@given(st.floats(1e-12, 1.0 - 1e-12))
+def test_log_odds_and_probability_are_each_others_inverse(p: float) -> None:
+    assert probability(log_odds(p)) == pytest.approx(p, rel=1e-9)
+
+
+@pytest.mark.parametrize("bad", [0.0, 1.0, -0.1, math.nan])
+def test_certainty_has_no_log_odds(bad: float) -> None:
+    with pytest.raises(ValueError, match="want inside"):
+        log_odds(bad)
+
+
+@FEW
+@given(
+    st.lists(
+        st.dictionaries(st.sampled_from([cue.value for cue in Cue]), st.integers(0, 3)), max_size=6
+    ),
+    st.booleans(),
+)
+def test_in_the_mirror_left_and_right_change_places(
+    frames: list[dict[str, int]], near: bool
+) -> None:
+    mirrored = [{other_side(cue): n for cue, n in counts.items()} for counts in frames]
+
+    seen = heard(USUAL, frames, near=near)
+    seen_in_mirror = heard(USUAL, mirrored, near=near)
+
+    assert {other_side(name): p for name, p in seen.items()} == pytest.approx(seen_in_mirror)
+
+
+def test_eq_18_is_the_normalised_product_of_messages() -> None:
+    # two parked cars and one road: 0.83^2 * 0.77 against 0.17^2 * 0.23
+    yes, no = 0.83**2 * 0.77, 0.17**2 * 0.23
+
+    now = heard(USUAL, [{"parked_left": 2, "road_left": 1}])
+
+    assert now["left"] == pytest.approx(yes / (yes + no))
+    assert now["right"] == pytest.approx(0.5)
+
+
+def test_a_counted_cue_sends_one_message_for_each_detection_another_one_for_each_frame() -> None:
+    twice = heard(USUAL, [{"parked_left": 1, "stop_sign": 1}] * 2)
+    at_once = heard(USUAL, [{"parked_left": 2, "stop_sign": 2}])
+
+    assert at_once["left"] == pytest.approx(twice["left"])
+    assert at_once["intersection"] == pytest.approx(0.97)
+    assert twice["intersection"] > 0.99
+
+
+def test_an_exclusive_edge_sends_the_reverse() -> None:
+    now = heard(USUAL, [{"one_way_right": 1, "do_not_enter": 1}])
+
+    assert now["left"] == pytest.approx(0.05)
+    assert now["right"] == pytest.approx(0.95)
+    assert now["straight"] == pytest.approx(0.05)
+
+
+def test_near_by_absent_direct_cues_of_directions_dissent_and_signs_do_not() -> None:
+    absent = heard(USUAL, [{cue.value: 0 for cue in Cue}], near=True)
+
+    three = 0.49**3 / (0.49**3 + 0.51**3)
+    assert absent == pytest.approx(
+        {"intersection": 0.5, "left": three, "right": three, "straight": three}
+    )
+
+
+def test_before_presence_is_established_only_four_cues_speak() -> None:
+    speaker = source_speaker(USUAL, DISSENT)
+
+    speaking = {
+        cue.value for cue in Cue if any(speaker(situation({cue.value: 1}, established=False)))
+    }
+
+    assert speaking == {"traffic_light", "stop_sign", "road_left", "road_right"}
+
+
+@pytest.mark.parametrize(
+    ("odds", "expected"),
+    [((2.3, 0, 0, 0), True), ((0, 2.3, 0, 0), True), ((0, 0, 2.3, 0), True), ((0, 0, 0, 9), False)],
+)
+def test_presence_is_established_by_intersection_left_or_right(
+    odds: tuple[float, float, float, float], expected: bool
+) -> None:
+    assert establish(Belief(odds), USUAL, 0.9).is_established is expected
+
+
+def test_presence_once_established_stays_so() -> None:
+    assert establish(Belief((-5.0, -5.0, -5.0, -5.0), True), USUAL, 0.9).is_established
+
+
+def test_the_usual_graph_falls_into_three_parts_as_the_source_says() -> None:
+    parts = [{name} for name in USUAL.feature_names]
+    for cue in USUAL.cues:
+        ends = {edge.feature for edge in USUAL.edges if edge.cue == cue.name}
+        touched = [part for part in parts if part & ends]
+        parts = [part for part in parts if not part & ends] + [set().union(*touched)]
+
+    assert sorted(map(sorted, parts)) == [["intersection"], ["left", "right"], ["straight"]]
+
+
+def test_the_usual_graph_has_every_cue_that_detectors_give() -> None:
+    assert set(CUES) == {cue.value for cue in Cue}
+
+
+def test_a_cue_left_out_is_gone_and_the_rest_stays() -> None:
+    less = USUAL.without("stop_sign")
+
+    assert {c.name for c in USUAL.cues} - {c.name for c in less.cues} == {"stop_sign"}
+    assert heard(less, [{"stop_sign": 1, "road_left": 1}])["intersection"] == 0.5
+    with pytest.raises(ValueError, match="no cue 'stop_sgn'; there are: stop_sign"):
+        USUAL.without("stop_sgn")
+
+
+@pytest.mark.parametrize(
+    ("edges", "match"),
+    [
+        ((Edge("z", "nowhere"),), "no feature 'nowhere'; there are: f"),
+        ((Edge("nobody", "f"),), "no cue 'nobody'; there are: z"),
+        ((Edge("z", "f"), Edge("z", "f", False)), "joined twice"),
+    ],
+)
+def test_edges_that_lead_nowhere_are_refused(edges: tuple[Edge, ...], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        FactorGraph((Feature("f"),), (CueNode("z", 0.9),), edges)
+
+
+def test_a_name_that_stands_twice_is_refused() -> None:
+    with pytest.raises(ValueError, match="feature 'f' stands twice"):
+        FactorGraph((Feature("f"), Feature("f")), (), ())

@@ -1,0 +1,247 @@
+"""The scalar filter against answers worked out by hand, an independent library, and chance."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.fusion.intersection_range import RangeBelief, initialise, nis, predict, update
+from crosscue.fusion.range_track import NOTHING, RangeTrack, Verdict, advance, go_blind, measure
+from crosscue.replay.vehicle.fusion import RangeFilter
+
+METRES = st.floats(-200.0, 200.0)
+VARIANCES = st.floats(0.01, 400.0)
+FEW = settings(max_examples=60, deadline=None)
+
+
+def test_eq_8_the_way_gone_comes_off_the_range() -> None:
+    assert predict(RangeBelief(40.0, 2.0), 1.5, 0.1).mean_m == pytest.approx(38.5)
+
+
+def test_eq_8_reversing_adds_to_the_range() -> None:
+    assert predict(RangeBelief(40.0, 2.0), -1.5, 0.1).mean_m == pytest.approx(41.5)
+
+
+def test_eq_9_odometry_noise_adds_to_the_variance() -> None:
+    assert predict(RangeBelief(40.0, 2.0), 1.5, 0.1).var_m2 == pytest.approx(2.1)
+
+
+def test_eq_10_and_11_the_gain_shares_out_the_innovation() -> None:
+    # K = 6 / (6 + 2) = 0.75; 20 + 0.75 * (24 - 20) = 23
+    assert update(RangeBelief(20.0, 6.0), 24.0, 2.0).mean_m == pytest.approx(23.0)
+
+
+def test_eq_12_the_variance_shrinks_by_the_gain() -> None:
+    assert update(RangeBelief(20.0, 6.0), 24.0, 2.0).var_m2 == pytest.approx(1.5)
+
+
+def test_the_first_measurement_is_the_belief() -> None:
+    assert initialise(31.0, 2.9) == RangeBelief(31.0, 2.9)
+
+
+def test_the_innovation_is_judged_against_both_variances() -> None:
+    assert nis(RangeBelief(20.0, 6.0), 24.0, 2.0) == pytest.approx(2.0)
+
+
+@FEW
+@given(METRES, VARIANCES, st.lists(st.tuples(METRES, VARIANCES), min_size=1, max_size=6))
+def test_order_of_measurements_does_not_matter(
+    mean_m: float, var_m2: float, seen: list[tuple[float, float]]
+) -> None:
+    there = back = RangeBelief(mean_m, var_m2)
+    for one, other in zip(seen, reversed(seen), strict=True):
+        there, back = update(there, *one), update(back, *other)
+
+    np.testing.assert_allclose(there, back, rtol=1e-9, atol=1e-9)
+
+
+@FEW
+@given(METRES, VARIANCES, METRES, VARIANCES)
+def test_a_measurement_leaves_the_belief_surer_than_either(
+    mean_m: float, var_m2: float, measured_m: float, sensor_var_m2: float
+) -> None:
+    after = update(RangeBelief(mean_m, var_m2), measured_m, sensor_var_m2)
+
+    assert 0.0 < after.var_m2 <= min(var_m2, sensor_var_m2) * (1.0 + 1e-9)
+    assert min(mean_m, measured_m) - 1e-9 <= after.mean_m <= max(mean_m, measured_m) + 1e-9
+
+
+@FEW
+@given(st.lists(st.tuples(METRES, VARIANCES, st.none() | METRES, VARIANCES), max_size=20))
+def test_filterpy_comes_to_the_same(steps: list[tuple[float, float, float | None, float]]) -> None:
+    theirs = _filterpy(50.0, 9.0)
+    ours = RangeBelief(50.0, 9.0)
+    for travelled_m, odometry_var_m2, measured_m, sensor_var_m2 in steps:
+        theirs.predict(u=np.array([travelled_m]), Q=np.array([[odometry_var_m2]]))
+        ours = predict(ours, travelled_m, odometry_var_m2)
+        if measured_m is not None:
+            theirs.update(np.array([measured_m]), R=np.array([[sensor_var_m2]]))
+            ours = update(ours, measured_m, sensor_var_m2)
+
+    np.testing.assert_allclose(ours, (theirs.x[0], theirs.P[0, 0]), rtol=1e-9, atol=1e-9)
+
+
+def _filterpy(mean_m: float, var_m2: float) -> Any:
+    from filterpy.kalman import KalmanFilter
+
+    theirs = KalmanFilter(dim_x=1, dim_z=1, dim_u=1)
+    theirs.x, theirs.P = np.array([mean_m]), np.array([[var_m2]])
+    theirs.F, theirs.B, theirs.H = np.eye(1), -np.eye(1), np.eye(1)
+    return theirs
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan])
+def test_a_sensor_that_claims_certainty_is_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="sensor_var_m2"):
+        update(RangeBelief(30.0, 4.0), 26.0, bad)
+    with pytest.raises(ValueError, match="sensor_var_m2"):
+        initialise(26.0, bad)
+
+
+@pytest.mark.parametrize("bad", [-1.0, math.nan])
+def test_odometry_that_makes_surer_is_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="odometry_var_m2"):
+        predict(RangeBelief(30.0, 4.0), 1.0, bad)
+
+
+def test_errors_are_as_large_as_the_filter_says() -> None:
+    rng = np.random.default_rng(seed=11)
+    runs = 2000
+    nees = []
+    for _ in range(runs):
+        truth_m = float(rng.uniform(40.0, 80.0))
+        track = NOTHING
+        for _ in range(30):
+            truth_m -= 1.0
+            track = advance(track, 1.0 + rng.normal(0.0, 0.1), 0.01, RangeFilter())
+            if rng.random() < 0.5:
+                seen_m = truth_m + rng.normal(0.0, 1.7)
+                track, _ = measure(
+                    track, seen_m, 1.7**2, RangeFilter(gate_nis=None, fade_m=0.0), 20.0
+                )
+        if track.belief is not None:
+            nees.append((track.belief.mean_m - truth_m) ** 2 / track.belief.var_m2)
+
+    assert len(nees) > 0.99 * runs
+    assert np.mean(nees) == pytest.approx(1.0, abs=4 * math.sqrt(2 / len(nees)))
+
+
+def test_an_absurd_measurement_is_refused_and_changes_no_belief() -> None:
+    before = RangeTrack(RangeBelief(40.0, 2.0))
+
+    after, verdict = measure(before, 90.0, 2.9, RangeFilter(), 20.0)
+
+    assert verdict is Verdict.REFUSED
+    assert after.belief == before.belief
+
+
+def test_an_absurd_first_measurement_does_not_shut_out_the_good_ones() -> None:
+    track, verdicts = NOTHING, []
+    source = RangeFilter(begin_after=1, restart_after=5)
+    for measured_m in (120.0, 60.0, 59.0, 61.0, 60.0, 60.0):
+        track, verdict = measure(track, measured_m, 2.9, source, 20.0)
+        verdicts.append(verdict)
+
+    assert verdicts == [Verdict.BEGAN, *[Verdict.REFUSED] * 4, Verdict.RESTARTED]
+    assert track.belief is not None
+    assert track.belief.mean_m == pytest.approx(60.0, abs=0.5)
+
+
+def test_what_is_seen_once_gives_no_range_and_is_forgotten() -> None:
+    once, verdict = measure(NOTHING, 60.0, 2.9, RangeFilter(), 20.0)
+    gone = advance(advance(once, 4.0, 0.1, RangeFilter()), 2.0, 0.1, RangeFilter())
+
+    assert verdict is Verdict.WAITS
+    assert once.belief is None
+    assert gone == NOTHING
+
+
+def test_a_second_look_that_agrees_begins_a_range_from_both() -> None:
+    independent = RangeFilter(fade_m=0.0)
+    once, _ = measure(NOTHING, 60.0, 2.0, independent, 20.0)
+    twice, verdict = measure(advance(once, 1.0, 0.0, independent), 61.0, 2.0, independent, 20.0)
+
+    assert verdict is Verdict.BEGAN
+    assert twice.belief == pytest.approx(RangeBelief(60.0, 1.0))
+
+
+def test_looks_that_contradict_each_other_begin_nothing() -> None:
+    track = NOTHING
+    for measured_m in (60.0, 20.0, 110.0, 45.0, 80.0):
+        track, verdict = measure(track, measured_m, 2.9, RangeFilter(), 20.0)
+        assert verdict is Verdict.WAITS
+
+    assert track.belief is None
+
+
+def test_a_first_look_waits_while_the_car_stands_and_widens_where_nobody_measured() -> None:
+    once, _ = measure(NOTHING, 60.0, 2.9, RangeFilter(), 20.0)
+    stood = advance(once, 0.0, 0.0, RangeFilter())
+    blind = go_blind(once, 3.0, RangeFilter())
+
+    assert stood.rival == once.rival
+    assert blind.rival is not None
+    assert math.sqrt(blind.rival.var_m2) == pytest.approx(math.sqrt(2.9) + 3.0)
+    assert go_blind(blind, 3.0, RangeFilter()) == NOTHING
+
+
+def test_absurd_measurements_that_contradict_each_other_never_take_over() -> None:
+    track = RangeTrack(RangeBelief(50.0, 2.0))
+    for measured_m in (100.0, 20.0, 130.0, 10.0, 90.0, 140.0, 70.0):
+        track, verdict = measure(track, measured_m, 2.9, RangeFilter(restart_after=2), 20.0)
+        assert verdict is Verdict.REFUSED
+
+    assert track.belief == RangeBelief(50.0, 2.0)
+
+
+def test_the_next_intersections_sign_does_not_pull_away_one_that_is_near() -> None:
+    track = RangeTrack(RangeBelief(8.0, 2.0))
+    for _ in range(20):
+        track, verdict = measure(track, 70.0, 2.9, RangeFilter(), 20.0)
+        assert verdict is Verdict.REFUSED
+
+    assert track.belief == RangeBelief(8.0, 2.0)
+
+
+def test_a_range_that_has_become_too_unsure_is_dropped() -> None:
+    assert advance(RangeTrack(RangeBelief(50.0, 399.0)), 0.0, 2.0, RangeFilter()) == NOTHING
+
+
+def test_a_look_from_the_same_place_says_nothing_new_where_errors_fade() -> None:
+    fading = RangeFilter(fade_m=2.0, begin_after=1)
+    track, _ = measure(NOTHING, 40.0, 2.9, fading, 20.0)
+
+    again, verdict = measure(track, 42.0, 2.9, fading, 20.0)
+    far, _ = measure(advance(track, 30.0, 0.0, fading), 12.0, 2.9, fading, 20.0)
+
+    assert verdict is Verdict.TAKEN
+    assert again.belief == pytest.approx(RangeBelief(40.0, 2.9))
+    assert far.belief == pytest.approx(RangeBelief(11.0, 1.45))
+
+
+def test_errors_that_fade_along_the_way_are_as_large_as_the_filter_says() -> None:
+    rng = np.random.default_rng(3)
+    fade_m, sd_m, runs = 3.0, 1.7, 1500
+    rho = math.exp(-1.0 / fade_m)
+    nees: dict[float, list[float]] = {fade_m: [], 0.0: []}
+    for _ in range(runs):
+        tracks = dict.fromkeys(nees, NOTHING)
+        truth_m, error_m = 70.0, float(rng.normal(0.0, sd_m))
+        for _ in range(40):
+            truth_m -= 1.0
+            error_m = rho * error_m + math.sqrt(1.0 - rho**2) * float(rng.normal(0.0, sd_m))
+            for fade in tracks:
+                filters = RangeFilter(gate_nis=None, fade_m=fade)
+                gone = advance(tracks[fade], 1.0, 0.0, filters)
+                tracks[fade], _ = measure(gone, truth_m + error_m, sd_m**2, filters, 20.0)
+        for fade, track in tracks.items():
+            assert track.belief is not None
+            nees[fade].append((track.belief.mean_m - truth_m) ** 2 / track.belief.var_m2)
+
+    assert np.mean(nees[fade_m]) == pytest.approx(1.0, abs=0.15)
+    assert np.mean(nees[0.0]) > 3.0

@@ -1,0 +1,411 @@
+"""The landmark database: what goes in comes out, the ellipse is a query, damage is refused."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.localization.landmarks.database import (
+    LandmarkDatabase,
+    LandmarkWriter,
+    Place,
+    is_positive,
+)
+from crosscue.localization.landmarks.features import Features
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import LogError, LogFormatError, OutputError, UsageError
+from support.landmark_files import database_of, place_at, some_features
+
+GRID = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0)), axis=-1).reshape(-1, 2) * 50.0
+
+
+def test_what_goes_in_comes_out(tmp_path: Path) -> None:
+    cov = np.array([[4.0, 1.0], [1.0, 9.0]])
+    place = Place("north\nwest ☃", np.array([4.1e5, 5.3e6]), cov, -1.25, "survey")
+    given_features = some_features(3)
+    with LandmarkWriter(tmp_path / "lm.sqlite", "orb") as writer:
+        writer.add(place, given_features)
+        writer.add(Place("no heading", np.zeros(2), cov), some_features(4, 0))
+
+    with LandmarkDatabase(tmp_path / "lm.sqlite") as database:
+        first, second = list(database)
+        found = database.features(first.key)
+        assert len(database) == 2
+        assert database.kind == "orb"
+        assert len(database.features(second.key)) == 0
+
+    assert (first.place.name, first.place.source) == ("north\nwest ☃", "survey")
+    assert first.place.heading_rad == -1.25
+    assert second.place.heading_rad is None
+    np.testing.assert_array_equal(first.place.xy_m, place.xy_m)
+    np.testing.assert_array_equal(first.place.cov_m2, cov)
+    np.testing.assert_array_equal(found.points_px, given_features.points_px)
+    np.testing.assert_array_equal(found.descriptors, given_features.descriptors)
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return database_of(tmp_path_factory.mktemp("grid") / "grid.sqlite", GRID + 5e6)
+
+
+@given(
+    x=st.floats(-50.0, 550.0),
+    y=st.floats(-50.0, 550.0),
+    sd=st.tuples(st.floats(0.0, 200.0), st.floats(0.0, 200.0)),
+    correlation=st.floats(-1.0, 1.0),
+    sigmas=st.floats(0.1, 4.0),
+)
+@settings(max_examples=60, deadline=None)
+def test_the_ellipse_holds_just_the_landmarks_that_a_full_look_finds(
+    grid: Path, x: float, y: float, sd: tuple[float, float], correlation: float, sigmas: float
+) -> None:
+    off = correlation * sd[0] * sd[1]
+    cov = np.array([[sd[0] ** 2, off], [off, sd[1] ** 2]])
+    centre = np.array([x, y]) + 5e6
+    apart = GRID + 5e6 - centre
+    distance = np.sqrt(np.einsum("ni,ij,nj->n", apart, np.linalg.inv(cov + 4.0 * np.eye(2)), apart))
+    sure = np.abs(distance - sigmas) > 1e-6
+
+    with LandmarkDatabase(grid) as database:
+        found = database.near(centre, cov, sigmas, most=1000)
+
+    names = {int(one.place.name) for one in found}
+    assert names >= set(np.flatnonzero(sure & (distance < sigmas)).tolist())
+    assert not names & set(np.flatnonzero(sure & (distance > sigmas)).tolist())
+    assert [one.sigmas for one in found] == sorted(one.sigmas for one in found)
+
+
+def test_no_more_candidates_than_asked_for_and_the_nearest_of_them(grid: Path) -> None:
+    with LandmarkDatabase(grid) as database:
+        centre = np.array([110.0, 60.0]) + 5e6
+        nearest = database.near(centre, 1e4 * np.eye(2), most=3)
+        names = [one.place.name for one in database.within(np.array([0.0, 0.0]) + 5e6, 51.0)]
+
+    assert [one.place.name for one in nearest] == ["12", "13", "22"]
+    assert names == ["0", "1", "10"]
+
+
+def test_an_empty_database_has_no_candidates(tmp_path: Path) -> None:
+    path = database_of(tmp_path / "none.sqlite", np.empty((0, 2)))
+
+    with LandmarkDatabase(path) as database:
+        assert len(database) == 0
+        assert database.near(np.zeros(2), 1e6 * np.eye(2)) == ()
+
+
+@pytest.mark.parametrize(
+    ("cov", "why"),
+    [
+        ([[1.0, 2.0], [2.0, 1.0]], "positive definite"),
+        ([[0.0, 0.0], [0.0, 1.0]], "positive definite"),
+        ([[-1.0, 0.0], [0.0, -1.0]], "positive definite"),
+        ([[1.0, 0.5], [0.0, 1.0]], "symmetric"),
+        ([[1.0, 0.0], [0.0, np.inf]], "finite"),
+        ([[np.nan, 0.0], [0.0, 1.0]], "finite"),
+    ],
+)
+def test_a_covariance_that_is_none_is_refused(cov: list[list[float]], why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        Place("bad", np.zeros(2), np.array(cov))
+
+
+@given(st.floats(0.01, 1e3), st.floats(0.01, 1e3), st.floats(-0.99, 0.99))
+@settings(max_examples=50, deadline=None)
+def test_every_real_covariance_is_taken(sd_x: float, sd_y: float, correlation: float) -> None:
+    off = correlation * sd_x * sd_y
+    assert is_positive(np.array([[sd_x**2, off], [off, sd_y**2]]))
+
+
+def test_coordinates_that_are_no_numbers_are_refused() -> None:
+    with pytest.raises(ValueError, match="landmark x: want finite numbers"):
+        Place("x", np.array([np.nan, 0.0]), np.eye(2))
+    with pytest.raises(ValueError, match="heading inf"):
+        Place("x", np.zeros(2), np.eye(2), np.inf)
+
+
+def test_a_nameless_landmark_and_odd_features_are_refused() -> None:
+    with pytest.raises(ValueError, match="name"):
+        Place("", np.zeros(2), np.eye(2))
+    with pytest.raises(ValueError, match="want Unicode"):
+        Place("\udcff", np.zeros(2), np.eye(2))
+    with pytest.raises(ValueError, match=r"points_px: want \(3, 2\)"):
+        Features(1, 1, np.zeros((2, 2), np.float32), np.zeros((3, 32), np.uint8))
+
+
+def test_a_search_wider_than_the_boxes_is_refused(grid: Path) -> None:
+    with LandmarkDatabase(grid) as database:
+        with pytest.raises(ValueError, match=r"sigmas: want 0 to 4\.0, got 5"):
+            database.near(np.zeros(2), np.eye(2), sigmas=5.0)
+        with pytest.raises(ValueError, match="finite"):
+            database.near(np.array([np.nan, 0.0]), np.eye(2))
+
+
+@pytest.mark.parametrize("share", [0.5, 0.02, 0.99])
+def test_a_file_cut_short_is_refused(grid: Path, tmp_path: Path, share: float) -> None:
+    whole = grid.read_bytes()
+    cut = tmp_path / "cut.sqlite"
+    cut.write_bytes(whole[: int(share * len(whole))])
+
+    with pytest.raises(LogFormatError, match=r"cut\.sqlite: cut short: .* build it anew"):
+        LandmarkDatabase(cut)
+    with pytest.raises(LogFormatError, match="cut short"):
+        LandmarkWriter(cut, "orb")
+    assert cut.read_bytes() == whole[: int(share * len(whole))]
+
+
+def test_another_version_is_refused_and_left_alone(grid: Path, tmp_path: Path) -> None:
+    path = tmp_path / "new.sqlite"
+    path.write_bytes(grid.read_bytes())
+    later = sqlite3.connect(path)
+    later.execute("PRAGMA user_version = 7")
+    later.close()
+
+    with pytest.raises(LogFormatError, match="version 7, this crosscue reads 1"):
+        LandmarkDatabase(path)
+    with pytest.raises(LogFormatError, match="version 7"):
+        LandmarkWriter(path, "orb")
+
+
+def test_foreign_files_are_refused(tmp_path: Path) -> None:
+    other = sqlite3.connect(tmp_path / "other.sqlite")
+    other.execute("CREATE TABLE landmark (x)")
+    other.close()
+    (tmp_path / "text.sqlite").write_text("not a database at all\n" * 20)
+
+    with pytest.raises(LogFormatError, match="no landmark database; give one"):
+        LandmarkDatabase(tmp_path / "other.sqlite")
+    with pytest.raises(LogFormatError, match="not SQLite"):
+        LandmarkDatabase(tmp_path / "text.sqlite")
+    with pytest.raises(LogError, match="crosscue landmarks add"):
+        LandmarkDatabase(tmp_path / "missing.sqlite")
+    with pytest.raises(LogError, match="no regular file"):
+        LandmarkDatabase(tmp_path)
+
+
+def test_foreign_tables_under_our_mark_are_refused(grid: Path, tmp_path: Path) -> None:
+    path = tmp_path / "strange.sqlite"
+    path.write_bytes(grid.read_bytes())
+    strange = sqlite3.connect(path)
+    strange.execute("CREATE TABLE extra (x)")
+    strange.close()
+
+    with pytest.raises(LogFormatError, match="damaged: its tables"):
+        LandmarkDatabase(path)
+
+
+def test_a_changed_byte_is_found_before_the_features_are_used(tmp_path: Path) -> None:
+    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
+    whole = bytearray(path.read_bytes())
+    where = whole.index(some_features(1).descriptors.tobytes())
+    whole[where + 100] ^= 1
+    path.write_bytes(whole)
+
+    with LandmarkDatabase(path) as database:
+        keys = [one.key for one in database]
+        assert len(database.features(keys[0])) == 20
+        with pytest.raises(LogFormatError, match="landmark 1: its checksum does not fit"):
+            database.features(keys[1])
+
+
+def test_a_moved_landmark_is_found(tmp_path: Path) -> None:
+    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
+    hand = sqlite3.connect(path)
+    hand.execute("UPDATE landmark SET x_m = x_m + 1 WHERE id = 2")
+    hand.execute("UPDATE landmark SET var_x_m2 = -1 WHERE id = 3")
+    hand.commit()
+    hand.close()
+
+    with LandmarkDatabase(path) as database:
+        with pytest.raises(LogFormatError, match="checksum"):
+            database.features(2)
+        with pytest.raises(LogFormatError, match="damaged: landmark 2: covariance"):
+            list(database)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 255))
+@settings(max_examples=60, deadline=None)
+def test_damage_is_refused_or_harmless_never_a_crash(
+    tmp_path_factory: pytest.TempPathFactory, where: int, flip: int
+) -> None:
+    path = tmp_path_factory.mktemp("hurt") / "lm.sqlite"
+    whole = bytearray(database_of(path, GRID[:4]).read_bytes())
+    whole[where % len(whole)] ^= flip
+    path.write_bytes(whole)
+
+    try:
+        with LandmarkDatabase(path) as database:
+            for one in database:
+                read = database.features(one.key)
+                if one.place.name.isdigit() and int(one.place.name) < 4:
+                    right = some_features(int(one.place.name))
+                    np.testing.assert_array_equal(read.descriptors, right.descriptors)
+    except LogError as refused:
+        message = str(refused)
+        assert message.startswith(str(path))
+
+
+def test_adding_goes_on_where_it_ended(tmp_path: Path) -> None:
+    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
+    with LandmarkWriter(path, "orb") as writer:
+        writer.add(place_at(1.0, 1.0, "more"), some_features(9))
+
+    with LandmarkDatabase(path) as database:
+        assert [one.place.name for one in database] == ["0", "1", "2", "more"]
+
+
+def _add(path: Path, names: list[str], most_pages: int = 1_000_000) -> None:
+    with LandmarkWriter(path, "orb") as writer:
+        writer._sql.execute(f"PRAGMA max_page_count = {most_pages}")
+        for name in names:
+            writer.add(place_at(1.0, 1.0, name), some_features(9, 200))
+
+
+def test_a_failure_leaves_all_as_it_was(tmp_path: Path) -> None:
+    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
+    before = path.read_bytes()
+
+    with pytest.raises(UsageError, match="'2' is there already"):
+        _add(path, ["new", "2"])
+    assert path.read_bytes() == before
+
+    with pytest.raises(UsageError, match="'twin' is there already"):
+        _add(tmp_path / "fresh.sqlite", ["twin", "twin"])
+    assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]
+
+
+def test_features_of_another_matcher_are_refused(tmp_path: Path) -> None:
+    path = database_of(tmp_path / "lm.sqlite", GRID[:1], kind="learned")
+
+    with pytest.raises(UsageError, match="matcher 'learned', not 'orb'"):
+        LandmarkWriter(path, "orb")
+
+
+def test_a_second_writer_is_told_of_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("crosscue.localization.landmarks.file._BUSY_S", 0.05)
+    path = database_of(tmp_path / "lm.sqlite", GRID[:1])
+
+    with LandmarkWriter(path, "orb") as first:
+        with pytest.raises(OutputError, match="another process is writing it"):
+            LandmarkWriter(path, "orb")
+        first.add(place_at(1.0, 1.0, "more"), some_features(9))
+    with LandmarkDatabase(path) as database:
+        assert len(database) == 2
+
+
+@pytest.mark.parametrize("name", ["a%41.sqlite", "q?mode=x.sqlite", "h#sh.sqlite", "ü b.sqlite"])
+def test_a_file_is_opened_by_just_its_name(tmp_path: Path, name: str) -> None:
+    database_of(tmp_path / name, GRID[:2])
+
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    with LandmarkDatabase(tmp_path / name) as database:
+        assert len(database) == 2
+
+
+def test_a_name_that_is_not_utf8_works(tmp_path: Path) -> None:
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff\xfe.sqlite"))
+    database_of(path, GRID[:2])
+
+    assert [os.fsencode(p.name) for p in tmp_path.iterdir()] == [b"\xff\xfe.sqlite"]
+    with LandmarkDatabase(path) as database:
+        assert len(database) == 2
+
+
+WRITE_MANY = """
+import os, sys
+from pathlib import Path
+from crosscue.localization.landmarks.database import LandmarkWriter
+from support.landmark_files import place_at, some_features
+with LandmarkWriter(Path(sys.argv[1]), "orb") as writer:
+    writer._sql.execute("PRAGMA cache_size = 4")
+    for i in range(int(sys.argv[2])):
+        writer.add(place_at(float(i), 0.0, f"new {i}"), some_features(i, 200))
+    if len(sys.argv) > 3:
+        os.kill(os.getpid(), 9)
+"""
+
+
+def _in_child(
+    path: Path, count: int, *more: str, most_bytes: int | None = None
+) -> subprocess.CompletedProcess[str]:
+    def limit() -> None:
+        if most_bytes is not None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+
+    return subprocess.run(
+        [sys.executable, "-c", WRITE_MANY, str(path), str(count), *more],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        preexec_fn=limit,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_a_writer_killed_half_way_leaves_what_was_there(tmp_path: Path) -> None:
+    """Its pages are on the disk already (a tiny cache spills): reading rolls them back."""
+    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
+    before = path.stat().st_size
+
+    assert _in_child(path, 200, "die").returncode == -9
+    assert path.stat().st_size > before
+    assert (tmp_path / "lm.sqlite-journal").exists()
+
+    with LandmarkDatabase(path) as database:
+        assert [one.place.name for one in database] == ["0", "1", "2"]
+        assert [len(database.features(one.key)) for one in database] == [20, 20, 20]
+    assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]
+
+
+def test_a_disk_that_fills_up_is_told_and_leaves_what_was_there(tmp_path: Path) -> None:
+    """The kernel refuses to let the file grow, as a full disk would."""
+    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
+
+    done = _in_child(path, 200, most_bytes=200_000)
+
+    assert done.returncode == 1
+    assert "OutputError" in done.stderr
+    with LandmarkDatabase(path) as database:
+        assert [len(database.features(one.key)) for one in database] == [20, 20, 20]
+    fresh = tmp_path / "fresh.sqlite"
+    assert "OutputError" in _in_child(fresh, 200, most_bytes=200_000).stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]
+
+
+def test_a_database_that_may_not_grow_says_the_disk_is_full(tmp_path: Path) -> None:
+    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
+
+    with pytest.raises(OutputError, match=r"lm\.sqlite: the disk is full"):
+        _add(path, [f"new {i}" for i in range(200)], most_pages=1)
+    with LandmarkDatabase(path) as database:
+        assert len(database) == 3
+
+
+def test_a_folder_that_may_not_be_written_is_told(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"lm\.sqlite: .*check the path and its mode"):
+        LandmarkWriter(tmp_path / "missing" / "lm.sqlite", "orb")
+
+
+def test_distance_counts_the_landmarks_own_covariance(tmp_path: Path) -> None:
+    positions: Floats = np.array([[30.0, 0.0]])
+    sharp = database_of(tmp_path / "sharp.sqlite", positions, sd_m=1.0)
+    vague = database_of(tmp_path / "vague.sqlite", positions, sd_m=20.0)
+    cov = 100.0 * np.eye(2)
+
+    with LandmarkDatabase(sharp) as database:
+        assert database.near(np.zeros(2), cov) == ()
+    with LandmarkDatabase(vague) as database:
+        (one,) = database.near(np.zeros(2), cov)
+    assert one.sigmas == pytest.approx(30.0 / np.sqrt(500.0))

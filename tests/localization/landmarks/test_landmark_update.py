@@ -1,0 +1,322 @@
+"""Landmarks in the pose filter: consistent, symmetric, once per visit. All drives are simulated."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.eval.scoring.consistency import mean_band
+from crosscue.localization.angles import wrap_all
+from crosscue.localization.ekf import PoseBelief, is_lost, major_axis_m, update_position
+from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
+from crosscue.localization.landmarks.update import (
+    LandmarkSettings,
+    camera_position,
+    update_camera_position,
+)
+from crosscue.localization.odometry import OdometrySettings, integrate
+from crosscue.localization.pose_track import (
+    Advance,
+    TrackSettings,
+    TrackState,
+    advance,
+    start_belief,
+)
+from crosscue.replay.columns import Floats
+from support.landmark_drive import PlaceLooks, landmarks_along, search_in, there
+from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
+
+ODOMETRY = OdometrySettings(
+    track_width_m=TRACK_M, wheel_step_mps=0.01, slip_per_sqrt_m=0.2, gyro_noise_rad_per_sqrt_s=0.02
+)
+EVERY_READING = TrackSettings(heading_interval_m=0.0, heading_gate_nis=None)
+COV = np.array([[4.0, 1.5], [1.5, 3.0]])
+SETTINGS = LandmarkSettings(min_score=70.0, interval_m=0.2, gate_nis=None, sigmas=4.0)
+
+
+def some_belief(seed: int, heading: float = 0.3) -> PoseBelief:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(0.0, 1.0, (4, 4)) * [[3.0], [3.0], [0.1], [1.0]]
+    return PoseBelief(0, np.array([5.0, -2.0, heading, 3.0]), root @ root.T + 1e-3 * np.eye(4))
+
+
+@given(st.integers(0, 1000), st.floats(-20.0, 20.0), st.floats(-20.0, 20.0))
+@settings(max_examples=40, deadline=None)
+def test_without_a_lever_it_is_the_filters_own_update(seed: int, x: float, y: float) -> None:
+    belief, measured = some_belief(seed), np.array([x, y])
+
+    ours = update_camera_position(belief, measured, COV)
+    filters = update_position(belief, measured, COV)
+    np.testing.assert_allclose(ours.belief.mean, filters.belief.mean, atol=1e-9)
+    np.testing.assert_allclose(ours.belief.cov, filters.belief.cov, atol=1e-9)
+    assert ours.nis == pytest.approx(filters.nis)
+
+
+@given(
+    seed=st.integers(0, 1000),
+    ahead=st.floats(-3.0, 3.0),
+    left=st.floats(-2.0, 2.0),
+    heading=st.floats(-3.14, 3.14),
+)
+@settings(max_examples=40, deadline=None)
+def test_an_update_keeps_the_covariance_symmetric_positive_and_smaller(
+    seed: int, ahead: float, left: float, heading: float
+) -> None:
+    belief = some_belief(seed, heading)
+    done = update_camera_position(belief, np.array([6.0, 1.0]), COV, (ahead, left))
+
+    np.testing.assert_array_equal(done.belief.cov, done.belief.cov.T)
+    assert (np.linalg.eigvalsh(done.belief.cov) > -1e-9).all()
+    assert (np.linalg.eigvalsh(belief.cov - done.belief.cov) > -1e-7).all()
+    assert -math.pi < done.belief.mean[2] <= math.pi
+
+
+def test_the_levers_jacobian_is_that_of_the_cameras_place() -> None:
+    belief, lever = some_belief(1), (1.7, -0.4)
+    step = 1e-6
+    turned = PoseBelief(0, belief.mean + np.array([0.0, 0.0, step, 0.0]), belief.cov)
+    slope = (camera_position(turned, lever)[0] - camera_position(belief, lever)[0]) / step
+    observe = np.column_stack([np.eye(2), slope, np.zeros(2)])
+
+    np.testing.assert_allclose(
+        camera_position(belief, lever)[1], observe @ belief.cov @ observe.T, atol=1e-5
+    )
+
+
+def test_a_heading_across_the_seam_is_turned_the_shorter_way() -> None:
+    cov = np.diag([1.0, 1.0, 0.04, 0.0])
+    cov[1, 2] = cov[2, 1] = 0.15
+    belief = PoseBelief(0, np.array([0.0, 0.0, math.pi - 0.01, 5.0]), cov)
+    done = update_camera_position(belief, np.array([0.0, 2.0]), 0.1 * np.eye(2))
+
+    assert done.belief.mean[2] == pytest.approx(math.pi - 0.01 + 0.3 / 1.1 - 2 * math.pi)
+
+
+def test_the_gate_refuses_what_is_far_off_and_changes_nothing() -> None:
+    belief = some_belief(2)
+    far = update_camera_position(belief, np.array([500.0, 0.0]), COV, gate_nis=13.8)
+
+    assert not far.is_accepted
+    assert far.belief is belief
+    assert far.nis > 13.8
+
+
+@pytest.mark.parametrize(
+    ("xy", "cov"),
+    [
+        ([np.nan, 0.0], [[1.0, 0.0], [0.0, 1.0]]),
+        ([0.0, 0.0], [[1.0, 2.0], [2.0, 1.0]]),
+        ([0.0, 0.0], [[0.0, 0.0], [0.0, 0.0]]),
+        ([0.0, 0.0], [[np.inf, 0.0], [0.0, 1.0]]),
+        ([0.0, 0.0], [[1.0, 0.5], [0.0, 1.0]]),
+    ],
+)
+def test_no_number_and_no_covariance_is_let_in(xy: list[float], cov: list[list[float]]) -> None:
+    with pytest.raises(ValueError, match=r"xy_m|cov_m2"):
+        update_camera_position(some_belief(1), np.array(xy), np.array(cov))
+
+
+def test_settings_that_mean_nothing_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"sigmas: want 0 to 4\.0, got 9"):
+        LandmarkSettings(sigmas=9.0)
+    with pytest.raises(ValueError, match="revisit_m: want >= 0, got nan"):
+        LandmarkSettings(revisit_m=math.nan)
+
+
+def run(
+    folder: Path, seed: int, lever_m: tuple[float, float] = (0.0, 0.0)
+) -> tuple[Advance, Truth, PlaceLooks]:
+    rng = np.random.default_rng(seed)
+    truth = drive(rng, seconds=40.0)
+    made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng))
+    headings = compass(truth, 0.2, rng)
+    sd = np.array([3.0, 3.0, 0.1, 1.0])
+    off = rng.normal(0.0, sd)
+    x, y, heading = truth.xyh[0] + off[:3]
+    speed = truth.speed_mps[0] + off[3]
+    first = start_belief(int(truth.t_ns[0]), x, y, heading, speed, 3.0, 0.1, 1.0)
+    path = landmarks_along(folder / f"{seed}.sqlite", truth, rng, 60.0, COV, lever_m)
+    with LandmarkDatabase(path) as database:
+        options = LandmarkSettings(
+            min_score=99.0,
+            interval_m=0.2,
+            gate_nis=None,
+            sigmas=4.0,
+            revisit_m=1e6,
+            lever_m=lever_m,
+        )
+        looks = PlaceLooks(search_in(database, options), truth, lever_m=lever_m)
+        done = advance(TrackState(first), made.increments, EVERY_READING, headings, looks=looks)
+    return done, truth, looks
+
+
+def nees(done: Advance, truth: Truth) -> float:
+    poses = done.poses
+    error = np.array([poses.x_m[-1], poses.y_m[-1], poses.heading_rad[-1]]) - truth.xyh[-1]
+    error[2] = wrap_all(error[2:])[0]
+    xx, xy, xh, yy, yh, hh = poses.cov_xyh[-1]
+    return float(
+        error @ np.linalg.solve(np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]]), error)
+    )
+
+
+SEEDS = 50
+
+
+def test_simulated_errors_are_as_large_as_claimed(tmp_path: Path) -> None:
+    """NEES of the last pose and NIS of all landmarks, seeds 0 to 49."""
+    runs = [run(tmp_path, seed) for seed in range(SEEDS)]
+
+    low, high = mean_band(3, SEEDS)
+    assert low < np.mean([nees(done, truth) for done, truth, _ in runs]) < high
+    nis = np.array([s.nis for _, _, looks in runs for s in looks.search.sightings])
+    low, high = mean_band(2, len(nis))
+    assert len(nis) > 3 * SEEDS
+    assert low < nis.mean() < high
+
+
+def test_a_camera_ahead_of_the_axle_is_no_bias(tmp_path: Path) -> None:
+    """Heading errors swing the camera: the covariance swings along."""
+    runs = [run(tmp_path, seed, (2.0, 0.5)) for seed in range(SEEDS)]
+
+    nis = np.array([s.nis for _, _, looks in runs for s in looks.search.sightings])
+    assert mean_band(2, len(nis))[0] < nis.mean() < mean_band(2, len(nis))[1]
+
+
+def test_every_frame_is_accounted_for_and_every_row_named(tmp_path: Path) -> None:
+    done, _, looks = run(tmp_path, 3)
+    counts = looks.search.counts
+
+    assert counts.frames == len(looks.times_ns())
+    assert counts.accepted == len(looks.times) == len(looks.search.sightings)
+    assert counts.accepted <= counts.matched <= counts.frames - counts.thinned
+    assert counts.candidates >= counts.matched
+    assert set(looks.times) <= set(done.poses.t_ns.tolist())
+    assert len(np.unique(done.poses.t_ns)) == len(done.poses)
+
+
+def straight(length_m: float = 400.0, speed_mps: float = 10.0) -> Truth:
+    n = round(length_m / speed_mps * 20.0) + 1
+    t_s = np.arange(n) / 20.0
+    xyh = np.column_stack([speed_mps * t_s, np.zeros(n), np.zeros(n)])
+    return Truth(np.round(t_s * 1e9).astype(np.int64), xyh, np.full(n, speed_mps), np.zeros(n))
+
+
+def follow(
+    path: Path, truth: Truth, marks: dict[str, Floats], options: LandmarkSettings, **start: float
+) -> tuple[Advance, PlaceLooks]:
+    """Drive without noise past landmarks at their true places."""
+    if not path.exists():
+        with LandmarkWriter(path, "nearness") as writer:
+            for name, xy in marks.items():
+                writer.add(Place(name, xy, np.eye(2)), there(xy))
+    exact = OdometrySettings(track_width_m=TRACK_M)
+    made = integrate(wheels(truth, exact), exact, gyro(truth, exact)).increments
+    first = start_belief(
+        int(truth.t_ns[0]), start.get("x_m", 0.0), 0.0, truth.xyh[0, 2], truth.speed_mps[0],
+        start.get("sd_m", 10.0), 0.05, 0.1,
+    )  # fmt: skip
+    with LandmarkDatabase(path) as database:
+        looks = PlaceLooks(search_in(database, options), truth)
+        return advance(TrackState(first), made, TrackSettings(), looks=looks), looks
+
+
+def test_a_landmark_counts_once_at_its_best(tmp_path: Path) -> None:
+    """Odometry starts 8 m off; what is weighed in is where the car was at the peak, carried on."""
+    done, looks = follow(
+        tmp_path / "lm.sqlite", straight(), {"gate": np.array([100.0, 0.0])}, SETTINGS, x_m=8.0
+    )
+
+    (sighting,) = looks.search.sightings
+    true_x = 10.0 * sighting.t_ns * 1e-9
+    assert sighting.xy_m[0] == pytest.approx(true_x, abs=0.3)
+    assert sighting.score == pytest.approx(100.0, abs=0.3)
+    row = int(np.searchsorted(done.poses.t_ns, sighting.t_ns))
+    assert abs(done.poses.x_m[row - 1] - true_x) > 7.0
+    assert abs(done.poses.x_m[row] - true_x) < 0.5
+    assert looks.search.counts.matched > 10
+
+
+def test_backing_past_a_landmark_carries_its_place_backwards(tmp_path: Path) -> None:
+    ahead = straight()
+    truth = Truth(ahead.t_ns, ahead.xyh * [-1.0, 1.0, 1.0], -ahead.speed_mps, ahead.yaw_radps)
+    _, looks = follow(
+        tmp_path / "lm.sqlite", truth, {"gate": np.array([-100.0, 0.0])}, SETTINGS, x_m=5.0
+    )
+
+    (sighting,) = looks.search.sightings
+    assert sighting.xy_m[0] == pytest.approx(-10.0 * sighting.t_ns * 1e-9, abs=0.3)
+
+
+def test_a_standing_car_does_not_count_a_landmark_again_and_again(tmp_path: Path) -> None:
+    moving = straight()
+    still = np.tile(moving.xyh[200], (len(moving.xyh), 1))
+    truth = Truth(moving.t_ns, still, np.zeros(len(still)), moving.yaw_radps)
+    _, looks = follow(tmp_path / "lm.sqlite", truth, {"gate": still[0, :2]}, SETTINGS, x_m=100.0)
+
+    assert looks.search.sightings == []
+    assert looks.search.counts.thinned == len(truth.t_ns) - 1
+
+
+def test_a_second_visit_counts_only_after_a_while(tmp_path: Path) -> None:
+    there_and_back = straight(300.0)
+    n = len(there_and_back.t_ns)
+    xyh = there_and_back.xyh.copy()
+    xyh[n // 2 :, 0] = 2 * xyh[n // 2, 0] - xyh[n // 2 :, 0]
+    speed = np.where(np.arange(n) < n // 2, 10.0, -10.0)
+    truth = Truth(there_and_back.t_ns, xyh, speed, there_and_back.yaw_radps)
+    marks = {"near": np.array([120.0, 0.0]), "far": np.array([20.0, 0.0])}
+    _, looks = follow(tmp_path / "lm.sqlite", truth, marks, SETTINGS)
+
+    assert [s.name for s in looks.search.sightings] == ["far", "near", "far"]
+    assert looks.search.counts.repeated == 1
+
+
+def test_only_landmarks_inside_the_ellipse_are_compared(tmp_path: Path) -> None:
+    """A twin that looks the same, a hundred metres off, is not even asked."""
+    place = np.array([100.0, 0.0])
+    path = tmp_path / "twins.sqlite"
+    with LandmarkWriter(path, "nearness") as writer:
+        writer.add(Place("right", place, np.eye(2)), there(place))
+        writer.add(
+            Place("twin", place + np.array([0.0, 100.0]), np.eye(2)),
+            there(place + np.array([0.0, 0.01])),
+        )
+
+    narrow = LandmarkSettings(min_score=70.0, interval_m=0.2)
+    _, looks = follow(path, straight(), {}, narrow, sd_m=5.0)
+    assert [s.name for s in looks.search.sightings] == ["right"]
+    assert looks.search.counts.candidates < 100
+    _, wide = follow(path, straight(), {}, narrow, sd_m=200.0)
+    assert wide.search.counts.candidates > 4 * looks.search.counts.candidates
+
+
+def test_no_landmarks_at_all_leave_the_track_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "none.sqlite"
+    with LandmarkWriter(path, "nearness"):
+        pass
+    done, looks = follow(path, straight(), {}, SETTINGS)
+
+    assert looks.search.counts.without_candidate == looks.search.counts.frames > 0
+    assert looks.search.counts.candidates == 0
+    assert done.poses.x_m[-1] == pytest.approx(400.0)
+
+
+def test_a_lost_car_is_found_again_by_a_landmark(tmp_path: Path) -> None:
+    """Lost above 100 m of major axis: a start that is off by tens of metres, one landmark."""
+    done, looks = follow(
+        tmp_path / "lm.sqlite", straight(), {"gate": np.array([100.0, 0.0])}, SETTINGS,
+        x_m=30.0, sd_m=40.0,
+    )  # fmt: skip
+
+    assert done.poses.major_axis_m[0] > 100.0
+    assert len(looks.search.sightings) == 1
+    assert done.poses.major_axis_m[-1] < 100.0
+    assert not is_lost(done.state.belief)
+    assert major_axis_m(done.state.belief) == pytest.approx(done.poses.major_axis_m[-1])
+    assert abs(done.poses.x_m[-1] - 400.0) < 3.0

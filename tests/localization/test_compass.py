@@ -1,0 +1,317 @@
+"""Laws of the compass and of its fit. The fields here are simulated."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.localization.angles import circular_mean, interpolate_angle, wrap_all
+from crosscue.localization.compass import CompassSettings, Matrix, course_at, heading, level_field
+from crosscue.localization.compass_fit import (
+    HARD_IRON,
+    MOUNTING,
+    SOFT_IRON,
+    CompassFit,
+    coverage_deg,
+    fit_compass,
+    persistence,
+)
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import VehicleError
+
+DOWN_T = 42e-6
+LEVEL_T = 23e-6
+FRD_TO_FLU: Matrix = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+IRON = CompassSettings(
+    mounting_rotation=FRD_TO_FLU,
+    mounting_yaw_rad=0.4,
+    hard_iron_t=(12e-6, -9e-6, 0.0),
+    soft_iron=((1.1, 0.08, 0.0), (0.08, 0.92, 0.0), (0.0, 0.0, 1.0)),
+    declination_rad=0.23,
+)
+
+
+def readings(
+    heading_rad: Floats,
+    compass: CompassSettings,
+    roll: float = 0.0,
+    pitch: float = 0.0,
+    sd_t: float = 0.0,
+    seed: int = 0,
+) -> Floats:
+    """What the magnetometer of a car with this heading and attitude would read."""
+    north = math.pi / 2 - compass.declination_rad - heading_rad - compass.mounting_yaw_rad
+    level = np.column_stack(
+        [LEVEL_T * np.cos(north), LEVEL_T * np.sin(north), np.full(len(north), -DOWN_T)]
+    )
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    about_left = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    about_forward = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    body = level @ (about_left @ about_forward)
+    sensor = body @ np.array(compass.mounting_rotation)
+    raw = np.linalg.solve(np.array(compass.soft_iron), sensor.T).T + compass.hard_iron_t
+    return raw + np.random.default_rng(seed).normal(0.0, sd_t, raw.shape) if sd_t else raw
+
+
+def times(n: int, period_s: float = 0.1) -> Int64s:
+    return np.round(np.arange(n) * period_s * 1e9).astype(np.int64)
+
+
+def apart_deg(a: Floats, b: Floats) -> float:
+    return float(np.degrees(np.abs(wrap_all(a - b)).max()))
+
+
+def around(share: float, n: int = 600) -> Floats:
+    return wrap_all(np.linspace(0.0, share * 2 * math.pi, n) + 0.3)
+
+
+def test_facing_magnetic_north_is_a_quarter_turn_from_east() -> None:
+    north = np.array([[LEVEL_T, 0.0, -DOWN_T]])
+
+    assert heading(north, CompassSettings())[0] == pytest.approx(math.pi / 2)
+    east_of_north = heading(north, CompassSettings(declination_rad=0.2))[0]
+    assert east_of_north == pytest.approx(math.pi / 2 - 0.2)
+
+
+def test_north_to_the_left_means_facing_east() -> None:
+    assert heading(np.array([[0.0, LEVEL_T, 0.0]]), CompassSettings())[0] == pytest.approx(0.0)
+
+
+@given(true=st.floats(-3.1, 3.1), roll=st.floats(-0.4, 0.4), pitch=st.floats(-0.4, 0.4))
+@settings(max_examples=60, deadline=None)
+def test_corrections_undo_iron_mounting_and_tilt(true: float, roll: float, pitch: float) -> None:
+    field = readings(np.array([true]), IRON, roll, pitch)
+
+    found = heading(field, IRON, np.array([roll]), np.array([pitch]))
+    assert apart_deg(found, np.array([true])) < 1e-9
+
+
+def test_levelling_keeps_the_fields_strength_and_finds_down() -> None:
+    field = readings(around(1.0, 20), IRON, roll=0.3, pitch=-0.2)
+    level = level_field(field, IRON, np.full(20, 0.3), np.full(20, -0.2))
+
+    np.testing.assert_allclose(level[:, 2], -DOWN_T)
+    np.testing.assert_allclose(np.hypot(level[:, 0], level[:, 1]), LEVEL_T)
+
+
+def test_tilt_not_told_is_an_error_not_a_crash() -> None:
+    field = readings(np.array([0.0]), IRON, roll=0.1)
+
+    assert 2.0 < apart_deg(heading(field, IRON), np.zeros(1)) < 20.0
+
+
+def test_readings_without_a_direction_are_nan() -> None:
+    field = np.array([[0.0, 0.0, 1.0], [np.nan, 1.0, 0.0], [1.0, 0.0, 0.0]])
+
+    np.testing.assert_array_equal(np.isnan(heading(field, CompassSettings())), [True, True, False])
+
+
+def check_correct(fit: CompassFit, limit_deg: float) -> None:
+    everywhere = around(1.0)
+    assert apart_deg(heading(readings(everywhere, IRON), fit.settings), everywhere) < limit_deg
+
+
+def given_mounting(compass: CompassSettings) -> CompassSettings:
+    return CompassSettings(
+        mounting_rotation=compass.mounting_rotation, declination_rad=compass.declination_rad
+    )
+
+
+def test_a_drive_all_the_way_round_shows_everything() -> None:
+    truth = around(2.5)
+    fit = fit_compass(times(600), readings(truth, IRON), truth, given_mounting(IRON))
+
+    assert fit.observable == (MOUNTING, HARD_IRON, SOFT_IRON)
+    assert fit.coverage_deg == 360
+    assert fit.settings.mounting_yaw_rad == pytest.approx(0.4, abs=0.05)
+    np.testing.assert_allclose(fit.settings.hard_iron_t[:2], IRON.hard_iron_t[:2], atol=1e-12)
+    check_correct(fit, 1e-6)
+
+
+def test_noise_comes_out_as_the_residual() -> None:
+    """Simulated noise of 0.5 uT on a level field of 23 uT: about 1.25 degrees."""
+    truth = around(2.5, 3000)
+    noisy = readings(truth, IRON, sd_t=0.5e-6)
+    fit = fit_compass(times(3000), noisy, truth, given_mounting(IRON))
+
+    assert math.degrees(fit.residual_sd_rad) == pytest.approx(1.25, rel=0.15)
+    assert abs(fit.residual_autocorrelation) < 0.1
+    check_correct(fit, 0.4)
+
+
+def test_a_half_turn_shows_hard_iron_but_not_soft() -> None:
+    hard = replace(IRON, soft_iron=CompassSettings().soft_iron)
+    truth = around(0.6)
+    fit = fit_compass(times(600), readings(truth, hard), truth, given_mounting(hard))
+
+    assert fit.observable == (MOUNTING, HARD_IRON)
+    assert "soft iron" in [missing.parameter for missing in fit.not_observable]
+    np.testing.assert_allclose(fit.settings.hard_iron_t[:2], hard.hard_iron_t[:2], atol=1e-12)
+    assert fit.settings.mounting_yaw_rad == pytest.approx(0.4)
+
+
+def test_known_soft_iron_is_kept_when_hard_iron_is_fitted() -> None:
+    truth = around(0.6)
+    known = replace(given_mounting(IRON), soft_iron=IRON.soft_iron)
+    fit = fit_compass(times(600), readings(truth, IRON), truth, known)
+
+    assert fit.settings.soft_iron == IRON.soft_iron
+    check_correct(fit, 1e-6)
+
+
+def test_a_straight_drive_shows_the_mounting_alone_and_says_so() -> None:
+    rng = np.random.default_rng(1)
+    truth = 1.3 + rng.normal(0.0, 0.01, 600)
+    given = replace(given_mounting(IRON), hard_iron_t=(1e-6, 2e-6, 0.0))
+    fit = fit_compass(times(600), readings(truth, IRON), truth, given)
+
+    assert fit.observable == (MOUNTING,)
+    reasons = dict(fit.not_observable)
+    assert reasons["hard iron"] == "headings cover 10 of 360 degrees, 180 are wanted"
+    assert reasons["soft iron"] == "headings cover 10 of 360 degrees, 300 are wanted"
+    assert set(reasons) >= {"declination", "hard iron, upward part"}
+    assert fit.settings.hard_iron_t == given.hard_iron_t
+    assert fit.settings.soft_iron == given.soft_iron
+    found = heading(readings(np.array([1.3]), IRON), fit.settings)
+    assert apart_deg(found, np.array([1.3])) < 0.2
+
+
+def test_without_a_reference_an_ellipse_shows_the_iron_but_not_the_mounting() -> None:
+    truth = around(1.5)
+    fit = fit_compass(times(600), readings(truth, IRON), None, given_mounting(IRON))
+
+    assert fit.observable == (HARD_IRON, SOFT_IRON)
+    assert MOUNTING in [missing.parameter for missing in fit.not_observable]
+    assert math.isnan(fit.residual_sd_rad)
+    apart = wrap_all(heading(readings(truth, IRON), fit.settings) - truth)
+    assert np.std(wrap_all(apart - circular_mean(apart))) < 1e-8
+
+
+def test_without_a_reference_a_straight_drive_shows_nothing() -> None:
+    truth = 1.2 + np.random.default_rng(1).normal(0.0, 0.01, 600)
+    field = readings(truth, IRON, sd_t=0.3e-6)
+    given = given_mounting(IRON)
+    fit = fit_compass(times(600), field, None, given)
+
+    assert fit.observable == ()
+    assert dict(fit.not_observable)["hard iron"] == "the readings do not go round an ellipse"
+    assert fit.settings == given
+
+
+def test_without_a_reference_half_an_ellipse_is_not_enough() -> None:
+    truth = around(0.6)
+    fit = fit_compass(times(600), readings(truth, IRON), None, given_mounting(IRON))
+
+    assert fit.observable == ()
+    assert dict(fit.not_observable)["soft iron"].startswith("headings cover 2")
+
+
+@pytest.mark.parametrize("share", [0.6, 2.0])
+def test_mirrored_axes_are_refused(share: float) -> None:
+    truth = around(share)
+    mirrored = readings(truth, IRON) * [1.0, -1.0, 1.0]
+    with pytest.raises(VehicleError, match="turn the wrong way round"):
+        fit_compass(times(600), mirrored, truth, given_mounting(IRON))
+
+
+def test_too_few_readings_are_refused() -> None:
+    truth = np.full(600, np.nan)
+    truth[:7] = 0.1
+    with pytest.raises(VehicleError, match="7 of 600 readings are finite and have a reference"):
+        fit_compass(times(600), readings(around(1.0), IRON), truth, given_mounting(IRON))
+
+
+def test_dead_and_missing_readings_are_left_out_and_counted() -> None:
+    truth = around(2.0)
+    field = readings(truth, IRON)
+    field[3] = 0.0
+    field[5, 1] = np.nan
+    fit = fit_compass(times(600), field, truth, given_mounting(IRON))
+
+    assert (fit.readings, fit.readings_used) == (600, 598)
+    check_correct(fit, 1e-6)
+
+
+@pytest.mark.parametrize("persists_s", [0.5, 3.0])
+def test_a_lasting_error_is_recognised_as_lasting(persists_s: float) -> None:
+    """Simulated residuals that fade exponentially, read ten times a second for an hour."""
+    rng = np.random.default_rng(2)
+    n, kept = 36_000, math.exp(-0.1 / persists_s)
+    residual = np.zeros(n)
+    kicks = rng.normal(0.0, math.sqrt(1 - kept**2), n)
+    for i in range(1, n):
+        residual[i] = kept * residual[i - 1] + kicks[i]
+    found = persistence(times(n), residual)
+
+    assert found.seconds == pytest.approx(persists_s, rel=0.2)
+    assert found.next_correlation == pytest.approx(kept, abs=0.02)
+    assert found.independent == pytest.approx(3600.0 / (2 * persists_s), rel=0.25)
+    assert not found.is_bound
+
+
+def test_a_drift_all_drive_long_counts_as_one_reading_or_so() -> None:
+    found = persistence(times(100), np.linspace(-1.0, 1.0, 100))
+
+    assert found.seconds > 1.5
+    assert found.independent < 4.0
+
+
+def test_coverage_counts_directions_not_readings() -> None:
+    assert coverage_deg(np.full(1000, 0.1)) == 10
+    assert coverage_deg(np.array([0.1, 0.1])) == 0
+    assert coverage_deg(around(1.0)) == 360
+
+
+def test_a_slow_car_has_no_course() -> None:
+    t_ns = times(5, 1.0)
+    course = np.array([0.0, 0.2, 3.0, 0.6, 0.8])
+    speed = np.array([9.0, 9.0, 0.5, 9.0, 9.0])
+    found = course_at(times(9, 0.5), t_ns, course, speed)
+
+    np.testing.assert_allclose(
+        found, [0.0, 0.1, 0.2, np.nan, np.nan, np.nan, 0.6, 0.7, 0.8], atol=1e-12
+    )
+
+
+def test_angles_between_neighbours_go_the_shorter_way() -> None:
+    t_ns = np.array([0, 10], np.int64)
+    found = interpolate_angle(np.array([-1, 0, 5, 10, 11]), t_ns, np.array([3.0, -3.0]))
+
+    assert np.isnan(found[[0, 4]]).all()
+    assert apart_deg(found[1:4], np.array([3.0, math.pi, -3.0])) < 1e-9
+    assert np.isnan(interpolate_angle(t_ns, np.empty(0, np.int64), np.empty(0))).all()
+
+
+def test_opposite_angles_have_no_mean() -> None:
+    with pytest.raises(ValueError, match="cancel out"):
+        circular_mean(np.array([0.0, math.pi]))
+    with pytest.raises(ValueError, match="at least one"):
+        circular_mean(np.empty(0))
+
+
+def test_readings_unrelated_to_the_heading_are_refused() -> None:
+    field = np.tile([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], (50, 1))
+    with pytest.raises(VehicleError, match="nothing to do with the headings"):
+        fit_compass(times(100), field, np.full(100, 0.2), CompassSettings())
+
+
+def test_nonsense_is_refused_by_name() -> None:
+    mirror: Matrix = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
+    stretch: Matrix = ((2.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    with pytest.raises(ValueError, match="got a mirror"):
+        CompassSettings(mounting_rotation=mirror)
+    with pytest.raises(ValueError, match="mounting_rotation: want a rotation"):
+        CompassSettings(mounting_rotation=stretch)
+    with pytest.raises(ValueError, match="soft_iron: want determinant > 0"):
+        CompassSettings(soft_iron=mirror)
+    with pytest.raises(ValueError, match="declination_rad: want finite"):
+        CompassSettings(declination_rad=math.nan)
+    with pytest.raises(ValueError, match=r"field_t: want \(4, 3\), got \(4, 2\)"):
+        heading(np.zeros((4, 2)), CompassSettings())
+    with pytest.raises(ValueError, match=r"roll_rad: want \(4,\), got \(3,\)"):
+        heading(np.zeros((4, 3)), CompassSettings(), roll_rad=np.zeros(3))

@@ -1,0 +1,324 @@
+"""The track over columns: equal to the filter's functions, whole in windows, errors as claimed.
+
+All drives here are simulated, with the very noise that the filter is told of.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.eval.scoring.consistency import mean_band
+from crosscue.localization.angles import wrap_all
+from crosscue.localization.ekf import (
+    PoseBelief,
+    major_axis_m,
+    predict_odometry,
+    update_heading,
+    update_speed,
+)
+from crosscue.localization.odometry import (
+    Increments,
+    OdometrySettings,
+    Pending,
+    TurnSignal,
+    WheelSpeeds,
+    integrate,
+)
+from crosscue.localization.pose_track import (
+    NO_HEADINGS,
+    Advance,
+    Headings,
+    PoseColumns,
+    TrackCounts,
+    TrackSettings,
+    TrackState,
+    advance,
+    start_belief,
+)
+from crosscue.replay.columns import Floats, Int64s
+from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
+
+ODOMETRY = OdometrySettings(
+    track_width_m=TRACK_M,
+    wheel_step_mps=0.01,
+    slip_per_sqrt_m=0.05,
+    gyro_noise_rad_per_sqrt_s=0.01,
+)
+EVERY_READING = TrackSettings(heading_interval_m=0.0, heading_gate_nis=None)
+
+
+def begin(truth: Truth, rng: np.random.Generator, heading_sd: float = 0.05) -> PoseBelief:
+    """A start that is off by as much as it says."""
+    x, y, heading = truth.xyh[0] + rng.normal(0.0, [1.0, 1.0, heading_sd])
+    speed = truth.speed_mps[0] + rng.normal(0.0, 1.0)
+    return start_belief(int(truth.t_ns[0]), x, y, heading, speed, 1.0, heading_sd, 1.0)
+
+
+def nees_of(poses: PoseColumns, truth: Truth, row: int) -> float:
+    estimate = np.array([poses.x_m[row], poses.y_m[row], poses.heading_rad[row]])
+    error = estimate - truth.xyh[np.searchsorted(truth.t_ns, poses.t_ns[row])]
+    error[2] = wrap_all(error[2:])[0]
+    xx, xy, xh, yy, yh, hh = poses.cov_xyh[row]
+    cov = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
+    return float(error @ np.linalg.solve(cov, error))
+
+
+def run(seed: int, settings: TrackSettings, persists_s: float = 0.0) -> tuple[Advance, Truth]:
+    rng = np.random.default_rng(seed)
+    truth = drive(rng)
+    made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng))
+    headings = compass(truth, 0.1, rng, persists_s=persists_s)
+    first = TrackState(begin(truth, rng))
+    return advance(first, made.increments, settings, headings, truth.t_ns[::200]), truth
+
+
+def test_simulated_errors_are_as_large_as_claimed() -> None:
+    runs = [run(seed, EVERY_READING) for seed in range(200)]
+
+    for row in (2, -1):
+        mean = np.mean([nees_of(done.poses, truth, row) for done, truth in runs])
+        low, high = mean_band(3, 200)
+        assert low < mean < high
+    nis = np.concatenate([done.headings.nis for done, _ in runs])
+    low, high = mean_band(1, len(nis))
+    assert low < nis.mean() < high
+
+
+def test_simulated_compass_errors_that_last_need_an_interval() -> None:
+    """An error that fades over 2 s, read at 10 Hz: over-sure unless readings are thinned."""
+    thinned = TrackSettings(heading_interval_m=0.0, heading_interval_s=4.0, heading_gate_nis=None)
+
+    def mean_nees(settings: TrackSettings) -> float:
+        runs = [run(seed, settings, persists_s=2.0) for seed in range(60)]
+        return float(np.mean([nees_of(done.poses, truth, -1) for done, truth in runs]))
+
+    assert mean_nees(EVERY_READING) > 1.5 * 3.0
+    assert 2.4 < mean_nees(thinned) < 3.6
+
+
+def reference(
+    belief: PoseBelief, made: Increments, settings: TrackSettings, headings: Headings
+) -> PoseBelief:
+    """The track by the filter's own functions, one at a time."""
+    waiting = list(zip(headings.t_ns, headings.heading_rad, headings.var_rad2, strict=True))
+    for k in range(len(made)):
+        start, stop = int(made.start_ns[k]), int(made.stop_ns[k])
+        inside = [w for w in waiting if belief.t_ns <= w[0] <= stop]
+        for t_ns, heading, var in [*inside, (stop, None, None)]:
+            share = (int(t_ns) - belief.t_ns) / (stop - start)
+            dt_s = (int(t_ns) - belief.t_ns) * 1e-9
+            moved = predict_odometry(
+                belief,
+                share * made.distance_m[k],
+                share * made.turn_rad[k],
+                share * made.distance_var_m2[k],
+                share * made.turn_var_rad2[k],
+                dt_s,
+                settings.accel_var_m2ps3,
+            )
+            belief = PoseBelief(int(t_ns), moved.mean, moved.cov)
+            if heading is not None:
+                belief = update_heading(belief, heading, var).belief
+        waiting = [w for w in waiting if w[0] > stop]
+        speed, var = made.speed_mps[k], made.speed_var_m2ps2[k]
+        belief = update_speed(belief, speed, var).belief
+    return belief
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_plain_floats_give_the_filters_own_numbers(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = drive(rng, seconds=20.0)
+    made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng)).increments
+    on_time = compass(truth, 0.1, rng, every=7)
+    headings = Headings(on_time.t_ns - 7_654_321, on_time.heading_rad, on_time.var_rad2)
+    belief = begin(truth, rng)
+    mixed = belief.cov + 0.01 * np.outer([1.0, 2.0, 0.1, 0.5], [1.0, 2.0, 0.1, 0.5])
+    belief = PoseBelief(belief.t_ns, belief.mean, mixed)
+
+    done = advance(TrackState(belief), made, EVERY_READING, headings)
+    wanted = reference(belief, made, EVERY_READING, headings)
+    np.testing.assert_allclose(done.state.belief.mean, wanted.mean, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(done.state.belief.cov, wanted.cov, rtol=1e-9, atol=1e-9)
+    assert done.state.belief.t_ns == wanted.t_ns
+    assert done.poses.major_axis_m[-1] == pytest.approx(major_axis_m(wanted))
+    assert done.counts.headings_accepted == len(headings)
+
+
+def cut(t_ns: Int64s, low: int, high: int) -> slice:
+    return slice(*np.searchsorted(t_ns, [low, high], side="left"))
+
+
+@given(
+    cuts=st.lists(st.integers(0, 12_000), max_size=6),
+    seed=st.integers(0, 30),
+    hole=st.integers(0, 10_000),
+    every_interval=st.booleans(),
+)
+@settings(max_examples=40, deadline=None)
+def test_windows_give_the_same_track_bit_for_bit(
+    cuts: list[int], seed: int, hole: int, every_interval: bool
+) -> None:
+    """Gyro on its own clock and with a hole, headings between samples, rows at frame times."""
+    rng = np.random.default_rng(seed)
+    truth = drive(rng, seconds=12.0)
+    zero = int(truth.t_ns[0])
+    speeds = wheels(truth, ODOMETRY, rng)
+    rates = gyro(truth, ODOMETRY, rng)
+    rate_t = rates.t_ns + 13_000_000
+    has = np.abs(rate_t - zero - hole * 1_000_000) > 900_000_000
+    rate_t, rate = rate_t[has], rates.values[has]
+    readings = compass(truth, 0.1, rng, every=3)
+    heading_t = readings.t_ns - 4_321_000
+    frames = np.arange(zero + 10_000_000, zero + 12_000_000_000, 51_000_000)
+    track = TrackSettings(heading_interval_m=2.0, heading_interval_s=0.3)
+    belief = begin(truth, rng)
+
+    def windowed(edges: list[int]) -> tuple[list[Floats], TrackState, TrackCounts]:
+        pending, state, counts = Pending(), TrackState(belief), TrackCounts()
+        columns: list[Floats] = []
+        for low, high in pairwise(edges):
+            w, g = cut(speeds.t_ns, low, high), cut(rate_t, low, high)
+            h, f = cut(heading_t, low, high), cut(frames, low, high)
+            made, pending, _ = integrate(
+                WheelSpeeds(speeds.t_ns[w], speeds.wheels_mps[w]),
+                ODOMETRY,
+                TurnSignal(rate_t[g], rate[g], "yaw rate"),
+                pending,
+                None if high == edges[-1] else high,
+            )
+            state, poses, _, some = advance(
+                state,
+                made,
+                track,
+                Headings(heading_t[h], readings.heading_rad[h], readings.var_rad2[h]),
+                None if every_interval else frames[f],
+            )
+            counts += some
+            columns.append(np.column_stack([poses.t_ns, poses.x_m, poses.y_m, poses.heading_rad]))
+            columns[-1] = np.hstack([columns[-1], poses.cov_xyh, poses.travelled_m[:, None]])
+        return columns, state, counts
+
+    ends = [zero - 10_000_000_000, zero + 20_000_000_000]
+    inner = [zero + c * 1_000_000 for c in cuts]
+    whole, last, counts = windowed(ends)
+    parts, last_of_parts, counts_of_parts = windowed(sorted([*ends, *inner]))
+    np.testing.assert_array_equal(np.vstack(parts), np.vstack(whole))
+    np.testing.assert_array_equal(last_of_parts.belief.mean, last.belief.mean)
+    np.testing.assert_array_equal(last_of_parts.belief.cov, last.belief.cov)
+    assert counts_of_parts == counts
+    assert counts.headings_accepted > 0
+
+
+def test_without_noise_the_track_is_the_truth() -> None:
+    truth = drive(np.random.default_rng(5))
+    exact = OdometrySettings(track_width_m=TRACK_M)
+    made = integrate(wheels(truth, exact), exact, gyro(truth, exact)).increments
+    belief = start_belief(int(truth.t_ns[0]), *truth.xyh[0])
+    poses = advance(TrackState(belief), made, TrackSettings()).poses
+
+    np.testing.assert_allclose(poses.x_m, truth.xyh[1:, 0], atol=1e-8)
+    np.testing.assert_allclose(poses.y_m, truth.xyh[1:, 1], atol=1e-8)
+    np.testing.assert_allclose(wrap_all(poses.heading_rad - truth.xyh[1:, 2]), 0.0, atol=1e-10)
+    assert poses.travelled_m[-1] == pytest.approx(np.abs(made.distance_m).sum())
+
+
+def test_a_missing_compass_only_costs_certainty() -> None:
+    with_compass, truth = run(3, EVERY_READING)
+    rng = np.random.default_rng(3)
+    truth = drive(rng)
+    made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng)).increments
+    first = TrackState(begin(truth, np.random.default_rng(3)))
+    without = advance(first, made, EVERY_READING, NO_HEADINGS, truth.t_ns[::200])
+
+    assert len(without.poses) == len(with_compass.poses)
+    assert without.poses.cov_xyh[-1, 5] > with_compass.poses.cov_xyh[-1, 5]
+    assert without.counts.headings == 0
+
+
+def straight(n: int = 11, speed: float = 10.0, first_ns: int = 0) -> Increments:
+    t_ns = first_ns + np.arange(n, dtype=np.int64) * 100_000_000
+    speeds = WheelSpeeds(t_ns, np.full((n, 2), speed))
+    return integrate(speeds, OdometrySettings(track_width_m=TRACK_M)).increments
+
+
+def headings_at(*t_s: float, heading: float = 0.0, var: float = 0.01) -> Headings:
+    t_ns = np.round(np.array(t_s) * 1e9).astype(np.int64)
+    return Headings(t_ns, np.full(len(t_s), heading), np.full(len(t_s), var))
+
+
+def test_every_heading_is_accounted_for() -> None:
+    nan = Headings(np.array([400_000_000]), np.array([np.nan]), np.array([0.01]))
+    given = headings_at(0.4, 0.2, 0.25, 0.3, 0.9, 5.0)
+    far = headings_at(0.6, heading=2.0)
+    every = Headings(
+        np.concatenate([nan.t_ns, given.t_ns, far.t_ns]),
+        np.concatenate([nan.heading_rad, given.heading_rad, far.heading_rad]),
+        np.concatenate([nan.var_rad2, given.var_rad2, far.var_rad2]),
+    )
+    belief = start_belief(210_000_000, 0.0, 0.0, 0.0, heading_sd_rad=0.1)
+    settings = TrackSettings(heading_interval_m=1.2)
+    done = advance(TrackState(belief), straight(), settings, every)
+
+    assert done.counts == TrackCounts(
+        intervals=8,
+        intervals_late=2,
+        headings=5,
+        headings_accepted=3,
+        headings_thinned=1,
+        headings_rejected=1,
+        headings_late=1,
+        headings_bad=1,
+    )
+    assert done.state.waiting.t_ns.tolist() == [5_000_000_000]
+    assert done.headings.t_ns.tolist() == [250_000_000, 400_000_000, 600_000_000, 900_000_000]
+    assert done.headings.outcome.tolist() == [0, 0, 1, 0]
+
+
+@pytest.mark.parametrize("var", [np.inf, np.nan, 0.0, -1.0])
+def test_a_heading_without_a_usable_variance_is_bad(var: float) -> None:
+    belief = start_belief(0, 0.0, 0.0, 0.0, heading_sd_rad=0.1)
+    done = advance(TrackState(belief), straight(), TrackSettings(), headings_at(0.5, var=var))
+
+    assert (done.counts.headings_bad, done.counts.headings) == (1, 0)
+
+
+def test_a_standing_car_does_not_count_readings_twice() -> None:
+    belief = start_belief(0, 0.0, 0.0, 0.0, heading_sd_rad=0.1)
+    many = headings_at(*np.arange(0.0, 1.0, 0.05))
+    done = advance(TrackState(belief), straight(speed=0.0), TrackSettings(), many)
+
+    assert done.counts.headings_accepted == 1
+
+
+def test_time_without_odometry_is_driven_blind_and_told() -> None:
+    belief = start_belief(0, 0.0, 0.0, 0.0, speed_mps=10.0, speed_sd_mps=0.5)
+    done = advance(TrackState(belief), straight(first_ns=2_000_000_000), TrackSettings())
+
+    assert done.counts.coasts == 1
+    assert done.counts.coast_ns == 2_000_000_000
+    assert done.poses.x_m[0] == pytest.approx(21.0)
+    assert done.poses.cov_xyh[0, 0] > (0.5 * 2.0) ** 2
+
+
+def test_rows_come_at_the_times_asked_for() -> None:
+    belief = start_belief(0, 0.0, 0.0, 0.0, speed_mps=10.0)
+    wanted = np.array([-5, 50_000_000, 333_000_000, 333_000_000, 9_000_000_000], np.int64)
+    done = advance(TrackState(belief), straight(), TrackSettings(), rows_ns=wanted)
+
+    assert done.poses.t_ns.tolist() == [50_000_000, 333_000_000, 333_000_000]
+    np.testing.assert_allclose(done.poses.x_m, [0.5, 3.33, 3.33])
+    assert done.counts.rows_late == 1
+    assert done.state.waiting_rows_ns.tolist() == [9_000_000_000]
+
+
+def test_wrong_shapes_and_settings_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"var_rad2: want \(2,\), got \(1,\)"):
+        Headings(np.zeros(2, np.int64), np.zeros(2), np.zeros(1))
+    with pytest.raises(ValueError, match="heading_interval_m: want >= 0, got -1"):
+        TrackSettings(heading_interval_m=-1.0)

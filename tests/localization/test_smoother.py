@@ -1,0 +1,197 @@
+"""The batch smoother: exact where all is linear, never worse than the filter, honest. Simulated."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import numpy as np
+import pytest
+
+from crosscue.eval.scoring.consistency import mean_band
+from crosscue.localization.angles import wrap_all
+from crosscue.localization.ekf import PoseBelief
+from crosscue.localization.landmarks.update import update_camera_position
+from crosscue.localization.odometry import Increments, OdometrySettings, WheelSpeeds, integrate
+from crosscue.localization.pose_track import (
+    NO_HEADINGS,
+    Headings,
+    TrackSettings,
+    TrackState,
+    advance,
+    start_belief,
+)
+from crosscue.localization.smoother import Fixes, smooth
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import UsageError
+from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
+
+pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
+
+ODOMETRY = OdometrySettings(
+    track_width_m=TRACK_M, wheel_step_mps=0.01, slip_per_sqrt_m=0.1, gyro_noise_rad_per_sqrt_s=0.01
+)
+EVERY_READING = TrackSettings(heading_interval_m=0.0, heading_gate_nis=None)
+
+
+def straight(n: int, slip: float) -> Increments:
+    t_ns = np.arange(n + 1, dtype=np.int64) * 1_000_000_000
+    settings = OdometrySettings(
+        track_width_m=TRACK_M, slip_per_sqrt_m=slip, wheel_turn_rad_per_sqrt_m=0.0, max_gap_s=2.0
+    )
+    return integrate(WheelSpeeds(t_ns, np.full((n + 1, 2), 10.0)), settings).increments
+
+
+def test_along_a_straight_line_it_is_the_least_squares_solution() -> None:
+    """Heading known, slip along: positions are a chain of Gaussians, solved by hand here."""
+    slip, fix_var, start_var = 0.5, 4.0, 9.0
+    made = straight(10, slip)
+    start = start_belief(0, 3.0, 0.0, 0.0, 10.0, math.sqrt(start_var), 1e-4, 1.0)
+    fixes = Fixes(
+        np.array([4, 10]) * 1_000_000_000,
+        np.array([[42.0, 0.0], [97.0, 0.0]]),
+        np.tile(fix_var * np.eye(2), (2, 1, 1)),
+    )
+    at = np.arange(11, dtype=np.int64) * 1_000_000_000
+    found = smooth(start, made, NO_HEADINGS, fixes, at)
+
+    step_var = float(made.distance_var_m2[0])
+    information = np.zeros((11, 11))
+    vector = np.zeros(11)
+    information[0, 0], vector[0] = 1 / start_var, 3.0 / start_var
+    for i in range(10):
+        pull = np.zeros(11)
+        pull[i], pull[i + 1] = -1.0, 1.0
+        information += np.outer(pull, pull) / step_var
+        vector += pull * 10.0 / step_var
+    for i, x in ((4, 42.0), (10, 97.0)):
+        information[i, i] += 1 / fix_var
+        vector[i] += x / fix_var
+    cov = np.linalg.inv(information)
+    np.testing.assert_allclose(found.xyh[:, 0], cov @ vector, atol=1e-4)
+    np.testing.assert_allclose(found.cov[:, 0, 0], np.diag(cov), rtol=1e-4)
+    np.testing.assert_allclose(found.xyh[:, 1], 0.0, atol=1e-6)
+
+
+def test_without_measurements_it_is_dead_reckoning_with_the_filters_covariance() -> None:
+    rng = np.random.default_rng(2)
+    truth = drive(rng, seconds=20.0)
+    made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng)).increments
+    x, y, heading = truth.xyh[0].tolist()
+    first = start_belief(int(truth.t_ns[0]), x, y, heading, 0.0, 1.0, 0.02, 1.0)
+    track = advance(TrackState(first), made, EVERY_READING).poses
+    found = smooth(first, made, NO_HEADINGS, at_ns=track.t_ns[19::40])
+
+    rows = np.searchsorted(track.t_ns, found.t_ns)
+    np.testing.assert_allclose(found.xyh[:, 0], track.x_m[rows], atol=1e-5)
+    np.testing.assert_allclose(found.xyh[:, 1], track.y_m[rows], atol=1e-5)
+    upper = found.cov[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    np.testing.assert_allclose(upper, track.cov_xyh[rows], rtol=0.02, atol=2e-3)
+
+
+def one(seed: int) -> tuple[Truth, PoseBelief, Increments, Headings, Fixes]:
+    rng = np.random.default_rng(seed)
+    truth = drive(rng, seconds=30.0)
+    made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng)).increments
+    off = rng.normal(0.0, [2.0, 2.0, 0.1])
+    x, y, heading = truth.xyh[0] + off
+    first = start_belief(int(truth.t_ns[0]), x, y, heading, truth.speed_mps[0], 2.0, 0.1, 1.0)
+    headings = compass(truth, 0.2, rng, every=20)
+    rows = np.arange(100, len(truth.t_ns), 150)
+    cov = np.tile(np.array([[2.0, 0.5], [0.5, 1.0]]), (len(rows), 1, 1))
+    noise = rng.multivariate_normal([0.0, 0.0], cov[0], len(rows))
+    return truth, first, made, headings, Fixes(truth.t_ns[rows], truth.xyh[rows, :2] + noise, cov)
+
+
+class FixLooks:
+    """Hands the fixes to the filter."""
+
+    def __init__(self, fixes: Fixes) -> None:
+        self.fixes = fixes
+
+    def times_ns(self) -> list[int]:
+        """Of the fixes."""
+        return [int(t) for t in self.fixes.t_ns]
+
+    def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
+        """Weigh one in."""
+        i = int(np.searchsorted(self.fixes.t_ns, belief.t_ns))
+        return update_camera_position(belief, self.fixes.xy_m[i], self.fixes.cov_m2[i]).belief
+
+
+def errors(truth: Truth, t_ns: Int64s, xyh: Floats) -> Floats:
+    error: Floats = xyh - truth.xyh[np.searchsorted(truth.t_ns, t_ns)]
+    error[:, 2] = wrap_all(error[:, 2])
+    return error
+
+
+def test_simulated_errors_are_as_claimed_and_no_larger_than_the_filters() -> None:
+    """Seeds 0 to 29: at the end both know the same; in the middle the smoother knows more."""
+    nees, filter_m2, smoother_m2, ends = [], [], [], []
+    for seed in range(30):
+        truth, first, made, headings, fixes = one(seed)
+        at = truth.t_ns[20::20]
+        looks = FixLooks(fixes)
+        track = advance(TrackState(first), made, EVERY_READING, headings, at, looks).poses
+        found = smooth(first, made, headings, fixes, at)
+        error = errors(truth, found.t_ns, found.xyh)
+        nees.append(float(error[15] @ np.linalg.solve(found.cov[15], error[15])))
+        smoother_m2.append(np.mean(np.sum(error[:, :2] ** 2, axis=1)))
+        filtered = np.column_stack([track.x_m, track.y_m, track.heading_rad])
+        filter_error = errors(truth, track.t_ns, filtered)
+        filter_m2.append(np.mean(np.sum(filter_error[:, :2] ** 2, axis=1)))
+        ends.append(math.dist(found.xyh[-1, :2], filtered[-1, :2]))
+
+    low, high = mean_band(3, 30)
+    assert low < np.mean(nees) < high
+    assert np.sqrt(np.mean(smoother_m2)) < 0.9 * np.sqrt(np.mean(filter_m2))
+    assert np.median(ends) < 0.2
+
+
+def test_at_the_end_of_hours_without_landmarks_it_knows_what_the_filter_knows() -> None:
+    """Position is held a hundred million times more loosely than each step: seed 5, 24 km."""
+    rng, n = np.random.default_rng(5), 12_000
+    settings = OdometrySettings(
+        track_width_m=TRACK_M, slip_per_sqrt_m=2e-3, wheel_turn_rad_per_sqrt_m=3e-3, max_gap_s=2.0
+    )
+    t_ns = np.arange(n + 1, dtype=np.int64) * 1_000_000_000
+    speeds = 2.0 + np.outer(rng.normal(0.0, 3e-3 * math.sqrt(2.0), n + 1), [-0.5, 0.5]) * TRACK_M
+    made = integrate(WheelSpeeds(t_ns, speeds), settings).increments
+    first = start_belief(0, 0.0, 0.0, 0.0, 2.0, 1.0, 0.09, 1.0)
+    headings = Headings(t_ns[1:], rng.normal(0.0, 0.2, n), np.full(n, 0.04))
+    end = advance(TrackState(first), made, EVERY_READING, headings).poses
+    found = smooth(first, made, headings, at_ns=t_ns[[-1]])
+
+    sd_m = math.sqrt(found.cov[0, 1, 1])
+    assert 20.0 < sd_m < 60.0
+    assert found.xyh[0, 1] == pytest.approx(end.y_m[-1], abs=0.02 * sd_m)
+    # Along the way a filter that linearises at noisy headings falls short by a little.
+    assert found.xyh[0, 0] == pytest.approx(end.x_m[-1], abs=10.0)
+    assert sd_m == pytest.approx(math.sqrt(end.cov_xyh[-1, 3]), rel=0.1)
+
+
+def test_the_camera_ahead_of_the_axle_is_where_the_fix_is() -> None:
+    made = straight(4, 0.5)
+    start = start_belief(0, 0.0, 0.0, 0.0, 10.0, 10.0, 1e-4, 1.0)
+    fix = Fixes(np.array([2_000_000_000]), np.array([[25.0, 1.0]]), 1e-4 * np.eye(2)[None])
+    found = smooth(start, made, NO_HEADINGS, fix, np.array([2_000_000_000]), (2.0, 0.5))
+
+    np.testing.assert_allclose(found.xyh[0, :2], [23.0, 0.5], atol=0.01)
+
+
+def test_holes_and_odd_columns_are_refused() -> None:
+    made = straight(4, 0.5)
+    late = start_belief(9_000_000_000, 0.0, 0.0, 0.0)
+    early = start_belief(-1, 0.0, 0.0, 0.0)
+    with pytest.raises(ValueError, match="want odometry after 9000000000 ns"):
+        smooth(late, made, NO_HEADINGS)
+    with pytest.raises(ValueError, match="want no holes, got one at -1 ns"):
+        smooth(early, made, NO_HEADINGS)
+    with pytest.raises(ValueError, match=r"want xy_m \(1, 2\)"):
+        Fixes(np.zeros(1, np.int64), np.zeros((2, 2)), np.zeros((1, 2, 2)))
+
+
+def test_without_the_package_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    with pytest.raises(UsageError, match=r"pip install 'crosscue\[gtsam\]'"):
+        smooth(start_belief(0, 0.0, 0.0, 0.0), straight(2, 0.1), NO_HEADINGS)

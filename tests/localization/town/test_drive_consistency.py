@@ -1,0 +1,106 @@
+"""The simulator's filter is as wrong as it says: NEES and NIS in their chi-square bands.
+
+Here the wheels' encoders are fine enough to be no source of error, because the filter does not know
+of their steps. docs/studies.md tells where the filter is over-sure, and by how much.
+"""
+
+import math
+
+import numpy as np
+import pytest
+
+from crosscue.eval.scoring.consistency import mean_band
+from crosscue.eval.studies.town.consistency import nees_along_the_arc
+from crosscue.localization.angles import wrap_all
+from crosscue.localization.town.kernel import (
+    LANDMARK_REFUSED,
+    LANDMARK_TAKEN,
+    Traced,
+    drive_many,
+    drive_traced,
+)
+from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
+from crosscue.localization.town.simulator import Result
+from crosscue.replay.columns import Floats
+
+NEES = Result._fields.index("nees")
+FINE_M = 1e-4
+NO_GATE = 1e9
+
+
+def fine(compass_2sigma_deg: float | None, *, goals: int = 1) -> Drive:
+    sensors = Sensors(compass_2sigma_deg=compass_2sigma_deg, encoder_step_m=FINE_M)
+    return Drive(sensors=sensors, goals=goals)
+
+
+def compass_innovations(settings: Drive, traced: Traced) -> tuple[Floats, Floats]:
+    """Innovations of the compass, and the variances that the filter gave them."""
+    sensors, track_m = settings.sensors, settings.car.track_width_m
+    assert sensors.compass_2sigma_deg is not None
+    left, right, compass = traced.steps[1:, 4:7].T
+    before, var = traced.steps[:-1, 9], traced.steps[:-1, 15]
+    slip = sensors.slip_per_sqrt_m**2 * np.abs(0.5 * (left + right))
+    expected = before + (right - left) / track_m
+    spread = var + 2.0 * slip / track_m**2 + (math.radians(sensors.compass_2sigma_deg) / 2.0) ** 2
+    is_read = ~np.isnan(compass)
+    return wrap_all(compass - expected)[is_read], spread[is_read]
+
+
+def landmark_nis(traced: Traced) -> list[float]:
+    found = []
+    for event in traced.of_kind(LANDMARK_TAKEN, LANDMARK_REFUSED):
+        row = traced.steps[int(event[0]) - 1]
+        spread = np.array([[row[10], row[11]], [row[11], row[13]]]) + 25.0 * np.eye(2)
+        off = event[4:6] - row[7:9]
+        found.append(float(off @ np.linalg.solve(spread, off)))
+    return found
+
+
+@pytest.mark.parametrize("goals", [1, 1_000_000], ids=["to the goal", "as far as allowed"])
+def test_nees_at_ten_degrees_is_in_its_band(goals: int) -> None:
+    count = 2000 if goals == 1 else 300
+    settings = fine(10.0, goals=goals).model_copy(update={"longest_m": 20_000.0})
+    rows = drive_many(settings, np.arange(count, dtype=np.uint64))
+    low, high = mean_band(3, count)
+
+    assert low < rows[:, NEES].mean() < high
+
+
+@pytest.mark.parametrize("compass_deg", [10.0, 20.0, 30.0])
+def test_compass_innovations_are_white_and_as_large_as_the_filter_says(compass_deg: float) -> None:
+    settings = fine(compass_deg)
+    parts = [compass_innovations(settings, drive_traced(settings, seed)) for seed in range(12)]
+    nis = np.concatenate([off**2 / spread for off, spread in parts])
+    following = np.concatenate([
+        (off[1:] * off[:-1]) / np.sqrt(spread[1:] * spread[:-1]) for off, spread in parts
+    ])  # fmt: skip
+    low, high = mean_band(1, len(nis))
+
+    assert len(nis) > 20_000
+    assert low < nis.mean() < high
+    assert abs(following.mean()) < 2.0 / math.sqrt(len(following))
+
+
+def test_landmark_innovations_are_as_large_as_the_filter_says() -> None:
+    settings = Drive(
+        city=City(largest_km2=9.0),
+        landmarks_per_km2=5.0,
+        navigation=Navigation(strategy="landmark to landmark"),
+        sensors=Sensors(compass_2sigma_deg=10.0, encoder_step_m=FINE_M, landmark_gate_nis=NO_GATE),
+    )
+    nis = [one for seed in range(120) for one in landmark_nis(drive_traced(settings, seed))]
+    low, high = mean_band(2, len(nis))
+
+    assert len(nis) > 200
+    assert low < np.mean(nis) < high
+
+
+def test_without_a_compass_errors_lie_on_an_arc() -> None:
+    """Over-sure as an ellipse in x, y and heading; honest as a turn and a shift."""
+    settings = fine(None)
+    ends = [drive_traced(settings, seed).steps[-1] for seed in range(400)]
+    rows = drive_many(settings, np.arange(400, dtype=np.uint64))
+    low, high = mean_band(3, 400)
+
+    assert rows[:, NEES].mean() > high + 1.0
+    assert low < np.mean([nees_along_the_arc(row) for row in ends]) < high

@@ -1,0 +1,255 @@
+"""The compiled drive is the readable one; its filter is honest; it gets lost as physics says."""
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from crosscue.eval.scoring.consistency import mean_band
+from crosscue.localization import ekf
+from crosscue.localization.town import settings as drive_settings
+from crosscue.localization.town.kernel import (
+    GOAL_SET,
+    LANDMARK_MISSED,
+    LANDMARK_REFUSED,
+    LANDMARK_SET,
+    LANDMARK_TAKEN,
+    LANES,
+    as_result,
+    drive_many,
+    drive_traced,
+    filter_rows,
+    numbers_of,
+)
+from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
+from crosscue.localization.town.simulator import Outcome, Result, Trace, as_rows, drive
+from crosscue.replay.columns import Floats
+
+FIELD = {name: i for i, name in enumerate(Result._fields)}
+TOWN = City(largest_km2=3.0)
+TANGLED = City(largest_km2=4.0, dead_end_share=0.15, one_way_share=0.6)
+KINDS = {
+    "town": Drive(city=TOWN),
+    "no compass": Drive(sensors=Sensors(compass_2sigma_deg=None)),
+    "tangled, hybrid": Drive(
+        city=TANGLED,
+        landmarks_per_km2=4.0,
+        navigation=Navigation(strategy="hybrid", hybrid_above_m=15.0),
+        longest_m=2000.0,
+    ),
+    "landmark to landmark": Drive(
+        city=TOWN,
+        landmarks_per_km2=8.0,
+        sensors=Sensors(detection_rate=0.6, landmark_gate_nis=4.0),
+        navigation=Navigation(strategy="landmark to landmark"),
+    ),
+    "field": Drive(
+        city=City(smallest_km2=1.0, largest_km2=1.0),
+        landmarks_per_km2=0.55,
+        landmark_per_goal=True,
+        goals=1_000_000,
+        longest_s=200.0,
+        navigation=Navigation(strategy="landmark to landmark"),
+    ),
+    "maze": Drive(
+        city=City(dead_end_share=0.2, one_way_share=0.8, smallest_km2=2.0, largest_km2=3.0),
+        landmarks_per_km2=5.0,
+        longest_m=600.0,
+    ),
+    "coarse": Drive(
+        city=TOWN, car=drive_settings.Car(step_s=0.05, cruise_mps=7.0), longest_m=800.0
+    ),
+}
+
+
+def seeds(count: int, first: int = 0) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
+    return np.arange(first, first + count, dtype=np.uint64)
+
+
+def many(settings: Drive, count: int, first: int = 0) -> Floats:
+    parts = np.array_split(seeds(count, first), 8)
+    with ThreadPoolExecutor(2) as pool:
+        return np.concatenate(list(pool.map(lambda part: drive_many(settings, part), parts)))
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_the_compiled_drive_is_the_readable_one(kind: str) -> None:
+    readable = as_rows([drive(KINDS[kind], seed) for seed in range(3)])
+
+    np.testing.assert_allclose(drive_many(KINDS[kind], seeds(3)), readable, rtol=1e-9, atol=1e-9)
+
+
+def test_a_traced_drive_is_the_readable_one_step_by_step() -> None:
+    settings, trace = KINDS["landmark to landmark"], Trace()
+    result = drive(settings, 3, trace)
+    traced = drive_traced(settings, 3)
+
+    assert traced.result == pytest.approx(result, rel=1e-9)
+    np.testing.assert_allclose(traced.steps[:, :4], trace.true_poses, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(traced.steps[:, 4:6], trace.wheels_m, rtol=1e-9, atol=1e-9)
+    read = np.flatnonzero(~np.isnan(traced.steps[:, 6]))
+    assert (read + 1).tolist() == [step for step, _ in trace.compass]
+    means = np.array([belief.mean[:3] for belief in trace.beliefs])
+    np.testing.assert_allclose(traced.steps[:, 7:10], means, rtol=1e-9, atol=1e-9)
+    axes = [ekf.axis_of(*row) for row in traced.steps[:, [10, 11, 13]].tolist()]
+    np.testing.assert_allclose(axes, [ekf.major_axis_m(b) for b in trace.beliefs], rtol=1e-9)
+
+
+def test_events_tell_all_goals_and_landmarks() -> None:
+    traced = drive_traced(KINDS["field"], 2)
+    result = traced.result
+
+    assert len(traced.of_kind(GOAL_SET)) == result.goals + 1
+    assert len(traced.of_kind(LANDMARK_SET)) >= result.landmarks
+    assert len(traced.of_kind(LANDMARK_TAKEN)) == result.detected
+    assert len(traced.of_kind(LANDMARK_REFUSED)) == result.refused
+    passed = traced.of_kind(LANDMARK_MISSED, LANDMARK_TAKEN, LANDMARK_REFUSED)
+    assert len(passed) == result.passed
+
+
+def test_the_filter_alone_is_the_filter_of_the_drive() -> None:
+    settings, steps = Drive(), 400
+    many = [drive_traced(settings, seed) for seed in range(LANES)]
+    first = np.array([traced.first_belief for traced in many]).T.copy()
+    readings = np.stack([traced.steps[:steps, 4:7] for traced in many], axis=2).copy()
+    ends = np.empty((9, LANES))
+
+    filter_rows(numbers_of(settings), first, readings, ends)
+
+    wanted = np.array([traced.steps[steps - 1, 7:16] for traced in many]).T
+    np.testing.assert_allclose(ends, wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_no_drive_depends_on_its_neighbours() -> None:
+    settings = KINDS["landmark to landmark"]
+    together = drive_many(settings, seeds(2 * LANES + 3))
+    alone = [drive_many(settings, seeds(1, seed))[0] for seed in (0, LANES - 1, LANES, 2 * LANES)]
+
+    assert together[[0, LANES - 1, LANES, 2 * LANES]].tobytes() == np.array(alone).tobytes()
+
+
+def test_turns_too_sharp_for_a_series_are_the_readable_ones() -> None:
+    """A short, slipping car that hardly knows which way it faces."""
+    settings = Drive(
+        city=City(largest_km2=1.5),
+        car=drive_settings.Car(wheelbase_m=0.8),
+        sensors=Sensors(slip_per_sqrt_m=0.2, start_heading_sd_deg=60.0),
+    )
+    readable = as_rows([drive(settings, seed) for seed in range(3)])
+
+    np.testing.assert_allclose(drive_many(settings, seeds(3)), readable, rtol=1e-9, atol=1e-9)
+
+
+def test_rows_and_records_are_the_same() -> None:
+    row = drive_many(KINDS["town"], seeds(1))[0]
+    result = as_result(row)
+
+    assert isinstance(result.steps, int)
+    np.testing.assert_array_equal(np.array(result, float), row)
+
+
+def test_parts_of_the_seeds_give_the_same_bytes_as_all_at_once() -> None:
+    whole = drive_many(KINDS["town"], seeds(9))
+    parts = [drive_many(KINDS["town"], seeds(3, first)) for first in (0, 3, 6)]
+
+    assert np.concatenate(parts).tobytes() == whole.tobytes()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        Drive(),
+        Drive(sensors=Sensors(compass_2sigma_deg=20.0)),
+        Drive(sensors=Sensors(compass_2sigma_deg=10.0)),
+        Drive(
+            landmarks_per_km2=1.0,
+            navigation=Navigation(strategy="hybrid"),
+            sensors=Sensors(detection_rate=0.6),
+        ),
+    ],
+    ids=["30 degrees", "20 degrees", "10 degrees", "landmarks"],
+)
+def test_errors_are_as_large_as_the_filter_says(settings: Drive) -> None:
+    """As far as 400 drives can tell; 20,000 show 4 % too much at 20 to 30 degrees."""
+    rows = many(settings, 400)
+    low, high = mean_band(3, 400)
+
+    assert low < rows[:, FIELD["nees"]].mean() < high
+
+
+def test_a_heading_off_by_five_degrees_is_more_than_a_linear_filter_admits() -> None:
+    """Without a compass the true errors lie on an arc, the filter's ellipse is straight."""
+    rows = many(Drive(sensors=Sensors(compass_2sigma_deg=None)), 400)
+    _, high = mean_band(3, 400)
+
+    assert rows[:, FIELD["nees"]].mean() > high
+
+
+@pytest.mark.parametrize("compass_deg", [20.0, 30.0])
+def test_straight_driving_spreads_as_r_ds_d(compass_deg: float) -> None:
+    """N readings bound the summed heading, whatever the heading's own noise."""
+    interval_m, way_m = 2.0, 4000.0
+    r = math.radians(compass_deg / 2.0) ** 2
+    for slip in (1e-4, 1e-3):
+        belief = ekf.PoseBelief(0, np.zeros(4), np.diag([1e-6, 1e-6, 0.01, 0.1]))
+        for _ in range(round(way_m / interval_m)):
+            belief = ekf.predict_odometry(belief, interval_m, 0.0, slip**2, slip**2, 0.2, 1.0)
+            belief = ekf.update_heading(belief, 0.0, r).belief
+
+        assert belief.cov[1, 1] == pytest.approx(r * interval_m * way_m, rel=0.15)
+
+
+def test_simulated_cars_in_one_long_street_are_lost_where_the_law_says() -> None:
+    """Few turns: the mean is near 25^2 / (r ds), turns and the start's uncertainty beside."""
+    city = City(
+        smallest_km2=400.0, largest_km2=400.0, dead_end_share=0.0, one_way_share=0.0,
+        shortest_block_m=1000.0, longest_block_m=1000.0, goal_at_least_m=250.0,
+    )  # fmt: skip
+    # Slip enough that the start's heading is soon forgotten.
+    sensors = Sensors(compass_2sigma_deg=60.0, compass_interval_m=4.0, slip_per_sqrt_m=0.03)
+    rows = many(Drive(city=city, sensors=sensors), 200)
+    lost = rows[(rows[:, FIELD["outcome"]] == Outcome.LOST) & (rows[:, FIELD["turns"]] == 0)]
+    law_m = 25.0**2 / (math.radians(30.0) ** 2 * 4.0)
+
+    assert len(lost) > 20
+    assert lost[:, FIELD["travelled_m"]].mean() == pytest.approx(law_m, rel=0.15)
+
+
+def test_zero_landmarks_and_zero_detections_give_the_same_drive() -> None:
+    none = drive_many(Drive(city=TOWN), seeds(6))
+    blind = Drive(city=TOWN, landmarks_per_km2=5.0, sensors=Sensors(detection_rate=0.0))
+    unseen = drive_many(blind, seeds(6))
+
+    assert (none[:, FIELD["passed"]] == 0).all()
+    assert (unseen[:, FIELD["passed"]] > 0).any()
+    assert (unseen[:, FIELD["detected"]] == 0).all()
+
+
+def test_a_city_without_intersections_is_refused() -> None:
+    blocks = City(
+        smallest_km2=0.25, largest_km2=0.25, shortest_block_m=900.0, longest_block_m=950.0
+    )
+
+    with pytest.raises(ValueError, match="no intersection"):
+        drive_many(Drive(city=blocks), seeds(3))
+
+
+@pytest.mark.parametrize(
+    ("section", "field", "value"),
+    [
+        (Drive, "landmarks_per_km2", -1.0),
+        (Drive, "landmarks_per_km2", 1e6),
+        (Sensors, "detection_rate", 1.1),
+        (Sensors, "landmark_sd_m", 0.0),
+        (Sensors, "compass_2sigma_deg", float("nan")),
+        (City, "one_way_share", 0.9),
+        (City, "shortest_block_m", 10.0),
+    ],
+)
+def test_values_out_of_range_are_refused(
+    section: type[Drive] | type[Sensors] | type[City], field: str, value: float
+) -> None:
+    with pytest.raises(ValidationError, match=field):
+        section.model_validate({field: value})

@@ -1,0 +1,33 @@
+"""Simulated drives: the same from the same seed, honest about their errors, lost as predicted."""
+
+import numpy as np
+
+from crosscue.localization.town.settings import City, Drive, Sensors
+from crosscue.localization.town.simulator import Outcome, drive
+
+TOWN = City(largest_km2=2.0)
+
+
+def test_the_same_seed_gives_the_same_drive_and_another_another() -> None:
+    settings = Drive(city=TOWN)
+
+    assert drive(settings, 4) == drive(settings, 4)
+    assert drive(settings, 4) != drive(settings, 5)
+
+
+def test_a_better_compass_keeps_the_ellipse_smaller() -> None:
+    poor, good = (
+        drive(Drive(city=TOWN, sensors=Sensors(compass_2sigma_deg=deg)), 6) for deg in (30.0, 10.0)
+    )
+
+    per_metre = [result.major_axis_m**2 / result.travelled_m for result in (poor, good)]
+    assert per_metre[1] < per_metre[0]
+
+
+def test_without_a_compass_the_car_is_lost_within_a_kilometre() -> None:
+    settings = Drive(city=City(smallest_km2=20.0), sensors=Sensors(compass_2sigma_deg=None))
+    results = [drive(settings, seed) for seed in range(8)]
+
+    lost = [r for r in results if r.outcome == Outcome.LOST]
+    assert len(lost) >= 6
+    assert np.mean([r.travelled_m for r in lost]) < 1000.0

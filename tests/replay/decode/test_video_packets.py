@@ -1,0 +1,104 @@
+"""Packets of a video become pictures with their own times, as every other camera's do."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from crosscue.eval.cli import run
+from crosscue.replay.columns import Block, Images, Topic
+from crosscue.replay.decode.packets import NO_PICTURE, NOT_DECODED
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import open_log
+from crosscue.replay.signals import Extractor, Plan, Source
+from crosscue.replay.vehicle.vehicle import Vehicle
+from support.videos import SIZE_PX, number_of, video
+
+STEP_NS = 50_000_000
+CODECS = ["libx264", "libx265", "libsvtav1"]
+
+
+def packets(path: Path) -> tuple[Topic, list[Block]]:
+    with open_log(path) as log:
+        return log.topics[0], list(log.read(Ledger("video")))
+
+
+def shown(topic: Topic, blocks: list[Block]) -> tuple[dict[int, int], Ledger]:
+    """From time to the number that the picture shows, through the extractor."""
+    found: dict[int, int] = {}
+
+    def see(block: Block) -> None:
+        assert isinstance(block.rows, Images)
+        for i, t_ns in enumerate(block.log_ns.tolist()):
+            pixels = np.frombuffer(block.rows.bytes_.payload(i), np.uint8)
+            found[t_ns] = number_of(pixels.reshape(SIZE_PX[1], SIZE_PX[0], 3))
+
+    ledger = Ledger("video")
+    planned = Plan((Source(0, topic, ()),), {})
+    extractor = Extractor(planned, Vehicle(version=1), 0, ledger, on_pictures=see)
+    for block in blocks:
+        for _ in extractor(block):
+            pass
+    for _ in extractor.finish():
+        pass
+    return found, ledger
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_every_packet_becomes_the_picture_of_its_time(codec: str, tmp_path: Path) -> None:
+    suffix = ".mkv" if codec == "libsvtav1" else ".mp4"
+    topic, blocks = packets(video(tmp_path / f"front{suffix}", codec=codec))
+
+    found, ledger = shown(topic, blocks)
+
+    assert [found[t] for t in sorted(found)] == list(range(24))
+    assert sorted(found) == [k * STEP_NS for k in range(24)]
+    assert not any(account.skipped for account in ledger.accounts.values())
+
+
+def test_a_stream_that_begins_within_a_group_loses_what_cannot_be_known(tmp_path: Path) -> None:
+    topic, blocks = packets(video(tmp_path / "front.mp4", options={"g": "12", "bf": "0"}))
+    (block,) = blocks
+
+    found, ledger = shown(topic, [block.take(slice(5, None))])
+
+    account = ledger.topic(topic.name)
+    skipped = account.skipped + account.dropped
+    assert sum(skipped.values()) + len(found) == 19
+    assert set(skipped) <= {NO_PICTURE, NOT_DECODED}
+    assert sorted(found)[-1] == 23 * STEP_NS
+    assert all(found[12 * STEP_NS + k * STEP_NS] == 12 + k for k in range(12))
+
+
+def test_a_broken_packet_is_told_and_the_next_group_is_whole(tmp_path: Path) -> None:
+    topic, blocks = packets(video(tmp_path / "front.mp4", options={"g": "12", "bf": "0"}))
+    (block,) = blocks
+    assert isinstance(block.rows, Images)
+    held = block.rows.bytes_
+    buffer = held.buffer.copy()
+    buffer[int(held.start[3]) : int(held.stop[3])] = 0xFF
+    broken = replace(block.rows, bytes_=replace(held, buffer=buffer))
+
+    found, ledger = shown(topic, [replace(block, rows=broken)])
+
+    assert ledger.topic(topic.name).dropped.total() >= 1
+    assert all(found[12 * STEP_NS + k * STEP_NS] == 12 + k for k in range(12))
+
+
+def test_detect_looks_at_every_picture_of_a_video(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = video(tmp_path / "front.mp4")
+    argv = ["detect", str(log), "-o", str(tmp_path / "run"), "--json", "--no-cache",
+            "--detectors", "support.detecting:build"]  # fmt: skip
+
+    assert run(argv) == 0
+
+    assert json.loads(capsys.readouterr().out)["frames"] == 24
+    times = pq.read_table(tmp_path / "run" / "frames.parquet")["t_ns"].to_pylist()
+    assert times == [k * STEP_NS for k in range(24)]

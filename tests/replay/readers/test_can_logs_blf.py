@@ -1,0 +1,299 @@
+"""Vector BLF logs: containers, objects, clocks and hostile files."""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import can
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.columns import ERROR
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import NOT_ASKED_TIME, Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import Selection, open_log
+from support.can_files import START_NS, Sent, blf, by_bus, made, read_back, same_as_python_can
+from support.data import shared
+
+
+def _log(folder: Path, content: bytes) -> Path:
+    path = folder / "x.blf"
+    path.write_bytes(content)
+    return path
+
+
+def _container(content: bytes, declared: int | None = None) -> bytes:
+    coded = zlib.compress(content)
+    size = len(content) if declared is None else declared
+    head = struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 32 + len(coded), 10, 2, size)
+    return head + coded + bytes(len(coded) % 4)
+
+
+def _objects(frames: list[Sent]) -> bytes:
+    return zlib.decompress(blf(frames, container=1 << 30)[144 + 32 :])
+
+
+def test_a_lost_container_costs_its_frames_and_no_more(tmp_path: Path) -> None:
+    frames = made(400)
+    content = bytearray(blf(frames, container=4000))
+    hit = content.find(b"LOBJ", 3000) + 60
+    content[hit] ^= 0xFF
+
+    found, ledger = read_back(_log(tmp_path, bytes(content)))
+
+    read = [f for rows in found.values() for f in rows]
+    assert set(read) < {f for rows in by_bus(frames).values() for f in rows}
+    assert len(read) > 250
+    assert ledger.topic("").dropped.total() == len(frames) - len(read)
+    assert "checksum" in next(ledger.drops()).detail
+
+
+def test_an_unclosed_log_gives_all_it_holds_and_says_so(tmp_path: Path) -> None:
+    frames = made(200)
+
+    found, ledger = read_back(_log(tmp_path, blf(frames, is_closed=False)))
+
+    assert sum(map(len, found.values())) == 200
+    assert ledger.topic("").dropped_unknown == ["file was not closed by its writer"]
+    assert any("no start time" in notice for notice in ledger.notices)
+
+
+def test_fewer_objects_than_declared_are_lost(tmp_path: Path) -> None:
+    frames = made(50)
+    content = bytearray(blf(frames))
+    content[32:36] = struct.pack("<L", 60)
+
+    _, ledger = read_back(_log(tmp_path, bytes(content)))
+
+    assert ledger.topic("").dropped.total() == 10
+
+
+def test_error_frames_are_kept(tmp_path: Path) -> None:
+    (frame,) = made(1, fd=False)
+    error = Sent(frame.t_ns, "1", 0x12, b"\1\2", False, ERROR)
+
+    found, _ = read_back(_log(tmp_path, blf([error])))
+
+    assert found == by_bus([error])
+
+
+def test_other_objects_are_counted_as_no_frames(tmp_path: Path) -> None:
+    objects = bytearray(_objects(made(3, fd=False)))
+    objects[12:16] = struct.pack("<L", 96)
+    header = blf(made(3))[:144]
+
+    found, ledger = read_back(_log(tmp_path, header + _container(bytes(objects))))
+
+    assert sum(map(len, found.values())) == 2
+    assert ledger.topic("").skipped == {"object of type 96 is no CAN frame": 1}
+    assert ledger.is_whole
+
+
+def test_objects_outside_containers_are_read(tmp_path: Path) -> None:
+    frames = made(50)
+
+    found, ledger = read_back(_log(tmp_path, blf(frames)[:144] + _objects(frames)))
+
+    assert found == by_bus(frames)
+    assert ledger.topic("").dropped.total() == 0
+
+
+def test_a_payload_that_looks_like_an_object_is_a_payload(tmp_path: Path) -> None:
+    frames = [Sent(f.t_ns, f.bus, 0x7, b"xLOBJabc", False) for f in made(20)]
+
+    found, ledger = read_back(_log(tmp_path, blf(frames, container=333)))
+
+    assert found == by_bus(frames)
+    assert ledger.is_whole
+
+
+@pytest.mark.parametrize("size", [0, 1, 15, 1 << 20, 0xFFFFFFFF])
+@pytest.mark.parametrize("stored", [False, True])
+def test_an_object_of_impossible_size_does_not_stop_the_reading(
+    tmp_path: Path, size: int, stored: bool
+) -> None:
+    frames = made(100, fd=False)
+    objects = bytearray(_objects(frames))
+    objects[10 * 48 + 8 : 10 * 48 + 12] = struct.pack("<L", size)
+    content = blf(frames)[:144] + (bytes(objects) if stored else _container(bytes(objects)))
+
+    found, ledger = read_back(_log(tmp_path, content))
+
+    assert sum(map(len, found.values())) == 99
+    assert ledger.topic("").dropped.total() == 1
+
+
+@pytest.mark.parametrize("declared", [100, 50_000_000])
+def test_a_container_cannot_inflate_beyond_what_it_declares_or_the_limit(
+    tmp_path: Path, declared: int
+) -> None:
+    frames = made(30)
+    bomb = _container(bytes(50_000_000), declared)
+    path = _log(tmp_path, blf(frames) + bomb)
+    ledger = Ledger(str(path))
+
+    with open_log(path, Limits(chunk_bytes=1 << 20)) as log:
+        rows = sum(len(block) for block in log.read(ledger))
+
+    assert rows == 30
+    assert not ledger.is_whole
+
+
+def test_a_file_of_nothing_but_false_containers_ends_soon(tmp_path: Path) -> None:
+    false = struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 0xFFFF, 10, 2, 0xFFFF)
+    nested = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 8, 10)
+
+    for junk in (false * 20_000, nested * 20_000, b"LOBJ" * 100_000):
+        found, ledger = read_back(_log(tmp_path, blf(made(30)) + junk))
+
+        assert sum(map(len, found.values())) == 30
+        assert not ledger.is_whole
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(b"", "empty"), (b"LOGG", "no BLF header"), (bytes(500), "no BLF header")],
+)
+def test_what_is_no_blf_log_is_refused_in_one_line(
+    tmp_path: Path, content: bytes, says: str
+) -> None:
+    with pytest.raises(LogFormatError, match=says):
+        open_log(_log(tmp_path, content))
+
+
+def _peer(path: Path) -> list[can.Message]:
+    """As python-can reads it; it counts channels from 0."""
+    peer = list(can.BLFReader(path))
+    for message in peer:
+        assert isinstance(message.channel, int)
+        message.channel += 1
+    return peer
+
+
+def test_python_can_writes_what_we_read(tmp_path: Path) -> None:
+    path = tmp_path / "x.blf"
+    frames = made(3000)
+    with can.BLFWriter(path) as writer:
+        for k, f in enumerate(frames):
+            is_error = k % 100 == 7
+            writer(
+                can.Message(
+                    timestamp=f.t_ns * 1e-9,
+                    arbitration_id=f.arbitration_id,
+                    is_extended_id=f.is_extended,
+                    is_remote_frame=f.kind == 1,
+                    is_error_frame=is_error,
+                    is_fd=f.is_fd and not is_error,
+                    data=f.payload[:8] if is_error else f.payload,
+                    channel=int(f.bus) - 1,
+                )
+            )
+    same_as_python_can(path, _peer(path), "can/{}")
+
+
+def test_the_real_log_reads_as_python_can_reads_it() -> None:
+    path = shared("can", "python_can", "issue_1905.blf")
+    same_as_python_can(path, _peer(path), "can/{}")
+
+
+MINUTE = [replace(f, t_ns=START_NS + k * 10_000_000) for k, f in enumerate(made(6_000))]
+WHOLE = blf(MINUTE, container=4_000)
+
+
+@given(
+    window=st.tuples(st.integers(-5, 65), st.integers(-5, 65)),
+    ends=st.sampled_from(["both", "from", "to"]),
+    stored=st.booleans(),
+)
+@settings(max_examples=20, deadline=None)
+def test_a_window_costs_the_containers_in_it_and_its_account_is_exact(
+    tmp_path_factory: pytest.TempPathFactory, window: tuple[int, int], ends: str, stored: bool
+) -> None:
+    start_ns, end_ns = (START_NS + s * 10**9 for s in sorted(window))
+    asked = Selection(
+        start_ns=None if ends == "to" else start_ns, end_ns=None if ends == "from" else end_ns
+    )
+    content = blf(MINUTE, container=4_000, stored=stored) if stored else WHOLE
+
+    found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), content), asked)
+
+    wanted = [
+        f
+        for f in MINUTE
+        if (asked.start_ns or 0) <= f.t_ns and (asked.end_ns is None or f.t_ns < asked.end_ns)
+    ]
+    assert found == by_bus(wanted)
+    accounts = ledger.accounts.values()
+    assert sum(one.in_file for one in accounts) == len(MINUTE)
+    assert sum(one.used for one in accounts) == len(wanted)
+    assert {reason for one in accounts for reason in one.skipped} <= {NOT_ASKED_TIME}
+    assert ledger.is_whole
+
+
+def test_what_a_window_leaves_unread_is_said(tmp_path: Path) -> None:
+    window = Selection(start_ns=START_NS + 50 * 10**9, end_ns=START_NS + 52 * 10**9)
+
+    found, ledger = read_back(_log(tmp_path, WHOLE), window)
+
+    assert found == by_bus(MINUTE[5_000:5_200])
+    assert "bytes outside --from/--to not read" in ledger.integrity
+    unread = int(re.findall(r"(\d+) bytes outside", ledger.integrity)[0])
+    assert unread > 0.85 * len(WHOLE)
+    assert sum(one.found for name, one in ledger.accounts.items() if name) < 700
+
+
+def test_a_log_whose_clock_goes_back_is_read_wherever_the_window_may_be(tmp_path: Path) -> None:
+    again = [replace(f, t_ns=f.t_ns - 59 * 10**9) for f in MINUTE[5_900:]]
+    frames = [*MINUTE[:3_000], *again, *MINUTE[3_000:]]
+    window = Selection(start_ns=START_NS, end_ns=START_NS + 10**9)
+
+    found, ledger = read_back(_log(tmp_path, blf(frames, container=4_000)), window)
+
+    assert found == by_bus([f for f in frames if START_NS <= f.t_ns < START_NS + 10**9])
+    assert sum(one.in_file for one in ledger.accounts.values()) == len(frames)
+
+
+def test_damage_inside_the_window_is_reported(tmp_path: Path) -> None:
+    content = bytearray(WHOLE)
+    content[content.find(b"LOBJ", len(content) * 51 // 60) + 1_500] ^= 0xFF
+    window = Selection(start_ns=START_NS + 45 * 10**9, end_ns=START_NS + 58 * 10**9)
+
+    found, ledger = read_back(_log(tmp_path, bytes(content)), window)
+
+    assert sum(map(len, found.values())) < 1_300
+    assert "container does not match its checksum" in ledger.topic("").dropped_unknown
+
+
+@pytest.mark.parametrize("step", range(500, 548))
+def test_stretches_may_end_anywhere_in_an_object(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    monkeypatch.setattr("crosscue.replay.readers.blf.reader.STREAM_BYTES", step)
+    frames = made(100)
+
+    found, ledger = read_back(_log(tmp_path, blf(frames, container=4_000)))
+
+    assert found == by_bus(frames)
+    assert ledger.is_whole
+
+
+@given(deleted=st.sets(st.integers(0, 79)))
+@settings(max_examples=25, deadline=None)
+def test_each_object_taken_out_is_reported_as_dropped(
+    tmp_path_factory: pytest.TempPathFactory, deleted: set[int]
+) -> None:
+    frames = made(80)
+    kept = [frame for k, frame in enumerate(frames) if k not in deleted]
+    content = blf(kept)[:32] + struct.pack("<L", len(frames)) + blf(kept)[36:]
+
+    found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), content))
+
+    assert found == by_bus(kept)
+    assert ledger.topic("").dropped.total() == len(deleted)
+    assert ledger.is_whole == (not deleted)

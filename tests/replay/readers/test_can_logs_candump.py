@@ -1,0 +1,269 @@
+"""candump and BUSMASTER logs: every line is used, skipped or lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.columns import DATA, ERROR, REMOTE
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.log import Selection, open_log
+from crosscue.replay.readers.can_text import dialect as can_text
+from crosscue.replay.readers.can_text import digits
+from crosscue.replay.readers.can_text.lines import Lines, Overlong, Tail, lines_of
+from support.can_files import Sent, by_bus, candump, made, read_back, same_as_python_can
+from support.data import shared
+
+WHOLE = "(1.000000) can0 123#DEADBEEF\n"
+
+
+def _log(folder: Path, text: str | bytes, name: str = "x.log") -> Path:
+    path = folder / name
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return path
+
+
+@given(st.integers(0, 2**31), st.booleans())
+@settings(max_examples=15, deadline=None)
+def test_what_was_sent_is_what_is_read(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, fd: bool
+) -> None:
+    frames = made(300, seed, fd=fd)
+    path = _log(tmp_path_factory.mktemp("log"), candump(frames))
+
+    found, ledger = read_back(path)
+
+    assert found == by_bus(frames, "can{}")
+    assert ledger.is_whole
+
+
+def test_chunk_borders_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = made(400)
+    path = _log(tmp_path, candump(frames))
+    monkeypatch.setattr(can_text, "lines_of", lambda p, _=0: lines_of(p, 400))
+
+    found, ledger = read_back(path)
+
+    assert found == by_bus(frames, "can{}")
+    assert ledger.is_whole
+
+
+@pytest.mark.parametrize(
+    ("line", "frame"),
+    [
+        ("(1.5) can0 123#", Sent(1_500_000_000, "can0", 0x123, b"")),
+        ("(1.000000001) can0 123#AA", Sent(1_000_000_001, "can0", 0x123, b"\xaa")),
+        ("(0001.5) a 7FF#aa R", Sent(1_500_000_000, "a", 0x7FF, b"\xaa")),
+        ("(1.5) can0 00000123#AA T", Sent(1_500_000_000, "can0", 0x123, b"\xaa", True)),
+        ("(1.5) can0 123#R", Sent(1_500_000_000, "can0", 0x123, b"", False, REMOTE)),
+        ("(1.5) can0 123#R8 R", Sent(1_500_000_000, "can0", 0x123, b"", False, REMOTE)),
+        ("(1.5) can0 20000088#0001", Sent(1_500_000_000, "can0", 0x88, b"\0\1", False, ERROR)),
+        ("(1.5) can0 123##3", Sent(1_500_000_000, "can0", 0x123, b"", False, DATA, True)),
+        (
+            "(1.5) can0 123#1122334455667788_E",
+            Sent(1_500_000_000, "can0", 0x123, b'\x11"3DUfw\x88'),
+        ),
+        (" (1.5)  can0  123   [2]  0A 0B", Sent(1_500_000_000, "can0", 0x123, b"\n\x0b")),
+        (
+            " (1.5)  can0  123   [0]  remote request",
+            Sent(1_500_000_000, "can0", 0x123, b"", False, REMOTE),
+        ),
+        ("(1.5) 0 123#AA\r", Sent(1_500_000_000, "can/0", 0x123, b"\xaa")),
+    ],
+)
+def test_a_line_says_what_it_says(tmp_path: Path, line: str, frame: Sent) -> None:
+    found, ledger = read_back(_log(tmp_path, line + "\n"))
+
+    assert found == {frame.bus: [frame]}
+    assert ledger.is_whole
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "(nan) can0 123#AA",
+        "(inf) can0 123#AA",
+        "(-1.0) can0 123#AA",
+        "(99999999999.0) can0 123#AA",
+        "(9223372036.9) can0 123#AA",
+        "(1.0) can0 123#AAB",
+        "(1.0) can0 123#AG",
+        "(1.0) can0 FFF#AA",
+        "(1.0) can0 40000000#AA",
+        "(1.0) can0 1234#AA",
+        "(1.0) can0 123#112233445566778899",
+        "(1.0) can0 123##1112233445566778899",
+        "(1.0) can0 123##G11",
+        "(1.0) can0 123 AA",
+        "(1.0) c\x01n0 123#AA",
+        "(1.0)  123#AA",
+        "(1.0) can0 123#AA X",
+        "(1.0 can0 123#AA",
+        " (1.5)  can0  123   [3]  0A 0B",
+        "(1.0) can0 123#" + "A" * 20_000,
+    ],
+)
+def test_a_line_that_can_be_no_frame_is_lost_and_told(tmp_path: Path, line: str) -> None:
+    found, ledger = read_back(_log(tmp_path, WHOLE + line + "\n" + WHOLE))
+
+    assert len(found["can0"]) == 2
+    assert ledger.topic("").dropped.total() == 1
+    assert "line 2" in next(ledger.drops()).detail
+
+
+def test_a_line_broken_in_two_is_not_read_as_a_shorter_frame(tmp_path: Path) -> None:
+    found, ledger = read_back(_log(tmp_path, WHOLE + "(2.0) can0 123#DE\nADBEEF\n" + WHOLE))
+
+    assert [f.payload for f in found["can0"]] == [b"\xde\xad\xbe\xef"] * 2
+    assert ledger.topic("can0").dropped.total() == 1
+    assert ledger.topic("").dropped.total() == 1
+
+
+def test_a_last_line_without_end_is_not_trusted(tmp_path: Path) -> None:
+    found, ledger = read_back(_log(tmp_path, WHOLE + WHOLE[:-3]))
+
+    assert len(found["can0"]) == 1
+    assert ledger.topic("").dropped == {"last line has no line end, may be cut": 1}
+
+
+def test_no_cut_is_silent_and_none_invents_a_frame(tmp_path: Path) -> None:
+    frames = made(40)
+    text = candump(frames)
+    ends = {0, *(k + 1 for k, c in enumerate(text) if c == 10)}
+    for at in range(1, len(text), 3):
+        whole = text[:at].count(b"\n")
+        path = _log(tmp_path, text[:at])
+        if not whole:
+            with pytest.raises(LogFormatError, match="candump"):
+                open_log(path)
+            continue
+
+        found, ledger = read_back(path)
+
+        assert found == by_bus(frames[:whole], "can{}")
+        assert ledger.is_whole == (at in ends)
+
+
+def test_only_what_was_asked_for_comes_and_the_rest_is_counted(tmp_path: Path) -> None:
+    frames = made(500)
+    path = _log(tmp_path, candump(frames))
+    lo, hi = frames[100].t_ns, frames[300].t_ns
+
+    found, ledger = read_back(path, Selection(frozenset({"can1"}), lo, hi))
+
+    expected = [f for f in by_bus(frames, "can{}")["can1"] if lo <= f.t_ns < hi]
+    assert found == {"can1": expected}
+    for name in ("can1", "can2"):
+        assert ledger.topic(name).found == len(by_bus(frames, "can{}")[name])
+    assert ledger.topic("can2").used == 0
+
+
+def test_a_bus_that_comes_late_becomes_a_topic(tmp_path: Path) -> None:
+    text = WHOLE * 5000 + WHOLE.replace("can0", "can7")
+    with open_log(_log(tmp_path, text)) as log:
+        assert [t.name for t in log.topics] == ["can0"]
+    found, _ = read_back(_log(tmp_path, text))
+    assert len(found["can7"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "empty"),
+        (b"\x1f\x8b\x08abc", "gzip"),
+        ("(1.0) can0 1#\n".encode("utf-16"), "UTF-16"),
+        (b"  can0  123   [8]  00 11 22 33 44 55 66 77\n", "without times"),
+        (b" (2015-07-10 06:17:32.249713)  can0  123   [1]  DE\n", "time zone"),
+        (b"hello\nworld\n", "no frame of a candump log"),
+        (bytes(200_000), "without a line end"),
+    ],
+)
+def test_what_is_no_candump_log_is_refused_in_one_line(
+    tmp_path: Path, content: bytes, says: str
+) -> None:
+    with pytest.raises(LogFormatError, match=says) as refused:
+        open_log(_log(tmp_path, content))
+    assert "\n" not in str(refused.value)
+
+
+def test_zeros_in_the_middle_cost_the_lines_they_hit(tmp_path: Path) -> None:
+    text = WHOLE * 10 + "\0" * 3_000_000 + "\n" + WHOLE * 10
+
+    found, ledger = read_back(_log(tmp_path, text))
+
+    assert len(found["can0"]) == 20
+    assert not ledger.is_whole
+
+
+def test_many_bus_names_are_damage_not_topics(tmp_path: Path) -> None:
+    text = "".join(f"(1.0) can{k} 123#AA\n" for k in range(1000))
+
+    found, ledger = read_back(_log(tmp_path, text))
+
+    assert len(found) == 256
+    assert ledger.topic("").dropped == {"more buses than a log can have": 744}
+
+
+@pytest.mark.parametrize("size", [64, 100, 1000])
+def test_lines_come_whole_whatever_the_chunk(tmp_path: Path, size: int) -> None:
+    lines = [b"x" * (k % 29) for k in range(300)]
+    path = _log(tmp_path, b"\n".join(lines) + b"\r\nlast")
+    got: list[bytes] = []
+    for piece in lines_of(path, size):
+        if isinstance(piece, Lines):
+            assert piece.first_number == len(got) + 1
+            got += [piece.text(i) for i in range(piece.done)]
+        else:
+            assert isinstance(piece, Tail)
+            got.append(piece.text)
+    assert got == [*lines, b"last"]
+
+
+def test_a_line_longer_than_a_chunk_is_named_and_the_next_one_read(tmp_path: Path) -> None:
+    path = _log(tmp_path, b"a\n" + b"x" * 1000 + b"\nb\nc\n")
+
+    pieces = list(lines_of(path, 64))
+
+    assert any(isinstance(piece, Overlong) and piece.number == 2 for piece in pieces)
+
+
+@pytest.mark.parametrize("byte", range(256))
+def test_only_digits_are_digits(byte: int) -> None:
+    buffer = np.full(digits.FRONT + digits.BACK, ord("1"), np.uint8)
+    buffer[digits.FRONT + 1] = byte
+    stop, count = np.array([digits.FRONT + 3]), np.array([3])
+    for read, base, alphabet in (
+        (digits.decimal, 10, b"0123456789"),
+        (digits.hexadecimal, 16, b"0123456789abcdefABCDEF"),
+    ):
+        value, ok = read(digits.words_of(buffer), stop, count)
+        assert bool(ok[0]) == (byte in alphabet)
+        if ok[0]:
+            assert value[0] == int(f"1{chr(byte)}1", base)
+
+
+def test_ford_bus_reads_as_python_can_reads_it() -> None:
+    path = shared(
+        "can", "ford_fusion_2017", "acc_on_speed_changing_from_30km_to_80km_per_hour.candump"
+    )
+    same_as_python_can(path, can.CanutilsLogReader(path))
+
+
+def test_savvycan_candump_reads_as_python_can_reads_it() -> None:
+    path = shared("can", "savvycan", "candump.log")
+    same_as_python_can(path, can.CanutilsLogReader(path))
+
+
+def test_busmaster_log_holds_the_same_frames_as_the_candump_of_it() -> None:
+    busmaster, ledger = read_back(shared("can", "savvycan", "BusMasterLog.log"))
+    candump_, _ = read_back(shared("can", "savvycan", "candump.log"))
+
+    assert ledger.is_whole
+    assert [(f.arbitration_id, f.payload) for f in busmaster["can/0"]] == [
+        (f.arbitration_id, f.payload) for f in candump_["vcan0"]
+    ]

@@ -1,0 +1,315 @@
+"""MDF 4 logs: bus logging and signals, held against python-can and asammdf."""
+
+from __future__ import annotations
+
+import random
+import struct
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from crosscue.replay.columns import Table
+from crosscue.replay.errors import CrosscueError, LogFormatError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
+from crosscue.replay.log import EVERYTHING, Selection, open_log
+from crosscue.replay.readers.mf4.blocks import Blocks
+from support.can_files import Sent, made, read_back, same_as_python_can
+from support.data import shared
+
+asammdf = pytest.importorskip("asammdf")
+REAL = ("can", "css_canedge", "3BA199E2", "00000164", "00000001-60FE3F04.MF4")
+
+
+def _bus_log(path: Path, frames: Sequence[Sent], compression: int = 0) -> Path:
+    """As python-can writes it, through asammdf."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        writer = can.MF4Writer(path, compression_level=compression)
+        for f in frames:
+            writer(
+                can.Message(
+                    timestamp=f.t_ns * 1e-9,
+                    arbitration_id=f.arbitration_id,
+                    is_extended_id=f.is_extended,
+                    is_remote_frame=f.kind == 1,
+                    is_fd=f.is_fd,
+                    data=f.payload,
+                    channel=int(f.bus),
+                )
+            )
+        writer.stop()
+    return path
+
+
+def _signals(path: Path, count: int = 1000, compression: int = 0) -> Path:
+    """A log with two groups of signals: plain, converted, signed and big ones."""
+    times = np.arange(count) * 0.01
+    signal: Any = asammdf.Signal
+    linear = {"a": 0.5, "b": -10.0}
+    with asammdf.MDF(version="4.10") as mdf:
+        mdf.append(
+            [
+                signal(np.arange(count, dtype=np.uint16), times, name="speed", unit="km/h",
+                       conversion=linear),
+                signal(np.linspace(-1, 1, count), times, name="angle", unit="deg"),
+                signal(-np.arange(count, dtype=np.int32), times, name="torque", unit="Nm"),
+                signal(np.array([b"abc"] * count), times, name="label", encoding="utf-8"),
+            ],
+            acq_name="drive",
+        )  # fmt: skip
+        mdf.append(
+            [signal(np.arange(10, dtype=np.float32), np.arange(10) * 1.0, name="speed")],
+            acq_name="drive",
+        )
+        mdf.save(path, compression=compression, overwrite=True)
+    return path
+
+
+def _tables(path: Path, selection: Selection = EVERYTHING) -> tuple[dict[str, list[Any]], Ledger]:
+    ledger = Ledger(str(path))
+    found: dict[str, list[Any]] = {}
+    with open_log(path) as log:
+        for block in log.read(ledger, selection):
+            found.setdefault(block.topic, []).append(block)
+    return found, ledger
+
+
+@pytest.mark.parametrize("compression", [0, 1, 2])
+def test_signals_come_as_tables_with_names_units_and_times(
+    tmp_path: Path, compression: int
+) -> None:
+    path = _signals(tmp_path / "x.mf4", compression=compression)
+
+    found, ledger = _tables(path)
+
+    assert set(found) == {"drive", "drive (2)"}
+    (block,) = found["drive"]
+    table = block.rows
+    assert isinstance(table, Table)
+    np.testing.assert_array_equal(table["speed"], np.arange(1000) * 0.5 - 10)
+    np.testing.assert_array_equal(table["angle"], np.linspace(-1, 1, 1000))
+    np.testing.assert_array_equal(table["torque"], -np.arange(1000))
+    assert table.units == {"speed": "km/h", "angle": "deg", "torque": "Nm"}
+    np.testing.assert_array_equal(np.diff(block.log_ns), 10_000_000)
+    assert "label" not in table.columns
+    assert any("label" in notice for notice in ledger.notices)
+    assert ledger.topic("drive").declared == ledger.topic("drive").used == 1000
+    assert ledger.is_whole
+
+
+def test_signals_equal_what_asammdf_gives_on_a_log_of_many_layouts(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    times = np.arange(500) * 1e-3
+    path = tmp_path / "x.mf4"
+    types = ("u1", "i1", "<u2", ">u2", "<i4", ">i4", "<u8", ">i8", "<f4", ">f8", "<f8")
+    samples = {t: rng.integers(0, 256, 500 * np.dtype(t).itemsize, np.uint8).view(t) for t in types}
+    samples = {t: np.nan_to_num(s) if "f" in t else s for t, s in samples.items()}
+    with asammdf.MDF(version="4.10") as mdf:
+        mdf.append([asammdf.Signal(s, times, name=t) for t, s in samples.items()])
+        mdf.save(path)
+
+    found, _ = _tables(path)
+
+    (blocks,) = found.values()
+    for name, expected in samples.items():
+        np.testing.assert_array_equal(blocks[0].rows[name], expected)
+
+
+def _peer(path: Path) -> list[can.Message]:
+    """As python-can reads it, which warns of what it leaves out."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with can.MF4Reader(path) as reader:
+            return list(reader)
+
+
+@pytest.mark.parametrize("compression", [0, 2])
+def test_bus_logs_read_as_python_can_reads_them(tmp_path: Path, compression: int) -> None:
+    frames = [f for f in made(500) if f.kind == 0]
+    path = _bus_log(tmp_path / "x.mf4", frames, compression)
+    same_as_python_can(path, _peer(path), "can/{}", within_ns=2_000)
+
+
+def test_the_real_log_reads_as_python_can_reads_it() -> None:
+    path = shared(*REAL)
+    same_as_python_can(path, _peer(path), "can/{}", within_ns=2_000)
+
+
+def test_only_what_was_asked_for_comes_and_the_rest_is_counted(tmp_path: Path) -> None:
+    path = _signals(tmp_path / "x.mf4")
+    everything, _ = _tables(path)
+    times = everything["drive"][0].log_ns
+
+    found, ledger = _tables(path, Selection(frozenset({"drive"}), int(times[10]), int(times[20])))
+
+    assert [len(block) for block in found["drive"]] == [10]
+    assert ledger.topic("drive").found == 1000
+    assert ledger.topic("drive (2)").skipped.total() == 10
+
+
+def _frames_of_cut(path: Path, content: bytes, at: int) -> tuple[int, bool] | None:
+    path.write_bytes(content[:at])
+    try:
+        open_log(path).close()
+    except CrosscueError as refused:
+        message = str(refused)
+    else:
+        found, ledger = read_back(path)
+        return sum(map(len, found.values())), ledger.is_whole
+    assert "\n" not in message
+    return None
+
+
+@pytest.mark.parametrize("compression", [0, 2])
+def test_no_cut_is_silent(tmp_path: Path, compression: int) -> None:
+    frames = [f for f in made(300) if f.kind == 0]
+    content = _bus_log(tmp_path / "whole.mf4", frames, compression).read_bytes()
+    for at in range(0, len(content) - 1, len(content) // 150):
+        outcome = _frames_of_cut(tmp_path / "x.mf4", content, at)
+        if outcome is not None and outcome[0] < len(frames):
+            assert not outcome[1], f"cut at {at}: {outcome[0]} frames, nothing said"
+
+
+def test_no_cut_of_the_real_log_is_silent(tmp_path: Path) -> None:
+    content = shared(*REAL).read_bytes()
+    for at in range(5_000, len(content) - 1, len(content) // 12):
+        outcome = _frames_of_cut(tmp_path / "x.mf4", content, at)
+        if outcome is not None and outcome[0] < 65_296:
+            assert not outcome[1]
+
+
+@pytest.mark.parametrize("compression", [0, 2])
+def test_damage_raises_nothing_but_our_own_errors(tmp_path: Path, compression: int) -> None:
+    content = _bus_log(tmp_path / "whole.mf4", made(200), compression).read_bytes()
+    path = tmp_path / "x.mf4"
+    for seed in range(150):
+        chance = random.Random(seed)
+        at = chance.randrange(len(content) if seed % 2 else 6_000)
+        count = chance.randrange(1, 65)
+        patch = chance.randbytes(count) if seed % 3 else bytes(count)
+        path.write_bytes((content[:at] + patch + content[at + count :])[: len(content)])
+        try:
+            open_log(path, Limits(chunk_bytes=1 << 22)).close()
+        except CrosscueError as refused:
+            message = str(refused)
+        else:
+            _tables(path)
+            continue
+        assert "\n" not in message
+        assert "x.mf4" in message
+
+
+def test_a_damaged_compressed_block_costs_its_records_and_no_more(tmp_path: Path) -> None:
+    path = _signals(tmp_path / "x.mf4", count=200_000, compression=1)
+    content = bytearray(path.read_bytes())
+    hit = content.find(b"##DZ") + 200
+    content[hit] ^= 0xFF
+    path.write_bytes(content)
+
+    found, ledger = _tables(path)
+
+    used = sum(map(len, found["drive"]))
+    assert used + ledger.topic("drive").dropped.total() == 200_000
+    assert 0 < ledger.topic("drive").dropped.total() < 200_000
+    assert "compressed block" in next(ledger.drops()).detail
+    (last,) = found["drive"][-1:]
+    assert last.rows["torque"][-1] == -199_999
+
+
+def test_blocks_that_run_in_a_circle_are_found_out(tmp_path: Path) -> None:
+    path = _signals(tmp_path / "x.mf4")
+    content = bytearray(path.read_bytes())
+    at = content.find(b"##DG")
+    content[at + 24 : at + 32] = struct.pack("<Q", at)
+    path.write_bytes(content)
+
+    _, ledger = _tables(path)
+
+    assert any("circle" in d.detail for d in ledger.drops())
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "empty file"),
+        (b"PK\x03\x04" + bytes(100), "no MDF file"),
+        (b"MDF     3.30    " + bytes(100), "version '3.30'"),
+        (b"MDF     4.10    " + bytes(100), "header damaged"),
+    ],
+)
+def test_what_is_no_mdf_4_log_is_refused_in_one_line(
+    tmp_path: Path, content: bytes, says: str
+) -> None:
+    path = tmp_path / "x.mf4"
+    path.write_bytes(content)
+    before = len(list(Path("/proc/self/fd").iterdir()))
+
+    with pytest.raises(LogFormatError, match=says):
+        open_log(path)
+
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+@pytest.mark.parametrize("compression", [0, 2])
+def test_a_span_of_time_reads_the_blocks_that_overlap_and_no_other(
+    tmp_path: Path, compression: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(3)
+    count = 400_000
+    times = np.arange(count) * 1e-3
+    samples = [rng.integers(0, 1 << 60, count) for _ in range(3)]
+    path = tmp_path / "x.mf4"
+    with asammdf.MDF(version="4.10") as mdf:
+        mdf.configure(write_fragment_size=1 << 18)
+        signals = [asammdf.Signal(s, times, name=f"s{k}") for k, s in enumerate(samples)]
+        mdf.append(signals, acq_name="drive")
+        mdf.save(path, compression=compression)
+    read: list[int] = []
+    plain = Blocks.read
+
+    def counted(self: Blocks, at: int, size: int) -> bytes:
+        read.append(size)
+        return plain(self, at, size)
+
+    monkeypatch.setattr(Blocks, "read", counted)
+    with open_log(path) as log:
+        ledger = Ledger(str(path))
+        first_ns = next(log.read(ledger)).log_ns[0]
+        read.clear()
+        span = Selection(None, int(first_ns) + 200 * 10**9, int(first_ns) + 202 * 10**9)
+        ledger = Ledger(str(path))
+        blocks = list(log.read(ledger, span))
+
+    (block,) = blocks
+    assert isinstance(block.rows, Table)
+    np.testing.assert_array_equal(block.rows["s1"], samples[1][200_000:202_000])
+    assert sum(read) < path.stat().st_size / (4 if compression else 30)
+    account = ledger.topic("drive")
+    assert account.declared == account.found == count
+    assert account.skipped.total() == count - 2_000
+    assert ledger.is_whole
+    assert "of other times, were not read" in ledger.integrity
+
+
+def test_a_span_of_time_of_a_bus_gives_what_a_whole_pass_gives() -> None:
+    path = shared(*REAL)
+    whole, _ = read_back(path)
+    times = sorted(f.t_ns for frames in whole.values() for f in frames)
+    for begin, end in ((0.5, 0.51), (0.0, 0.1), (0.98, 1.0), (0.3, 0.3)):
+        start_ns, end_ns = times[int(begin * len(times))], times[int(end * (len(times) - 1))]
+
+        part, ledger = read_back(path, Selection(None, start_ns, end_ns))
+
+        expected = {
+            name: [f for f in frames if start_ns <= f.t_ns < end_ns]
+            for name, frames in whole.items()
+        }
+        assert part == {name: frames for name, frames in expected.items() if frames}
+        assert ledger.is_whole
+        assert sum(account.found for account in ledger.accounts.values()) == len(times)

@@ -1,0 +1,250 @@
+"""PEAK TRC logs: versions, start times, and lines off the common pattern."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import can
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.columns import DATA, ERROR, REMOTE
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.log import open_log
+from crosscue.replay.readers.can_text.lines import CHUNK_BYTES
+from crosscue.replay.readers.can_text.message_numbers import GO_BACK, MISFIT, MISSING
+from crosscue.replay.readers.can_text.trc import NOT_UNDERSTOOD
+from support.can_files import Sent, made, read_back, same_as_python_can, trc
+from support.data import shared
+
+V1 = ";$FILEVERSION=1.1\n;$STARTTIME=25569.5\n"
+V2 = ";$FILEVERSION=2.1\n;$STARTTIME=25569.5\n;$COLUMNS=N,O,T,B,I,d,R,L,D\n"
+NOON_NS = 43_200_000_000_000
+LINE_1 = "     1)      1.6  Rx         0480  2  C2 08 \n"
+LINE_2 = "      1      1.600 DT 1      0300 Rx -  2    C2 08\n"
+
+
+def _log(folder: Path, text: str) -> Path:
+    path = folder / "x.trc"
+    path.write_text(text, encoding="latin-1")
+    return path
+
+
+T_NS = NOON_NS + 1_600_000
+
+
+@pytest.mark.parametrize(
+    ("text", "frame"),
+    [
+        (V1 + LINE_1, Sent(T_NS, "can/1", 0x480, b"\xc2\x08")),
+        (V1 + LINE_1.replace("0480", "00000480"), Sent(T_NS, "can/1", 0x480, b"\xc2\x08", True)),
+        (V1 + " 1) 1.6 Tx 0480 3 RTR\n", Sent(T_NS, "can/1", 0x480, b"", False, REMOTE)),
+        (V1 + " 1) 1.6 Error 0008 2 02 00\n", Sent(T_NS, "can/1", 8, b"\2\0", False, ERROR)),
+        (V1 + " 1) 1,6 Rx 0480 0\n", Sent(T_NS, "can/1", 0x480, b"")),
+        (V2 + LINE_2, Sent(T_NS, "can/1", 0x300, b"\xc2\x08")),
+        (V2 + " 1 1.6 RR 3 0300 Rx - 4\n", Sent(T_NS, "can/3", 0x300, b"", False, REMOTE)),
+        (V2 + " 1 1.6 ER 1 - Rx - 2 04 00\n", Sent(T_NS, "can/1", 0, b"\4\0", False, ERROR)),
+        (V2 + " 1 1.6 FB 1 0300 Rx - 9 " + "AB " * 12 + "\n",
+         Sent(T_NS, "can/1", 0x300, b"\xab" * 12, False, DATA, True)),
+        (V2.replace("R,L,D", "l,D") + " 1 1.6 FD 1 0300 Rx 12 " + "AB " * 12 + "\n",
+         Sent(T_NS, "can/1", 0x300, b"\xab" * 12, False, DATA, True)),
+        ("; no version\n 1)  1  0480 2 C2 08\n", Sent(1_000_000, "can/1", 0x480, b"\xc2\x08")),
+    ],
+)  # fmt: skip
+def test_a_line_says_what_it_says(tmp_path: Path, text: str, frame: Sent) -> None:
+    found, ledger = read_back(_log(tmp_path, text))
+
+    assert found == {frame.bus: [frame]}
+    assert ledger.is_whole
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        " 1) 1.6 Rx 0480 3 C2 08",
+        " 1) 1.6 Rx 0480 1 C2 08",
+        " 1) 1.6 Rx 0480 2 C2 0",
+        " 1) 1.6 Rx 0480 2 C2 0G",
+        " 1) 1.6 Rx 0480 2 C2  08 77",
+        " 1) 1.6 Rx 0800 2 C2 08",
+        " 1) 1.6 Qx 0480 2 C2 08",
+        " 1) nan Rx 0480 2 C2 08",
+        " 1) -1.6 Rx 0480 2 C2 08",
+        " 1  1.6 Rx 0480 2 C2 08",
+        " x) 1.6 Rx 0480 2 C2 08",
+        "gibberish",
+    ],
+)
+def test_a_line_that_can_be_no_frame_is_lost_and_told(tmp_path: Path, line: str) -> None:
+    found, ledger = read_back(_log(tmp_path, V1 + LINE_1 + line + "\n" + LINE_1))
+
+    assert len(found["can/1"]) == 2
+    assert ledger.topic("").dropped.total() == 1
+    assert "line 4" in next(ledger.drops()).detail
+
+
+@pytest.mark.parametrize(
+    "line", [" 1) 1.6 Warng FFFFFFFF 4 00 00 00 08 BUSHEAVY", " 1) 1.6 ErrCt 0000 2 00 00"]
+)
+def test_status_lines_are_counted_as_no_frames(tmp_path: Path, line: str) -> None:
+    found, ledger = read_back(_log(tmp_path, V1 + LINE_1 + line + "\n"))
+
+    assert len(found["can/1"]) == 1
+    assert ledger.topic("").skipped == {"status line, no frame": 1}
+
+
+@pytest.mark.parametrize(
+    ("days", "t_ns"),
+    [
+        ("25569", 0),
+        ("25569.25", 21_600_000_000_000),
+        ("25569.0000000001", 8_640),
+        ("25569.00000000000001", 1),
+        ("45332.7893418634", 1_707_591_399_136_997_760),
+    ],
+)
+def test_start_times_are_exact(tmp_path: Path, days: str, t_ns: int) -> None:
+    text = V1.replace("25569.5", days) + LINE_1.replace("1.6", "0.0")
+
+    found, _ = read_back(_log(tmp_path, text))
+
+    assert found["can/1"][0].t_ns == t_ns
+
+
+def test_without_a_start_time_times_count_from_zero_and_it_is_said(tmp_path: Path) -> None:
+    found, ledger = read_back(_log(tmp_path, ";$FILEVERSION=1.1\n" + LINE_1))
+
+    assert found["can/1"][0].t_ns == 1_600_000
+    assert any("no $STARTTIME" in notice for notice in ledger.notices)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (";$FILEVERSION=3.0\n" + LINE_1, "version 3.0 unknown"),
+        (";$FILEVERSION=2.1\n" + LINE_2, "columns 'missing'"),
+        (V2.replace("N,O", "N,N") + LINE_2, "header is damaged"),
+        (V2.replace("L,D", "D,L") + LINE_2, "header is damaged"),
+        ("once upon a time\n", "no frame of a PEAK TRC log"),
+    ],
+)
+def test_a_header_that_cannot_be_followed_is_refused(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(LogFormatError, match=says):
+        open_log(_log(tmp_path, text))
+
+
+def test_another_version_in_the_middle_ends_the_reading(tmp_path: Path) -> None:
+    found, ledger = read_back(_log(tmp_path, V1 + LINE_1 + V2 + LINE_2))
+
+    assert len(found["can/1"]) == 1
+    assert ledger.topic("").dropped_unknown == ["another version begins inside the file"]
+
+
+def test_two_logs_in_one_file_keep_their_start_times(tmp_path: Path) -> None:
+    text = V1 + LINE_1 + V1.replace("25569", "25570") + LINE_1
+
+    found, ledger = read_back(_log(tmp_path, text))
+
+    assert [f.t_ns - T_NS for f in found["can/1"]] == [0, 86_400_000_000_000]
+    assert ledger.is_whole
+
+
+@pytest.mark.parametrize(
+    ("name", "missing"),
+    [
+        ("passat-idling.trc", 0),
+        # Filtered after they were recorded; happy.trc is two such logs in one.
+        ("happy.trc", 11_458),
+        ("test_motorola.trc", 99_976 - 2_863),
+    ],
+)
+def test_real_logs_read_as_python_can_reads_them(name: str, missing: int) -> None:
+    path = shared("can", "rusefi_trc", name)
+
+    # It rounds the start time to microseconds.
+    same_as_python_can(path, can.TRCReader(path), "can/{}", within_ns=800, missing=missing)
+
+
+@dataclass(frozen=True)
+class Holes:
+    """A log with rows taken out."""
+
+    text: str
+    missing: int
+
+
+def _without(version: str, count: int, deleted: set[int]) -> Holes:
+    """A log of ``count`` rows without those at ``deleted``; the last one left hides later ones."""
+    is_old = version < "1.2"
+    frames = [replace(f, bus="1") if is_old else f for f in made(count, fd=version > "2")]
+    lines = trc(frames, version).decode().splitlines(keepends=True)
+    head, rows = lines[:-count], lines[-count:]
+    kept = [k for k in range(count) if k not in deleted]
+    last = kept[-1] if kept else -1
+    text = "".join([*head, *(rows[k] for k in kept)])
+    return Holes(text, sum(k < last for k in deleted))
+
+
+@pytest.mark.parametrize("version", ["1.0", "1.1", "1.2", "1.3", "2.1"])
+@given(deleted=st.sets(st.integers(0, 59)))
+@settings(max_examples=25, deadline=None)
+def test_each_row_taken_out_is_reported_as_dropped(
+    tmp_path_factory: pytest.TempPathFactory, version: str, deleted: set[int]
+) -> None:
+    holes = _without(version, 60, deleted)
+
+    found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), holes.text))
+
+    assert sum(map(len, found.values())) == 60 - len(deleted)
+    assert ledger.topic("").dropped == ({MISSING: holes.missing} if holes.missing else {})
+    assert ledger.is_whole == (not holes.missing)
+
+
+def test_rows_missing_where_chunks_of_the_file_meet_are_reported(tmp_path: Path) -> None:
+    deleted = set(range(100, 40_000, 37))
+    holes = _without("2.1", 40_000, deleted)
+
+    _, ledger = read_back(_log(tmp_path, holes.text))
+
+    assert len(holes.text) > 2 * CHUNK_BYTES
+    assert ledger.topic("").dropped == {MISSING: holes.missing}
+    assert "line 105: 101; line 141: 138" in next(ledger.drops()).detail
+
+
+def _numbered(*numbers: int, head: str = V1) -> str:
+    rows = (f"{n:>6}) {k}.5  Rx  0480  2  C2 08\n" for k, n in enumerate(numbers))
+    return head + "".join(rows)
+
+
+@pytest.mark.parametrize(
+    ("text", "lost", "unknown", "rows"),
+    [
+        (_numbered(1, 3, 2, 4), {}, [], 4),
+        (_numbered(0, 1, 2), {}, [], 3),
+        (_numbered(3, 4), {MISSING: 2}, [], 2),
+        (_numbered(1, 2, 2, 3), {}, [GO_BACK], 4),
+        (_numbered(1, 2, 3, 1, 2, 4), {MISSING: 1}, [GO_BACK], 6),
+        (_numbered(1, 2, 5, 6, 2, 3, 4), {MISSING: 2}, [GO_BACK], 7),
+        (_numbered(1, 2, 9, 4, 5), {MISFIT: 1}, [], 4),
+        (_numbered(1, 2, 900_003, 4, 5), {MISFIT: 1}, [], 4),
+        (_numbered(1, 2) + _numbered(1, 3), {MISSING: 1}, [], 4),
+        (_numbered(1) + "gibberish\n" + _numbered(3, head=""), {NOT_UNDERSTOOD: 1}, [], 2),
+        (_numbered(1) + "gibberish\n" + _numbered(4, head=""), {NOT_UNDERSTOOD: 1, MISSING: 1},
+         [], 2),
+        (_numbered(1) + "gibberish\n" + _numbered(2, 4, head=""), {NOT_UNDERSTOOD: 1, MISSING: 1},
+         [], 3),
+        (_numbered(1, 2) + " 5) 9.0 Warng FFFFFFFF 4 00 00 00 08 BUSHEAVY\n", {MISSING: 2}, [], 2),
+        (_numbered(1, 2) + " 5) 9.0 Rx 0480 1 C2", {MISSING: 2},
+         ["file may be cut after its last frame"], 3),
+    ],
+)  # fmt: skip
+def test_numbers_that_do_not_follow_are_reported(
+    tmp_path: Path, text: str, lost: dict[str, int], unknown: list[str], rows: int
+) -> None:
+    found, ledger = read_back(_log(tmp_path, text))
+
+    assert sum(map(len, found.values())) == rows
+    assert ledger.topic("").dropped == lost
+    assert ledger.topic("").dropped_unknown == unknown

@@ -1,0 +1,97 @@
+"""Files of any content and shape: ours and the mcap package read the very same messages."""
+
+from __future__ import annotations
+
+import struct
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import NonSeekingReader
+from mcap.writer import CompressionType, IndexType, Writer
+
+from crosscue.replay.readers.mcap.scan import Scan, _scan_compiled, _scan_plainly
+from support.mcap_files import Message, read_back
+
+MESSAGES = st.lists(
+    st.tuples(
+        st.integers(0, 4),
+        st.integers(0, 2**63 - 1) | st.integers(0, 50),
+        st.integers(0, 2**63 - 1),
+        st.binary(max_size=120),
+    ),
+    max_size=60,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    messages=MESSAGES,
+    compression=st.sampled_from(list(CompressionType)),
+    index=st.sampled_from([IndexType.NONE, IndexType.CHUNK, IndexType.MESSAGE, IndexType.ALL]),
+    chunk_size=st.sampled_from([1, 200, 2_000, 1 << 20]),
+    use_chunking=st.booleans(),
+    repeat=st.booleans(),
+    statistics=st.booleans(),
+    data_crc=st.booleans(),
+)
+def test_ours_and_the_mcap_package_agree(
+    messages: list[tuple[int, int, int, bytes]],
+    compression: CompressionType,
+    index: IndexType,
+    chunk_size: int,
+    use_chunking: bool,
+    repeat: bool,
+    statistics: bool,
+    data_crc: bool,
+) -> None:
+    stream = BytesIO()
+    writer = Writer(
+        stream, chunk_size, compression, index, repeat, repeat, use_chunking, statistics,
+        enable_data_crcs=data_crc,
+    )  # fmt: skip
+    writer.start()
+    schemas = [writer.register_schema(name, "ros2msg", b"") for name in ("a/B", "c/D")]
+    channels = [writer.register_channel(f"/t{i}", "cdr", (0, *schemas)[i % 3]) for i in range(5)]
+    for sequence, (k, log, publish, payload) in enumerate(messages):
+        writer.add_message(channels[k], log, payload, publish, sequence)
+    writer.finish()  # type: ignore[no-untyped-call]
+
+    theirs: dict[str, list[Message]] = {}
+    stream.seek(0)
+    for _, channel, found in NonSeekingReader(stream).iter_messages(log_time_order=False):
+        one = (found.log_time, found.publish_time, found.data)
+        theirs.setdefault(channel.topic, []).append(one)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "log.mcap"
+        path.write_bytes(stream.getvalue())
+        ours = read_back(path)
+
+    assert ours.messages == theirs
+    assert ours.ledger.is_whole
+    assert ours.adds_up()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    records=st.lists(st.tuples(st.integers(0, 12), st.integers(0, 40)), max_size=50),
+    tail=st.binary(max_size=20),
+    stop=st.integers(1, 12),
+    most=st.integers(0, 60),
+)
+def test_the_compiled_scan_steps_like_the_plain_one(
+    records: list[tuple[int, int]], tail: bytes, stop: int, most: int
+) -> None:
+    coded = b"".join(struct.pack("<BQ", kind, size) + bytes(size) for kind, size in records)
+    buffer = np.frombuffer(coded + tail, dtype=np.uint8)
+    stops = np.arange(256) == stop
+
+    plain: Scan = _scan_plainly(buffer, stops, most)
+    compiled: Scan = _scan_compiled(buffer, stops, most)
+
+    np.testing.assert_array_equal(plain.offset, compiled.offset)
+    np.testing.assert_array_equal(plain.opcode, compiled.opcode)
+    assert plain.end == compiled.end

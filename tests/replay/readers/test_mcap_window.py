@@ -1,0 +1,182 @@
+"""A part of an MCAP log: what walking through all of it gives, at the cost of that part alone."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.log import Selection
+from crosscue.replay.readers.mcap import recording_pass as mcap_pass
+from crosscue.replay.readers.mcap.chunk_table import run_of, table_of
+from crosscue.replay.readers.mcap.records import PREFIX
+from support.mcap_files import (
+    ChunkOf,
+    McapFile,
+    Reading,
+    attachment,
+    channel,
+    message,
+    read_back,
+    record,
+    schema,
+)
+
+TOPICS = 4
+DEFINED = [schema(1), *(channel(i, 1, f"/t{i}") for i in range(TOPICS))]
+LATE = 1 << 63
+TIMES = st.integers(0, 60) | st.sampled_from([LATE - 1, LATE, (1 << 64) - 1])
+ROWS = st.lists(st.tuples(st.integers(0, TOPICS - 1), TIMES, st.binary(max_size=20)), max_size=8)
+BOUND = st.none() | st.integers(-5, 70) | st.just(LATE)
+
+
+def walked(path: Path, selection: Selection) -> Reading:
+    """The same, every chunk's head and indexes being read."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mcap_pass, "find_window", lambda *_: "a test")
+        return read_back(path, selection)
+
+
+@st.composite
+def files(draw: st.DrawFn) -> McapFile:
+    """Chunks that overlap in time, some without message index, and messages between them."""
+    parts: list[bytes | ChunkOf] = [*DEFINED]
+    for _ in range(draw(st.integers(0, 8))):
+        rows = [message(*row) for row in draw(ROWS)]
+        kind = draw(st.sampled_from(["chunk", "chunk", "chunk", "bare", "attachment"]))
+        if kind == "chunk":
+            compression = draw(st.sampled_from(["", "lz4", "zstd"]))
+            parts.append(ChunkOf(rows, compression, is_indexed=draw(st.integers(0, 3)) > 0))
+        elif kind == "bare":
+            parts += rows
+        else:
+            parts.append(attachment("a", b"body"))
+    return McapFile(parts, draw(st.booleans()), summary_crc=draw(st.integers(0, 3)) > 0)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    file=files(),
+    topics=st.none() | st.frozensets(st.sampled_from(["/t0", "/t1", "/t2", "/t3", "/none"])),
+    start_ns=BOUND,
+    end_ns=BOUND,
+)
+def test_a_window_is_what_the_walk_gives(
+    file: McapFile, topics: frozenset[str] | None, start_ns: int | None, end_ns: int | None
+) -> None:
+    selection = Selection(topics, start_ns, end_ns)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "log.mcap"
+        path.write_bytes(file.coded())
+        ours, whole = read_back(path, selection), walked(path, selection)
+
+    assert ours.messages == whole.messages
+    assert ours.ledger.accounts == whole.ledger.accounts
+    assert ours.ledger.is_whole
+    assert ours.adds_up()
+
+
+def chunk(k: int, topic: int = 0, times: tuple[int, int] | None = None) -> ChunkOf:
+    rows = [message(topic, 100 * k + i, b"%d" % i) for i in range(10)]
+    return ChunkOf(rows, "zstd", times=times)
+
+
+def spoilt(path: Path, is_kept: Callable[[int], bool], chunks: list[ChunkOf]) -> None:
+    """Overwrite all chunks and message indexes but those kept."""
+    coded = bytearray(McapFile([*DEFINED, *chunks]).coded())
+    for k, one in enumerate(chunks):
+        if not is_kept(k):
+            body = one.coded()
+            at = coded.index(body)
+            coded[at : at + len(body)] = b"\xff" * len(body)
+    path.write_bytes(coded)
+
+
+def test_chunks_outside_the_time_are_not_looked_at(tmp_path: Path) -> None:
+    spoilt(tmp_path / "x.mcap", lambda k: k in (3, 4), [chunk(k) for k in range(9)])
+
+    reading = read_back(tmp_path / "x.mcap", Selection(None, 305, 405))
+
+    assert [log for log, _, _ in reading.messages["/t0"]] == [*range(305, 310), *range(400, 405)]
+    assert reading.ledger.is_whole
+    assert reading.ledger.accounts["/t0"].skipped == {"outside --from/--to": 80}
+    assert reading.ledger.integrity == (
+        "CRC-32 verified: the summary; of 9 chunks 2 were read and verified; the rest was not"
+    )
+
+
+def test_chunks_without_the_topic_are_not_looked_at(tmp_path: Path) -> None:
+    chunks = [chunk(k, topic=k % 3) for k in range(9)]
+    spoilt(tmp_path / "x.mcap", lambda k: k % 3 == 1, chunks)
+
+    reading = read_back(tmp_path / "x.mcap", Selection(frozenset({"/t1"})))
+
+    assert len(reading.messages["/t1"]) == 30
+    assert reading.ledger.is_whole
+    assert reading.ledger.accounts["/t2"].skipped == {"topic not asked for": 30}
+
+
+def test_an_index_that_contradicts_a_chunk_is_given_up(tmp_path: Path) -> None:
+    coded = bytearray(McapFile([*DEFINED, *map(chunk, range(9))]).coded())
+    at = coded.index(chunk(4).coded()) + PREFIX.size
+    coded[at : at + 16] = struct.pack("<QQ", 300, 409)  # its head now tells another beginning
+    path = tmp_path / "x.mcap"
+    path.write_bytes(coded)
+
+    reading = read_back(path, Selection(None, 400, 405))
+
+    assert len(reading.messages["/t0"]) == 5
+    assert any("every chunk was looked at" in notice for notice in reading.ledger.notices)
+    assert reading.ledger.accounts == walked(path, Selection(None, 400, 405)).ledger.accounts
+
+
+def test_counts_that_do_not_add_up_are_not_trusted(tmp_path: Path) -> None:
+    file = McapFile([*DEFINED, *map(chunk, range(9))], summary_crc=False)
+    counts = struct.pack("<HQ", 0, 90)
+    before, _, after = file.coded().rpartition(counts)
+    coded = before + struct.pack("<HQ", 0, 91) + after
+    path = tmp_path / "x.mcap"
+    path.write_bytes(coded)
+
+    reading = read_back(path, Selection(None, 400, 405))
+
+    assert any("do not add up" in notice for notice in reading.ledger.notices)
+    assert reading.ledger.accounts["/t0"].dropped.total() == 1
+
+
+def test_a_wrong_time_in_an_index_without_checksum_is_found_out(tmp_path: Path) -> None:
+    coded = McapFile([*DEFINED, *map(chunk, range(9))], summary_crc=False).coded()
+    at = coded.rindex(struct.pack("<QQ", 400, 409))
+    coded = coded[:at] + struct.pack("<QQ", 400, 404) + coded[at + 16 :]
+    path = tmp_path / "x.mcap"
+    path.write_bytes(coded)
+
+    reading = read_back(path, Selection(None, 405, 505))
+
+    assert [m[0] for m in reading.messages["/t0"]] == [*range(405, 410), *range(500, 505)]
+    assert any("does not fit the chunk" in notice for notice in reading.ledger.notices)
+
+
+@settings(max_examples=100, deadline=None)
+@given(sizes=st.lists(st.integers(0, 3), min_size=1, max_size=200))
+def test_runs_of_equal_records_are_counted_right(sizes: list[int]) -> None:
+    records = b"".join(record(8, bytes(size)) for size in sizes) + b"tail"
+    at = 0
+    while at < len(records) - 4:
+        size = PREFIX.size + records[at + 1]
+        run = run_of(records, at, size)
+        same = 0
+        while records[at + same * size : at + same * size + 9] == records[at : at + 9]:
+            same += 1
+        assert 1 <= run <= same
+        at += run * size
+    assert at == len(records) - 4
+
+
+def test_an_empty_index_is_an_empty_table() -> None:
+    assert len(table_of(b"", (), (), 0)) == 0

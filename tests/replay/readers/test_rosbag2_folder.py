@@ -1,0 +1,322 @@
+"""ROS 2 bag folders: what lies in the folder counts, not what metadata.yaml says."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.rosbag2 import Reader
+
+from crosscue.replay.errors import LogError
+from crosscue.replay.ledger import NOT_ASKED_TIME
+from crosscue.replay.log import Selection, open_log
+from support.data import shared
+from support.rosbag_files import Row, by_topic, read_rows, rows_of, write_folder
+
+Storage = Literal["sqlite3", "mcap"]
+STORAGES: tuple[Storage, ...] = ("sqlite3", "mcap")
+
+
+def joined(folder: Path, *parts: list[Row], storage: Storage = "sqlite3") -> Path:
+    """A folder whose storage files ``part_0``, ``part_1``, ... hold the rows of each part."""
+    folder.mkdir()
+    suffix = "db3" if storage == "sqlite3" else "mcap"
+    for i, rows in enumerate(parts):
+        made = write_folder(folder.parent / f"{folder.name}_{i}", rows, storage)
+        next(made.glob(f"*.{suffix}")).rename(folder / f"part_{i}.{suffix}")
+    return folder
+
+
+def listing(folder: Path, *names: str, counts: dict[str, int] | None = None) -> None:
+    """A metadata.yaml that lists ``names``, with message counts by topic."""
+    files = "".join(f"  - {name}\n" for name in names)
+    topics = "".join(
+        f"  - topic_metadata: {{name: {name}, type: std_msgs/msg/String, serialization_format: cdr,"
+        f" offered_qos_profiles: ''}}\n    message_count: {count}\n"
+        for name, count in (counts or {}).items()
+    )
+    (folder / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: sqlite3\n"
+        f"  relative_file_paths:\n{files}  topics_with_message_count:\n{topics}"
+    )
+
+
+def count_by_topic(rows: list[Row]) -> dict[str, int]:
+    return dict(Counter(row.topic for row in rows))
+
+
+def test_a_real_folder_reads_as_rosbags_reads_it() -> None:
+    path = shared("bags", "evo", "tf_example")
+    reading = read_rows(path)
+    with Reader(path) as reader:
+        theirs = [Row(c.topic, t, bytes(raw)) for c, t, raw in reader.messages()]
+
+    assert Counter(reading.rows) == Counter(theirs)
+    assert reading.ledger.is_whole
+    assert not reading.ledger.notices
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("compression", ["none", "file", "message"])
+def test_every_kind_of_folder_comes_back_whole(
+    tmp_path: Path, storage: Storage, compression: Literal["none", "file", "message"]
+) -> None:
+    rows = rows_of(600)
+    reading = read_rows(write_folder(tmp_path / "bag", rows, storage, compression))
+
+    assert by_topic(reading.rows) == by_topic(rows)
+    assert reading.ledger.is_whole
+    # SQLite counts nothing by itself, and opening reads the topics only.
+    declared = dict.fromkeys(count_by_topic(rows)) if storage == "sqlite3" else count_by_topic(rows)
+    assert {t.name: t.declared for t in reading.log.topics} == declared
+    assert any("unpacked" in said for said in reading.ledger.notices) == (compression == "file")
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_files_are_read_in_the_order_of_time_not_of_names(tmp_path: Path, storage: Storage) -> None:
+    rows = rows_of(400)
+    folder = joined(tmp_path / "bag", rows[200:], rows[:200], storage=storage)
+    listing(folder, *(path.name for path in sorted(folder.iterdir())))
+    reading = read_rows(folder)
+
+    assert by_topic(reading.rows) == by_topic(rows)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_overlapping_files_are_merged_by_time(tmp_path: Path, storage: Storage) -> None:
+    rows = rows_of(900)
+    folder = joined(tmp_path / "bag", rows[0::3], rows[1::3], rows[2::3], storage=storage)
+    reading = read_rows(folder)
+
+    assert by_topic(reading.rows) == by_topic(rows)
+    assert reading.ledger.is_whole
+
+
+@settings(max_examples=8, deadline=None)
+@given(cuts=st.lists(st.integers(0, 300), min_size=2, max_size=4), seed=st.integers(0, 99))
+def test_however_rows_are_split_they_come_back_in_order(
+    tmp_path_factory: pytest.TempPathFactory, cuts: list[int], seed: int
+) -> None:
+    rows = rows_of(300, seed)
+    edges = sorted({0, 300, *cuts})
+    parts = [rows[a:b] for a, b in pairwise(edges)]
+    overlapping = [part[i::2] for part in parts for i in (0, 1)]
+    folder = joined(tmp_path_factory.mktemp("split") / "bag", *[p for p in overlapping if p])
+
+    assert by_topic(read_rows(folder).rows) == by_topic(rows)
+
+
+def test_a_file_that_is_not_listed_is_read_and_told(tmp_path: Path) -> None:
+    rows = rows_of(300)
+    folder = joined(tmp_path / "bag", rows[:100], rows[100:])
+    listing(folder, "part_0.db3", counts=count_by_topic(rows))
+    reading = read_rows(folder)
+
+    assert by_topic(reading.rows) == by_topic(rows)
+    assert reading.ledger.is_whole
+    assert "part_1.db3 is not listed in metadata.yaml; it was read" in reading.ledger.notices
+
+
+def test_a_listed_file_that_is_missing_is_lost_by_topic(tmp_path: Path) -> None:
+    rows = rows_of(300)
+    folder = joined(tmp_path / "bag", rows[:100], rows[100:])
+    listing(folder, "part_0.db3", "part_1.db3", counts=count_by_topic(rows))
+    (folder / "part_1.db3").unlink()
+    ledger = read_rows(folder).ledger
+    lost = {name: a.dropped["storage file is missing"] for name, a in ledger.accounts.items()}
+
+    assert {name: count for name, count in lost.items() if count} == count_by_topic(rows[100:])
+    for name, count in count_by_topic(rows).items():
+        assert ledger.topic(name).in_file == count
+
+
+def test_a_missing_file_without_counts_is_still_told(tmp_path: Path) -> None:
+    folder = joined(tmp_path / "bag", rows_of(50))
+    listing(folder, "part_0.db3", "part_1.db3")
+    ledger = read_rows(folder).ledger
+
+    assert not ledger.is_whole
+    assert [d.detail for d in ledger.drops()] == ["part_1.db3"]
+
+
+def test_a_listed_file_that_does_not_open_is_lost_and_named(tmp_path: Path) -> None:
+    rows = rows_of(300)
+    folder = joined(tmp_path / "bag", rows[:100], rows[100:])
+    listing(folder, "part_0.db3", "part_1.db3", counts=count_by_topic(rows))
+    (folder / "part_1.db3").write_bytes(b"nothing of the kind")
+    reading = read_rows(folder)
+
+    assert by_topic(reading.rows) == by_topic(rows[:100])
+    lost = sum(account.dropped.total() for account in reading.ledger.accounts.values())
+    assert lost == 200
+    assert any("part_1.db3" in sentence for sentence in reading.ledger.notices)
+
+
+@pytest.mark.parametrize("declared", [0, 1, 10_000])
+def test_wrong_counts_in_the_metadata_are_a_notice(tmp_path: Path, declared: int) -> None:
+    rows = rows_of(200)
+    folder = joined(tmp_path / "bag", rows)
+    listing(folder, "part_0.db3", counts={"/can": declared})
+    reading = read_rows(folder)
+
+    assert by_topic(reading.rows) == by_topic(rows)
+    assert reading.ledger.is_whole
+    assert any(f"counts {declared} messages" in said for said in reading.ledger.notices)
+
+
+def test_topics_that_the_metadata_leaves_out_or_describes_otherwise_are_read(
+    tmp_path: Path,
+) -> None:
+    rows = rows_of(300)
+    folder = write_folder(tmp_path / "bag", rows)
+    path = folder / "metadata.yaml"
+    # Other QoS text for one topic, another topic renamed away.
+    text = path.read_text().replace("offered_qos_profiles: []", "offered_qos_profiles: '- x: 1'", 1)
+    path.write_text(text.replace("name: /gps/fix", "name: /gone"))
+    reading = read_rows(folder)
+
+    assert by_topic(reading.rows) == by_topic(rows)
+    assert reading.ledger.is_whole
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[" * 50_000,
+        "a: &a [x]\nb: [*a, *a]\n",
+        "rosbag2_bagfile_information: 7\n",
+        "rosbag2_bagfile_information: {relative_file_paths: 3, files: [1, {path: 5}]}\n",
+        "rosbag2_bagfile_information:\n  relative_file_paths: [../../etc/passwd]\n",
+        "!!python/object/apply:os.system [exit]\n",
+        "\x00\x01",
+        "k: " + "9" * 5000 + "\n",
+        "x" * 2_000_000,
+    ],
+)
+def test_metadata_of_any_kind_never_stops_the_reading(tmp_path: Path, text: str) -> None:
+    rows = rows_of(60)
+    folder = joined(tmp_path / "bag", rows)
+    (folder / "metadata.yaml").write_text(text)
+    reading = read_rows(folder)
+
+    assert by_topic(reading.rows) == by_topic(rows)
+    assert reading.ledger.notices
+
+
+def test_a_packed_file_and_its_unpacked_twin_are_read_once(tmp_path: Path) -> None:
+    rows = rows_of(100)
+    folder = write_folder(tmp_path / "bag", rows, compression="file")
+    plain = write_folder(tmp_path / "plain", rows)
+    shutil.copy(next(plain.glob("*.db3")), folder / "bag.db3")
+    reading = read_rows(folder)
+
+    assert by_topic(reading.rows) == by_topic(rows)
+    assert any("it was not read" in sentence for sentence in reading.ledger.notices)
+
+
+def test_the_same_recording_in_two_formats_is_read_once(tmp_path: Path) -> None:
+    rows = rows_of(100)
+    folder = joined(tmp_path / "bag", rows)
+    other = write_folder(tmp_path / "other", rows, "mcap")
+    shutil.copy(next(other.glob("*.mcap")), folder / "part_0.mcap")
+    listing(folder, "part_0.db3")
+    reading = read_rows(folder)
+
+    assert by_topic(reading.rows) == by_topic(rows)
+    assert any("in another format" in sentence for sentence in reading.ledger.notices)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_cut_packed_file_gives_its_readable_part(tmp_path: Path, storage: Storage) -> None:
+    rows = rows_of(4000)
+    folder = write_folder(tmp_path / "bag", rows, storage, compression="file")
+    path = next(folder.glob("*.zstd"))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    reading = read_rows(folder)
+
+    assert len(reading.rows) > 1000 or storage == "mcap"
+    assert not Counter(reading.rows) - Counter(rows)
+    assert not reading.ledger.is_whole
+    lost = sum(a.dropped.total() for n, a in reading.ledger.accounts.items())
+    assert lost == len(rows) - len(reading.rows)
+
+
+def test_a_packed_file_cut_at_its_start_is_refused_by_its_own_name(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "bag", rows_of(100), compression="file")
+    path = next(folder.glob("*.zstd"))
+    path.write_bytes(path.read_bytes()[:50])
+
+    with pytest.raises(LogError, match=r"bag\.db3\.zstd: .*compressed file is cut"):
+        open_log(folder)
+
+
+def test_a_packed_file_that_grows_without_bound_is_stopped(tmp_path: Path) -> None:
+    import zstandard
+
+    from crosscue.replay.limits import Limits
+    from crosscue.replay.readers.rosbag2.split import unpack
+
+    packed = tmp_path / "a.db3.zstd"
+    packed.write_bytes(zstandard.ZstdCompressor().compress(bytes(300 << 20)))
+    fault = unpack(packed, tmp_path / "a.db3", Limits(chunk_bytes=1 << 20))
+
+    assert "grows to over" in fault
+    assert (tmp_path / "a.db3").stat().st_size < 80 << 20
+
+
+def test_topics_of_two_types_are_not_mixed(tmp_path: Path) -> None:
+    rows = rows_of(100)
+    folder = joined(tmp_path / "bag", rows[:50], rows[50:])
+    with sqlite3.connect(folder / "part_1.db3") as db:
+        db.execute("UPDATE topics SET type = 'std_msgs/msg/Int8' WHERE name = '/can'")
+    db.close()
+    reading = read_rows(folder)
+    odd = count_by_topic(rows[50:])["/can"]
+
+    assert reading.ledger.topic("/can").skipped == {"another message type on the same topic": odd}
+
+
+def test_a_time_range_reaches_over_files(tmp_path: Path) -> None:
+    rows = rows_of(400)
+    folder = joined(tmp_path / "bag", rows[:200], rows[200:])
+    selection = Selection(start_ns=rows[150].log_ns, end_ns=rows[250].log_ns)
+    reading = read_rows(folder, selection)
+
+    assert by_topic(reading.rows) == by_topic(rows[150:250])
+    skipped = sum(a.skipped[NOT_ASKED_TIME] for a in reading.ledger.accounts.values())
+    assert skipped == 300
+
+
+def test_nothing_is_left_behind_in_the_temporary_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_folder(tmp_path / "bag", rows_of(100), compression="file")
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(scratch))
+    with open_log(folder) as log:
+        from crosscue.replay.ledger import Ledger
+
+        blocks = log.read(Ledger("a"))
+        next(iter(blocks))
+        assert list(scratch.iterdir())
+        blocks.close()  # type: ignore[attr-defined]
+
+    assert not list(scratch.iterdir())
+
+
+def test_a_folder_without_a_file_that_opens_is_refused(tmp_path: Path) -> None:
+    folder = joined(tmp_path / "bag", rows_of(10))
+    (folder / "part_0.db3").write_bytes(b"")
+    (folder / "metadata.yaml").write_text("")
+
+    with pytest.raises(LogError, match="want at least one storage file that opens"):
+        open_log(folder)

@@ -1,0 +1,35 @@
+"""Files of settings and annotations are read whole or refused; none has no end."""
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crosscue.datasets.truth import truth
+from crosscue.detectors.catalog.card import read_card
+from crosscue.eval.fit.range_pairs import pairs_of_table
+from crosscue.eval.scoring.gates import load_gates
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.vehicle import vehicle
+
+ENDLESS = Path("/dev/zero")
+
+
+@given(content=st.binary(max_size=40), most=st.integers(0, 40))
+def test_a_file_comes_whole_or_not_at_all(content: bytes, most: int) -> None:
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(content)
+        file.flush()
+
+        assert read_at_most(Path(file.name), most) == (content if len(content) <= most else None)
+
+
+@pytest.mark.skipif(not ENDLESS.exists(), reason="no /dev/zero here")
+@pytest.mark.parametrize("read", [vehicle.load, read_card, load_gates, truth.load, pairs_of_table])
+def test_a_file_without_an_end_is_refused(read: Callable[[Path], object]) -> None:
+    with pytest.raises(CrosscueError, match=r"/dev/zero: over \d+ MiB"):
+        read(ENDLESS)

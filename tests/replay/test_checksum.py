@@ -1,0 +1,34 @@
+"""CRC-32: whichever library computes it, it is zlib's."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.files import checksum
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.binary(max_size=9000), st.binary(max_size=300))
+def test_equals_zlib_in_one_piece_and_in_two(first: bytes, second: bytes) -> None:
+    whole = zlib.crc32(first + second)
+    assert checksum.crc32(first + second) == whole
+    assert checksum.crc32(memoryview(second), checksum.crc32(first)) == whole
+    assert checksum.crc32(np.frombuffer(first, np.uint8)) == zlib.crc32(first)
+
+
+def test_zlib_serves_where_isal_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "isal.isal_zlib", None)
+    try:
+        importlib.reload(checksum)
+        assert checksum._crc32 is zlib.crc32
+        assert checksum.crc32(b"123456789") == 0xCBF43926
+    finally:
+        monkeypatch.undo()
+        importlib.reload(checksum)

@@ -1,0 +1,97 @@
+"""Cues and features of one's own as lines of the vehicle file, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from crosscue.fusion.approaches import Approaches, FrameEvidence
+from crosscue.fusion.factor_graph import graph_of
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.vehicle.fusion import CUES, Fusion
+from crosscue.replay.vehicle.vehicle import parse
+
+
+def fusion_of(text: str) -> Fusion:
+    return parse("version = 1\n" + text, "car.toml").fusion
+
+
+def test_a_file_that_says_nothing_has_the_published_table() -> None:
+    assert fusion_of("") == Fusion()
+    assert fusion_of("").cues == dict(CUES)
+
+
+def test_one_number_changes_and_the_rest_of_the_entry_stays() -> None:
+    fusion = fusion_of("[fusion.cues]\nstop_sign = { precision = 0.99 }")
+
+    assert fusion.cues["stop_sign"] == CUES["stop_sign"].model_copy(update={"precision": 0.99})
+    assert fusion.cues["traffic_light"] == CUES["traffic_light"]
+
+
+def test_a_cue_and_a_feature_of_ones_own_are_a_line_each() -> None:
+    fusion = fusion_of(
+        "[fusion.features]\nzebra = { prior = 0.2 }\n"
+        "[fusion.cues]\nstripes = { precision = 0.8, supports = ['zebra'], speaks_first = true }"
+    )
+    graph = graph_of(fusion)
+    approaches = Approaches(graph, fusion, parse("version = 1", "").range_filter)
+
+    step = approaches(FrameEvidence(0, 0.0, 0.0, (), {"stripes": 1}))
+
+    # odds of 0.2 / 0.8 times 0.8 / 0.2
+    assert step.probabilities["zebra"] == pytest.approx(0.5)
+    assert step.probabilities["left"] == 0.5
+
+
+def test_a_cue_that_is_not_used_is_no_part_of_the_graph() -> None:
+    graph = graph_of(fusion_of("[fusion.cues]\nlanes_past = { use = false }"))
+
+    assert "lanes_past" not in {cue.name for cue in graph.cues}
+    assert "lanes_past" not in {edge.cue for edge in graph.edges}
+
+
+def test_edges_to_a_feature_that_is_not_used_are_gone() -> None:
+    graph = graph_of(fusion_of("[fusion.features]\nstraight = { use = false }"))
+
+    assert graph.feature_names == ("intersection", "left", "right")
+    assert "straight" not in {edge.feature for edge in graph.edges}
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("[fusion.cues]\nstop_sgn = { speaks_first = true }", r"did you mean stop_sign\?.*there"),
+        (
+            "[fusion.cues]\nstripes = { precision = 0.8, supports = ['strait'] }",
+            r"stripes: no feature 'strait' \(did you mean straight\?\); there are: intersection",
+        ),
+        ("[fusion.cues]\nstripes = { precision = 0.8 }", "neither supports nor excludes"),
+        (
+            "[fusion.cues]\nroad_left = { excludes = ['left'] }",
+            "road_left: a feature stands twice",
+        ),
+        ("[fusion.cues]\nroad_left = { precision = 1.0 }", "precision: .*less than 1"),
+        ("[fusion.cues]\nroad_left = { precission = 0.5 }", "precission: no such key"),
+        ("[fusion.cues]\nroad_left = 0.5", "road_left: "),
+        ("[fusion]\ncues = 3", "fusion.cues"),
+        ("[fusion.features]\nestablished = {}", "established: a column of the belief table"),
+        ("[fusion.features]\n'Big Road' = {}", "pattern"),
+        (
+            "[fusion.features]\nleft = { use = false }\nright = { use = false }\n"
+            "intersection = { use = false }",
+            "none establishes presence",
+        ),
+        ("[fusion]\nreference = 'middle'", "reference"),
+        ("[fusion]\nkind = 'best'", "kind"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_with_the_choices(text: str, match: str) -> None:
+    with pytest.raises(VehicleError, match=match):
+        fusion_of(text)
+
+
+def test_no_cue_that_speaks_first_is_refused() -> None:
+    silent = "\n".join(
+        f"{name} = {{ speaks_first = false }}" for name in CUES if CUES[name].speaks_first
+    )
+    with pytest.raises(VehicleError, match="none speaks first"):
+        fusion_of(f"[fusion.cues]\n{silent}")

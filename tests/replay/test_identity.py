@@ -1,0 +1,136 @@
+"""The identity of a log: one for each log, wherever it lies, and cheap for a large one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from pathlib import Path
+
+import pytest
+
+from crosscue.replay.errors import LogError
+from crosscue.replay.files.identity import SHARE_BYTES, identity_of, identity_of_all
+
+LARGE: int = 3 * SHARE_BYTES
+
+
+def _log(path: Path, content: bytes | bytearray = b"rows") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    return path
+
+
+def test_place_and_age_do_not_matter_and_name_does(tmp_path: Path) -> None:
+    first = _log(tmp_path / "a" / "drive.mcap")
+    second = _log(tmp_path / "b" / "drive.mcap")
+    os.utime(second, (0, 0))
+
+    assert identity_of(first) == identity_of(second) == identity_of(str(first))
+    assert identity_of(first).digest != identity_of(_log(tmp_path / "other.mcap")).digest
+
+
+@pytest.mark.parametrize("at", [0, 1, SHARE_BYTES // 3, SHARE_BYTES // 2 + 7, SHARE_BYTES - 1])
+def test_any_byte_of_a_log_that_is_hashed_whole_counts(tmp_path: Path, at: int) -> None:
+    content = bytearray(SHARE_BYTES)
+    before = identity_of(_log(tmp_path / "a.mcap", content))
+    content[at] ^= 1
+
+    assert identity_of(_log(tmp_path / "a.mcap", content)).digest != before.digest
+
+
+@pytest.mark.parametrize(
+    "at", [0, SHARE_BYTES // 4 - 1, LARGE - 1, LARGE - SHARE_BYTES // 4, SHARE_BYTES // 4 + 1]
+)
+def test_head_tail_and_samples_of_a_large_log_count(tmp_path: Path, at: int) -> None:
+    content = bytearray(LARGE)
+    before = identity_of(_log(tmp_path / "a.mcap", content))
+    content[at] ^= 1
+
+    assert identity_of(_log(tmp_path / "a.mcap", content)).digest != before.digest
+    assert identity_of(_log(tmp_path / "a.mcap", content + b"x")).digest != before.digest
+
+
+def _with_index(kind: str, start: int) -> bytearray:
+    """A large file without content, but with an index that begins at ``start``."""
+    content = bytearray(LARGE)
+    if kind == "mcap":
+        content[:8] = b"\x89MCAP0\r\n"
+        footer = bytes([2]) + (20).to_bytes(8, "little") + start.to_bytes(8, "little")
+        content[-37:] = footer + bytes(12) + b"\x89MCAP0\r\n"
+    else:
+        head = b"#ROSBAG V2.0\n" + (0).to_bytes(4, "little") + b"index_pos="
+        content[: len(head) + 8] = head + start.to_bytes(8, "little")
+    return content
+
+
+@pytest.mark.parametrize("kind", ["mcap", "bag"])
+def test_the_whole_index_of_a_large_log_counts(tmp_path: Path, kind: str) -> None:
+    # Between the last sample and the tail, in which nothing but the index is hashed.
+    place = LARGE - SHARE_BYTES // 4 - SHARE_BYTES // 64 - 3
+    for start, counts in ((place - 10, True), (place + 1, False)):
+        content = _with_index(kind, start)
+        before = identity_of(_log(tmp_path / f"a.{kind}", content))
+        content[place] ^= 1
+        assert (identity_of(_log(tmp_path / f"a.{kind}", content)) != before) is counts
+
+
+@pytest.mark.parametrize("start", [0, 1 << 63, LARGE * 2])
+def test_an_index_that_is_not_there_is_not_believed(tmp_path: Path, start: int) -> None:
+    for kind in ("mcap", "bag"):
+        identity_of(_log(tmp_path / f"a.{kind}", _with_index(kind, start)))
+
+
+def test_all_files_of_a_folder_count_and_what_we_put_there_does_not(tmp_path: Path) -> None:
+    folder = tmp_path / "a" / "images"
+    for i in range(5):
+        _log(folder / f"{i}.png", bytes([i]))
+    _log(folder / "deep" / "x.png")
+    before = identity_of(folder)
+
+    for name in ("truth.json", "vehicle.toml", ".DS_Store", "x.seal"):
+        _log(folder / name)
+    assert identity_of(folder) == before
+    assert identity_of(shutil.copytree(folder, tmp_path / "b" / "images")) == before
+
+    changed = []
+    for change in (
+        lambda: _log(folder / "deep" / "x.png", b"other"),
+        lambda: (folder / "4.png").rename(folder / "5.png"),
+        lambda: (folder / "3.png").unlink(),
+        lambda: _log(folder.with_name("images.csv"), b"0.1"),
+    ):
+        change()
+        changed.append(identity_of(folder).digest)
+    assert len({before.digest, *changed}) == 5
+
+
+def test_what_is_read_beside_a_log_belongs_to_it(tmp_path: Path) -> None:
+    for log, beside in (("a.db3", "a.db3-wal"), ("v.mp4", "v.csv"), ("v.mp4", "v.txt")):
+        path = _log(tmp_path / log)
+        before = identity_of(path)
+        _log(tmp_path / beside, b"more")
+        assert identity_of(path) != before
+
+
+def test_a_drive_is_its_logs_in_any_order(tmp_path: Path) -> None:
+    logs = [identity_of(_log(tmp_path / name, name.encode())) for name in ("a.mcap", "b.blf")]
+
+    assert identity_of_all(logs) == identity_of_all(logs[::-1])
+    assert identity_of_all(logs[:1]) == logs[0]
+    assert "a.mcap + b.blf" in str(identity_of_all(logs))
+
+
+def test_a_log_of_a_hundred_gigabytes_is_known_in_no_time(tmp_path: Path) -> None:
+    path = tmp_path / "large.bag"
+    with path.open("wb") as file:
+        file.truncate(100 << 30)
+    began = time.process_time()
+
+    assert identity_of(path).size == 100 << 30
+    assert time.process_time() - began < 0.5
+
+
+def test_a_log_that_is_gone_is_said(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="gone"):
+        identity_of(tmp_path / "gone.mcap")

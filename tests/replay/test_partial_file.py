@@ -1,0 +1,183 @@
+"""Half-written files: swept when nobody holds them, left alone while somebody does."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from crosscue.eval import cli
+from crosscue.replay.files import partial_file
+from crosscue.replay.files.partial_file import PARTIAL, PartialFile, Scratch, is_partial, sweep
+from crosscue.replay.files.run_folder import create, locked, write_text
+from support import faults
+
+
+def _partials(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.rglob(f".*{PARTIAL}"))
+
+
+@contextmanager
+def _child(code: str) -> Iterator[subprocess.Popen[str]]:
+    """A process that says a line when it has begun, and lives until it is killed."""
+    lines = f"{code}\nprint('begun', flush=True)\nimport time; time.sleep(60)\n"
+    with subprocess.Popen(
+        [sys.executable, "-c", lines], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "begun\n"
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def _begun(folder: Path) -> str:
+    return (
+        "from pathlib import Path\nfrom crosscue.replay.files.partial_file import PartialFile\n"
+        f"held = PartialFile(Path({str(folder)!r}, 'a.txt'))"
+    )
+
+
+def test_a_file_of_a_killed_process_is_swept_and_one_of_a_living_process_is_not(
+    tmp_path: Path,
+) -> None:
+    with _child(_begun(tmp_path)) as process:
+        sweep(tmp_path, again=True)
+        write_text(tmp_path / "b.txt", "b")
+        assert len(_partials(tmp_path)) == 1
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+
+    # The process number may be in use again by now; nothing looks at it.
+    sweep(tmp_path, again=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["b.txt"]
+
+
+def test_only_our_own_files_are_swept(tmp_path: Path) -> None:
+    others = [".a.txt.1234.partial", "a.partial", ".drive.crosscue-xyz.partial", ".a.partial"]
+    for name in others:
+        (tmp_path / name).write_text("of another program")
+    (tmp_path / f".folder.crosscue-{'0' * 16}.partial").mkdir()
+    (tmp_path / f".link.crosscue-{'0' * 16}.partial").symlink_to(tmp_path / others[0])
+    os.mkfifo(tmp_path / f".pipe.crosscue-{'0' * 16}.partial")
+    before = sorted(path.name for path in tmp_path.iterdir())
+
+    sweep(tmp_path, again=True)
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("name", ["ä" * 120, "x" * 255, "line\nbreak.json"])
+def test_any_name_that_a_file_can_have_can_be_written(tmp_path: Path, name: str) -> None:
+    write_text(tmp_path / name, "whole")
+
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_file_system_without_locks_keeps_what_nobody_can_know_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = tmp_path / f".a.crosscue-{'0' * 16}.partial"
+    left.write_text("half")
+    monkeypatch.setattr(partial_file, "lock", lambda _: None)
+
+    write_text(tmp_path / "b.txt", "b")
+
+    assert left.exists()
+    assert (tmp_path / "b.txt").read_text() == "b"
+
+
+def test_a_file_that_is_kept_or_dropped_is_let_go(tmp_path: Path) -> None:
+    open_before = len(list(Path("/proc/self/fd").iterdir()))
+    kept, dropped = PartialFile(tmp_path / "a"), PartialFile(tmp_path / "b")
+    assert is_partial(kept.path.name)
+
+    kept.keep()
+    dropped.drop()
+    dropped.drop()
+
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+    assert len(list(Path("/proc/self/fd").iterdir())) == open_before
+
+
+def test_temporary_folders_of_killed_processes_are_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    code = (
+        "from crosscue.replay.files.partial_file import Scratch\n"
+        "held = Scratch(); (held.path / 'copy.db3').write_text('large')"
+    )
+    with _child(code) as process:
+        with Scratch():
+            assert len(list(tmp_path.iterdir())) == 2
+        assert len(list(tmp_path.iterdir())) == 1
+        process.kill()
+        process.wait()
+
+    with Scratch() as folder:
+        assert list(tmp_path.iterdir()) == [folder]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_whose_holder_died_is_free_though_its_number_is_in_use(tmp_path: Path) -> None:
+    run = create(tmp_path / "run", overwrite=False)
+    code = (
+        "from pathlib import Path\nfrom crosscue.replay.files.run_folder import RunFolder, locked\n"
+        f"held = locked(RunFolder(Path({str(run.path)!r}))); held.__enter__()"
+    )
+    with _child(code) as process:
+        process.kill()
+        process.wait()
+    text = run.file(".lock").read_text()
+    assert text.startswith(f"{process.pid} ")
+    # As if that number now belonged to the program that started us.
+    run.file(".lock").write_text(text.replace(str(process.pid), str(os.getppid()), 1))
+
+    with locked(run):
+        pass
+
+
+def _convert(folder: Path) -> list[str]:
+    log = folder / "can0.log"
+    log.write_text(
+        "".join(f"(1700000000.{i:06d}) can0 123#{i % 256:02X}\n" for i in range(0, 9000, 3))
+    )
+    return ["convert", str(log), "-o", str(folder / "out" / "a.mcap"), "--overwrite", "-q"]
+
+
+def _simulate(folder: Path) -> list[str]:
+    return [
+        "simulate", "C", "-o", str(folder / "out"), "--width", "192", "--rate", "10", "--overwrite",
+        "-q",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", [_convert, _simulate])
+def test_killed_anywhere_the_next_start_leaves_no_half_file(
+    tmp_path: Path, command: Callable[[Path], list[str]]
+) -> None:
+    argv = command(tmp_path)
+    out = tmp_path / "out"
+    count = len(faults.operations(out, faults.CHANGES, argv))
+    left = 0
+
+    for operation in (2, count // 2, count - 2):
+        shutil.rmtree(out)
+        assert faults.killed_before(out, operation, argv).status == -signal.SIGKILL
+        left += len(_partials(out))
+        time.sleep(partial_file.SWEEP_S)
+        assert cli.run(argv) == 0
+        assert not _partials(out)
+    assert left

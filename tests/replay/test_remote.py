@@ -1,0 +1,196 @@
+"""Logs on object stores, tried with fsspec's store in memory."""
+
+import uuid
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from crosscue.replay.errors import LogError, LogTooLargeError, OutputError, UsageError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import open_log
+from crosscue.replay.remote import logs as remote
+from crosscue.replay.remote.logs import Store, fetch, is_remote, matches, version_of
+from support.can_files import candump, made
+from support.can_files import read_back as read_file
+
+
+@pytest.fixture
+def bucket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """An empty bucket's URL; what is fetched goes under ``tmp_path/store``."""
+    monkeypatch.setenv(remote.STORE_VARIABLE, str(tmp_path / "store"))
+    name = f"bucket-{uuid.uuid4().hex}"
+    system = import_module("fsspec").filesystem("memory")
+    system.mkdir(f"/{name}")
+    yield f"memory://{name}"
+    system.rm(f"/{name}", recursive=True)
+
+
+def _put(url: str, content: bytes) -> str:
+    with import_module("fsspec").open(url, "wb") as file:
+        file.write(content)
+    return url
+
+
+def test_a_remote_log_reads_like_a_local_one(bucket: str, tmp_path: Path) -> None:
+    frames = made(300)
+    here = tmp_path / "can.log"
+    here.write_bytes(candump(frames))
+    url = _put(f"{bucket}/drives/can.log", candump(frames))
+
+    with open_log(url) as log:
+        ledger = Ledger(url)
+        rows = sum(len(block) for block in log.read(ledger))
+        assert (log.format, log.path.name) == ("candump", "can.log")
+        assert {topic.name for topic in log.topics} == {"can1", "can2"}
+
+    assert rows == sum(map(len, read_file(here)[0].values())) == 300
+    assert ledger.is_whole
+
+
+def test_it_is_fetched_once_and_again_when_it_changed(
+    bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fetches: list[str] = []
+    download = remote._download
+
+    def counted(url: str, *rest: object) -> None:
+        fetches.append(url)
+        download(url, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(remote, "_download", counted)
+    url = _put(f"{bucket}/a.log", b"one")
+    before = version_of(url)
+    for _ in range(2):
+        with fetch(url) as fetched:
+            assert fetched.path.read_bytes() == b"one"
+    assert len(fetches) == 1
+    assert version_of(url) == before
+
+    _put(url, b"two")
+
+    with fetch(url) as fetched:
+        assert fetched.path.read_bytes() == b"two"
+    assert len(fetches) == 2
+    assert version_of(url) != before
+
+
+def test_a_folder_comes_whole_and_a_file_with_its_companions(bucket: str) -> None:
+    for name in ("bag/metadata.yaml", "bag/part/a.db3", "v.mp4", "v.csv", "v.mp4.txt", "vv.csv"):
+        _put(f"{bucket}/{name}", name.encode())
+
+    with fetch(f"{bucket}/bag/") as folder, fetch(f"{bucket}/v.mp4") as video:
+        assert folder.path.name == "bag"
+        assert (folder.path / "part" / "a.db3").read_bytes() == b"bag/part/a.db3"
+        assert sorted(p.name for p in video.path.parent.iterdir()) == [
+            "v.csv", "v.mp4", "v.mp4.txt",
+        ]  # fmt: skip
+
+
+def test_the_longest_unused_goes_first_and_one_in_use_never(bucket: str, tmp_path: Path) -> None:
+    store = Store(tmp_path / "small", max_bytes=250)
+    urls = [_put(f"{bucket}/{name}.log", name.encode() * 100) for name in "abcd"]
+
+    with fetch(urls[0], store) as held:
+        fetch(urls[1], store).close()
+        fetch(urls[2], store).close()
+        assert held.path.exists()
+        with fetch(urls[3], store), pytest.raises(OutputError, match="full of logs in use"):
+            fetch(urls[1], store)
+
+    kept = {path.name for path in store.folder.rglob("*.log")}
+    assert kept == {"a.log", "d.log"}
+    with pytest.raises(LogTooLargeError, match=r"the store may hold.*CROSSCUE_STORE_GIB"):
+        fetch(_put(f"{bucket}/large.log", bytes(300)), store)
+
+
+def test_a_fetch_that_fails_leaves_nothing(
+    bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = _put(f"{bucket}/a.log", b"abc")
+    short = remote._Object(f"{bucket.removeprefix('memory:/')}/a.log", "a.log", 5, "")
+    monkeypatch.setattr(remote, "_objects", lambda *_: [short])
+
+    with pytest.raises(LogError, match=r"a\.log is not as long as its store says"):
+        fetch(url)
+
+    assert not list((tmp_path / "store").rglob("a.log"))
+
+
+def test_a_log_that_grows_while_fetched_is_refused(
+    bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = _put(f"{bucket}/a.log", b"abc")
+    chunks = remote._chunks
+
+    def then_grow(*args: object) -> Iterator[bytes]:
+        yield from chunks(*args)  # type: ignore[arg-type]
+        _put(url, b"abcdef")
+
+    monkeypatch.setattr(remote, "_chunks", then_grow)
+
+    with pytest.raises(LogError, match="changed while it was fetched"):
+        fetch(url)
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("memory://nowhere/a.log", "no such object"),
+        ("s3://bucket/a.log", "s3"),
+        ("nonsense://a/b.log", "nonsense"),
+    ],
+)
+def test_what_cannot_be_fetched_is_told(
+    url: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(remote.STORE_VARIABLE, str(tmp_path))
+
+    with pytest.raises(LogError, match=said) as caught:
+        open_log(url)
+
+    assert "\n" not in str(caught.value)
+    assert url in str(caught.value)
+
+
+def test_a_name_that_would_leave_the_store_is_refused() -> None:
+    with pytest.raises(LogError, match="no name for a file"):
+        remote._object("log/../../etc/passwd", {"name": "b/log/../../etc/passwd", "size": 1})
+
+
+def test_a_file_url_is_read_in_place(tmp_path: Path) -> None:
+    path = tmp_path / "can.log"
+    path.write_bytes(candump(made(3)))
+
+    with open_log(path.as_uri()) as log:
+        assert log.path == path
+    assert version_of(path.as_uri()) == version_of(str(path))
+
+
+def test_patterns_find_urls(bucket: str) -> None:
+    for name in ("a/x.mcap", "b/x.mcap", "b/y.log"):
+        _put(f"{bucket}/{name}", b"")
+
+    assert matches(f"{bucket}/*/x.mcap") == (f"{bucket}/a/x.mcap", f"{bucket}/b/x.mcap")
+
+
+def test_versions_of_folders_see_every_file(tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "a").write_text("1")
+    before = version_of(str(tmp_path / "bag"))
+
+    (tmp_path / "bag" / "b").write_text("")
+
+    assert version_of(str(tmp_path / "bag")) != before
+    with pytest.raises(LogError, match="No such file"):
+        version_of(str(tmp_path / "gone"))
+
+
+def test_only_texts_are_urls(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert is_remote("s3://bucket/a.mcap")
+    assert not is_remote("folder/a.mcap")
+    assert not is_remote(Path("s3://bucket/a.mcap"))
+    monkeypatch.setenv(remote.LIMIT_VARIABLE, "-1")
+    with pytest.raises(UsageError, match="want a number of GiB above 0"):
+        remote.default_store()

@@ -1,0 +1,124 @@
+"""A run folder holds whole files or none, and one writer at a time."""
+
+import errno
+import json
+import os
+import socket
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from crosscue.replay.errors import OutputError, RunError
+from crosscue.replay.files import run_folder
+from crosscue.replay.files.run_folder import TableSink, create, locked, open_run, write_text
+
+SCHEMA = pa.schema([("t_ns", pa.int64())])
+
+
+def test_a_writer_that_fails_leaves_the_old_file_alone(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "old")
+
+    def fail(partial: Path) -> None:
+        partial.write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OutputError, match="disk is full"):
+        run_folder.write_whole(tmp_path / "a.txt", fail)
+
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_a_table_is_named_only_when_whole(tmp_path: Path) -> None:
+    run = create(tmp_path / "run", overwrite=False)
+
+    def cut_short() -> None:
+        with TableSink(run, "pose", SCHEMA) as sink:
+            sink.write({"t_ns": np.arange(3)})
+            raise RuntimeError("killed")
+
+    with pytest.raises(RuntimeError, match="killed"):
+        cut_short()
+
+    assert list(run.path.iterdir()) == []
+
+
+def test_a_flipped_byte_in_a_table_is_told(tmp_path: Path) -> None:
+    run = create(tmp_path / "run", overwrite=False)
+    with TableSink(run, "pose", SCHEMA) as sink:
+        sink.write({"t_ns": np.arange(10_000)})
+    assert run.table("pose").num_rows == 10_000
+    raw = bytearray(run.file("pose.parquet").read_bytes())
+    raw[len(raw) // 4] ^= 0x10
+    run.file("pose.parquet").write_bytes(raw)
+
+    with pytest.raises(RunError, match=r"pose\.parquet: damaged"):
+        run.table("pose")
+
+
+def test_the_same_rows_give_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        run = create(tmp_path / name, overwrite=False)
+        with TableSink(run, "pose", SCHEMA) as sink:
+            sink.write({"t_ns": np.arange(100)})
+
+    first, second = ((tmp_path / n / "pose.parquet").read_bytes() for n in ("a", "b"))
+    assert first == second
+
+
+def test_where_the_kernel_keeps_no_locks_the_text_tells_who_holds_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = create(tmp_path / "run", overwrite=False)
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    parent = os.getppid()
+    ticks = Path(f"/proc/{parent}/stat").read_text().rpartition(")")[2].split()[19]
+    monkeypatch.setattr(run_folder, "lock", lambda _: None)
+
+    run.file(".lock").write_text(f"{parent} {socket.gethostname()} {boot} {ticks}")
+    with pytest.raises(RunError, match=f"process {parent} "), locked(run):
+        pass
+    # The same number, but begun at another time: used again by another program.
+    run.file(".lock").write_text(f"{parent} {socket.gethostname()} {boot} {int(ticks) + 1}")
+    with locked(run):
+        pass
+
+
+def test_a_lock_of_a_dead_process_is_taken_over(tmp_path: Path) -> None:
+    run = create(tmp_path / "run", overwrite=False)
+    run.file(".lock").write_text(f"4194305 {socket.gethostname()} some-other-boot")
+
+    with locked(run):
+        assert run.file(".lock").read_text().startswith(str(os.getpid()))
+    assert not run.file(".lock").exists()
+
+
+def test_foreign_files_are_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+
+    with pytest.raises(RunError, match=r"thesis\.tex"):
+        create(tmp_path, overwrite=True)
+    with pytest.raises(RunError, match="--overwrite"):
+        create(tmp_path, overwrite=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{", "unreadable"),
+        (json.dumps({"format_version": 99}), "format 99"),
+        (json.dumps([1]), "format None"),
+    ],
+)
+def test_a_damaged_or_foreign_manifest_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "manifest.json").write_text(text)
+
+    with pytest.raises(RunError, match=said):
+        open_run(tmp_path)
+
+
+def test_a_folder_without_manifest_is_no_finished_run(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="cut short"):
+        open_run(tmp_path)

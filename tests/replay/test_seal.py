@@ -1,0 +1,375 @@
+"""Seals: a changed byte is seen in every format, by every reader, and located."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.eval.cli import run
+from crosscue.replay.errors import LogError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import MIB
+from crosscue.replay.log import FORMATS, Selection, open_log
+from crosscue.replay.seal.log import CHANGED, DIFFERS
+from crosscue.replay.seal.seal import read_seal, seal_path
+from support.accounted import read
+from support.can_files import candump, made
+from support.every_format import EVERY_FORMAT
+from support.pictures import picture_folder
+from support.rosbag_files import rows_of, write_bag, write_folder
+
+
+def _sealed(folder: Path, kind: str) -> Path:
+    log = EVERY_FORMAT[kind](folder)
+    assert run(["seal", str(log)]) == 0
+    return log
+
+
+def _files(log: Path) -> list[Path]:
+    if log.is_dir():
+        return sorted(path for path in log.rglob("*") if path.is_file())
+    return [log]
+
+
+def _flip(path: Path, at: int) -> None:
+    with path.open("r+b") as file:
+        file.seek(at)
+        (byte,) = file.read(1)
+        file.seek(at)
+        file.write(bytes([byte ^ 0x10]))
+
+
+def _said(log: Path) -> str:
+    """All that reading a log says of its losses."""
+    try:
+        _, ledger = read(log)
+    except LogError as error:
+        return str(error)
+    assert not ledger.is_whole
+    return "; ".join(detail.detail for detail in ledger.drops())
+
+
+@pytest.fixture
+def long_log(tmp_path: Path) -> Path:
+    """A sealed candump log of more than three blocks."""
+    log = tmp_path / "can.log"
+    log.write_bytes(candump(made(300)) * 300)
+    assert log.stat().st_size > 3 * MIB
+    assert run(["seal", str(log)]) == 0
+    return log
+
+
+def test_every_format_has_a_log_here() -> None:
+    assert set(EVERY_FORMAT) == set(FORMATS)
+
+
+@pytest.mark.parametrize("kind", EVERY_FORMAT)
+def test_an_untouched_sealed_log_is_whole(tmp_path: Path, kind: str) -> None:
+    before, _ = read(EVERY_FORMAT[kind](tmp_path))
+    log = next(p for p in tmp_path.iterdir() if p.suffix != ".txt" and p.name != "whole")
+    assert run(["seal", str(log)]) == 0
+
+    after, ledger = read(log)
+
+    assert ledger.is_whole, ledger.details
+    assert "sealed at" in ledger.integrity
+    assert "none differs" in ledger.integrity
+    assert [len(block) for block in after] == [len(block) for block in before]
+    assert run(["seal", "--check", str(log)]) == 0
+
+
+@pytest.mark.parametrize("kind", EVERY_FORMAT)
+def test_a_flipped_byte_anywhere_is_reported_with_its_block(
+    tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = _sealed(tmp_path, kind)
+    rng = np.random.default_rng(11)
+    for path in _files(log):
+        size = path.stat().st_size
+        name = path.relative_to(log).as_posix() if log.is_dir() else log.name
+        for at in {0, size - 1, int(rng.integers(size)), int(rng.integers(size))}:
+            _flip(path, at)
+            assert f"{name}: bytes 0 to {size}" in _said(log), (name, at)
+            _flip(path, at)
+    assert read(log)[1].is_whole
+
+    _flip(path, size // 2)
+    capsys.readouterr()
+    status = run(["info", str(log)])
+    assert status in (3, 4)
+    assert "the seal" in "".join(capsys.readouterr()) or status == 4
+    assert run(["seal", "--check", str(log)]) == 3
+    assert f"{name}: bytes 0 to {size} differ from the seal" in capsys.readouterr().err
+
+
+def test_the_block_is_named_to_one_mib_and_its_rows_are_delivered(long_log: Path) -> None:
+    rows = sum(len(block) for block in read(long_log)[0])
+    # A digit of a payload: the line stays a right one, and no reader can see it.
+    at = long_log.read_bytes().index(b"#AA", 2 * MIB) + 2
+    text = bytearray(long_log.read_bytes())
+    text[at : at + 1] = b"B"
+    long_log.write_bytes(text)
+
+    blocks, ledger = read(long_log)
+
+    (drop,) = ledger.drops()
+    assert (drop.reason, drop.count) == (DIFFERS, None)
+    assert drop.detail == f"can.log: bytes {2 * MIB} to {3 * MIB}"
+    assert sum(len(block) for block in blocks) == rows
+    assert "some differ" in ledger.integrity
+
+
+def test_neighbouring_blocks_are_one_span(long_log: Path) -> None:
+    for at in (5, MIB + 5, 3 * MIB + 5):
+        _flip(long_log, at)
+
+    spans = [drop.detail for drop in read(long_log)[1].drops() if drop.reason == DIFFERS]
+
+    size = long_log.stat().st_size
+    assert spans == [f"can.log: bytes 0 to {2 * MIB}", f"can.log: bytes {3 * MIB} to {size}"]
+
+
+def test_every_command_that_reads_a_sealed_log_reports(
+    long_log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    at = long_log.read_bytes().index(b"#", MIB) + 2
+    _flip(long_log, at)
+    out = long_log.with_name("out.mcap")
+
+    assert run(["convert", str(long_log), "-o", str(out)]) == 3
+    assert f"can.log: bytes {MIB} to {2 * MIB}" in " ".join(capsys.readouterr().err.split())
+    assert run(["info", str(long_log)]) == 3
+    assert f"can.log: bytes {MIB} to {2 * MIB}" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("is_cut", [True, False])
+def test_another_size_is_reported_in_one_line(long_log: Path, is_cut: bool) -> None:
+    size = long_log.stat().st_size
+    with long_log.open("r+b") as file:
+        if is_cut:
+            file.truncate(2 * MIB)
+        else:
+            file.seek(size)
+            file.write(candump(made(3)))
+
+    losses = [drop for drop in read(long_log)[1].drops() if drop.reason == CHANGED]
+
+    (drop,) = losses
+    now = long_log.stat().st_size
+    assert drop.detail == f"size changed: can.log ({size} bytes when sealed, now {now})"
+
+
+def test_missing_and_new_files_are_reported_in_one_line_each(tmp_path: Path) -> None:
+    log = picture_folder(tmp_path / "front", 12, "rate_hz: 10\n")
+    assert run(["seal", str(log)]) == 0
+    for number in range(5):
+        (log / f"frame_{number}.png").unlink()
+    (log / "frame_99.png").write_bytes((log / "frame_7.png").read_bytes())
+
+    said = [drop.detail for drop in read(log)[1].drops() if drop.reason == CHANGED]
+
+    assert said == [
+        "missing: frame_0.png, frame_1.png, frame_2.png and 2 more",
+        "not in the seal: frame_99.png",
+    ]
+
+
+def test_a_seal_is_not_replaced_by_accident(
+    long_log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = seal_path(long_log).read_bytes()
+    assert run(["seal", str(long_log)]) == 0
+    assert seal_path(long_log).read_bytes() == before
+
+    _flip(long_log, 7)
+    capsys.readouterr()
+    assert run(["seal", str(long_log)]) == 1
+    assert "--overwrite only if the log is right" in capsys.readouterr().err
+    assert seal_path(long_log).read_bytes() == before
+
+    assert run(["seal", "--overwrite", str(long_log)]) == 0
+    assert run(["seal", "--check", str(long_log)]) == 0
+
+
+def test_info_says_whether_a_log_is_sealed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = EVERY_FORMAT["candump"](tmp_path)
+    for quick in ([], ["--quick"]):
+        assert run(["info", str(log), *quick]) == 0
+        assert "not sealed" in capsys.readouterr().out
+    assert run(["seal", str(log)]) == 0
+    sealed_at = read_seal(seal_path(log)).sealed_at
+    capsys.readouterr()
+    for quick in ([], ["--quick"]):
+        assert run(["info", str(log), *quick]) == 0
+        assert f"sealed at {sealed_at} (xxh3_128" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_log_and_its_seal_can_be_renamed_together(tmp_path: Path) -> None:
+    log = _sealed(tmp_path, "rosbag1")
+    moved = log.rename(tmp_path / "other.bag")
+    seal_path(log).rename(seal_path(moved))
+
+    assert "none differs" in read(moved)[1].integrity
+    _flip(moved, moved.stat().st_size // 2)
+    assert "other.bag: bytes 0 to" in _said(moved)
+
+
+def test_a_write_ahead_log_and_a_time_file_are_sealed_too(tmp_path: Path) -> None:
+    film = _sealed(tmp_path, "video")
+
+    assert set(read_seal(seal_path(film)).files) == {".", "front.txt"}
+    _flip(tmp_path / "front.txt", 30)
+    assert "front.txt" in _said(film)
+
+
+def _hostile() -> Iterator[tuple[str, bytes]]:
+    def entry(**changes: object) -> bytes:
+        one = {"name": ".", "size": 3, "blocks": "00" * 16} | changes
+        tree: dict[str, object] = {
+            "kind": "crosscue seal", "version": 1, "hash": "xxh3_128", "block_bytes": MIB,
+            "sealed_at": "2026-01-01T00:00:00Z", "files": [one],
+        }  # fmt: skip
+        from crosscue.replay.seal.seal import _own_check
+
+        return json.dumps(tree | {"check": _own_check(tree)}).encode()
+
+    yield "not JSON", b""
+    yield "not JSON", b"\xff\x00junk"
+    yield "not JSON", b"[" * 200_000
+    yield "not a seal", b"[]"
+    yield "not a seal", b"{}"
+    yield "version 2", b'{"kind": "crosscue seal", "version": 2, "hash": "xxh3_128"}'
+    yield "with hash 'md5'", b'{"kind": "crosscue seal", "version": 1, "hash": "md5"}'
+    yield "own checksum", b'{"kind": "crosscue seal", "version": 1, "hash": "xxh3_128"}'
+    yield "leads out of the log", entry(name="../can.log")
+    yield "leads out of the log", entry(name="/etc/passwd")
+    yield "leads out of the log", entry(name="a/../../b")
+    yield "leads out of the log", entry(name="")
+    yield "bytes of hashes for", entry(size=10**18)
+    yield "bytes of hashes for", entry(size=-3)
+    yield "wrong entry", entry(blocks="zz")
+    yield "wrong entry", entry(name=7)
+    yield "wrong entry", entry(size="3")
+
+
+@pytest.mark.parametrize(("why", "content"), list(_hostile()))
+def test_a_damaged_or_hostile_seal_is_one_clear_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], why: str, content: bytes
+) -> None:
+    log = EVERY_FORMAT["candump"](tmp_path)
+    seal_path(log).write_bytes(content)
+
+    for command in (["info"], ["seal", "--check"]):
+        assert run([*command, str(log)]) == 4
+        said = capsys.readouterr().err
+        assert why in said
+        assert said.count("\n") == 1
+        assert "delete it and seal the log again" in said
+    assert run(["seal", str(log)]) == 1
+
+
+def test_a_flipped_byte_in_the_seal_is_not_taken_for_one_in_the_log(tmp_path: Path) -> None:
+    log = _sealed(tmp_path, "candump")
+    whole, sound = seal_path(log).read_bytes(), read_seal(seal_path(log))
+    refused = 0
+    for at in range(0, len(whole) - 1, 7):
+        text = bytearray(whole)
+        text[at] ^= 1
+        seal_path(log).write_bytes(text)
+        try:
+            assert read_seal(seal_path(log)) == sound
+        except LogError:
+            refused += 1
+
+    # Only a blank between two words may change without harm.
+    assert refused > 0.6 * len(whole) / 7
+
+
+@pytest.mark.parametrize(
+    ("argv", "status", "why"),
+    [
+        (["s3://bucket/a.bag"], 2, "a URL cannot be sealed"),
+        (["can.log.seal"], 2, "is a seal itself"),
+        (["gone.bag"], 4, "no such file"),
+        (["--check", "can.asc"], 1, "not sealed"),
+    ],
+)
+def test_what_cannot_be_sealed_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], argv: list[str], status: int, why: str
+) -> None:
+    EVERY_FORMAT["asc"](tmp_path)
+    words = [w if w[0] == "-" or "://" in w else str(tmp_path / w) for w in argv]
+
+    assert run(["seal", *words]) == status
+    assert why in capsys.readouterr().err
+
+
+def test_a_converted_file_does_not_come_under_an_old_seal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = EVERY_FORMAT["candump"](tmp_path)
+    out = tmp_path / "out.mcap"
+    assert run(["convert", str(log), "-o", str(out)]) == 0
+    assert run(["seal", str(out)]) == 0
+    before = out.read_bytes()
+
+    assert run(["convert", str(log), "-o", str(out), "--overwrite"]) == 1
+    assert "out.mcap.seal" in capsys.readouterr().err
+    assert out.read_bytes() == before
+
+
+def test_a_log_whose_name_is_as_long_as_a_name_can_be_opens(tmp_path: Path) -> None:
+    log = tmp_path / ("x" * 251 + ".log")
+    log.write_bytes(candump(made(30)))
+
+    assert read(log)[1].is_whole
+
+
+def test_hidden_files_and_links_in_a_circle(tmp_path: Path) -> None:
+    log = picture_folder(tmp_path / "front", 3, "rate_hz: 10\n")
+    (log / ".hidden").write_bytes(b"x")
+    (log / "again").symlink_to(log)
+    assert run(["seal", str(log)]) == 0
+
+    assert set(read_seal(seal_path(log)).files) == {
+        "frame_0.png", "frame_1.png", "frame_2.png", "timestamps.txt",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["mcap", "rosbag1"])
+def test_a_window_of_an_indexed_log_checks_its_own_blocks_alone(tmp_path: Path, kind: str) -> None:
+    rows = rows_of(40_000)
+    if kind == "mcap":
+        log = next(write_folder(tmp_path / "bag", rows, "mcap").glob("*.mcap"))
+    else:
+        log = write_bag(tmp_path / "log.bag", rows, chunk_bytes=300_000)
+    assert log.stat().st_size > 3 * MIB
+    assert run(["seal", str(log)]) == 0
+    total = read_seal(seal_path(log)).blocks
+    early = Selection(end_ns=rows[200].log_ns)
+
+    def losses(selection: Selection) -> list[str]:
+        ledger = Ledger(str(log))
+        with open_log(log) as opened:
+            for _ in opened.read(ledger, selection):
+                pass
+        (checked,) = re.findall(r"(\d+) of \d+ blocks|$", ledger.integrity)[:1]
+        assert selection != early or 0 < int(checked) < total, ledger.integrity
+        return [drop.detail for drop in ledger.drops() if drop.reason == DIFFERS]
+
+    assert losses(early) == losses(Selection()) == []
+    middle = total // 2
+    _flip(log, middle * MIB + 77)
+    assert losses(early) == []
+    assert losses(Selection()) == [f"{log.name}: bytes {middle * MIB} to {(middle + 1) * MIB}"]
+    _flip(log, middle * MIB + 77)
+    at = rows[10].payload[4:20]
+    _flip(log, log.read_bytes().index(at)) if at in log.read_bytes() else _flip(log, 5000)
+    assert losses(early) == [f"{log.name}: bytes 0 to {MIB}"]

@@ -1,0 +1,192 @@
+"""Deeply nested JSON and TOML: one line from every command that reads some, never a bug of ours."""
+
+import ast
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crosscue.eval import cli
+from crosscue.replay.files.tree_text import MAX_DEPTH, json_tree, toml_tree
+from support.scoring import run_folder, truth_folder
+
+ROOT: Final = Path(__file__).parents[2]
+DEEP_JSON: Final = (
+    "[" * 100_000,
+    '{"a":' * 100_000,
+    "[" * 200 + "]" * 200,
+    '{"a":' * 900 + "1" + "}" * 900,
+)
+DEEP_TOML: Final = (
+    "a = " + "[" * 100_000,
+    "a = " + "{a=" * 5_000,
+    "a." * 10_000 + "a = 1",
+    "a = " + "[" * 900 + "]" * 900,
+)
+
+
+_VALUES: Final = st.recursive(
+    st.none() | st.integers() | st.text('[]{}"\\a', max_size=6),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(st.text('[]{}"\\', max_size=3), inner, max_size=4)
+    ),
+    max_leaves=40,
+)
+
+
+@given(_VALUES, st.integers(0, MAX_DEPTH + 5))
+def test_what_nests_little_is_read_as_json_reads_it(value: object, around: int) -> None:
+    text = "[" * around + json.dumps(value) + "]" * around
+    depth = _depth(json.loads(text))
+
+    for form in (text, text.encode()):
+        if depth <= MAX_DEPTH:
+            assert json_tree(form) == json.loads(text)
+        else:
+            with pytest.raises(ValueError, match=f"nested over {MAX_DEPTH} levels"):
+                json_tree(form)
+
+
+def _depth(value: object) -> int:
+    if not isinstance(value, dict | list):
+        return 0
+    below = value.values() if isinstance(value, dict) else value
+    return 1 + max(map(_depth, below), default=0)
+
+
+@pytest.mark.parametrize("text", DEEP_JSON)
+def test_deep_json_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="nested"):
+        json_tree(text)
+
+
+@pytest.mark.parametrize("text", DEEP_TOML)
+def test_deep_toml_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="nested"):
+        toml_tree(text)
+
+
+def test_toml_at_the_limit_is_read() -> None:
+    assert toml_tree("a = " + "[" * (MAX_DEPTH - 1) + "]" * (MAX_DEPTH - 1))["a"]
+    with pytest.raises(ValueError, match="nested"):
+        toml_tree("a = " + "[" * MAX_DEPTH + "]" * MAX_DEPTH)
+
+
+@pytest.mark.parametrize(
+    "text", ['"' + '\\"' * 2_000_000, '"\\' * 2_000_000, "[" * 70 + '"\\"' * 900_000]
+)
+def test_quotes_without_end_take_no_time(text: str) -> None:
+    began = time.process_time()
+    with pytest.raises(ValueError):  # noqa: PT011
+        json_tree("[" * 70 + text)
+    assert time.process_time() - began < 2.0
+
+
+def _vehicle(folder: Path) -> list[str]:
+    (folder / "deep").rename(folder / "car.toml")
+    return ["decode", str(folder), "-o", str(folder / "out"), "--vehicle", str(folder / "car.toml")]
+
+
+def _gates(folder: Path) -> list[str]:
+    truth_folder(folder / "one")
+    run_folder(folder / "one" / "run")
+    return ["score", str(folder / "one" / "run"), "--gate", str(folder / "deep")]
+
+
+def _study(folder: Path) -> list[str]:
+    return ["study", "range", "--settings", str(folder / "deep"), "-o", str(folder / "out")]
+
+
+def _truth(folder: Path) -> list[str]:
+    return ["truth", "check", str(folder / "deep"), "--log", str(folder)]
+
+
+def _coco(folder: Path) -> list[str]:
+    (folder / "deep").rename(folder / "coco.json")
+    (folder / "can.log").write_text("(1.0) can0 1#00\n")
+    return ["truth", "import", str(folder / "coco.json"), "--log", str(folder / "can.log"),
+            "-o", str(folder / "truth.json")]  # fmt: skip
+
+
+def _training(folder: Path) -> list[str]:
+    (folder / "deep").rename(folder / "coco.json")
+    return [
+        "train",
+        "mask-rcnn",
+        "--data",
+        str(folder / "coco.json"),
+        "--images",
+        str(folder),
+        "-o",
+        str(folder / "out.safetensors"),
+    ]
+
+
+def _manifest(folder: Path) -> list[str]:
+    (folder / "deep").rename(folder / "manifest.json")
+    return ["estimate", str(folder)]
+
+
+def _metrics(folder: Path) -> list[str]:
+    for name in ("a", "b"):
+        run_folder(folder / name)
+        (folder / name / "score").mkdir()
+        (folder / name / "score" / "metrics.json").write_bytes((folder / "deep").read_bytes())
+    return ["compare", str(folder / "a"), str(folder / "b")]
+
+
+@pytest.mark.parametrize("deep", DEEP_TOML)
+@pytest.mark.parametrize("command", [_vehicle, _gates, _study])
+def test_every_command_refuses_deep_toml_in_a_line(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    command: Callable[[Path], list[str]],
+    deep: str,
+) -> None:
+    _refused_in_a_line(tmp_path, capsys, command, deep)
+
+
+@pytest.mark.parametrize("deep", DEEP_JSON)
+@pytest.mark.parametrize("command", [_truth, _coco, _training, _manifest, _metrics])
+def test_every_command_refuses_deep_json_in_a_line(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    command: Callable[[Path], list[str]],
+    deep: str,
+) -> None:
+    _refused_in_a_line(tmp_path, capsys, command, deep)
+
+
+def _refused_in_a_line(
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    command: Callable[[Path], list[str]],
+    deep: str,
+) -> None:
+    (folder / "deep").write_text(deep)
+
+    assert cli.run(command(folder)) in (1, 2)
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "nested over" in err
+    assert "bug" not in err
+
+
+def test_nothing_else_parses_json_or_toml() -> None:
+    """A new reader of such a file cannot forget the limit."""
+    for path in ROOT.glob("*/**/*.py"):
+        room = path.relative_to(ROOT).parts[0]
+        if room in ("tests", "benchmarks", "crosscue", "notebooks") or path.name == "tree_text.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                name = f"{node.value.id}.{node.attr}"
+                assert name not in ("json.loads", "json.load", "tomllib.loads", "tomllib.load"), (
+                    path
+                )

@@ -1,0 +1,49 @@
+"""The vehicle file is checked at the door, and the error says where to look."""
+
+from pathlib import Path
+
+import pytest
+
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
+
+
+def test_an_empty_file_of_version_1_is_all_defaults() -> None:
+    assert parse("version = 1", "car.toml") == Vehicle(version=1)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("version = 1\n[odometry]\nwheel_scal = 1.0", r"car.toml:3: odometry.* wheel_scale"),
+        ("version = 1\n[compass]\nheading_sd_deg = 3.0", r":3: .*did you mean heading_sd_rad"),
+        ("version = 1\n\n[can.wheel_speeds]\nrear_left = 'A.B'", r":3: .*rear_right: missing"),
+        ("version = 1\n[odometry]\nwheelbase_m = '2.7'", r":3: .*valid number, got '2.7'"),
+        ("version = 1\n[odometry]\nwheelbase_m = -2.7", r":3: .*greater than 0"),
+        ("version = 1\n[odometry]\nwheelbase_m = nan", r":3: odometry.wheelbase_m"),
+        ("version = 2", r":1: version: .*1, got 2"),
+        ("version = 1\n[can.yaw_rate]\nsignal = 'YAW'", r":3: can.yaw_rate.signal"),
+        ("version = 1\nversion = 1", r"not TOML: .*"),
+        ("version = 1\n[radar]\nx = 1", r":2: radar: no such key; there are: .*topics"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_with_its_line(text: str, said: str) -> None:
+    with pytest.raises(VehicleError, match=said):
+        parse(text, "car.toml")
+
+
+def test_dbc_files_are_found_beside_the_vehicle_file(tmp_path: Path) -> None:
+    (tmp_path / "car.toml").write_text('version = 1\n[can]\ndbc = ["bus.dbc"]\n')
+
+    assert load(tmp_path / "car.toml").can.dbc == (str((tmp_path / "bus.dbc").resolve()),)
+
+
+def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
+    with pytest.raises(VehicleError, match="crosscue vehicle init"):
+        load(tmp_path / "none.toml")
+
+
+def test_a_typo_inside_a_named_entry_is_met_with_the_right_name() -> None:
+    with pytest.raises(VehicleError, match="no such key; did you mean precision"):
+        parse("version = 1\n[fusion.cues]\nzebra = { precison = 0.8, precision = 0.8, "
+              "supports = ['left'] }\n", "v.toml")  # fmt: skip

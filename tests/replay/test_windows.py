@@ -1,0 +1,121 @@
+"""Windows hold every sample once, in order of time, however the logs are cut into blocks."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import EVERYTHING
+from crosscue.replay.signals import Extractor, Signal, plan
+from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.windows import HORIZON_NS, Window, windows
+from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
+
+SECOND = 1_000_000_000
+
+
+def _windows(logs: list[MemoryLog], ledgers: list[Ledger] | None = None) -> list[Window]:
+    vehicle = Vehicle(version=1)
+    planned = plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+    ledgers = ledgers or [Ledger(str(i)) for i in range(len(logs))]
+    extractors = [Extractor(planned, vehicle, i, ledger) for i, ledger in enumerate(ledgers)]
+    return list(windows(logs, extractors, [EVERYTHING] * len(logs), planned))
+
+
+def _chunks(t_ns: list[int], sizes: list[int]) -> list[list[int]]:
+    chunks, at = [], 0
+    for size in sizes:
+        chunks.append(t_ns[at : at + size])
+        at += size
+    return [c for c in [*chunks, t_ns[at:]] if c]
+
+
+_TIMES = st.lists(st.integers(0, 200 * SECOND), max_size=40, unique=True).map(sorted)
+_SIZES = st.lists(st.integers(1, 9), max_size=12)
+
+
+@settings(deadline=None, max_examples=60)
+@given(wheels=_TIMES, gyro=_TIMES, wheel_sizes=_SIZES, gyro_sizes=_SIZES, apart=st.booleans())
+def test_every_sample_comes_once_and_in_order(
+    wheels: list[int], gyro: list[int], wheel_sizes: list[int], gyro_sizes: list[int], apart: bool
+) -> None:
+    one = [wheel_block(t, [x * 1e-9 for x in t]) for t in _chunks(wheels, wheel_sizes)]
+    two = [gyro_block(t, [x * 1e-9 for x in t]) for t in _chunks(gyro, gyro_sizes)]
+    if apart:
+        logs = [MemoryLog((WHEELS,), one), MemoryLog((GYRO,), two)]
+    else:
+        both = sorted([*one, *two], key=lambda block: int(block.log_ns[0]))
+        logs = [MemoryLog((WHEELS, GYRO), both)]
+
+    found = _windows(logs)
+
+    assert [w.start_ns for w in found] == sorted({t // SECOND * SECOND for t in [*wheels, *gyro]})
+    for signal, times in ((Signal.WHEEL_SPEEDS, wheels), (Signal.YAW_RATE, gyro)):
+        parts = [w.samples[signal] for w in found if signal in w.samples]
+        got = [int(t) for part in parts for t in part.t_ns]
+        assert got == times
+    for window in found:
+        for part in window.samples.values():
+            assert ((part.t_ns >= window.start_ns) & (part.t_ns < window.end_ns)).all()
+
+
+def test_a_sensor_that_falls_silent_does_not_hold_up_the_rest() -> None:
+    seconds = range(0, 3 * HORIZON_NS // SECOND)
+    blocks: list[Block] = [gyro_block([5], [0.0])]
+    blocks += [wheel_block([s * SECOND], [1.0]) for s in seconds]
+    read: list[int] = []
+
+    log = MemoryLog((WHEELS, GYRO), _Watched(blocks, read))
+    vehicle = Vehicle(version=1)
+    planned = plan([(0, WHEELS), (0, GYRO)], vehicle)
+    first = next(
+        windows([log], [Extractor(planned, vehicle, 0, Ledger(""))], [EVERYTHING], planned)
+    )
+
+    assert first.start_ns == 0
+    assert len(read) <= HORIZON_NS // SECOND + 4
+
+
+class _Watched(list[Block]):
+    """Notes how far it has been read."""
+
+    def __init__(self, blocks: list[Block], read: list[int]) -> None:
+        super().__init__(blocks)
+        self._read = read
+
+    def __iter__(self) -> Iterator[Block]:
+        for i, block in enumerate(super().__iter__()):
+            self._read.append(i)
+            yield block
+
+
+def test_rows_that_come_too_late_are_told_not_mixed_in() -> None:
+    late = wheel_block([7], [9.0])
+    blocks = [wheel_block([s * SECOND], [1.0]) for s in range(10)]
+    ledger = Ledger("late")
+
+    found = _windows([MemoryLog((WHEELS,), [*blocks, late])], [ledger])
+
+    assert sum(len(w.samples[Signal.WHEEL_SPEEDS].t_ns) for w in found) == 10
+    assert ledger.topic("wheels").skipped == {"too late to be put in order": 1}
+    assert ledger.topic("wheels").used == 10
+
+
+def test_two_candidates_for_a_role_are_listed() -> None:
+    other = Topic("imu2", "sensor_msgs/msg/Imu", "columns")
+
+    with pytest.raises(VehicleError, match=r"gyro, imu2; name one as topics\.imu"):
+        plan([(0, GYRO), (0, other)], Vehicle(version=1))
+
+
+def test_a_column_that_its_role_needs_and_lacks_is_counted() -> None:
+    block = Block("gyro", np.array([1], np.int64), wheel_block([1], [1.0]).rows)
+    ledger = Ledger("odd")
+
+    assert _windows([MemoryLog((GYRO,), [block])], [ledger]) == []
+    assert ledger.topic("gyro").skipped == {"lacks a column its role needs": 1}
