@@ -24,10 +24,9 @@ from crosscue.eval.studies.town.range_study import law_m
 from crosscue.eval.studies.town.settings import UNTIL_LOST, FieldStudy, LandmarkStudy
 from crosscue.eval.studies.town.work import chunks_of
 from crosscue.eval.studies.words import km, percent
-from crosscue.localization.town.kernel import Keys, drive_many, drive_traced
+from crosscue.localization.town.drive import Keys, Outcome, Result, drive_many, drive_traced
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
-from crosscue.localization.town.simulator import Outcome, Result
 
 NEES = Result._fields.index("nees")
 FINE_M = 1e-4

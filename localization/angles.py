@@ -14,6 +14,8 @@ TWO_PI: Final = 2.0 * math.pi
 
 def wrap(angle_rad: float) -> float:
     """The same direction in (-pi, pi]; an angle already there is returned unchanged."""
+    if -math.pi < angle_rad <= math.pi:
+        return angle_rad
     return angle_rad - TWO_PI * math.ceil((angle_rad - math.pi) / TWO_PI)
 
 

@@ -21,17 +21,16 @@ import numpy as np
 
 from crosscue.replay.columns import Floats
 
+from . import pose_filter
 from .angles import wrap
+from .pose_filter import HEADING, SPEED, State, arc
 
 X: Final = 0
 Y: Final = 1
-HEADING: Final = 2
-SPEED: Final = 3
 
 LOST_M: Final = 100.0
 """Full major axis of the 2-sigma ellipse above which the source calls the car lost."""
 
-_SMALL_RAD: Final = 1e-2
 _ROUNDING: Final = 1e-9
 
 
@@ -94,26 +93,6 @@ class MotionNoise:
                 raise ValueError(f"{name}: want >= 0, got {getattr(self, name)}")
 
 
-class Arc(NamedTuple):
-    """A step along a circle in the car's frame, with its derivatives.
-
-    Attributes:
-        dx_m: Forward.
-        dy_m: To the left.
-        dx_by_distance: Derivative of ``dx_m`` by the arc's length.
-        dy_by_distance: Of ``dy_m`` by the arc's length.
-        dx_by_turn: Of ``dx_m`` by the angle turned, m/rad.
-        dy_by_turn: Of ``dy_m`` by the angle turned, m/rad.
-    """
-
-    dx_m: float
-    dy_m: float
-    dx_by_distance: float
-    dy_by_distance: float
-    dx_by_turn: float
-    dy_by_turn: float
-
-
 class Motion(NamedTuple):
     """One step of the motion model.
 
@@ -142,30 +121,6 @@ class Updated(NamedTuple):
     is_accepted: bool
     innovation: Floats
     nis: float
-
-
-def arc(distance_m: float, turn_rad: float) -> Arc:
-    """Follow a circle for ``distance_m`` while turning by ``turn_rad`` (eq. 6)."""
-    t, t2 = turn_rad, turn_rad * turn_rad
-    if abs(t) < _SMALL_RAD:
-        along = 1.0 - t2 / 6.0 * (1.0 - t2 / 20.0)
-        across = t / 2.0 * (1.0 - t2 / 12.0 * (1.0 - t2 / 30.0))
-        along_by_turn = -t / 3.0 * (1.0 - t2 / 10.0 * (1.0 - t2 / 28.0))
-        across_by_turn = 0.5 - t2 / 8.0 * (1.0 - t2 / 18.0 * (1.0 - t2 / 40.0))
-    else:
-        sine = math.sin(t)
-        along = sine / t
-        across = 2.0 * math.sin(t / 2.0) ** 2 / t
-        along_by_turn = (math.cos(t) - along) / t
-        across_by_turn = (sine - across) / t
-    return Arc(
-        distance_m * along,
-        distance_m * across,
-        along,
-        across,
-        distance_m * along_by_turn,
-        distance_m * across_by_turn,
-    )
 
 
 def bicycle(
@@ -242,14 +197,10 @@ def predict_odometry(
     _check_inputs(dt_s, distance_m=distance_m, turn_rad=turn_rad)
     if not (distance_var_m2 >= 0.0 and turn_var_rad2 >= 0.0 and accel_var_m2ps3 >= 0.0):
         raise ValueError(f"variances: want >= 0, got {distance_var_m2}, {turn_var_rad2}")
-    none = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    motion = _drive(belief.mean, 0.0, dt_s, distance_m, turn_rad, *none)
-    by_input = motion.by_input.copy()
-    by_input[SPEED] = 0.0
-    inputs = np.diag([distance_var_m2, turn_var_rad2])
-    cov = motion.by_state @ belief.cov @ motion.by_state.T + by_input @ inputs @ by_input.T
-    cov[SPEED, SPEED] += accel_var_m2ps3 * dt_s
-    return _belief(belief.t_ns + round(dt_s * 1e9), motion.mean, cov)
+    after = pose_filter.predict(
+        packed(belief), distance_m, turn_rad, distance_var_m2, turn_var_rad2, accel_var_m2ps3 * dt_s
+    )
+    return unpacked(belief.t_ns + round(dt_s * 1e9), after)
 
 
 def coast(
@@ -292,7 +243,7 @@ def update_speed(
         ValueError: The reading is not finite or its variance not positive.
     """
     innovation = np.array([speed_mps - belief.mean[SPEED]])
-    return _update(belief, (SPEED,), innovation, np.array([[var_m2ps2]]), gate_nis)
+    return _update_one(belief, SPEED, innovation, var_m2ps2, gate_nis)
 
 
 def update_heading(
@@ -304,7 +255,7 @@ def update_heading(
         ValueError: The reading is not finite or its variance not positive.
     """
     innovation = np.array([_wrapped(heading_rad - belief.mean[HEADING])])
-    return _update(belief, (HEADING,), innovation, np.array([[var_rad2]]), gate_nis)
+    return _update_one(belief, HEADING, innovation, var_rad2, gate_nis)
 
 
 def update_position(
@@ -323,19 +274,20 @@ def update_position(
     """
     if xy_m.shape != (2,):
         raise ValueError(f"xy_m: want (2,), got {xy_m.shape}")
-    return _update(belief, (X, Y), xy_m - belief.mean[:2], cov_m2, gate_nis)
+    innovation = xy_m - belief.mean[:2]
+    _check_measurement(innovation, cov_m2)
+    (var_x, cov_xy), (_, var_y) = cov_m2.tolist()
+    gate = math.inf if gate_nis is None else gate_nis
+    found = pose_filter.update_position(
+        packed(belief), float(xy_m[0]), float(xy_m[1]), var_x, cov_xy, var_y, gate
+    )
+    after = unpacked(belief.t_ns, found.state) if found.is_accepted else belief
+    return Updated(after, found.is_accepted, innovation, found.nis)
 
 
 def major_axis_m(belief: PoseBelief) -> float:
     """Full major axis of the 2-sigma position ellipse: four standard deviations."""
-    return axis_of(belief.cov[X, X], belief.cov[X, Y], belief.cov[Y, Y])
-
-
-def axis_of(var_x_m2: float, cov_xy_m2: float, var_y_m2: float) -> float:
-    """The same from the three entries of a position covariance."""
-    half_sum = 0.5 * (var_x_m2 + var_y_m2)
-    radius = math.hypot(0.5 * (var_x_m2 - var_y_m2), cov_xy_m2)
-    return 4.0 * math.sqrt(max(half_sum + radius, 0.0))
+    return pose_filter.major_axis_m(belief.cov[X, X], belief.cov[X, Y], belief.cov[Y, Y])
 
 
 def is_lost(belief: PoseBelief, lost_m: float = LOST_M) -> bool:
@@ -402,27 +354,16 @@ def _predicted(
     return _belief(belief.t_ns + round(dt_s * 1e9), motion.mean, cov)
 
 
-def _update(
-    belief: PoseBelief,
-    measured: tuple[int, ...],
-    innovation: Floats,
-    cov: Floats,
-    gate_nis: float | None,
+def _update_one(
+    belief: PoseBelief, measured: int, innovation: Floats, var: float, gate_nis: float | None
 ) -> Updated:
-    """Kalman update of directly measured states, in Joseph form."""
-    _check_measurement(innovation, cov)
-    observe = np.eye(4)[list(measured)]
-    spread = observe @ belief.cov @ observe.T + cov
-    weighed = np.linalg.solve(spread, innovation)
-    nis = float(innovation @ weighed)
+    """Fuse a measurement of one state."""
+    _check_measurement(innovation, np.array([[var]]))
+    nis = float(innovation[0] ** 2 / (belief.cov[measured, measured] + var))
     if gate_nis is not None and nis > gate_nis:
         return Updated(belief, False, innovation, nis)
-    gain = np.linalg.solve(spread, observe @ belief.cov).T
-    keep = np.eye(4) - gain @ observe
-    posterior = keep @ belief.cov @ keep.T + gain @ cov @ gain.T
-    mean = belief.mean + gain @ innovation
-    mean[HEADING] = wrap(mean[HEADING])
-    return Updated(_belief(belief.t_ns, mean, posterior), True, innovation, nis)
+    after = pose_filter.update(packed(belief), measured, float(innovation[0]), var)
+    return Updated(unpacked(belief.t_ns, after), True, innovation, nis)
 
 
 def _belief(t_ns: int, mean: Floats, cov: Floats) -> PoseBelief:
@@ -449,3 +390,16 @@ def _check_measurement(innovation: Floats, cov: Floats) -> None:
         raise ValueError("measurement: want finite numbers, got NaN or infinity")
     if (np.linalg.eigvalsh(cov) <= 0.0).any() or not np.allclose(cov, cov.T):
         raise ValueError(f"measurement covariance: want positive definite, got {cov.tolist()}")
+
+
+def packed(belief: PoseBelief) -> State:
+    """The belief's numbers; its time stays behind."""
+    p = belief.cov
+    return State(*map(float, (*belief.mean, *p[0], *p[1, 1:], *p[2, 2:], p[3, 3])))
+
+
+def unpacked(t_ns: int, state: State) -> PoseBelief:
+    """A belief with just these numbers."""
+    x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
+    cov = np.array([[xx, xy, xh, xv], [xy, yy, yh, yv], [xh, yh, hh, hv], [xv, yv, hv, vv]])
+    return PoseBelief(t_ns, np.array([x, y, heading, speed]), cov)

@@ -17,7 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .ekf import HEADING, SPEED, PoseBelief, coast
+from .ekf import PoseBelief, coast
+from .pose_filter import HEADING, SPEED
 
 FULL_TURN_VAR_RAD2 = math.pi**2 / 3.0
 """Of a heading of which nothing is known."""

@@ -10,69 +10,69 @@ to Tabu search. Intersections are recognised from the *estimated* position only.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from enum import Enum
-from typing import NamedTuple
+from enum import IntEnum
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.replay.columns import Floats
 
 from .angles import wrap
 
+Ints = NDArray[np.int64]
+NONE: Final = -1
+"""In place of a number where there is nothing: no place, no option, no landmark."""
+PLACES, OPTIONS = 0, 1
+_ROOM: Final = 64
 
-class Strategy(Enum):
+
+class Strategy(IntEnum):
     """What the car drives to; the source's three variants."""
 
-    STRAIGHT = "straight to goal"
-    LANDMARKS = "landmark to landmark"
-    HYBRID = "hybrid"
+    STRAIGHT = 0
+    LANDMARKS = 1
+    HYBRID = 2
 
 
-class Option(NamedTuple):
-    """One way to leave an intersection.
-
-    Attributes:
-        heading_rad: Of the car after it.
-        bearing_rad: Direction from the car to the goal after it.
-        penalty_rad: For having done so here before.
-    """
-
-    heading_rad: float
-    bearing_rad: float
-    penalty_rad: float = 0.0
+STRATEGIES: Final = {
+    "straight to goal": Strategy.STRAIGHT,
+    "landmark to landmark": Strategy.LANDMARKS,
+    "hybrid": Strategy.HYBRID,
+}
+"""By the names in a study's settings."""
+_LANDMARKS: Final = int(Strategy.LANDMARKS)
+_HYBRID: Final = int(Strategy.HYBRID)
 
 
-class Decision(NamedTuple):
-    """The way chosen.
-
-    Attributes:
-        option: Its place in the list.
-        costs_rad: Of every option.
-    """
-
-    option: int
-    costs_rad: tuple[float, ...]
+def option_cost(heading_rad: float, bearing_rad: float, penalty_rad: float) -> float:
+    """What eq. 4 minimises: how far an option's heading is off the goal, plus its penalty."""
+    return abs(wrap(heading_rad - bearing_rad)) + penalty_rad
 
 
-def choose(options: Sequence[Option]) -> Decision:
+def choose(headings_rad: Floats, bearings_rad: Floats, penalties_rad: Floats) -> int:
     """The option of least cost (eq. 4); of equal ones the first.
 
+    Args:
+        headings_rad: Shape (N,): of the car after each option.
+        bearings_rad: Shape (N,): direction from the car to the goal after it.
+        penalties_rad: Shape (N,): for having done so here before.
+
     Raises:
-        ValueError: No options, an angle that is not finite, or a negative penalty.
+        ValueError: No options.
     """
-    if not options:
-        raise ValueError("choose: want at least one option, got none")
-    for i, option in enumerate(options):
-        if not all(map(math.isfinite, option)) or option.penalty_rad < 0.0:
-            raise ValueError(f"option {i}: want finite angles and a penalty >= 0, got {option}")
-    costs = tuple(abs(wrap(o.heading_rad - o.bearing_rad)) + o.penalty_rad for o in options)
-    return Decision(costs.index(min(costs)), costs)
+    if len(headings_rad) == 0:
+        raise ValueError("choose: expected at least one option, found none")
+    chosen, least = 0, np.inf
+    for i in range(len(headings_rad)):
+        cost = option_cost(headings_rad[i], bearings_rad[i], penalties_rad[i])
+        if cost < least:
+            chosen, least = i, cost
+    return chosen
 
 
 def bearing_after(
-    x_m: float, y_m: float, heading_rad: float, goal_m: tuple[float, float], after_m: float
+    x_m: float, y_m: float, heading_rad: float, goal_x_m: float, goal_y_m: float, after_m: float
 ) -> float:
     """Direction to the goal once the car has left an intersection.
 
@@ -80,118 +80,173 @@ def bearing_after(
         x_m: Of the intersection, as believed.
         y_m: Likewise.
         heading_rad: Of the road taken.
-        goal_m: Shape (2,).
+        goal_x_m: Of the goal.
+        goal_y_m: Likewise.
         after_m: How far into that road the car is then.
     """
     after_x = x_m + after_m * math.cos(heading_rad)
     after_y = y_m + after_m * math.sin(heading_rad)
-    return math.atan2(goal_m[1] - after_y, goal_m[0] - after_x)
+    return math.atan2(goal_y_m - after_y, goal_x_m - after_x)
 
 
-@dataclass(slots=True)
-class _Place:
-    x_m: float
-    y_m: float
-    headings_rad: list[float] = field(default_factory=list)
-    times: list[int] = field(default_factory=list)
-
-
-@dataclass(slots=True)
-class Memory:
-    """Places where the car believes to have decided, and what it did there.
+class Memory(NamedTuple):
+    """Places where the car believes to have decided, and what it did there; arrays with room.
 
     Attributes:
-        radius_m: A place is recognised within this distance; the nearest counts.
-        penalty_rad: Added for each time that an option was taken.
-        same_option_rad: Roads whose headings differ by less are one option.
+        sizes: Shape (2,): how many places and options there are.
+        x_m: Of each place.
+        y_m: Likewise.
+        first: Of each place: its first option.
+        following: Of each option: the next one of the same place, or ``NONE``.
+        headings_rad: Of each option.
+        times: Of each option: how often it was taken.
     """
 
-    radius_m: float
-    penalty_rad: float
-    same_option_rad: float
-    _places: list[_Place] = field(default_factory=list)
+    sizes: Ints
+    x_m: Floats
+    y_m: Floats
+    first: Ints
+    following: Ints
+    headings_rad: Floats
+    times: Floats
 
-    def __post_init__(self) -> None:
-        """Refuse settings that mean nothing.
 
-        Raises:
-            ValueError: Not positive or, for the penalty, negative.
-        """
-        if not (self.radius_m > 0.0 and self.same_option_rad > 0.0 and self.penalty_rad >= 0.0):
-            raise ValueError(
-                f"memory: want radius and angle > 0, penalty >= 0; got {self.radius_m}, "
-                f"{self.same_option_rad}, {self.penalty_rad}"
-            )
+def empty_memory() -> Memory:
+    """Nothing decided yet."""
+    return Memory(
+        np.zeros(2, np.int64),
+        np.empty(_ROOM),
+        np.empty(_ROOM),
+        np.empty(_ROOM, np.int64),
+        np.empty(_ROOM, np.int64),
+        np.empty(_ROOM),
+        np.empty(_ROOM),
+    )
 
-    def __len__(self) -> int:
-        return len(self._places)
 
-    def penalties(self, x_m: float, y_m: float, headings_rad: Sequence[float]) -> tuple[float, ...]:
-        """The penalty of each option at an intersection believed to be here."""
-        place = self._recognised(x_m, y_m)
-        if place is None:
-            return (0.0,) * len(headings_rad)
-        found = [self._option(place, heading) for heading in headings_rad]
-        return tuple(0.0 if i is None else self.penalty_rad * place.times[i] for i in found)
+def recognise(memory: Memory, x_m: float, y_m: float, radius_m: float) -> int:
+    """The nearest known place within the radius, or ``NONE``."""
+    nearest, least = NONE, radius_m**2
+    for i in range(memory.sizes[PLACES]):
+        square = (memory.x_m[i] - x_m) ** 2 + (memory.y_m[i] - y_m) ** 2
+        if square < least:
+            nearest, least = i, square
+    return nearest
 
-    def record(self, x_m: float, y_m: float, heading_rad: float) -> None:
-        """Remember that the road of this heading was taken here."""
-        place = self._recognised(x_m, y_m)
-        if place is None:
-            place = _Place(x_m, y_m)
-            self._places.append(place)
-        i = self._option(place, heading_rad)
-        if i is None:
-            place.headings_rad.append(heading_rad)
-            place.times.append(1)
-        else:
-            place.times[i] += 1
 
-    def _recognised(self, x_m: float, y_m: float) -> _Place | None:
-        nearest, least = None, self.radius_m**2
-        for place in self._places:
-            square = (place.x_m - x_m) ** 2 + (place.y_m - y_m) ** 2
-            if square < least:
-                nearest, least = place, square
-        return nearest
+def known_option(memory: Memory, place: int, heading_rad: float, same_rad: float) -> int:
+    """The option of a place whose heading is nearest and closer than ``same_rad``, or ``NONE``."""
+    if place == NONE:
+        return NONE
+    nearest, least = NONE, same_rad
+    option = memory.first[place]
+    while option != NONE:
+        apart = abs(wrap(memory.headings_rad[option] - heading_rad))
+        if apart < least:
+            nearest, least = option, apart
+        option = memory.following[option]
+    return nearest
 
-    def _option(self, place: _Place, heading_rad: float) -> int | None:
-        nearest, least = None, self.same_option_rad
-        for i, known in enumerate(place.headings_rad):
-            apart = abs(wrap(known - heading_rad))
-            if apart < least:
-                nearest, least = i, apart
-        return nearest
+
+def penalty(
+    memory: Memory, place: int, heading_rad: float, same_rad: float, each_rad: float
+) -> float:
+    """``each_rad`` for each time that this option was taken at this place."""
+    option = known_option(memory, place, heading_rad, same_rad)
+    return 0.0 if option == NONE else each_rad * memory.times[option]
+
+
+def remember(
+    memory: Memory, place: int, x_m: float, y_m: float, heading_rad: float, same_rad: float
+) -> Memory:
+    """The memory after a road was taken at a place, or at a new one where ``place`` is ``NONE``."""
+    if place == NONE:
+        place = memory.sizes[PLACES]
+        if place == len(memory.x_m):
+            memory = _with_room_for_places(memory)
+        memory.x_m[place], memory.y_m[place], memory.first[place] = x_m, y_m, NONE
+        memory.sizes[PLACES] += 1
+    option = known_option(memory, place, heading_rad, same_rad)
+    if option != NONE:
+        memory.times[option] += 1.0
+        return memory
+    option = memory.sizes[OPTIONS]
+    if option == len(memory.times):
+        memory = _with_room_for_options(memory)
+    memory.sizes[OPTIONS] += 1
+    memory.headings_rad[option], memory.times[option] = heading_rad, 1.0
+    # New ones last: of options equally near, the first remembered counts.
+    memory.following[option] = NONE
+    if memory.first[place] == NONE:
+        memory.first[place] = option
+    else:
+        last = memory.first[place]
+        while memory.following[last] != NONE:
+            last = memory.following[last]
+        memory.following[last] = option
+    return memory
+
+
+def _with_room_for_places(memory: Memory) -> Memory:
+    sizes, x_m, y_m, first, following, headings, times = memory
+    return Memory(
+        sizes, _doubled(x_m), _doubled(y_m), _doubled_ints(first), following, headings, times
+    )
+
+
+def _with_room_for_options(memory: Memory) -> Memory:
+    sizes, x_m, y_m, first, following, headings, times = memory
+    return Memory(
+        sizes, x_m, y_m, first, _doubled_ints(following), _doubled(headings), _doubled(times)
+    )
+
+
+def _doubled(numbers: Floats) -> Floats:
+    larger = np.empty(2 * len(numbers))
+    larger[: len(numbers)] = numbers
+    return larger
+
+
+def _doubled_ints(numbers: Ints) -> Ints:
+    larger = np.empty(2 * len(numbers), np.int64)
+    larger[: len(numbers)] = numbers
+    return larger
 
 
 def landmark_ahead(
-    xy_m: tuple[float, float],
-    goal_m: tuple[float, float],
+    x_m: float,
+    y_m: float,
+    goal_x_m: float,
+    goal_y_m: float,
     landmarks_m: Floats,
-    is_visited: Sequence[bool],
-) -> int | None:
-    """The nearest landmark that brings the car closer to its goal, or None.
+    is_visited: NDArray[np.bool_],
+) -> int:
+    """The nearest landmark that brings the car closer to its goal, or ``NONE``.
 
     A landmark further off than the goal itself is no help on the way; neither is one that was
     visited already.
 
     Args:
-        xy_m: Where the car believes to be.
-        goal_m: Where it wants to.
+        x_m: Where the car believes to be.
+        y_m: Likewise.
+        goal_x_m: Where it wants to.
+        goal_y_m: Likewise.
         landmarks_m: Shape (L, 2).
-        is_visited: Of each landmark.
+        is_visited: Shape (L,).
     """
-    if not len(landmarks_m):
-        return None
-    to_goal = (goal_m[0] - xy_m[0]) ** 2 + (goal_m[1] - xy_m[1]) ** 2
-    to_car = (landmarks_m[:, 0] - xy_m[0]) ** 2 + (landmarks_m[:, 1] - xy_m[1]) ** 2
-    left = (landmarks_m[:, 0] - goal_m[0]) ** 2 + (landmarks_m[:, 1] - goal_m[1]) ** 2
-    helps = (left < to_goal) & (to_car < to_goal) & ~np.asarray(is_visited)
-    return int(np.argmin(np.where(helps, to_car, np.inf))) if helps.any() else None
+    to_goal = (goal_x_m - x_m) ** 2 + (goal_y_m - y_m) ** 2
+    nearest, least = NONE, np.inf
+    for i in range(len(landmarks_m)):
+        lx, ly = landmarks_m[i, 0], landmarks_m[i, 1]
+        to_car = (lx - x_m) ** 2 + (ly - y_m) ** 2
+        left = (lx - goal_x_m) ** 2 + (ly - goal_y_m) ** 2
+        if left < to_goal and to_car < to_goal and not is_visited[i] and to_car < least:
+            nearest, least = i, to_car
+    return nearest
 
 
-def seeks_landmarks(strategy: Strategy, major_axis_m: float, hybrid_above_m: float) -> bool:
+def seeks_landmarks(strategy: int, major_axis_m: float, hybrid_above_m: float) -> bool:
     """Does this strategy look for landmarks at the present uncertainty?"""
-    if strategy is Strategy.HYBRID:
+    if strategy == _HYBRID:
         return major_axis_m > hybrid_above_m
-    return strategy is Strategy.LANDMARKS
+    return strategy == _LANDMARKS

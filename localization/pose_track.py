@@ -31,9 +31,9 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import Floats, Int64s
 
 from .angles import wrap
-from .ekf import HEADING, SPEED, PoseBelief, axis_of, coast
+from .ekf import PoseBelief, coast, packed, unpacked
 from .odometry import Increments
-from .packed_state import HEADING_VARIANCE, driven, packed, unpacked, weighed
+from .pose_filter import HEADING, SPEED, major_axis_m, predict, update
 
 ACCEPTED: Final = 0
 REJECTED: Final = 1
@@ -386,7 +386,7 @@ class _Run:
                 break
             self._handle_events()
         innovation = speed_mps - self.state[SPEED]
-        self.state = weighed(self.state, SPEED, innovation, speed_var)
+        self.state = update(self.state, SPEED, innovation, speed_var)
         if self.event_ns == stop_ns:
             self._handle_events()
         if self.every_interval:
@@ -396,7 +396,7 @@ class _Run:
         self, to_ns: int, distance_m: float, turn_rad: float, distance_var: float, turn_var: float
     ) -> None:
         speed_var = self.settings.accel_var_m2ps3 * ((to_ns - self.t_ns) * 1e-9)
-        self.state = driven(self.state, distance_m, turn_rad, distance_var, turn_var, speed_var)
+        self.state = predict(self.state, distance_m, turn_rad, distance_var, turn_var, speed_var)
         self.travelled_m += abs(distance_m)
         self.t_ns = to_ns
 
@@ -455,7 +455,7 @@ class _Run:
             self.tally["headings_thinned"] += 1
             return
         innovation = wrap(heading_rad - self.state[HEADING])
-        nis = innovation * innovation / (self.state[HEADING_VARIANCE] + var_rad2)
+        nis = innovation * innovation / (self.state.hh + var_rad2)
         gate = self.settings.heading_gate_nis
         outcome = ACCEPTED if gate is None or nis <= gate else REJECTED
         self.used.append((self.t_ns, heading_rad, var_rad2, innovation, nis, outcome))
@@ -464,7 +464,7 @@ class _Run:
             return
         self.tally["headings_accepted"] += 1
         self.counted_ns, self.counted_m = self.t_ns, self.travelled_m
-        self.state = weighed(self.state, HEADING, innovation, var_rad2)
+        self.state = update(self.state, HEADING, innovation, var_rad2)
 
     def _is_due(self) -> bool:
         if self.counted_ns is None:
@@ -480,7 +480,7 @@ class _Run:
             self.poses.pop()
         x, y, heading, speed, xx, xy, xh, _, yy, yh, _, hh, _, _ = self.state
         self.pose_times.append(self.t_ns)
-        axis = axis_of(xx, xy, yy)
+        axis = major_axis_m(xx, xy, yy)
         self.poses.append((x, y, heading, speed, xx, xy, xh, yy, yh, hh, axis, self.travelled_m))
 
     def result(self) -> Advance:

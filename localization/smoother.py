@@ -21,7 +21,7 @@ from crosscue.replay.errors import UsageError
 from .angles import wrap
 from .ekf import PoseBelief
 from .odometry import BY_NOTHING, Increments
-from .packed_state import PackedState, driven
+from .pose_filter import State, predict
 from .pose_track import Headings
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ _LEAST_VARIANCE: Final = np.diag([1e-5, 1e-5, 1e-8])
 """Added so that exact odometry (an arc has no sideways error) can be inverted: 3 mm, 0.1 mrad."""
 RELATIVE_TOLERANCE: Final = 1e-10
 ABSOLUTE_TOLERANCE: Final = 1e-6
-_AT_REST: Final[PackedState] = (0.0,) * 14
+_AT_REST: Final = State(*(0.0,) * len(State._fields))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,7 +177,7 @@ def _steps(times: Int64s, increments: Increments) -> list[tuple[Floats, Floats]]
             to = min(until, stops[i])
             share = (to - now) / (stops[i] - starts[i])
             distance, turn, distance_var, turn_var = (share * value for value in rows[i])
-            state = driven(state, distance, turn, distance_var, turn_var, 0.0)
+            state = predict(state, distance, turn, distance_var, turn_var, 0.0)
             aside_var += distance_var if is_blind[i] else 0.0
             now = to
             i += now == stops[i]

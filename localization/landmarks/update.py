@@ -25,7 +25,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.localization.angles import wrap
-from crosscue.localization.ekf import HEADING, SPEED, PoseBelief, Updated
+from crosscue.localization.ekf import PoseBelief, Updated
+from crosscue.localization.pose_filter import HEADING, SPEED
 from crosscue.localization.pose_track import ACCEPTED, REJECTED
 from crosscue.replay.columns import Floats
 

@@ -14,7 +14,6 @@ from crosscue.localization.angles import wrap, wrap_all
 from crosscue.localization.ekf import (
     MotionNoise,
     PoseBelief,
-    arc,
     bicycle,
     coast,
     is_lost,
@@ -27,6 +26,7 @@ from crosscue.localization.ekf import (
     update_position,
     update_speed,
 )
+from crosscue.localization.pose_filter import arc
 from crosscue.replay.columns import Floats
 
 NOISE = MotionNoise(

@@ -8,86 +8,105 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.localization.navigation import (
+    NONE,
+    PLACES,
     Memory,
-    Option,
     Strategy,
     bearing_after,
     choose,
+    empty_memory,
     landmark_ahead,
+    option_cost,
+    penalty,
+    recognise,
+    remember,
     seeks_landmarks,
 )
 
 _ANGLE = st.floats(-math.pi, math.pi)
-_OPTIONS = st.lists(st.builds(Option, _ANGLE, _ANGLE, st.floats(0.0, 3.0)), min_size=1, max_size=6)
+_PENALTY = st.floats(0.0, 3.0)
+EACH_RAD, SAME_RAD, RADIUS_M = 0.5, 0.5, 30.0
 
 
-def test_the_car_of_fig_13_goes_straight_on() -> None:
-    goal = (80.0, 10.0)
-    straight, right = 0.0, -math.pi / 2
-    options = [Option(h, bearing_after(0.0, 0.0, h, goal, 10.0)) for h in (straight, right)]
+def test_the_car_of_fig_13_goes_straight() -> None:
+    headings = np.array([0.0, -math.pi / 2])
+    bearings = np.array([bearing_after(0.0, 0.0, h, 80.0, 10.0, 10.0) for h in headings])
 
-    assert choose(options).option == 0
-
-
-@given(options=_OPTIONS, turn=_ANGLE)
-def test_turning_the_map_changes_no_cost(options: list[Option], turn: float) -> None:
-    turned = [Option(o.heading_rad + turn, o.bearing_rad + turn, o.penalty_rad) for o in options]
-
-    assert choose(turned).costs_rad == pytest.approx(choose(options).costs_rad, abs=1e-9)
+    assert choose(headings, bearings, np.zeros(2)) == 0
 
 
-@given(options=_OPTIONS)
-def test_the_mirror_image_decides_alike(options: list[Option]) -> None:
-    mirrored = [Option(-o.heading_rad, -o.bearing_rad, o.penalty_rad) for o in options]
+@given(heading=_ANGLE, bearing=_ANGLE, added=_PENALTY, turn=_ANGLE)
+def test_turning_or_mirroring_the_map_changes_no_cost(
+    heading: float, bearing: float, added: float, turn: float
+) -> None:
+    cost = option_cost(heading, bearing, added)
 
-    assert choose(mirrored).costs_rad == pytest.approx(choose(options).costs_rad, abs=1e-9)
+    assert option_cost(heading + turn, bearing + turn, added) == pytest.approx(cost, abs=1e-9)
+    assert option_cost(-heading, -bearing, added) == pytest.approx(cost, abs=1e-9)
 
 
-def test_of_equal_options_the_first_is_taken() -> None:
-    assert choose([Option(0.3, 0.0), Option(-0.3, 0.0)]).option == 0
+@given(st.lists(st.tuples(_ANGLE, _ANGLE, _PENALTY), min_size=1, max_size=6))
+def test_the_choice_costs_least_and_of_equal_ones_is_the_first(
+    options: list[tuple[float, float, float]],
+) -> None:
+    costs = [option_cost(*option) for option in options]
+
+    assert choose(*np.array(options).T) == costs.index(min(costs))
+
+
+def test_without_options_there_is_no_choice() -> None:
+    with pytest.raises(ValueError, match="at least one option"):
+        choose(np.empty(0), np.empty(0), np.empty(0))
+
+
+def _decided(memory: Memory, x: float, y: float, heading: float) -> Memory:
+    return remember(memory, recognise(memory, x, y, RADIUS_M), x, y, heading, SAME_RAD)
 
 
 def test_a_repeated_decision_costs_more_each_time_until_another_wins() -> None:
-    memory = Memory(radius_m=30.0, penalty_rad=0.5, same_option_rad=0.5)
-    headings, bearings = (0.0, math.pi / 2), (0.1, 0.1)
+    memory, headings, bearings = empty_memory(), np.array([0.0, math.pi / 2]), np.array([0.1, 0.1])
     taken = []
     for visit in range(6):
         # Each time the car believes itself a little elsewhere; the place is the same.
         x, y = 3.0 * visit, -2.0 * visit
-        penalties = memory.penalties(x, y, headings)
-        options = [Option(h, b, p) for h, b, p in zip(headings, bearings, penalties, strict=True)]
-        taken.append(choose(options).option)
-        memory.record(x, y, headings[taken[-1]])
+        place = recognise(memory, x, y, RADIUS_M)
+        penalties = np.array([penalty(memory, place, h, SAME_RAD, EACH_RAD) for h in headings])
+        taken.append(choose(headings, bearings, penalties))
+        memory = _decided(memory, x, y, headings[taken[-1]])
 
     assert taken[:3] == [0, 0, 0]
     assert 1 in taken
-    assert len(memory) == 1
+    assert memory.sizes[PLACES] == 1
 
 
 def test_another_intersection_remembers_nothing() -> None:
-    memory = Memory(radius_m=30.0, penalty_rad=0.5, same_option_rad=0.5)
-    memory.record(0.0, 0.0, 0.0)
+    memory = _decided(empty_memory(), 0.0, 0.0, 0.0)
 
-    assert memory.penalties(100.0, 0.0, (0.0,)) == (0.0,)
+    assert recognise(memory, 100.0, 0.0, RADIUS_M) == NONE
+    assert penalty(memory, NONE, 0.0, SAME_RAD, EACH_RAD) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [([], "at least one"), ([Option(math.nan, 0.0)], "finite"), ([Option(0.0, 0.0, -1.0)], ">= 0")],
-)
-def test_what_means_nothing_is_refused(options: list[Option], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        choose(options)
+def test_the_memory_holds_more_than_it_has_room_for_at_first() -> None:
+    memory = empty_memory()
+    for i in range(200):
+        memory = _decided(memory, 100.0 * i, 0.0, 0.0)
+        memory = _decided(memory, 100.0 * i, 0.0, math.pi / 2)
+
+    places = [recognise(memory, 100.0 * i, 0.0, RADIUS_M) for i in range(200)]
+    assert places == list(range(200))
+    assert {penalty(memory, one, math.pi / 2, SAME_RAD, EACH_RAD) for one in places} == {EACH_RAD}
 
 
 def test_a_landmark_must_be_on_the_way() -> None:
-    car, goal = (0.0, 0.0), (100.0, 0.0)
     behind, beside, further = (-5.0, 0.0), (30.0, 5.0), (130.0, 0.0)
     landmarks = np.array([behind, beside, further])
 
-    assert landmark_ahead(car, goal, landmarks, [False] * 3) == 1
-    assert landmark_ahead(car, goal, landmarks, [False, True, False]) is None
-    assert landmark_ahead(car, goal, np.empty((0, 2)), []) is None
+    def ahead(places_m: np.ndarray[tuple[int, int], np.dtype[np.float64]], *visited: bool) -> int:
+        return landmark_ahead(0.0, 0.0, 100.0, 0.0, places_m, np.array(visited, np.bool_))
+
+    assert ahead(landmarks, False, False, False) == 1
+    assert ahead(landmarks, False, True, False) == NONE
+    assert ahead(np.empty((0, 2))) == NONE
 
 
 def test_the_hybrid_seeks_landmarks_only_when_unsure() -> None:

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from crosscue.eval.studies.pictures import figure, save
-from crosscue.localization.town.city import City, make_city
-from crosscue.localization.town.kernel import (
+from crosscue.localization.town.drive import (
     GOAL_SET,
     LANDMARK_MISSED,
     LANDMARK_REFUSED,
     LANDMARK_SET,
     LANDMARK_TAKEN,
+    Outcome,
     Traced,
+    streets_of,
 )
-from crosscue.localization.town.random_stream import Stream, key_of
 from crosscue.localization.town.settings import Drive
-from crosscue.localization.town.simulator import CITY_STREAM, Outcome
+from crosscue.localization.town.streets import Streets, has_way, place_of, step_of
 from crosscue.replay.columns import Floats
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def draw(settings: Drive, traced: Traced, seed: int, folder: Path) -> Path:
     """
     made, (axes,) = figure(1, 9.0, 8.2)
     axes.grid(visible=False)
-    _streets(axes, make_city(Stream(key_of(seed, CITY_STREAM)), settings.city).city)
+    _draw_streets(axes, streets_of(settings, seed))
     x, y = traced.steps[:, 0], traced.steps[:, 1]
     axes.plot(x, y, color=TRUTH, lw=3.0, alpha=0.6, label="truth")
     axes.plot(traced.steps[:, 7], traced.steps[:, 8], color=ESTIMATE, lw=1.2, label="estimate")
@@ -85,19 +85,23 @@ def _places(
         )
 
 
-def _streets(axes: Axes, city: City) -> None:
+def _draw_streets(axes: Axes, streets: Streets) -> None:
     """Two-way streets grey, one-way streets lighter."""
     from matplotlib.collections import LineCollection
 
     both: list[list[tuple[float, float]]] = []
     single: list[list[tuple[float, float]]] = []
-    for node in range(len(city)):
-        for way in np.flatnonzero(city.ways[node]).tolist():
-            there = city.neighbour(node, way)
-            is_both = bool(city.ways[there, (way + 2) % 4])
+    for node in range(len(streets.ways)):
+        for way in range(4):
+            if not has_way(streets.ways, node, way):
+                continue
+            there = node + step_of(way, len(streets.xs_m))
+            is_both = has_way(streets.ways, there, (way + 2) % 4)
             if is_both and there < node:
                 continue
-            (both if is_both else single).append([city.place(node), city.place(there)])
+            (both if is_both else single).append(
+                [place_of(streets, node), place_of(streets, there)]
+            )
     axes.add_collection(LineCollection(both, colors="0.78", linewidths=1.2, zorder=0))
     axes.add_collection(
         LineCollection(single, colors="0.78", linewidths=1.0, linestyles=":", zorder=0)

@@ -20,7 +20,7 @@ from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.truth import save as save_truth
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.localization.angles import wrap_all
-from crosscue.localization.town.kernel import (
+from crosscue.localization.town.drive import (
     LANDMARK_MISSED,
     LANDMARK_REFUSED,
     LANDMARK_TAKEN,

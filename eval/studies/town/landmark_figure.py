@@ -11,7 +11,7 @@ import numpy as np
 
 from crosscue.eval.studies.intervals import logistic, share_of
 from crosscue.eval.studies.pictures import COLOURS, figure, save
-from crosscue.localization.town.simulator import Outcome
+from crosscue.localization.town.drive import Outcome
 from crosscue.replay.columns import Floats
 
 from .landmark_study import PUBLISHED_POINT, Cell, LandmarkResult

@@ -23,8 +23,8 @@ from crosscue.eval.studies.intervals import (
 )
 from crosscue.eval.studies.page import Table
 from crosscue.eval.studies.words import km, percent
+from crosscue.localization.town.drive import Outcome
 from crosscue.localization.town.settings import Drive
-from crosscue.localization.town.simulator import Outcome
 from crosscue.replay.columns import Floats
 
 from .range_study import split

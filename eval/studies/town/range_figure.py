@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from crosscue.eval.studies.pictures import COLOURS, figure, save
-from crosscue.localization.town.simulator import Outcome
+from crosscue.localization.town.drive import Outcome
 from crosscue.replay.columns import Floats
 
 from .range_study import CompassResult, points

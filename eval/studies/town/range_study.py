@@ -16,10 +16,9 @@ import numpy as np
 
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.studies.intervals import Measured, mean_of, measured, share_of, weights_of
-from crosscue.localization.town.kernel import drive_many
+from crosscue.localization.town.drive import Outcome, Result, drive_many
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
-from crosscue.localization.town.simulator import Outcome, Result
 from crosscue.replay.columns import Floats
 
 from .settings import UNTIL_LOST, RangeStudy, changed

@@ -9,7 +9,7 @@ from pathlib import Path
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.scoring.pose.score import PoseScore, score
-from crosscue.localization.town.kernel import Traced, drive_traced
+from crosscue.localization.town.drive import Traced, drive_traced
 from crosscue.localization.town.settings import Drive
 from crosscue.replay.files.run_folder import RunFolder, create
 from crosscue.replay.log import EVERYTHING, open_log

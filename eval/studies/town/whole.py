@@ -10,7 +10,7 @@ from typing import Final
 
 from crosscue.eval.studies.page import Table, write_page
 from crosscue.eval.studies.words import km, percent
-from crosscue.localization.town.simulator import Result
+from crosscue.localization.town.drive import Result
 from crosscue.replay.errors import RunError
 from crosscue.replay.files.run_folder import RunFolder, locked, strict_json, write_text
 from crosscue.replay.files.tree_text import json_tree

@@ -21,15 +21,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crosscue.eval.batch.ray_cluster import joined
-from crosscue.localization import angles
-from crosscue.localization.town import city, random_stream
-from crosscue.localization.town import kernel as drive_kernel
+from crosscue.localization.compiled import fingerprint
+from crosscue.localization.town import parameters
 from crosscue.localization.town import settings as drive_settings
-from crosscue.localization.town import simulator as drive_simulator
-from crosscue.localization.town.kernel import Keys, drive_many
+from crosscue.localization.town.drive import Keys, Result, drive_many, drive_one
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
-from crosscue.localization.town.simulator import Result
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import CrosscueError, RunError, UsageError
 from crosscue.replay.files.run_folder import RunFolder, TableSink
@@ -42,8 +39,6 @@ if TYPE_CHECKING:
 CHUNK_DRIVES: Final = 100
 CHUNKS: Final = "chunks"
 DRIVES: Final = "drives"
-_COMPILED: Final = (angles, city, drive_kernel, drive_settings, drive_simulator, random_stream)
-"""The kernel and what it takes its constants from."""
 DriveMany = Callable[[Drive, Keys], Floats]
 
 
@@ -189,7 +184,8 @@ def _chunk_schema() -> pa.Schema:
 
 @cache
 def _code() -> bytes:
-    return b"".join(Path(str(module.__file__)).read_bytes() for module in _COMPILED)
+    settings = (Path(str(one.__file__)).read_bytes() for one in (parameters, drive_settings))
+    return fingerprint(drive_one).encode() + b"".join(settings)
 
 
 def _read(kept: RunFolder, chunk: Chunk) -> dict[str, Floats] | None:

@@ -38,9 +38,8 @@ from crosscue.eval.studies.town.settings import (
 )
 from crosscue.eval.studies.town.whole import drive_study, finish_landmarks, finish_range
 from crosscue.eval.studies.town.work import WorkerError, assemble, chunks_of, run
-from crosscue.localization.town.kernel import Keys, drive_many
+from crosscue.localization.town.drive import Keys, Result, drive_many
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
-from crosscue.localization.town.simulator import Result
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.files.run_folder import RunFolder

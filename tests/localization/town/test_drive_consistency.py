@@ -12,15 +12,15 @@ import pytest
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.studies.town.consistency import nees_along_the_arc
 from crosscue.localization.angles import wrap_all
-from crosscue.localization.town.kernel import (
+from crosscue.localization.town.drive import (
     LANDMARK_REFUSED,
     LANDMARK_TAKEN,
+    Result,
     Traced,
     drive_many,
     drive_traced,
 )
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
-from crosscue.localization.town.simulator import Result
 from crosscue.replay.columns import Floats
 
 NEES = Result._fields.index("nees")

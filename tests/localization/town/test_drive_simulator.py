@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from crosscue.localization.town.drive import Outcome, drive
 from crosscue.localization.town.settings import City, Drive, Sensors
-from crosscue.localization.town.simulator import Outcome, drive
 
 TOWN = City(largest_km2=2.0)
 

@@ -1,7 +1,9 @@
-"""The compiled drive is the readable one; its filter is honest; it gets lost as physics says."""
+"""The compiled drive is the plain one; its filter is consistent; it is lost as physics says."""
 
+import importlib.util
 import math
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,22 +11,25 @@ from pydantic import ValidationError
 
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization import ekf
+from crosscue.localization.compiled import fingerprint
 from crosscue.localization.town import settings as drive_settings
-from crosscue.localization.town.kernel import (
+from crosscue.localization.town.drive import (
+    EVENT_FIELDS,
     GOAL_SET,
     LANDMARK_MISSED,
     LANDMARK_REFUSED,
     LANDMARK_SET,
     LANDMARK_TAKEN,
-    LANES,
+    STEP_FIELDS,
+    Log,
+    Outcome,
+    Result,
     as_result,
+    drive,
     drive_many,
     drive_traced,
-    filter_rows,
-    numbers_of,
 )
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
-from crosscue.localization.town.simulator import Outcome, Result, Trace, as_rows, drive
 from crosscue.replay.columns import Floats
 
 FIELD = {name: i for i, name in enumerate(Result._fields)}
@@ -75,26 +80,47 @@ def many(settings: Drive, count: int, first: int = 0) -> Floats:
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_the_compiled_drive_is_the_readable_one(kind: str) -> None:
-    readable = as_rows([drive(KINDS[kind], seed) for seed in range(3)])
+def test_the_compiled_drive_is_the_plain_one(kind: str) -> None:
+    plain = np.array([drive(KINDS[kind], seed) for seed in range(3)], np.float64)
 
-    np.testing.assert_allclose(drive_many(KINDS[kind], seeds(3)), readable, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(drive_many(KINDS[kind], seeds(3)), plain, rtol=1e-9, atol=1e-9)
 
 
-def test_a_traced_drive_is_the_readable_one_step_by_step() -> None:
-    settings, trace = KINDS["landmark to landmark"], Trace()
-    result = drive(settings, 3, trace)
+def test_a_traced_drive_is_the_plain_one_step_by_step() -> None:
+    settings = KINDS["landmark to landmark"]
     traced = drive_traced(settings, 3)
+    n_steps, n_events = len(traced.steps), len(traced.events)
+    log = Log(
+        np.empty((n_steps, STEP_FIELDS)), np.empty((n_events, EVENT_FIELDS)), np.zeros(1, np.int64)
+    )
+    result = drive(settings, 3, log)
 
     assert traced.result == pytest.approx(result, rel=1e-9)
-    np.testing.assert_allclose(traced.steps[:, :4], trace.true_poses, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(traced.steps[:, 4:6], trace.wheels_m, rtol=1e-9, atol=1e-9)
-    read = np.flatnonzero(~np.isnan(traced.steps[:, 6]))
-    assert (read + 1).tolist() == [step for step, _ in trace.compass]
-    means = np.array([belief.mean[:3] for belief in trace.beliefs])
-    np.testing.assert_allclose(traced.steps[:, 7:10], means, rtol=1e-9, atol=1e-9)
-    axes = [ekf.axis_of(*row) for row in traced.steps[:, [10, 11, 13]].tolist()]
-    np.testing.assert_allclose(axes, [ekf.major_axis_m(b) for b in trace.beliefs], rtol=1e-9)
+    np.testing.assert_allclose(traced.steps, log.steps, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(traced.events, log.events, rtol=1e-9, atol=1e-9)
+
+
+def test_code_kept_by_the_compiler_is_named_after_every_file_that_it_was_made_of(
+    tmp_path: Path,
+) -> None:
+    def named() -> str:
+        place = importlib.util.spec_from_file_location("crosscue.below", tmp_path / "below.py")
+        assert place is not None
+        assert place.loader is not None
+        below = importlib.util.module_from_spec(place)
+        place.loader.exec_module(below)
+
+        def above() -> int:
+            return int(callee())  # type: ignore[name-defined]  # noqa: F821
+
+        above.__globals__["callee"] = below.callee
+        return fingerprint(above)
+
+    (tmp_path / "below.py").write_text("def callee():\n    return 1\n")
+    before, again = named(), named()
+    (tmp_path / "below.py").write_text("def callee():\n    return 22\n")
+
+    assert before == again != named()
 
 
 def test_events_tell_all_goals_and_landmarks() -> None:
@@ -107,39 +133,6 @@ def test_events_tell_all_goals_and_landmarks() -> None:
     assert len(traced.of_kind(LANDMARK_REFUSED)) == result.refused
     passed = traced.of_kind(LANDMARK_MISSED, LANDMARK_TAKEN, LANDMARK_REFUSED)
     assert len(passed) == result.passed
-
-
-def test_the_filter_alone_is_the_filter_of_the_drive() -> None:
-    settings, steps = Drive(), 400
-    many = [drive_traced(settings, seed) for seed in range(LANES)]
-    first = np.array([traced.first_belief for traced in many]).T.copy()
-    readings = np.stack([traced.steps[:steps, 4:7] for traced in many], axis=2).copy()
-    ends = np.empty((9, LANES))
-
-    filter_rows(numbers_of(settings), first, readings, ends)
-
-    wanted = np.array([traced.steps[steps - 1, 7:16] for traced in many]).T
-    np.testing.assert_allclose(ends, wanted, rtol=1e-9, atol=1e-9)
-
-
-def test_no_drive_depends_on_its_neighbours() -> None:
-    settings = KINDS["landmark to landmark"]
-    together = drive_many(settings, seeds(2 * LANES + 3))
-    alone = [drive_many(settings, seeds(1, seed))[0] for seed in (0, LANES - 1, LANES, 2 * LANES)]
-
-    assert together[[0, LANES - 1, LANES, 2 * LANES]].tobytes() == np.array(alone).tobytes()
-
-
-def test_turns_too_sharp_for_a_series_are_the_readable_ones() -> None:
-    """A short, slipping car that hardly knows which way it faces."""
-    settings = Drive(
-        city=City(largest_km2=1.5),
-        car=drive_settings.Car(wheelbase_m=0.8),
-        sensors=Sensors(slip_per_sqrt_m=0.2, start_heading_sd_deg=60.0),
-    )
-    readable = as_rows([drive(settings, seed) for seed in range(3)])
-
-    np.testing.assert_allclose(drive_many(settings, seeds(3)), readable, rtol=1e-9, atol=1e-9)
 
 
 def test_rows_and_records_are_the_same() -> None:

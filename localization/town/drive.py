@@ -1,0 +1,670 @@
+"""A whole simulated drive: town, vehicle, sensors, filter and decisions, step by step.
+
+Truth and estimate meet in three places only: sensors measure the truth, local sensors show the
+roads of the next intersection as seen from the vehicle, and the result compares the two at the end.
+Decisions see the estimate.
+
+Everything here is plain Python on numbers and arrays. ``drive`` runs it as it is, to be stepped
+through in a debugger; ``drive_many`` compiles the same functions and is thousands of times as fast.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final, NamedTuple, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.localization.angles import wrap
+from crosscue.localization.compiled import compiled, kept
+from crosscue.localization.navigation import (
+    NONE,
+    Memory,
+    bearing_after,
+    choose,
+    empty_memory,
+    landmark_ahead,
+    penalty,
+    recognise,
+    remember,
+    seeks_landmarks,
+)
+from crosscue.localization.pose_filter import (
+    HEADING,
+    SPEED,
+    State,
+    major_axis_m,
+    nees,
+    predict,
+    update,
+    update_position,
+)
+from crosscue.replay.columns import Floats
+
+from . import settings as settings_of
+from .parameters import Parameters, parameters_of
+from .random_stream import Stream, below, normal, stream_of, uniform
+from .route import (
+    ARC_FIELDS,
+    BACK,
+    MAX_ARCS,
+    STRAIGHT,
+    UNDECIDED,
+    Route,
+    advance,
+    enter,
+    entry_m,
+    lane_of,
+    next_arc,
+    remaining_m,
+    wanted_mps,
+)
+from .streets import (
+    COSINES,
+    HEADINGS_RAD,
+    SINES,
+    Streets,
+    draw_goal,
+    draw_landmarks,
+    draw_place,
+    has_intersection,
+    has_way,
+    make_streets,
+    place_of,
+    step_of,
+)
+from .vehicle import Reading, Vehicle, measure, move
+
+Keys = NDArray[np.uint64]
+Ints = NDArray[np.int64]
+
+CITY_STREAM: Final = np.uint64(1)
+PLACE_STREAM: Final = np.uint64(2)
+SENSOR_STREAM: Final = np.uint64(3)
+NO_CITY: Final = -1.0
+"""In place of an outcome: the settings gave a city without intersections."""
+STEP_FIELDS: Final = 16
+EVENT_FIELDS: Final = 6
+GOAL_SET, LANDMARK_SET, LANDMARK_MISSED, LANDMARK_TAKEN, LANDMARK_REFUSED = range(5)
+"""Kinds of events: a new goal, a new landmark, one passed unnoticed, fused, refused."""
+_QUARTERS: Final = (0, 1, 3)
+"""Straight, left, right: the order in which options are listed."""
+
+
+class Outcome(IntEnum):
+    """How a drive ended."""
+
+    REACHED = 0
+    LOST = 1
+    GIVEN_UP = 2
+
+
+REACHED, LOST, GIVEN_UP = (int(outcome) for outcome in Outcome)
+
+
+class Result(NamedTuple):
+    """What is kept of a drive; all lengths in metres.
+
+    Attributes:
+        outcome: As ``Outcome``.
+        travelled_m: Driven in truth.
+        seconds: Of driving.
+        steps: Of the filter.
+        straight_m: From start to the first goal as the crow flies.
+        manhattan_m: The same along x and along y.
+        area_km2: Of the city.
+        landmarks: In the city at the start.
+        passed: Landmarks driven past.
+        detected: Of these, those fused.
+        refused: Of these, those refused by the gate.
+        decisions: At intersections.
+        turns: Decisions that were not straight.
+        goals: Reached.
+        first_goal_m: Travelled when the first goal was reached; NaN if it never was.
+        first_goal_axis_m: Major axis then.
+        major_axis_m: At the end.
+        error_m: Estimate from truth at the end.
+        nees: Of x, y, heading at the end.
+        goal_error_m: True distance from the last goal reached, when it was; NaN if none was.
+        furthest_m: Largest distance from the start of any goal reached; 0 without.
+        longest_gap_m: Longest distance between landmarks fused, start and end included.
+    """
+
+    outcome: int
+    travelled_m: float
+    seconds: float
+    steps: int
+    straight_m: float
+    manhattan_m: float
+    area_km2: float
+    landmarks: int
+    passed: int
+    detected: int
+    refused: int
+    decisions: int
+    turns: int
+    goals: int
+    first_goal_m: float
+    first_goal_axis_m: float
+    major_axis_m: float
+    error_m: float
+    nees: float
+    goal_error_m: float
+    furthest_m: float
+    longest_gap_m: float
+
+
+FIELDS: Final = len(Result._fields)
+
+
+class Landmarks(NamedTuple):
+    """L landmarks.
+
+    Attributes:
+        nodes: Shape (L,): their intersections.
+        places_m: Shape (L, 2).
+        is_visited: Shape (L,).
+    """
+
+    nodes: Ints
+    places_m: Floats
+    is_visited: NDArray[np.bool_]
+
+
+class Targets(NamedTuple):
+    """The present goal and the landmarks, and the stream that later ones are drawn from."""
+
+    goal: int
+    landmarks: Landmarks
+    places: Stream
+
+
+class Tally(NamedTuple):
+    """Counts and distances of the result that grow while driving."""
+
+    passed: int
+    detected: int
+    refused: int
+    decisions: int
+    turns: int
+    goals: int
+    first_goal_m: float
+    first_goal_axis_m: float
+    goal_error_m: float
+    furthest_m: float
+    longest_gap_m: float
+    last_fix_m: float
+
+
+class Log(NamedTuple):
+    """What is kept of a drive step by step; arrays without rows keep nothing.
+
+    Attributes:
+        steps: Shape (S, 16): true x, y, heading, speed; left and right wheel's path as read;
+            compass, NaN where none was read; then the filter's x, y, heading and their covariance
+            xx, xy, xh, yy, yh, hh.
+        events: Shape (E, 6): step, kind, x, y of goal or landmark, x, y that a landmark gave.
+        noted: Shape (1,): events so far.
+    """
+
+    steps: Floats
+    events: Floats
+    noted: Ints
+
+
+def drive_one(p: Parameters, seed: np.uint64, row: Floats, log: Log) -> None:
+    """Drive once.
+
+    Args:
+        p: Settings.
+        seed: Everything random comes from it.
+        row: Shape (22,), filled: the fields of ``Result``; with three more columns, x, y, heading
+            of the filter before the first step follow.
+        log: Filled as far as it has room.
+    """
+    row[:] = np.nan
+    streets = make_streets(stream_of(seed, CITY_STREAM), p)
+    if not has_intersection(streets):
+        row[0] = NO_CITY
+        return
+    start, way, targets = _start(p, streets, stream_of(seed, PLACE_STREAM))
+    start_x, start_y = place_of(streets, start)
+    goal_x, goal_y = place_of(streets, targets.goal)
+    _describe_start(row, streets, targets, goal_x - start_x, goal_y - start_y)
+    _note_targets(log, 0, streets, targets, True)
+    x, y = start_x + p.lane_offset_m * SINES[way], start_y - p.lane_offset_m * COSINES[way]
+    vehicle = Vehicle(x, y, HEADINGS_RAD[way], p.turn_mps, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    belief, noise = _first_belief(p, vehicle, stream_of(seed, SENSOR_STREAM))
+    if len(row) > FIELDS:
+        row[FIELDS], row[FIELDS + 1], row[FIELDS + 2] = (
+            belief.x_m,
+            belief.y_m,
+            belief.heading_rad,
+        )
+    route = Route(way, start + step_of(way, len(streets.xs_m)), UNDECIDED, 0, 0, 0.0)
+    arcs, memory = np.empty((MAX_ARCS, ARC_FIELDS)), empty_memory()
+    tally = Tally(0, 0, 0, 0, 0, 0, math.nan, math.nan, math.nan, 0.0, 0.0, 0.0)
+    steps = 0
+    while True:
+        lane = lane_of(p, streets, route, arcs, vehicle)
+        moved = move(p, vehicle, lane, wanted_mps(p, streets, route, vehicle))
+        distance_m = moved.travelled_m - vehicle.travelled_m
+        vehicle, reading, noise = measure(p, vehicle, moved, noise)
+        route = advance(route, arcs, lane, distance_m)
+        belief = estimate(p, belief, reading)
+        if steps < len(log.steps):
+            _keep(log.steps[steps], vehicle, reading, belief)
+        steps += 1
+        axis_m = major_axis_m(belief.xx, belief.xy, belief.yy)
+        if axis_m > p.lost_above_m:
+            break
+        if _is_at_goal(p, streets, targets, belief, axis_m):
+            tally = _arrived(streets, targets, tally, vehicle, start, axis_m)
+            if tally.goals == p.goals:
+                break
+            targets = _next_targets(p, streets, targets, route.node)
+            _note_targets(log, steps, streets, targets, p.landmark_per_goal)
+        if vehicle.travelled_m > p.max_travelled_m or steps * p.step_s > p.max_s:
+            break
+        if route.arc < route.arcs:
+            route = next_arc(route, arcs)
+            continue
+        room_m = remaining_m(streets, route, vehicle)
+        if route.turn == UNDECIDED and room_m <= p.decide_at_m:
+            turn, memory = _decide(p, streets, route, targets, memory, belief, room_m, axis_m)
+            route = Route(route.way, route.node, turn, route.arc, route.arcs, 0.0)
+            tally = _decided(tally, turn)
+        if route.turn != UNDECIDED and room_m <= entry_m(p, route.turn):
+            landmark = _landmark_at(targets.landmarks, route.node)
+            if landmark != NONE:
+                belief, tally, noise = _pass_landmark(
+                    p, streets, targets.landmarks, landmark, vehicle, belief, tally, noise, log,
+                    steps,
+                )  # fmt: skip
+            route = enter(p, streets, route, arcs)
+    _finish(p, row, vehicle, belief, tally, steps)
+
+
+def drive_each(p: Parameters, seeds: Keys, rows: Floats, log: Log) -> None:
+    """``drive_one`` for each of N seeds; rows have shape (N, 22)."""
+    for i in range(len(seeds)):
+        drive_one(p, seeds[i], rows[i], log)
+
+
+def estimate(p: Parameters, belief: State, reading: Reading) -> State:
+    """The belief after one step's odometry and, where it was read, the compass."""
+    distance_m = 0.5 * (reading.left_m + reading.right_m)
+    turn_rad = (reading.right_m - reading.left_m) / p.track_width_m
+    slip_var = p.slip_per_sqrt_m**2 * abs(distance_m)
+    belief = predict(
+        belief,
+        distance_m,
+        turn_rad,
+        slip_var / 2.0,
+        2.0 * slip_var / p.track_width_m**2,
+        p.accel_var_m2ps3 * p.step_s,
+    )
+    speed_error = distance_m / p.step_s - belief.speed_mps
+    belief = update(belief, SPEED, speed_error, p.speed_sd_mps**2)
+    if math.isnan(reading.compass_rad):
+        return belief
+    heading_error = wrap(reading.compass_rad - belief.heading_rad)
+    return update(belief, HEADING, heading_error, p.compass_sd_rad**2)
+
+
+def _start(p: Parameters, streets: Streets, places: Stream) -> tuple[int, int, Targets]:
+    """Where the drive starts, in which direction, and where to."""
+    start, places = draw_place(places, streets.inside)
+    way, places = below(places, 4)
+    while not has_way(streets.ways, start, way):
+        way = (way + 1) & 3
+    goal, places = draw_goal(places, streets, start, p.min_goal_m)
+    if p.landmark_per_goal:
+        nodes, places = _one_landmark(p, streets, places)
+    else:
+        nodes, places = draw_landmarks(places, streets, p.landmarks_per_km2)
+    return start, way, Targets(goal, _landmarks(streets, nodes), places)
+
+
+def _one_landmark(p: Parameters, streets: Streets, places: Stream) -> tuple[Ints, Stream]:
+    """Perhaps one landmark, as dense as asked for on average."""
+    number, places = uniform(places)
+    nodes = np.empty(1 if number < p.landmarks_per_km2 * streets.area_km2 else 0, np.int64)
+    if len(nodes):
+        nodes[0], places = draw_place(places, streets.inside)
+    return nodes, places
+
+
+def _landmarks(streets: Streets, nodes: Ints) -> Landmarks:
+    places_m = np.empty((len(nodes), 2))
+    for i in range(len(nodes)):
+        places_m[i, 0], places_m[i, 1] = place_of(streets, nodes[i])
+    return Landmarks(nodes, places_m, np.zeros(len(nodes), np.bool_))
+
+
+def _landmark_at(landmarks: Landmarks, node: int) -> int:
+    for i in range(len(landmarks.nodes)):
+        if landmarks.nodes[i] == node:
+            return i
+    return NONE
+
+
+def _next_targets(p: Parameters, streets: Streets, targets: Targets, near: int) -> Targets:
+    goal, places = draw_goal(targets.places, streets, near, p.min_goal_m)
+    if not p.landmark_per_goal:
+        return Targets(goal, targets.landmarks, places)
+    nodes, places = _one_landmark(p, streets, places)
+    return Targets(goal, _landmarks(streets, nodes), places)
+
+
+def _first_belief(p: Parameters, vehicle: Vehicle, noise: Stream) -> tuple[State, Stream]:
+    x_error, noise = normal(noise)
+    y_error, noise = normal(noise)
+    heading_error, noise = normal(noise)
+    position_var, heading_var = p.start_position_sd_m**2, p.start_heading_sd_rad**2
+    belief = State(
+        vehicle.x_m + p.start_position_sd_m * x_error,
+        vehicle.y_m + p.start_position_sd_m * y_error,
+        wrap(vehicle.heading_rad + p.start_heading_sd_rad * heading_error),
+        vehicle.speed_mps,
+        position_var, 0.0, 0.0, 0.0, position_var, 0.0, 0.0, heading_var, 0.0, p.speed_sd_mps**2,
+    )  # fmt: skip
+    return belief, noise
+
+
+def _is_at_goal(
+    p: Parameters, streets: Streets, targets: Targets, belief: State, axis_m: float
+) -> bool:
+    """Does the vehicle believe to be at its goal?"""
+    x, y = place_of(streets, targets.goal)
+    away_m = math.hypot(belief.x_m - x, belief.y_m - y)
+    return away_m <= max(p.arrive_within_m, axis_m / 2.0)
+
+
+def _arrived(
+    streets: Streets, targets: Targets, tally: Tally, vehicle: Vehicle, start: int, axis_m: float
+) -> Tally:
+    x, y = place_of(streets, targets.goal)
+    start_x, start_y = place_of(streets, start)
+    t, is_first = tally, tally.goals == 0
+    return Tally(
+        t.passed,
+        t.detected,
+        t.refused,
+        t.decisions,
+        t.turns,
+        t.goals + 1,
+        vehicle.travelled_m if is_first else t.first_goal_m,
+        axis_m if is_first else t.first_goal_axis_m,
+        math.hypot(vehicle.x_m - x, vehicle.y_m - y),
+        max(t.furthest_m, math.hypot(x - start_x, y - start_y)),
+        t.longest_gap_m,
+        t.last_fix_m,
+    )
+
+
+def _decide(
+    p: Parameters,
+    streets: Streets,
+    route: Route,
+    targets: Targets,
+    memory: Memory,
+    belief: State,
+    room_m: float,
+    axis_m: float,
+) -> tuple[int, Memory]:
+    """The turn at the intersection ahead (eq. 4), seen from where the vehicle believes to be."""
+    heading = belief.heading_rad
+    at_x = belief.x_m + room_m * math.cos(heading)
+    at_y = belief.y_m + room_m * math.sin(heading)
+    target_x, target_y = _target(p, streets, targets, at_x, at_y, axis_m)
+    turns = np.empty(len(_QUARTERS), np.int64)
+    count = 0
+    for turn in _QUARTERS:
+        if has_way(streets.ways, route.node, (route.way + turn) & 3):
+            turns[count] = turn
+            count += 1
+    if count == 0:
+        turns[0], count = BACK, 1
+    headings, bearings, penalties = np.empty(count), np.empty(count), np.empty(count)
+    place = recognise(memory, at_x, at_y, p.recognise_within_m)
+    for i in range(count):
+        after = wrap(heading + HEADINGS_RAD[turns[i]])
+        headings[i] = after
+        bearings[i] = bearing_after(at_x, at_y, after, target_x, target_y, p.after_m)
+        penalties[i] = penalty(memory, place, after, p.same_option_rad, p.penalty_rad)
+    chosen = choose(headings, bearings, penalties)
+    memory = remember(memory, place, at_x, at_y, headings[chosen], p.same_option_rad)
+    return turns[chosen], memory
+
+
+def _target(
+    p: Parameters, streets: Streets, targets: Targets, x_m: float, y_m: float, axis_m: float
+) -> tuple[float, float]:
+    """The goal, or the landmark sought on the way to it."""
+    goal_x, goal_y = place_of(streets, targets.goal)
+    if not seeks_landmarks(p.strategy, axis_m, p.hybrid_above_m):
+        return goal_x, goal_y
+    marks = targets.landmarks
+    while True:
+        found = landmark_ahead(x_m, y_m, goal_x, goal_y, marks.places_m, marks.is_visited)
+        if found == NONE:
+            return goal_x, goal_y
+        x, y = marks.places_m[found, 0], marks.places_m[found, 1]
+        if math.hypot(x - x_m, y - y_m) > max(p.arrive_within_m, axis_m / 2.0):
+            return x, y
+        marks.is_visited[found] = True
+
+
+def _decided(tally: Tally, turn: int) -> Tally:
+    t = tally
+    return Tally(
+        t.passed, t.detected, t.refused, t.decisions + 1, t.turns + int(turn != STRAIGHT), t.goals,
+        t.first_goal_m, t.first_goal_axis_m, t.goal_error_m, t.furthest_m, t.longest_gap_m,
+        t.last_fix_m,
+    )  # fmt: skip
+
+
+def _pass_landmark(
+    p: Parameters,
+    streets: Streets,
+    landmarks: Landmarks,
+    landmark: int,
+    vehicle: Vehicle,
+    belief: State,
+    tally: Tally,
+    noise: Stream,
+    log: Log,
+    steps: int,
+) -> tuple[State, Tally, Stream]:
+    """Perhaps recognise it: then it gives the vehicle's position."""
+    number, noise = uniform(noise)
+    node = landmarks.nodes[landmark]
+    if number >= p.detection_rate:
+        _note(log, steps, LANDMARK_MISSED, streets, node, math.nan, math.nan)
+        return belief, _passed(tally, vehicle, False, False), noise
+    x_error, noise = normal(noise)
+    y_error, noise = normal(noise)
+    x, y = vehicle.x_m + p.landmark_sd_m * x_error, vehicle.y_m + p.landmark_sd_m * y_error
+    var = p.landmark_sd_m**2
+    landmarks.is_visited[landmark] = True
+    updated = update_position(belief, x, y, var, 0.0, var, p.landmark_gate_nis)
+    kind = LANDMARK_TAKEN if updated.is_accepted else LANDMARK_REFUSED
+    _note(log, steps, kind, streets, node, x, y)
+    tally = _passed(tally, vehicle, updated.is_accepted, not updated.is_accepted)
+    return updated.state, tally, noise
+
+
+def _passed(tally: Tally, vehicle: Vehicle, is_fused: bool, is_refused: bool) -> Tally:
+    t, gap_m = tally, vehicle.travelled_m - tally.last_fix_m
+    return Tally(
+        t.passed + 1,
+        t.detected + int(is_fused),
+        t.refused + int(is_refused),
+        t.decisions,
+        t.turns,
+        t.goals,
+        t.first_goal_m,
+        t.first_goal_axis_m,
+        t.goal_error_m,
+        t.furthest_m,
+        max(t.longest_gap_m, gap_m) if is_fused else t.longest_gap_m,
+        vehicle.travelled_m if is_fused else t.last_fix_m,
+    )
+
+
+def _describe_start(
+    row: Floats, streets: Streets, targets: Targets, goal_dx: float, goal_dy: float
+) -> None:
+    row[4], row[5] = math.hypot(goal_dx, goal_dy), abs(goal_dx) + abs(goal_dy)
+    row[6], row[7] = streets.area_km2, len(targets.landmarks.nodes)
+
+
+def _finish(
+    p: Parameters, row: Floats, vehicle: Vehicle, belief: State, tally: Tally, steps: int
+) -> None:
+    """The rest of the drive's ``Result``."""
+    axis_m = major_axis_m(belief.xx, belief.xy, belief.yy)
+    outcome = REACHED if tally.goals == p.goals else GIVEN_UP
+    ex, ey = belief.x_m - vehicle.x_m, belief.y_m - vehicle.y_m
+    eh = wrap(belief.heading_rad - vehicle.heading_rad)
+    row[0] = LOST if axis_m > p.lost_above_m else outcome
+    row[1], row[2], row[3] = vehicle.travelled_m, steps * p.step_s, steps
+    row[8], row[9], row[10] = tally.passed, tally.detected, tally.refused
+    row[11], row[12], row[13] = tally.decisions, tally.turns, tally.goals
+    row[14], row[15], row[16] = tally.first_goal_m, tally.first_goal_axis_m, axis_m
+    row[17], row[18] = math.hypot(ex, ey), nees(ex, ey, eh, belief)
+    row[19], row[20] = tally.goal_error_m, tally.furthest_m
+    row[21] = max(tally.longest_gap_m, vehicle.travelled_m - tally.last_fix_m)
+
+
+def _keep(kept: Floats, vehicle: Vehicle, reading: Reading, belief: State) -> None:
+    b = belief
+    kept[0], kept[1], kept[2] = vehicle.x_m, vehicle.y_m, vehicle.heading_rad
+    kept[3] = vehicle.speed_mps
+    kept[4], kept[5], kept[6] = reading.left_m, reading.right_m, reading.compass_rad
+    kept[7], kept[8], kept[9] = b.x_m, b.y_m, b.heading_rad
+    kept[10], kept[11], kept[12], kept[13], kept[14], kept[15] = b.xx, b.xy, b.xh, b.yy, b.yh, b.hh
+
+
+def _note_targets(
+    log: Log, steps: int, streets: Streets, targets: Targets, with_landmarks: bool
+) -> None:
+    _note(log, steps, GOAL_SET, streets, targets.goal, math.nan, math.nan)
+    if with_landmarks:
+        for node in targets.landmarks.nodes:
+            _note(log, steps, LANDMARK_SET, streets, node, math.nan, math.nan)
+
+
+def _note(
+    log: Log, steps: int, kind: int, streets: Streets, node: int, x_m: float, y_m: float
+) -> None:
+    """Keep an event while there is room."""
+    if log.noted[0] == len(log.events):
+        return
+    row = log.events[log.noted[0]]
+    row[0], row[1], row[4], row[5] = steps, kind, x_m, y_m
+    row[2], row[3] = place_of(streets, node)
+    log.noted[0] += 1
+
+
+def no_log() -> Log:
+    """Keeps nothing."""
+    return Log(np.empty((0, STEP_FIELDS)), np.empty((0, EVENT_FIELDS)), np.zeros(1, np.int64))
+
+
+def drive(settings: settings_of.Drive, seed: int, log: Log | None = None) -> Result:
+    """Drive once without compiling anything; the same numbers, slowly."""
+    row = np.empty(FIELDS)
+    with np.errstate(over="ignore"):
+        drive_one(parameters_of(settings), np.uint64(seed), row, no_log() if log is None else log)
+    return as_result(row)
+
+
+def drive_many(settings: settings_of.Drive, seeds: Keys) -> Floats:
+    """Drive once for each seed; other threads run meanwhile.
+
+    Args:
+        settings: City, vehicle, sensors, navigation.
+        seeds: Shape (N,), uint64.
+
+    Returns:
+        Shape (N, 22): the fields of ``Result``.
+
+    Raises:
+        ValueError: The settings gave a city without intersections.
+    """
+    rows = np.empty((len(seeds), FIELDS))
+    kept(drive_each)(parameters_of(settings), seeds, rows, no_log())
+    if failed := np.flatnonzero(rows[:, 0] == NO_CITY).tolist():
+        raise ValueError(
+            f"city of seed {seeds[failed[0]]}: no intersection; expected at least one where three "
+            "roads meet; try a larger area or shorter blocks"
+        )
+    return rows
+
+
+def streets_of(settings: settings_of.Drive, seed: int) -> Streets:
+    """The streets that a drive with this seed has."""
+    make = compiled(make_streets)
+    with np.errstate(over="ignore"):
+        stream = stream_of(np.uint64(seed), CITY_STREAM)
+    return make(stream, parameters_of(settings))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Traced:
+    """One drive step by step; simulated throughout.
+
+    Attributes:
+        result: As ``drive`` returns it.
+        steps: Shape (S, 16), as in ``Log``.
+        events: Shape (E, 6), likewise.
+        first_belief: x, y, heading of the filter before the first step.
+    """
+
+    result: Result
+    steps: Floats
+    events: Floats
+    first_belief: tuple[float, float, float]
+
+    def of_kind(self, *kinds: int) -> Floats:
+        """Shape (K, 6): events of these kinds."""
+        chosen: Floats = self.events[np.isin(self.events[:, 1], kinds)]
+        return chosen
+
+    def goal_to_goal_m(self) -> float:
+        """From the start to each goal reached, as the crow flies, added up."""
+        begin = np.array(self.first_belief[:2])
+        ways = np.diff(np.vstack([begin, self.of_kind(GOAL_SET)[: self.result.goals, 2:4]]), axis=0)
+        return float(np.hypot(ways[:, 0], ways[:, 1]).sum())
+
+
+def drive_traced(settings: settings_of.Drive, seed: int) -> Traced:
+    """Drive once and keep every step.
+
+    Raises:
+        ValueError: As ``drive_many``.
+    """
+    seeds = np.array([seed], np.uint64)
+    result = as_result(drive_many(settings, seeds)[0])
+    room = 2 * (result.goals + 1) + result.landmarks + result.passed
+    log = Log(
+        np.empty((result.steps, STEP_FIELDS)),
+        np.full((room, EVENT_FIELDS), np.nan),
+        np.zeros(1, np.int64),
+    )
+    rows = np.empty((1, FIELDS + 3))
+    kept(drive_each)(parameters_of(settings), seeds, rows, log)
+    x, y, heading = rows[0, FIELDS:].tolist()
+    return Traced(result, log.steps, log.events[: log.noted[0]], (x, y, heading))
+
+
+def as_result(row: Floats) -> Result:
+    """One row as a record, its counts whole numbers again."""
+    kinds = get_type_hints(Result)
+    pairs = zip(Result._fields, row.tolist(), strict=True)
+    return Result(**{name: kinds[name](value) for name, value in pairs})

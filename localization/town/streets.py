@@ -1,0 +1,275 @@
+"""The streets of random gridded cities: blocks of many sizes, dead ends, one-way streets.
+
+An intersection is a crossing of a street along x with one along y, numbered row by row. Directions
+are 0 east, 1 north, 2 west, 3 south; the bits of one byte say in which of them an intersection may
+be left. Streets that would let a car in and never out again are opened both ways, so that from any
+intersection of the city every other one can be reached.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats
+
+from .parameters import Parameters
+from .random_stream import Stream, below, uniform
+
+Bytes = NDArray[np.uint8]
+HEADINGS_RAD: Final = (0.0, math.pi / 2.0, math.pi, -math.pi / 2.0)
+COSINES: Final = tuple(math.cos(heading) for heading in HEADINGS_RAD)
+SINES: Final = tuple(math.sin(heading) for heading in HEADINGS_RAD)
+MAX_TRIES: Final = 1000
+ONWARD, HOMEWARD, EITHER = 1, 2, 4
+"""Kinds of reach: from a place along roads, to it, and whichever way roads lead."""
+_BOTH: Final = ONWARD | HOMEWARD
+_ALL: Final = ONWARD | HOMEWARD | EITHER
+
+
+class Streets(NamedTuple):
+    """A city with the part of it that is driven in.
+
+    Attributes:
+        xs_m: Shape (X,), increasing: the streets along y.
+        ys_m: Shape (Y,), increasing: the streets along x.
+        ways: Shape (X * Y,), uint8: bit d is set where direction d may be taken.
+        inside: Shape (X * Y,): intersections of the largest connected part.
+        area_km2: As asked for; the grid ends within a block of it.
+    """
+
+    xs_m: Floats
+    ys_m: Floats
+    ways: Bytes
+    inside: NDArray[np.bool_]
+    area_km2: float
+
+
+def step_of(way: int, columns: int) -> int:
+    """From an intersection's number to that of its neighbour in a direction."""
+    return (1, columns, -1, -columns)[way]
+
+
+def has_way(ways: Bytes, node: int, way: int) -> bool:
+    """May intersection ``node`` be left in this direction?"""
+    return (int(ways[node]) >> way) & 1 == 1
+
+
+def place_of(streets: Streets, node: int) -> tuple[float, float]:
+    """Where an intersection is, metres."""
+    columns = len(streets.xs_m)
+    return streets.xs_m[node % columns], streets.ys_m[node // columns]
+
+
+def make_streets(stream: Stream, p: Parameters) -> Streets:
+    """A random city; the same stream and settings give the same one."""
+    number, stream = uniform(stream)
+    area_km2 = p.min_km2 + (p.max_km2 - p.min_km2) * number
+    side_m = 1000.0 * math.sqrt(area_km2)
+    xs, stream = _coordinates(stream, side_m, p)
+    ys, stream = _coordinates(stream, side_m, p)
+    columns, size = len(xs), len(xs) * len(ys)
+    ways = _all_ways(columns, size)
+    for _ in range(int(p.dead_end_fraction * size)):
+        node, stream = below(stream, size)
+        way, stream = below(stream, 4)
+        _make_dead_end(ways, columns, node, way)
+    for _ in range(int(p.one_way_fraction * 2 * size)):
+        node, stream = below(stream, size)
+        way, stream = below(stream, 4)
+        if has_way(ways, node, way):
+            _close(ways, node + step_of(way, columns), (way + 2) & 3)
+    gates = _gates_of(ways, columns)
+    reach = _largest_part(gates, columns)
+    inside = reach != 0
+    # Nobody can come to what is not connected with the rest; its streets are no streets.
+    for node in range(size):
+        if not inside[node]:
+            ways[node] = 0
+    _open_traps(ways, columns, reach, gates)
+    return Streets(xs, ys, ways, inside, area_km2)
+
+
+def _coordinates(stream: Stream, side_m: float, p: Parameters) -> tuple[Floats, Stream]:
+    span = p.max_block_m - p.min_block_m
+    places = np.empty(3 + int(side_m / p.min_block_m))
+    places[0], count = 0.0, 1
+    while True:
+        number, stream = uniform(stream)
+        there = places[count - 1] + p.min_block_m + span * number
+        if there > side_m and count > 1:
+            return places[:count].copy(), stream
+        places[count] = there
+        count += 1
+
+
+def _all_ways(columns: int, size: int) -> Bytes:
+    ways = np.full(size, 15, np.uint8)
+    for node in range(0, size, columns):
+        _close(ways, node, 2)
+        _close(ways, node + columns - 1, 0)
+    for column in range(columns):
+        _close(ways, column, 3)
+        _close(ways, size - columns + column, 1)
+    return ways
+
+
+def _close(ways: Bytes, node: int, way: int) -> None:
+    ways[node] = np.uint8(int(ways[node]) & (15 - (1 << way)))
+
+
+def _open(ways: Bytes, node: int, way: int) -> None:
+    ways[node] = np.uint8(int(ways[node]) | (1 << way))
+
+
+def _make_dead_end(ways: Bytes, columns: int, node: int, keep: int) -> None:
+    """Leave one street of an intersection: the first one there is, from ``keep`` on."""
+    kept = False
+    for turn in range(4):
+        way = (keep + turn) & 3
+        if not has_way(ways, node, way):
+            continue
+        if kept:
+            _close(ways, node, way)
+            _close(ways, node + step_of(way, columns), (way + 2) & 3)
+        kept = True
+
+
+def _gates_of(ways: Bytes, columns: int) -> Bytes:
+    """Shape (4, N): which kinds of reach come into each place, from the neighbour on each side."""
+    size = len(ways)
+    gates = np.zeros((4, size), np.uint8)
+    for way, apart in ((0, 1), (1, columns)):
+        for i in range(size - apart):
+            there = int(has_way(ways, i, way))
+            back = int(has_way(ways, i + apart, way + 2))
+            either = (there | back) << 2
+            gates[way, i] = back | there << 1 | either
+            gates[way + 2, i + apart] = there | back << 1 | either
+    return gates
+
+
+def _spread(reach: Bytes, gates: Bytes, columns: int) -> None:
+    """Let all kinds of reach go on through the gates, sweep by sweep, until none grows.
+
+    Cities are mostly open: a few sweeps do, each as quick as one pass over all places.
+    """
+    size, grows = len(reach), True
+    while grows:
+        grows = False
+        for i in range(size):
+            _reach_from(reach, gates, i, i - columns, 3)
+            _reach_from(reach, gates, i, i - 1, 2)
+        for i in range(size - 1, -1, -1):
+            grows |= _reach_from(reach, gates, i, i + columns, 1)
+            grows |= _reach_from(reach, gates, i, i + 1, 0)
+
+
+def _reach_from(reach: Bytes, gates: Bytes, node: int, neighbour: int, way: int) -> bool:
+    """Reach a place from its neighbour in direction ``way``; is there more than before?"""
+    if neighbour < 0 or neighbour >= len(reach):
+        return False
+    before = reach[node]
+    reach[node] = before | (reach[neighbour] & gates[way, node])
+    return bool(reach[node] != before)
+
+
+def _largest_part(gates: Bytes, columns: int) -> Bytes:
+    """What can be reached, and how, from the first place of the part with most places."""
+    size = gates.shape[1]
+    best, seen = np.zeros(size, np.uint8), np.zeros(size, np.bool_)
+    most, left = 0, size
+    for start in range(size):
+        if seen[start]:
+            continue
+        reach = np.zeros(size, np.uint8)
+        reach[start] = _ALL
+        _spread(reach, gates, columns)
+        count = 0
+        for node in range(size):
+            if reach[node] != 0:
+                seen[node] = True
+                count += 1
+        if count > most:
+            most, best = count, reach
+        left -= count
+        if left <= most:
+            break
+    return best
+
+
+def _open_traps(ways: Bytes, columns: int, reach: Bytes, gates: Bytes) -> None:
+    """Open one-way streets both ways where they lead into, or out of, what has no way back."""
+    opened = True
+    while opened:
+        opened = False
+        for node in range(len(ways)):
+            if int(reach[node]) & _BOTH == _BOTH or reach[node] == 0:
+                continue
+            for way in range(4):
+                there, back = node + step_of(way, columns), (way + 2) & 3
+                if gates[way, node] == 0 or int(reach[there]) & _BOTH != _BOTH:
+                    continue
+                _open(ways, node, way)
+                _open(ways, there, back)
+                gates[way, node] = gates[back, there] = _ALL
+                opened = True
+        if opened:
+            _spread(reach, gates, columns)
+
+
+def has_intersection(streets: Streets) -> bool:
+    """Is there a place where at least three roads begin or end?"""
+    ways, columns = streets.ways, len(streets.xs_m)
+    comes = np.zeros(len(ways), np.int64)
+    for node in range(len(ways)):
+        out = 0
+        for way in range(4):
+            if has_way(ways, node, way):
+                out += 1
+                there = node + step_of(way, columns)
+                comes[there] += 1
+                if comes[there] == 3:
+                    return True
+        if out > 2:
+            return True
+    return False
+
+
+def draw_place(stream: Stream, inside: NDArray[np.bool_]) -> tuple[int, Stream]:
+    """A random intersection of the part driven in."""
+    while True:
+        node, stream = below(stream, len(inside))
+        if inside[node]:
+            return node, stream
+
+
+def draw_goal(stream: Stream, streets: Streets, start: int, min_m: float) -> tuple[int, Stream]:
+    """A random intersection at least so far from ``start``; the last one drawn after many tries."""
+    x, y = place_of(streets, start)
+    goal = start
+    for _ in range(MAX_TRIES):
+        goal, stream = draw_place(stream, streets.inside)
+        there_x, there_y = place_of(streets, goal)
+        if goal != start and (there_x - x) ** 2 + (there_y - y) ** 2 >= min_m**2:
+            break
+    return goal, stream
+
+
+def draw_landmarks(
+    stream: Stream, streets: Streets, per_km2: float
+) -> tuple[NDArray[np.int64], Stream]:
+    """Intersections with a landmark, all different, in the order drawn."""
+    number, stream = uniform(stream)
+    wanted = min(int(per_km2 * streets.area_km2 + number), streets.inside.sum())
+    has = np.zeros(len(streets.ways), np.bool_)
+    found = np.empty(wanted, np.int64)
+    for i in range(wanted):
+        node, stream = draw_place(stream, streets.inside)
+        while has[node]:
+            node, stream = draw_place(stream, streets.inside)
+        has[node], found[i] = True, node
+    return found, stream
