@@ -80,8 +80,9 @@ def claims(run: RunFolder, vehicle: Vehicle) -> Iterator[tuple[int, str, float, 
                 part = slice(i, i + 1)
                 one = replace(pairs, step_px=pairs.step_px[part], nose=pairs.nose[part])
                 told = {
-                    "cross_traffic": cross_traffic(one, rules), "parked": parked_cars(one, rules)
-                }  # fmt: skip
+                    "cross_traffic": cross_traffic(one, rules),
+                    "parked": parked_cars(one, rules),
+                }
                 for cue, (left, right) in told.items():
                     if left or right:
                         yield now.t_ns, f"{cue}_{'left' if left else 'right'}", x, y

@@ -143,8 +143,10 @@ def main() -> None:
         scene = outcome.scene
         assert scene is not None
         print(f"simulated drive of {seconds:.0f} s, {size / 1e6:.0f} MB, {scene.frames:,} frames")
-        print(f"estimate: {median(taken):.2f} s wall, {median(cpu):.2f} s CPU; "
-              f"{seconds / median(taken):.0f} times real time")  # fmt: skip
+        print(
+            f"estimate: {median(taken):.2f} s wall, {median(cpu):.2f} s CPU; "
+            f"{seconds / median(taken):.0f} times real time"
+        )
 
 
 if __name__ == "__main__":

@@ -108,9 +108,18 @@ def main() -> None:
         drive, run, cache = folder / "drive", folder / "run", folder / "cache.sqlite"
         write_scene(drive, SceneSettings("C", camera=Camera(width_px=192, height_px=108)))
         argv = [
-            "replay", str(drive / "drive.mcap"), "--vehicle", str(drive / "vehicle.toml"), "-q",
-            "--detectors", "kills:build", "--cache", str(cache), "-o", str(run),
-        ]  # fmt: skip
+            "replay",
+            str(drive / "drive.mcap"),
+            "--vehicle",
+            str(drive / "vehicle.toml"),
+            "-q",
+            "--detectors",
+            "kills:build",
+            "--cache",
+            str(cache),
+            "-o",
+            str(run),
+        ]
         whole = folder / "whole"
         for _ in range(2):
             assert cli.run([*argv, "-o", str(whole), "--overwrite"]) == 0
@@ -127,8 +136,10 @@ def main() -> None:
             outcomes.update(found)
             resumed_s.append(took_s)
             shutil.rmtree(run)
-    print(f"simulated drive; a replay takes {usual_s:.2f} s, a resumed one "
-          f"{median(resumed_s):.2f} s (median)")  # fmt: skip
+    print(
+        f"simulated drive; a replay takes {usual_s:.2f} s, a resumed one "
+        f"{median(resumed_s):.2f} s (median)"
+    )
     for outcome, times in outcomes.most_common():
         print(f"  {outcome:<40} {times:5} of {kills}")
 

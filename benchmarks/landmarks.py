@@ -94,8 +94,10 @@ def growth(sizes: list[int]) -> None:
             built_s = build(path, count)
             child = subprocess.run(
                 [sys.executable, __file__, "--measure", str(path), str(count)],
-                capture_output=True, text=True, check=True,
-            )  # fmt: skip
+                capture_output=True,
+                text=True,
+                check=True,
+            )
             got = json.loads(child.stdout)
             size_mib = path.stat().st_size / 2**20
         print(
@@ -201,11 +203,15 @@ def real_days(data: Path) -> None:
     orb = OrbMatcher(OrbSettings(features=1000))
     seen = {p.stem: orb.describe(grey_of(read_picture(p))) for p in folder.rglob("*.jpg")}
     same = {
-        ("gmb_q1", "gmb_db2"), ("gmb_q2", "gmb_db5"), ("gmb_q3", "gmb_db11"),
-        ("gmb_q5", "gmb_db13"), ("prbonn_query_1", "prbonn_ref_0"),
-        ("prbonn_query_2", "prbonn_ref_1"), ("prbonn_query_2", "prbonn_ref_3"),
+        ("gmb_q1", "gmb_db2"),
+        ("gmb_q2", "gmb_db5"),
+        ("gmb_q3", "gmb_db11"),
+        ("gmb_q5", "gmb_db13"),
+        ("prbonn_query_1", "prbonn_ref_0"),
+        ("prbonn_query_2", "prbonn_ref_1"),
+        ("prbonn_query_2", "prbonn_ref_3"),
         ("prbonn_query_3", "prbonn_ref_2"),
-    }  # fmt: skip
+    }
     unsure = {("gmb_q4", f"gmb_db{i}") for i in (15, 16, 17)}
     pairs = [(q, d) for q in seen for d in seen if "_q" in q and "_q" not in d]
     score = {pair: orb.match(seen[pair[0]], seen[pair[1]]).score for pair in pairs}

@@ -150,8 +150,17 @@ def drive_hours(folder: Path, seconds: float, rounds: int) -> None:
 
     def replay(workers: int) -> tuple[float, float]:
         shutil.rmtree(runs, ignore_errors=True)
-        argv = ["replay", str(folder / "drives"), "-o", str(runs), "--workers", str(workers), "-q",
-                "--cache", str(folder / "cache.sqlite")]  # fmt: skip
+        argv = [
+            "replay",
+            str(folder / "drives"),
+            "-o",
+            str(runs),
+            "--workers",
+            str(workers),
+            "-q",
+            "--cache",
+            str(folder / "cache.sqlite"),
+        ]
         began, began_cpu = time.perf_counter(), cpu_s()
         assert cli.run(argv) == 0
         return time.perf_counter() - began, cpu_s() - began_cpu
@@ -167,8 +176,10 @@ def drive_hours(folder: Path, seconds: float, rounds: int) -> None:
     for workers, taken in spent.items():
         wall, cpu = median(one[0] for one in taken), median(one[1] for one in taken)
         hours = seconds / 3600.0
-        print(f"{workers:7} {wall:8.2f} {cpu:7.2f} {wall / hours:21.1f} {cpu / hours:20.1f}"
-              f" {seconds / wall:17.0f}")  # fmt: skip
+        print(
+            f"{workers:7} {wall:8.2f} {cpu:7.2f} {wall / hours:21.1f} {cpu / hours:20.1f}"
+            f" {seconds / wall:17.0f}"
+        )
     one, two = (median(wall for wall, _ in spent[workers]) for workers in (1, 2))
     print(f"\ntwo workers take {two / one:.2f} of one worker's time")
     held = sum(path.stat().st_size for path in runs.rglob("*.parquet")) / 2
@@ -191,9 +202,11 @@ def merging(folder: Path, rounds: int) -> None:
         for kind in kinds:
             tables = [_with_name(run.table(kind), name) for name, run in of.items()]
             pq.write_table(
-                pa.concat_tables(tables), out.path / f"{kind}.parquet", compression="zstd",
+                pa.concat_tables(tables),
+                out.path / f"{kind}.parquet",
+                compression="zstd",
                 write_page_checksum=True,
-            )  # fmt: skip
+            )
 
     taken: dict[str, list[float]] = {"ours, streamed": [], "read all, write one": []}
     for _ in range(rounds):
@@ -206,8 +219,10 @@ def merging(folder: Path, rounds: int) -> None:
     print(f"\nmerging {len(runs)} runs, {rows:,} rows of {len(kinds)} tables\n")
     print("way                      s    rows/s   of peer")
     for way, seconds in taken.items():
-        print(f"{way:20} {median(seconds):6.3f} {rows / median(seconds):9,.0f}"
-              f" {median(seconds) / peer_s:9.2f}")  # fmt: skip
+        print(
+            f"{way:20} {median(seconds):6.3f} {rows / median(seconds):9,.0f}"
+            f" {median(seconds) / peer_s:9.2f}"
+        )
     print("\npeak of Arrow's memory while merging, MB, by number of drives")
     for times in (1, 4, 16):
         more = {f"{name}-{i}": run for i in range(times) for name, run in runs.items()}

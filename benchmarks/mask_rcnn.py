@@ -117,9 +117,13 @@ class PlainLoop:
         boxes = found["boxes"].double().numpy() + np.tile(placed.corner_px, 2)
         labels = tuple(str(self.plan.classes[i - 1]) for i in found["labels"].tolist())
         return Detections(
-            frame.t_ns, frame.size_px, boxes / np.tile(placed.scale, 2),
-            found["scores"].double().numpy(), labels, (b"",) * len(labels),
-        )  # fmt: skip
+            frame.t_ns,
+            frame.size_px,
+            boxes / np.tile(placed.scale, 2),
+            found["scores"].double().numpy(),
+            labels,
+            (b"",) * len(labels),
+        )
 
 
 def plain_loop(checkpoint: Checkpoint) -> PlainLoop:
@@ -172,9 +176,11 @@ def in_rotation(ways: Mapping[str, Way], frames: Sequence[Frame]) -> None:
             wall_s[name].append(time.perf_counter() - began_wall)
     first = next(iter(ways))
     for name in ways:
-        print(f"  {name:36} {median(cpu_s[name]):7.3f} CPU s a picture   "
-              f"x {_faster(cpu_s[first], cpu_s[name]):5.2f} CPU   "
-              f"x {_faster(wall_s[first], wall_s[name]):5.2f} wall")  # fmt: skip
+        print(
+            f"  {name:36} {median(cpu_s[name]):7.3f} CPU s a picture   "
+            f"x {_faster(cpu_s[first], cpu_s[name]):5.2f} CPU   "
+            f"x {_faster(wall_s[first], wall_s[name]):5.2f} wall"
+        )
 
 
 def _faster(first: Sequence[float], other: Sequence[float]) -> float:
@@ -224,19 +230,24 @@ def judged(found: Detections, scene: Scene, least: Least) -> Counter[str]:
 
 
 def told_equality(
-    plain: PlainLoop, ours: Mapping[str, MaskRcnnDetector], seen: Sequence[Scene],
-    levels: Mapping[str, Least], is_true: bool,
-) -> None:  # fmt: skip
+    plain: PlainLoop,
+    ours: Mapping[str, MaskRcnnDetector],
+    seen: Sequence[Scene],
+    levels: Mapping[str, Least],
+    is_true: bool,
+) -> None:
     """Print what ours finds of what the plain loop finds, and where truth counts, what is right."""
     theirs = [plain.detections(scene.frame) for scene in seen]
     found = {name: [one_result(d, s.frame) for s in seen] for name, d in ours.items()}
     for level, least in levels.items():
         print(f"  {level}")
         for name, results in {PLAIN: theirs, **found}.items():
-            same = sum((matches(a, b, least) for a, b in zip(theirs, results, strict=True)),
-                       Counter[str]())  # fmt: skip
-            true = sum((judged(a, s, least) for a, s in zip(results, seen, strict=True)),
-                       Counter[str]())  # fmt: skip
+            same = sum(
+                (matches(a, b, least) for a, b in zip(theirs, results, strict=True)), Counter[str]()
+            )
+            true = sum(
+                (judged(a, s, least) for a, s in zip(results, seen, strict=True)), Counter[str]()
+            )
             told = f"    {name:36} {same['the same']:4} the same, {same['only plain']} only plain, "
             told += f"{same['only ours']} only ours"
             if is_true:
@@ -247,8 +258,9 @@ def told_equality(
 def score_levels(checkpoint: Checkpoint) -> dict[str, Least]:
     """A raw score of one half, and the scores from which the cues take detections."""
     by = checkpoint.facts.calibration
-    cues = {name: raw_score(least, by.get(name, Calibration()))
-            for name, least in CUE_SCORES.items()}  # fmt: skip
+    cues = {
+        name: raw_score(least, by.get(name, Calibration())) for name, least in CUE_SCORES.items()
+    }
     return {
         "raw score of 0.5 and more": lambda name: 0.5,
         "calibrated 0.9 and more, cars 0.95 (what the cues take)": lambda name: cues.get(name, 2.0),
@@ -291,9 +303,12 @@ def random_resnet() -> Checkpoint:
 
 
 def compare(
-    checkpoint: Checkpoint, counts: Sequence[int], seen: Sequence[Scene],
-    levels: Mapping[str, Least], is_true: bool,
-) -> None:  # fmt: skip
+    checkpoint: Checkpoint,
+    counts: Sequence[int],
+    seen: Sequence[Scene],
+    levels: Mapping[str, Least],
+    is_true: bool,
+) -> None:
     """Print times and equality of one network."""
     plain, ours = plain_loop(checkpoint), our_ways(checkpoint, counts)
     ways: dict[str, Way] = {PLAIN: plain}

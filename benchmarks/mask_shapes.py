@@ -64,8 +64,10 @@ def print_heights(labelled: LabelledSet, found: Sequence[Detections], name: str)
         height_px(own, picture.size_px) / height_px(true, picture.size_px)
         for _, _, own, true, picture in pairs(labelled, found, name, 0.9)
     ]
-    print(f"{name}, score above 0.9: height over the true one: median {np.median(ratios):.2f}, "
-          f"s.d. {np.std(ratios):.2f}, {len(ratios)} masks")  # fmt: skip
+    print(
+        f"{name}, score above 0.9: height over the true one: median {np.median(ratios):.2f}, "
+        f"s.d. {np.std(ratios):.2f}, {len(ratios)} masks"
+    )
 
 
 def print_noses(labelled: LabelledSet, found: Sequence[Detections]) -> None:
@@ -77,8 +79,10 @@ def print_noses(labelled: LabelledSet, found: Sequence[Detections]) -> None:
         if is_whole and width > LONG * height:
             noses = [nose_of(rle.column_heights_px(m, picture.size_px)) for m in (own, true)]
             agree.append(noses[0] == noses[1])
-    print(f"cars from the side, score above 0.95: nose at the true mask's end for {sum(agree)} of "
-          f"{len(agree)}")  # fmt: skip
+    print(
+        f"cars from the side, score above 0.95: nose at the true mask's end for {sum(agree)} of "
+        f"{len(agree)}"
+    )
 
 
 def main() -> None:

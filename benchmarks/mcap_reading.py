@@ -78,9 +78,18 @@ def frames(address: np.ndarray, payload: np.ndarray, t_ns: np.ndarray, frame: by
     """can_msgs/Frame in CDR, one per row."""
     head = np.zeros(
         len(t_ns),
-        dtype=[("cdr", "S4"), ("sec", "<i4"), ("nanosec", "<u4"), ("size", "<u4"), ("frame", "S8"),
-               ("id", "<u4"), ("flags", "u1", 3), ("dlc", "u1"), ("payload", "u1", 8)],
-    )  # fmt: skip
+        dtype=[
+            ("cdr", "S4"),
+            ("sec", "<i4"),
+            ("nanosec", "<u4"),
+            ("size", "<u4"),
+            ("frame", "S8"),
+            ("id", "<u4"),
+            ("flags", "u1", 3),
+            ("dlc", "u1"),
+            ("payload", "u1", 8),
+        ],
+    )
     head["cdr"], head["frame"], head["size"] = b"\x00\x01\x00\x00", frame, len(frame) + 1
     head["sec"], head["nanosec"] = t_ns // 10**9, t_ns % 10**9
     head["id"], head["dlc"], head["payload"] = address, 8, payload

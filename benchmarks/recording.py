@@ -111,9 +111,10 @@ def frame_by_frame(run: RunFolder, path: Path) -> None:
             recording.log("camera/boxes", boxes)
             recording.log("camera/masks", rr.SegmentationImage(classes))
     for table, names in (
-        ("belief", ("intersection", "left", "right", "straight")), ("range", ("range_m",)),
+        ("belief", ("intersection", "left", "right", "straight")),
+        ("range", ("range_m",)),
         ("pose", ("x_m", "y_m", "speed_mps", "major_axis_m")),
-    ):  # fmt: skip
+    ):
         for row in run.table(table).to_pylist():
             recording.set_time("drive", timestamp=np.datetime64(row["t_ns"], "ns"))
             for name in names:
@@ -126,8 +127,9 @@ def main() -> None:
     """Make the drive once, record it several times both ways."""
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 2.0
     cases: dict[str, Callable[[RunFolder, Path], None]] = {
-        "crosscue, bulk columns": save, "frame by frame": frame_by_frame,
-    }  # fmt: skip
+        "crosscue, bulk columns": save,
+        "frame by frame": frame_by_frame,
+    }
     with tempfile.TemporaryDirectory() as name:
         run, seconds = make_run(Path(name) / "one", minutes)
         jpegs = picture_bytes(run)
@@ -145,14 +147,18 @@ def main() -> None:
         ours = taken["crosscue, bulk columns"]
         for case, times in taken.items():
             ratio = median(a / b for a, b in zip(times, ours, strict=True))
-            print(f"{case:24}{median(times):8.2f}{seconds / median(times):13.0f}"
-                  f"{sizes[case] / jpegs:14.3f}{ratio:14.2f}")  # fmt: skip
+            print(
+                f"{case:24}{median(times):8.2f}{seconds / median(times):13.0f}"
+                f"{sizes[case] / jpegs:14.3f}{ratio:14.2f}"
+            )
         twice, longer = make_run(Path(name) / "two", 2.0 * minutes)
         for one, length in ((run, seconds), (twice, longer)):
             told = subprocess.run(
                 [sys.executable, "-c", MEMORY, str(one.path), str(Path(name) / "m.rrd")],
-                capture_output=True, text=True, check=True,
-            )  # fmt: skip
+                capture_output=True,
+                text=True,
+                check=True,
+            )
             print(f"peak memory over {length:.0f} s of drive: {told.stdout.strip()} MiB")
 
 

@@ -119,8 +119,11 @@ class WindowSearch:
         found: list[tuple[float, str, Floats]] = []
         for one in drawn:
             pairs = self._matcher.knnMatch(points, one.described, k=2)
-            alike = {a.trainIdx for a, b in pairs if a.distance < RULES.ratio * b.distance
-                     and a.distance <= RULES.most_bits}  # fmt: skip
+            alike = {
+                a.trainIdx
+                for a, b in pairs
+                if a.distance < RULES.ratio * b.distance and a.distance <= RULES.most_bits
+            }
             found.append((len(alike) / len(one.described), one.kind, _about(window, one.size_px)))
         return found
 

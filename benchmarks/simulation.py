@@ -55,8 +55,10 @@ def main() -> None:
                 spent += cpu_s(lambda picture=picture: jpeg(picture, 90))  # type: ignore[misc]
             coding.append(spent / len(times))
         draw, code = statistics.median(drawing), statistics.median(coding)
-        print(f"{name:6} {build:6.2f} {draw:9.4f} {code:7.4f} {1 / (draw + code):11.1f} "
-              f"{draw / code:16.1f}")  # fmt: skip
+        print(
+            f"{name:6} {build:6.2f} {draw:9.4f} {code:7.4f} {1 / (draw + code):11.1f} "
+            f"{draw / code:16.1f}"
+        )
     with TemporaryDirectory() as folder:
         began = time.process_time()
         files = write_scene(Path(folder) / "drive", SceneSettings("C", 1, camera=Camera()))

@@ -92,14 +92,19 @@ class Odometry(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no t
         self.predict((way, (right - left) * self.per_track))
         if len(self.x) == 4:
             self.update(
-                np.array([[way / self.step_s]]), lambda x: self.of_speed, lambda x: x[3:],
+                np.array([[way / self.step_s]]),
+                lambda x: self.of_speed,
+                lambda x: x[3:],
                 R=self.speed_var,
-            )  # fmt: skip
+            )
         if compass == compass:
             self.update(
-                np.array([[compass]]), lambda x: self.of_heading, lambda x: x[2:3],
-                R=self.compass_var, residual=wrapped,
-            )  # fmt: skip
+                np.array([[compass]]),
+                lambda x: self.of_heading,
+                lambda x: x[2:3],
+                R=self.compass_var,
+                residual=wrapped,
+            )
 
 
 def wrapped(a: Floats, b: Floats) -> Floats:
@@ -156,14 +161,19 @@ def growth() -> None:
 
         def work(drives: int = drives) -> None:
             nonlocal rows
-            rows = np.concatenate([
-                drive_many(SETTINGS, part) for part in np.array_split(seeds(drives), drives // 100)
-            ])  # fmt: skip
+            rows = np.concatenate(
+                [
+                    drive_many(SETTINGS, part)
+                    for part in np.array_split(seeds(drives), drives // 100)
+                ]
+            )
 
         spent = cpu_s(work)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(f"{drives:6} {int(rows[:, 3].sum()):10} {spent:9.2f} {1e3 * spent / drives:11.2f} "
-              f"{peak:14.0f}")  # fmt: skip
+        print(
+            f"{drives:6} {int(rows[:, 3].sum()):10} {spent:9.2f} {1e3 * spent / drives:11.2f} "
+            f"{peak:14.0f}"
+        )
 
 
 def main() -> None:

@@ -76,11 +76,15 @@ def landmarks(drives: int, seed: int) -> None:
         parts: dict[int, list[np.ndarray[tuple[int, int], np.dtype[np.float64]]]] = {}
         for chunk in chunks_of(study.cases(), drives, seed):
             parts.setdefault(chunk.case, []).append(drive_many(chunk.settings, chunk.seeds()))
-        rows = [dict(zip(Result._fields, np.concatenate(parts[case]).T, strict=True))
-                for case in sorted(parts)]  # fmt: skip
+        rows = [
+            dict(zip(Result._fields, np.concatenate(parts[case]).T, strict=True))
+            for case in sorted(parts)
+        ]
         for compared in comparisons_of(study, rows):
-            print(f"{name:42} {percent(compared.extra):>24} {percent(compared.extra_reached):>24} "
-                  f"{percent(compared.extra_all):>24}  {compared.strategy}")  # fmt: skip
+            print(
+                f"{name:42} {percent(compared.extra):>24} {percent(compared.extra_reached):>24} "
+                f"{percent(compared.extra_all):>24}  {compared.strategy}"
+            )
             name = ""
 
 
@@ -112,11 +116,21 @@ def nees(drives: int, seed: int) -> None:
             drive_many(one, seeds_of(seed, count)) for one in coarse_and_fine(compass_deg, goals)
         ]
         told(name, count, [float(rows[:, NEES].mean()) for rows in both])
-    told("no compass, errors along an arc", fewer, [
-        float(np.mean([nees_along_the_arc(drive_traced(one, int(s)).steps[-1])
-                       for s in seeds_of(seed, fewer)]))
-        for one in coarse_and_fine(None, 1)
-    ])  # fmt: skip
+    told(
+        "no compass, errors along an arc",
+        fewer,
+        [
+            float(
+                np.mean(
+                    [
+                        nees_along_the_arc(drive_traced(one, int(s)).steps[-1])
+                        for s in seeds_of(seed, fewer)
+                    ]
+                )
+            )
+            for one in coarse_and_fine(None, 1)
+        ],
+    )
 
 
 def coarse_and_fine(compass_deg: float | None, goals: int) -> list[Drive]:

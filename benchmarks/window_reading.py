@@ -114,9 +114,12 @@ def small_mcap(path: Path, begin: int, end: int) -> int:
     decoder = import_module("mcap_ros2_support_fast.decoder").DecoderFactory()
     with path.open("rb") as stream:
         found = import_module("small_mcap").read_message_decoded(
-            stream, lambda channel, _: channel.topic == TOPIC, begin, end,
+            stream,
+            lambda channel, _: channel.topic == TOPIC,
+            begin,
+            end,
             decoder_factories=[decoder],
-        )  # fmt: skip
+        )
         return sum(1 for one in found if one.decoded_message is not None)
 
 
@@ -138,9 +141,12 @@ def rosbags(path: Path, begin: int, end: int) -> int:
 
 def rerun(path: Path, begin: int, end: int) -> int:
     reader = McapReader(
-        path, decoders=["ros2msg", "ros2_reflection"], include_topic_regex=[f"^{TOPIC}$"],
-        start_time_ns=begin, end_time_ns=end,
-    )  # fmt: skip
+        path,
+        decoders=["ros2msg", "ros2_reflection"],
+        include_topic_regex=[f"^{TOPIC}$"],
+        start_time_ns=begin,
+        end_time_ns=end,
+    )
     return max((chunk.num_rows for chunk in reader.stream()), default=0)
 
 

@@ -148,8 +148,9 @@ def _prepare_streams() -> None:
     if sys.stderr is None or isinstance(sys.stderr, io.TextIOWrapper):
         sys.stderr = io.TextIOWrapper(
             io.BufferedWriter(_Messages(2, "w", closefd=False)),
-            errors="backslashreplace", line_buffering=True,
-        )  # fmt: skip
+            errors="backslashreplace",
+            line_buffering=True,
+        )
 
 
 def _without_reader() -> int:

@@ -290,10 +290,16 @@ class Approaches:
             at_hand.since_dissent_m = 0.0
         messages = at_hand.speaker(
             Situation(
-                counts, at_hand.belief.is_established, is_near, may_dissent, evidence.objects,
-                evidence.is_new_picture, moved.way_m, moved.time_s,
+                counts,
+                at_hand.belief.is_established,
+                is_near,
+                may_dissent,
+                evidence.objects,
+                evidence.is_new_picture,
+                moved.way_m,
+                moved.time_s,
             )
-        )  # fmt: skip
+        )
         was_established = at_hand.belief.is_established
         belief = multiply(at_hand.belief, messages)
         at_hand.belief = belief = establish(belief, self._graph, self._fusion.established)

@@ -132,9 +132,11 @@ def _side(approaches: Sequence[AnnotatedApproach], cue: CueNode, near: bool, fad
         alike = approach.is_near[rows] == near
         if not alike.any():
             continue
-        at = approach.time_s[rows] / fade.time_s if fade.time_s else (
-            approach.way_m[rows] / (fade.way_m or np.inf)
-        )  # fmt: skip
+        at = (
+            approach.time_s[rows] / fade.time_s
+            if fade.time_s
+            else (approach.way_m[rows] / (fade.way_m or np.inf))
+        )
         worth = np.concatenate([[1.0], np.tanh(0.5 * np.diff(at))])[alike]
         is_positive = approach.counts[cue.name][rows][alike] > 0
         looks, hits = totals.get(approach.place, (0.0, 0.0))
@@ -142,9 +144,11 @@ def _side(approaches: Sequence[AnnotatedApproach], cue: CueNode, near: bool, fad
         frames += len(worth)
     kept = [(looks, hits) for looks, hits in totals.values() if looks > 0.0]
     return Side(
-        tuple(hits / looks for looks, hits in kept), frames,
-        sum(looks for looks, _ in kept), sum(hits for _, hits in kept),
-    )  # fmt: skip
+        tuple(hits / looks for looks, hits in kept),
+        frames,
+        sum(looks for looks, _ in kept),
+        sum(hits for _, hits in kept),
+    )
 
 
 def _exponents(

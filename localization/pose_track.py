@@ -379,9 +379,12 @@ class _Run:
             if to_ns > self.t_ns:
                 share = (to_ns - self.t_ns) * per_ns
                 self._move(
-                    to_ns, share * distance_m, share * turn_rad, share * distance_var,
+                    to_ns,
+                    share * distance_m,
+                    share * turn_rad,
+                    share * distance_var,
                     share * turn_var,
-                )  # fmt: skip
+                )
             if to_ns == stop_ns:
                 break
             self._handle_events()
@@ -495,9 +498,15 @@ class _Run:
             waiting_rows_ns=self.rows[self.next_row :],
         )
         columns = PoseColumns(
-            np.array(self.pose_times, np.int64), poses[:, 0], poses[:, 1], poses[:, 2],
-            poses[:, 3], poses[:, 4:10], poses[:, 10], poses[:, 11],
-        )  # fmt: skip
+            np.array(self.pose_times, np.int64),
+            poses[:, 0],
+            poses[:, 1],
+            poses[:, 2],
+            poses[:, 3],
+            poses[:, 4:10],
+            poses[:, 10],
+            poses[:, 11],
+        )
         headings = HeadingColumns(
             np.array([t for t, *_ in self.used], np.int64),
             used[:, 1],

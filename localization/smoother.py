@@ -195,8 +195,13 @@ def _guessed(
 
     Hours of wheels alone end headings and kilometres away, from where no solver comes back.
     """
-    read = dict(zip(headings.t_ns.tolist(), zip(headings.heading_rad.tolist(),
-                    headings.var_rad2.tolist(), strict=True), strict=True))  # fmt: skip
+    read = dict(
+        zip(
+            headings.t_ns.tolist(),
+            zip(headings.heading_rad.tolist(), headings.var_rad2.tolist(), strict=True),
+            strict=True,
+        )
+    )
     x, y, heading = (float(value) for value in start.mean[:3])
     var = float(start.cov[2, 2])
     poses = [(x, y, heading)]
@@ -251,9 +256,11 @@ def _add_headings(graph: gtsam.NonlinearFactorGraph, times: Int64s, headings: He
     import gtsam
 
     for t_ns, heading, var in zip(
-        headings.t_ns.tolist(), headings.heading_rad.tolist(), headings.var_rad2.tolist(),
+        headings.t_ns.tolist(),
+        headings.heading_rad.tolist(),
+        headings.var_rad2.tolist(),
         strict=True,
-    ):  # fmt: skip
+    ):
         key = int(np.searchsorted(times, t_ns))
         if key == len(times) or times[key] != t_ns:
             continue

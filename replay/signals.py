@@ -403,9 +403,12 @@ class Extractor:
                 if role_of(one.topic) is Role.MOBILEYE
             }
             self._mobileye = MobileyeStream(
-                source.topic.name, self.ledger, self.vehicle.mobileye, types,
+                source.topic.name,
+                self.ledger,
+                self.vehicle.mobileye,
+                types,
                 is_shared_bus=not {*source.signals} <= {*MOBILEYE_SIGNALS},
-            )  # fmt: skip
+            )
         return self._mobileye
 
     def _from_can(self, block: Block, source: Source) -> Iterator[Samples]:

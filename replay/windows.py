@@ -119,9 +119,12 @@ class _Pending:
             late = samples.t_ns < self._closed_ns
             if late.any():
                 self._ledgers[log].skip(
-                    topic, "too late to be put in order", int(late.sum()),
-                    f"before {self._closed_ns} ns", int(samples.t_ns[late][0]),
-                )  # fmt: skip
+                    topic,
+                    "too late to be put in order",
+                    int(late.sum()),
+                    f"before {self._closed_ns} ns",
+                    int(samples.t_ns[late][0]),
+                )
                 samples = samples.take(~late)
         if len(samples.t_ns):
             self._parts.setdefault(samples.signal, []).append(samples)

@@ -112,8 +112,9 @@ class Look:
 
 def any_look(rng: Generator) -> Look:
     """A car as one meets them."""
-    kind = str(rng.choice(["sedan", "hatchback", "suv", "pickup", "van"],
-                          p=[0.4, 0.17, 0.28, 0.09, 0.06]))  # fmt: skip
+    kind = str(
+        rng.choice(["sedan", "hatchback", "suv", "pickup", "van"], p=[0.4, 0.17, 0.28, 0.09, 0.06])
+    )
     return Look(kind, PAINTS[int(rng.integers(len(PAINTS)))])
 
 
@@ -177,8 +178,14 @@ def _cabin(shape: Shape, paint: Rgb) -> list[Mesh]:
         parts.append(quad(skin, rgb))
         yf = half(belt)
         for side in (-1.0, 1.0):
-            wall = np.array([(xa, side * yf, belt), (xb, side * yf, belt),
-                             (xb, side * yb, zb), (xa, side * ya, za)])  # fmt: skip
+            wall = np.array(
+                [
+                    (xa, side * yf, belt),
+                    (xb, side * yf, belt),
+                    (xb, side * yb, zb),
+                    (xa, side * ya, za),
+                ]
+            )
             parts.append(quad(wall if side < 0 else wall[::-1], paint))
     parts += _windows(shape, edge, belt, half)
     return parts
@@ -234,14 +241,20 @@ def _ends(shape: Shape, *, lamps_on: bool, brakes_on: bool) -> list[Mesh]:
     parts = []
     for side in (-1.0, 1.0):
         near, far = side * (w - 0.36), side * (w - 0.06)
-        lamp = [(nose, near, low - 0.12), (nose, far, low - 0.12), (nose, far, low + 0.02),
-                (nose, near, low + 0.02)]  # fmt: skip
+        lamp = [
+            (nose, near, low - 0.12),
+            (nose, far, low - 0.12),
+            (nose, far, low + 0.02),
+            (nose, near, low + 0.02),
+        ]
         rgb: Rgb = (1.0, 0.98, 0.9) if lamps_on else (0.75, 0.77, 0.8)
         parts.append(quad(lamp, rgb, glow=1.0 if lamps_on else 0.0))
-        corner = [(nose - 0.42, side * (w + TILL_SHUT_M), low + 0.02),
-                  (nose - 0.1, side * (w + TILL_SHUT_M), low - 0.02),
-                  (nose - 0.06, side * (w + TILL_SHUT_M), low + 0.06),
-                  (nose - 0.4, side * (w + TILL_SHUT_M), low + 0.13)]  # fmt: skip
+        corner = [
+            (nose - 0.42, side * (w + TILL_SHUT_M), low + 0.02),
+            (nose - 0.1, side * (w + TILL_SHUT_M), low - 0.02),
+            (nose - 0.06, side * (w + TILL_SHUT_M), low + 0.06),
+            (nose - 0.4, side * (w + TILL_SHUT_M), low + 0.13),
+        ]
         parts.append(quad(corner, (0.72, 0.74, 0.78)))
         top = shape.body[0][1] - 0.02
         back = [
@@ -253,9 +266,27 @@ def _ends(shape: Shape, *, lamps_on: bool, brakes_on: bool) -> list[Mesh]:
         glows = 1.0 if brakes_on or lamps_on else 0.0
         red: Rgb = (0.95, 0.08, 0.06) if brakes_on else (0.55, 0.05, 0.05)
         parts.append(quad(back, red, glow=glows))
-    parts.append(quad([(nose, -0.45, low - 0.3), (nose, 0.45, low - 0.3), (nose, 0.45, low - 0.14),
-                       (nose, -0.45, low - 0.14)], (0.06, 0.06, 0.06)))  # fmt: skip
+    parts.append(
+        quad(
+            [
+                (nose, -0.45, low - 0.3),
+                (nose, 0.45, low - 0.3),
+                (nose, 0.45, low - 0.14),
+                (nose, -0.45, low - 0.14),
+            ],
+            (0.06, 0.06, 0.06),
+        )
+    )
     plate_z = shape.body[0][1] - 0.3
-    parts.append(quad([(tail, -0.16, plate_z), (tail, 0.16, plate_z), (tail, 0.16, plate_z + 0.16),
-                       (tail, -0.16, plate_z + 0.16)], (0.85, 0.83, 0.6)))  # fmt: skip
+    parts.append(
+        quad(
+            [
+                (tail, -0.16, plate_z),
+                (tail, 0.16, plate_z),
+                (tail, 0.16, plate_z + 0.16),
+                (tail, -0.16, plate_z + 0.16),
+            ],
+            (0.85, 0.83, 0.6),
+        )
+    )
     return parts

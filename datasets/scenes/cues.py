@@ -52,10 +52,12 @@ def present(layout: Layout, picture: Picture) -> dict[Cue, Presence]:
 def cue_of(layout: Layout, thing: Thing, t_s: float) -> Cue | None:
     """The cue that a thing is, if it can be seen."""
     signs: Mapping[str, Cue] = {
-        "stop_sign": "stop_sign", "traffic_light": "traffic_light",
-        "one_way_left": "one_way_left", "one_way_right": "one_way_right",
+        "stop_sign": "stop_sign",
+        "traffic_light": "traffic_light",
+        "one_way_left": "one_way_left",
+        "one_way_right": "one_way_right",
         "do_not_enter": "do_not_enter",
-    }  # fmt: skip
+    }
     if thing.category in signs:
         return signs[thing.category]
     goes_left = thing.heading_rad > 0.0
@@ -97,10 +99,16 @@ class CueRuns:
         if run is not None:
             start, last, presence = run
             self._done.append(
-                CueTruth(start_ns=start, end_ns=last + self._period_ns, cue=cue,
-                         present=presence.things > 0, count=presence.things,
-                         visible=presence.visible, approach=self._approach)
-            )  # fmt: skip
+                CueTruth(
+                    start_ns=start,
+                    end_ns=last + self._period_ns,
+                    cue=cue,
+                    present=presence.things > 0,
+                    count=presence.things,
+                    visible=presence.visible,
+                    approach=self._approach,
+                )
+            )
 
     def finished(self) -> tuple[CueTruth, ...]:
         """All spans, by start and cue."""

@@ -195,9 +195,12 @@ class _Record:
         return batch[-1][0] + 1_000_000_000 // self.settings.rate_hz
 
     def _second(
-        self, batch: list[tuple[int, Picture]], others: list[Block], device: Device,
+        self,
+        batch: list[tuple[int, Picture]],
+        others: list[Block],
+        device: Device,
         late: np.random.Generator,
-    ) -> Iterator[Block]:  # fmt: skip
+    ) -> Iterator[Block]:
         if not batch:
             return
         times = np.array([t_ns for t_ns, _ in batch], np.int64)
@@ -242,20 +245,35 @@ class _Record:
         )
         start_ns, step = int(motion.t_ns[0]), 1_000_000_000 // self.settings.rate_hz
         approach = Approach(
-            id=0, intersection=layout.name, start_ns=start_ns, enter_ns=self._enter_ns,
-            control=layout.control, one_way=layout.one_way, do_not_enter=layout.do_not_enter,
-            features=Features(left=layout.goes_left, right=layout.goes_right,
-                              straight=layout.goes_ahead),
-            conditions=self.conditions.tags(layout), length_m=layout.end_m,
-        )  # fmt: skip
+            id=0,
+            intersection=layout.name,
+            start_ns=start_ns,
+            enter_ns=self._enter_ns,
+            control=layout.control,
+            one_way=layout.one_way,
+            do_not_enter=layout.do_not_enter,
+            features=Features(
+                left=layout.goes_left, right=layout.goes_right, straight=layout.goes_ahead
+            ),
+            conditions=self.conditions.tags(layout),
+            length_m=layout.end_m,
+        )
         return save(
-            Truth(version=1, log="drive.mcap", log_sha256=sha256_of(folder / "drive.mcap"),
-                  start_ns=start_ns,
-                  end_ns=int(motion.t_ns[-1]) + step, pose="pose.tum", source=SOURCE,
-                  approaches=(approach,), cues=self._cues.finished(), objects="objects.json",
-                  ranges="ranges.csv"),
+            Truth(
+                version=1,
+                log="drive.mcap",
+                log_sha256=sha256_of(folder / "drive.mcap"),
+                start_ns=start_ns,
+                end_ns=int(motion.t_ns[-1]) + step,
+                pose="pose.tum",
+                source=SOURCE,
+                approaches=(approach,),
+                cues=self._cues.finished(),
+                objects="objects.json",
+                ranges="ranges.csv",
+            ),
             folder,
-        )  # fmt: skip
+        )
 
 
 def _in_map(motion: TrueMotion, heading_rad: float) -> TrueMotion:
@@ -293,15 +311,18 @@ def _calibration(times: Int64s, log_ns: Int64s, camera: Camera) -> Block:
         plan, {"header.frame_id": "camera", "distortion_model": "plumb_bob"}, {"d": 5}
     )
     rows = filled(
-        plan, layout, n,
+        plan,
+        layout,
+        n,
         {
             "header.stamp": times,
-            "height": np.full(n, camera.height_px), "width": np.full(n, camera.width_px),
+            "height": np.full(n, camera.height_px),
+            "width": np.full(n, camera.width_px),
             "k": np.tile([f, 0, cx, 0, f, cy, 0, 0, 1.0], (n, 1)),
             "r": np.tile(np.eye(3).ravel(), (n, 1)),
             "p": np.tile([f, 0, cx, 0, 0, f, cy, 0, 0, 0, 1.0, 0], (n, 1)),
         },
-    )  # fmt: skip
+    )
     stop = np.arange(1, n + 1, dtype=np.int64) * rows.shape[1]
     messages = Messages(np.ascontiguousarray(rows).ravel(), stop - rows.shape[1], stop)
     return Block(CALIBRATION, np.maximum.accumulate(log_ns), messages)

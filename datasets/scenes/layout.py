@@ -123,8 +123,11 @@ def any_layout(seed: int) -> Layout:
     return Layout(
         name=f"L{seed}",
         seed=1000 + seed,
-        control="traffic_light" if control == "traffic_light"
-        else "stop_sign" if control == "stop_sign" else "none",
+        control="traffic_light"
+        if control == "traffic_light"
+        else "stop_sign"
+        if control == "stop_sign"
+        else "none",
         has_left=arms != "no_left",
         has_right=arms != "no_right",
         has_ahead=arms != "t",
@@ -139,7 +142,7 @@ def any_layout(seed: int) -> Layout:
         vegetation=bool(rng.random() < 0.2),
         is_town=bool(rng.random() < 0.45),
         has_lot=bool(rng.random() < 0.6),
-    )  # fmt: skip
+    )
 
 
 def layout_named(name: str) -> Layout:

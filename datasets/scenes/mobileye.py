@@ -69,10 +69,14 @@ class Device:
 
     def frames(self, times_ns: Int64s, pictures: Sequence[Picture], bus: str) -> Block:
         """CAN frames for pictures grabbed at ``times_ns``."""
-        rows = [row for t_ns, picture in zip(times_ns.tolist(), pictures, strict=True)
-                for row in self._obstacles(t_ns, picture)]  # fmt: skip
-        columns = {name: np.array([row[name] for row in rows], kind)
-                   for name, kind in _COLUMNS.items()}  # fmt: skip
+        rows = [
+            row
+            for t_ns, picture in zip(times_ns.tolist(), pictures, strict=True)
+            for row in self._obstacles(t_ns, picture)
+        ]
+        columns = {
+            name: np.array([row[name] for row in rows], kind) for name, kind in _COLUMNS.items()
+        }
         latency = 80_000_000 + np.rint(self._rng.exponential(1.5e6, len(times_ns))).astype(np.int64)
         tables = bursts_of(times_ns, Table(columns), SETTINGS, latency_ns=latency, bus=bus)
         tables.append(self._lanes(times_ns, pictures, latency, bus))

@@ -159,9 +159,20 @@ class _Site:
         number = len(self.things)
         owned = None if later is None else later.owned_by(number)
         self.things.append(
-            Thing(number, category, role, mesh.owned_by(number), at, heading, size, velocity,
-                  span_s, owned, later_s)
-        )  # fmt: skip
+            Thing(
+                number,
+                category,
+                role,
+                mesh.owned_by(number),
+                at,
+                heading,
+                size,
+                velocity,
+                span_s,
+                owned,
+                later_s,
+            )
+        )
 
     def add_car(
         self,
@@ -178,9 +189,16 @@ class _Site:
         mesh = car(look, lamps_on=self.lamps_on and moving, brakes_on=False)
         shape = look.shape
         velocity = (speed * float(np.cos(heading)), speed * float(np.sin(heading)))
-        self.add("car", role, mesh.placed(x, y, heading), (x, y, shape.height_m / 2), heading,
-                 (shape.length_m, 2 * shape.half_width_m, shape.height_m),
-                 velocity if moving else (0.0, 0.0), span_s)  # fmt: skip
+        self.add(
+            "car",
+            role,
+            mesh.placed(x, y, heading),
+            (x, y, shape.height_m / 2),
+            heading,
+            (shape.length_m, 2 * shape.half_width_m, shape.height_m),
+            velocity if moving else (0.0, 0.0),
+            span_s,
+        )
         if not moving and span_s == ALWAYS:
             c, s = abs(np.cos(heading)), abs(np.sin(heading))
             a = shape.length_m / 2 * c + shape.half_width_m * s
@@ -204,8 +222,12 @@ def build(layout: Layout, conditions: Conditions) -> World:
     _parked(site, varied)
     _traffic(site, conditions, drive, varied)
     painted, road = paint(layout, site.patches, np.random.default_rng([layout.seed, 3]))
-    cast_shadows(painted, site.shadows.outlines(light.to_sun), site.shadows.blobs(light.to_sun),
-                 light.in_shadow)  # fmt: skip
+    cast_shadows(
+        painted,
+        site.shadows.outlines(light.to_sun),
+        site.shadows.blobs(light.to_sun),
+        light.in_shadow,
+    )
     scenery = joined([*site.parts, *(t.mesh for t in site.things if t.is_fixed)])
     ground = with_levels(painted, road)
     return World(layout, conditions, drive, light, ground, scenery, tuple(site.things), site.atlas)
@@ -248,8 +270,9 @@ def _buildings(site: _Site, fixed: Generator, varied: Generator) -> None:
         if has_arm:
             first = w + back + 16.0
             _row_across(site, fixed, near - back, -1.0, side, first, 62.0)
-            _row_across(site, fixed, far + back, 1.0, side,
-                        first if layout.has_ahead else 7.0, 62.0)  # fmt: skip
+            _row_across(
+                site, fixed, far + back, 1.0, side, first if layout.has_ahead else 7.0, 62.0
+            )
     if not layout.has_ahead:
         _row_across(site, fixed, far + back, 1.0, 1.0, -7.0, 7.0)
 
@@ -266,8 +289,9 @@ def _row_along(
         gap = float(fixed.uniform(0.3, 1.5) if shop else fixed.uniform(5.0, 9.0))
         ys = (y, y + side * deep)
         low, high = min(ys), max(ys)
-        blocked = any(at - wide < b and at > a and low < d and high > c
-                      for a, b, c, d in site.taken)  # fmt: skip
+        blocked = any(
+            at - wide < b and at > a and low < d and high > c for a, b, c, d in site.taken
+        )
         if not blocked and fixed.random() < (0.97 if shop else 0.9):
             _place(site, fixed, (at - wide, at), (low, high))
             is_before = at < NEAR_KERB_M
@@ -333,14 +357,25 @@ def _plants(site: _Site, fixed: Generator) -> None:
     for _ in range(26):
         x, y = fixed.uniform(-95, near - 16), fixed.choice([-1, 1]) * (w + fixed.uniform(6.5, 8.0))
         if site.is_free(x, y, 0.4) and not layout.is_town:
-            site.parts.append(bush(float(x), float(y), 0.9, float(fixed.uniform(0.9, 1.5)),
-                                   site.atlas, fixed))  # fmt: skip
+            site.parts.append(
+                bush(float(x), float(y), 0.9, float(fixed.uniform(0.9, 1.5)), site.atlas, fixed)
+            )
     # Beyond the last houses the view must end in trees, not in nothing.
     for x in (-112.0, 116.0):
         for y in np.arange(-60.0, 60.0, 5.0):
             if abs(y) > w + 3:
-                site.parts.append(crown(x + float(fixed.uniform(-2, 2)), float(y), 4.0, 4.0, 4.0, 5,
-                                        site.atlas, fixed))  # fmt: skip
+                site.parts.append(
+                    crown(
+                        x + float(fixed.uniform(-2, 2)),
+                        float(y),
+                        4.0,
+                        4.0,
+                        4.0,
+                        5,
+                        site.atlas,
+                        fixed,
+                    )
+                )
     if layout.vegetation:
         _overgrowth(site, fixed)
 
@@ -387,8 +422,7 @@ def _sign(site: _Site, category: Category, x: float, y: float, z: float, turn: f
     flat = face.corners.reshape(-1, 3)
     wide, high = (float(np.ptp(flat[:, k])) for k in (1, 2))
     site.parts += [post(x, y, z + high / 2), sign_back(face).placed(x, y, turn, z)]
-    site.add(category, "furniture", face.placed(x, y, turn, z), (x, y, z), turn,
-             (0.02, wide, high))  # fmt: skip
+    site.add(category, "furniture", face.placed(x, y, turn, z), (x, y, z), turn, (0.02, wide, high))
 
 
 def _control(site: _Site, drive: Approach) -> None:
@@ -424,8 +458,16 @@ def _lights(site: _Site, drive: Approach) -> None:
         if drive.green_s < 0.0:
             site.add("traffic_light", "furniture", green, (end, y, z), 0.0, size)
         else:
-            site.add("traffic_light", "furniture", red, (end, y, z), 0.0, size,
-                     later=green, later_s=drive.green_s)  # fmt: skip
+            site.add(
+                "traffic_light",
+                "furniture",
+                red,
+                (end, y, z),
+                0.0,
+                size,
+                later=green,
+                later_s=drive.green_s,
+            )
 
 
 def _parked(site: _Site, varied: Generator) -> None:
@@ -474,8 +516,16 @@ def _traffic(site: _Site, conditions: Conditions, drive: Approach, varied: Gener
     for heading, x in flows:
         _stream(site, "cross", heading, x, rate, drive, length_s, varied)
     if layout.has_ahead:
-        _stream(site, "oncoming", np.pi, -lane_y_m(layout), 5.0 * conditions.traffic / 60.0, drive,
-                length_s, varied)  # fmt: skip
+        _stream(
+            site,
+            "oncoming",
+            np.pi,
+            -lane_y_m(layout),
+            5.0 * conditions.traffic / 60.0,
+            drive,
+            length_s,
+            varied,
+        )
         if not layout.ahead_is_closed:
             _ahead_of_us(site, conditions, varied)
         if drive.green_s >= 0.0 and varied.random() < 0.7 * conditions.traffic:
@@ -488,9 +538,15 @@ def _traffic(site: _Site, conditions: Conditions, drive: Approach, varied: Gener
 
 
 def _stream(
-    site: _Site, role: Role, heading: float, lane: float, rate_hz: float, drive: Approach,
-    length_s: float, varied: Generator,
-) -> None:  # fmt: skip
+    site: _Site,
+    role: Role,
+    heading: float,
+    lane: float,
+    rate_hz: float,
+    drive: Approach,
+    length_s: float,
+    varied: Generator,
+) -> None:
     """Cars that follow one another at random, none where it would hit us."""
     at = -9.0
     speed = float(varied.uniform(8.0, 12.0))

@@ -136,8 +136,9 @@ def place(annotations: Annotations, log: LogPictures) -> Placed:
     )
     for t_ns, times in Counter(placed.t_ns).items():
         if times > 1:
-            names = [p.name for p, t in zip(annotations.pictures, placed.t_ns, strict=True)
-                     if t == t_ns]  # fmt: skip
+            names = [
+                p.name for p, t in zip(annotations.pictures, placed.t_ns, strict=True) if t == t_ns
+            ]
             raise SchemaError(
                 f"{annotations.where}: {' and '.join(names[:2])} belong to one frame, {t_ns} ns "
                 f"({placed.rule}); give each its own time or number"
@@ -216,9 +217,12 @@ def _by_number(annotations: Annotations, log: LogPictures) -> Placed:
 
 
 def meanings(
-    annotations: Annotations, own: Mapping[str, str], own_cues: Sequence[str] = (),
-    *, any_thing: bool = False,
-) -> dict[str, str | None]:  # fmt: skip
+    annotations: Annotations,
+    own: Mapping[str, str],
+    own_cues: Sequence[str] = (),
+    *,
+    any_thing: bool = False,
+) -> dict[str, str | None]:
     """From label to cue; None for things that are no cue.
 
     Args:
@@ -309,10 +313,14 @@ def cue_truths(
             seen = [thing.visible for thing in mine if thing.visible is not None]
             counted = not any(thing.is_crowd for thing in mine)
             told.append(
-                CueTruth(cue=cue, present=bool(mine), t_ns=t_ns,
-                         count=len(mine) if counted else None,
-                         visible=max(seen) if mine and len(seen) == len(mine) else None)
-            )  # fmt: skip
+                CueTruth(
+                    cue=cue,
+                    present=bool(mine),
+                    t_ns=t_ns,
+                    count=len(mine) if counted else None,
+                    visible=max(seen) if mine and len(seen) == len(mine) else None,
+                )
+            )
     return tuple(told)
 
 
@@ -332,8 +340,15 @@ def coco_tree(
         zip(annotations.pictures, placed.t_ns, strict=True), start=1
     ):
         width, height = picture.size_px
-        images.append({"id": number, "t_ns": t_ns, "file_name": picture.name, "width": width,
-                       "height": height})  # fmt: skip
+        images.append(
+            {
+                "id": number,
+                "t_ns": t_ns,
+                "file_name": picture.name,
+                "width": width,
+                "height": height,
+            }
+        )
         for thing in picture.things:
             if thing.box_px is not None:
                 things.append(_coco_thing(len(things) + 1, number, numbers[thing.label], thing))
@@ -349,12 +364,18 @@ def _coco_thing(number: int, image: int, category: int, thing: Thing) -> dict[st
     assert thing.box_px is not None
     x0, y0, x1, y1 = thing.box_px
     found: dict[str, Any] = {
-        "id": number, "image_id": image, "category_id": category,
-        "bbox": [x0, y0, x1 - x0, y1 - y0], "area": (x1 - x0) * (y1 - y0),
+        "id": number,
+        "image_id": image,
+        "category_id": category,
+        "bbox": [x0, y0, x1 - x0, y1 - y0],
+        "area": (x1 - x0) * (y1 - y0),
         "iscrowd": int(thing.is_crowd),
-    }  # fmt: skip
-    for name, value in (("segmentation", thing.segmentation), ("visible", thing.visible),
-                        ("track_id", thing.track)):  # fmt: skip
+    }
+    for name, value in (
+        ("segmentation", thing.segmentation),
+        ("visible", thing.visible),
+        ("track_id", thing.track),
+    ):
         if value is not None:
             found[name] = value
     return found

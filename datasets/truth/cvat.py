@@ -101,8 +101,9 @@ class _Reader:
             self._meta.setdefault("/".join(self._path[-2:]), text)
         elif tag == "image":
             last = self._pictures.pop()
-            self._pictures.append(Picture(last.name, last.size_px, None, last.frame,
-                                          tuple(self._things)))  # fmt: skip
+            self._pictures.append(
+                Picture(last.name, last.size_px, None, last.frame, tuple(self._things))
+            )
         elif tag == "track":
             self._track = None
         self._path.pop()

@@ -94,11 +94,14 @@ def car_shapes(found: Sequence[Detections], settings: Cars) -> CarShapes:
         (box, mask)
         for detections in found
         for label, score, box, mask in zip(
-            detections.labels, detections.scores.tolist(), detections.boxes_px.tolist(),
-            detections.masks, strict=True,
+            detections.labels,
+            detections.scores.tolist(),
+            detections.boxes_px.tolist(),
+            detections.masks,
+            strict=True,
         )
         if label in settings.labels and score > settings.score and _is_long(box, settings)
-    ]  # fmt: skip
+    ]
     boxes = np.array([box for box, _ in rows], np.float64).reshape(-1, 4)
     # Counting pixels by column gives both area and nose from one reading of the runs.
     heights = [rle.column_heights_px(mask, size) if mask else None for _, mask in rows]

@@ -94,7 +94,7 @@ def orb_points(grey: Bytes, most: int, fast: int = 10) -> Points:
     # OpenCV's defaults leave no point in a window of 64 pixels: border and patch of 31.
     orb = cv2.ORB.create(
         nfeatures=most, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=fast
-    )  # fmt: skip
+    )
     # ORB's detection is FAST, then a choice of the best and angles: needless where all may stay.
     keypoints = cv2.FastFeatureDetector.create(fast).detect(grey, None)
     if len(keypoints) > most:
@@ -262,10 +262,12 @@ def _apart(
     boxes = np.array([box for _, _, box in candidates])
     shares = np.array([share for share, _, _ in candidates])
     kinds = np.array([kind for _, kind, _ in candidates])
-    sums = np.array([
-        shares[(overlaps(box, boxes) > _SAME_SIGN) & (kinds == kind)].sum()
-        for _, kind, box in candidates
-    ])  # fmt: skip
+    sums = np.array(
+        [
+            shares[(overlaps(box, boxes) > _SAME_SIGN) & (kinds == kind)].sum()
+            for _, kind, box in candidates
+        ]
+    )
     scores = shares * sums / (sums + 1.0)
     kept: list[int] = []
     for i in np.lexsort((-shares, -scores)).tolist():

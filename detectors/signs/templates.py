@@ -71,10 +71,17 @@ def _one_way(width: int, height: int, is_left: bool) -> Bytes:
     import cv2
 
     sign = np.full((height, width), _BLACK, np.uint8)
-    shape = np.array([
-        (0.04, 0.5), (0.24, 0.08), (0.24, 0.28), (0.96, 0.28), (0.96, 0.72), (0.24, 0.72),
-        (0.24, 0.92),
-    ])  # fmt: skip
+    shape = np.array(
+        [
+            (0.04, 0.5),
+            (0.24, 0.08),
+            (0.24, 0.28),
+            (0.96, 0.28),
+            (0.96, 0.72),
+            (0.24, 0.72),
+            (0.24, 0.92),
+        ]
+    )
     if not is_left:
         shape[:, 0] = 1.0 - shape[:, 0]
     cv2.fillPoly(sign, [np.round(shape * (width, height)).astype(np.int32)], _WHITE)

@@ -95,9 +95,14 @@ class Point:
 
 
 def run_job(
-    job: Job, train: LabelledSet, held_out: LabelledSet, *, resume: bool, overwrite: bool,
+    job: Job,
+    train: LabelledSet,
+    held_out: LabelledSet,
+    *,
+    resume: bool,
+    overwrite: bool,
     tell: Callable[[Point], None],
-) -> Facts:  # fmt: skip
+) -> Facts:
     """Train, validate, calibrate, write; gives what the checkpoint says of itself.
 
     Raises:
@@ -115,9 +120,14 @@ def run_job(
 
 
 def _run(
-    job: Job, train: LabelledSet, held_out: LabelledSet, device: torch.device, *, resume: bool,
+    job: Job,
+    train: LabelledSet,
+    held_out: LabelledSet,
+    device: torch.device,
+    *,
+    resume: bool,
     tell: Callable[[Point], None],
-) -> Facts:  # fmt: skip
+) -> Facts:
     training = Training(lambda: starting_network(job), job.schedule, device)
     points: list[Point] = []
     if resume and job.state_path.exists():
@@ -177,11 +187,18 @@ def _learned(
         seconds = before_s + time.monotonic() - began - checking_s
         checked = time.monotonic()
         found = raw_detections(
-            job.plan, training.averaged, some, MaskRcnnSettings(threads=job.threads),
+            job.plan,
+            training.averaged,
+            some,
+            MaskRcnnSettings(threads=job.threads),
             training.device,
-        )  # fmt: skip
-        point = Point(step, float(np.mean(losses or [math.nan])), round(seconds, 1),
-                      average_precisions(some, found))  # fmt: skip
+        )
+        point = Point(
+            step,
+            float(np.mean(losses or [math.nan])),
+            round(seconds, 1),
+            average_precisions(some, found),
+        )
         points.append(point)
         training.save(job.state_path, {"points": [asdict(one) for one in points]})
         write_text(job.curve_path, strict_json([asdict(one) for one in points]) + "\n")
@@ -210,9 +227,13 @@ def finished_facts(job: Job, network: Any, held_out: LabelledSet, device: torch.
     measured = average_precisions(held_out, found)
     for name, rows in judged(second, found[half:]).items():
         measured |= told_rates(name, rows, by[name])
-    recipe = {**job.recipe, "start": Path(job.start).name,
-              **{f"schedule.{k}": v for k, v in asdict(job.schedule).items()},
-              "held_out_pictures": len(held_out.pictures), **decides_bits(device)}  # fmt: skip
+    recipe = {
+        **job.recipe,
+        "start": Path(job.start).name,
+        **{f"schedule.{k}": v for k, v in asdict(job.schedule).items()},
+        "held_out_pictures": len(held_out.pictures),
+        **decides_bits(device),
+    }
     return Facts(plan=job.plan, calibration=by, recipe=recipe, measured=measured)
 
 

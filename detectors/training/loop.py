@@ -123,8 +123,9 @@ class Training:
         pictures = torch.from_numpy(np.stack([sample.pixels for sample in batch]))
         pictures = pictures.to(self.device, memory_format=torch.channels_last)
         targets = [_target(sample, self.device) for sample in batch]
-        with torch.autocast(self.device.type, enabled=self.device.type == "cuda",
-                            dtype=torch.bfloat16):  # fmt: skip
+        with torch.autocast(
+            self.device.type, enabled=self.device.type == "cuda", dtype=torch.bfloat16
+        ):
             loss = forward_training(self.network, pictures, targets)
         value = float(loss.detach())
         self.done += 1

@@ -65,9 +65,12 @@ def measure(
 
 
 def raw_detections(
-    plan: Plan, network: Any, labelled: LabelledSet, settings: MaskRcnnSettings,
+    plan: Plan,
+    network: Any,
+    labelled: LabelledSet,
+    settings: MaskRcnnSettings,
     device: torch.device,
-) -> list[Detections]:  # fmt: skip
+) -> list[Detections]:
     """What a network finds, with its own scores from ``LEAST_SCORE``.
 
     Args:

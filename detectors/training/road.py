@@ -114,8 +114,10 @@ class RoadTraining:
         Raises:
             OutputError: It cannot be written.
         """
-        tensors = {f"network.{k}": v.detach().cpu().contiguous().clone()
-                   for k, v in self.network.state_dict().items()}  # fmt: skip
+        tensors = {
+            f"network.{k}": v.detach().cpu().contiguous().clone()
+            for k, v in self.network.state_dict().items()
+        }
         for number, slot in self._optimizer.state_dict()["state"].items():
             for name, value in slot.items():
                 tensors[f"optimizer.{number}.{name}"] = value.detach().cpu().contiguous().clone()
@@ -174,10 +176,12 @@ def varied(pixels: Bytes, road: Bytes, rng: np.random.Generator) -> tuple[Bytes,
     high, wide = road.shape
     zoom = float(rng.uniform(0.92, 1.12))
     shift = rng.uniform(-1.0, 1.0, 2) * (0.03 * wide, 0.035 * high)
-    onto = np.array([
-        [zoom, 0.0, (1 - zoom) * wide / 2 + shift[0]],
-        [0.0, zoom, (1 - zoom) * high / 2 + shift[1]],
-    ])  # fmt: skip
+    onto = np.array(
+        [
+            [zoom, 0.0, (1 - zoom) * wide / 2 + shift[0]],
+            [0.0, zoom, (1 - zoom) * high / 2 + shift[1]],
+        ]
+    )
     picture = cv2.warpAffine(pixels, onto, (wide, high), borderMode=cv2.BORDER_REPLICATE)
     mask = cv2.warpAffine(road, onto, (wide, high), borderMode=cv2.BORDER_REPLICATE)
     if rng.random() < 0.5:

@@ -148,9 +148,13 @@ def _is_big_enough(box: Box, picture: LabelledPicture, plan: Plan) -> bool:
 
 
 def _corner(
-    size_px: tuple[int, int], about: Box | None, scale: float, window: Window, plan: Plan,
+    size_px: tuple[int, int],
+    about: Box | None,
+    scale: float,
+    window: Window,
+    plan: Plan,
     rng: Generator,
-) -> Floats:  # fmt: skip
+) -> Floats:
     """Top left of the window in the picture; it may stick out where the picture is smaller."""
     span = np.array([window.width_px, window.height_px]) / scale
     low = np.array([0.0, plan.top * size_px[1]])
@@ -169,9 +173,16 @@ def _warped(pixels: Bytes, warp: Floats, window: Window) -> Bytes:
     import cv2
 
     return np.asarray(
-        cv2.warpAffine(pixels, _to_middles(warp), (window.width_px, window.height_px),
-                       flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
-                       borderValue=(114, 114, 114)), np.uint8)  # fmt: skip
+        cv2.warpAffine(
+            pixels,
+            _to_middles(warp),
+            (window.width_px, window.height_px),
+            flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(114, 114, 114),
+        ),
+        np.uint8,
+    )
 
 
 def _to_middles(warp: Floats) -> Floats:
@@ -235,15 +246,18 @@ def _may_be_inside(one: Labelled, warp: Floats, window: Window) -> bool:
     x0, y0, x1, y1 = one.box_px
     across = np.sort(warp[0, 0] * np.array([x0, x1]) + warp[0, 2])
     down = warp[1, 1] * np.array([y0, y1]) + warp[1, 2]
-    return bool(across[1] > 0 and across[0] < window.width_px
-                and down[1] > 0 and down[0] < window.height_px)  # fmt: skip
+    return bool(
+        across[1] > 0 and across[0] < window.width_px and down[1] > 0 and down[0] < window.height_px
+    )
 
 
 def _warped_mask(mask: NDArray[np.bool_], warp: Floats, window: Window) -> Bytes:
     import cv2
 
     grey = cv2.warpAffine(
-        mask.astype(np.uint8) * 255, _to_middles(warp), (window.width_px, window.height_px),
+        mask.astype(np.uint8) * 255,
+        _to_middles(warp),
+        (window.width_px, window.height_px),
         flags=cv2.INTER_LINEAR,
-    )  # fmt: skip
+    )
     return np.asarray(np.asarray(grey) >= 128, np.uint8)

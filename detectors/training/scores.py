@@ -97,12 +97,17 @@ def _truth(labelled: LabelledSet) -> dict[str, Any]:
             text = _runs(one.mask, picture, one)
             area = area_px(text)
             x0, y0, x1, y1 = one.box_px
-            annotations.append({
-                "id": len(annotations) + 1, "image_id": number, "category_id": one.label,
-                "bbox": [x0, y0, x1 - x0, y1 - y0], "area": area,
-                "iscrowd": int(one.is_crowd or area < LEAST_AREA_PX),
-                "segmentation": {"size": list(picture.size_px[::-1]), "counts": text},
-            })  # fmt: skip
+            annotations.append(
+                {
+                    "id": len(annotations) + 1,
+                    "image_id": number,
+                    "category_id": one.label,
+                    "bbox": [x0, y0, x1 - x0, y1 - y0],
+                    "area": area,
+                    "iscrowd": int(one.is_crowd or area < LEAST_AREA_PX),
+                    "segmentation": {"size": list(picture.size_px[::-1]), "counts": text},
+                }
+            )
     return {
         "images": [
             {"id": i, "width": p.size_px[0], "height": p.size_px[1]}
@@ -123,7 +128,9 @@ def _answers(labelled: LabelledSet, found: Sequence[Detections]) -> list[dict[st
     numbers = {name: i for i, name in enumerate(labelled.classes)}
     return [
         {
-            "image_id": i, "category_id": numbers[label], "score": float(score),
+            "image_id": i,
+            "category_id": numbers[label],
+            "score": float(score),
             "bbox": [float(box[0]), float(box[1]), float(box[2] - box[0]), float(box[3] - box[1])],
             "segmentation": {"size": [one.size_px[1], one.size_px[0]], "counts": mask},
         }
@@ -132,4 +139,4 @@ def _answers(labelled: LabelledSet, found: Sequence[Detections]) -> list[dict[st
             one.boxes_px, one.scores, one.labels, one.masks, strict=True
         )
         if label in numbers
-    ]  # fmt: skip
+    ]

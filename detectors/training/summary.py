@@ -54,8 +54,12 @@ def measured_tree(proposals: int, reached: Measured) -> dict[str, object]:
     """The same for JSON."""
     rates: Sequence[dict[str, object]] = [
         {"label": name, "score": score, "found": at.found, "right": at.right, "objects": at.signs}
-        for name, by_score in reached.rates.items() for score, at in by_score.items()
-    ]  # fmt: skip
+        for name, by_score in reached.rates.items()
+        for score, at in by_score.items()
+    ]
     return {
-        "proposals": proposals, "cpu_s": reached.cpu_s, "ap": dict(reached.ap), "rates": rates,
-    }  # fmt: skip
+        "proposals": proposals,
+        "cpu_s": reached.cpu_s,
+        "ap": dict(reached.ap),
+        "rates": rates,
+    }

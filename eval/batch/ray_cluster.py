@@ -74,9 +74,11 @@ def _connect(ray: Any, address: str, workers: int | None) -> None:
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
     if address == LOCAL:
         options |= {
-            "num_cpus": workers, "include_dashboard": False,
-            "object_store_memory": STORE_BYTES, "_node_ip_address": "127.0.0.1",
-        }  # fmt: skip
+            "num_cpus": workers,
+            "include_dashboard": False,
+            "object_store_memory": STORE_BYTES,
+            "_node_ip_address": "127.0.0.1",
+        }
     _knock(address)
     try:
         ray.init(address=address, **options)

@@ -166,8 +166,9 @@ def read_tolerance(text: str) -> Tolerance:
     except ValueError:
         by = math.nan
     if not (math.isfinite(by) and by >= 0.0):
-        raise UsageError(f"--tolerance {text}: want 0.01, 2% or PATTERN=0.01, such as "
-                         "'cues.*.precision=0.02'")  # fmt: skip
+        raise UsageError(
+            f"--tolerance {text}: want 0.01, 2% or PATTERN=0.01, such as 'cues.*.precision=0.02'"
+        )
     return Tolerance(pattern or "*", by, is_share)
 
 
@@ -195,8 +196,11 @@ def compare_runs(
     scores = [_metrics_of(run) for run in (first, second)]
     same = len(names) - len(tables)
     if scores[0] is None or scores[1] is None:
-        bare = [str(run.path) for run, found in zip((first, second), scores, strict=True)
-                if found is None]  # fmt: skip
+        bare = [
+            str(run.path)
+            for run, found in zip((first, second), scores, strict=True)
+            if found is None
+        ]
         why = f"not scored: {', '.join(bare)}"
         return Comparison(changes, tuple(tables), (), same, 0, why)
     metrics, metrics_same = compare_metrics(scores[0], scores[1], tolerances)

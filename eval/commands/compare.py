@@ -41,9 +41,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("first", type=Path, metavar="RUN_A", help="the run that was good")
     parser.add_argument("second", type=Path, metavar="RUN_B", help="the run to judge")
     parser.add_argument(
-        "--tolerance", nargs="+", default=[], metavar="T",
+        "--tolerance",
+        nargs="+",
+        default=[],
+        metavar="T",
         help="how much worse metrics may be: 0.01, 2%% or PATTERN=0.01",
-    )  # fmt: skip
+    )
     parser.add_argument("--json", action="store_true", help="print everything that differs as JSON")
 
 

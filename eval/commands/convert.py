@@ -54,9 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--overwrite", action="store_true", help="replace OUT.mcap if it is there")
     parser.add_argument(
-        "--salvage", action="store_true",
+        "--salvage",
+        action="store_true",
         help="the log is damaged: list every place where something was dropped",
-    )  # fmt: skip
+    )
     parser.add_argument("--json", action="store_true", help="print the account as JSON")
 
 
@@ -195,10 +196,16 @@ def _as_json(args: argparse.Namespace, ledger: Ledger, writer: LogWriter) -> obj
 def _print(args: argparse.Namespace, ledger: Ledger, writer: LogWriter) -> None:
     width = terminal_width()
     rows = [
-        [name, writer.types.get(name, "-"), str(account.found), str(writer.kept[name]),
-         str(account.skipped.total()), str(_lost(account)) + "+" * bool(account.dropped_unknown)]
+        [
+            name,
+            writer.types.get(name, "-"),
+            str(account.found),
+            str(writer.kept[name]),
+            str(account.skipped.total()),
+            str(_lost(account)) + "+" * bool(account.dropped_unknown),
+        ]
         for name, account in ledger.accounts.items()
-    ]  # fmt: skip
+    ]
     head = ["topic", "type", "found", "written", "skipped", "dropped"]
     print("\n".join(table(head, rows, width, (0, 1))))
     size = args.output.stat().st_size / 1e6

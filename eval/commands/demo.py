@@ -36,8 +36,14 @@ from .replay import summary as replay_summary
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("-o", "--output", type=Path, default=Path("demo"), metavar="DIR",
-                        help="folder for drive, run and report (default: demo)")  # fmt: skip
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("demo"),
+        metavar="DIR",
+        help="folder for drive, run and report (default: demo)",
+    )
     parser.add_argument("--layout", default="C", choices=SCORED, help="which intersection")
     parser.add_argument("--run", type=int, default=1, metavar="N", help="which drive up to it")
     parser.add_argument("--seed", type=int, default=0, help="of what differs from run to run")
@@ -74,9 +80,17 @@ def run(args: argparse.Namespace) -> int:
     recording = folder.file("drive.rrd")
     save(folder, recording, truth_track(files.truth, folder), one.truth.ranges)
     if args.json:
-        print_json({"log": str(files.log), "vehicle": str(files.vehicle), "truth": str(files.truth),
-                    "run": str(folder.path), "report": str(report), "recording": str(recording),
-                    "metrics": metrics})  # fmt: skip
+        print_json(
+            {
+                "log": str(files.log),
+                "vehicle": str(files.vehicle),
+                "truth": str(files.truth),
+                "run": str(folder.path),
+                "report": str(report),
+                "recording": str(recording),
+                "metrics": metrics,
+            }
+        )
     elif talk:
         print(replay_summary(outcome))
         print("\nagainst the truth of the simulation")

@@ -39,11 +39,20 @@ def run(args: argparse.Namespace) -> int:
         raise RunError(f"{args.folders[0]}: no finished run in it; replay first")
     merged = merge_runs(runs, create(args.output, overwrite=args.overwrite), failures)
     if args.json:
-        print_json({"merged": str(merged.run.path), "drives": sorted(runs), "failures": failures,
-                    "rows": merged.rows})  # fmt: skip
+        print_json(
+            {
+                "merged": str(merged.run.path),
+                "drives": sorted(runs),
+                "failures": failures,
+                "rows": merged.rows,
+            }
+        )
     elif not args.quiet:
         failed = [f"failed   {name}: {why}" for name, why in sorted(failures.items())]
-        lines = [*failed, f"drives   {merged.drives}, {len(failures)} failed",
-                 f"tables   {merged.run.path}"]  # fmt: skip
+        lines = [
+            *failed,
+            f"drives   {merged.drives}, {len(failures)} failed",
+            f"tables   {merged.run.path}",
+        ]
         print("\n".join(visible(line) for line in lines))
     return 3 if failures else 0

@@ -62,29 +62,41 @@ from crosscue.replay.vehicle.vehicle import Vehicle, load
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument(
-        "logs", nargs="+", metavar="LOG",
+        "logs",
+        nargs="+",
+        metavar="LOG",
         help="recordings of one drive, or drives; paths or URLs",
-    )  # fmt: skip
+    )
     add_part_arguments(parser)
     parser.add_argument(
-        "-o", "--output", required=True, type=Path, metavar="RUN",
+        "-o",
+        "--output",
+        required=True,
+        type=Path,
+        metavar="RUN",
         help="run folder; for many drives, the folder that gets one for each",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--vehicle", type=Path, metavar="V.toml",
+        "--vehicle",
+        type=Path,
+        metavar="V.toml",
         help="the vehicle file (default: vehicle.toml beside a drive's logs)",
-    )  # fmt: skip
+    )
     parser.add_argument("--each", action="store_true", help="every LOG is a drive of its own")
     parser.add_argument(
-        "--workers", type=int, metavar="N",
+        "--workers",
+        type=int,
+        metavar="N",
         help="drives at a time (default: 1; with --ray, as many as the cluster has cores)",
-    )  # fmt: skip
+    )
     parser.add_argument("--ray", metavar="ADDRESS", help="on a Ray cluster; local starts one here")
     add_detector_arguments(parser)
     parser.add_argument(
-        "--landmarks", type=Path, metavar="DB",
+        "--landmarks",
+        type=Path,
+        metavar="DB",
         help="landmark database that camera frames are compared with",
-    )  # fmt: skip
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier run")
     parser.add_argument(
         "--resume", action="store_true", help="go on with an interrupted run, keeping what is done"
@@ -95,13 +107,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
     """``--detectors``, ``--draw``, ``--cache`` and ``--no-cache``."""
     parser.add_argument(
-        "--detectors", metavar="NAMES",
+        "--detectors",
+        metavar="NAMES",
         help="comma-separated; all of the vehicle file's, if left out; none: pose alone",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--draw", type=int, default=0, metavar="N",
+        "--draw",
+        type=int,
+        default=0,
+        metavar="N",
         help="write up to N pictures with what was found, spread over the drive",
-    )  # fmt: skip
+    )
     parser.add_argument("--cache", type=Path, metavar="FILE", help="where results are kept")
     parser.add_argument("--no-cache", action="store_true", help="run every detector again")
 
@@ -192,11 +208,15 @@ def _run_many(args: argparse.Namespace, drives: DriveList) -> int:
     engine = engine_of(args.workers, args.ray)
     jobs = [
         Job(
-            drive.name, drive.logs, args.output / drive.name, _fingerprint(args, drive),
-            drive.vehicle, drive.truth,
+            drive.name,
+            drive.logs,
+            args.output / drive.name,
+            _fingerprint(args, drive),
+            drive.vehicle,
+            drive.truth,
         )
         for drive in drives.drives
-    ]  # fmt: skip
+    ]
     line = DriveProgress(not args.quiet and sys.stderr.isatty())
     done = run_many(jobs, _Work(args), engine, overwrite=args.overwrite, on_progress=line)
     line.end()
@@ -424,7 +444,9 @@ def as_json(outcome: Outcome) -> dict[str, object]:
             "major_axis_m": outcome.major_axis_m,
         },
         "landmarks": outcome.landmark_counts,
-        "detected": None if outcome.detected is None else {
+        "detected": None
+        if outcome.detected is None
+        else {
             "frames": outcome.detected.counts.frames,
             "ran": outcome.detected.counts.ran,
             "from_cache": outcome.detected.counts.from_cache,
@@ -433,4 +455,4 @@ def as_json(outcome: Outcome) -> dict[str, object]:
         "scene": None if outcome.scene is None else asdict(outcome.scene),
         "notices": list(outcome.notices),
         "seconds": outcome.seconds,
-    }  # fmt: skip
+    }

@@ -60,37 +60,53 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folders, or folders of them")
     parser.add_argument(
-        "--truth", type=Path, metavar="T.json",
+        "--truth",
+        type=Path,
+        metavar="T.json",
         help="the truth of all runs (default: the truth.json beside each run's log)",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--any-log", action="store_true",
+        "--any-log",
+        action="store_true",
         help="take truth that names the hash of another file: the same drive, converted",
-    )  # fmt: skip
+    )
     add_logs_argument(parser)
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR",
+        "-o",
+        "--output",
+        type=Path,
+        metavar="DIR",
         help="folder for metrics, report and junit.xml, pooled over all runs",
-    )  # fmt: skip
+    )
     parser.add_argument("--gate", type=Path, metavar="G.toml", help="bounds on metrics")
     parser.add_argument(
-        "--threshold", type=float, default=DEFAULTS.threshold, metavar="P",
+        "--threshold",
+        type=float,
+        default=DEFAULTS.threshold,
+        metavar="P",
         help="a feature is detected above this probability (default: 0.9)",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--rpe", nargs="+", type=metres, default=[10.0, 100.0], metavar="M",
+        "--rpe",
+        nargs="+",
+        type=metres,
+        default=[10.0, 100.0],
+        metavar="M",
         help="distances of the relative pose error in metres (default: 10 100)",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--attribution", action="store_true",
+        "--attribution",
+        action="store_true",
         help="estimate again with each cue left out, and score what it was worth",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--smoother", choices=("gtsam",),
+        "--smoother",
+        choices=("gtsam",),
         help="beside the filter, a batch smoother over the same measurements",
-    )  # fmt: skip
-    parser.add_argument("--workers", type=int, default=1, metavar="N",
-                        help="runs scored at a time (default: 1)")  # fmt: skip
+    )
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="runs scored at a time (default: 1)"
+    )
     parser.add_argument("--json", action="store_true", help="print the metrics as JSON")
 
 
@@ -107,9 +123,13 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--threshold: {error}") from None
     gates = () if args.gate is None else load_gates(args.gate)
     work = ScoreWork(
-        args.truth, settings, tuple(args.rpe), args.smoother is not None, args.any_log,
+        args.truth,
+        settings,
+        tuple(args.rpe),
+        args.smoother is not None,
+        args.any_log,
         args.logs,
-    )  # fmt: skip
+    )
     scored, failed = _score_all(paths, work, args)
     if len(paths) == 1:
         tree = _tell_one(scored[0], settings, args)
@@ -117,8 +137,13 @@ def run(args: argparse.Namespace) -> int:
         tree = _pool(scored, failed, settings, args)
     results = _gate(gates, tree, args.output or scored[0].one.run.file(FOLDER), paths)
     if args.json:
-        print_json({"metrics": tree, "gates": _as_json(results),
-                    "runs": {str(one.one.run.path): one.metrics for one in scored}})  # fmt: skip
+        print_json(
+            {
+                "metrics": tree,
+                "gates": _as_json(results),
+                "runs": {str(one.one.run.path): one.metrics for one in scored},
+            }
+        )
     elif results and not args.quiet:
         print(gate_lines(results))
     if any(one.failure for one in results):
@@ -184,9 +209,11 @@ def _print_scores(scores: Scores, why_no_pose: str, worth: dict[str, Attribution
 
 
 def _attribution(
-    scored: Sequence[Scored], tree: dict[str, Any], settings: ScoreSettings,
+    scored: Sequence[Scored],
+    tree: dict[str, Any],
+    settings: ScoreSettings,
     args: argparse.Namespace,
-) -> dict[str, Attribution]:  # fmt: skip
+) -> dict[str, Attribution]:
     """What each cue was worth, also put into the metrics; nothing unless asked for."""
     if not args.attribution:
         return {}
@@ -198,9 +225,11 @@ def _attribution(
 
 
 def _pool(
-    scored: Sequence[Scored], failed: Sequence[Failed], settings: ScoreSettings,
+    scored: Sequence[Scored],
+    failed: Sequence[Failed],
+    settings: ScoreSettings,
     args: argparse.Namespace,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Score all runs together, into the folder asked for."""
     ones = [found.one for found in scored]
     scores = scores_of(ones, settings)
@@ -240,7 +269,14 @@ def _gate(
 
 def _as_json(results: Sequence[GateResult]) -> list[dict[str, Any]]:
     return [
-        {"metric": one.gate.metric, "min": one.gate.min, "max": one.gate.max, "use": one.gate.use,
-         "value": one.value, "passed": not one.failure, "failure": one.failure}
+        {
+            "metric": one.gate.metric,
+            "min": one.gate.min,
+            "max": one.gate.max,
+            "use": one.gate.use,
+            "value": one.value,
+            "passed": not one.failure,
+            "failure": one.failure,
+        }
         for one in results
-    ]  # fmt: skip
+    ]

@@ -75,9 +75,14 @@ def _seal(log: Path, args: argparse.Namespace) -> dict[str, object]:
             + f"{seal.blocks} blocks of 1 MiB"
         )
     return {
-        "log": str(log), "seal": str(path), "is_new": is_new, "is_whole": True,
-        "files": len(seal.files), "bytes": sealing.total, "blocks": seal.blocks,
-    }  # fmt: skip
+        "log": str(log),
+        "seal": str(path),
+        "is_new": is_new,
+        "is_whole": True,
+        "files": len(seal.files),
+        "bytes": sealing.total,
+        "blocks": seal.blocks,
+    }
 
 
 def _check(log: Path, args: argparse.Namespace) -> dict[str, object]:
@@ -109,7 +114,12 @@ def _check(log: Path, args: argparse.Namespace) -> dict[str, object]:
         if is_whole and not args.quiet:
             print(visible(f"{log}: all {seal.blocks} blocks match the seal of {seal.sealed_at}"))
     return {
-        "log": str(log), "seal": str(path), "sealed_at": seal.sealed_at, "is_whole": is_whole,
-        "blocks": seal.blocks, "checked": check.checked, "files_changed": list(check.oddities),
+        "log": str(log),
+        "seal": str(path),
+        "sealed_at": seal.sealed_at,
+        "is_whole": is_whole,
+        "blocks": seal.blocks,
+        "checked": check.checked,
+        "files_changed": list(check.oddities),
         "damaged": [{"file": s.name, "from": s.start, "to": s.stop} for s in spans],
-    }  # fmt: skip
+    }

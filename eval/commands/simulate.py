@@ -33,10 +33,12 @@ PUBLISHED_RUNS = 10
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("layouts", nargs="*", metavar="LAYOUT", help="A to H, or L0, L1, ...")
-    parser.add_argument("-o", "--output", type=Path, metavar="DIR",
-                        help="folder that gets one folder a drive")  # fmt: skip
-    parser.add_argument("--sheet", type=Path, metavar="JPEG",
-                        help="no drives: one picture with a frame of each")  # fmt: skip
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="folder that gets one folder a drive"
+    )
+    parser.add_argument(
+        "--sheet", type=Path, metavar="JPEG", help="no drives: one picture with a frame of each"
+    )
     parser.add_argument("--run", type=int, metavar="N", help="one run, from 1")
     parser.add_argument("--runs", type=int, metavar="N", help="the first N runs (default: 1)")
     parser.add_argument("--all", action="store_true", help="A to H, ten runs each")
@@ -114,8 +116,11 @@ def _wanted(args: argparse.Namespace) -> list[SceneSettings]:
     runs = [args.run] if args.run is not None else list(range(1, last + 1))
     camera = Camera(width_px=args.width, height_px=args.width * 9 // 16)
     try:
-        return [SceneSettings(layout=layout, run=run, seed=args.seed, rate_hz=args.rate,
-                              camera=camera) for layout in layouts for run in runs]  # fmt: skip
+        return [
+            SceneSettings(layout=layout, run=run, seed=args.seed, rate_hz=args.rate, camera=camera)
+            for layout in layouts
+            for run in runs
+        ]
     except ValueError as error:
         raise UsageError(f"simulate: {error}") from None
 

@@ -122,9 +122,16 @@ def check_truth(path: Path, log_path: Path, vehicle: Vehicle) -> TruthFit:
         )
     ranges = 0 if drive.ranges is None else len(drive.ranges.t_ns)
     return TruthFit(
-        (truth.end_ns - truth.start_ns) * 1e-9, len(truth.approaches), len(truth.cues), matched,
-        len(moments), objects, ranges, poses, has_hash,
-    )  # fmt: skip
+        (truth.end_ns - truth.start_ns) * 1e-9,
+        len(truth.approaches),
+        len(truth.cues),
+        matched,
+        len(moments),
+        objects,
+        ranges,
+        poses,
+        has_hash,
+    )
 
 
 def _check_times(truth: Truth, span: tuple[int, int], path: Path, log_path: Path) -> None:
@@ -180,9 +187,14 @@ def read_annotations(path: Path) -> Annotations:
 
 
 def import_annotations(
-    source: Path, log_path: Path, output: Path, vehicle: Vehicle, own: Mapping[str, str],
-    *, add: bool = False,
-) -> Imported:  # fmt: skip
+    source: Path,
+    log_path: Path,
+    output: Path,
+    vehicle: Vehicle,
+    own: Mapping[str, str],
+    *,
+    add: bool = False,
+) -> Imported:
     """Turn annotated pictures of a log into its truth.
 
     Args:
@@ -205,10 +217,14 @@ def import_annotations(
     truth = _truth(annotations, placed, cues, pictures, log_path, source)
     if add:
         before = truth_file.load(output)
-        kept = {"start_ns": min(before.start_ns, truth.start_ns),
-                "end_ns": max(before.end_ns, truth.end_ns), "cues": truth.cues,
-                "own_cues": truth.own_cues,
-                "objects": truth.objects, "log_sha256": truth.log_sha256}  # fmt: skip
+        kept = {
+            "start_ns": min(before.start_ns, truth.start_ns),
+            "end_ns": max(before.end_ns, truth.end_ns),
+            "cues": truth.cues,
+            "own_cues": truth.own_cues,
+            "objects": truth.objects,
+            "log_sha256": truth.log_sha256,
+        }
         truth = before.model_copy(update=kept)
     objects = output.parent / OBJECTS
     write_text(objects, strict_json(coco_tree(annotations, placed, cues)) + "\n")
@@ -217,16 +233,24 @@ def import_annotations(
     for one in truth.cues:
         there[one.cue] = there.get(one.cue, 0) + one.present
     return Imported(
-        output, objects, len(annotations.pictures),
-        sum(len(picture.things) for picture in annotations.pictures), placed.rule, there,
+        output,
+        objects,
+        len(annotations.pictures),
+        sum(len(picture.things) for picture in annotations.pictures),
+        placed.rule,
+        there,
         annotations.ignored,
-    )  # fmt: skip
+    )
 
 
 def _truth(
-    annotations: Annotations, placed: Placed, cues: Mapping[str, str | None],
-    pictures: LogPictures, log_path: Path, source: Path,
-) -> Truth:  # fmt: skip
+    annotations: Annotations,
+    placed: Placed,
+    cues: Mapping[str, str | None],
+    pictures: LogPictures,
+    log_path: Path,
+    source: Path,
+) -> Truth:
     return Truth(
         version=1,
         log=log_path.name,

@@ -167,10 +167,17 @@ def _in_bulk(
             known = {row["reason"] for row in single if row["count"] is None}
             counts += [(why, None) for why in account["dropped_unknown"] if why not in known]
         rows += [
-            {"t_ns": None, "topic": topic, "reason": why, "detail": "not listed one by one",
-             "count": count, "is_dropped": is_dropped, "log": log}
+            {
+                "t_ns": None,
+                "topic": topic,
+                "reason": why,
+                "detail": "not listed one by one",
+                "count": count,
+                "is_dropped": is_dropped,
+                "log": log,
+            }
             for why, count in counts
-        ]  # fmt: skip
+        ]
     return rows
 
 

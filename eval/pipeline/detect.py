@@ -160,11 +160,14 @@ def detect_into(
     is_sign = [choice.kind == "signs" for choice in choices]
     with ResultCache(cache) as results:
         runner = Runner(
-            named, results, topic.name, vehicle.camera.depth_bits,
+            named,
+            results,
+            topic.name,
+            vehicle.camera.depth_bits,
             lambda t_ns, reason, why: ledger.spoil(
                 topic.name, reason, 1, why, int(clock.log_times(np.array([t_ns]))[0])
             ),
-        )  # fmt: skip
+        )
         drawer = Drawer(run.path / "pictures", draw)
         tables = _Tables(
             run, topic.name, vehicle, named, drawer, CuePass(vehicle), is_sign, timeline, clock
@@ -192,34 +195,52 @@ def detect_into(
         write_skipped(run, [ledger], made["reading"], timeline=timeline)
         seconds = time.monotonic() - began
         notices = (*gaps_told(timeline.segments), *tables.notices)
-        write_manifest(run, {
-            "stage": "detect",
-            "versions": versions(),
-            "logs": log_rows(logs, run),
-            "selection": selection_told(selection),
-            "settings": vehicle.model_dump(mode="json"),
-            "camera": topic.name,
-            "camera_log": camera[0],
-            "time": time_told(timeline),
-            "detectors": [
-                {"name": one.name, "identity": one.detector.identity, "kind": choice.kind,
-                 "role": tables.roles.get(one.name), "settings": dict(choice.settings)}
-                for one, choice in zip(named, choices, strict=True)
-            ],
-            "clocks": [clock_rows(extractor)],
-            "account": made,
-            "counts": {
-                "frames": runner.counts.frames, "decoded": runner.counts.decoded,
-                "ran": runner.counts.ran, "from_cache": runner.counts.from_cache,
-                "objects": tables.objects, "cues": tables.cue_frames,
+        write_manifest(
+            run,
+            {
+                "stage": "detect",
+                "versions": versions(),
+                "logs": log_rows(logs, run),
+                "selection": selection_told(selection),
+                "settings": vehicle.model_dump(mode="json"),
+                "camera": topic.name,
+                "camera_log": camera[0],
+                "time": time_told(timeline),
+                "detectors": [
+                    {
+                        "name": one.name,
+                        "identity": one.detector.identity,
+                        "kind": choice.kind,
+                        "role": tables.roles.get(one.name),
+                        "settings": dict(choice.settings),
+                    }
+                    for one, choice in zip(named, choices, strict=True)
+                ],
+                "clocks": [clock_rows(extractor)],
+                "account": made,
+                "counts": {
+                    "frames": runner.counts.frames,
+                    "decoded": runner.counts.decoded,
+                    "ran": runner.counts.ran,
+                    "from_cache": runner.counts.from_cache,
+                    "objects": tables.objects,
+                    "cues": tables.cue_frames,
+                },
+                "notices": list(notices),
+                "timings": {"seconds": seconds},
             },
-            "notices": list(notices),
-            "timings": {"seconds": seconds},
-        })  # fmt: skip
+        )
     return DetectOutcome(
-        run, ledger, runner.counts, tables.objects, tables.cue_frames, notices, seconds, made,
+        run,
+        ledger,
+        runner.counts,
+        tables.objects,
+        tables.cue_frames,
+        notices,
+        seconds,
+        made,
         timeline.has_gaps,
-    )  # fmt: skip
+    )
 
 
 def _through(runner: Runner, block: Block, tables: _Tables, on_frame: Callable[[], None]) -> None:
@@ -279,10 +300,15 @@ class _Tables:
         self._frame += 1
         sorted_by_role = seen(result.t_ns, result.found, self.is_for_signs)
         cues = self.cues(sorted_by_role)
-        self._held["frames"].append({
-            "frame": self._frame, "t_ns": result.t_ns, "camera": self.camera,
-            "width_px": result.size_px[0], "height_px": result.size_px[1],
-        })  # fmt: skip
+        self._held["frames"].append(
+            {
+                "frame": self._frame,
+                "t_ns": result.t_ns,
+                "camera": self.camera,
+                "width_px": result.size_px[0],
+                "height_px": result.size_px[1],
+            }
+        )
         for named, found, for_signs in zip(
             self.detectors, result.found, self.is_for_signs, strict=True
         ):
@@ -291,12 +317,19 @@ class _Tables:
                 self._held["detections"] += self._detection_rows(named.name, found)
         road = sorted_by_role.road
         if cues.road is not None and isinstance(road, RoadMask):
-            self._held["road"].append({
-                "frame": self._frame, "t_ns": result.t_ns, "camera": self.camera,
-                "share_left": cues.road.left, "share_straight": cues.road.straight,
-                "share_right": cues.road.right, "mask": road.mask,
-                "mask_width_px": road.mask_size_px[0], "mask_height_px": road.mask_size_px[1],
-            })  # fmt: skip
+            self._held["road"].append(
+                {
+                    "frame": self._frame,
+                    "t_ns": result.t_ns,
+                    "camera": self.camera,
+                    "share_left": cues.road.left,
+                    "share_straight": cues.road.straight,
+                    "share_right": cues.road.right,
+                    "mask": road.mask,
+                    "mask_width_px": road.mask_size_px[0],
+                    "mask_height_px": road.mask_size_px[1],
+                }
+            )
         self._add_cues(result.t_ns, cues)
         self.drawer(result, cues)
         for name, rows in self._held.items():
@@ -321,14 +354,25 @@ class _Tables:
             key = f"{name}: {label}"
             self.objects[key] = self.objects.get(key, 0) + 1
             height = _height_px(found, i)
-            rows.append({
-                "frame": self._frame, "t_ns": found.t_ns, "camera": self.camera,
-                "detector": name, "label": label,
-                "score": float(found.scores[i]), "x0": x0, "y0": y0, "x1": x1, "y1": y1,
-                "mask": found.masks[i] or None, "height_px": height,
-                "range_m": self._range_m(label, height),
-                "picture_width_px": found.size_px[0], "picture_height_px": found.size_px[1],
-            })  # fmt: skip
+            rows.append(
+                {
+                    "frame": self._frame,
+                    "t_ns": found.t_ns,
+                    "camera": self.camera,
+                    "detector": name,
+                    "label": label,
+                    "score": float(found.scores[i]),
+                    "x0": x0,
+                    "y0": y0,
+                    "x1": x1,
+                    "y1": y1,
+                    "mask": found.masks[i] or None,
+                    "height_px": height,
+                    "range_m": self._range_m(label, height),
+                    "picture_width_px": found.size_px[0],
+                    "picture_height_px": found.size_px[1],
+                }
+            )
         return rows
 
     def _range_m(self, label: str, height_px: float) -> float | None:
@@ -359,23 +403,53 @@ def schemas() -> dict[str, pa.Schema]:
 
     number, text = pa.float64(), pa.string()
     return {
-        "frames": pa.schema([
-            ("frame", pa.int64()), ("t_ns", pa.int64()), ("camera", text),
-            ("width_px", pa.int32()), ("height_px", pa.int32()),
-        ]),
-        "detections": pa.schema([
-            ("frame", pa.int64()), ("t_ns", pa.int64()), ("camera", text),
-            ("detector", text), ("label", text),
-            ("score", number), ("x0", number), ("y0", number), ("x1", number), ("y1", number),
-            ("mask", pa.binary()), ("height_px", number), ("range_m", number),
-            ("picture_width_px", pa.int32()), ("picture_height_px", pa.int32()),
-        ]),
-        "road": pa.schema([
-            ("frame", pa.int64()), ("t_ns", pa.int64()), ("camera", text),
-            ("share_left", number), ("share_straight", number), ("share_right", number),
-            ("mask", pa.binary()), ("mask_width_px", pa.int32()), ("mask_height_px", pa.int32()),
-        ]),
-        "cues": pa.schema([
-            ("t_ns", pa.int64()), ("approach", pa.int64()), ("cue", text), ("count", pa.int64()),
-        ]),
-    }  # fmt: skip
+        "frames": pa.schema(
+            [
+                ("frame", pa.int64()),
+                ("t_ns", pa.int64()),
+                ("camera", text),
+                ("width_px", pa.int32()),
+                ("height_px", pa.int32()),
+            ]
+        ),
+        "detections": pa.schema(
+            [
+                ("frame", pa.int64()),
+                ("t_ns", pa.int64()),
+                ("camera", text),
+                ("detector", text),
+                ("label", text),
+                ("score", number),
+                ("x0", number),
+                ("y0", number),
+                ("x1", number),
+                ("y1", number),
+                ("mask", pa.binary()),
+                ("height_px", number),
+                ("range_m", number),
+                ("picture_width_px", pa.int32()),
+                ("picture_height_px", pa.int32()),
+            ]
+        ),
+        "road": pa.schema(
+            [
+                ("frame", pa.int64()),
+                ("t_ns", pa.int64()),
+                ("camera", text),
+                ("share_left", number),
+                ("share_straight", number),
+                ("share_right", number),
+                ("mask", pa.binary()),
+                ("mask_width_px", pa.int32()),
+                ("mask_height_px", pa.int32()),
+            ]
+        ),
+        "cues": pa.schema(
+            [
+                ("t_ns", pa.int64()),
+                ("approach", pa.int64()),
+                ("cue", text),
+                ("count", pa.int64()),
+            ]
+        ),
+    }

@@ -172,9 +172,10 @@ def estimate_into(
         accounts = joined_accounts(accounts, found["account"]["reading"], found["camera"])
     frames = None if scene is None or found is None else (found["counts"]["frames"], scene.frames)
     made = account(
-        accounts, {} if found is None else found["account"]["detecting"],
+        accounts,
+        {} if found is None else found["account"]["detecting"],
         estimating_of(stage, frames),
-    )  # fmt: skip
+    )
     write_skipped(run, reading.ledgers, made["reading"], kept, timeline)
     before = 0.0 if detected is None else detected.seconds
     seconds = time.monotonic() - began
@@ -190,35 +191,54 @@ def estimate_into(
         *stage.doubts(),
         *clock_changes(reading.extractors),
     )
-    write_manifest(run, {
-        "stage": "estimate",
-        "versions": versions(),
-        "logs": _hashed(logs, run, found) if told is None else list(told),
-        "selection": selection_told(selection),
-        "settings": vehicle.model_dump(mode="json"),
-        "sources": _sources(reading.planned, logs),
-        "clocks": [clock_rows(extractor) for extractor in reading.extractors],
-        "account": made,
-        "counts": stage.counts(),
-        "time": time_told(timeline),
-        "landmarks": None if landmarks is None else {
-            "database": relative(landmarks.path, run), "landmarks": len(landmarks),
-            "sha256": sha256_of(landmarks.path),
+    write_manifest(
+        run,
+        {
+            "stage": "estimate",
+            "versions": versions(),
+            "logs": _hashed(logs, run, found) if told is None else list(told),
+            "selection": selection_told(selection),
+            "settings": vehicle.model_dump(mode="json"),
+            "sources": _sources(reading.planned, logs),
+            "clocks": [clock_rows(extractor) for extractor in reading.extractors],
+            "account": made,
+            "counts": stage.counts(),
+            "time": time_told(timeline),
+            "landmarks": None
+            if landmarks is None
+            else {
+                "database": relative(landmarks.path, run),
+                "landmarks": len(landmarks),
+                "sha256": sha256_of(landmarks.path),
+            },
+            "notices": list(notices),
+            "pose": {
+                "rows": tally.rows,
+                "travelled_m": tally.travelled_m,
+                "major_axis_m": tally.major_axis_m,
+            },
+            "scene": None if scene is None else _scene_told(scene),
+            DETECT: None
+            if found is None
+            else {key: value for key, value in found.items() if key != "format_version"},
+            "timings": {"seconds": seconds + before, "detect_seconds": before},
         },
-        "notices": list(notices),
-        "pose": {"rows": tally.rows, "travelled_m": tally.travelled_m,
-                 "major_axis_m": tally.major_axis_m},
-        "scene": None if scene is None else _scene_told(scene),
-        DETECT: None if found is None else {
-            key: value for key, value in found.items() if key != "format_version"
-        },
-        "timings": {"seconds": seconds + before, "detect_seconds": before},
-    })  # fmt: skip
+    )
     return Outcome(
-        run, reading.ledgers, tally.rows, tally.travelled_m, tally.major_axis_m, notices,
-        seconds + before, _driven_s(timeline, tally), stage.landmarks.counts(), made, detected,
-        scene, timeline.segments,
-    )  # fmt: skip
+        run,
+        reading.ledgers,
+        tally.rows,
+        tally.travelled_m,
+        tally.major_axis_m,
+        notices,
+        seconds + before,
+        _driven_s(timeline, tally),
+        stage.landmarks.counts(),
+        made,
+        detected,
+        scene,
+        timeline.segments,
+    )
 
 
 def _of_detecting(found: Mapping[str, Any] | None) -> list[str]:
@@ -256,10 +276,14 @@ class _Reading:
     """A drive's logs, planned and with their clocks chosen."""
 
     def __init__(
-        self, logs: Sequence[Log], vehicle: Vehicle, selection: Selection,
-        landmarks: LandmarkDatabase | None, timeline: Timeline | None,
+        self,
+        logs: Sequence[Log],
+        vehicle: Vehicle,
+        selection: Selection,
+        landmarks: LandmarkDatabase | None,
+        timeline: Timeline | None,
         found: Mapping[str, Any] | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
         self.logs = logs
         self.has_camera = any(role_of(topic) is Role.CAMERA for _, topic in topics)
@@ -336,9 +360,14 @@ def _scene(
         }
         past = StoredMobileye(run, vehicle.past)
         return estimate_scene(
-            run, vehicle, found, lambda name, rows: sinks[name].write(rows), past.cues,
-            timeline=timeline, on_restart=past.forget_before,
-        )  # fmt: skip
+            run,
+            vehicle,
+            found,
+            lambda name, rows: sinks[name].write(rows),
+            past.cues,
+            timeline=timeline,
+            on_restart=past.forget_before,
+        )
 
 
 def _scene_told(scene: SceneOutcome) -> dict[str, object]:

@@ -74,11 +74,17 @@ def start_rows(belief: PoseBelief) -> dict[str, object]:
         "start",
         np.array([belief.t_ns]),
         {
-            "x_m": [x], "y_m": [y], "heading_rad": [heading], "speed_mps": [speed],
-            "xx_m2": [cov[0][0]], "xy_m2": [cov[0][1]], "yy_m2": [cov[1][1]],
-            "heading_var_rad2": [cov[2][2]], "speed_var_m2ps2": [cov[3][3]],
+            "x_m": [x],
+            "y_m": [y],
+            "heading_rad": [heading],
+            "speed_mps": [speed],
+            "xx_m2": [cov[0][0]],
+            "xy_m2": [cov[0][1]],
+            "yy_m2": [cov[1][1]],
+            "heading_var_rad2": [cov[2][2]],
+            "speed_var_m2ps2": [cov[3][3]],
         },
-    )  # fmt: skip
+    )
 
 
 def odometry_rows(made: Increments) -> dict[str, object]:
@@ -95,19 +101,24 @@ def gap_rows(start_ns: int, crossed: Crossed) -> dict[str, object]:
         "gap",
         np.array([crossed.belief.t_ns]),
         {
-            "start_ns": [start_ns], "distance_m": [crossed.distance_m], "turn_rad": [0.0],
-            "distance_var_m2": [crossed.distance_var_m2], "turn_var_rad2": [crossed.turn_var_rad2],
-            "speed_mps": [speed_mps], "speed_var_m2ps2": [crossed.belief.cov[3, 3]],
+            "start_ns": [start_ns],
+            "distance_m": [crossed.distance_m],
+            "turn_rad": [0.0],
+            "distance_var_m2": [crossed.distance_var_m2],
+            "turn_var_rad2": [crossed.turn_var_rad2],
+            "speed_mps": [speed_mps],
+            "speed_var_m2ps2": [crossed.belief.cov[3, 3]],
         },
-    )  # fmt: skip
+    )
 
 
 def heading_rows(used: HeadingColumns) -> dict[str, object]:
     """Headings that counted as rows."""
     good = used.outcome == ACCEPTED
     columns: dict[str, object] = {
-        "heading_rad": used.heading_rad[good], "heading_var_rad2": used.var_rad2[good],
-    }  # fmt: skip
+        "heading_rad": used.heading_rad[good],
+        "heading_var_rad2": used.var_rad2[good],
+    }
     return _rows("heading", used.t_ns[good], columns)
 
 
@@ -115,10 +126,13 @@ def landmark_rows(sightings: list[Sighting]) -> dict[str, object]:
     """Landmarks weighed in as rows."""
     good = [s for s in sightings if s.outcome == ACCEPTED]
     columns: dict[str, object] = {
-        "x_m": [s.xy_m[0] for s in good], "y_m": [s.xy_m[1] for s in good],
-        "xx_m2": [s.cov_m2[0, 0] for s in good], "xy_m2": [s.cov_m2[0, 1] for s in good],
-        "yy_m2": [s.cov_m2[1, 1] for s in good], "landmark": [s.name for s in good],
-    }  # fmt: skip
+        "x_m": [s.xy_m[0] for s in good],
+        "y_m": [s.xy_m[1] for s in good],
+        "xx_m2": [s.cov_m2[0, 0] for s in good],
+        "xy_m2": [s.cov_m2[0, 1] for s in good],
+        "yy_m2": [s.cov_m2[1, 1] for s in good],
+        "landmark": [s.name for s in good],
+    }
     return _rows("landmark", np.array([s.t_ns for s in good], np.int64), columns)
 
 
@@ -182,7 +196,7 @@ def read_measured(run: RunFolder) -> Measured:
             np.column_stack([landmark["x_m"], landmark["y_m"]]),
             _matrices(landmark),
         ),
-    )  # fmt: skip
+    )
 
 
 def _matrices(columns: Mapping[str, Floats]) -> Floats:

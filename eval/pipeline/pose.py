@@ -206,15 +206,21 @@ class PoseStage:
                 return
             self._cross(self._gap, int(wheels.t_ns[0]))
         step = odometry.integrate(
-            _wheels(wheels), odometry_settings(self.vehicle), self._turn(window), self._pending,
+            _wheels(wheels),
+            odometry_settings(self.vehicle),
+            self._turn(window),
+            self._pending,
             until_ns,
-        )  # fmt: skip
+        )
         self._pending = step.pending
         self.odometry_counts += step.counts
         made = pose_track.advance(
-            self._state, step.increments, track_settings(self.vehicle), headings,
+            self._state,
+            step.increments,
+            track_settings(self.vehicle),
+            headings,
             looks=self.landmarks,
-        )  # fmt: skip
+        )
         self._state = made.state
         self._measured += [
             odometry_rows(step.increments),
@@ -245,9 +251,13 @@ class PoseStage:
                 "no start heading and no compass: the map's x axis points where the car did"
             )
         belief = pose_track.start_belief(
-            t_ns, start.x_m, start.y_m, heading_rad,
-            position_sd_m=start.position_sd_m, heading_sd_rad=sd_rad,
-        )  # fmt: skip
+            t_ns,
+            start.x_m,
+            start.y_m,
+            heading_rad,
+            position_sd_m=start.position_sd_m,
+            heading_sd_rad=sd_rad,
+        )
         self._state = TrackState(belief)
         self._measured.append(start_rows(belief))
         return headings

@@ -44,9 +44,14 @@ def pose_schema() -> pa.Schema:
     import pyarrow as pa
 
     numbers = [
-        "x_m", "y_m", "heading_rad", "speed_mps",
-        *(f"cov_{name}" for name in COVARIANCES), "major_axis_m", "travelled_m",
-    ]  # fmt: skip
+        "x_m",
+        "y_m",
+        "heading_rad",
+        "speed_mps",
+        *(f"cov_{name}" for name in COVARIANCES),
+        "major_axis_m",
+        "travelled_m",
+    ]
     return pa.schema(
         [
             ("t_ns", pa.int64()),

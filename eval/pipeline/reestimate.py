@@ -58,9 +58,14 @@ def estimate_run(
             begin_again(run, detected_part(manifest))
             write_input(run, changed)
         return estimate_into(
-            logs, settings, run, selection_used(manifest), on_time,
-            earlier=detected_part(manifest), told=manifest["logs"],
-        )  # fmt: skip
+            logs,
+            settings,
+            run,
+            selection_used(manifest),
+            on_time,
+            earlier=detected_part(manifest),
+            told=manifest["logs"],
+        )
 
 
 def _reopened(run: RunFolder, said: Mapping[str, Any]) -> Log:

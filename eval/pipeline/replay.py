@@ -81,9 +81,13 @@ def replay_drive(
         OutputError: The disk is full.
     """
     mine = input_of(
-        logs, vehicle, selection, detecting.choices, detecting.draw,
+        logs,
+        vehicle,
+        selection,
+        detecting.choices,
+        detecting.draw,
         None if landmarks is None else landmarks.path,
-    )  # fmt: skip
+    )
     with locked(run):
         if detecting.resume and not overwrite:
             refuse_another(run, mine)
@@ -103,9 +107,11 @@ def replay_drive(
 
 
 def _camera(
-    logs: Sequence[Log], vehicle: Vehicle, detecting: Detecting,
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    detecting: Detecting,
     landmarks: LandmarkDatabase | None,
-) -> tuple[int, Topic] | None:  # fmt: skip
+) -> tuple[int, Topic] | None:
     """The camera, where anything will look at it."""
     if not detecting.choices and landmarks is None:
         return None
@@ -113,22 +119,36 @@ def _camera(
 
 
 def _detect(
-    logs: Sequence[Log], vehicle: Vehicle, run: RunFolder, selection: Selection,
-    detecting: Detecting, timeline: Timeline,
-) -> DetectOutcome | None:  # fmt: skip
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    run: RunFolder,
+    selection: Selection,
+    detecting: Detecting,
+    timeline: Timeline,
+) -> DetectOutcome | None:
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
     if not detecting.choices or camera_of(topics, vehicle) is None:
         return None
     return detect_into(
-        logs, vehicle, run, selection, detecting.choices, detecting.cache, detecting.draw,
-        detecting.on_frames, timeline,
-    )  # fmt: skip
+        logs,
+        vehicle,
+        run,
+        selection,
+        detecting.choices,
+        detecting.cache,
+        detecting.draw,
+        detecting.on_frames,
+        timeline,
+    )
 
 
 def _kept(
-    logs: Sequence[Log], vehicle: Vehicle, run: RunFolder, selection: Selection,
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    run: RunFolder,
+    selection: Selection,
     detecting: Detecting,
-) -> Mapping[str, Any] | None:  # fmt: skip
+) -> Mapping[str, Any] | None:
     """The detect stage of an earlier start, where its tables are what it would give again."""
     try:
         earlier = detected_part(run.manifest())

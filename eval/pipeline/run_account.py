@@ -92,8 +92,11 @@ def estimating_of(stage: PoseStage, frames: tuple[int, int] | None) -> dict[str,
         frames: Frames detected and frames that cues and belief were estimated for, if any were.
     """
     wheels, track, got = stage.odometry_counts, stage.track_counts, stage.received
-    rejected = {"not finite": wheels.not_finite, "repeated time": wheels.repeated,
-                "out of order": wheels.out_of_order}  # fmt: skip
+    rejected = {
+        "not finite": wheels.not_finite,
+        "repeated time": wheels.repeated,
+        "out of order": wheels.out_of_order,
+    }
     found = {
         "wheel speeds": line(
             got[Signal.WHEEL_SPEEDS], wheels.rows - sum(rejected.values()), rejected
@@ -101,19 +104,24 @@ def estimating_of(stage: PoseStage, frames: tuple[int, int] | None) -> dict[str,
         "headings": line(
             got[Signal.HEADING] + got[Signal.MAGNETIC_FIELD],
             track.headings_accepted + stage.started_with,
-            {"too soon after the last one used": track.headings_thinned,
-             "refused by the gate": track.headings_rejected,
-             "earlier than the estimate": track.headings_late,
-             "not finite": track.headings_bad,
-             "after the last wheel speeds": stage.waiting},
+            {
+                "too soon after the last one used": track.headings_thinned,
+                "refused by the gate": track.headings_rejected,
+                "earlier than the estimate": track.headings_late,
+                "not finite": track.headings_bad,
+                "after the last wheel speeds": stage.waiting,
+            },
         ),
-    }  # fmt: skip
+    }
     if stage.turn is not None:
         found["turn rates"] = line(
-            got[stage.turn], wheels.turn_rows - wheels.turn_dropped,
-            {"not finite, repeated or out of order": wheels.turn_dropped,
-             "before the first wheel speeds": stage.turn_early},
-        )  # fmt: skip
+            got[stage.turn],
+            wheels.turn_rows - wheels.turn_dropped,
+            {
+                "not finite, repeated or out of order": wheels.turn_dropped,
+                "before the first wheel speeds": stage.turn_early,
+            },
+        )
     if frames is not None:
         found["frames"] = line(*frames, {})
     return {name: one for name, one in found.items() if one["in"]}
@@ -132,11 +140,14 @@ def scoring_of(one: RunScored) -> dict[str, Line]:
     if one.pose is not None:
         of = one.pose.coverage
         found["poses"] = line(
-            of.truth_poses, of.scored,
-            {"before the first estimate": of.before_estimate,
-             "after the last estimate": of.after_estimate,
-             "no estimate near enough": of.in_gap},
-        )  # fmt: skip
+            of.truth_poses,
+            of.scored,
+            {
+                "before the first estimate": of.before_estimate,
+                "after the last estimate": of.after_estimate,
+                "no estimate near enough": of.in_gap,
+            },
+        )
     return found
 
 
@@ -192,8 +203,14 @@ def summed(accounts: Iterable[Mapping[str, Any]]) -> Account:
     for one in accounts:
         whole = whole and bool(one["is_whole"])
         for stage, name, counts in lines(one):
-            empty: Line = {"in": 0, "used": 0, "skipped": {}, "dropped": {}, "runs": 0,
-                           "runs_with_unknown_drops": 0}  # fmt: skip
+            empty: Line = {
+                "in": 0,
+                "used": 0,
+                "skipped": {},
+                "dropped": {},
+                "runs": 0,
+                "runs_with_unknown_drops": 0,
+            }
             total = totals[stage].setdefault(name, empty)
             total["runs"] += 1
             total["runs_with_unknown_drops"] += bool(counts["dropped_unknown"])

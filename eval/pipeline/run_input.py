@@ -24,9 +24,13 @@ from .run_logs import origin
 
 
 def input_of(
-    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, choices: Sequence[Choice],
-    draw: int, landmarks: Path | None,
-) -> dict[str, object]:  # fmt: skip
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    selection: Selection,
+    choices: Sequence[Choice],
+    draw: int,
+    landmarks: Path | None,
+) -> dict[str, object]:
     """The content of ``input.json``.
 
     Args:

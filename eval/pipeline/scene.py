@@ -130,9 +130,12 @@ def estimate_scene(
     scene.rows.flush()
     scene.approaches.finish()
     return SceneOutcome(
-        scene.frames, dict(sorted(scene.positive.items())), tuple(scene.summaries.values()),
-        scene.approaches.counts, scene.without_odometry,
-    )  # fmt: skip
+        scene.frames,
+        dict(sorted(scene.positive.items())),
+        tuple(scene.summaries.values()),
+        scene.approaches.counts,
+        scene.without_odometry,
+    )
 
 
 @dataclass(slots=True)
@@ -182,9 +185,11 @@ class _Scene:
             if _MEASURES[sign.reference] not in without
         )
         evidence = self._evidence(seen.t_ns, counts, signs)
-        step = self.approaches(evidence) if past is None else self.approaches(
-            evidence, _leaving_out(past, without)
-        )  # fmt: skip
+        step = (
+            self.approaches(evidence)
+            if past is None
+            else self.approaches(evidence, _leaving_out(past, without))
+        )
         self.frames += 1
         self.positive.update(cue for cue, count in step.counts.items() if count)
         self.rows.add(step)
@@ -293,12 +298,22 @@ def schemas(features: Sequence[str] = FEATURES) -> dict[str, pa.Schema]:
         "cues": pa.schema(
             [("t_ns", integer), ("approach", integer), ("cue", text), ("count", integer)]
         ),
-        "range": pa.schema([
-            ("t_ns", integer), ("approach", integer), ("reference", text), ("range_m", number),
-            ("var_m2", number), ("measured_m", number),
-        ]),
-        "belief": pa.schema([
-            ("t_ns", integer), ("approach", integer), *((name, number) for name in features),
-            ("established", pa.bool_()),
-        ]),
-    }  # fmt: skip
+        "range": pa.schema(
+            [
+                ("t_ns", integer),
+                ("approach", integer),
+                ("reference", text),
+                ("range_m", number),
+                ("var_m2", number),
+                ("measured_m", number),
+            ]
+        ),
+        "belief": pa.schema(
+            [
+                ("t_ns", integer),
+                ("approach", integer),
+                *((name, number) for name in features),
+                ("established", pa.bool_()),
+            ]
+        ),
+    }

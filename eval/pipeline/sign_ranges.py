@@ -43,9 +43,13 @@ def sign_ranges(
 
 
 def _of_kind(
-    found: Detections, heights_px: Floats, labels: tuple[str, ...], score: float,
-    curve: RangeCurve, reference: Reference,
-) -> list[SignRange]:  # fmt: skip
+    found: Detections,
+    heights_px: Floats,
+    labels: tuple[str, ...],
+    score: float,
+    curve: RangeCurve,
+    reference: Reference,
+) -> list[SignRange]:
     width, height = found.size_px
     ranges = []
     for i, label in enumerate(found.labels):

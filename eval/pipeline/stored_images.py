@@ -115,10 +115,14 @@ def read_pictures(
     """
     ledger = Ledger(str(camera.log))
     extractor = Extractor(
-        Plan((Source(0, camera.topic, ()),), {}), Vehicle(version=1), 0, ledger,
-        {camera.topic.name: camera.clock}, on_pictures=on_pictures,
+        Plan((Source(0, camera.topic, ()),), {}),
+        Vehicle(version=1),
+        0,
+        ledger,
+        {camera.topic.name: camera.clock},
+        on_pictures=on_pictures,
         shift_at=camera.time.shift_at if len(camera.time.epochs) > 1 else None,
-    )  # fmt: skip
+    )
     selection = camera.selection
     # Rows are told apart by counting where stamps alone do not do.
     if around_ns is not None and camera.topic.name not in camera.time.topics:

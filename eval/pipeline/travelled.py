@@ -111,6 +111,9 @@ def _parts(run: RunFolder) -> Iterator[tuple[Int64s, Int64s, Floats, Floats, Flo
             )
             moves = stop > start
             yield (
-                start[moves].astype(np.int64), stop[moves].astype(np.int64),
-                metres[moves], radians[moves], variance[moves],
-            )  # fmt: skip
+                start[moves].astype(np.int64),
+                stop[moves].astype(np.int64),
+                metres[moves],
+                radians[moves],
+                variance[moves],
+            )

@@ -63,9 +63,15 @@ def scene_tables(
     timeline = timeline_in(manifest)
     past = StoredMobileye(run, settings.past)
     estimate_scene(
-        run, settings, detected, keep, past.cues, without,
-        timeline=timeline, on_restart=past.forget_before,
-    )  # fmt: skip
+        run,
+        settings,
+        detected,
+        keep,
+        past.cues,
+        without,
+        timeline=timeline,
+        on_restart=past.forget_before,
+    )
     clock = timeline.clock(detected["camera_log"])
     return {
         name: with_labels(pa.concat_tables(some), timeline, clock) for name, some in parts.items()

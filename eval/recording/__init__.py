@@ -70,10 +70,14 @@ def save(
 
 
 def _log_all(
-    recording: rr.RecordingStream, time: DriveTime, run: RunFolder,
-    pose: Mapping[str, Floats] | None, truth: TruthTrack | None, true_ranges: TrueRanges | None,
+    recording: rr.RecordingStream,
+    time: DriveTime,
+    run: RunFolder,
+    pose: Mapping[str, Floats] | None,
+    truth: TruthTrack | None,
+    true_ranges: TrueRanges | None,
     stored: StoredCamera | None,
-) -> None:  # fmt: skip
+) -> None:
     from . import ahead, camera, plan, series
     from .notes import notes
     from .scene_rows import scene_rows

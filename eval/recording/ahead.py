@@ -38,9 +38,13 @@ _CUBIC: Final = [_LANE[name] for name in ("c0_m", "c1", "c2_per_m", "c3_per_m2")
 
 
 def log_ahead(
-    recording: rr.RecordingStream, time: DriveTime, run: RunFolder, vehicle: Vehicle,
-    scene: SceneRows, truth: TrueRanges | None,
-) -> None:  # fmt: skip
+    recording: rr.RecordingStream,
+    time: DriveTime,
+    run: RunFolder,
+    vehicle: Vehicle,
+    scene: SceneRows,
+    truth: TrueRanges | None,
+) -> None:
     """Everything ahead of the car, frame by frame."""
     _log_ground(recording, vehicle)
     _log_intersection(recording, time, scene)
@@ -61,17 +65,23 @@ def _log_ground(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
     marks = above(tens, np.full(len(tens), ASIDE_M - 2.5))
     recording.log(
         "ahead/metres",
-        rr.Points2D(marks, colors=[QUIET], radii=[0.0], labels=[f"{x:.0f} m" for x in tens],
-                    show_labels=True),
+        rr.Points2D(
+            marks,
+            colors=[QUIET],
+            radii=[0.0],
+            labels=[f"{x:.0f} m" for x in tens],
+            show_labels=True,
+        ),
         static=True,
-    )  # fmt: skip
+    )
     length_m = vehicle.odometry.wheelbase_m + 1.8
     recording.log(
         "ahead/car",
-        rr.Boxes2D(centers=[[0.0, 0.9 - length_m / 2]], half_sizes=[[0.9, length_m / 2]],
-                   colors=[ESTIMATE]),
+        rr.Boxes2D(
+            centers=[[0.0, 0.9 - length_m / 2]], half_sizes=[[0.9, length_m / 2]], colors=[ESTIMATE]
+        ),
         static=True,
-    )  # fmt: skip
+    )
 
 
 def _log_intersection(recording: rr.RecordingStream, time: DriveTime, scene: SceneRows) -> None:

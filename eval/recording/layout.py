@@ -52,22 +52,23 @@ def _scene(shown: Shown) -> rrb.Container:
     if shown.camera is not None:
         left.insert(0, _camera(shown.camera))
     ahead = rrb.Spatial2DView(
-        origin="ahead", name="Ahead of the car (m)",
-        visual_bounds=rrb.VisualBounds2D(
-            x_range=[-ASIDE_M, ASIDE_M], y_range=[-FAR_M, BEHIND_M]
-        ),
-    )  # fmt: skip
+        origin="ahead",
+        name="Ahead of the car (m)",
+        visual_bounds=rrb.VisualBounds2D(x_range=[-ASIDE_M, ASIDE_M], y_range=[-FAR_M, BEHIND_M]),
+    )
     belief = rrb.TimeSeriesView(
-        origin="/".join(BELIEF), name="Probability: is it there?",
+        origin="/".join(BELIEF),
+        name="Probability: is it there?",
         axis_x=rrb.TimeAxis(view_range=_whole()),
         axis_y=rrb.ScalarAxis(range=(-0.03, 1.03)),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightBottom),
-    )  # fmt: skip
+    )
     ranges = rrb.TimeSeriesView(
-        origin="/".join(RANGE), name="Range to the intersection (m), 2-sigma band",
+        origin="/".join(RANGE),
+        name="Range to the intersection (m), 2-sigma band",
         axis_x=rrb.TimeAxis(view_range=_whole()),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
-    )  # fmt: skip
+    )
     tabs: list[rrb.View] = [_notes()]
     if shown.pose is not None:
         tabs = [_plan(shown, shown.pose), *_pose_series(), *tabs]
@@ -116,9 +117,11 @@ def _whole() -> rrb.TimeRange:
 
 def _plan(shown: Shown, pose: Mapping[str, Floats]) -> rrb.View:
     return rrb.Spatial3DView(
-        origin="plan", name="Map, truth in green" if shown.has_truth else "Map",
-        line_grid=rrb.LineGrid3D(visible=True), eye_controls=_from_above(pose),
-    )  # fmt: skip
+        origin="plan",
+        name="Map, truth in green" if shown.has_truth else "Map",
+        line_grid=rrb.LineGrid3D(visible=True),
+        eye_controls=_from_above(pose),
+    )
 
 
 def _from_above(pose: Mapping[str, Floats]) -> rrb.EyeControls3D:
@@ -127,6 +130,8 @@ def _from_above(pose: Mapping[str, Floats]) -> rrb.EyeControls3D:
     middle = (float(x.min() + x.max()) / 2, float(y.min() + y.max()) / 2)
     height_m = 1.15 * max(float(np.ptp(x)), float(np.ptp(y)), 20.0)
     return rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital, position=(*middle, height_m), look_target=(*middle, 0.0),
+        kind=rrb.Eye3DKind.Orbital,
+        position=(*middle, height_m),
+        look_target=(*middle, 0.0),
         eye_up=(0.0, 1.0, 0.0),
-    )  # fmt: skip
+    )

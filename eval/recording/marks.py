@@ -138,9 +138,11 @@ class Marks:
         pairs = pair_cars(before, now, self.vehicle.cars)
         for i in range(len(pairs.nose)):
             one = Pairs(
-                pairs.step_px[i : i + 1], pairs.center_px[i : i + 1], pairs.nose[i : i + 1],
+                pairs.step_px[i : i + 1],
+                pairs.center_px[i : i + 1],
+                pairs.nose[i : i + 1],
                 pairs.width_px,
-            )  # fmt: skip
+            )
             if any(cross_traffic(one, self.vehicle.cars)):
                 self._arrow(one.center_px[0], ARROW_STEPS * one.step_px[0], CROSSING, "crossing")
             elif any(parked_cars(one, self.vehicle.cars)):

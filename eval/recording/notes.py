@@ -33,9 +33,17 @@ def notes(run: RunFolder, more: Sequence[str]) -> rr.TextDocument:
         else f"{dropped} log(s) with losses: see manifest"
     )
     lines = [
-        f"# {inert(run.path.name)}", "", f"Logs ({whole}):", *logs, "", "Notes:",
-        *(notices or ["- none"]), "", "Colours:", *COLOURS,
-    ]  # fmt: skip
+        f"# {inert(run.path.name)}",
+        "",
+        f"Logs ({whole}):",
+        *logs,
+        "",
+        "Notes:",
+        *(notices or ["- none"]),
+        "",
+        "Colours:",
+        *COLOURS,
+    ]
     return rr.TextDocument("\n".join(lines), media_type="text/markdown")
 
 

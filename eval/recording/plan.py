@@ -33,9 +33,10 @@ def log_pose(recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, 
     thin = slice(None, None, max(1, len(t_ns) // PATH_POINTS))
     flat = np.stack([pose["x_m"], pose["y_m"], np.zeros(len(t_ns))], axis=1)
     recording.log(
-        "plan/estimate", rr.LineStrips3D([flat[thin]], colors=[ESTIMATE]),
+        "plan/estimate",
+        rr.LineStrips3D([flat[thin]], colors=[ESTIMATE]),
         static=True,
-    )  # fmt: skip
+    )
     some = _every(t_ns, ELLIPSES_PER_S)
     times = time.column(t_ns[some])
     rings = _rings(flat[some], _position_cov(pose, some))
@@ -47,9 +48,10 @@ def log_pose(recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, 
     ahead = np.stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))], axis=1)
     car_m = max(CAR_M, CAR_SHARE * float(np.ptp(flat, axis=0).max()))
     recording.send_columns(
-        "plan/car", indexes=times,
+        "plan/car",
+        indexes=times,
         columns=rr.Arrows3D.columns(origins=flat[some], vectors=ahead * car_m),
-    )  # fmt: skip
+    )
     recording.log(
         "plan/car", rr.Arrows3D.from_fields(colors=[ESTIMATE], radii=[0.1 * car_m]), static=True
     )
@@ -66,11 +68,13 @@ def log_landmarks(
     recording.log(
         "plan/landmarks",
         rr.Points3D(
-            flat, colors=[LANDMARK], radii=rr.Radius.ui_points(LANDMARK_POINTS),
+            flat,
+            colors=[LANDMARK],
+            radii=rr.Radius.ui_points(LANDMARK_POINTS),
             labels=[str(names[i]) for i in rows],
         ),
         static=True,
-    )  # fmt: skip
+    )
 
 
 def log_truth(recording: rr.RecordingStream, time: DriveTime, truth: TruthTrack) -> None:
@@ -78,9 +82,10 @@ def log_truth(recording: rr.RecordingStream, time: DriveTime, truth: TruthTrack)
     flat = np.stack([truth.x_m, truth.y_m, np.zeros(len(truth.t_ns))], axis=1)
     recording.log("plan/truth", rr.LineStrips3D([flat], colors=[TRUTH]), static=True)
     recording.send_columns(
-        "plan/true_car", indexes=time.column(truth.t_ns),
+        "plan/true_car",
+        indexes=time.column(truth.t_ns),
         columns=rr.Points3D.columns(positions=flat),
-    )  # fmt: skip
+    )
     dot = rr.Radius.ui_points(TRUE_CAR_POINTS)
     recording.log("plan/true_car", rr.Points3D.from_fields(colors=[TRUTH], radii=dot), static=True)
 

@@ -109,8 +109,9 @@ def _log_measured(
         entity = [*RANGE, _path_part(name)]
         style = rr.SeriesPoints(colors=[colour], names=[name], marker_sizes=[2.0])
         recording.log(rr.new_entity_path([*entity]), style, static=True)
-        _send(recording, time, entity, measured["t_ns"].to_numpy(),
-              measured["measured_m"].to_numpy())  # fmt: skip
+        _send(
+            recording, time, entity, measured["t_ns"].to_numpy(), measured["measured_m"].to_numpy()
+        )
 
 
 def log_cues(recording: rr.RecordingStream, time: DriveTime, scene: SceneRows) -> None:
@@ -160,9 +161,13 @@ def _line(
 
 
 def _send(
-    recording: rr.RecordingStream, time: DriveTime, entity: list[str], t_ns: Int64s,
-    values: Floats, approach: Int64s | None = None,
-) -> None:  # fmt: skip
+    recording: rr.RecordingStream,
+    time: DriveTime,
+    entity: list[str],
+    t_ns: Int64s,
+    values: Floats,
+    approach: Int64s | None = None,
+) -> None:
     """Send a series, broken between approaches."""
     if approach is not None:
         breaks = np.flatnonzero(np.diff(approach)) + 1

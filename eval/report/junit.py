@@ -55,6 +55,9 @@ def fit_for_xml(text: str) -> str:
 
 def _is_allowed(code: int) -> bool:
     # Tabs and line ends are legal, but within attributes they would come back as spaces.
-    return 0x20 <= code <= 0x7E or 0xA0 <= code <= 0xD7FF or 0xE000 <= code <= 0xFFFD or (
-        0x10000 <= code <= 0x10FFFF
-    )  # fmt: skip
+    return (
+        0x20 <= code <= 0x7E
+        or 0xA0 <= code <= 0xD7FF
+        or 0xE000 <= code <= 0xFFFD
+        or (0x10000 <= code <= 0x10FFFF)
+    )

@@ -127,9 +127,12 @@ def _heading(axes: Axes, poses: ScoredPoses) -> None:
         poses.seconds, -claimed, claimed, color=BAND, alpha=0.25, lw=0, label="2 sigma"
     )
     axes.plot(
-        poses.seconds, np.rad2deg(poses.heading_error_rad), color=ESTIMATE, lw=1.2,
+        poses.seconds,
+        np.rad2deg(poses.heading_error_rad),
+        color=ESTIMATE,
+        lw=1.2,
         label="heading error",
-    )  # fmt: skip
+    )
     axes.set_xlim(0.0, float(poses.seconds[-1]))
     axes.set_xlabel("time (s)")
     axes.set_ylabel("degrees")
@@ -150,9 +153,13 @@ def _major_axis(axes: Axes, poses: ScoredPoses, lost_above_m: float) -> None:
     axes.plot(poses.travelled_m, poses.major_axis_m, color=ESTIMATE, lw=1.4)
     axes.axhline(lost_above_m, color="0.3", ls="--", lw=1.0)
     axes.annotate(
-        "lost above this", (0.0, lost_above_m), xytext=(4, 3), textcoords="offset points",
-        fontsize=8, color="0.3",
-    )  # fmt: skip
+        "lost above this",
+        (0.0, lost_above_m),
+        xytext=(4, 3),
+        textcoords="offset points",
+        fontsize=8,
+        color="0.3",
+    )
     axes.set_ylim(bottom=0.0)
     axes.set_xlim(left=0.0)
     axes.set_xlabel("distance travelled (m)")

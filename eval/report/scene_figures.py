@@ -40,10 +40,12 @@ def draw_distances(results: Sequence[ApproachResult]) -> Markup:
     known = _known([v for one in results for v in (one.detected_m, one.full_m)])
     panel = Panel(66, 34, WIDTH - 82, 30.0 * len(names), (0.0, max([40.0, *known]) * 1.05), (0, 1))
     drawing = Drawing(
-        WIDTH, panel.bottom + 56, "Distance at detection",
+        WIDTH,
+        panel.bottom + 56,
+        "Distance at detection",
         "True distance of the rear axle to the intersection when it was detected and when all "
         "that is there was, for each approach; the numbers are in the table.",
-    )  # fmt: skip
+    )
     drawing.axes(panel, "true distance to the intersection (m)", "", y_ticks=[])
     for value, style in (
         (PUBLISHED_DETECTED_M, "line s0 dash"),
@@ -56,16 +58,26 @@ def draw_distances(results: Sequence[ApproachResult]) -> Markup:
         mine = [one for one in results if one.intersection == name]
         for what, style, up in (("detected_m", "s0", -5.0), ("full_m", "s1", 6.0)):
             _dots(drawing, panel, y + up, [(one, getattr(one, what)) for one in mine], style)
-    drawing.legend(10, 14, [("fill s0", "detected"), ("fill s1", "in full"),
-                            ("line dash", "published means, real drives"),
-                            ("line bad", "never")])  # fmt: skip
+    drawing.legend(
+        10,
+        14,
+        [
+            ("fill s0", "detected"),
+            ("fill s1", "in full"),
+            ("line dash", "published means, real drives"),
+            ("line bad", "never"),
+        ],
+    )
     return drawing.svg()
 
 
 def _dots(
-    drawing: Drawing, panel: Panel, y: float,
-    found: Sequence[tuple[ApproachResult, float | None]], style: str,
-) -> None:  # fmt: skip
+    drawing: Drawing,
+    panel: Panel,
+    y: float,
+    found: Sequence[tuple[ApproachResult, float | None]],
+    style: str,
+) -> None:
     values = _known([value for _, value in found])
     if values:
         mean = panel.x(sum(values) / len(values))
@@ -90,21 +102,26 @@ def draw_belief(curve: Curve, cues: Sequence[CueJudged], threshold: float = THRE
         threshold: Above it a feature is detected.
     """
     shown = [
-        (one, found) for one in cues
-        for found in [(one.count > 0) & (one.approach == curve.approach)] if found.any()
-    ]  # fmt: skip
+        (one, found)
+        for one in cues
+        for found in [(one.count > 0) & (one.approach == curve.approach)]
+        if found.any()
+    ]
     seen_m = [one.distance_m[found] for one, found in shown]
     far = max([1.0, *_known(np.concatenate([curve.distance_m, *seen_m]).tolist())])
     panel = Panel(112, 30, WIDTH - 96, 170, (far, 0.0), (0.0, 1.0))
     lanes = Panel(112, panel.bottom + 38, WIDTH - 96, 14.0 * len(shown), panel.x_range, (0, 1))
     drawing = Drawing(
-        WIDTH + 24, lanes.bottom + 8, f"Probability against distance: {curve.intersection}",
+        WIDTH + 24,
+        lanes.bottom + 8,
+        f"Probability against distance: {curve.intersection}",
         "Probability of each feature over the true distance still to go, and below it at which "
         "distances each cue was found: "
         + "; ".join(_told(name, curve, threshold) for name in curve.features),
-    )  # fmt: skip
-    drawing.axes(panel, "true distance to the intersection (m)", "",
-                 y_ticks=[0.0, 0.25, 0.5, 0.75, 1.0])  # fmt: skip
+    )
+    drawing.axes(
+        panel, "true distance to the intersection (m)", "", y_ticks=[0.0, 0.25, 0.5, 0.75, 1.0]
+    )
     drawing.rule(panel.left, panel.y(threshold), panel.right, panel.y(threshold), "line dash")
     for name, values in curve.features.items():
         drawing.curve(panel, curve.distance_m, values, f"line {style_of(name)}")
@@ -164,12 +181,15 @@ def draw_range(judged: Sequence[RangeJudged], scores: Mapping[str, RangeScore]) 
     above = Panel(40, 46, WIDTH - 50, 130, (far, near), (-most, most))
     below = Panel(40, above.bottom + 62, WIDTH - 50, 80, (far, near), (0.0, _most_nees(scores)))
     drawing = Drawing(
-        WIDTH, below.bottom + 38, "Range errors and their honesty",
+        WIDTH,
+        below.bottom + 38,
+        "Range errors and their honesty",
         "; ".join(
             f"range to {name}: bias {one.bias_m.value:.2f} m, rms error {one.rmse_m:.2f} m, mean "
-            f"NEES {one.nees.mean:.2f}" for name, one in scores.items()
+            f"NEES {one.nees.mean:.2f}"
+            for name, one in scores.items()
         ),
-    )  # fmt: skip
+    )
     drawing.axes(above, "true range (m)", "estimate less truth (m)")
     for one in rows:
         style = "s2" if one.reference == "start" else "s5"
@@ -186,8 +206,15 @@ def draw_range(judged: Sequence[RangeJudged], scores: Mapping[str, RangeScore]) 
                 nees = min(score.by_distance[bin_].nees, below.y_range[1])
                 style = "s2" if name == "start" else "s5"
                 drawing.dot(below.x(middle), below.y(nees), 4.0, f"fill {style}", bin_)
-    drawing.legend(10, 14, [("line s2", "to the start"), ("line s5", "to the end"),
-                            ("bandkey", "claimed 2 sigma" if few else "rms error")])  # fmt: skip
+    drawing.legend(
+        10,
+        14,
+        [
+            ("line s2", "to the start"),
+            ("line s5", "to the end"),
+            ("bandkey", "claimed 2 sigma" if few else "rms error"),
+        ],
+    )
     return drawing.svg()
 
 
@@ -197,8 +224,9 @@ def _traces(drawing: Drawing, panel: Panel, one: RangeJudged, style: str) -> Non
         mine = one.approach == number
         two_sd = np.minimum(2.0 * np.sqrt(one.var_m2[mine]), high)
         drawing.band(panel, one.true_m[mine], -two_sd, two_sd, f"band {style}")
-        drawing.curve(panel, one.true_m[mine], np.clip(one.error_m[mine], low, high),
-                      f"line {style}")  # fmt: skip
+        drawing.curve(
+            panel, one.true_m[mine], np.clip(one.error_m[mine], low, high), f"line {style}"
+        )
 
 
 def _bins(drawing: Drawing, panel: Panel, score: RangeScore, style: str) -> None:
@@ -226,10 +254,12 @@ def draw_reliability(belief: Mapping[str, BeliefScore]) -> Markup:
     """How often a feature is there against how probable it was held; bars are 95 % intervals."""
     panel = Panel(40, 46, 300, 260, (0.0, 1.0), (0.0, 1.0))
     drawing = Drawing(
-        panel.right + 20, panel.bottom + 38, "Reliability",
+        panel.right + 20,
+        panel.bottom + 38,
+        "Reliability",
         "Share of steps in which a feature was there, for ten bins of its stated probability; "
         "points on the diagonal are honest.",
-    )  # fmt: skip
+    )
     drawing.axes(panel, "stated probability", "share that is so")
     drawing.rule(panel.x(0), panel.y(0), panel.x(1), panel.y(1), "line dash")
     most = max((one.steps for score in belief.values() for one in score.reliability), default=1)
@@ -237,13 +267,19 @@ def draw_reliability(belief: Mapping[str, BeliefScore]) -> Markup:
         for one in score.reliability:
             # A little apart, so that features do not hide each other.
             x = panel.x(one.mean_probability) + 3.0 * (place - 1.5)
-            low, high = interval(one.there.low, one.there.high,
-                                 one.there.clusters_low, one.there.clusters_high)  # fmt: skip
+            low, high = interval(
+                one.there.low, one.there.high, one.there.clusters_low, one.there.clusters_high
+            )
             drawing.rule(x, panel.y(low), x, panel.y(high), f"line {style_of(name)}")
             radius = 2.0 + 4.0 * math.sqrt(one.steps / most)
             hint = f"{name}: {one.steps} steps, stated {one.mean_probability:.2f}, so in "
-            drawing.dot(x, panel.y(one.there.value), radius, f"fill {style_of(name)}",
-                        f"{hint}{one.there.value:.2f}")  # fmt: skip
+            drawing.dot(
+                x,
+                panel.y(one.there.value),
+                radius,
+                f"fill {style_of(name)}",
+                f"{hint}{one.there.value:.2f}",
+            )
     drawing.legend(8, 14, [(f"fill {style_of(name)}", name) for name in belief])
     return drawing.svg()
 

@@ -128,17 +128,23 @@ def _ends(one: Share) -> tuple[float, float]:
 
 def _approaches(one: ApproachScore) -> list[str]:
     lines = [
-        _line("approaches", f"{one.approaches} true, the runs know {one.matched}; extra "
-              f"{one.extra} ({one.extra_detected} believed), in pieces {one.splits}"),
+        _line(
+            "approaches",
+            f"{one.approaches} true, the runs know {one.matched}; extra "
+            f"{one.extra} ({one.extra_detected} believed), in pieces {one.splits}",
+        ),
         _line("detected", _distance(one.detected, one.detected_m)),
         _line("in full", _distance(one.full, one.full_m)),
-    ]  # fmt: skip
+    ]
     if one.false_by_feature:
         told = ", ".join(f"{name} {n}" for name, n in one.false_by_feature.items())
         lines.append(
-            _line("false", f"absent features believed in {one.false_features.right} of "
-                           f"{one.false_features.of} approaches: {told}")
-        )  # fmt: skip
+            _line(
+                "false",
+                f"absent features believed in {one.false_features.right} of "
+                f"{one.false_features.of} approaches: {told}",
+            )
+        )
     for what, reasons in one.failures.items():
         for reason, count in reasons.items():
             lines.append(_line("failed", f"{what}: {count} {reason}"))
@@ -195,8 +201,11 @@ def _number(value: float, digits: int = 3) -> str:
 def headline(name: str, values: Mapping[str, MetricValue]) -> str:
     """One line for one drive of many."""
     parts = []
-    for label, path in (("detected", "approaches.detected_m"), ("in full", "approaches.full_m"),
-                        ("pose", "pose.ape.none.translation_m.rmse")):  # fmt: skip
+    for label, path in (
+        ("detected", "approaches.detected_m"),
+        ("in full", "approaches.full_m"),
+        ("pose", "pose.ape.none.translation_m.rmse"),
+    ):
         value = values[path].value if path in values else math.nan
         if not math.isnan(value):
             parts.append(f"{label} {value:.1f} m")

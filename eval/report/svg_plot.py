@@ -123,9 +123,10 @@ class Drawing:
         for part in _finite_parts(np.asarray(x, np.float64), np.asarray(y, np.float64)):
             places = [(_n(panel.x(a)), _n(panel.y(b))) for a, b in part]
             kept = [
-                p for i, p in enumerate(places)
+                p
+                for i, p in enumerate(places)
                 if i in (0, len(places) - 1) or not places[i - 1] == p == places[i + 1]
-            ]  # fmt: skip
+            ]
             path = " ".join(f"{a},{b}" for a, b in kept)
             self._parts.append(f'<polyline points="{path}" class="{style}"/>')
 

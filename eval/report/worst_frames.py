@@ -87,13 +87,18 @@ def _wrong(scored: RunScored) -> list[WorstFrame]:
         sure = [_confidence(scores.get(int(cue.t_ns[i]), []), labels) for i in rows]
         at = int(rows[int(np.argmax([-1.0 if value is None else value for value in sure]))])
         true = int(cue.true_count[at])
-        found.append(WorstFrame(
-            run=scored.judged.coverage.drive, t_ns=int(cue.t_ns[at]), cue=cue.cue,
-            count=int(cue.count[at]), true_count=None if true < 0 else true,
-            distance_m=float(cue.distance_m[at]),
-            confidence=max((value for value in sure if value is not None), default=None),
-            frames=len(rows),
-        ))  # fmt: skip
+        found.append(
+            WorstFrame(
+                run=scored.judged.coverage.drive,
+                t_ns=int(cue.t_ns[at]),
+                cue=cue.cue,
+                count=int(cue.count[at]),
+                true_count=None if true < 0 else true,
+                distance_m=float(cue.distance_m[at]),
+                confidence=max((value for value in sure if value is not None), default=None),
+                frames=len(rows),
+            )
+        )
     return found
 
 
@@ -160,10 +165,13 @@ def _drawn(picture: Encoded, one: WorstFrame, rows: Sequence[Mapping[str, Any]])
     size = (pixels.shape[1], pixels.shape[0])
     boxes = np.array([[row[k] for k in ("x0", "y0", "x1", "y1")] for row in rows], np.float64)
     found = Detections(
-        one.t_ns, size, boxes.reshape(-1, 4) * (size[0] / whole[0]),
+        one.t_ns,
+        size,
+        boxes.reshape(-1, 4) * (size[0] / whole[0]),
         np.array([row["score"] for row in rows], np.float64),
-        tuple(row["label"] for row in rows), (b"",) * len(rows),
-    )  # fmt: skip
+        tuple(row["label"] for row in rows),
+        (b"",) * len(rows),
+    )
     cues = FrameCues({one.cue: one.count}, None)
     canvas = draw(pixels, FrameResult(one.t_ns, size, picture, (found,)), cues)
     ok, jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])

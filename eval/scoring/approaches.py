@@ -246,9 +246,14 @@ def _steps_of(belief: BeliefRows, number: int | None, approach: Approach) -> Bel
 
 
 def _result(
-    one: Approach, steps: BeliefRows, number: int | None, splits: int,
-    tables: RunTables, truth: DriveTruth, threshold: float,
-) -> ApproachResult:  # fmt: skip
+    one: Approach,
+    steps: BeliefRows,
+    number: int | None,
+    splits: int,
+    tables: RunTables,
+    truth: DriveTruth,
+    threshold: float,
+) -> ApproachResult:
     present = tuple(name for name in FEATURES if has_feature(one, name))
     absent = tuple(name for name in FEATURES if has_feature(one, name) is False)
     above = {name: values > threshold for name, values in steps.features.items()}
@@ -330,9 +335,12 @@ def _curve(one: Approach, steps: BeliefRows, truth: DriveTruth) -> Curve:
 
 
 def _extras(
-    belief: BeliefRows, spans: Mapping[int, tuple[int, int]], pairs: Mapping[int, int],
-    truth: DriveTruth, threshold: float,
-) -> tuple[int, int, int]:  # fmt: skip
+    belief: BeliefRows,
+    spans: Mapping[int, tuple[int, int]],
+    pairs: Mapping[int, int],
+    truth: DriveTruth,
+    threshold: float,
+) -> tuple[int, int, int]:
     """Extra approaches, those of them that were detected, those outside the truth's time."""
     extra = detected = outside = 0
     for number, (first, last) in spans.items():
@@ -356,12 +364,14 @@ def score_approaches(judged: Sequence[ApproachesJudged], seed: int = 0) -> Appro
     return ApproachScore(
         approaches=len(results),
         matched=sum(one.run_approach is not None for one in results),
-        without_range=sum(_is_unknown(one.detected_m) or _is_unknown(one.full_m)
-                          for one in results),
+        without_range=sum(
+            _is_unknown(one.detected_m) or _is_unknown(one.full_m) for one in results
+        ),
         detected=_share([one.detected_m is not None for one in results]),
         full=_share([one.full_m is not None for one in results]),
-        full_from_8_m=_share([(one.full_m or 0.0) >= NEAR_M for one in results
-                              if not _is_unknown(one.full_m)]),
+        full_from_8_m=_share(
+            [(one.full_m or 0.0) >= NEAR_M for one in results if not _is_unknown(one.full_m)]
+        ),
         detected_m=_mean([one.detected_m for one in results], seed),
         full_m=_mean([one.full_m for one in results], seed),
         false_features=_share([bool(one.false_features) for one in results]),
@@ -375,12 +385,18 @@ def score_approaches(judged: Sequence[ApproachesJudged], seed: int = 0) -> Appro
             "detected": _counts([one.why_not_detected for one in results]),
             "full": _counts([one.why_not_full for one in results]),
         },
-        by_intersection=_groups({one.intersection for one in results}, results,
-                                lambda name, one: one.intersection == name),
-        by_condition=_groups({tag for one in results for tag in one.conditions}, results,
-                             lambda tag, one: tag in one.conditions),
+        by_intersection=_groups(
+            {one.intersection for one in results},
+            results,
+            lambda name, one: one.intersection == name,
+        ),
+        by_condition=_groups(
+            {tag for one in results for tag in one.conditions},
+            results,
+            lambda tag, one: tag in one.conditions,
+        ),
         results=results,
-    )  # fmt: skip
+    )
 
 
 def _is_unknown(distance_m: float | None) -> bool:

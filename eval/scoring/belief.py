@@ -149,9 +149,16 @@ def judge_belief(tables: RunTables, truth: DriveTruth) -> list[BeliefJudged]:
         if silent:
             left_out[SILENT] = silent
         judged.append(
-            BeliefJudged(truth.drive, name, belief.t_ns[left], at[left], values[left],
-                         label[left] == 1, left_out)
-        )  # fmt: skip
+            BeliefJudged(
+                truth.drive,
+                name,
+                belief.t_ns[left],
+                at[left],
+                values[left],
+                label[left] == 1,
+                left_out,
+            )
+        )
     return judged
 
 
@@ -231,13 +238,19 @@ def compare_belief(
     first: Sequence[BeliefJudged], second: Sequence[BeliefJudged], seed: int = 0
 ) -> dict[str, BeliefDifference]:
     """Two fusions over the same drives, feature by feature, on the steps that both have."""
-    names = [name for name in dict.fromkeys(one.feature for one in first)
-             if name in {one.feature for one in second}]  # fmt: skip
+    names = [
+        name
+        for name in dict.fromkeys(one.feature for one in first)
+        if name in {one.feature for one in second}
+    ]
     return {
-        name: _difference([one for one in first if one.feature == name],
-                          [one for one in second if one.feature == name], seed)
+        name: _difference(
+            [one for one in first if one.feature == name],
+            [one for one in second if one.feature == name],
+            seed,
+        )
         for name in names
-    }  # fmt: skip
+    }
 
 
 def _difference(

@@ -259,15 +259,20 @@ def has_feature(approach: Approach, feature: str) -> bool | None:
     """Whether an approach's intersection has a feature; None for one that truth does not know."""
     if feature == "intersection":
         return True
-    there = {"left": approach.features.left, "right": approach.features.right,
-             "straight": approach.features.straight}  # fmt: skip
+    there = {
+        "left": approach.features.left,
+        "right": approach.features.right,
+        "straight": approach.features.straight,
+    }
     return there.get(feature)
 
 
 def _reasons(
-    has_truth: NDArray[np.bool_], was_looked: NDArray[np.bool_],
-    is_told: NDArray[np.bool_], is_crossing: NDArray[np.bool_],
-) -> dict[str, int]:  # fmt: skip
+    has_truth: NDArray[np.bool_],
+    was_looked: NDArray[np.bool_],
+    is_told: NDArray[np.bool_],
+    is_crossing: NDArray[np.bool_],
+) -> dict[str, int]:
     """Why frames are not scored; each has one reason, the first that holds."""
     reasons = {
         "outside the truth's time": ~is_told & ~has_truth,
@@ -329,9 +334,7 @@ def score_cues(
     return {cue: _score(cue, rows, bins_m, seed) for cue, rows in by_cue.items()}
 
 
-def _score(
-    cue: str, rows: Sequence[CueJudged], bins_m: Sequence[float], seed: int
-) -> CueScore:  # fmt: skip
+def _score(cue: str, rows: Sequence[CueJudged], bins_m: Sequence[float], seed: int) -> CueScore:
     pooled = _Pooled(rows)
     readings: dict[Reading, Judgement] = {
         reading: _judgement(pooled, reading, bins_m, seed) for reading in ("object", "feature")
@@ -352,9 +355,7 @@ def _score(
     )
 
 
-def _judgement(
-    pooled: _Pooled, reading: Reading, bins_m: Sequence[float], seed: int
-) -> Judgement:  # fmt: skip
+def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float], seed: int) -> Judgement:
     truth = pooled.ints("is_object" if reading == "object" else "is_feature")
     left_out = summed(one.left_out[reading] for one in pooled.rows)
     frames = sum(one.frames for one in pooled.rows)

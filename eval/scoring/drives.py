@@ -168,8 +168,11 @@ def _not_scored(tables: RunTables, truth: DriveTruth) -> dict[str, str]:
         found["cues"] = "the run has no cues"
     elif not told.cues and not told.approaches:
         found["cues"] = "the truth tells neither cues nor approaches"
-    for section, table in (("approaches", tables.belief), ("belief", tables.belief),
-                           ("range", tables.ranges)):  # fmt: skip
+    for section, table in (
+        ("approaches", tables.belief),
+        ("belief", tables.belief),
+        ("range", tables.ranges),
+    ):
         if table is None:
             what = "range" if section == "range" else "belief"
             found[section] = f"the run has no {what}"
@@ -216,8 +219,10 @@ def as_metrics(scores: Scores) -> dict[str, Any]:
             "not_scored": scores.not_scored(),
             "by_drive": tree["drives"],
         },
-        "settings": tree["settings"] | {
-            "confidence": intervals.CONFIDENCE, "resampling_rounds": intervals.ROUNDS,
+        "settings": tree["settings"]
+        | {
+            "confidence": intervals.CONFIDENCE,
+            "resampling_rounds": intervals.ROUNDS,
             "log_score_clip": score_belief.CLIP,
             "crossing_s": score_truth.CROSSING_NS * 1e-9,
         },
@@ -225,4 +230,4 @@ def as_metrics(scores: Scores) -> dict[str, Any]:
         "approaches": tree["approaches"],
         "belief": tree["belief"],
         "range": tree["range"],
-    }  # fmt: skip
+    }

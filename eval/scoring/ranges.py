@@ -106,10 +106,18 @@ def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
         }
         mine, left_out = first_reasons(mine, reasons)
         judged.append(
-            RangeJudged(truth.drive, reference, rows.t_ns[mine], at[mine], true_m[mine],
-                        rows.range_m[mine] - true_m[mine], rows.var_m2[mine], left_out,
-                        controls)
-        )  # fmt: skip
+            RangeJudged(
+                truth.drive,
+                reference,
+                rows.t_ns[mine],
+                at[mine],
+                true_m[mine],
+                rows.range_m[mine] - true_m[mine],
+                rows.var_m2[mine],
+                left_out,
+                controls,
+            )
+        )
     return judged
 
 

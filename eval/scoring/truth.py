@@ -153,9 +153,11 @@ def _read_ranges(path: Path, truth: Truth) -> TrueRanges:
     rows.sort()
     t_ns, approach, start, end = zip(*rows, strict=True) if rows else ((), (), (), ())
     return TrueRanges(
-        np.array(t_ns, np.int64), np.array(approach, np.int64),
-        np.array(start, np.float64), np.array(end, np.float64),
-    )  # fmt: skip
+        np.array(t_ns, np.int64),
+        np.array(approach, np.int64),
+        np.array(start, np.float64),
+        np.array(end, np.float64),
+    )
 
 
 def _range_row(row: dict[str, str], known: set[int], where: str) -> tuple[int, int, float, float]:

@@ -140,9 +140,14 @@ class OrbMatcher:
                 centre = np.array([cx, cy], np.float32)
                 same = np.eye(3)
                 _, mask = cv2.findEssentialMat(
-                    (here - centre) / np.float32(focal), (there - centre) / np.float32(focal),
-                    same, same, np.zeros(4), np.zeros(4), params,
-                )  # fmt: skip
+                    (here - centre) / np.float32(focal),
+                    (there - centre) / np.float32(focal),
+                    same,
+                    same,
+                    np.zeros(4),
+                    np.zeros(4),
+                    params,
+                )
         except cv2.error:
             # Points on one spot or line: no such geometry, hence nothing that agrees.
             return 0

@@ -281,9 +281,17 @@ def drive_one(p: Parameters, seed: np.uint64, row: Floats, log: Log) -> None:
             landmark = _landmark_at(targets.landmarks, route.node)
             if landmark != NONE:
                 belief, tally, noise = _pass_landmark(
-                    p, streets, targets.landmarks, landmark, vehicle, belief, tally, noise, log,
+                    p,
+                    streets,
+                    targets.landmarks,
+                    landmark,
+                    vehicle,
+                    belief,
+                    tally,
+                    noise,
+                    log,
                     steps,
-                )  # fmt: skip
+                )
             route = enter(p, streets, route, arcs)
     _finish(p, row, vehicle, belief, tally, steps)
 
@@ -370,8 +378,17 @@ def _first_belief(p: Parameters, vehicle: Vehicle, noise: Stream) -> tuple[State
         vehicle.y_m + p.start_position_sd_m * y_error,
         wrap(vehicle.heading_rad + p.start_heading_sd_rad * heading_error),
         vehicle.speed_mps,
-        position_var, 0.0, 0.0, 0.0, position_var, 0.0, 0.0, heading_var, 0.0, p.speed_sd_mps**2,
-    )  # fmt: skip
+        position_var,
+        0.0,
+        0.0,
+        0.0,
+        position_var,
+        0.0,
+        0.0,
+        heading_var,
+        0.0,
+        p.speed_sd_mps**2,
+    )
     return belief, noise
 
 
@@ -462,10 +479,19 @@ def _target(
 def _decided(tally: Tally, turn: int) -> Tally:
     t = tally
     return Tally(
-        t.passed, t.detected, t.refused, t.decisions + 1, t.turns + int(turn != STRAIGHT), t.goals,
-        t.first_goal_m, t.first_goal_axis_m, t.goal_error_m, t.furthest_m, t.longest_gap_m,
+        t.passed,
+        t.detected,
+        t.refused,
+        t.decisions + 1,
+        t.turns + int(turn != STRAIGHT),
+        t.goals,
+        t.first_goal_m,
+        t.first_goal_axis_m,
+        t.goal_error_m,
+        t.furthest_m,
+        t.longest_gap_m,
         t.last_fix_m,
-    )  # fmt: skip
+    )
 
 
 def _pass_landmark(

@@ -276,11 +276,23 @@ def _message(parsed: _Message, found: _Found) -> CanMessage:
         multiplexer, branches = _branch(one, only, switches)
         signals.append(
             CanSignal(
-                one.name, one.start, one.length, one.is_big_endian, one.is_signed, is_float, scale,
-                offset, one.unit, one.minimum, one.maximum, choices or {},
-                one.marker.endswith("M"), multiplexer, branches,
+                one.name,
+                one.start,
+                one.length,
+                one.is_big_endian,
+                one.is_signed,
+                is_float,
+                scale,
+                offset,
+                one.unit,
+                one.minimum,
+                one.maximum,
+                choices or {},
+                one.marker.endswith("M"),
+                multiplexer,
+                branches,
             )
-        )  # fmt: skip
+        )
     signals.sort(key=lambda signal: signal.first_bit)
     return CanMessage(
         name=parsed.name,

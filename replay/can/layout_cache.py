@@ -145,16 +145,35 @@ def _version_of_cantools() -> str:
 def _row(message: CanMessage) -> list[Any]:
     signals = [
         [
-            s.name, s.start, s.length, s.is_big_endian, s.is_signed, s.is_float, s.scale, s.offset,
-            s.unit, s.minimum, s.maximum, list(s.choices.items()), s.is_multiplexer, s.multiplexer,
+            s.name,
+            s.start,
+            s.length,
+            s.is_big_endian,
+            s.is_signed,
+            s.is_float,
+            s.scale,
+            s.offset,
+            s.unit,
+            s.minimum,
+            s.maximum,
+            list(s.choices.items()),
+            s.is_multiplexer,
+            s.multiplexer,
             sorted(s.branches),
         ]
         for s in message.signals
-    ]  # fmt: skip
+    ]
     return [
-        message.name, message.arbitration_id, message.is_extended, message.length, signals,
-        message.is_fd, message.topic, message.problem, message.source,
-    ]  # fmt: skip
+        message.name,
+        message.arbitration_id,
+        message.is_extended,
+        message.length,
+        signals,
+        message.is_fd,
+        message.topic,
+        message.problem,
+        message.source,
+    ]
 
 
 def _message(

@@ -103,9 +103,13 @@ class PacketDecoder:
         buffer = np.concatenate([np.asarray(picture, np.uint8).ravel() for picture in pixels])
         sizes = np.array([picture.shape[:2] for picture in pixels], np.int32)
         images = Images(
-            Messages(buffer, start, stop), ("raw",) * len(frames), sizes[:, 1], sizes[:, 0],
-            3 * sizes[:, 1], ("bgr8",) * len(frames),
-        )  # fmt: skip
+            Messages(buffer, start, stop),
+            ("raw",) * len(frames),
+            sizes[:, 1],
+            sizes[:, 0],
+            3 * sizes[:, 1],
+            ("bgr8",) * len(frames),
+        )
         return Block(self._topic, np.array([frame.pts for frame in frames], np.int64), images)
 
 

@@ -62,8 +62,11 @@ _XY: Final = frozenset({"x_m", "y_m"})
 def _imu_rest(columns: Columns, size: int) -> Columns:
     """Say which of the three estimates there are."""
     rest: dict[str, NDArray[np.generic]] = {}
-    for name, field in (("quat_w", "orientation"), ("gyro_x_radps", "angular_velocity"),
-                        ("accel_x_mps2", "linear_acceleration")):  # fmt: skip
+    for name, field in (
+        ("quat_w", "orientation"),
+        ("gyro_x_radps", "angular_velocity"),
+        ("accel_x_mps2", "linear_acceleration"),
+    ):
         if name not in columns or np.isnan(columns[name].astype(np.float64)).all():
             covariance = np.zeros((size, 9))
             covariance[:, 0] = ABSENT

@@ -30,9 +30,14 @@ class MobileyeStream:
     """Reads one device, from frames of its bus or from messages, a block at a time."""
 
     def __init__(
-        self, bus: str, ledger: Ledger, section: Mobileye, types: Mapping[str, str], *,
+        self,
+        bus: str,
+        ledger: Ledger,
+        section: Mobileye,
+        types: Mapping[str, str],
+        *,
         is_shared_bus: bool,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Prepare.
 
         Args:

@@ -85,9 +85,11 @@ class _WheelRuns:
             if self._is_stray(begin):
                 continue
             era = bisect_right(self.watch.set_backs, begin, key=attrgetter("row"))
-            part = block if (begin, end) == (first, stop) else block.take(
-                slice(begin - first, end - first)
-            )  # fmt: skip
+            part = (
+                block
+                if (begin, end) == (first, stop)
+                else block.take(slice(begin - first, end - first))
+            )
             for samples in self.extractor(part):
                 self._see(samples, era)
 
@@ -309,11 +311,19 @@ def _segments(
                 continue
             first_ns, last_ns = one.first_ns[number], one.last_ns[number]
             event = one.events[number - 1]
-            found.append(Segment(
-                0, epoch.begins_ns, first_ns + epoch.shift_ns, last_ns + epoch.shift_ns, first_ns,
-                last_ns, Cause.SET_BACK, by_ns=event.after_ns - event.before_ns,
-                breaks_odometry=False,
-            ))  # fmt: skip
+            found.append(
+                Segment(
+                    0,
+                    epoch.begins_ns,
+                    first_ns + epoch.shift_ns,
+                    last_ns + epoch.shift_ns,
+                    first_ns,
+                    last_ns,
+                    Cause.SET_BACK,
+                    by_ns=event.after_ns - event.before_ns,
+                    breaks_odometry=False,
+                )
+            )
     found.sort(key=lambda segment: segment.begins_ns)
     return tuple(replace(segment, number=number) for number, segment in enumerate(found))
 
@@ -343,24 +353,40 @@ def _of_wheels(
         epoch = clock.epochs[number]
         first_ns, last_ns = run.first_ns + epoch.shift_ns, run.last_ns + epoch.shift_ns
         if not found:
-            found.append(Segment(
-                0, BEGINNING, first_ns, last_ns, run.first_ns, run.last_ns, Cause.START
-            ))  # fmt: skip
+            found.append(
+                Segment(0, BEGINNING, first_ns, last_ns, run.first_ns, run.last_ns, Cause.START)
+            )
         elif number != epoch_before:
             event = one.events[number - 1]
-            found.append(Segment(
-                0, epoch.begins_ns, first_ns, last_ns, run.first_ns, run.last_ns, Cause.SET_BACK,
-                by_ns=event.after_ns - event.before_ns,
-            ))  # fmt: skip
+            found.append(
+                Segment(
+                    0,
+                    epoch.begins_ns,
+                    first_ns,
+                    last_ns,
+                    run.first_ns,
+                    run.last_ns,
+                    Cause.SET_BACK,
+                    by_ns=event.after_ns - event.before_ns,
+                )
+            )
         elif first_ns - found[-1].end_ns <= limit_ns:
             end_ns = max(found[-1].end_ns, last_ns)
             found[-1] = replace(found[-1], end_ns=end_ns, log_end_ns=end_ns - epoch.shift_ns)
         else:
             end_ns = found[-1].end_ns
             begins_ns = max(end_ns + 1, first_ns - limit_ns)
-            found.append(Segment(
-                0, begins_ns, first_ns, last_ns, run.first_ns, run.last_ns, Cause.SILENCE,
-                gap_ns=first_ns - end_ns,
-            ))  # fmt: skip
+            found.append(
+                Segment(
+                    0,
+                    begins_ns,
+                    first_ns,
+                    last_ns,
+                    run.first_ns,
+                    run.last_ns,
+                    Cause.SILENCE,
+                    gap_ns=first_ns - end_ns,
+                )
+            )
         epoch_before = number
     return found

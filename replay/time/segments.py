@@ -181,7 +181,7 @@ def timeline_of(told: Mapping[str, Any] | None) -> Timeline:
     return Timeline(
         tuple(Segment(**(one | {"cause": Cause(one["cause"])})) for one in told["segments"]),
         tuple(_clock_of(clock) for clock in told["clocks"]),
-    )  # fmt: skip
+    )
 
 
 def _clock_of(told: Mapping[str, Any]) -> LogClock:
@@ -233,10 +233,12 @@ class TimedLog:
         if not is_stray.any():
             return placed
         ledger.skip(
-            block.topic, STRAY_STAMP, int(is_stray.sum()),
+            block.topic,
+            STRAY_STAMP,
+            int(is_stray.sum()),
             "far from the stamps of the rows before and after it",
             int(block.log_ns[is_stray][0]),
-        )  # fmt: skip
+        )
         ledger.notice(
             f"{block.topic}: rows whose time stamp lies far from those around it were skipped"
         )

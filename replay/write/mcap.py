@@ -215,9 +215,12 @@ class McapWriter:
             )
         stored = self._compress(records)
         head = struct.pack(
-            "<QQQI", int(rows.log_ns.min()), int(rows.log_ns.max()), len(records),
+            "<QQQI",
+            int(rows.log_ns.min()),
+            int(rows.log_ns.max()),
+            len(records),
             crc32(records),
-        )  # fmt: skip
+        )
         head += _text(self._compression) + struct.pack("<Q", len(stored))
         whole = struct.pack("<BQ", CHUNK, len(head) + len(stored)) + head
         return _Packed(rows, whole, stored, len(records))
@@ -285,12 +288,19 @@ class McapWriter:
         counts = b"".join(struct.pack("<HQ", *pair) for pair in sorted(summary.counts.items()))
         return (
             struct.pack(
-                "<QHIIIIQQ", summary.counts.total(), len(summary.schemas), len(summary.channels),
-                0, 0, len(summary.chunks), summary.first_ns or 0, summary.last_ns,
+                "<QHIIIIQQ",
+                summary.counts.total(),
+                len(summary.schemas),
+                len(summary.channels),
+                0,
+                0,
+                len(summary.chunks),
+                summary.first_ns or 0,
+                summary.last_ns,
             )
             + struct.pack("<I", len(counts))
             + counts
-        )  # fmt: skip
+        )
 
     def _guarded(self, step: Callable[[], None]) -> None:
         try:

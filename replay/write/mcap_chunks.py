@@ -96,8 +96,9 @@ def merged(stretches: Sequence[Stretch], chunk_bytes: int) -> Iterator[ChunkRows
     at = 0
     for stretch, count in zip(stretches, counts, strict=True):
         place = begins[at : at + count] + HEAD.itemsize
-        copy_ranges(records, place, stretch.messages.buffer, stretch.messages.start,
-                    sizes[at : at + count])  # fmt: skip
+        copy_ranges(
+            records, place, stretch.messages.buffer, stretch.messages.start, sizes[at : at + count]
+        )
         at += count
     yield from _cut(records, channel[order], log[order], begins[order], ends, chunk_bytes)
 

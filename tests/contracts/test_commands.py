@@ -121,8 +121,11 @@ def test_no_stream_that_is_gone_or_full_brings_a_traceback(
     )
     done = subprocess.run(
         ["bash", "-c", f"exec 9>{tmp_path / 'status'}\n{line}"],
-        capture_output=True, text=True, check=False, timeout=60,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
 
     assert "Traceback" not in done.stderr
     assert "Exception ignored" not in done.stderr

@@ -51,10 +51,15 @@ def test_a_log_cut_in_the_middle(
 
 @pytest.mark.parametrize(
     "flags",
-    ["replay -o {out} --vehicle {car}", "replay -o {out} --vehicle {car} --topics /can",
-     "replay -o {out} --vehicle {car} --to 5", "decode -o {out} --topics /can",
-     "convert -o {out}.mcap --topics /can", "fit compass --vehicle {car}"],
-)  # fmt: skip
+    [
+        "replay -o {out} --vehicle {car}",
+        "replay -o {out} --vehicle {car} --topics /can",
+        "replay -o {out} --vehicle {car} --to 5",
+        "decode -o {out} --topics /can",
+        "convert -o {out}.mcap --topics /can",
+        "fit compass --vehicle {car}",
+    ],
+)
 def test_a_log_cut_before_its_first_topic_is_unreadable_and_not_wrong_usage(
     drive: DriveFiles, flags: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -62,11 +62,16 @@ def test_a_vehicle_file_of_another_car_is_no_empty_run(
     drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     dbc = next(drive.vehicle.parent.glob("*.dbc")).read_text()
-    (tmp_path / "other.dbc").write_text("\n".join(
-        f"BO_ {int(line.split()[1]) ^ 0x400} {line.split(maxsplit=2)[2]}"
-        if line.startswith("BO_ ") else line
-        for line in dbc.splitlines() if line.startswith(("VERSION", "BO_ ", " SG_", "BU_"))
-    ) + "\n")  # fmt: skip
+    (tmp_path / "other.dbc").write_text(
+        "\n".join(
+            f"BO_ {int(line.split()[1]) ^ 0x400} {line.split(maxsplit=2)[2]}"
+            if line.startswith("BO_ ")
+            else line
+            for line in dbc.splitlines()
+            if line.startswith(("VERSION", "BO_ ", " SG_", "BU_"))
+        )
+        + "\n"
+    )
     text = drive.vehicle.read_text()
     name = next(drive.vehicle.parent.glob("*.dbc")).name
     (tmp_path / "car.toml").write_text(text.replace(name, "other.dbc"))

@@ -35,15 +35,16 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def coco(**changes: Any) -> dict[str, Any]:
     """Frames 1 and 3; a stop sign in 1, a car in each."""
     tree: dict[str, Any] = {
-        "images": [{"id": n, "file_name": f"{n:06d}.png", "width": WIDE, "height": HIGH}
-                   for n in (1, 3)],
+        "images": [
+            {"id": n, "file_name": f"{n:06d}.png", "width": WIDE, "height": HIGH} for n in (1, 3)
+        ],
         "categories": [{"id": 13, "name": "stop sign"}, {"id": 3, "name": "car"}],
         "annotations": [
             {"id": 1, "image_id": 1, "category_id": 13, "bbox": [5, 5, 10, 10], "visible": 0.5},
             {"id": 2, "image_id": 1, "category_id": 3, "bbox": [20, 5, 30.5, 10]},
             {"id": 3, "image_id": 3, "category_id": 3, "bbox": [20, 5, 30.5, 10]},
         ],
-    }  # fmt: skip
+    }
     return tree | changes
 
 
@@ -85,8 +86,10 @@ def test_what_was_imported_can_be_imported_again(tmp_path: Path, log: Path) -> N
 
     first, second = load(tmp_path), load(tmp_path / "again")
     assert first.cues == second.cues
-    before, after = (json.loads((folder / "objects.json").read_text())
-                     for folder in (tmp_path, tmp_path / "again"))  # fmt: skip
+    before, after = (
+        json.loads((folder / "objects.json").read_text())
+        for folder in (tmp_path, tmp_path / "again")
+    )
     assert before["annotations"] == after["annotations"]
 
 
@@ -222,8 +225,11 @@ def test_labels_mean_what_the_user_says(
     assert _import(source, log, tmp_path / "t.json", "--map", "halt = stop=stop_sign", "dog=") == 0
     assert {one.cue for one in load(tmp_path / "t.json").cues} == {"stop_sign"}
     assert cli.run(["truth", "check", str(tmp_path / "t.json"), "--log", str(log), "-q"]) == 0
-    for own, said in (("cat=stop_sign", "no such label"), ("dog=sing", "no such cue"),
-                      ("dog", "want LABEL=CUE")):  # fmt: skip
+    for own, said in (
+        ("cat=stop_sign", "no such label"),
+        ("dog=sing", "no such cue"),
+        ("dog", "want LABEL=CUE"),
+    ):
         assert _import(source, log, tmp_path / "u.json", "--map", own) == 2
         assert said in _refused(capsys)
 
@@ -243,8 +249,9 @@ def test_a_cue_of_ones_own_is_told_as_the_vehicle_file_names_it(
     truth = load(path)
     assert truth.own_cues == ("zebra_crossing",)
     assert {(one.cue, one.present) for one in truth.cues} == {
-        ("zebra_crossing", True), ("zebra_crossing", False)
-    }  # fmt: skip
+        ("zebra_crossing", True),
+        ("zebra_crossing", False),
+    }
     assert cli.run(["truth", "check", str(path), "--log", str(log), "-q"]) == 0
 
 
@@ -276,12 +283,17 @@ def test_cvat_for_images(tmp_path: Path, log: Path, capsys: pytest.CaptureFixtur
     assert "not taken  1 polyline" in capsys.readouterr().out
     found = {(one.cue, one.t_ns): one.present for one in load(tmp_path).cues}
     assert found == {
-        ("stop_sign", START_NS + STEP_NS): True, ("road_left", START_NS + STEP_NS): True,
-        ("stop_sign", START_NS + 3 * STEP_NS): False, ("road_left", START_NS + 3 * STEP_NS): False,
-    }  # fmt: skip
+        ("stop_sign", START_NS + STEP_NS): True,
+        ("road_left", START_NS + STEP_NS): True,
+        ("stop_sign", START_NS + 3 * STEP_NS): False,
+        ("road_left", START_NS + 3 * STEP_NS): False,
+    }
     things = json.loads((tmp_path / "objects.json").read_text())["annotations"]
     assert [thing["bbox"] for thing in things] == [
-        [5.0, 5.0, 10.0, 10.0], [20.0, 5.0, 30.5, 10.0], [2, 3, 4, 2]]  # fmt: skip
+        [5.0, 5.0, 10.0, 10.0],
+        [20.0, 5.0, 30.5, 10.0],
+        [2, 3, 4, 2],
+    ]
     assert things[1]["segmentation"] == [[20.0, 5.0, 50.5, 5.0, 50.5, 15.0]]
 
 
@@ -296,8 +308,10 @@ def _video(boxes: str, meta: str = "<start_frame>1</start_frame><stop_frame>5</s
 
 
 def _track_box(frame: int, outside: int = 0) -> str:
-    return (f'<box frame="{frame}" outside="{outside}" occluded="1" keyframe="1" xtl="1.5" '
-            'ytl="2" xbr="9" ybr="8"></box>')  # fmt: skip
+    return (
+        f'<box frame="{frame}" outside="{outside}" occluded="1" keyframe="1" xtl="1.5" '
+        'ytl="2" xbr="9" ybr="8"></box>'
+    )
 
 
 def test_cvat_for_video_counts_every_frame_of_its_task(tmp_path: Path, log: Path) -> None:
@@ -372,9 +386,14 @@ def _truth(**changes: Any) -> dict[str, Any]:
 
 
 def _approach(first_s: float, last_s: float, number: int = 0) -> dict[str, Any]:
-    return {"id": number, "intersection": "A", "control": "none",
-            "start_ns": START_NS + int(first_s * 1e9), "enter_ns": START_NS + int(last_s * 1e9),
-            "features": {"left": True, "right": True, "straight": True}}  # fmt: skip
+    return {
+        "id": number,
+        "intersection": "A",
+        "control": "none",
+        "start_ns": START_NS + int(first_s * 1e9),
+        "enter_ns": START_NS + int(last_s * 1e9),
+        "features": {"left": True, "right": True, "straight": True},
+    }
 
 
 LATE = {"end_ns": START_NS + 10**12}
@@ -386,17 +405,21 @@ LATE = {"end_ns": START_NS + 10**12}
         (_truth(start_ns=5, end_ns=9), "give the truth of this log"),
         (_truth(**LATE, approaches=[_approach(100, 200)]), "approach 0 from"),
         (_truth(approaches=[_approach(0, 0.3), _approach(0.2, 0.4, 1)]), "0 and 1 overlap"),
-        (_truth(**LATE, cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 10**11}]),
-         "cues.0 \\(stop_sign\\)"),
+        (
+            _truth(**LATE, cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 10**11}]),
+            "cues.0 \\(stop_sign\\)",
+        ),
         (_truth(cues=[{"cue": "stop_sing", "present": True, "t_ns": START_NS}]), "meant: stop_s"),
         (_truth(cues=[{"cue": "Zebra!", "present": True, "t_ns": START_NS}]), "cues.0.cue"),
-        (_truth(cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 7}]),
-         "at none of 1 moments"),
+        (
+            _truth(cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 7}]),
+            "at none of 1 moments",
+        ),
         (_truth(log_sha256={"a": "b"}), "by its hash"),
         (_truth(pose="../secret.tum"), "secret.tum"),
         (_truth(objects="gone.json"), "gone.json"),
     ],
-)  # fmt: skip
+)
 def test_truth_that_does_not_fit_its_log_is_refused(
     tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str], tree: dict[str, Any], said: str
 ) -> None:

@@ -251,9 +251,12 @@ def test_calibrated_scores_reach_the_detections() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(
-    st.integers(-20, 90), st.integers(-20, 60), st.integers(8, 120), st.integers(8, 90),
+    st.integers(-20, 90),
+    st.integers(-20, 60),
+    st.integers(8, 120),
+    st.integers(8, 90),
     st.floats(0.5, 1.0),
-)  # fmt: skip
+)
 def test_a_mask_laid_into_its_box_is_the_one_torchvision_pastes(
     x: int, y: int, width: int, height: int, fullness: float
 ) -> None:
@@ -491,18 +494,22 @@ def test_coco_weights_give_the_levels_that_torchvisions_own_network_gives(
     from torchvision.models import detection
 
     weights = getattr(detection, COCO_NETWORKS[name]).DEFAULT
-    make = {"resnet50": detection.maskrcnn_resnet50_fpn,
-            "resnet50-v2": detection.maskrcnn_resnet50_fpn_v2}[name]  # fmt: skip
+    make = {
+        "resnet50": detection.maskrcnn_resnet50_fpn,
+        "resnet50-v2": detection.maskrcnn_resnet50_fpn_v2,
+    }[name]
     with torch.device("meta"):
         empty = make(weights=None, weights_backbone=None).state_dict()
     torch.manual_seed(0)
     # Variances so small that an epsilon of 1e-5 is seen.
     state = {
-        key: torch.full(value.shape, 1e-4) if key.endswith("running_var")
-        else torch.zeros(value.shape, dtype=value.dtype) if "tracked" in key
+        key: torch.full(value.shape, 1e-4)
+        if key.endswith("running_var")
+        else torch.zeros(value.shape, dtype=value.dtype)
+        if "tracked" in key
         else torch.randn(value.shape) * 0.03
         for key, value in empty.items()
-    }  # fmt: skip
+    }
     monkeypatch.setattr(
         "torchvision.models._api.load_state_dict_from_url", lambda *args, **given: dict(state)
     )
@@ -537,9 +544,12 @@ def test_the_checkpoint_in_the_package_is_small_and_says_what_it_is() -> None:
 
 @pytest.mark.parametrize(
     ("layout", "x_m", "category", "label"),
-    [("A", -20.0, "stop_sign", "stop sign"), ("E", -25.0, "traffic_light", "traffic light"),
-     ("C", -15.0, "car", "car")],
-)  # fmt: skip
+    [
+        ("A", -20.0, "stop_sign", "stop sign"),
+        ("E", -25.0, "traffic_light", "traffic light"),
+        ("C", -15.0, "car", "car"),
+    ],
+)
 def test_the_checkpoint_in_the_package_sees_what_stands_at_intersections_it_never_saw(
     layout: str, x_m: float, category: str, label: str
 ) -> None:

@@ -115,10 +115,13 @@ def _told_by_torchvision(
     )
     masks = found["masks"][keep][:, 0].numpy()
     return Detections(
-        frame.t_ns, frame.size_px, boxes, found["scores"][keep].double().numpy(),
+        frame.t_ns,
+        frame.size_px,
+        boxes,
+        found["scores"][keep].double().numpy(),
         tuple(str(plan.classes[i - 1]) for i in found["labels"][keep].tolist()),
         tuple(laid_in(m, b, frame.size_px) for m, b in zip(masks, boxes, strict=True)),
-    )  # fmt: skip
+    )
 
 
 def _assert_equal(ours: Detections, theirs: Detections) -> None:
@@ -203,8 +206,14 @@ def test_identity_tells_back_ends_apart() -> None:
 
 
 @settings(max_examples=10, deadline=None)
-@given(st.integers(48, 80), st.integers(48, 80), st.integers(1, 40), st.integers(1, 40),
-       st.integers(1, 2), st.booleans())  # fmt: skip
+@given(
+    st.integers(48, 80),
+    st.integers(48, 80),
+    st.integers(1, 40),
+    st.integers(1, 40),
+    st.integers(1, 2),
+    st.booleans(),
+)
 def test_winograds_way_gives_the_plain_sum(
     inputs: int, outputs: int, height: int, width: int, count: int, has_bias: bool
 ) -> None:
@@ -329,9 +338,13 @@ def test_openvino_sends_nothing_and_leaves_nothing_in_the_home_folder(tmp_path: 
     around = {k: v for k, v in os.environ.items() if k not in hidden}
 
     done = subprocess.run(
-        [sys.executable, "-c", _WATCHED], env={**around, "HOME": str(tmp_path)},
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+        [sys.executable, "-c", _WATCHED],
+        env={**around, "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
 
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "intel").exists()

@@ -61,9 +61,15 @@ def test_a_16_bit_camera_uses_the_whole_range_of_8(bits: int, top: int) -> None:
 
 @pytest.mark.parametrize(
     ("name", "channels", "depth"),
-    [("mono8", 1, 1), ("mono16", 1, 2), ("bgr8", 3, 1), ("rgb8", 3, 1), ("rgba8", 4, 1),
-     ("bayer_rggb8", 1, 1)],
-)  # fmt: skip
+    [
+        ("mono8", 1, 1),
+        ("mono16", 1, 2),
+        ("bgr8", 3, 1),
+        ("rgb8", 3, 1),
+        ("rgba8", 4, 1),
+        ("bayer_rggb8", 1, 1),
+    ],
+)
 @pytest.mark.parametrize("view", [COLOUR, GREY])
 def test_raw_pictures_with_padded_rows(name: str, channels: int, depth: int, view: View) -> None:
     step = 16 * channels * depth + 5

@@ -16,9 +16,12 @@ SIZE_PX = (96, 128)
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.lists(st.integers(0, 500), min_size=1, max_size=4), st.integers(1, 1000),
-    st.sampled_from([0.0, 0.3, 0.9]), st.integers(0, 1000), st.floats(5.0, 60.0),
-)  # fmt: skip
+    st.lists(st.integers(0, 500), min_size=1, max_size=4),
+    st.integers(1, 1000),
+    st.sampled_from([0.0, 0.3, 0.9]),
+    st.integers(0, 1000),
+    st.floats(5.0, 60.0),
+)
 def test_the_boxes_and_their_order_are_torchvisions(
     counts: list[int], most: int, floor: float, seed: int, spread_px: float
 ) -> None:

@@ -38,8 +38,22 @@ def _road_set(folder: Path, numbers: list[int]) -> None:
 
 
 def test_two_trainings_of_the_road_network_are_the_same_bytes(tmp_path: Path) -> None:
-    argv = ["train", "road", "--data", "set", "--steps", "2", "--batch", "2", "--width", "128",
-            "--device", "cpu", "--threads", "2"]  # fmt: skip
+    argv = [
+        "train",
+        "road",
+        "--data",
+        "set",
+        "--steps",
+        "2",
+        "--batch",
+        "2",
+        "--width",
+        "128",
+        "--device",
+        "cpu",
+        "--threads",
+        "2",
+    ]
     found = []
     for hash_seed, numbers in ((1, [0, 1, 2, 3]), (2, [3, 1, 0, 2])):
         folder = tmp_path / str(hash_seed)
@@ -50,9 +64,29 @@ def test_two_trainings_of_the_road_network_are_the_same_bytes(tmp_path: Path) ->
 
 
 def test_two_trainings_of_mask_rcnn_are_the_same_bytes(tmp_path: Path) -> None:
-    argv = ["train", "mask-rcnn", "--data", "set/coco.json", "--images", "set/images",
-            "--classes", "car", "--steps", "2", "--batch", "2", "--width", "128",
-            "--window", "96", "64", "--device", "cpu", "--threads", "2"]  # fmt: skip
+    argv = [
+        "train",
+        "mask-rcnn",
+        "--data",
+        "set/coco.json",
+        "--images",
+        "set/images",
+        "--classes",
+        "car",
+        "--steps",
+        "2",
+        "--batch",
+        "2",
+        "--width",
+        "128",
+        "--window",
+        "96",
+        "64",
+        "--device",
+        "cpu",
+        "--threads",
+        "2",
+    ]
     found = []
     for hash_seed in (1, 2):
         folder = tmp_path / str(hash_seed)

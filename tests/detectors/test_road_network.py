@@ -171,9 +171,25 @@ def test_own_pictures_with_masks_train_too(
 ) -> None:
     data = folder(tmp_path / "own", 11)
     out = tmp_path / "own.safetensors"
-    argv = ["train", "road", "--data", str(data), "-o", str(out), "--steps", "4",
-            "--stop-at", "2", "--batch", "2", "--width", "128", "--device", "cpu",
-            "--json"]  # fmt: skip
+    argv = [
+        "train",
+        "road",
+        "--data",
+        str(data),
+        "-o",
+        str(out),
+        "--steps",
+        "4",
+        "--stop-at",
+        "2",
+        "--batch",
+        "2",
+        "--width",
+        "128",
+        "--device",
+        "cpu",
+        "--json",
+    ]
 
     assert run(argv) == 0
 

@@ -180,8 +180,14 @@ def coco(folder: Path, seeds: range) -> Path:
         assert ok
         (folder / "images" / f"{seed}.png").write_bytes(encoded.tobytes())
         images.append({"id": seed, "file_name": f"{seed}.png"})
-        annotations.append({"id": seed, "image_id": seed, "category_id": seed % 2,
-                            "bbox": [x0, y0, x1 - x0, y1 - y0]})  # fmt: skip
+        annotations.append(
+            {
+                "id": seed,
+                "image_id": seed,
+                "category_id": seed % 2,
+                "bbox": [x0, y0, x1 - x0, y1 - y0],
+            }
+        )
     names = [{"id": i, "name": name} for i, name in enumerate(kinds)]
     tree = {"images": images, "annotations": annotations, "categories": names}
     (folder / "coco.json").write_text(json.dumps(tree))
@@ -212,8 +218,14 @@ def drive(folder: Path, seeds: range) -> Path:
         pictures.append(cv2.imencode(".png", grey if has_sign else clutter(seed))[1].ravel())
         images.append({"id": number, "t_ns": t_ns, "file_name": f"{t_ns}.jpg"})
         if has_sign:
-            annotations.append({"id": number, "image_id": number, "category_id": 101,
-                                "bbox": [x0, y0, x1 - x0, y1 - y0]})  # fmt: skip
+            annotations.append(
+                {
+                    "id": number,
+                    "image_id": number,
+                    "category_id": 101,
+                    "bbox": [x0, y0, x1 - x0, y1 - y0],
+                }
+            )
     edges = np.cumsum([0, *map(len, pictures)])
     rows = Images(
         Messages(np.concatenate(pictures), edges[:-1], edges[1:]), ("png",) * len(pictures)
@@ -221,8 +233,11 @@ def drive(folder: Path, seeds: range) -> Path:
     with LogWriter(folder / "drive.mcap", Ledger("drive.mcap")) as writer:
         writer.add_topic(Topic("/camera", "crosscue/Images", "columns"))
         writer.write(Block("/camera", np.array(times), rows))
-    tree = {"images": images, "annotations": annotations,
-            "categories": [{"id": 101, "name": "one way left"}]}  # fmt: skip
+    tree = {
+        "images": images,
+        "annotations": annotations,
+        "categories": [{"id": 101, "name": "one way left"}],
+    }
     (folder / "objects.json").write_text(json.dumps(tree))
     return folder
 

@@ -286,9 +286,13 @@ def test_a_second_detection_of_the_same_object_is_wrong(tmp_path: Path) -> None:
     labelled = _bars(tmp_path)
     one = _perfect(labelled)[0]
     doubled = Detections(
-        0, one.size_px, np.tile(one.boxes_px, (2, 1)), np.tile(one.scores, 2), one.labels * 2,
+        0,
+        one.size_px,
+        np.tile(one.boxes_px, (2, 1)),
+        np.tile(one.scores, 2),
+        one.labels * 2,
         one.masks * 2,
-    )  # fmt: skip
+    )
     others = [found.above(2.0) for found in _perfect(labelled)[1:]]
 
     rows = judged(labelled, [doubled, *others])["car"]
@@ -320,10 +324,28 @@ def test_from_simulated_pictures_to_a_checkpoint_by_commands_alone(
     frames, out = tmp_path / "frames", tmp_path / "mine.safetensors"
     assert run(["train", "frames", "L3", "--each", "4", "--width", "320", "-o", str(frames)]) == 0
     learn = [
-        "train", "mask-rcnn", "--data", str(frames / "coco.json"),
-        "--images", str(frames / "images"), "-o", str(out), "--width", "320", "--steps", "2",
-        "--batch", "1", "--window", "128", "64", "--check-every", "1", "--check-pictures", "1",
-    ]  # fmt: skip
+        "train",
+        "mask-rcnn",
+        "--data",
+        str(frames / "coco.json"),
+        "--images",
+        str(frames / "images"),
+        "-o",
+        str(out),
+        "--width",
+        "320",
+        "--steps",
+        "2",
+        "--batch",
+        "1",
+        "--window",
+        "128",
+        "64",
+        "--check-every",
+        "1",
+        "--check-pictures",
+        "1",
+    ]
 
     assert run(learn) == 0
 
@@ -368,8 +390,16 @@ def test_wrong_flags_are_told_before_any_work(
     tmp_path: Path, flags: list[str], why: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_bars(tmp_path / "set", 11)
-    base = ["train", "mask-rcnn", "--data", str(path), "--images", str(path.parent / "images"),
-            "-o", str(tmp_path / "out.safetensors")]  # fmt: skip
+    base = [
+        "train",
+        "mask-rcnn",
+        "--data",
+        str(path),
+        "--images",
+        str(path.parent / "images"),
+        "-o",
+        str(tmp_path / "out.safetensors"),
+    ]
 
     assert run([*base, *flags]) == 2
     assert why in capsys.readouterr().err
@@ -392,8 +422,16 @@ def test_a_network_is_measured_without_training(
 ) -> None:
     frames = tmp_path / "frames"
     run(["train", "frames", "L901", "--each", "3", "-o", str(frames), "-q"])
-    base = ["train", "mask-rcnn", "--measure", "embedded", "--data", str(frames / "coco.json"),
-            "--images", str(frames / "images")]  # fmt: skip
+    base = [
+        "train",
+        "mask-rcnn",
+        "--measure",
+        "embedded",
+        "--data",
+        str(frames / "coco.json"),
+        "--images",
+        str(frames / "images"),
+    ]
 
     assert run([*base, "--pictures", "1:", "--proposals", "100", "200", "--json"]) == 0
     tree = json.loads(capsys.readouterr().out)
@@ -428,8 +466,16 @@ def test_a_measurement_of_nothing_is_refused(
     path = write_bars(tmp_path / "set", 4)
     torch_file = tmp_path / "bars.safetensors"
     save_checkpoint(torch_file, build_network(plan_of(256)), Facts(plan=plan_of(256)))
-    base = ["train", "mask-rcnn", "--measure", str(torch_file), "--data", str(path),
-            "--images", str(path.parent / "images")]  # fmt: skip
+    base = [
+        "train",
+        "mask-rcnn",
+        "--measure",
+        str(torch_file),
+        "--data",
+        str(path),
+        "--images",
+        str(path.parent / "images"),
+    ]
 
     assert run([*base, *flags]) == 2
     assert why in capsys.readouterr().err

@@ -51,8 +51,10 @@ def test_a_drive_past_one_intersection_is_one_approach() -> None:
     assert len(open_for) == 60 + 17 + 1
     assert open_for[-1].probabilities["left"] > 0.9
     assert loop.counts == {
-        "approaches opened": 1, "approaches established": 1, "approaches closed: passed": 1,
-    }  # fmt: skip
+        "approaches opened": 1,
+        "approaches established": 1,
+        "approaches closed: passed": 1,
+    }
 
 
 def test_a_sign_seen_once_opens_an_approach_but_tells_no_range() -> None:

@@ -174,8 +174,10 @@ def test_the_fit_finds_the_rates_that_the_looks_were_drawn_with() -> None:
                 assert share == pytest.approx(rate, abs=four_sd)
     learned = {(one.cue, one.feature) for one in fit.calibrated.rates}
     assert learned == {
-        ("road_left", "left"), ("parked_left", "left"), ("road_straight", "straight"),
-    }  # fmt: skip
+        ("road_left", "left"),
+        ("parked_left", "left"),
+        ("road_straight", "straight"),
+    }
 
 
 def test_the_fit_finds_the_fade_that_the_looks_were_drawn_with() -> None:

@@ -157,9 +157,16 @@ def test_spans_that_touch_are_not_apart() -> None:
 
 @pytest.mark.parametrize(
     ("ns", "text"),
-    [(0, "0 ns"), (999, "999 ns"), (1500, "1.5 us"), (20_000_000, "20 ms"), (999_999_999, "1 s"),
-     (-1_234_000_000, "-1.23 s"), (7_200 * SECOND_NS, "7200 s")],
-)  # fmt: skip
+    [
+        (0, "0 ns"),
+        (999, "999 ns"),
+        (1500, "1.5 us"),
+        (20_000_000, "20 ms"),
+        (999_999_999, "1 s"),
+        (-1_234_000_000, "-1.23 s"),
+        (7_200 * SECOND_NS, "7200 s"),
+    ],
+)
 def test_durations_read_well(ns: int, text: str) -> None:
     assert duration_text(ns) == text
 

@@ -159,9 +159,17 @@ def _convert(folder: Path) -> list[str]:
 
 def _simulate(folder: Path) -> list[str]:
     return [
-        "simulate", "C", "-o", str(folder / "out"), "--width", "192", "--rate", "10", "--overwrite",
+        "simulate",
+        "C",
+        "-o",
+        str(folder / "out"),
+        "--width",
+        "192",
+        "--rate",
+        "10",
+        "--overwrite",
         "-q",
-    ]  # fmt: skip
+    ]
 
 
 @pytest.mark.parametrize("command", [_convert, _simulate])

@@ -84,8 +84,10 @@ def test_a_folder_comes_whole_and_a_file_with_its_companions(bucket: str) -> Non
         assert folder.path.name == "bag"
         assert (folder.path / "part" / "a.db3").read_bytes() == b"bag/part/a.db3"
         assert sorted(p.name for p in video.path.parent.iterdir()) == [
-            "v.csv", "v.mp4", "v.mp4.txt",
-        ]  # fmt: skip
+            "v.csv",
+            "v.mp4",
+            "v.mp4.txt",
+        ]
 
 
 def test_the_longest_unused_goes_first_and_one_in_use_never(bucket: str, tmp_path: Path) -> None:

@@ -233,9 +233,13 @@ def _hostile() -> Iterator[tuple[str, bytes]]:
     def entry(**changes: object) -> bytes:
         one = {"name": ".", "size": 3, "blocks": "00" * 16} | changes
         tree: dict[str, object] = {
-            "kind": "crosscue seal", "version": 1, "hash": "xxh3_128", "block_bytes": MIB,
-            "sealed_at": "2026-01-01T00:00:00Z", "files": [one],
-        }  # fmt: skip
+            "kind": "crosscue seal",
+            "version": 1,
+            "hash": "xxh3_128",
+            "block_bytes": MIB,
+            "sealed_at": "2026-01-01T00:00:00Z",
+            "files": [one],
+        }
         from crosscue.replay.seal.seal import _own_check
 
         return json.dumps(tree | {"check": _own_check(tree)}).encode()
@@ -339,8 +343,11 @@ def test_hidden_files_and_links_in_a_circle(tmp_path: Path) -> None:
     assert run(["seal", str(log)]) == 0
 
     assert set(read_seal(seal_path(log)).files) == {
-        "frame_0.png", "frame_1.png", "frame_2.png", "timestamps.txt",
-    }  # fmt: skip
+        "frame_0.png",
+        "frame_1.png",
+        "frame_2.png",
+        "timestamps.txt",
+    }
 
 
 @pytest.mark.parametrize("kind", ["mcap", "rosbag1"])

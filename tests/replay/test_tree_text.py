@@ -110,8 +110,15 @@ def _truth(folder: Path) -> list[str]:
 def _coco(folder: Path) -> list[str]:
     (folder / "deep").rename(folder / "coco.json")
     (folder / "can.log").write_text("(1.0) can0 1#00\n")
-    return ["truth", "import", str(folder / "coco.json"), "--log", str(folder / "can.log"),
-            "-o", str(folder / "truth.json")]  # fmt: skip
+    return [
+        "truth",
+        "import",
+        str(folder / "coco.json"),
+        "--log",
+        str(folder / "can.log"),
+        "-o",
+        str(folder / "truth.json"),
+    ]
 
 
 def _training(folder: Path) -> list[str]:

@@ -26,7 +26,7 @@ def test_an_empty_file_of_version_1_is_all_defaults() -> None:
         ("version = 1\nversion = 1", r"not TOML: .*"),
         ("version = 1\n[radar]\nx = 1", r":2: radar: no such key; there are: .*topics"),
     ],
-)  # fmt: skip
+)
 def test_what_does_not_fit_is_refused_with_its_line(text: str, said: str) -> None:
     with pytest.raises(VehicleError, match=said):
         parse(text, "car.toml")
@@ -45,5 +45,8 @@ def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
 
 def test_a_typo_inside_a_named_entry_is_met_with_the_right_name() -> None:
     with pytest.raises(VehicleError, match="no such key; did you mean precision"):
-        parse("version = 1\n[fusion.cues]\nzebra = { precison = 0.8, precision = 0.8, "
-              "supports = ['left'] }\n", "v.toml")  # fmt: skip
+        parse(
+            "version = 1\n[fusion.cues]\nzebra = { precison = 0.8, precision = 0.8, "
+            "supports = ['left'] }\n",
+            "v.toml",
+        )

@@ -178,9 +178,24 @@ def blf(
         start = stop = (0,) * 8
     size, count = (144 + len(body), len(frames)) if is_closed else (144, 0)
     header = struct.pack(
-        "<4sL8BQQLL8H8H", b"LOGG", 144, 5, 0, 0, 0, 2, 6, 8, 1, size, 144 + len(content), count, 0,
-        *start, *stop,
-    )  # fmt: skip
+        "<4sL8BQQLL8H8H",
+        b"LOGG",
+        144,
+        5,
+        0,
+        0,
+        0,
+        2,
+        6,
+        8,
+        1,
+        size,
+        144 + len(content),
+        count,
+        0,
+        *start,
+        *stop,
+    )
     return header.ljust(144, b"\0") + body
 
 

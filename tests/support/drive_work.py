@@ -51,12 +51,23 @@ def letters(job: Job) -> Letters:
         with TableSink(run, "letters", SCHEMA) as sink:
             sink.write({"t_ns": range(len(word)), "letter": list(word)})
             _obey(word, log)
-        write_manifest(run, {
-            "account": account([{"log": str(log), "is_whole": word != "loss", "topics": {
-                "letters": line(len(word), len(word) - 1, {"dull": 1}),
-            }}]),
-            "timings": {"seconds": time.monotonic()},
-        })  # fmt: skip
+        write_manifest(
+            run,
+            {
+                "account": account(
+                    [
+                        {
+                            "log": str(log),
+                            "is_whole": word != "loss",
+                            "topics": {
+                                "letters": line(len(word), len(word) - 1, {"dull": 1}),
+                            },
+                        }
+                    ]
+                ),
+                "timings": {"seconds": time.monotonic()},
+            },
+        )
     status = 3 if word == "loss" else 0
     return Letters(len(word), status, os.getpid(), os.environ.get("OMP_NUM_THREADS", ""))
 

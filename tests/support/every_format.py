@@ -42,11 +42,15 @@ def _mf4(path: Path, frames: Sequence[Sent]) -> Path:
         for f in frames:
             writer(
                 can.Message(
-                    timestamp=f.t_ns * 1e-9, arbitration_id=f.arbitration_id,
-                    is_extended_id=f.is_extended, is_remote_frame=f.kind == 1, is_fd=f.is_fd,
-                    data=f.payload, channel=int(f.bus),
+                    timestamp=f.t_ns * 1e-9,
+                    arbitration_id=f.arbitration_id,
+                    is_extended_id=f.is_extended,
+                    is_remote_frame=f.kind == 1,
+                    is_fd=f.is_fd,
+                    data=f.payload,
+                    channel=int(f.bus),
                 )
-            )  # fmt: skip
+            )
         writer.stop()
     return path
 

@@ -91,9 +91,13 @@ def write_truth(folder: Path, *, left: bool, enter_ns: int = 59 * FRAME_NS) -> P
     """The truth of one drive: one approach over all of it."""
     folder.mkdir()
     one = Approach(
-        id=0, intersection=folder.name, start_ns=0, enter_ns=enter_ns, control="none",
+        id=0,
+        intersection=folder.name,
+        start_ns=0,
+        enter_ns=enter_ns,
+        control="none",
         features=Features(left=left, right=True, straight=True),
-    )  # fmt: skip
+    )
     return save(Truth(version=1, start_ns=0, end_ns=10**12, approaches=(one,)), folder)
 
 

@@ -44,12 +44,32 @@ def packet_lines(count: int) -> list[str]:
         north, east = SPEED_MPS * np.sin(yaw[i]), SPEED_MPS * np.cos(yaw[i])
         sideways = SPEED_MPS * YAW_RATE_RADPS
         numbers = [
-            lat[i], lon[i], alt[i], 0.0, 0.0, np.arctan2(np.sin(yaw[i]), np.cos(yaw[i])),
-            north, east, SPEED_MPS, 0.0, 0.0,
-            0.0, sideways, 9.81, 0.0, sideways, 9.81,
-            0.0, 0.0, YAW_RATE_RADPS, 0.0, 0.0, YAW_RATE_RADPS,
-            0.05, 0.02,
-        ]  # fmt: skip
+            lat[i],
+            lon[i],
+            alt[i],
+            0.0,
+            0.0,
+            np.arctan2(np.sin(yaw[i]), np.cos(yaw[i])),
+            north,
+            east,
+            SPEED_MPS,
+            0.0,
+            0.0,
+            0.0,
+            sideways,
+            9.81,
+            0.0,
+            sideways,
+            9.81,
+            0.0,
+            0.0,
+            YAW_RATE_RADPS,
+            0.0,
+            0.0,
+            YAW_RATE_RADPS,
+            0.05,
+            0.02,
+        ]
         lines.append(" ".join(repr(float(n)) for n in numbers) + " 4 9 4 4 0")
     return lines
 

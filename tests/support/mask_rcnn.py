@@ -67,12 +67,21 @@ def write_bars(folder: Path, count: int) -> Path:
         images.append({"id": i, "file_name": f"{i}.png", "width": 128, "height": 96})
         for x, y, width, height in boxes:
             corners = [x, y, x + width, y, x + width, y + height, x, y + height]
-            annotations.append({
-                "id": len(annotations), "image_id": i, "category_id": 3, "iscrowd": 0,
-                "bbox": [x, y, width, height], "segmentation": [corners],
-            })  # fmt: skip
-    tree = {"images": images, "annotations": annotations,
-            "categories": [{"id": 3, "name": "car"}, {"id": 9, "name": "boat"}]}  # fmt: skip
+            annotations.append(
+                {
+                    "id": len(annotations),
+                    "image_id": i,
+                    "category_id": 3,
+                    "iscrowd": 0,
+                    "bbox": [x, y, width, height],
+                    "segmentation": [corners],
+                }
+            )
+    tree = {
+        "images": images,
+        "annotations": annotations,
+        "categories": [{"id": 3, "name": "car"}, {"id": 9, "name": "boat"}],
+    }
     path = folder / "coco.json"
     path.write_text(json.dumps(tree), encoding="utf-8")
     return path

@@ -19,10 +19,20 @@ from typing import Any
 from support.mcap_files import MAGIC, Message, mapping, record, text
 
 OPCODES = {
-    "Header": 1, "Footer": 2, "Schema": 3, "Channel": 4, "Message": 5, "ChunkIndex": 8,
-    "Attachment": 9, "AttachmentIndex": 10, "Statistics": 11, "Metadata": 12,
-    "MetadataIndex": 13, "SummaryOffset": 14, "DataEnd": 15,
-}  # fmt: skip
+    "Header": 1,
+    "Footer": 2,
+    "Schema": 3,
+    "Channel": 4,
+    "Message": 5,
+    "ChunkIndex": 8,
+    "Attachment": 9,
+    "AttachmentIndex": 10,
+    "Statistics": 11,
+    "Metadata": 12,
+    "MetadataIndex": 13,
+    "SummaryOffset": 14,
+    "DataEnd": 15,
+}
 NEVER_PADDED = ("Message", "DataEnd", "Footer")
 IN_CHUNK = ("Schema", "Channel", "Message")
 PADDING = b"\x01\xff\xff"

@@ -115,9 +115,25 @@ def channels(blocks: Blocks, fields: Sequence[Field]) -> int:
         is_master = one.type in (MASTER, VIRTUAL_MASTER)
         flags, invalid = (0, 0) if one.invalid_bit is None else (2, one.invalid_bit)
         body = struct.pack(
-            "<BBBBLLLLBBHdddddd", one.type, int(is_master), one.data_type, one.bit, one.byte,
-            one.bits, flags, invalid, 0, 0, 0, 0, 0, 0, 0, 0, 0,
-        )  # fmt: skip
+            "<BBBBLLLLBBHdddddd",
+            one.type,
+            int(is_master),
+            one.data_type,
+            one.bit,
+            one.byte,
+            one.bits,
+            flags,
+            invalid,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+        )
         following = blocks.add(b"##CN", [following, 0, name, 0, conversion, one.data, 0, 0], body)
     return following
 
@@ -276,9 +292,12 @@ def _group_of(groups: dict[object, Made], frame: Sent, virtual: bool) -> Made:
         made = one_group()
         if virtual:
             made = virtual_group(
-                int(frame.bus), frame.kind, is_extended=frame.is_extended, is_fd=frame.is_fd,
+                int(frame.bus),
+                frame.kind,
+                is_extended=frame.is_extended,
+                is_fd=frame.is_fd,
                 is_long=is_long,
-            )  # fmt: skip
+            )
         made.identifier = 10 + 2 * len(groups)
         if not virtual or is_long:
             made.values = made.identifier + 1

@@ -35,10 +35,21 @@ TYPES: Final[Mapping[str, str]] = {
 TOPIC_TYPES: Final = {topic: f"mobileye_560_660_msgs/msg/{name}" for topic, name in TYPES.items()}
 
 _FLOAT32: Final = (
-    "obstacle_length", "obstacle_width", "radar_pos_x", "radar_vel_x", "obstacle_angle_rate",
-    "object_accel_x", "obstacle_angle", "marking_width", "view_range", "headway_measurement",
-    "distance_to_left_lane", "distance_to_right_lane", "sign_position_x", "sign_position_y",
-)  # fmt: skip
+    "obstacle_length",
+    "obstacle_width",
+    "radar_pos_x",
+    "radar_vel_x",
+    "obstacle_angle_rate",
+    "object_accel_x",
+    "obstacle_angle",
+    "marking_width",
+    "view_range",
+    "headway_measurement",
+    "distance_to_left_lane",
+    "distance_to_right_lane",
+    "sign_position_x",
+    "sign_position_y",
+)
 
 
 def messages_of(block: Block, only: str = "") -> list[Block]:

@@ -36,10 +36,20 @@ SIZE: Final = (160, 90)
 LABEL: Final = "<img src=x onerror=alert(1)>"
 TOPIC: Final = "/camera/[red]<script>alert(1)</script>"
 ACCOUNT: Final[dict[str, Any]] = {
-    "log": "drive.mcap", "integrity": "not checkable", "is_whole": False, "notices": [],
-    "topics": {TOPIC: {"in": FRAMES, "used": FRAMES - 1, "skipped": {},
-                       "dropped": {"<b>cut</b>": 1}, "dropped_unknown": []}},
-}  # fmt: skip
+    "log": "drive.mcap",
+    "integrity": "not checkable",
+    "is_whole": False,
+    "notices": [],
+    "topics": {
+        TOPIC: {
+            "in": FRAMES,
+            "used": FRAMES - 1,
+            "skipped": {},
+            "dropped": {"<b>cut</b>": 1},
+            "dropped_unknown": [],
+        }
+    },
+}
 
 
 def write_pictures(path: Path, frames: int = FRAMES) -> int:
@@ -66,11 +76,22 @@ def detections(frames: int = FRAMES) -> pa.Table:
             (LABEL, 0.5, (5.0, 5.0, 15.0, 15.0), None),
         ):
             names = zip(("x0", "y0", "x1", "y1"), box, strict=True)
-            rows.append({
-                "frame": frame, "t_ns": at(frame), "camera": TOPIC, "detector": "finder",
-                "label": label, "score": score, **dict(names), "mask": runs, "height_px": 12.0,
-                "range_m": None, "picture_width_px": SIZE[0], "picture_height_px": SIZE[1],
-            })  # fmt: skip
+            rows.append(
+                {
+                    "frame": frame,
+                    "t_ns": at(frame),
+                    "camera": TOPIC,
+                    "detector": "finder",
+                    "label": label,
+                    "score": score,
+                    **dict(names),
+                    "mask": runs,
+                    "height_px": 12.0,
+                    "range_m": None,
+                    "picture_width_px": SIZE[0],
+                    "picture_height_px": SIZE[1],
+                }
+            )
     return pa.Table.from_pylist(rows, schema=schemas()["detections"])
 
 
@@ -78,11 +99,19 @@ def road(frames: int = FRAMES) -> pa.Table:
     """The lower half of every picture is road."""
     mask = rle.encode(np.ones((5, 16), np.bool_), (0, 4), (16, 9))
     rows = [
-        {"frame": frame, "t_ns": at(frame), "camera": TOPIC, "share_left": 1.0,
-         "share_straight": 1.0, "share_right": 0.1, "mask": mask, "mask_width_px": 16,
-         "mask_height_px": 9}
+        {
+            "frame": frame,
+            "t_ns": at(frame),
+            "camera": TOPIC,
+            "share_left": 1.0,
+            "share_straight": 1.0,
+            "share_right": 0.1,
+            "mask": mask,
+            "mask_width_px": 16,
+            "mask_height_px": 9,
+        }
         for frame in range(frames)
-    ]  # fmt: skip
+    ]
     return pa.Table.from_pylist(rows, schema=schemas()["road"])
 
 
@@ -101,10 +130,9 @@ def poses(frames: int = FRAMES) -> pa.Table:
     schema = pose_schema()
     rows = [
         {name: None if name == "landmark" else 1.0 for name in schema.names}
-        | {"t_ns": at(frame), "x_m": float(frame), "y_m": 0.0, "heading_rad": 0.0,
-           "cov_xy_m2": 0.0}
+        | {"t_ns": at(frame), "x_m": float(frame), "y_m": 0.0, "heading_rad": 0.0, "cov_xy_m2": 0.0}
         for frame in range(frames)
-    ]  # fmt: skip
+    ]
     return pa.Table.from_pylist(rows, schema=schema)
 
 
@@ -119,23 +147,33 @@ def scene_run(folder: Path, *, without: frozenset[str] = frozenset()) -> RunFold
     write_pictures(folder / "drive.mcap")
     cues = {**CUES, "cross_traffic_right": {frame: int(frame > 20) for frame in range(1, FRAMES)}}
     tables = {
-        "frames": frames_seen(), "detections": detections(), "road": road(), "pose": poses(),
-        "cues": cue_table(cues), "belief": belief_table(BELIEF), "range": range_table(8, 45, 0.5),
-    }  # fmt: skip
+        "frames": frames_seen(),
+        "detections": detections(),
+        "road": road(),
+        "pose": poses(),
+        "cues": cue_table(cues),
+        "belief": belief_table(BELIEF),
+        "range": range_table(8, 45, 0.5),
+    }
     detect = {
-        "camera": TOPIC, "clocks": [{TOPIC: {"used": "log time"}}], "notices": [],
+        "camera": TOPIC,
+        "clocks": [{TOPIC: {"used": "log time"}}],
+        "notices": [],
         "detectors": [{"name": "finder", "role": "objects"}, {"name": "network", "role": "road"}],
-    }  # fmt: skip
+    }
     return run_folder(
         folder / "run",
         {name: table for name, table in tables.items() if name not in without},
-        stage="estimate", detect=detect,
+        stage="estimate",
+        detect=detect,
         account={
-            "reading": [ACCOUNT], "is_whole": False, "estimating": {},
+            "reading": [ACCOUNT],
+            "is_whole": False,
+            "estimating": {},
             "detecting": {TOPIC: line(FRAMES, FRAMES - 1, {}, {"<b>not decoded</b>": 1})},
         },
         settings=Vehicle(version=1).model_dump(mode="json"),
         logs=[log_row(folder / "drive.mcap", RunFolder(folder / "run"), "00", TOPIC)],
         selection={"start_ns": None, "end_ns": None, "topics": None},
         notices=["[here](http://example.org) ![x](http://example.org/x.png) </td><script>"],
-    )  # fmt: skip
+    )

@@ -31,10 +31,15 @@ def at(frame: int) -> int:
 def approach(**changes: Any) -> Approach:
     """A T junction with a stop sign: left and right, not straight."""
     content: dict[str, Any] = {
-        "id": 0, "intersection": "A", "start_ns": at(0), "enter_ns": at(ENTER),
-        "control": "stop_sign", "features": Features(left=True, right=True, straight=False),
-        "conditions": ("rain",), "length_m": 10.0,
-    }  # fmt: skip
+        "id": 0,
+        "intersection": "A",
+        "start_ns": at(0),
+        "enter_ns": at(ENTER),
+        "control": "stop_sign",
+        "features": Features(left=True, right=True, straight=False),
+        "conditions": ("rain",),
+        "length_m": 10.0,
+    }
     return Approach.model_validate(content | changes)
 
 
@@ -52,8 +57,14 @@ def truth(
 ) -> DriveTruth:
     """The made-up drive's truth; ranges go on beyond none of its approaches."""
     approaches = [approach()] if approaches is None else approaches
-    told = Truth(version=1, start_ns=at(0), end_ns=at(end), cues=tuple(cues),
-                 approaches=tuple(approaches), source="made up")  # fmt: skip
+    told = Truth(
+        version=1,
+        start_ns=at(0),
+        end_ns=at(end),
+        cues=tuple(cues),
+        approaches=tuple(approaches),
+        source="made up",
+    )
     return DriveTruth(drive, told, true_ranges(approaches))
 
 
@@ -66,21 +77,26 @@ def true_ranges(approaches: Sequence[Approach]) -> TrueRanges:
     ]
     start = np.array([row[2] for row in rows], np.float64)
     return TrueRanges(
-        np.array([row[0] for row in rows], np.int64), np.array([row[1] for row in rows], np.int64),
-        start, start + 10.0,
-    )  # fmt: skip
+        np.array([row[0] for row in rows], np.int64),
+        np.array([row[1] for row in rows], np.int64),
+        start,
+        start + 10.0,
+    )
 
 
 def cue_table(found: Mapping[str, Mapping[int, int]]) -> pa.Table:
     """From cue to frame to count."""
-    rows = [(at(frame), cue, count) for cue, frames in found.items()
-            for frame, count in frames.items()]  # fmt: skip
-    return pa.table({
-        "t_ns": pa.array([row[0] for row in rows], pa.int64()),
-        "approach": pa.nulls(len(rows), pa.int64()),
-        "cue": pa.array([row[1] for row in rows], pa.string()),
-        "count": pa.array([row[2] for row in rows], pa.int64()),
-    })  # fmt: skip
+    rows = [
+        (at(frame), cue, count) for cue, frames in found.items() for frame, count in frames.items()
+    ]
+    return pa.table(
+        {
+            "t_ns": pa.array([row[0] for row in rows], pa.int64()),
+            "approach": pa.nulls(len(rows), pa.int64()),
+            "cue": pa.array([row[1] for row in rows], pa.string()),
+            "count": pa.array([row[2] for row in rows], pa.int64()),
+        }
+    )
 
 
 def frame_table(frames: int) -> pa.Table:
@@ -101,28 +117,37 @@ def belief_table(
             now = changes.get(frame, now)
             values.append(now)
         columns[name] = pa.array(values, pa.float64())
-    open_doors = [columns[name].to_pylist() for name in ("intersection", "left", "right")
-                  if name in columns]  # fmt: skip
+    open_doors = [
+        columns[name].to_pylist() for name in ("intersection", "left", "right") if name in columns
+    ]
     sure = [any(v[i] > 0.9 for v in open_doors) for i in range(len(frames))]
     columns["established"] = pa.array([any(sure[: i + 1]) for i in range(len(frames))], pa.bool_())
     return pa.table(columns)
 
 
 def range_table(
-    first: int, last: int, error_m: float = 0.0, var_m2: float = 1.0, number: int = 7,
+    first: int,
+    last: int,
+    error_m: float = 0.0,
+    var_m2: float = 1.0,
+    number: int = 7,
     reference: str = "start",
-) -> pa.Table:  # fmt: skip
+) -> pa.Table:
     """Ranges that are wrong by ``error_m``, frame by frame."""
     frames = range(first, last)
     offset = 0.0 if reference == "start" else 10.0
-    return pa.table({
-        "t_ns": pa.array([at(frame) for frame in frames], pa.int64()),
-        "approach": pa.array([number] * len(frames), pa.int64()),
-        "reference": pa.array([reference] * len(frames), pa.string()),
-        "range_m": pa.array([ENTER - frame + offset + error_m for frame in frames], pa.float64()),
-        "var_m2": pa.array([var_m2] * len(frames), pa.float64()),
-        "measured_m": pa.nulls(len(frames), pa.float64()),
-    })  # fmt: skip
+    return pa.table(
+        {
+            "t_ns": pa.array([at(frame) for frame in frames], pa.int64()),
+            "approach": pa.array([number] * len(frames), pa.int64()),
+            "reference": pa.array([reference] * len(frames), pa.string()),
+            "range_m": pa.array(
+                [ENTER - frame + offset + error_m for frame in frames], pa.float64()
+            ),
+            "var_m2": pa.array([var_m2] * len(frames), pa.float64()),
+            "measured_m": pa.nulls(len(frames), pa.float64()),
+        }
+    )
 
 
 def tables(
@@ -141,8 +166,11 @@ def tables(
 
 
 BELIEF: Final[Mapping[str, Mapping[int, float]]] = {
-    "intersection": {10: 0.95}, "left": {20: 0.97}, "right": {25: 0.92}, "straight": {30: 0.2},
-}  # fmt: skip
+    "intersection": {10: 0.95},
+    "left": {20: 0.97},
+    "right": {25: 0.92},
+    "straight": {30: 0.2},
+}
 CUES: Final[Mapping[str, Mapping[int, int]]] = {
     "stop_sign": {frame: int(frame >= 10) for frame in range(40)},
     "road_left": {frame: int(frame == 35) for frame in range(50)},
@@ -157,19 +185,26 @@ def good_tables() -> RunTables:
 def good_truth(drive: str = "made up") -> DriveTruth:
     """Its truth: the sign can be seen from frame 5 on, road to the left always."""
     return truth(
-        [span("stop_sign", 0, 5, present=False), span("stop_sign", 5, 40, count=1, visible=1.0),
-         span("road_left", 0, 40)],
+        [
+            span("stop_sign", 0, 5, present=False),
+            span("stop_sign", 5, 40, count=1, visible=1.0),
+            span("road_left", 0, 40),
+        ],
         drive=drive,
-    )  # fmt: skip
+    )
 
 
 def log_row(log: Path, run: RunFolder, sha256: str = "00", *cameras: str) -> dict[str, Any]:
     """A log as a manifest tells of it; of one that is not there, with a made-up identity."""
     found = identity_of(log) if log.exists() else Identity(log.name, 0, "0" * 64)
     return {
-        "name": log.name, "path": relative(log, run), "format": "mcap", "cameras": list(cameras),
-        "identity": as_row(found), "sha256": {log.name: sha256},
-    }  # fmt: skip
+        "name": log.name,
+        "path": relative(log, run),
+        "format": "mcap",
+        "cameras": list(cameras),
+        "identity": as_row(found),
+        "sha256": {log.name: sha256},
+    }
 
 
 def run_folder(
@@ -178,16 +213,25 @@ def run_folder(
     """A finished run folder with tables of the made-up drive."""
     run = create(path, overwrite=False)
     if found is None:
-        found = {"frames": frame_table(50), "cues": cue_table(CUES), "belief": belief_table(BELIEF),
-                 "range": range_table(8, 45, 0.5)}  # fmt: skip
+        found = {
+            "frames": frame_table(50),
+            "cues": cue_table(CUES),
+            "belief": belief_table(BELIEF),
+            "range": range_table(8, 45, 0.5),
+        }
     for name, table in found.items():
         pq.write_table(table, run.file(f"{name}.parquet"), write_page_checksum=True)
     content: dict[str, Any] = {
-        "stage": "replay", "versions": {"crosscue": "0"}, "settings": {}, "notices": [],
+        "stage": "replay",
+        "versions": {"crosscue": "0"},
+        "settings": {},
+        "notices": [],
         "logs": [log_row(path.parent / "drive.mcap", run)],
         "account": account([]),
-        "clocks": [], "counts": {}, "timings": {"seconds": 1.0},
-    }  # fmt: skip
+        "clocks": [],
+        "counts": {},
+        "timings": {"seconds": 1.0},
+    }
     write_manifest(run, content | manifest)
     return run
 
@@ -198,8 +242,9 @@ def truth_folder(path: Path, drive_truth: DriveTruth | None = None) -> Path:
     one = good_truth() if drive_truth is None else drive_truth
     told = one.truth
     if one.ranges is not None:
-        rows = zip(one.ranges.t_ns, one.ranges.approach, one.ranges.start_m, one.ranges.end_m,
-                   strict=True)  # fmt: skip
+        rows = zip(
+            one.ranges.t_ns, one.ranges.approach, one.ranges.start_m, one.ranges.end_m, strict=True
+        )
         lines = ["t_ns,approach,start_m,end_m", *(f"{t},{a},{s},{e}" for t, a, s, e in rows), ""]
         write_text(path / "ranges.csv", "\n".join(lines))
         told = told.model_copy(update={"ranges": "ranges.csv"})

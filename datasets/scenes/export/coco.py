@@ -31,24 +31,39 @@ class Objects:
         """Take in all objects of a picture with enough pixels."""
         high, wide = picture.owner.shape
         number = len(self.images) + 1
-        self.images.append({"id": number, "t_ns": t_ns, "file_name": f"{t_ns}.jpg", "width": wide,
-                            "height": high, "tags": list(tags),
-                            "intersection_m": round(distance_m, 3)})  # fmt: skip
+        self.images.append(
+            {
+                "id": number,
+                "t_ns": t_ns,
+                "file_name": f"{t_ns}.jpg",
+                "width": wide,
+                "height": high,
+                "tags": list(tags),
+                "intersection_m": round(distance_m, 3),
+            }
+        )
         for seen in picture.seen:
             area = int(seen.mask.sum())
             if area < LEAST_PIXELS:
                 continue
             x0, y0, x1, y1 = seen.box_px
             counts = encode(seen.mask, (x0, y0), (wide, high)).decode("ascii")
-            self.annotations.append({
-                "id": len(self.annotations) + 1, "image_id": number,
-                "category_id": COCO_IDS[seen.thing.category][0],
-                "bbox": [x0, y0, x1 - x0, y1 - y0], "area": area, "iscrowd": 0,
-                "segmentation": {"size": [high, wide], "counts": counts},
-                "track_id": seen.thing.number, "role": seen.thing.role,
-                "visible": round(seen.visible, 3), "in_picture": round(seen.in_picture, 3),
-                "distance_m": round(seen.distance_m, 3),
-            })  # fmt: skip
+            self.annotations.append(
+                {
+                    "id": len(self.annotations) + 1,
+                    "image_id": number,
+                    "category_id": COCO_IDS[seen.thing.category][0],
+                    "bbox": [x0, y0, x1 - x0, y1 - y0],
+                    "area": area,
+                    "iscrowd": 0,
+                    "segmentation": {"size": [high, wide], "counts": counts},
+                    "track_id": seen.thing.number,
+                    "role": seen.thing.role,
+                    "visible": round(seen.visible, 3),
+                    "in_picture": round(seen.in_picture, 3),
+                    "distance_m": round(seen.distance_m, 3),
+                }
+            )
 
     def save(self, path: Path, source: str) -> None:
         """Write the file.
@@ -57,6 +72,10 @@ class Objects:
             OutputError: It cannot be written.
         """
         categories = [{"id": COCO_IDS[c][0], "name": COCO_IDS[c][1]} for c in CATEGORIES]
-        tree = {"info": {"description": source}, "images": self.images,
-                "annotations": self.annotations, "categories": categories}  # fmt: skip
+        tree = {
+            "info": {"description": source},
+            "images": self.images,
+            "annotations": self.annotations,
+            "categories": categories,
+        }
         write_text(path, strict_json(tree) + "\n")

@@ -39,8 +39,16 @@ def contact_sheet(
         rgb = _middle(Renderer(world, settings.camera, settings.picture).picture(t_s).rgb)
         small = np.asarray(cv2.resize(rgb, (width_px, high), interpolation=cv2.INTER_AREA))
         for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            cv2.putText(small, settings.name, (4, high - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4,
-                        colour, thick, cv2.LINE_AA)  # fmt: skip
+            cv2.putText(
+                small,
+                settings.name,
+                (4, high - 5),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                0.4,
+                colour,
+                thick,
+                cv2.LINE_AA,
+            )
         y, x = place // columns * high, place % columns * width_px
         sheet[y : y + high, x : x + width_px] = small
     return sheet

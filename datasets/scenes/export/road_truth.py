@@ -43,9 +43,12 @@ def road_seen(
         ]
     )
     flat = cv2.warpPerspective(
-        road, onto, (wide, high), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        road,
+        onto,
+        (wide, high),
+        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
-    )  # fmt: skip
+    )
     free = (depth == 0.0).reshape(high, samples, wide, samples).sum(axis=(1, 3), dtype=np.uint8)
     seen: NDArray[np.bool_] = (flat > 0) & _falls(ray, wide, high) & (2 * free > samples**2)
     return seen

@@ -78,9 +78,14 @@ def view_at(camera: Camera, approach: Approach, t_s: float) -> View:
     at = np.arange(len(motion)) * 0.01
     x, y, heading, speed, rate = (
         float(np.interp(t_s, at, column))
-        for column in (motion.x_m, motion.y_m, motion.heading_rad, motion.speed_mps,
-                       motion.yaw_rate_radps)
-    )  # fmt: skip
+        for column in (
+            motion.x_m,
+            motion.y_m,
+            motion.heading_rad,
+            motion.speed_mps,
+            motion.yaw_rate_radps,
+        )
+    )
     before, after = np.interp([t_s - 0.25, t_s + 0.05], at, motion.speed_mps)
     nod = -0.0045 * float(after - before) / 0.3
     shake = 0.0011 * min(speed / 8.0, 1.0)

@@ -144,8 +144,13 @@ def paint(
         canvas.rectangle(area, patch.x, patch.y, 255)
         paved |= area
         is_tar = patch.kind == "asphalt"
-        _put(canvas.map, (area > 0) & (away > 0), ASPHALT if is_tar else CONCRETE,
-             0.92 * tar if is_tar else stone, 60 if is_tar else 30)  # fmt: skip
+        _put(
+            canvas.map,
+            (area > 0) & (away > 0),
+            ASPHALT if is_tar else CONCRETE,
+            0.92 * tar if is_tar else stone,
+            60 if is_tar else 30,
+        )
     _put(canvas.map, (away > 0) & (away < 0.22) & (paved == 0), KERB, stone, 20)
     is_road = road > 0
     _put(canvas.map, is_road, ASPHALT, tar, 80)
@@ -160,9 +165,12 @@ def paint(
 
 
 def _put(
-    canvas: Map, where: NDArray[np.bool_] | None, rgb: tuple[int, int, int],
-    light: NDArray[np.floating[Any]], grain: int,
-) -> None:  # fmt: skip
+    canvas: Map,
+    where: NDArray[np.bool_] | None,
+    rgb: tuple[int, int, int],
+    light: NDArray[np.floating[Any]],
+    grain: int,
+) -> None:
     """Colour times light, everywhere or where it is wanted."""
     everywhere = True if where is None else where
     for k, value in enumerate(rgb):

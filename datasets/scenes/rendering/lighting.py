@@ -71,19 +71,52 @@ class Daylight:
 def daylight(conditions: Conditions, rng: Generator) -> Daylight:
     """The light of a run."""
     high_deg, sun, ambient, haze, zenith, flare, noise, clouds = {
-        "noon": (52.0, (0.72, 0.69, 0.62), (0.50, 0.54, 0.60), (206, 216, 226),
-                 (96, 142, 206), 0.0, 2.0, 0.45),
-        "overcast": (50.0, (0.05, 0.05, 0.05), (0.80, 0.82, 0.84), (208, 212, 216),
-                     (186, 192, 200), 0.0, 2.6, 0.9),
-        "dusk": (4.0, (0.03, 0.02, 0.02), (0.36, 0.36, 0.43), (150, 130, 132),
-                 (66, 80, 124), 0.0, 5.5, 0.5),
-        "low_sun": (9.0, (1.05, 0.80, 0.50), (0.42, 0.43, 0.48), (240, 222, 188),
-                    (140, 166, 206), 1.0, 2.4, 0.35),
-    }[conditions.light]  # fmt: skip
+        "noon": (
+            52.0,
+            (0.72, 0.69, 0.62),
+            (0.50, 0.54, 0.60),
+            (206, 216, 226),
+            (96, 142, 206),
+            0.0,
+            2.0,
+            0.45,
+        ),
+        "overcast": (
+            50.0,
+            (0.05, 0.05, 0.05),
+            (0.80, 0.82, 0.84),
+            (208, 212, 216),
+            (186, 192, 200),
+            0.0,
+            2.6,
+            0.9,
+        ),
+        "dusk": (
+            4.0,
+            (0.03, 0.02, 0.02),
+            (0.36, 0.36, 0.43),
+            (150, 130, 132),
+            (66, 80, 124),
+            0.0,
+            5.5,
+            0.5,
+        ),
+        "low_sun": (
+            9.0,
+            (1.05, 0.80, 0.50),
+            (0.42, 0.43, 0.48),
+            (240, 222, 188),
+            (140, 166, 206),
+            1.0,
+            2.4,
+            0.35,
+        ),
+    }[conditions.light]
     elevation = np.deg2rad(high_deg)
     turn = conditions.sun_turn_rad
-    to_sun = np.array([np.cos(elevation) * np.cos(turn), np.cos(elevation) * np.sin(turn),
-                       np.sin(elevation)])  # fmt: skip
+    to_sun = np.array(
+        [np.cos(elevation) * np.cos(turn), np.cos(elevation) * np.sin(turn), np.sin(elevation)]
+    )
     wet = conditions.rain
     dim = 1.0 - 0.28 * wet
     return Daylight(
@@ -92,14 +125,20 @@ def daylight(conditions: Conditions, rng: Generator) -> Daylight:
         np.array(ambient) * dim,
         np.array(haze) * (1.0 - 0.15 * wet),
         1.0 / (900.0 - 690.0 * wet),
-        _sky(np.array(haze) * (1 - 0.15 * wet), np.array(zenith) * (1 - 0.1 * wet), to_sun,
-             clouds + 0.3 * wet, flare, rng),
+        _sky(
+            np.array(haze) * (1 - 0.15 * wet),
+            np.array(zenith) * (1 - 0.1 * wet),
+            to_sun,
+            clouds + 0.3 * wet,
+            flare,
+            rng,
+        ),
         flare * float(rng.uniform(0.75, 1.25)),
         1.0 - 0.16 * wet - 0.12 * flare,
         noise + 1.5 * wet,
         0.55 * wet,
         conditions.light == "dusk" or wet > 0.3,
-    )  # fmt: skip
+    )
 
 
 def _sky(

@@ -145,10 +145,13 @@ def box(
     parts = [
         quad(
             [(*a, z0), (*b, z0), (*b, z1), (*a, z1)],
-            rgb, repeat=(times, high), texture=texture, glow=glow,
+            rgb,
+            repeat=(times, high),
+            texture=texture,
+            glow=glow,
         )
         for (a, b), times in sides
-    ]  # fmt: skip
+    ]
     parts.append(quad([(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)], rgb, glow=glow))
     return joined(parts)
 
@@ -172,9 +175,14 @@ def tube(a: Sequence[float], b: Sequence[float], radius_m: float, rgb: Rgb, side
 
 
 def disc(
-    centre: Sequence[float], normal: Sequence[float], radius_m: float, rgb: Rgb, *,
-    glow: float = 0.0, sides: int = 14,
-) -> Mesh:  # fmt: skip
+    centre: Sequence[float],
+    normal: Sequence[float],
+    radius_m: float,
+    rgb: Rgb,
+    *,
+    glow: float = 0.0,
+    sides: int = 14,
+) -> Mesh:
     """A flat disc facing along ``normal``."""
     middle, n = np.asarray(centre, np.float64), np.asarray(normal, np.float64)
     helper = np.array([0.0, 0.0, 1.0]) if abs(n[2]) < 0.9 else np.array([1.0, 0.0, 0.0])

@@ -144,10 +144,23 @@ class Renderer:
         ahead = mesh.corners.mean(axis=1) @ view.eye_axes[2].astype(np.float32)
         self._kernels.draw(
             np.argsort(ahead, kind="stable"),
-            mesh.corners, mesh.uv, mesh.texture, tint, mesh.instance, shift.astype(np.float32),
-            view.eye_axes, view.at_m, *self._lens(self.settings.samples), light.haze_per_m,
-            light.haze, self._atlas, self._places, self._depth, self._colour, self._owner,
-        )  # fmt: skip
+            mesh.corners,
+            mesh.uv,
+            mesh.texture,
+            tint,
+            mesh.instance,
+            shift.astype(np.float32),
+            view.eye_axes,
+            view.at_m,
+            *self._lens(self.settings.samples),
+            light.haze_per_m,
+            light.haze,
+            self._atlas,
+            self._places,
+            self._depth,
+            self._colour,
+            self._owner,
+        )
 
     def _composed(self, view: View, t_s: float) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
         light, ground = self.world.light, self.world.ground
@@ -155,12 +168,28 @@ class Renderer:
         rgb = np.zeros((high, wide, 3), np.uint8)
         owner = np.zeros((high, wide), np.int16)
         self._kernels.compose(
-            self._depth, self._colour, self._owner, self.settings.samples, ground.texels,
-            ground.levels, X_M[0], Y_M[0], float(TEXELS_PER_M), self._grain, light.on_ground,
-            self._shadows(view, t_s), light.shine, light.sky,
-            np.ascontiguousarray(view.eye_axes.T), view.at_m, *self._lens(1.0),
-            light.haze_per_m, light.haze, rgb, owner,
-        )  # fmt: skip
+            self._depth,
+            self._colour,
+            self._owner,
+            self.settings.samples,
+            ground.texels,
+            ground.levels,
+            X_M[0],
+            Y_M[0],
+            float(TEXELS_PER_M),
+            self._grain,
+            light.on_ground,
+            self._shadows(view, t_s),
+            light.shine,
+            light.sky,
+            np.ascontiguousarray(view.eye_axes.T),
+            view.at_m,
+            *self._lens(1.0),
+            light.haze_per_m,
+            light.haze,
+            rgb,
+            owner,
+        )
         return rgb, owner
 
     def _shadows(self, view: View, t_s: float) -> NDArray[np.uint8]:
@@ -184,8 +213,7 @@ class Renderer:
             if (flat[:, 2] > 1.0).all() and np.abs(flat[:, :2]).max() < 30_000:
                 hull = cv2.convexHull(flat[:, :2].astype(np.float32))
                 dark = int(255 * max(0.35, light.in_shadow * 0.9))
-                cv2.fillConvexPoly(shade, np.rint(hull * 16).astype(np.int32), dark,
-                                   cv2.LINE_AA, 4)  # fmt: skip
+                cv2.fillConvexPoly(shade, np.rint(hull * 16).astype(np.int32), dark, cv2.LINE_AA, 4)
         return shade
 
     def _finish(self, rgb: NDArray[np.uint8], view: View, number: int) -> None:
@@ -211,10 +239,18 @@ class Renderer:
         flare = light.flare if sun[2] > 0 else 0.0
         row, column = (int(k) for k in rng.integers(0, 512, 2))
         self._kernels.develop(
-            rgb, self._noise, row, column, light.noise / 32.0, 0.22,
-            np.array([255.0, 226.0, 180.0]), float(np.clip(sun[0], -1e5, 1e5)),
-            float(np.clip(sun[1], -1e5, 1e5)), flare, light.contrast,
-        )  # fmt: skip
+            rgb,
+            self._noise,
+            row,
+            column,
+            light.noise / 32.0,
+            0.22,
+            np.array([255.0, 226.0, 180.0]),
+            float(np.clip(sun[0], -1e5, 1e5)),
+            float(np.clip(sun[1], -1e5, 1e5)),
+            flare,
+            light.contrast,
+        )
 
     def _seen(self, owner: NDArray[np.int16], view: View, t_s: float) -> tuple[Seen, ...]:
         counts = np.bincount(owner.ravel().astype(np.int64) + 1, minlength=1)[1:]
@@ -242,9 +278,15 @@ class Renderer:
         covered = np.zeros((max(bottom - top, 1), max(right - left, 1)), np.uint8)
         mesh = thing.mesh_at(t_s)
         total = self._kernels.cover(
-            mesh.corners, thing.shift(t_s).astype(np.float32), view.eye_axes, view.at_m,
-            *self._lens(1.0), covered, left, top,
-        )  # fmt: skip
+            mesh.corners,
+            thing.shift(t_s).astype(np.float32),
+            view.eye_axes,
+            view.at_m,
+            *self._lens(1.0),
+            covered,
+            left,
+            top,
+        )
         part = covered[max(-top, 0) : max(high - top, 0), max(-left, 0) : max(wide - left, 0)]
         within = int(part.sum())
         return min(1.0, pixels / max(within, 1)), within / max(total, 1)
@@ -260,8 +302,9 @@ def distance_m(thing: Thing, t_s: float, view: View) -> float:
 def _corners(thing: Thing, t_s: float) -> Floats:
     points: Floats = thing.mesh_at(t_s).corners.reshape(-1, 3).astype(np.float64)
     low, high = points.min(0) + thing.shift(t_s), points.max(0) + thing.shift(t_s)
-    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1])
-                     for z in (low[2], high[2])])  # fmt: skip
+    return np.array(
+        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    )
 
 
 def _cut_out(

@@ -62,8 +62,12 @@ def building(
     if is_shop:
         walls.texture[-2:] = -1
         walls.albedo[-2:] = 0.35
-        lip = box((x[0] - 0.2, x[1] + 0.2), (y[0] - 0.2, y[1] + 0.2), (high, high + 0.35),
-                  (0.5, 0.47, 0.44))  # fmt: skip
+        lip = box(
+            (x[0] - 0.2, x[1] + 0.2),
+            (y[0] - 0.2, y[1] + 0.2),
+            (high, high + 0.35),
+            (0.5, 0.47, 0.44),
+        )
         return joined([walls, lip]), high
     return joined([walls, _gable(x, y, high, atlas, rng)]), high + 1.5
 
@@ -80,21 +84,27 @@ def _gable(
             [(x0, y0, high), (x1, y0, high), (x1, m, ridge), (x0, m, ridge)],
             [(x1, y1, high), (x0, y1, high), (x0, m, ridge), (x1, m, ridge)],
         ]
-        ends = [[(x0, y1, high), (x0, y0, high), (x0, m, ridge)],
-                [(x1, y0, high), (x1, y1, high), (x1, m, ridge)]]  # fmt: skip
+        ends = [
+            [(x0, y1, high), (x0, y0, high), (x0, m, ridge)],
+            [(x1, y0, high), (x1, y1, high), (x1, m, ridge)],
+        ]
     else:
         m = (x0 + x1) / 2
         slopes = [
             [(x0, y1, high), (x0, y0, high), (m, y0, ridge), (m, y1, ridge)],
             [(x1, y0, high), (x1, y1, high), (m, y1, ridge), (m, y0, ridge)],
         ]
-        ends = [[(x0, y0, high), (x1, y0, high), (m, y0, ridge)],
-                [(x1, y1, high), (x0, y1, high), (m, y1, ridge)]]  # fmt: skip
+        ends = [
+            [(x0, y0, high), (x1, y0, high), (m, y0, ridge)],
+            [(x1, y1, high), (x0, y1, high), (m, y1, ridge)],
+        ]
     wall: Rgb = (0.62, 0.58, 0.52)
     return joined(
-        [*(quad(s, repeat=(5.0, 2.5), texture=tile) for s in slopes),
-         triangles(np.array(ends), wall)]
-    )  # fmt: skip
+        [
+            *(quad(s, repeat=(5.0, 2.5), texture=tile) for s in slopes),
+            triangles(np.array(ends), wall),
+        ]
+    )
 
 
 def tree(x: float, y: float, atlas: Atlas, rng: Generator) -> tuple[Mesh, float, float]:
@@ -115,9 +125,15 @@ def bush(x: float, y: float, radius: float, high: float, atlas: Atlas, rng: Gene
 
 
 def crown(
-    x: float, y: float, z: float, radius: float, half_high: float, count: int, atlas: Atlas,
+    x: float,
+    y: float,
+    z: float,
+    radius: float,
+    half_high: float,
+    count: int,
+    atlas: Atlas,
     rng: Generator,
-) -> Mesh:  # fmt: skip
+) -> Mesh:
     """Bunches of leaves turned any way within an ellipsoid."""
     parts = []
     for _ in range(count):
@@ -131,13 +147,21 @@ def crown(
         e2 = np.array([-np.sin(turn) * np.sin(lean), np.cos(turn) * np.sin(lean), np.cos(lean)])
         e2 = e2 * min(1.0, 1.3 * half_high / radius)
         light = 0.78 + 0.3 * spot[2] + float(rng.normal(0, 0.05))
-        corners = [centre - size * e1 - size * e2, centre + size * e1 - size * e2,
-                   centre + size * e1 + size * e2, centre - size * e1 + size * e2]  # fmt: skip
-        bunch = quad(corners, (light, light, light * 0.95),
-                     texture=atlas.number[f"leaves_{int(rng.integers(4))}"])  # fmt: skip
+        corners = [
+            centre - size * e1 - size * e2,
+            centre + size * e1 - size * e2,
+            centre + size * e1 + size * e2,
+            centre - size * e1 + size * e2,
+        ]
+        bunch = quad(
+            corners,
+            (light, light, light * 0.95),
+            texture=atlas.number[f"leaves_{int(rng.integers(4))}"],
+        )
         if bunch.normals()[0, 2] < 0.0:
-            bunch = quad([corners[i] for i in (1, 0, 3, 2)], (light,) * 3,
-                         texture=int(bunch.texture[0]))  # fmt: skip
+            bunch = quad(
+                [corners[i] for i in (1, 0, 3, 2)], (light,) * 3, texture=int(bunch.texture[0])
+            )
         parts.append(bunch)
     return joined(parts)
 
@@ -187,27 +211,41 @@ def light_head(state: str) -> Mesh:
     for lamp, z in zip(("red", "yellow", "green"), (0.345, 0.0, -0.345), strict=True):
         lit = lamp == state
         rgb = LAMPS[lamp] if lit else tuple(0.16 * c for c in LAMPS[lamp])
-        parts.append(disc((-0.02, 0.0, z), (-1.0, 0.0, 0.0), 0.14,
-                          (rgb[0], rgb[1], rgb[2]), glow=float(lit)))  # fmt: skip
-        parts.append(quad([(-0.2, 0.16, z + 0.15), (-0.2, -0.16, z + 0.15), (0.0, -0.16, z + 0.17),
-                           (0.0, 0.16, z + 0.17)], case))  # fmt: skip
+        parts.append(
+            disc((-0.02, 0.0, z), (-1.0, 0.0, 0.0), 0.14, (rgb[0], rgb[1], rgb[2]), glow=float(lit))
+        )
+        parts.append(
+            quad(
+                [
+                    (-0.2, 0.16, z + 0.15),
+                    (-0.2, -0.16, z + 0.15),
+                    (0.0, -0.16, z + 0.17),
+                    (0.0, 0.16, z + 0.17),
+                ],
+                case,
+            )
+        )
     return joined(parts)
 
 
 def mast(x: float, y: float, arm_to_y: float, high: float = 6.3) -> Mesh:
     """A pole with an arm over the road."""
-    return joined([
-        tube((x + 0.3, y, 0.0), (x + 0.3, y, high + 0.3), 0.13, STEEL, 8),
-        tube((x + 0.3, y, high), (x + 0.3, arm_to_y, high + 0.25), 0.07, STEEL),
-    ])  # fmt: skip
+    return joined(
+        [
+            tube((x + 0.3, y, 0.0), (x + 0.3, y, high + 0.3), 0.13, STEEL, 8),
+            tube((x + 0.3, y, high), (x + 0.3, arm_to_y, high + 0.25), 0.07, STEEL),
+        ]
+    )
 
 
 def utility_pole(x: float, y: float) -> Mesh:
     """A wooden pole with a cross-arm."""
-    return joined([
-        tube((x, y, 0.0), (x, y, 9.5), 0.15, WOOD),
-        box((x - 0.06, x + 0.06), (y - 1.1, y + 1.1), (8.7, 8.85), WOOD),
-    ])  # fmt: skip
+    return joined(
+        [
+            tube((x, y, 0.0), (x, y, 9.5), 0.15, WOOD),
+            box((x - 0.06, x + 0.06), (y - 1.1, y + 1.1), (8.7, 8.85), WOOD),
+        ]
+    )
 
 
 def wire(a: tuple[float, float, float], b: tuple[float, float, float]) -> Mesh:

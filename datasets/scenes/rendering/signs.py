@@ -87,10 +87,17 @@ def _one_way(size_px: int, *, points_left: bool) -> Rgba:
     high = canvas.shape[0] / n
     _fill(canvas, _box(n, 0.0, 0.0, 1.0, high), BLACK)
     middle = high / 2
-    arrow = np.array([
-        [0.035, middle], [0.215, 0.045], [0.215, 0.10], [0.965, 0.10],
-        [0.965, high - 0.10], [0.215, high - 0.10], [0.215, high - 0.045],
-    ])  # fmt: skip
+    arrow = np.array(
+        [
+            [0.035, middle],
+            [0.215, 0.045],
+            [0.215, 0.10],
+            [0.965, 0.10],
+            [0.965, high - 0.10],
+            [0.215, high - 0.10],
+            [0.215, high - 0.045],
+        ]
+    )
     text_at = 0.57
     if not points_left:
         arrow[:, 0], text_at = 1.0 - arrow[:, 0], 1.0 - text_at

@@ -106,8 +106,15 @@ def front(rng: Generator, *, is_shop: bool, size: int = 256) -> Rgba:
     """Eight by six metres of wall with two storeys of windows."""
     import cv2
 
-    walls = [(168, 92, 74), (196, 186, 168), (150, 158, 166), (206, 200, 188), (128, 104, 88),
-             (176, 164, 132), (110, 120, 112)]  # fmt: skip
+    walls = [
+        (168, 92, 74),
+        (196, 186, 168),
+        (150, 158, 166),
+        (206, 200, 188),
+        (128, 104, 88),
+        (176, 164, 132),
+        (110, 120, 112),
+    ]
     wall = np.array(walls[int(rng.integers(len(walls)))]) * rng.uniform(0.85, 1.08)
     grain = smooth_noise(rng, size, 32)[..., None] * 0.12 + 0.94
     canvas = np.full((size, size, 4), 255, np.uint8)

@@ -165,9 +165,13 @@ class MaskRcnnDetector:
             include={"score", "proposals", "objectness", "halve", "backend"}
         )
         return identity_of(
-            "mask-rcnn", VERSION, self.checkpoint.sha256, asked, self.device.type,
+            "mask-rcnn",
+            VERSION,
+            self.checkpoint.sha256,
+            asked,
+            self.device.type,
             str(torch.__version__),
-        )  # fmt: skip
+        )
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         """Detect.
@@ -215,9 +219,12 @@ class MaskRcnnDetector:
             raw[key].float().cpu().numpy() for key in ("boxes", "scores", "masks")
         )
         scores = np.array(
-            [calibrated(s, facts.calibration.get(name or "", Calibration()))
-             for s, name in zip(raw_scores.tolist(), names, strict=True)], np.float64
-        )  # fmt: skip
+            [
+                calibrated(s, facts.calibration.get(name or "", Calibration()))
+                for s, name in zip(raw_scores.tolist(), names, strict=True)
+            ],
+            np.float64,
+        )
         width, height = frame.size_px
         boxes_px = (
             (boxes.astype(np.float64) + np.tile(placed.corner_px, 2))
@@ -227,10 +234,13 @@ class MaskRcnnDetector:
         boxes_px = np.clip(boxes_px, 0.0, [width, height, width, height])
         keep = [i for i, name in enumerate(names) if name and scores[i] >= self.settings.score]
         return Detections(
-            frame.t_ns, frame.size_px, boxes_px[keep], scores[keep],
+            frame.t_ns,
+            frame.size_px,
+            boxes_px[keep],
+            scores[keep],
             tuple(str(names[i]) for i in keep),
             tuple(laid_in(masks[i, 0], boxes_px[i], frame.size_px) for i in keep),
-        )  # fmt: skip
+        )
 
 
 def _alike(frames: Sequence[Frame]) -> Sequence[Frame]:
@@ -326,8 +336,10 @@ def laid_in(mask: NDArray[np.float32], box_px: Floats, size_px: tuple[int, int])
     x0, y0 = (
         min(max(int(np.floor(v)), 0), side - 1) for v, side in zip(box_px, size_px, strict=False)
     )
-    x1, y1 = (min(max(int(np.ceil(v)), low + 1), side)
-              for v, low, side in zip(box_px[2:], (x0, y0), size_px, strict=True))  # fmt: skip
+    x1, y1 = (
+        min(max(int(np.ceil(v)), low + 1), side)
+        for v, low, side in zip(box_px[2:], (x0, y0), size_px, strict=True)
+    )
     rim = np.pad(mask, 1)
     step = np.maximum(box_px[2:] - box_px[:2], 1e-6) / mask.shape[::-1]
     # Pixel middles in the mask's grid, whose own first middle lies at 1 because of the rim.

@@ -69,8 +69,10 @@ class OpenVinoParts:
         if len(self._bodies) > KEPT_SIZES:
             self._bodies.popitem(last=False)
         each = [_tensors(run, picture[None]) for picture in pictures]
-        together = [torch.cat(of_all) if len(of_all) > 1 else of_all[0]
-                    for of_all in zip(*each, strict=True)]  # fmt: skip
+        together = [
+            torch.cat(of_all) if len(of_all) > 1 else of_all[0]
+            for of_all in zip(*each, strict=True)
+        ]
         third = len(together) // 3
         return Body(together[:third], together[third : 2 * third], together[2 * third :])
 

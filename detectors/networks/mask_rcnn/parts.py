@@ -112,8 +112,9 @@ def _proposals(rpn: Any, body: Body, sizes: list[tuple[int, int]]) -> list[Tenso
     every, likely = torch.cat(boxes, 1), torch.cat(scores, 1)
     if every.device.type == "cpu" and every.shape[1] > FEW:
         levels = np.repeat(np.arange(len(counts)), counts)
-        return [likeliest_apart(rpn, every[i], likely[i], levels, size)
-                for i, size in enumerate(sizes)]  # fmt: skip
+        return [
+            likeliest_apart(rpn, every[i], likely[i], levels, size) for i, size in enumerate(sizes)
+        ]
     kept: list[Tensor]
     kept, _ = rpn.filter_proposals(every, likely, sizes, counts)
     return kept

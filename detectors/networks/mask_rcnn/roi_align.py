@@ -52,8 +52,15 @@ class Pooler:
         for number, (level, halvings) in enumerate(zip(self._levels, self._halvings, strict=True)):
             rows = np.flatnonzero(wanted == number)
             if rows.size:
-                _pool(level, np.float32(0.5**halvings), every.numpy(), pictures, rows,
-                      int(pool.sampling_ratio), pooled)  # fmt: skip
+                _pool(
+                    level,
+                    np.float32(0.5**halvings),
+                    every.numpy(),
+                    pictures,
+                    rows,
+                    int(pool.sampling_ratio),
+                    pooled,
+                )
         return torch.from_numpy(pooled).permute(0, 3, 1, 2)
 
     def _levels_of(self, boxes: Tensor, pool: Any) -> Int64s:
@@ -67,9 +74,14 @@ class Pooler:
 
 @njit(cache=True)
 def _places(
-    start: np.float32, cell: np.float32, samples: int, size: int,
-    low: Int64s, high: Int64s, share: Grid,
-) -> None:  # fmt: skip
+    start: np.float32,
+    cell: np.float32,
+    samples: int,
+    size: int,
+    low: Int64s,
+    high: Int64s,
+    share: Grid,
+) -> None:
     """Where samples fall between the places of a row, and how far from the lower one.
 
     A sample more than one place outside has a lower place of -1.
@@ -90,18 +102,30 @@ def _places(
 
 @njit(cache=True, fastmath={"contract"})
 def _add(
-    into: Grid, a: Grid, b: Grid, c: Grid, d: Grid,
-    of_a: np.float32, of_b: np.float32, of_c: np.float32, of_d: np.float32,
-) -> None:  # fmt: skip
+    into: Grid,
+    a: Grid,
+    b: Grid,
+    c: Grid,
+    d: Grid,
+    of_a: np.float32,
+    of_b: np.float32,
+    of_c: np.float32,
+    of_d: np.float32,
+) -> None:
     for i in range(into.size):
         into[i] += of_a * a[i] + of_b * b[i] + of_c * c[i] + of_d * d[i]
 
 
 @njit(cache=True)
 def _pool(
-    level: Grid, scale: np.float32, boxes: Grid, pictures: Int64s, rows: Int64s, samples: int,
+    level: Grid,
+    scale: np.float32,
+    boxes: Grid,
+    pictures: Int64s,
+    rows: Int64s,
+    samples: int,
     pooled: Grid,
-) -> None:  # fmt: skip
+) -> None:
     _, height, width, channels = level.shape
     side = pooled.shape[1]
     count, one = side * samples, np.float32(1.0)
@@ -123,7 +147,15 @@ def _pool(
                 if left[x] < 0:
                     continue
                 u = of_right[x]
-                _add(cells[y // samples * side + x // samples],
-                     upper[left[x]], upper[right[x]], lower[left[x]], lower[right[x]],
-                     (one - v) * (one - u), (one - v) * u, v * (one - u), v * u)  # fmt: skip
+                _add(
+                    cells[y // samples * side + x // samples],
+                    upper[left[x]],
+                    upper[right[x]],
+                    lower[left[x]],
+                    lower[right[x]],
+                    (one - v) * (one - u),
+                    (one - v) * u,
+                    v * (one - u),
+                    v * u,
+                )
         cells *= one / np.float32(samples * samples)

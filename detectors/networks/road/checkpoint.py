@@ -95,6 +95,7 @@ def load_road(path: Path) -> RoadCheckpoint:
         why = one_line(error, 160)
         raise VehicleError(f"{path}: weights do not fit: {why}; train it again") from None
     return RoadCheckpoint(
-        facts, network.eval().to(memory_format=torch.channels_last),
+        facts,
+        network.eval().to(memory_format=torch.channels_last),
         hashlib.sha256(content).hexdigest(),
-    )  # fmt: skip
+    )

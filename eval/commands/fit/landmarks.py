@@ -42,9 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--database", type=Path, metavar="DB", help="landmarks of another drive")
     parser.add_argument("--poses", type=Path, metavar="RUN|T.json", help="where the drive went")
     parser.add_argument(
-        "--false-match-rate", type=_share, default=0.001, metavar="P",
+        "--false-match-rate",
+        type=_share,
+        default=0.001,
+        metavar="P",
         help="share of two-place pairs that may match (default: 0.001)",
-    )  # fmt: skip
+    )
     for flag, default, what in (
         ("--every", 5.0, "distance between frames taken"),
         ("--near", 5.0, "landmarks up to here show the same place"),

@@ -30,9 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folders")
     parser.add_argument(
-        "--truth", nargs="+", required=True, type=Path, metavar="T.json",
+        "--truth",
+        nargs="+",
+        required=True,
+        type=Path,
+        metavar="T.json",
         help="the truth of each run, in the same order",
-    )  # fmt: skip
+    )
     parser.add_argument("-o", "--output", type=Path, metavar="TOML", help="write the section here")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
@@ -138,11 +142,16 @@ def _as_json(fitted: MessageFit, used: Counter[str]) -> dict[str, object]:
             for one in fitted.rates
         ],
         "fades": [
-            {"cue": one.cue, "positives": one.positives, "frames": one.looks,
-             "learned": one.is_learned, **one.fade.model_dump()}
+            {
+                "cue": one.cue,
+                "positives": one.positives,
+                "frames": one.looks,
+                "learned": one.is_learned,
+                **one.fade.model_dump(),
+            }
             for one in fitted.fades
         ],
-    }  # fmt: skip
+    }
 
 
 def _side_json(side: Side) -> dict[str, object]:

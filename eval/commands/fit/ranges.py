@@ -32,18 +32,37 @@ PUBLISHED_SD_M = {"stop_sign": 1.7, "traffic_light": 5.9}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("table", nargs="?", type=Path, metavar="TABLE",
-                        help="height_px and range_m")  # fmt: skip
+    parser.add_argument(
+        "table", nargs="?", type=Path, metavar="TABLE", help="height_px and range_m"
+    )
     parser.add_argument(
         "--cue", required=True, choices=tuple(PUBLISHED_SD_M), help="what was measured"
     )
-    parser.add_argument("--truth", nargs="+", type=Path, metavar="TRUTH", default=[],
-                        help="drives with annotated objects and ranges")  # fmt: skip
-    parser.add_argument("--run", nargs="+", type=Path, metavar="RUN", default=[],
-                        help="take heights from these runs, one for each --truth")  # fmt: skip
+    parser.add_argument(
+        "--truth",
+        nargs="+",
+        type=Path,
+        metavar="TRUTH",
+        default=[],
+        help="drives with annotated objects and ranges",
+    )
+    parser.add_argument(
+        "--run",
+        nargs="+",
+        type=Path,
+        metavar="RUN",
+        default=[],
+        help="take heights from these runs, one for each --truth",
+    )
     parser.add_argument("--score", type=float, default=0.9, help="least score of a run's detection")
-    parser.add_argument("--test", nargs="+", type=Path, metavar="TRUTH", default=[],
-                        help="other drives to measure the curve on")  # fmt: skip
+    parser.add_argument(
+        "--test",
+        nargs="+",
+        type=Path,
+        metavar="TRUTH",
+        default=[],
+        help="other drives to measure the curve on",
+    )
     parser.add_argument("--family", choices=FAMILIES, help="fit this one only")
     parser.add_argument("--bin-m", type=float, default=10.0, help="width of the distance bins")
     parser.add_argument("--figure", type=Path, metavar="PNG", help="draw pairs, curves, residuals")
@@ -73,8 +92,10 @@ def run(args: argparse.Namespace) -> int:
         draw(args.figure, args.cue, pairs, fits, tested)
     if args.json:
         tree: dict[str, object] = {
-            "cue": args.cue, "best": best.curve.family, "fits": [_as_json(f) for f in fits],
-        }  # fmt: skip
+            "cue": args.cue,
+            "best": best.curve.family,
+            "fits": [_as_json(f) for f in fits],
+        }
         print_json(tree if tested is None else {**tree, "tested": _as_json(tested)})
     elif not args.quiet:
         print(_told(args.cue, fits, best, tested))
@@ -136,8 +157,13 @@ def _as_json(fit: RangeFit) -> dict[str, object]:
         "residual_sd_m": fit.curve.residual_sd_m,
         "pairs": fit.pairs,
         "bins": [
-            {"from_m": b.from_m, "to_m": b.to_m, "pairs": b.pairs, "mean_m": b.mean_m,
-             "rms_m": b.sd_m}
+            {
+                "from_m": b.from_m,
+                "to_m": b.to_m,
+                "pairs": b.pairs,
+                "mean_m": b.mean_m,
+                "rms_m": b.sd_m,
+            }
             for b in fit.bins
         ],
-    }  # fmt: skip
+    }

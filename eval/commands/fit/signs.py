@@ -33,18 +33,35 @@ LOWEST = 0.05
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("labels", type=Path, nargs="+", metavar="LABELS",
-                        help="CSV or COCO file of boxes, or a drive's folder")  # fmt: skip
-    parser.add_argument("--test", type=Path, nargs="+", metavar="LABELS", default=[],
-                        help="other frames to measure on")  # fmt: skip
-    parser.add_argument("--every", type=int, default=1, metavar="N",
-                        help="measure on every Nth picture only")  # fmt: skip
-    parser.add_argument("--label", required=True, nargs="+",
-                        help="the labels to choose one threshold for")  # fmt: skip
     parser.add_argument(
-        "--kinds", nargs="+", default=list(AMERICAN), choices=KINDS, metavar="KIND",
+        "labels",
+        type=Path,
+        nargs="+",
+        metavar="LABELS",
+        help="CSV or COCO file of boxes, or a drive's folder",
+    )
+    parser.add_argument(
+        "--test",
+        type=Path,
+        nargs="+",
+        metavar="LABELS",
+        default=[],
+        help="other frames to measure on",
+    )
+    parser.add_argument(
+        "--every", type=int, default=1, metavar="N", help="measure on every Nth picture only"
+    )
+    parser.add_argument(
+        "--label", required=True, nargs="+", help="the labels to choose one threshold for"
+    )
+    parser.add_argument(
+        "--kinds",
+        nargs="+",
+        default=list(AMERICAN),
+        choices=KINDS,
+        metavar="KIND",
         help=f"drawings to look for, of: {', '.join(KINDS)}",
-    )  # fmt: skip
+    )
     parser.add_argument("--crop-top", type=float, default=0.0, help="share not searched")
     parser.add_argument("--crop-bottom", type=float, default=0.25, help="share not searched")
     parser.add_argument(
@@ -57,8 +74,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--overlap", type=float, default=0.4, help="with the true box, to be right (0 to 1)"
     )
-    parser.add_argument("--least-height", type=float, default=0.0, metavar="PX",
-                        help="lower true signs count neither as found nor as missed")  # fmt: skip
+    parser.add_argument(
+        "--least-height",
+        type=float,
+        default=0.0,
+        metavar="PX",
+        help="lower true signs count neither as found nor as missed",
+    )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -94,10 +116,14 @@ def _shown(score: float | None) -> float | None:
 def _judged(args: argparse.Namespace) -> tuple[list[Judged], list[Judged]]:
     """What choosing and measuring pictures say, a part for each file or drive."""
     detector = build(
-        kinds=tuple(args.kinds), least_score=LOWEST,
-        crop_top=args.crop_top, crop_bottom=args.crop_bottom,
-        enlarge=args.enlarge, levels=args.levels, points=args.points,
-    )  # fmt: skip
+        kinds=tuple(args.kinds),
+        least_score=LOWEST,
+        crop_top=args.crop_top,
+        crop_bottom=args.crop_bottom,
+        enlarge=args.enlarge,
+        levels=args.levels,
+        points=args.points,
+    )
     rules = Rules(args.label, args.overlap, args.least_height)
     fit = slice(0, None, 1 if args.test else 2)
     rest = slice(0 if args.test else 1, None, args.every * fit.step)
@@ -166,8 +192,10 @@ def _as_json(
 
 def _tree(rates: _Rates) -> dict[str, object]:
     found: dict[str, object] = {
-        "found": rates.precision.of, "right": rates.recall.right, "signs": rates.recall.of
-    }  # fmt: skip
+        "found": rates.precision.of,
+        "right": rates.recall.right,
+        "signs": rates.recall.of,
+    }
     for name, part in (("precision", rates.precision), ("recall", rates.recall)):
         found[name] = part.value
         found[f"{name}_interval"] = (part.low, part.high)

@@ -51,14 +51,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--coordinates", type=Path, metavar="FILE.csv", help="where each picture was taken"
     )
     parser.add_argument(
-        "--every", type=metres, default=10.0, metavar="M",
+        "--every",
+        type=metres,
+        default=10.0,
+        metavar="M",
         help="distance between landmarks from a log (default: 10)",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--sd", type=metres, default=3.0, metavar="M",
+        "--sd",
+        type=metres,
+        default=3.0,
+        metavar="M",
         help="how far the car may be off when it matches, added to the poses' own error "
         "(default: 3)",
-    )  # fmt: skip
+    )
     parser.add_argument("--source", metavar="NAME", help="who took them (default: the log's name)")
     parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="camera and matcher")
     parser.add_argument("--matcher", metavar="NAME", help="orb, or module:factory of your own")

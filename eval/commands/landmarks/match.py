@@ -57,10 +57,15 @@ def run(args: argparse.Namespace) -> int:
     needed = vehicle.landmarks.min_score
     if args.json:
         rows = [
-            {"name": name, "score": m.score, "pairs": m.pairs, "agreeing": m.agreeing,
-             "is_match": m.score >= needed}
+            {
+                "name": name,
+                "score": m.score,
+                "pairs": m.pairs,
+                "agreeing": m.agreeing,
+                "is_match": m.score >= needed,
+            }
             for _, _, m, name in best
-        ]  # fmt: skip
+        ]
         print_json({"points": len(seen), "compared": compared, "min_score": needed, "best": rows})
     elif not args.quiet:
         print(f"{len(seen)} points; {compared} landmarks compared; a match from {needed:g} on")

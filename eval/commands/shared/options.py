@@ -33,9 +33,11 @@ def add_log_arguments(parser: argparse.ArgumentParser) -> None:
 def add_part_arguments(parser: argparse.ArgumentParser) -> None:
     """``--from``, ``--to`` and ``--topics``."""
     parser.add_argument(
-        "--from", dest="start", metavar="T",
+        "--from",
+        dest="start",
+        metavar="T",
         help="begin here: seconds after the log's first row (12.5) or absolute nanoseconds (...ns)",
-    )  # fmt: skip
+    )
     parser.add_argument("--to", dest="end", metavar="T", help="end before this time")
     parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="only these topics")
     add_limit_arguments(parser)
@@ -44,10 +46,13 @@ def add_part_arguments(parser: argparse.ArgumentParser) -> None:
 def add_limit_arguments(parser: argparse.ArgumentParser) -> None:
     """``--max-chunk``."""
     parser.add_argument(
-        "--max-chunk", type=_mebibytes, default=DEFAULT.chunk_bytes, metavar="MIB",
+        "--max-chunk",
+        type=_mebibytes,
+        default=DEFAULT.chunk_bytes,
+        metavar="MIB",
         help="the largest chunk, container or page that is decompressed "
         f"(default: {DEFAULT.chunk_bytes >> 20})",
-    )  # fmt: skip
+    )
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
@@ -68,18 +73,21 @@ def _mebibytes(text: str) -> int:
 def add_logs_argument(parser: argparse.ArgumentParser) -> None:
     """``--logs``."""
     parser.add_argument(
-        "--logs", type=Path, metavar="DIR",
+        "--logs",
+        type=Path,
+        metavar="DIR",
         help="the run's logs have moved to this folder; each is known by its content",
-    )  # fmt: skip
+    )
 
 
 def add_logs_arguments(parser: argparse.ArgumentParser) -> None:
     """``--logs`` and ``--without-pictures``."""
     add_logs_argument(parser)
     parser.add_argument(
-        "--without-pictures", action="store_true",
+        "--without-pictures",
+        action="store_true",
         help="leave out the pictures in the run's logs, which may be gone",
-    )  # fmt: skip
+    )
 
 
 def metres(text: str) -> float:

@@ -25,9 +25,13 @@ AnyStudy = TypeVar("AnyStudy", "RangeStudy", "LandmarkStudy", "FieldStudy")
 def add_study_arguments(parser: argparse.ArgumentParser, folder: str) -> None:
     """``-o``, ``--settings``, ``--seed``, ``--workers``, ``--overwrite`` and ``--json``."""
     parser.add_argument(
-        "-o", "--output", type=Path, default=Path(folder), metavar="DIR",
+        "-o",
+        "--output",
+        type=Path,
+        default=Path(folder),
+        metavar="DIR",
         help=f"folder for drives, summary, figures, page (default: {folder})",
-    )  # fmt: skip
+    )
     parser.add_argument("--settings", type=Path, metavar="X.toml", help="a study of one's own")
     parser.add_argument("--seed", type=int, help="everything random comes from it")
     parser.add_argument("--workers", type=int, metavar="N", help="cores (default: all)")
@@ -38,8 +42,9 @@ def add_study_arguments(parser: argparse.ArgumentParser, folder: str) -> None:
 def add_cluster_arguments(parser: argparse.ArgumentParser) -> None:
     """``--drives`` and ``--ray``."""
     parser.add_argument("--drives", type=int, metavar="N", help="with each combination")
-    parser.add_argument("--ray", metavar="ADDRESS",
-                        help="drive on a Ray cluster: its address, auto, or local")  # fmt: skip
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help="drive on a Ray cluster: its address, auto, or local"
+    )
 
 
 def study_of(args: argparse.Namespace, kind: type[AnyStudy]) -> AnyStudy:

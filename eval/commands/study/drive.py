@@ -27,12 +27,21 @@ STRATEGIES = ("straight to goal", "landmark to landmark", "hybrid")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument(
-        "-o", "--output", type=Path, default=Path("study-drive"), metavar="DIR",
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("study-drive"),
+        metavar="DIR",
         help="folder for log, truth, picture and run (default: study-drive)",
-    )  # fmt: skip
+    )
     parser.add_argument("--seed", type=int, default=7, help="of the drive")
-    parser.add_argument("--compass", type=float, default=30.0, metavar="DEG",
-                        help="2-sigma of the compass; 0: none (default: 30)")  # fmt: skip
+    parser.add_argument(
+        "--compass",
+        type=float,
+        default=30.0,
+        metavar="DEG",
+        help="2-sigma of the compass; 0: none (default: 30)",
+    )
     parser.add_argument("--strategy", choices=STRATEGIES, default=STRATEGIES[0])
     parser.add_argument("--landmarks", type=float, default=0.0, metavar="N", help="per km2")
     parser.add_argument("--rate", type=float, default=0.6, help="share of landmarks recognised")
@@ -55,13 +64,22 @@ def run(args: argparse.Namespace) -> int:
     recording = done.run.file("drive.rrd")
     save(done.run, recording, truth_track(done.files.truth, done.run))
     if args.json:
-        print_json({"result": done.traced.result._asdict(), "log": str(done.files.log),
-                    "truth": str(done.files.truth), "picture": str(picture),
-                    "run": str(done.run.path), "recording": str(recording)})  # fmt: skip
+        print_json(
+            {
+                "result": done.traced.result._asdict(),
+                "log": str(done.files.log),
+                "truth": str(done.files.truth),
+                "picture": str(picture),
+                "run": str(done.run.path),
+                "recording": str(recording),
+            }
+        )
     elif not args.quiet:
         result = done.traced.result
-        print(f"simulated  {result.travelled_m:.0f} m in {result.seconds:.0f} s, "
-              f"{result.decisions} decisions, {result.detected} landmarks weighed in")  # fmt: skip
+        print(
+            f"simulated  {result.travelled_m:.0f} m in {result.seconds:.0f} s, "
+            f"{result.decisions} decisions, {result.detected} landmarks weighed in"
+        )
         print("\nthe replay of its log against the truth")
         print(summary(done.score))
         print(f"\npicture    {picture}\nlog        {done.files.log}\nrecording  {recording}")
@@ -73,8 +91,11 @@ def _settings(args: argparse.Namespace) -> Drive:
 
     from crosscue.localization.town.settings import Drive, Navigation, Sensors
 
-    flags = {"compass_2sigma_deg": "compass", "detection_rate": "rate",
-             "landmarks_per_km2": "landmarks"}  # fmt: skip
+    flags = {
+        "compass_2sigma_deg": "compass",
+        "detection_rate": "rate",
+        "landmarks_per_km2": "landmarks",
+    }
     try:
         return Drive(
             sensors=Sensors(compass_2sigma_deg=args.compass or None, detection_rate=args.rate),

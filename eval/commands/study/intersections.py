@@ -25,22 +25,39 @@ from crosscue.replay.safe_text import visible
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("-o", "--output", required=True, type=Path, metavar="DIR",
-                        help="drives, runs, tables and page go there")  # fmt: skip
-    parser.add_argument("--layouts", default=",".join(SCORED), metavar="NAMES",
-                        help="comma-separated, of A to H (default: all)")  # fmt: skip
+    parser.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        type=Path,
+        metavar="DIR",
+        help="drives, runs, tables and page go there",
+    )
+    parser.add_argument(
+        "--layouts",
+        default=",".join(SCORED),
+        metavar="NAMES",
+        help="comma-separated, of A to H (default: all)",
+    )
     parser.add_argument("--runs", type=int, default=10, metavar="N", help="of each (default: 10)")
     parser.add_argument("--seed", type=int, default=0, help="of what differs from run to run")
     parser.add_argument("--width", type=int, default=1280, help="of the picture (9/16 high)")
-    parser.add_argument("--vehicle", type=Path, metavar="V.toml",
-                        help="replay with it instead of each drive's own")  # fmt: skip
-    parser.add_argument("--detectors", default=EMBEDDED, metavar="NAMES",
-                        help=f"comma-separated (default: {EMBEDDED})")  # fmt: skip
+    parser.add_argument(
+        "--vehicle", type=Path, metavar="V.toml", help="replay with it instead of each drive's own"
+    )
+    parser.add_argument(
+        "--detectors",
+        default=EMBEDDED,
+        metavar="NAMES",
+        help=f"comma-separated (default: {EMBEDDED})",
+    )
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="drives at a time")
-    parser.add_argument("--ray", metavar="ADDRESS",
-                        help="on a Ray cluster that shares DIR; local starts one here")  # fmt: skip
-    parser.add_argument("--no-attribution", action="store_true",
-                        help="leave out what each cue is worth")  # fmt: skip
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help="on a Ray cluster that shares DIR; local starts one here"
+    )
+    parser.add_argument(
+        "--no-attribution", action="store_true", help="leave out what each cue is worth"
+    )
     parser.add_argument("--json", action="store_true", help="print the tables as JSON")
 
 
@@ -49,9 +66,12 @@ def run(args: argparse.Namespace) -> int:
     engine = engine_of(args.workers, args.ray)
     settings = StudySettings(
         layouts=tuple(name.strip() for name in args.layouts.split(",") if name.strip()),
-        runs=args.runs, seed=args.seed, width_px=args.width, vehicle=args.vehicle,
+        runs=args.runs,
+        seed=args.seed,
+        width_px=args.width,
+        vehicle=args.vehicle,
         detectors=args.detectors,
-    )  # fmt: skip
+    )
     line = DriveProgress(not args.quiet and sys.stderr.isatty())
     done = run_drives(args.output, settings, engine, line)
     line.end()

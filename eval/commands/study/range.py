@@ -30,10 +30,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_study_arguments(parser, "study-range")
     add_cluster_arguments(parser)
     parser.add_argument(
-        "--calibrate", action="store_true",
+        "--calibrate",
+        action="store_true",
         help="no study: find the compass interval that gives the published 9.3 km at 30 degrees, "
         "on seeds of its own",
-    )  # fmt: skip
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -42,20 +42,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("--data", type=Path, required=True, metavar="COCO", help="annotations")
     parser.add_argument("--images", type=Path, required=True, metavar="DIR", help="their pictures")
-    parser.add_argument("--val-data", type=Path, metavar="COCO",
-                        help=f"held out (default: every {EVERY}th picture of --data)")  # fmt: skip
+    parser.add_argument(
+        "--val-data",
+        type=Path,
+        metavar="COCO",
+        help=f"held out (default: every {EVERY}th picture of --data)",
+    )
     parser.add_argument("--val-images", type=Path, metavar="DIR", help="their pictures")
     parser.add_argument("-o", "--output", type=Path, metavar="OUT")
-    parser.add_argument("--measure", metavar="NETWORK",
-                        help="train nothing, measure this one: as --from")  # fmt: skip
-    parser.add_argument("--pictures", metavar="A:B:N",
-                        help="measure on these of --data: ::4 is every 4th")  # fmt: skip
-    parser.add_argument("--proposals", type=int, nargs="+", default=[PROPOSALS], metavar="N",
-                        help="measure with so many places looked at; several in turn")  # fmt: skip
-    parser.add_argument("--from", dest="start", default="compact", metavar="NETWORK",
-                        help="compact, resnet50, resnet50-v2, embedded, or a file")  # fmt: skip
-    parser.add_argument("--backend", default="torch", choices=["torch", "openvino"],
-                        help="measure with the detector's layers run by this one")  # fmt: skip
+    parser.add_argument(
+        "--measure", metavar="NETWORK", help="train nothing, measure this one: as --from"
+    )
+    parser.add_argument(
+        "--pictures", metavar="A:B:N", help="measure on these of --data: ::4 is every 4th"
+    )
+    parser.add_argument(
+        "--proposals",
+        type=int,
+        nargs="+",
+        default=[PROPOSALS],
+        metavar="N",
+        help="measure with so many places looked at; several in turn",
+    )
+    parser.add_argument(
+        "--from",
+        dest="start",
+        default="compact",
+        metavar="NETWORK",
+        help="compact, resnet50, resnet50-v2, embedded, or a file",
+    )
+    parser.add_argument(
+        "--backend",
+        default="torch",
+        choices=["torch", "openvino"],
+        help="measure with the detector's layers run by this one",
+    )
     parser.add_argument("--classes", nargs="+", default=list(CLASSES), metavar="NAME")
     parser.add_argument("--steps", type=int, default=4000, help="batches altogether")
     parser.add_argument("--batch", type=int, default=8, help="samples in one")
@@ -64,10 +85,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--width", type=int, default=1280, help="pictures are scaled to")
     parser.add_argument("--top", type=float, default=0.0, help="share not looked at")
     parser.add_argument("--bottom", type=float, default=0.0, help="share not looked at")
-    parser.add_argument("--window", type=int, nargs=2, default=[544, 288], metavar=("W", "H"),
-                        help="size of the parts of pictures learnt from")  # fmt: skip
-    parser.add_argument("--balance", type=float, default=1.0, metavar="SHARE",
-                        help="0 learns from each object as often, 1 from each class")  # fmt: skip
+    parser.add_argument(
+        "--window",
+        type=int,
+        nargs=2,
+        default=[544, 288],
+        metavar=("W", "H"),
+        help="size of the parts of pictures learnt from",
+    )
+    parser.add_argument(
+        "--balance",
+        type=float,
+        default=1.0,
+        metavar="SHARE",
+        help="0 learns from each object as often, 1 from each class",
+    )
     parser.add_argument("--check-every", type=int, default=500, help="steps between validations")
     parser.add_argument("--check-pictures", type=int, default=60, help="in validations on the way")
     parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda", "mps"])
@@ -204,10 +236,15 @@ def _job(args: argparse.Namespace) -> Job:
     from crosscue.detectors.training.samples import Window
 
     try:
-        plan = Plan.model_validate({
-            "architecture": architecture_of(args.start), "classes": args.classes,
-            "width_px": args.width, "top": args.top, "bottom": args.bottom,
-        })  # fmt: skip
+        plan = Plan.model_validate(
+            {
+                "architecture": architecture_of(args.start),
+                "classes": args.classes,
+                "width_px": args.width,
+                "top": args.top,
+                "bottom": args.bottom,
+            }
+        )
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         name = ".".join(str(part) for part in first["loc"]) or "--top, --bottom"
@@ -215,10 +252,17 @@ def _job(args: argparse.Namespace) -> Job:
     schedule = Schedule(args.steps, args.batch, args.rate, min(100, args.steps), seed=args.seed)
     window = Window(args.window[0], args.window[1], balance=args.balance)
     return Job(
-        args.start, plan, schedule, window, args.output, args.check_every, args.check_pictures,
-        args.device, args.threads, {"data": args.data.parent.name, "window": str(args.window),
-         "balance": args.balance},
-    )  # fmt: skip
+        args.start,
+        plan,
+        schedule,
+        window,
+        args.output,
+        args.check_every,
+        args.check_pictures,
+        args.device,
+        args.threads,
+        {"data": args.data.parent.name, "window": str(args.window), "balance": args.balance},
+    )
 
 
 def _draw(job: Job) -> None:

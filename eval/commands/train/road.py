@@ -41,22 +41,36 @@ SAVED_EVERY = 100
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("--layouts", nargs="+", metavar="LAYOUT", help="L400 or a span: L400-L519")
-    parser.add_argument("--held", nargs="+", metavar="LAYOUT", default=[],
-                        help="layouts to measure on, none of them trained on")  # fmt: skip
-    parser.add_argument("--score", nargs="+", metavar="LAYOUT", default=[],
-                        help="further layouts to measure on at the end: A-H")  # fmt: skip
+    parser.add_argument(
+        "--held",
+        nargs="+",
+        metavar="LAYOUT",
+        default=[],
+        help="layouts to measure on, none of them trained on",
+    )
+    parser.add_argument(
+        "--score",
+        nargs="+",
+        metavar="LAYOUT",
+        default=[],
+        help="further layouts to measure on at the end: A-H",
+    )
     parser.add_argument("--data", type=Path, metavar="DIR", help="images/ and masks/ of one's own")
     parser.add_argument("-o", "--output", type=Path, metavar="OUT.safetensors")
-    parser.add_argument("--measure", metavar="NETWORK",
-                        help="train nothing, measure this one: embedded, or a file")  # fmt: skip
-    parser.add_argument("--from", dest="start", type=Path, metavar="FILE",
-                        help="begin with these weights")  # fmt: skip
-    parser.add_argument("--resume", action="store_true",
-                        help="go on after an interruption, from OUT.state")  # fmt: skip
+    parser.add_argument(
+        "--measure", metavar="NETWORK", help="train nothing, measure this one: embedded, or a file"
+    )
+    parser.add_argument(
+        "--from", dest="start", type=Path, metavar="FILE", help="begin with these weights"
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="go on after an interruption, from OUT.state"
+    )
     parser.add_argument("--each", type=int, default=12, help="pictures of each layout")
     parser.add_argument("--steps", type=int, default=1500)
-    parser.add_argument("--stop-at", type=int, metavar="N",
-                        help="end after so many of the schedule's steps")  # fmt: skip
+    parser.add_argument(
+        "--stop-at", type=int, metavar="N", help="end after so many of the schedule's steps"
+    )
     parser.add_argument("--batch", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--width", type=int, default=384, help="of the network's input (9/16 high)")
@@ -91,12 +105,17 @@ def run(args: argparse.Namespace) -> int:
             training.network.load_state_dict(load_road(args.start).network.state_dict())
         loss = _trained(training, learn, args)
     recipe: dict[str, str | int | float] = {
-        "layouts": " ".join(args.layouts or []), "pictures": len(learn), "steps": args.steps,
-        "stopped_at": training.done, "batch": args.batch, "seed": args.seed, "loss": round(loss, 5),
+        "layouts": " ".join(args.layouts or []),
+        "pictures": len(learn),
+        "steps": args.steps,
+        "stopped_at": training.done,
+        "batch": args.batch,
+        "seed": args.seed,
+        "loss": round(loss, 5),
         **_measured(training.network, training.device, "held_out", held),
         **_measured(training.network, training.device, "scored", _scored(args, size)),
         **decides_bits(device),
-    }  # fmt: skip
+    }
     facts = RoadFacts(width_px=size[0], height_px=size[1], recipe=recipe)
     save_road(args.output, training.network, facts)
     _state(args).unlink(missing_ok=True)
@@ -226,8 +245,9 @@ def _rendered(names: list[str], size: Size, args: argparse.Namespace) -> RoadFra
     if len(names) <= len(SCORED) and {*names} <= {*SCORED}:
         runs = [
             SceneSettings(layout=name, run=run, seed=args.seed, camera=camera)
-            for name in names for run in range(1, 11)
-        ]  # fmt: skip
+            for name in names
+            for run in range(1, 11)
+        ]
     parts: list[RoadFrames] = []
     made: Iterator[RoadFrames] = rendered(runs, args.each, size)
     for part in with_progress(made, lambda: len(parts) / len(runs), args, "rendering"):

@@ -22,8 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("truth", type=Path, metavar="T.json", help="the truth file")
     parser.add_argument("--log", type=Path, required=True, metavar="LOG", help="its log")
-    parser.add_argument("--vehicle", type=Path, metavar="V.toml",
-                        help="names the camera where the log has several")  # fmt: skip
+    parser.add_argument(
+        "--vehicle", type=Path, metavar="V.toml", help="names the camera where the log has several"
+    )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 

@@ -30,14 +30,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("source", type=Path, metavar="ANNOTATIONS", help="COCO .json, CVAT .xml")
     parser.add_argument("--log", type=Path, required=True, metavar="LOG", help="the annotated log")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="T.json",
-                        help="the truth file, or a folder for it")  # fmt: skip
-    parser.add_argument("--vehicle", type=Path, metavar="V.toml",
-                        help="names the camera of several, and cues of your own")  # fmt: skip
-    parser.add_argument("--map", nargs="+", default=[], metavar="LABEL=CUE",
-                        help="what labels mean; nothing after = for no cue")  # fmt: skip
-    parser.add_argument("--add", action="store_true",
-                        help="keep approaches and track of the truth that is there")  # fmt: skip
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="T.json",
+        help="the truth file, or a folder for it",
+    )
+    parser.add_argument(
+        "--vehicle",
+        type=Path,
+        metavar="V.toml",
+        help="names the camera of several, and cues of your own",
+    )
+    parser.add_argument(
+        "--map",
+        nargs="+",
+        default=[],
+        metavar="LABEL=CUE",
+        help="what labels mean; nothing after = for no cue",
+    )
+    parser.add_argument(
+        "--add", action="store_true", help="keep approaches and track of the truth that is there"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier truth file")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

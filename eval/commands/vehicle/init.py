@@ -20,8 +20,14 @@ from crosscue.replay.vehicle.vehicle import parse
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recordings of one drive")
-    parser.add_argument("--dbc", nargs="+", type=Path, default=[], metavar="FILE",
-                        help="DBC, KCD, ARXML or SYM files of its buses")  # fmt: skip
+    parser.add_argument(
+        "--dbc",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="FILE",
+        help="DBC, KCD, ARXML or SYM files of its buses",
+    )
     add_limit_arguments(parser)
     parser.add_argument("-o", "--output", type=Path, metavar="V.toml", help="default: print it")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")

@@ -85,9 +85,12 @@ def score_smoother(run: RunFolder, truth_path: Path) -> SmootherScore:
     names = ("x_m", "y_m", "heading_rad")
     cov = [table[f"cov_{name}"].to_numpy() for name in COVARIANCES]
     filtered = at_truths_point(
-        table["t_ns"].to_numpy(), np.column_stack([table[name].to_numpy() for name in names]),
-        np.column_stack(cov), vehicle, truth,
-    )  # fmt: skip
+        table["t_ns"].to_numpy(),
+        np.column_stack([table[name].to_numpy() for name in names]),
+        np.column_stack(cov),
+        vehicle,
+        truth,
+    )
     result = _compared(true, filtered, smoothed)
     folder = run.file("score")
     folder.mkdir(exist_ok=True)
@@ -118,9 +121,16 @@ def _compared(
         honest.append(summarise_nees(nees(paired, 3), 3))
     (filter_m, filter_rad, filter_end), (smoother_m, smoother_rad, smoother_end) = apart
     return SmootherScore(
-        len(true), filter_m, smoother_m, filter_rad, smoother_rad, filter_end, smoother_end,
-        honest[0], honest[1],
-    )  # fmt: skip
+        len(true),
+        filter_m,
+        smoother_m,
+        filter_rad,
+        smoother_rad,
+        filter_end,
+        smoother_end,
+        honest[0],
+        honest[1],
+    )
 
 
 def _rms(values: Floats) -> float:

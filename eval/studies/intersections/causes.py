@@ -114,9 +114,10 @@ def condition_costs(results: Sequence[ApproachResult]) -> tuple[ConditionCost, .
     always = _always(results)
     tags = sorted({tag for one in results for tag in one.conditions} - GOOD)
     return tuple(
-        _cost(tag, results, always) for tag in tags
+        _cost(tag, results, always)
+        for tag in tags
         if any(tag in _changing(one, always) for one in results)
-    )  # fmt: skip
+    )
 
 
 def _always(results: Sequence[ApproachResult]) -> dict[str, frozenset[str]]:
@@ -198,10 +199,14 @@ def _evidence(judged: CueJudged, approach: int) -> CueEvidence:
     is_seen = is_there & ~(judged.visible < SEEN)
     is_found = far & (judged.count > 0)
     return CueEvidence(
-        judged.cue, _count(far), _count(is_there), _count(is_seen), _count(is_found),
+        judged.cue,
+        _count(far),
+        _count(is_there),
+        _count(is_seen),
+        _count(is_found),
         _count(is_found & is_seen),
         float(judged.distance_m[is_found].max()) if is_found.any() else None,
-    )  # fmt: skip
+    )
 
 
 def _count(rows: NDArray[np.bool_]) -> int:
@@ -237,9 +242,11 @@ def _absent(
 
 
 def _cause(
-    result: ApproachResult, feature: str, for_it: Sequence[CueEvidence],
+    result: ApproachResult,
+    feature: str,
+    for_it: Sequence[CueEvidence],
     against: Sequence[CueEvidence],
-) -> tuple[Cause, str]:  # fmt: skip
+) -> tuple[Cause, str]:
     """The first that holds; each rule needs what the ones before it have ruled out."""
     there, seen = sum(one.there for one in for_it), sum(one.seen for one in for_it)
     found, denied = sum(one.found for one in for_it), sum(one.found for one in against)

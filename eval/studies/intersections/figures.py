@@ -110,8 +110,9 @@ def draw_reliability(
     for axes, name in zip(grid[0], names, strict=False):
         axes.plot([0, 1], [0, 1], color="#999999", lw=0.7, ls="--")
         for scores, colour, label in (
-            (source, "#d62728", "source"), (calibrated, "#1f77b4", "calibrated"),
-        ):  # fmt: skip
+            (source, "#d62728", "source"),
+            (calibrated, "#1f77b4", "calibrated"),
+        ):
             if scores is None or name not in scores:
                 continue
             some = [one for one in scores[name].reliability if one.steps]

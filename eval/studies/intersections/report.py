@@ -82,9 +82,12 @@ def write_study(
 
 
 def _tables(
-    settings: StudySettings, done: Sequence[Done[Outcome]], scored: StudyScores,
-    approaches: ApproachScore, found: Sequence[Finding],
-) -> dict[str, Any]:  # fmt: skip
+    settings: StudySettings,
+    done: Sequence[Done[Outcome]],
+    scored: StudyScores,
+    approaches: ApproachScore,
+    found: Sequence[Finding],
+) -> dict[str, Any]:
     learned = None if scored.calibrated is None else scored.calibrated.approaches
     flags = f"--runs {settings.runs} --seed {settings.seed} --width {settings.width_px}"
     return {

@@ -64,20 +64,22 @@ def cue_rows(cues: Mapping[str, CueScore]) -> list[Row]:
         highs = [one.precision.clusters_high for one in some if one.precision.of]
         recalls = [one.recall for one in some if one.recall is not None]
         ways = [one.readings["feature"].precision for one in some if "feature" in one.readings]
-        rows.append({
-            "cue": published.name,
-            "published": published.precision,
-            "published_is_bound": published.is_bound,
-            "precision": right / of if of else math.nan,
-            "wilson_low": low,
-            "wilson_high": high,
-            "clusters_low": min(lows, default=math.nan),
-            "clusters_high": max(highs, default=math.nan),
-            "positives": of,
-            "feature_precision": _pooled(ways),
-            "recall": _pooled(recalls),
-            "recall_of": sum(one.of for one in recalls),
-        })  # fmt: skip
+        rows.append(
+            {
+                "cue": published.name,
+                "published": published.precision,
+                "published_is_bound": published.is_bound,
+                "precision": right / of if of else math.nan,
+                "wilson_low": low,
+                "wilson_high": high,
+                "clusters_low": min(lows, default=math.nan),
+                "clusters_high": max(highs, default=math.nan),
+                "positives": of,
+                "feature_precision": _pooled(ways),
+                "recall": _pooled(recalls),
+                "recall_of": sum(one.of for one in recalls),
+            }
+        )
     return rows
 
 
@@ -97,13 +99,19 @@ def intersection_rows(results: Sequence[ApproachResult]) -> list[Row]:
         for one in mine:
             if one.why_not_full:
                 reasons[one.why_not_full] = reasons.get(one.why_not_full, 0) + 1
-        rows.append({
-            "intersection": name, "approaches": len(mine), "detected": len(found),
-            "detected_m": _mean(found), "full": len(full), "full_m": _mean(full),
-            "nearest_full_m": min(full, default=math.nan),
-            "false_features": sum(bool(one.false_features) for one in mine),
-            "why_not_full": reasons,
-        })  # fmt: skip
+        rows.append(
+            {
+                "intersection": name,
+                "approaches": len(mine),
+                "detected": len(found),
+                "detected_m": _mean(found),
+                "full": len(full),
+                "full_m": _mean(full),
+                "nearest_full_m": min(full, default=math.nan),
+                "false_features": sum(bool(one.false_features) for one in mine),
+                "why_not_full": reasons,
+            }
+        )
     return rows
 
 
@@ -123,12 +131,16 @@ def quoted_rows(scored: StudyScores) -> list[Row]:
         one = None
         if judged is not None and judged.approaches is not None:
             one = judged.approaches.results[0]
-        rows.append({
-            "run": name, "published_detected_m": detected_m, "published_full_m": full_m,
-            "detected_m": None if one is None else one.detected_m,
-            "full_m": None if one is None else one.full_m,
-            "was_run": one is not None,
-        })  # fmt: skip
+        rows.append(
+            {
+                "run": name,
+                "published_detected_m": detected_m,
+                "published_full_m": full_m,
+                "detected_m": None if one is None else one.detected_m,
+                "full_m": None if one is None else one.full_m,
+                "was_run": one is not None,
+            }
+        )
     return rows
 
 

@@ -69,8 +69,10 @@ def draw(settings: Drive, traced: Traced, seed: int, folder: Path) -> Path:
         f"{'no compass' if compass is None else f'compass ±{compass:g}°'}\n"
         f"{ENDS[Outcome(result.outcome)]} after {result.travelled_m / 1e3:.1f} km, "
         f"error {result.error_m:.0f} m, major axis {result.major_axis_m:.0f} m",
-        fontsize=9, loc="left", color="0.3",
-    )  # fmt: skip
+        fontsize=9,
+        loc="left",
+        color="0.3",
+    )
     axes.legend(frameon=True, framealpha=0.9, fontsize=8, loc="best")
     return save(made, folder, "drive_plan")
 

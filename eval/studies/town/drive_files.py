@@ -221,9 +221,13 @@ def _can_block(settings: Drive, traced: Traced, t_ns: Int64s, folder: Path) -> B
     payload[:, : coded.shape[1]] = coded
     n = len(t_ns)
     frames = CanFrames(
-        np.full(n, WHEELS_ID, np.uint32), np.zeros(n, np.bool_), np.full(n, DATA, np.uint8),
-        np.full(n, coded.shape[1], np.uint8), payload, np.zeros(n, np.bool_),
-    )  # fmt: skip
+        np.full(n, WHEELS_ID, np.uint32),
+        np.zeros(n, np.bool_),
+        np.full(n, DATA, np.uint8),
+        np.full(n, coded.shape[1], np.uint8),
+        payload,
+        np.zeros(n, np.bool_),
+    )
     return Block(BUS.name, t_ns - round(settings.car.step_s * 0.5e9), frames)
 
 
@@ -313,7 +317,11 @@ def _write_truth(folder: Path, traced: Traced, t_ns: Int64s) -> Path:
     x, y, heading = traced.steps[kept, :3].T
     write_tum(folder / "pose.tum", planar(t_ns[kept], x, y, heading), SOURCE)
     truth = Truth(
-        version=1, log="drive.mcap", start_ns=int(t_ns[0]), end_ns=int(t_ns[-1]) + 1,
-        pose="pose.tum", source=SOURCE,
-    )  # fmt: skip
+        version=1,
+        log="drive.mcap",
+        start_ns=int(t_ns[0]),
+        end_ns=int(t_ns[-1]) + 1,
+        pose="pose.tum",
+        source=SOURCE,
+    )
     return save_truth(truth, folder)

@@ -177,8 +177,11 @@ def finish_field(study: FieldStudy, runs: Sequence[FieldRun], folder: Path) -> t
     """Summary, picture and page; the tables come back."""
     made = _tables(runs)
     picture = _draw(study, runs, folder)
-    content = {"study": study.model_dump(mode="json"), "notes": NOTES,
-               "runs": [asdict(run) for run in runs]}  # fmt: skip
+    content = {
+        "study": study.model_dump(mode="json"),
+        "notes": NOTES,
+        "runs": [asdict(run) for run in runs],
+    }
     write_page(folder / PAGE, "Field protocol: simulated runs through logs", NOTES, made, [picture])
     write_text(folder / SUMMARY, strict_json(content) + "\n")
     return made
@@ -195,23 +198,38 @@ def _tables(runs: Sequence[FieldRun]) -> tuple[Table, ...]:
         lost = [r.lost_at_m for r in chosen if r.lost_at_m is not None]
         mean = mean_of(np.array(lost))
         far = sum(r.goal_to_goal_m >= PUBLISHED_GOAL_M for r in chosen)
-        rows.append((
-            label, str(len(chosen)), percent(share_of(len(lost), len(chosen))),
-            f"{mean.value / 1e3:.1f} ({mean.low / 1e3:.1f}..{mean.high / 1e3:.1f})"
-            if len(lost) > 1 else "",
-            "nearly 10" if label == "range runs" else "",
-            f"{far} of {len(chosen)}", "" if label == "range runs" else "8 of 10",
-            f"{np.mean([r.ape_rmse_m for r in chosen]):.1f}",
-            f"{np.mean([r.nees_mean for r in chosen]):.2f}",
-        ))  # fmt: skip
+        rows.append(
+            (
+                label,
+                str(len(chosen)),
+                percent(share_of(len(lost), len(chosen))),
+                f"{mean.value / 1e3:.1f} ({mean.low / 1e3:.1f}..{mean.high / 1e3:.1f})"
+                if len(lost) > 1
+                else "",
+                "nearly 10" if label == "range runs" else "",
+                f"{far} of {len(chosen)}",
+                "" if label == "range runs" else "8 of 10",
+                f"{np.mean([r.ape_rmse_m for r in chosen]):.1f}",
+                f"{np.mean([r.nees_mean for r in chosen]):.2f}",
+            )
+        )
     return (
         Table(
             "Replays of the simulated runs",
-            ("runs", "number", "lost", "lost after, km", "published, km", "goals 6.9 km on",
-             "published", "error rms, m", "NEES (3)"),
+            (
+                "runs",
+                "number",
+                "lost",
+                "lost after, km",
+                "published, km",
+                "goals 6.9 km on",
+                "published",
+                "error rms, m",
+                "NEES (3)",
+            ),
             tuple(rows),
         ),
-    )  # fmt: skip
+    )
 
 
 def _draw(study: FieldStudy, runs: Sequence[FieldRun], folder: Path) -> Path:
@@ -233,8 +251,9 @@ def _draw(study: FieldStudy, runs: Sequence[FieldRun], folder: Path) -> Path:
         variance = math.radians(degrees / 2.0) ** 2
         # Half of the straight law's variance on either axis: a car that turns all the time.
         both = 4.0 * np.sqrt(variance * interval_m * distance_m / 2.0)
-        axes.plot(distance_m / 1e3, both, style, color="0.4", lw=1.0,
-                  label=f"r ds D / 2 at ±{degrees:g}°")  # fmt: skip
+        axes.plot(
+            distance_m / 1e3, both, style, color="0.4", lw=1.0, label=f"r ds D / 2 at ±{degrees:g}°"
+        )
     axes.axhline(study.drive.navigation.lost_above_m, color="0.2", lw=0.9)
     axes.set_xlim(left=0.0)
     axes.set_ylim(0.0, 130.0)

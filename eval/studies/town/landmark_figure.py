@@ -46,8 +46,11 @@ def _ranges(study: LandmarkStudy, result: LandmarkResult, farthest_m: float, fol
     top = farthest_m * KM
     for axes, strategy in zip(panels, study.strategies, strict=True):
         for i, density in enumerate(study.densities_per_km2):
-            cells = [c for c in _grid(study, result)
-                     if c.strategy == strategy and c.landmarks_per_km2 == density]  # fmt: skip
+            cells = [
+                c
+                for c in _grid(study, result)
+                if c.strategy == strategy and c.landmarks_per_km2 == density
+            ]
             _range_line(axes, cells, COLOURS[i % len(COLOURS)], top, shift=1.2 * (i - 2))
         axes.axhline(top, color="0.4", ls=":", lw=1.0)
         axes.set_title(strategy, fontsize=10)
@@ -55,17 +58,27 @@ def _ranges(study: LandmarkStudy, result: LandmarkResult, farthest_m: float, fol
         axes.set_ylim(0.0, 1.08 * top)
         axes.set_xlim(10.0, 110.0)
         if strategy == "landmark to landmark":
-            axes.plot(100 * PUBLISHED_POINT[1], PUBLISHED_POINT[2] * KM, "k*", ms=10,
-                      label="field test: 0.55 per km², 60 %, 6.9 km")  # fmt: skip
+            axes.plot(
+                100 * PUBLISHED_POINT[1],
+                PUBLISHED_POINT[2] * KM,
+                "k*",
+                ms=10,
+                label="field test: 0.55 per km², 60 %, 6.9 km",
+            )
             for cell in result.cells[len(_grid(study, result)) :]:
                 axes.plot(
-                    100 * cell.detection_rate, min(cell.range_m.value * KM, top), "ko", ms=5,
-                    mfc="none", label=f"simulated at {cell.landmarks_per_km2:g} per km²",
-                )  # fmt: skip
+                    100 * cell.detection_rate,
+                    min(cell.range_m.value * KM, top),
+                    "ko",
+                    ms=5,
+                    mfc="none",
+                    label=f"simulated at {cell.landmarks_per_km2:g} per km²",
+                )
             axes.legend(frameon=False, fontsize=8, loc="lower right")
     panels[0].set_ylabel("start to goal at 80 % success (km)")
-    panels[0].legend(frameon=False, fontsize=8, title="landmarks per km²", title_fontsize=8,
-                     loc="lower right")  # fmt: skip
+    panels[0].legend(
+        frameon=False, fontsize=8, title="landmarks per km²", title_fontsize=8, loc="lower right"
+    )
     made.suptitle(
         "Range at 80 % success, simulated; triangles at the dotted line: beyond the farthest goal",
         fontsize=10,
@@ -80,10 +93,17 @@ def _range_line(axes: Axes, cells: Sequence[Cell], colour: str, top: float, shif
         for name in ("value", "low", "high")
     )
     axes.errorbar(
-        x, value, yerr=[np.maximum(value - low, 0.0), np.maximum(high - value, 0.0)], fmt="o-",
-        ms=3.5, lw=1.3, capsize=2, elinewidth=0.8, color=colour,
+        x,
+        value,
+        yerr=[np.maximum(value - low, 0.0), np.maximum(high - value, 0.0)],
+        fmt="o-",
+        ms=3.5,
+        lw=1.3,
+        capsize=2,
+        elinewidth=0.8,
+        color=colour,
         label=f"{cells[0].landmarks_per_km2:g}",
-    )  # fmt: skip
+    )
     beyond = np.array([math.isinf(c.range_m.value) for c in cells])
     axes.plot(x[beyond], value[beyond], "^", ms=7, color=colour)
 
@@ -101,8 +121,10 @@ def _successes(
         for i, density in enumerate(study.densities_per_km2):
             for cell, part in zip(_grid(study, result), rows, strict=False):
                 if (cell.strategy, cell.landmarks_per_km2, cell.detection_rate) == (
-                    strategy, density, rate
-                ):  # fmt: skip
+                    strategy,
+                    density,
+                    rate,
+                ):
                     _success(axes, part, COLOURS[i % len(COLOURS)], f"{density:g}")
         axes.axhline(0.8, color="0.3", ls="--", lw=1.0)
         axes.set_title(strategy, fontsize=10)
@@ -112,8 +134,9 @@ def _successes(
     panels[0].legend(frameon=False, fontsize=8, title="landmarks per km²", title_fontsize=8)
     made.suptitle(
         f"Success against distance at a detection rate of {100 * rate:.0f} %, simulated; "
-        "dots: bins with 95 % intervals, lines: logistic curves", fontsize=10,
-    )  # fmt: skip
+        "dots: bins with 95 % intervals, lines: logistic curves",
+        fontsize=10,
+    )
     return save(made, folder, "landmarks_success")
 
 
@@ -122,8 +145,13 @@ def _success(axes: Axes, part: dict[str, Floats], colour: str, label: str) -> No
     reached = (part["outcome"] == Outcome.REACHED).astype(np.float64)
     a, b = logistic(distance_m, reached, np.ones((1, len(reached))))
     line_m = np.linspace(0.0, float(distance_m.max()), 200)
-    axes.plot(line_m * KM, 1.0 / (1.0 + np.exp(-(a[0] + b[0] * line_m))), color=colour, lw=1.4,
-              label=label)  # fmt: skip
+    axes.plot(
+        line_m * KM,
+        1.0 / (1.0 + np.exp(-(a[0] + b[0] * line_m))),
+        color=colour,
+        lw=1.4,
+        label=label,
+    )
     edges = np.linspace(0.0, float(distance_m.max()), BINS + 1)
     bins = np.clip(np.searchsorted(edges, distance_m, side="right") - 1, 0, BINS - 1)
     for k in range(BINS):
@@ -132,10 +160,15 @@ def _success(axes: Axes, part: dict[str, Floats], colour: str, label: str) -> No
             continue
         share = share_of(int(reached[inside].sum()), int(inside.sum()))
         axes.errorbar(
-            float(distance_m[inside].mean()) * KM, share.value,
+            float(distance_m[inside].mean()) * KM,
+            share.value,
             yerr=[[max(share.value - share.low, 0.0)], [max(share.high - share.value, 0.0)]],
-            fmt="o", ms=3, color=colour, elinewidth=0.7, alpha=0.8,
-        )  # fmt: skip
+            fmt="o",
+            ms=3,
+            color=colour,
+            elinewidth=0.7,
+            alpha=0.8,
+        )
 
 
 def _grid(study: LandmarkStudy, result: LandmarkResult) -> tuple[Cell, ...]:

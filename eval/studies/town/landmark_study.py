@@ -252,32 +252,53 @@ def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[Table, ...]:
     ]
     compared = Table(
         "Against straight to goal",
-        ("strategy", "pairs", "drives farther by", "each its own", "all drives", "published",
-         "range gained, km", "published", "more drives succeed"),
+        (
+            "strategy",
+            "pairs",
+            "drives farther by",
+            "each its own",
+            "all drives",
+            "published",
+            "range gained, km",
+            "published",
+            "more drives succeed",
+        ),
         tuple(
             (
-                c.strategy, str(c.pairs), percent(c.extra), percent(c.extra_reached),
+                c.strategy,
+                str(c.pairs),
+                percent(c.extra),
+                percent(c.extra_reached),
                 percent(c.extra_all),
                 "" if math.isnan(c.published_extra) else f"{100 * c.published_extra:.0f} %",
-                "" if math.isnan(c.gain_m) else
-                f"{c.gain_m / 1e3:.1f} ({len(c.gains_m)} cells; {c.beyond} beyond)",
-                "1 to 2", percent(c.more_success),
+                ""
+                if math.isnan(c.gain_m)
+                else f"{c.gain_m / 1e3:.1f} ({len(c.gains_m)} cells; {c.beyond} beyond)",
+                "1 to 2",
+                percent(c.more_success),
             )
             for c in result.comparisons
         ),
-    )  # fmt: skip
+    )
     points = Table(
         "Landmark to landmark, single points",
         ("landmarks per km2", "rate", "drives", "reached", "range at 80 %, km", "field test, km"),
         tuple(
             (
-                f"{c.landmarks_per_km2:g}", f"{100 * c.detection_rate:.0f} %", str(c.drives),
-                percent(c.success), km(c.range_m, 1),
+                f"{c.landmarks_per_km2:g}",
+                f"{100 * c.detection_rate:.0f} %",
+                str(c.drives),
+                percent(c.success),
+                km(c.range_m, 1),
                 "at least 6.9 (8 of 10)"
-                if (c.landmarks_per_km2, c.detection_rate) == PUBLISHED_POINT[:2] else "",
+                if (c.landmarks_per_km2, c.detection_rate) == PUBLISHED_POINT[:2]
+                else "",
             )
             for c in result.cells[len(grid) :]
         ),
-    )  # fmt: skip
-    return (*by_strategy, *((compared,) if result.comparisons else ()),
-            *((points,) if points.rows else ()))  # fmt: skip
+    )
+    return (
+        *by_strategy,
+        *((compared,) if result.comparisons else ()),
+        *((points,) if points.rows else ()),
+    )

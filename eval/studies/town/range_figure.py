@@ -63,8 +63,9 @@ def _growth(axes: Axes, result: CompassResult, columns: dict[str, Floats], colou
     distance_m, axis_m = points(columns)
     axes.plot(distance_m * KM, axis_m, ".", ms=1.5, alpha=0.35, color=colour, rasterized=True)
     curve_m = np.linspace(0.0, FIRST_GOAL_KM / KM, 400)
-    axes.plot(curve_m * KM, result.growth.axis_m(curve_m), color=colour, lw=1.6,
-              label=name_of(result))  # fmt: skip
+    axes.plot(
+        curve_m * KM, result.growth.axis_m(curve_m), color=colour, lw=1.6, label=name_of(result)
+    )
 
 
 def _survival(axes: Axes, result: CompassResult, columns: dict[str, Floats], colour: str) -> None:
@@ -72,15 +73,21 @@ def _survival(axes: Axes, result: CompassResult, columns: dict[str, Floats], col
     left = 1.0 - np.arange(len(lost_m) + 1) / result.drives
     end_m = max(60_000.0, float(lost_m[-1]) if len(lost_m) else 0.0)
     axes.step(
-        np.concatenate([[0.0], lost_m, [end_m]]) * KM, np.concatenate([left, left[-1:]]),
-        where="post", color=colour, lw=1.6,
-    )  # fmt: skip
+        np.concatenate([[0.0], lost_m, [end_m]]) * KM,
+        np.concatenate([left, left[-1:]]),
+        where="post",
+        color=colour,
+        lw=1.6,
+    )
     if result.lost:
         mean = result.lost_after_m
         axes.errorbar(
-            mean.value * KM, 0.5,
+            mean.value * KM,
+            0.5,
             xerr=[[(mean.value - mean.low) * KM], [(mean.high - mean.value) * KM]],
-            fmt="x", color=colour, capsize=3,
-        )  # fmt: skip
+            fmt="x",
+            color=colour,
+            capsize=3,
+        )
     if math.isfinite(result.published_m):
         axes.axvline(result.published_m * KM, color=colour, ls=":", lw=1.4)

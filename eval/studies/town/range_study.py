@@ -155,8 +155,9 @@ def calibrate(drive: Drive, workers: int, tolerance: float = 2e-3) -> float:
             sensors = drive.sensors.model_copy(update={"compass_interval_m": interval_m})
             settings = changed(
                 drive.model_copy(update={"sensors": sensors}),
-                compass_2sigma_deg=CALIBRATED_DEG, goals=UNTIL_LOST,
-            )  # fmt: skip
+                compass_2sigma_deg=CALIBRATED_DEG,
+                goals=UNTIL_LOST,
+            )
             rows = np.concatenate(list(pool.map(lambda p: drive_many(settings, p), parts)))  # noqa: B023
             lost = rows[:, 0] == Outcome.LOST
             mean_m = float(rows[lost, Result._fields.index("travelled_m")].mean())

@@ -110,18 +110,27 @@ class LandmarkStudy(_Study):
     drives: Drives = 700
     """With each combination."""
     strategies: Annotated[tuple[StrategyName, ...], Field(min_length=1)] = (
-        "straight to goal", "landmark to landmark", "hybrid",
-    )  # fmt: skip
+        "straight to goal",
+        "landmark to landmark",
+        "hybrid",
+    )
     densities_per_km2: Annotated[tuple[Density, ...], Field(min_length=1)] = (
-        0.1, 0.5, 1.0, 5.0, 10.0,
-    )  # fmt: skip
+        0.1,
+        0.5,
+        1.0,
+        5.0,
+        10.0,
+    )
     detection_rates: Annotated[tuple[Share, ...], Field(min_length=1)] = (0.2, 0.4, 0.6, 0.8, 1.0)
     points: tuple[tuple[Density, Share], ...] = ((0.55, 0.6),)
     """More pairs of density and rate, driven landmark to landmark only."""
 
     varied: ClassVar[tuple[str, ...]] = (
-        "navigation.strategy", "sensors.detection_rate", "landmarks_per_km2", "goals",
-    )  # fmt: skip
+        "navigation.strategy",
+        "sensors.detection_rate",
+        "landmarks_per_km2",
+        "goals",
+    )
 
     def cases(self) -> tuple[Case, ...]:
         """Strategies outermost; strategies of one density and rate share their cities."""
@@ -151,18 +160,28 @@ class FieldStudy(_Study):
     detection_rate: Share = 0.6
 
     varied: ClassVar[tuple[str, ...]] = (
-        "navigation.strategy", "sensors.detection_rate", "sensors.compass_2sigma_deg",
-        "landmarks_per_km2", "landmark_per_goal", "goals", "longest_s", "city.smallest_km2",
+        "navigation.strategy",
+        "sensors.detection_rate",
+        "sensors.compass_2sigma_deg",
+        "landmarks_per_km2",
+        "landmark_per_goal",
+        "goals",
+        "longest_s",
+        "city.smallest_km2",
         "city.largest_km2",
-    )  # fmt: skip
+    )
 
     def settings(self, *, has_landmarks: bool) -> Drive:
         """Of one kind of run."""
         town = self.drive.city.model_dump(exclude={"smallest_km2", "largest_km2"})
-        base = self.drive.model_copy(update={
-            "city": City(smallest_km2=self.town_km2, largest_km2=self.town_km2, **town),
-            "landmark_per_goal": True, "longest_s": 60.0 * self.minutes, "longest_m": 1e6,
-        })  # fmt: skip
+        base = self.drive.model_copy(
+            update={
+                "city": City(smallest_km2=self.town_km2, largest_km2=self.town_km2, **town),
+                "landmark_per_goal": True,
+                "longest_s": 60.0 * self.minutes,
+                "longest_m": 1e6,
+            }
+        )
         return changed(
             base,
             compass_2sigma_deg=self.compass_2sigma_deg,
@@ -181,11 +200,13 @@ def changed(drive: Drive, **values: object) -> Drive:
     """A drive's settings with some of them replaced, named without their sections."""
     sensors = {name: values.pop(name) for name in _Sensors if name in values}
     navigation = {"strategy": values.pop("strategy")} if "strategy" in values else {}
-    return drive.model_copy(update={
-        "sensors": drive.sensors.model_copy(update=sensors),
-        "navigation": drive.navigation.model_copy(update=navigation),
-        **values,
-    })  # fmt: skip
+    return drive.model_copy(
+        update={
+            "sensors": drive.sensors.model_copy(update=sensors),
+            "navigation": drive.navigation.model_copy(update=navigation),
+            **values,
+        }
+    )
 
 
 def load_study(path: Path, kind: type[Study]) -> Study:

@@ -76,8 +76,15 @@ def finish_range(study: RangeStudy, folder: Path) -> Made:
         results, list(range_study.split(table)), study.drive.navigation.lost_above_m, folder
     )
     tables = range_tables(results)
-    return _finish(study, folder, "Range without landmarks", [asdict(r) for r in results],
-                   tables, (OURS, *RANGE_NOTES), [picture])  # fmt: skip
+    return _finish(
+        study,
+        folder,
+        "Range without landmarks",
+        [asdict(r) for r in results],
+        tables,
+        (OURS, *RANGE_NOTES),
+        [picture],
+    )
 
 
 def finish_landmarks(study: LandmarkStudy, folder: Path) -> Made:
@@ -86,8 +93,15 @@ def finish_landmarks(study: LandmarkStudy, folder: Path) -> Made:
     result = landmark_study.summarise(study, table)
     pictures = landmark_figure.draw(study, result, list(range_study.split(table)), folder)
     tables = landmark_study.tables(study, result)
-    return _finish(study, folder, "Landmarks, strategies and detection rates", asdict(result),
-                   tables, (OURS, *landmark_study.NOTES), pictures)  # fmt: skip
+    return _finish(
+        study,
+        folder,
+        "Landmarks, strategies and detection rates",
+        asdict(result),
+        tables,
+        (OURS, *landmark_study.NOTES),
+        pictures,
+    )
 
 
 RANGE_NOTES: Final = (
@@ -109,21 +123,33 @@ def range_tables(results: Sequence[range_study.CompassResult]) -> tuple[Table, .
     return (
         Table(
             "Distance at loss (95 % intervals)",
-            ("compass", "drives", "lost", "mean, km", "published, km", "shortest..longest",
-             "curve at 100 m", "r ds D", "NEES (honest)"),
+            (
+                "compass",
+                "drives",
+                "lost",
+                "mean, km",
+                "published, km",
+                "shortest..longest",
+                "curve at 100 m",
+                "r ds D",
+                "NEES (honest)",
+            ),
             tuple(
                 (
-                    range_figure.name_of(r), str(r.drives), percent(r.share_lost),
+                    range_figure.name_of(r),
+                    str(r.drives),
+                    percent(r.share_lost),
                     km(r.lost_after_m) if r.lost else "never lost",
-                    _published(r), f"{r.shortest_m / 1e3:.2f}..{r.longest_m / 1e3:.2f}"
-                    if r.lost else "",
-                    km(r.growth.crossing_m), "" if math.isnan(r.law_m) else f"{r.law_m / 1e3:.1f}",
+                    _published(r),
+                    f"{r.shortest_m / 1e3:.2f}..{r.longest_m / 1e3:.2f}" if r.lost else "",
+                    km(r.growth.crossing_m),
+                    "" if math.isnan(r.law_m) else f"{r.law_m / 1e3:.1f}",
                     f"{r.nees_mean:.2f} ({r.nees_band[0]:.2f}..{r.nees_band[1]:.2f})",
                 )
                 for r in results
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def _published(result: range_study.CompassResult) -> str:
@@ -134,11 +160,20 @@ def _published(result: range_study.CompassResult) -> str:
 
 
 def _finish(
-    study: RangeStudy | LandmarkStudy, folder: Path, title: str, results: object,
-    tables: tuple[Table, ...], notes: tuple[str, ...], pictures: Sequence[Path],
-) -> Made:  # fmt: skip
-    summary = {"study": study.model_dump(mode="json"), "notes": notes, "results": results,
-               "columns": ["case", "drive", "seed", *Result._fields]}  # fmt: skip
+    study: RangeStudy | LandmarkStudy,
+    folder: Path,
+    title: str,
+    results: object,
+    tables: tuple[Table, ...],
+    notes: tuple[str, ...],
+    pictures: Sequence[Path],
+) -> Made:
+    summary = {
+        "study": study.model_dump(mode="json"),
+        "notes": notes,
+        "results": results,
+        "columns": ["case", "drive", "seed", *Result._fields],
+    }
     write_page(folder / PAGE, f"{title}: simulated study", notes, tables, pictures)
     write_text(folder / SUMMARY, strict_json(summary) + "\n")
     return Made(folder, tables, notes)

@@ -154,12 +154,18 @@ def drives_schema() -> pa.Schema:
     """Columns of ``drives.parquet``."""
     import pyarrow as pa
 
-    return pa.schema([
-        ("case", pa.int32()), ("drive", pa.int32()), ("seed", pa.uint64()),
-        ("compass_2sigma_deg", pa.float64()), ("strategy", pa.string()),
-        ("landmarks_per_km2", pa.float64()), ("detection_rate", pa.float64()),
-        *_chunk_schema(),
-    ])  # fmt: skip
+    return pa.schema(
+        [
+            ("case", pa.int32()),
+            ("drive", pa.int32()),
+            ("seed", pa.uint64()),
+            ("compass_2sigma_deg", pa.float64()),
+            ("strategy", pa.string()),
+            ("landmarks_per_km2", pa.float64()),
+            ("detection_rate", pa.float64()),
+            *_chunk_schema(),
+        ]
+    )
 
 
 def _with_conditions(chunk: Chunk, rows: dict[str, Floats]) -> dict[str, object]:

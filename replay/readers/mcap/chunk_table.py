@@ -87,10 +87,16 @@ class ChunkTable(Mapping[int, ChunkIndex]):
         edges = np.concatenate(([0], np.cumsum(np.diff(self.edges)[picked]))).astype(np.int64)
         pairs = np.repeat(self.edges[picked] - edges[:-1], np.diff(edges)) + np.arange(edges[-1])
         return type(self)(
-            self.at[rows], self.length[rows], self.index_length[rows], self.start[rows],
-            self.end[rows], self.sizes[rows], self.compression[rows],
-            edges, self.channel[pairs],
-        )  # fmt: skip
+            self.at[rows],
+            self.length[rows],
+            self.index_length[rows],
+            self.start[rows],
+            self.end[rows],
+            self.sizes[rows],
+            self.compression[rows],
+            edges,
+            self.channel[pairs],
+        )
 
     def __len__(self) -> int:
         return len(self.at)
@@ -105,11 +111,16 @@ class ChunkTable(Mapping[int, ChunkIndex]):
         i = self._row[at]
         first, last, *numbers = (column[i] for column in self._numbers)
         return ChunkIndex(
-            first, last, at, numbers[0],
+            first,
+            last,
+            at,
+            numbers[0],
             frozenset(self.channel[self.edges[i] : self.edges[i + 1]].tolist()),
-            numbers[1], self.compression[i].decode("utf-8", "backslashreplace"),
-            numbers[2], numbers[3],
-        )  # fmt: skip
+            numbers[1],
+            self.compression[i].decode("utf-8", "backslashreplace"),
+            numbers[2],
+            numbers[3],
+        )
 
     @cached_property
     def _row(self) -> dict[int, int]:
@@ -118,9 +129,13 @@ class ChunkTable(Mapping[int, ChunkIndex]):
     @cached_property
     def _numbers(self) -> tuple[list[int], ...]:
         columns = (
-            self.start, self.end, self.length, self.index_length,
-            self.sizes[:, 0], self.sizes[:, 1],
-        )  # fmt: skip
+            self.start,
+            self.end,
+            self.length,
+            self.index_length,
+            self.sizes[:, 0],
+            self.sizes[:, 1],
+        )
         return tuple(column.tolist() for column in columns)
 
 

@@ -237,9 +237,13 @@ def test_wrong_usage_is_told(
 
 BASE: dict[str, Any] = {"version": 1, "start_ns": 0, "end_ns": 100}
 ONE: dict[str, Any] = {
-    "id": 0, "intersection": "A", "start_ns": 0, "enter_ns": 40, "control": "none",
+    "id": 0,
+    "intersection": "A",
+    "start_ns": 0,
+    "enter_ns": 40,
+    "control": "none",
     "features": {"left": True, "right": False, "straight": True},
-}  # fmt: skip
+}
 CUE: dict[str, Any] = {"cue": "stop_sign", "present": True}
 
 

@@ -155,9 +155,17 @@ def _side_view(kind: str, *, nose_left: bool) -> NDArray[np.bool_]:
     covered = np.zeros((216, 384), np.uint8)
     axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     compiled().cover(
-        placed.corners, np.zeros(3, np.float32), axes, np.array([0.0, 0.0, 1.4]), 400.0, 192.0,
-        108.0, covered, 0, 0,
-    )  # fmt: skip
+        placed.corners,
+        np.zeros(3, np.float32),
+        axes,
+        np.array([0.0, 0.0, 1.4]),
+        400.0,
+        192.0,
+        108.0,
+        covered,
+        0,
+        0,
+    )
     return covered.astype(np.bool_)
 
 

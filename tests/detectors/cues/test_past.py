@@ -221,8 +221,9 @@ def test_messages_give_the_same_obstacles_as_the_bus() -> None:
 
 @pytest.mark.parametrize("bus", ["", 'bus = "/not/there"\n'])
 def test_a_log_without_a_device_is_no_error(bus: str) -> None:
-    planned = plan([(0, Topic("gyro", "sensor_msgs/msg/Imu", "columns"))],
-                   vehicle_of(f"[mobileye]\n{bus}"))  # fmt: skip
+    planned = plan(
+        [(0, Topic("gyro", "sensor_msgs/msg/Imu", "columns"))], vehicle_of(f"[mobileye]\n{bus}")
+    )
 
     assert "mobileye.bus" in planned.missing[Signal.MOBILEYE_OBSTACLES]
 

@@ -71,9 +71,11 @@ def test_a_car_that_stands_says_where_its_lower_end_points(nose: int, want: Side
 
 @settings(deadline=None, max_examples=40)
 @given(
-    x=st.integers(60, 220), dx=st.integers(-25, 25), dy=st.integers(-8, 8),
+    x=st.integers(60, 220),
+    dx=st.integers(-25, 25),
+    dy=st.integers(-8, 8),
     nose=st.sampled_from([-1, 1]),
-)  # fmt: skip
+)
 def test_the_mirror_image_says_the_other_side(x: int, dx: int, dy: int, nose: int) -> None:
     before, now = _car(x, nose, 0), _car(x + dx, nose, 10**8, y=60 + dy)
 
@@ -125,9 +127,12 @@ def test_a_box_has_no_nose() -> None:
 
 @settings(deadline=None, max_examples=60)
 @given(
-    h=st.integers(1, 12), w=st.integers(1, 12), x=st.integers(0, 6), y=st.integers(0, 6),
+    h=st.integers(1, 12),
+    w=st.integers(1, 12),
+    x=st.integers(0, 6),
+    y=st.integers(0, 6),
     seed=st.integers(0, 999),
-)  # fmt: skip
+)
 def test_runs_come_back_as_they_went(h: int, w: int, x: int, y: int, seed: int) -> None:
     mask = np.random.default_rng(seed).random((h, w)) < 0.6
     size = (w + x + seed % 3, h + y + seed % 2)

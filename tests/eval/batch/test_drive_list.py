@@ -221,8 +221,10 @@ def test_a_link_that_leads_back_is_not_followed_for_ever(tmp_path: Path) -> None
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.text(min_size=1, max_size=300), min_size=1, max_size=6, unique=True))
 def test_names_are_safe_and_apart_whatever_the_logs_are_called(texts: list[str]) -> None:
-    logs = [f"memory://bucket/{text.replace('*', '').replace('?', '').replace('[', '')}.mcap"
-            for text in texts]  # fmt: skip
+    logs = [
+        f"memory://bucket/{text.replace('*', '').replace('?', '').replace('[', '')}.mcap"
+        for text in texts
+    ]
     logs = list(dict.fromkeys(logs))
 
     names = [one.name for one in drives_of(logs, each=True).drives]

@@ -41,8 +41,11 @@ def test_one_failing_drive_does_not_stop_the_rest(tmp_path: Path) -> None:
     assert [done.job for done in results] == jobs
     errors = {word: done.error for word, done in zip(words, results, strict=True)}
     assert [word for word, error in errors.items() if error is None] == [
-        "plain", "loss", "dies once", "last",
-    ]  # fmt: skip
+        "plain",
+        "loss",
+        "dies once",
+        "last",
+    ]
     assert errors["damaged"] == f"{jobs[1].logs[0]}: cut; copy it again"
     assert "killed by SIGKILL (out of memory?), 2 times" in str(errors["dies"])
     assert "ended with status 7, 2 times" in str(errors["leaves"])
@@ -215,8 +218,10 @@ def test_a_signal_stops_all_workers(tmp_path: Path, number: signal.Signals, stat
     here = os.pathsep.join(sys.path)
     parent = subprocess.Popen(
         [sys.executable, str(script), str(tmp_path / "drives")],
-        env={**os.environ, "PYTHONPATH": here}, stderr=subprocess.PIPE, start_new_session=True,
-    )  # fmt: skip
+        env={**os.environ, "PYTHONPATH": here},
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
     with parent:
         pids = _wait_for_two(tmp_path / "drives")
         parent.send_signal(number)

@@ -43,10 +43,14 @@ def _pair(tmp_path: Path, *, scored: bool = True, threshold: float = 0.3) -> tup
     good = run_folder(tmp_path / "a", settings=_settings(0.9))
     worse = run_folder(
         tmp_path / "b",
-        {"frames": frame_table(50), "cues": cue_table(WORSE_CUES), "belief": belief_table(BELIEF),
-         "range": range_table(8, 45, 0.5)},
+        {
+            "frames": frame_table(50),
+            "cues": cue_table(WORSE_CUES),
+            "belief": belief_table(BELIEF),
+            "range": range_table(8, 45, 0.5),
+        },
         settings=_settings(threshold),
-    )  # fmt: skip
+    )
     if scored:
         assert cli.run(["score", str(good.path), "-q"]) == 0
         assert cli.run(["score", str(worse.path), "-q"]) == 0
@@ -121,8 +125,10 @@ def test_losing_a_score_is_worse_and_gaining_one_is_not() -> None:
 @given(st.floats(0, 1), st.floats(0, 1), st.sampled_from(["precision", "brier", "share_there"]))
 def test_at_most_one_direction_is_worse(old: float, new: float, name: str) -> None:
     one, other = {name: MetricValue(old)}, {name: MetricValue(new)}
-    worse = [any(change.is_worse for change in compare_metrics(a, b)[0])
-             for a, b in ((one, other), (other, one))]  # fmt: skip
+    worse = [
+        any(change.is_worse for change in compare_metrics(a, b)[0])
+        for a, b in ((one, other), (other, one))
+    ]
 
     apart = abs(old - new) > 1e-12 * max(old, new)
     assert sum(worse) == (name != "share_there" and apart)
@@ -172,10 +178,13 @@ def test_hostile_names_cannot_drive_the_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = [
-        run_folder(tmp_path / name, {"t": pa.table({"\x1b[2J": [value]})},
-                   settings={"\x1b]0;x\x07": f"\x1b[31m{value}"})
+        run_folder(
+            tmp_path / name,
+            {"t": pa.table({"\x1b[2J": [value]})},
+            settings={"\x1b]0;x\x07": f"\x1b[31m{value}"},
+        )
         for name, value in (("a", 1), ("b", 2))
-    ]  # fmt: skip
+    ]
 
     assert cli.run(["compare", *(str(run.path) for run in runs)]) == 1
     assert "\x1b" not in capsys.readouterr().out

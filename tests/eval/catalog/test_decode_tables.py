@@ -25,8 +25,14 @@ def _mobileye_drive() -> list[Block]:
     """One car ahead, simulated, fifteen images a second."""
     image_ns = np.arange(30, dtype=np.int64) * 66_000_000 + 1_000_000_000
     x_m = 80.0 - np.arange(30)
-    objects = Table({"t_ns": image_ns, "x_m": x_m, "y_m": np.full(30, 2.0),
-                     "obstacle_id": np.full(30, 7, np.int16)})  # fmt: skip
+    objects = Table(
+        {
+            "t_ns": image_ns,
+            "x_m": x_m,
+            "y_m": np.full(30, 2.0),
+            "obstacle_id": np.full(30, 7, np.int16),
+        }
+    )
     settings = MobileyeSettings(mounting=Mounting(2.0, 0.0, 0.0))
     return [encode_tables(bursts_of(image_ns, objects, settings, bus="eye"), settings, "eye")]
 

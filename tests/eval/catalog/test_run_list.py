@@ -12,8 +12,12 @@ from crosscue.replay.files.run_folder import FORMAT_VERSION
 
 @pytest.fixture
 def runs(tmp_path: Path) -> Path:
-    for name, stage in (("a", "estimate"), ("b", "estimate"), ("deep/c", "estimate"),
-                        ("merged", "merged")):  # fmt: skip
+    for name, stage in (
+        ("a", "estimate"),
+        ("b", "estimate"),
+        ("deep/c", "estimate"),
+        ("merged", "merged"),
+    ):
         folder = tmp_path / "runs" / name
         folder.mkdir(parents=True)
         text = json.dumps({"format_version": FORMAT_VERSION, "stage": stage})

@@ -162,9 +162,11 @@ def test_a_dbc_that_does_not_parse(
 
 
 def test_a_disk_that_fills_up_leaves_nothing_half(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], drive: DriveFiles,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    drive: DriveFiles,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     def full(handle: int) -> None:
         raise OSError(28, "No space left on device")
 

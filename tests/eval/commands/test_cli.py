@@ -65,9 +65,16 @@ def test_hostile_bytes_in_an_error_are_shown_not_executed(
 
 @pytest.mark.parametrize(
     ("argv", "status"),
-    [([], 2), (["--help"], 0), (["fake", "--number", "3"], 3), (["fake", "--nubmer", "3"], 2),
-     (["fake", "--help"], 0), (["replya"], 2), (["--version"], 0)],
-)  # fmt: skip
+    [
+        ([], 2),
+        (["--help"], 0),
+        (["fake", "--number", "3"], 3),
+        (["fake", "--nubmer", "3"], 2),
+        (["fake", "--help"], 0),
+        (["replya"], 2),
+        (["--version"], 0),
+    ],
+)
 def test_usage(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

@@ -235,9 +235,11 @@ def test_quick_reads_no_body() -> None:
 def test_nothing_in_a_name_reaches_the_terminal_or_breaks_json() -> None:
     stream = Stream(40, 50 * MS)
     log = MadeLog(
-        (table_of(NASTY, stream.log_ns() * 0),), (Topic(NASTY, NASTY, "columns"),), dropped=1,
+        (table_of(NASTY, stream.log_ns() * 0),),
+        (Topic(NASTY, NASTY, "columns"),),
+        dropped=1,
         path=Path(NASTY),
-    )  # fmt: skip
+    )
 
     summary = summarise(log)
 

@@ -52,10 +52,20 @@ class Drive:
     def replay(self, run: Path, *more: str) -> list[str]:
         """The command line: three seconds of the drive."""
         return [
-            "replay", str(self.folder / "drive.mcap"), "--vehicle", str(self.vehicle), "-o",
-            str(run), "--cache", str(self.folder / "cache.sqlite"), "--from", "4", "--to", "7",
+            "replay",
+            str(self.folder / "drive.mcap"),
+            "--vehicle",
+            str(self.vehicle),
+            "-o",
+            str(run),
+            "--cache",
+            str(self.folder / "cache.sqlite"),
+            "--from",
+            "4",
+            "--to",
+            "7",
             *more,
-        ]  # fmt: skip
+        ]
 
 
 @pytest.fixture(scope="module")

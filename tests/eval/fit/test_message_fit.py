@@ -146,9 +146,10 @@ def test_the_section_is_printed_where_no_file_is_named(
     printed = json.loads(capsys.readouterr().out)
     assert printed["approaches"] == DRIVES
     (rate,) = [
-        one for one in printed["rates"]
+        one
+        for one in printed["rates"]
         if (one["cue"], one["feature"], one["near"]) == ("road_left", "left", True)
-    ]  # fmt: skip
+    ]
     for interval in ("wilson", "by_places"):
         low, high = rate["there"][interval]
         assert low < rate["there"]["rate"] < high

@@ -21,8 +21,9 @@ def test_the_curve_that_made_the_pairs_comes_back(family: str) -> None:
     parameters = {"pinhole": (750.0,), "pinhole-offset": (700.0, 2.5), "power": (600.0, -0.9)}
     curve = RangeCurve(
         family=family,  # type: ignore[arg-type]
-        parameters=parameters[family], residual_sd_m=1.0,
-    )  # fmt: skip
+        parameters=parameters[family],
+        residual_sd_m=1.0,
+    )
     height = np.linspace(9.0, 90.0, 80)
     noise = np.random.default_rng(3).normal(0.0, 1.7, 80)
 
@@ -100,19 +101,30 @@ def drive(folder: Path, noise_m: float = 0.0) -> Path:
         for number, (cue, size) in enumerate(HEIGHTS.items()):
             true_m = start if cue == "stop_sign" else start + 15.0
             height = size / (true_m + rng.normal(0.0, noise_m))
-            objects.append({"image_id": k, "category_id": number, "visible": 1.0,
-                            "bbox": [5, 5, 9, height]})  # fmt: skip
-            objects.append({"image_id": k, "category_id": number, "visible": 0.5,
-                            "bbox": [5, 5, 9, 3.0]})  # fmt: skip
+            objects.append(
+                {"image_id": k, "category_id": number, "visible": 1.0, "bbox": [5, 5, 9, height]}
+            )
+            objects.append(
+                {"image_id": k, "category_id": number, "visible": 0.5, "bbox": [5, 5, 9, 3.0]}
+            )
     names = [cue.replace("_", " ") for cue in HEIGHTS]
-    tree = {"images": images, "annotations": objects,
-            "categories": [{"id": i, "name": name} for i, name in enumerate(names)]}  # fmt: skip
+    tree = {
+        "images": images,
+        "annotations": objects,
+        "categories": [{"id": i, "name": name} for i, name in enumerate(names)],
+    }
     (folder / "objects.json").write_text(json.dumps(tree))
     (folder / "ranges.csv").write_text("\n".join(ranges))
     save(
-        Truth(version=1, start_ns=1_700_000_000_000_000_000, end_ns=1_700_000_007_000_000_000,
-              objects="objects.json", ranges="ranges.csv"), folder,
-    )  # fmt: skip
+        Truth(
+            version=1,
+            start_ns=1_700_000_000_000_000_000,
+            end_ns=1_700_000_007_000_000_000,
+            objects="objects.json",
+            ranges="ranges.csv",
+        ),
+        folder,
+    )
     return folder
 
 
@@ -131,8 +143,20 @@ def test_a_curve_is_measured_on_drives_it_was_not_fitted_to(
 ) -> None:
     fitted, other = drive(tmp_path / "a"), drive(tmp_path / "b", noise_m=1.0)
     figure = tmp_path / "f.png"
-    argv = ["fit", "ranges", "--cue", "stop_sign", "--truth", str(fitted), "--test", str(other),
-            "--figure", str(figure), "--family", "pinhole"]  # fmt: skip
+    argv = [
+        "fit",
+        "ranges",
+        "--cue",
+        "stop_sign",
+        "--truth",
+        str(fitted),
+        "--test",
+        str(other),
+        "--figure",
+        str(figure),
+        "--family",
+        "pinhole",
+    ]
 
     assert run([*argv, "--json"]) == 0
 
@@ -150,9 +174,13 @@ def test_a_runs_detections_are_paired_with_the_truth_of_its_drive(tmp_path: Path
     truth = drive(tmp_path / "a")
     t_ns = [1_700_000_000_000_000_000 + k * 100_000_000 for k in (3, 4, 5)] + [9]
     table = pa.table(
-        {"t_ns": t_ns, "label": ["stop sign", "stop sign", "car", "stop sign"],
-         "score": [0.95, 0.5, 0.99, 0.99], "height_px": [20.0] * 4}
-    )  # fmt: skip
+        {
+            "t_ns": t_ns,
+            "label": ["stop sign", "stop sign", "car", "stop sign"],
+            "score": [0.95, 0.5, 0.99, 0.99],
+            "height_px": [20.0] * 4,
+        }
+    )
     pq.write_table(table, tmp_path / "detections.parquet")
 
     pairs = pairs_of_run(tmp_path, truth, "stop_sign", 0.9)

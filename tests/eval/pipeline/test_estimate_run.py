@@ -46,9 +46,17 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _replay(folder: Path, out: Path, *more: str) -> None:
     arguments = [
-        "replay", str(folder / "drive.mcap"), "--vehicle", str(folder / "vehicle.toml"),
-        "-o", str(out), "--cache", str(folder / "cache.sqlite"), "-q", *more,
-    ]  # fmt: skip
+        "replay",
+        str(folder / "drive.mcap"),
+        "--vehicle",
+        str(folder / "vehicle.toml"),
+        "-o",
+        str(out),
+        "--cache",
+        str(folder / "cache.sqlite"),
+        "-q",
+        *more,
+    ]
     assert run(arguments) == 0
 
 
@@ -136,9 +144,16 @@ def test_only_a_changed_detector_runs_again(
     shutil.copy(drive / "simulated_car.dbc", tmp_path)
 
     arguments = [
-        "replay", str(drive / "drive.mcap"), "--vehicle", str(tmp_path / "v.toml"), "-o",
-        str(tmp_path / "run"), "--cache", str(drive / "cache.sqlite"), "--json",
-    ]  # fmt: skip
+        "replay",
+        str(drive / "drive.mcap"),
+        "--vehicle",
+        str(tmp_path / "v.toml"),
+        "-o",
+        str(tmp_path / "run"),
+        "--cache",
+        str(drive / "cache.sqlite"),
+        "--json",
+    ]
     assert run(arguments) == 0
 
     told = json.loads(capsys.readouterr().out)["detected"]
@@ -153,8 +168,16 @@ def test_a_resumed_run_gives_the_bytes_of_an_uninterrupted_one(
 
     with monkeypatch.context() as patch:
         patch.setattr("crosscue.eval.pipeline.replay.estimate_into", killed)
-        arguments = ["replay", str(drive / "drive.mcap"), "-o", str(tmp_path / "run"), "-q",
-                     "--vehicle", str(drive / "vehicle.toml"), "--no-cache"]  # fmt: skip
+        arguments = [
+            "replay",
+            str(drive / "drive.mcap"),
+            "-o",
+            str(tmp_path / "run"),
+            "-q",
+            "--vehicle",
+            str(drive / "vehicle.toml"),
+            "--no-cache",
+        ]
         assert run(arguments) == 130
     monkeypatch.setattr("crosscue.eval.pipeline.replay.detect_into", killed)
 

@@ -431,8 +431,9 @@ def test_a_matcher_of_ones_own_makes_and_asks_a_database(
 
     best = json.loads(capsys.readouterr().out)["best"]
     assert [(one["name"], one["score"]) for one in best] == [
-        ("photos/50.png", 90.0), ("photos/150.png", 10.0),
-    ]  # fmt: skip
+        ("photos/50.png", 90.0),
+        ("photos/150.png", 10.0),
+    ]
     status, text = refused(capsys, "landmarks", "match", database, str(picture))
     assert (status, "matcher 'shade', not 'orb'" in text) == (2, True)
 

@@ -61,10 +61,22 @@ def test_replay_and_estimate_of_a_damaged_log(
     run = tmp_path / "run"
     for argv in (
         ["replay", str(log), "--vehicle", str(vehicle), "-o", str(run), "--json"],
-        ["replay", str(log), "--vehicle", str(vehicle), "-o", str(run), "--json", "--overwrite",
-         "--from", "1", "--to", "8"],
+        [
+            "replay",
+            str(log),
+            "--vehicle",
+            str(vehicle),
+            "-o",
+            str(run),
+            "--json",
+            "--overwrite",
+            "--from",
+            "1",
+            "--to",
+            "8",
+        ],
         ["estimate", str(run), "--json"],
-    ):  # fmt: skip
+    ):
         assert cli.run(argv) == 3
         found = _agrees(run, json.loads(capsys.readouterr().out))
         assert {stage for stage, _, _ in lines(found)} == {"reading", "estimating"}
@@ -120,9 +132,11 @@ def test_single_rows_beyond_those_kept_are_added_up(tmp_path: Path) -> None:
 
 def _made() -> dict[str, Any]:
     topic = {**line(10, 7, {"dull": 2}, {"cut": 1})}
-    return account([{"log": "a", "is_whole": False, "topics": {"/t": topic}}],
-                   {"/cam": line(5, 4, {}, {"not decoded": 1})},
-                   {"headings": line(9, 6, {"refused by the gate": 3})})  # fmt: skip
+    return account(
+        [{"log": "a", "is_whole": False, "topics": {"/t": topic}}],
+        {"/cam": line(5, 4, {}, {"not decoded": 1})},
+        {"headings": line(9, 6, {"refused by the gate": 3})},
+    )
 
 
 @pytest.mark.parametrize("stage", ["reading", "detecting", "estimating"])
@@ -153,9 +167,13 @@ def test_runs_add_up_and_stay_damaged() -> None:
 def test_a_person_reads_every_stage_and_every_reason_once() -> None:
     text = "\n".join(account_lines(_made()))
 
-    for words in ("10 rows: 7 used, 2 skipped, 1 dropped", "5 frames: 4 used, 0 skipped, 1 dropped",
-                  "9 readings: 6 used, 3 skipped, 0 dropped", "dropped 1 of reading /t: cut",
-                  "skipped 3 of estimating headings: refused by the gate"):  # fmt: skip
+    for words in (
+        "10 rows: 7 used, 2 skipped, 1 dropped",
+        "5 frames: 4 used, 0 skipped, 1 dropped",
+        "9 readings: 6 used, 3 skipped, 0 dropped",
+        "dropped 1 of reading /t: cut",
+        "skipped 3 of estimating headings: refused by the gate",
+    ):
         assert text.count(words) == 1
     assert np.all([len(part) <= 100 for part in text.splitlines()])
 
@@ -186,8 +204,12 @@ def test_headings_that_the_first_belief_is_made_of_are_used(
     (tmp_path / "car.toml").write_text(text)
     run = tmp_path / "run"
 
-    assert cli.run(["replay", str(log), "--vehicle", str(tmp_path / "car.toml"), "-o", str(run),
-                    "--json"]) == 3  # fmt: skip
+    assert (
+        cli.run(
+            ["replay", str(log), "--vehicle", str(tmp_path / "car.toml"), "-o", str(run), "--json"]
+        )
+        == 3
+    )
 
     printed = json.loads(capsys.readouterr().out)
     assert any("start heading" in sentence for sentence in printed["notices"])

@@ -92,8 +92,12 @@ def test_a_run_of_the_old_format_is_refused(
     manifest.parent.mkdir()
     manifest.write_text('{"format_version": 1}')
 
-    for argv in (["estimate", "old"], ["view", "old", "--save", "x.rrd"], ["score", "old"],
-                 ["merge", "old", "-o", "all"]):  # fmt: skip
+    for argv in (
+        ["estimate", "old"],
+        ["view", "old", "--save", "x.rrd"],
+        ["score", "old"],
+        ["merge", "old", "-o", "all"],
+    ):
         argv = [str(tmp_path / word) if word in ("old", "all") else word for word in argv]
         assert run(argv) == 1
         assert "format 1, this crosscue reads 2: replay again" in capsys.readouterr().err

@@ -88,10 +88,12 @@ def test_a_clock_that_is_set_makes_no_distance_and_loses_none(tmp_path: Path, by
     pose = whole.run.table("pose")
     assert np.all(np.diff(pose["t_ns"].to_numpy()) > 0)
     original = pose["log_t_ns"].to_numpy()
-    expected = np.concatenate([
-        first.run.table("pose")["t_ns"].to_numpy(),
-        second.run.table("pose")["t_ns"].to_numpy() + by_s * SECOND,
-    ])  # fmt: skip
+    expected = np.concatenate(
+        [
+            first.run.table("pose")["t_ns"].to_numpy(),
+            second.run.table("pose")["t_ns"].to_numpy() + by_s * SECOND,
+        ]
+    )
     np.testing.assert_array_equal(original, expected)
 
 
@@ -163,9 +165,9 @@ def test_one_stray_stamp_is_skipped_and_reported(tmp_path: Path, by_s: int) -> N
     stray[20] += by_s * SECOND
     kept = np.arange(len(stray)) != 20
 
-    outcome = _replay(tmp_path / "run", [
-        *blocks[:2], Block("wheels", stray, blocks[2].rows), *blocks[3:]
-    ])  # fmt: skip
+    outcome = _replay(
+        tmp_path / "run", [*blocks[:2], Block("wheels", stray, blocks[2].rows), *blocks[3:]]
+    )
     without = _replay(tmp_path / "without", [*blocks[:2], blocks[2].take(kept), *blocks[3:]])
 
     assert len(outcome.segments) == 1
@@ -200,8 +202,9 @@ def test_a_watch_finds_the_same_in_any_pieces(pieces: int) -> None:
     assert [one.row for one in watch.set_backs] == [300]
     assert watch.strays == [(450, 451)]
     assert [(era.first_ns, era.last_ns) for era in watch.eras] == [
-        (0, 299 * ROW), (100 * ROW, 699 * ROW + 80 * SECOND),
-    ]  # fmt: skip
+        (0, 299 * ROW),
+        (100 * ROW, 699 * ROW + 80 * SECOND),
+    ]
 
 
 def _belief(speed_mps: float) -> PoseBelief:

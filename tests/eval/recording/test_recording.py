@@ -61,8 +61,16 @@ def test_every_frame_has_its_picture_marks_and_way_ahead_on_the_drives_timeline(
 ) -> None:
     rows = _rows(_saved(tmp_path))
 
-    marks = ("picture", "objects", "far_objects", "outlines", "sign_windows", "road", "regions",
-             "cars")  # fmt: skip
+    marks = (
+        "picture",
+        "objects",
+        "far_objects",
+        "outlines",
+        "sign_windows",
+        "road",
+        "regions",
+        "cars",
+    )
     for name in marks:
         assert rows[f"/camera/{name}"] == FRAMES
     for name in ("intersection", "band", "mobileye_objects", "mobileye_lanes"):
@@ -96,8 +104,12 @@ def test_names_from_outside_stay_text_and_paths_are_ours(tmp_path: Path) -> None
     labels = _cells(path, "/camera/objects", "labels")
     assert labels[0][-1] == f"{LABEL} 0.50"
     assert {entity.split("/")[1] for entity in _rows(path)} == {
-        "ahead", "camera", "cues", "plan", "plots"
-    }  # fmt: skip
+        "ahead",
+        "camera",
+        "cues",
+        "plan",
+        "plots",
+    }
     assert inert("[a](http://b) <i>") == r"\[a\]\(http\:\/\/b\) \<i\>"
 
 

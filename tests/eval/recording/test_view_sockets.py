@@ -68,9 +68,11 @@ def test_the_web_viewer_listens_on_loopback_only_and_ends_with_the_command(tmp_p
     code = "from crosscue.eval.cli import main; main()"
     view = subprocess.Popen(
         [sys.executable, "-c", code, "view", str(run), "--web"],
-        env={**os.environ, "BROWSER": "true"}, start_new_session=True,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+        env={**os.environ, "BROWSER": "true"},
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     try:
         heard: set[tuple[str, int]] = set()
         end = time.monotonic() + 40.0

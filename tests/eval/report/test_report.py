@@ -80,8 +80,10 @@ def test_nothing_that_logs_or_truth_say_becomes_active(tmp_path: Path) -> None:
 def test_coverage_comes_first_and_losses_are_told(tmp_path: Path) -> None:
     page = _written(tmp_path, _scored(tmp_path / "drive"))
 
-    order = [page.index(f"<h2>{name}</h2>") for name in
-             ("Coverage", "Intersections", "Cues", "Belief", "Range", "How")]  # fmt: skip
+    order = [
+        page.index(f"<h2>{name}</h2>")
+        for name in ("Coverage", "Intersections", "Cues", "Belief", "Range", "How")
+    ]
     assert order == sorted(order)
     assert "<b>50 of 50</b>" in page
     assert "rows were dropped." in page
@@ -149,11 +151,14 @@ def test_what_a_cue_was_worth_is_told_beside_the_others(tmp_path: Path) -> None:
     nothing = {"value": 0.0, "low": None, "high": None}
     worth = {
         "stop_sign": {
-            "detected_m": nothing | {"value": 12.34}, "full_m": nothing | {"value": None},
-            "detected_only_with": 3, "full_only_with": 2, "full_only_without": 1,
+            "detected_m": nothing | {"value": 12.34},
+            "full_m": nothing | {"value": None},
+            "detected_only_with": 3,
+            "full_only_with": 2,
+            "full_only_without": 1,
             "belief": {"left": {"log_score": nothing | {"value": -0.5}}},
         }
-    }  # fmt: skip
+    }
     one = _scored(tmp_path / "drive")
 
     page = _written(tmp_path, one, attribution=worth)

@@ -131,8 +131,10 @@ def test_every_approach_belongs_to_one_at_most_by_largest_shared_time() -> None:
 def test_shifting_all_times_changes_no_association() -> None:
     ones = [approach(id=i, start_ns=at(20 * i), enter_ns=at(20 * i + 15)) for i in range(3)]
     spans = {i: (at(20 * i + 3), at(20 * i + 17)) for i in range(3)}
-    later = [one.model_copy(update={"start_ns": one.start_ns + 77, "enter_ns": one.enter_ns + 77})
-             for one in ones]  # fmt: skip
+    later = [
+        one.model_copy(update={"start_ns": one.start_ns + 77, "enter_ns": one.enter_ns + 77})
+        for one in ones
+    ]
 
     moved = {number: (a + 77, b + 77) for number, (a, b) in spans.items()}
     assert associate(ones, spans) == associate(later, moved) == {0: 0, 1: 1, 2: 2}
@@ -283,8 +285,9 @@ def test_ranges_are_told_apart_by_what_stands_at_the_intersection() -> None:
     score = score_range([*judge_range(found, lit), *judge_range(phantom, truth())])["end"]
 
     assert {name: part.rows for name, part in score.by_control.items()} == {
-        "stop_sign": 20, "traffic_light": 40
-    }  # fmt: skip
+        "stop_sign": 20,
+        "traffic_light": 40,
+    }
     assert score.by_control["traffic_light"].nees == pytest.approx(1.0)
     assert score.by_control["stop_sign"].bias_m == pytest.approx(9.0)
 

@@ -130,8 +130,12 @@ def test_a_cue_of_an_intersection_where_none_is_ahead_is_wrong() -> None:
 
 
 def test_things_hidden_do_not_count_in_the_recall_of_what_can_be_seen() -> None:
-    drive = truth([span("parked_left", 0, 10, visible=0.2, count=2),
-                   span("parked_left", 10, 20, visible=0.8, count=2)])  # fmt: skip
+    drive = truth(
+        [
+            span("parked_left", 0, 10, visible=0.2, count=2),
+            span("parked_left", 10, 20, visible=0.8, count=2),
+        ]
+    )
     found = {"parked_left": {frame: int(frame >= 10) for frame in range(20)}}
     score = score_cues(judge_cues(tables(found), drive))["parked_left"].readings["object"]
 

@@ -159,8 +159,10 @@ def test_a_gate_on_what_was_not_scored_fails(tmp_path: Path) -> None:
     ]
 
     assert cli.run(["score", str(run), "-q", "--gate", _gates(tmp_path, *gates)]) == 1
-    messages = [one.get("message") or "" for one in
-                ET.parse(run / "score" / "junit.xml").getroot().iter("failure")]  # fmt: skip
+    messages = [
+        one.get("message") or ""
+        for one in ET.parse(run / "score" / "junit.xml").getroot().iter("failure")
+    ]
     assert len(messages) == 3
     assert "no track" in messages[0]
     assert "nothing to measure it by" in messages[1]
@@ -203,8 +205,16 @@ def test_control_characters_and_markup_are_shown_in_junit() -> None:
 
 
 def test_the_wider_of_two_intervals_is_the_one_that_gates_use() -> None:
-    tree = {"precision": {"value": 0.9, "low": 0.85, "high": 0.95, "clusters_low": 0.6,
-                          "clusters_high": None, "of": 50}}  # fmt: skip
+    tree = {
+        "precision": {
+            "value": 0.9,
+            "low": 0.85,
+            "high": 0.95,
+            "clusters_low": 0.6,
+            "clusters_high": None,
+            "of": 50,
+        }
+    }
     values = metric_values(tree)
 
     assert values["precision"] == MetricValue(0.9, 0.6, 0.95, 50)

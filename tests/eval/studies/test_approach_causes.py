@@ -24,11 +24,24 @@ FAR = int((DISTANCE_M >= 8.0).sum())
 
 def _result(**changes: object) -> ApproachResult:
     usual = ApproachResult(
-        drive="runs/X-01", approach=0, intersection="X", control="stop_sign", conditions=("dusk",),
-        present=("intersection", "left"), run_approach=1, overlap_s=4.0, splits=0, steps=FRAMES,
-        detected_m=40.0, full_m=30.0, why_not_detected="", why_not_full="",
-        features_m={"intersection": 40.0, "left": 30.0}, false_features=(), at_entering={},
-    )  # fmt: skip
+        drive="runs/X-01",
+        approach=0,
+        intersection="X",
+        control="stop_sign",
+        conditions=("dusk",),
+        present=("intersection", "left"),
+        run_approach=1,
+        overlap_s=4.0,
+        splits=0,
+        steps=FRAMES,
+        detected_m=40.0,
+        full_m=30.0,
+        why_not_detected="",
+        why_not_full="",
+        features_m={"intersection": 40.0, "left": 30.0},
+        false_features=(),
+        at_entering={},
+    )
     return replace(usual, **changes)  # type: ignore[arg-type]
 
 
@@ -38,13 +51,21 @@ def _cue(
     """Things there, and positives, in the first so many frames."""
     first = np.arange(FRAMES)
     return CueJudged(
-        drive="runs/X-01", cue=cue, t_ns=first.astype(np.int64),
-        count=(first < found).astype(np.int64), approach=np.full(FRAMES, approach, np.int64),
-        distance_m=DISTANCE_M, is_object=(first < there).astype(np.int8),
-        is_feature=np.ones(FRAMES, np.int8), true_count=np.ones(FRAMES, np.int64),
-        visible=np.full(FRAMES, visible), frames=FRAMES, moments_unmatched=0,
-        left_out={"object": {}, "feature": {}}, conditions={0: ("dusk",)},
-    )  # fmt: skip
+        drive="runs/X-01",
+        cue=cue,
+        t_ns=first.astype(np.int64),
+        count=(first < found).astype(np.int64),
+        approach=np.full(FRAMES, approach, np.int64),
+        distance_m=DISTANCE_M,
+        is_object=(first < there).astype(np.int8),
+        is_feature=np.ones(FRAMES, np.int8),
+        true_count=np.ones(FRAMES, np.int64),
+        visible=np.full(FRAMES, visible),
+        frames=FRAMES,
+        moments_unmatched=0,
+        left_out={"object": {}, "feature": {}},
+        conditions={0: ("dusk",)},
+    )
 
 
 def _found(result: ApproachResult, *cues: CueJudged) -> list[Finding]:

@@ -154,8 +154,9 @@ def test_a_larger_study_reuses_what_a_smaller_one_drove(tmp_path: Path) -> None:
 
 
 def test_ways_are_averaged_over_pairs_over_each_ones_own_goals_and_over_all() -> None:
-    study = SMALL.model_copy(update={"strategies": ("straight to goal", "hybrid"),
-                                     "densities_per_km2": (0.5,)})  # fmt: skip
+    study = SMALL.model_copy(
+        update={"strategies": ("straight to goal", "hybrid"), "densities_per_km2": (0.5,)}
+    )
     ways = np.array([[1000.0, 2000.0, 9000.0], [1100.0, 2200.0, 12_000.0]])
     outcomes = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
     assert math.isnan(ratio_of_means(ways[0], outcomes[1], ways[1], outcomes[1]).value)

@@ -168,9 +168,13 @@ def test_raw_pictures_are_grey_whatever_their_colours() -> None:
     padded[:, :40] = grey
     images = _raw(padded, "mono8", 48)
     narrow = Images(
-        images.bytes_, ("raw",), np.array([40], np.int32), images.height_px, images.step_bytes,
+        images.bytes_,
+        ("raw",),
+        np.array([40], np.int32),
+        images.height_px,
+        images.step_bytes,
         images.pixel_format,
-    )  # fmt: skip
+    )
     np.testing.assert_array_equal(grey_of(picture_of(narrow, 0)), grey)
 
 
@@ -190,11 +194,15 @@ def test_real_pictures_of_other_days_mostly_do_not_match() -> None:
     orb = OrbMatcher(OrbSettings(features=1000))
     seen = {p.stem: orb.describe(grey_of(read_picture(p))) for p in folder.rglob("*.jpg")}
     same = {
-        ("gmb_q1", "gmb_db2"), ("gmb_q2", "gmb_db5"), ("gmb_q3", "gmb_db11"),
-        ("gmb_q5", "gmb_db13"), ("prbonn_query_1", "prbonn_ref_0"),
-        ("prbonn_query_2", "prbonn_ref_1"), ("prbonn_query_2", "prbonn_ref_3"),
+        ("gmb_q1", "gmb_db2"),
+        ("gmb_q2", "gmb_db5"),
+        ("gmb_q3", "gmb_db11"),
+        ("gmb_q5", "gmb_db13"),
+        ("prbonn_query_1", "prbonn_ref_0"),
+        ("prbonn_query_2", "prbonn_ref_1"),
+        ("prbonn_query_2", "prbonn_ref_3"),
         ("prbonn_query_3", "prbonn_ref_2"),
-    }  # fmt: skip
+    }
     maybe = {("gmb_q4", f"gmb_db{i}") for i in (15, 16, 17)}
     score = {
         (q, d): orb.match(seen[q], seen[d]).score

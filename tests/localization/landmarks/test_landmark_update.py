@@ -218,9 +218,15 @@ def follow(
     exact = OdometrySettings(track_width_m=TRACK_M)
     made = integrate(wheels(truth, exact), exact, gyro(truth, exact)).increments
     first = start_belief(
-        int(truth.t_ns[0]), start.get("x_m", 0.0), 0.0, truth.xyh[0, 2], truth.speed_mps[0],
-        start.get("sd_m", 10.0), 0.05, 0.1,
-    )  # fmt: skip
+        int(truth.t_ns[0]),
+        start.get("x_m", 0.0),
+        0.0,
+        truth.xyh[0, 2],
+        truth.speed_mps[0],
+        start.get("sd_m", 10.0),
+        0.05,
+        0.1,
+    )
     with LandmarkDatabase(path) as database:
         looks = PlaceLooks(search_in(database, options), truth)
         return advance(TrackState(first), made, TrackSettings(), looks=looks), looks
@@ -310,9 +316,13 @@ def test_no_landmarks_at_all_leave_the_track_as_it_was(tmp_path: Path) -> None:
 def test_a_lost_car_is_found_again_by_a_landmark(tmp_path: Path) -> None:
     """Lost above 100 m of major axis: a start that is off by tens of metres, one landmark."""
     done, looks = follow(
-        tmp_path / "lm.sqlite", straight(), {"gate": np.array([100.0, 0.0])}, SETTINGS,
-        x_m=30.0, sd_m=40.0,
-    )  # fmt: skip
+        tmp_path / "lm.sqlite",
+        straight(),
+        {"gate": np.array([100.0, 0.0])},
+        SETTINGS,
+        x_m=30.0,
+        sd_m=40.0,
+    )
 
     assert done.poses.major_axis_m[0] > 100.0
     assert len(looks.search.sightings) == 1

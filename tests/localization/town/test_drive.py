@@ -197,9 +197,14 @@ def test_straight_driving_spreads_as_r_ds_d(compass_deg: float) -> None:
 def test_simulated_cars_in_one_long_street_are_lost_where_the_law_says() -> None:
     """Few turns: the mean is near 25^2 / (r ds), turns and the start's uncertainty beside."""
     city = City(
-        smallest_km2=400.0, largest_km2=400.0, dead_end_share=0.0, one_way_share=0.0,
-        shortest_block_m=1000.0, longest_block_m=1000.0, goal_at_least_m=250.0,
-    )  # fmt: skip
+        smallest_km2=400.0,
+        largest_km2=400.0,
+        dead_end_share=0.0,
+        one_way_share=0.0,
+        shortest_block_m=1000.0,
+        longest_block_m=1000.0,
+        goal_at_least_m=250.0,
+    )
     # Slip enough that the start's heading is soon forgotten.
     sensors = Sensors(compass_2sigma_deg=60.0, compass_interval_m=4.0, slip_per_sqrt_m=0.03)
     rows = many(Drive(city=city, sensors=sensors), 200)

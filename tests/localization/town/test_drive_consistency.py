@@ -71,9 +71,9 @@ def test_compass_innovations_are_white_and_as_large_as_the_filter_says(compass_d
     settings = fine(compass_deg)
     parts = [compass_innovations(settings, drive_traced(settings, seed)) for seed in range(12)]
     nis = np.concatenate([off**2 / spread for off, spread in parts])
-    following = np.concatenate([
-        (off[1:] * off[:-1]) / np.sqrt(spread[1:] * spread[:-1]) for off, spread in parts
-    ])  # fmt: skip
+    following = np.concatenate(
+        [(off[1:] * off[:-1]) / np.sqrt(spread[1:] * spread[:-1]) for off, spread in parts]
+    )
     low, high = mean_band(1, len(nis))
 
     assert len(nis) > 20_000

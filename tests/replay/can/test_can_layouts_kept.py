@@ -131,7 +131,7 @@ def test_no_damage_makes_the_two_readers_differ(text: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("SG_ other :", "SG_ real : 0|8@1+ (1,0) [0|0] \"\" ECU\n SG_ real :"),
+        ("SG_ other :", 'SG_ real : 0|8@1+ (1,0) [0|0] "" ECU\n SG_ real :'),
         ("BO_ 100 Fd", "BO_ 2147484000 Fd"),
         ("BO_ 100 Fd", "BO_ 4000 Fd"),
         ("VAL_ 2147484000 other", "VAL_ 2147484000 nobody"),
@@ -140,12 +140,12 @@ def test_no_damage_makes_the_two_readers_differ(text: str) -> None:
         ("0|32@1-", "0|0@1-"),
         ("(2.0,1.0)", "(.5,1.0)"),
         ("Fd: 64", "Fd: 064"),
-        ("\"VFrameFormat\" BO_ 100 2", "\"SystemMessageLongSymbol\" BO_ 100 \"Long\""),
-        ("\"VFrameFormat\" BO_ 100 2", "\"VFrameFormat\" BO_ 100 20"),
+        ('"VFrameFormat" BO_ 100 2', '"SystemMessageLongSymbol" BO_ 100 "Long"'),
+        ('"VFrameFormat" BO_ 100 2', '"VFrameFormat" BO_ 100 20'),
         ("\nVAL_ 2147484000", "\nBOGUS_ 2147484000"),
         ("7-9;\n", "7-9\n"),
     ],
-)  # fmt: skip
+)
 def test_what_is_unusual_is_left_to_cantools(old: str, new: str) -> None:
     assert EXTENDED.count(old) == 1
 

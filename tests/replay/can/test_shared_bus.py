@@ -34,15 +34,23 @@ def test_every_frame_is_decoded_or_told_of_by_one_of_the_two(
 ) -> None:
     ids, kinds, extended, fd, lengths = (np.array(column) for column in zip(*frames, strict=True))
     rows = CanFrames(
-        ids.astype(np.uint32), extended, kinds.astype(np.uint8), lengths.astype(np.uint8),
-        np.zeros((len(frames), 8), np.uint8), fd,
-    )  # fmt: skip
+        ids.astype(np.uint32),
+        extended,
+        kinds.astype(np.uint8),
+        lengths.astype(np.uint8),
+        np.zeros((len(frames), 8), np.uint8),
+        fd,
+    )
     log_ns = np.arange(len(frames), dtype=np.int64)
     ledger = Ledger("made up")
     car = BusDecoder(
-        CanDatabase.of([SPEED, TWIN]), "can0", ledger, None, DecodeSettings(engine=engine),
+        CanDatabase.of([SPEED, TWIN]),
+        "can0",
+        ledger,
+        None,
+        DecodeSettings(engine=engine),
         elsewhere=all_ids(TEN_SLOTS),
-    )  # fmt: skip
+    )
 
     decoded = sum(len(block) for block in car(Block("can0", log_ns, rows)))
     admitted = len(Admission("can0", ledger, TEN_SLOTS)(rows, log_ns))

@@ -56,9 +56,11 @@ FIX = (
 def schema_of(name: str, fields: Any) -> bytes:
     """A FileDescriptorSet that defines ``foxglove.<name>`` and what it imports."""
     file = descriptor_pb2.FileDescriptorProto(
-        name=f"foxglove/{name}.proto", package="foxglove", syntax="proto3",
+        name=f"foxglove/{name}.proto",
+        package="foxglove",
+        syntax="proto3",
         dependency=["google/protobuf/timestamp.proto"],
-    )  # fmt: skip
+    )
     message = file.message_type.add(name=name)
     for field_name, number, kind, *rest in fields:
         each = message.field.add(name=field_name, number=number, type=kind, label=F.LABEL_OPTIONAL)
@@ -263,9 +265,13 @@ def test_json_pictures_and_fixes_match_their_protobuf_twins() -> None:
     picture = b"\xff\xd8" + bytes(40)
     image = {"timestamp": when, "data": b64encode(picture).decode(), "format": "jpeg"}
     fix = {
-        "timestamp": when, "latitude": 1, "longitude": 2.5, "altitude": 3,
-        "position_covariance": list(range(9)), "position_covariance_type": 2,
-    }  # fmt: skip
+        "timestamp": when,
+        "latitude": 1,
+        "longitude": 2.5,
+        "altitude": 3,
+        "position_covariance": list(range(9)),
+        "position_covariance_type": 2,
+    }
     ledger = Ledger("made")
     images = must_decode(Topic("/t", "foxglove.CompressedImage", "json"))(
         json_block(image, image | {"data": "not base64!"}), ledger

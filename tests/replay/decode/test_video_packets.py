@@ -94,8 +94,16 @@ def test_detect_looks_at_every_picture_of_a_video(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = video(tmp_path / "front.mp4")
-    argv = ["detect", str(log), "-o", str(tmp_path / "run"), "--json", "--no-cache",
-            "--detectors", "support.detecting:build"]  # fmt: skip
+    argv = [
+        "detect",
+        str(log),
+        "-o",
+        str(tmp_path / "run"),
+        "--json",
+        "--no-cache",
+        "--detectors",
+        "support.detecting:build",
+    ]
 
     assert run(argv) == 0
 

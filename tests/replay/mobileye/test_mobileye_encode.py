@@ -123,9 +123,16 @@ def scene(seed: int, n: int) -> tuple[Columns, list[int]]:
 
 
 HALF_STEP = {
-    "x_m": 1 / 32, "y_m": 1 / 32, "vx_mps": 1 / 32, "length_m": 0.25, "width_m": 0.025,
-    "accel_x_mps2": 0.015, "angle_rate": 0.005, "scale_change": 1e-4, "radar_x_m": 1 / 32,
-}  # fmt: skip
+    "x_m": 1 / 32,
+    "y_m": 1 / 32,
+    "vx_mps": 1 / 32,
+    "length_m": 0.25,
+    "width_m": 0.025,
+    "accel_x_mps2": 0.015,
+    "angle_rate": 0.005,
+    "scale_change": 1e-4,
+    "radar_x_m": 1 / 32,
+}
 
 
 @given(seed=st.integers(0, 100_000), n=st.integers(1, 60))
@@ -177,8 +184,10 @@ def test_what_is_not_given_is_sent_as_missing() -> None:
 def test_the_nearest_objects_get_the_slots_and_far_ones_none() -> None:
     x_m = np.append(np.linspace(240.0, 20.0, 16), [252.0, 1.0, 50.0])
     y_m = np.append(np.zeros(18), [35.0])
-    back = table(decode(encode_burst(10**18, Table({"x_m": x_m, "y_m": y_m}), STRAIGHT), STRAIGHT),
-                 "obstacles")  # fmt: skip
+    back = table(
+        decode(encode_burst(10**18, Table({"x_m": x_m, "y_m": y_m}), STRAIGHT), STRAIGHT),
+        "obstacles",
+    )
 
     assert len(back) == 13
     assert (np.diff(values(back, "x_m")) > 0).all()

@@ -198,9 +198,11 @@ def lane_drive(seconds: int, mirrored: bool) -> list[Block]:
     """Left lane 1.75 m to the left, right lane 1.25 m to the right, as on the wire or mirrored."""
     left, right = ("40FE", "4001") if not mirrored else ("C001", "C0FE")
     burst = [
-        (0x766, f"A1{left}FF7FFF7F0A"), (0x767, "FF7F801E"),
-        (0x768, f"A1{right}FF7FFF7F0A"), (0x769, "FF7F801E"),
-    ]  # fmt: skip
+        (0x766, f"A1{left}FF7FFF7F0A"),
+        (0x767, "FF7F801E"),
+        (0x768, f"A1{right}FF7FFF7F0A"),
+        (0x769, "FF7F801E"),
+    ]
     n = 15 * seconds
     times = [k * 66 * MS + j * MS for k in range(n) for j in range(4)]
     return messages_of(frames(burst * n, [10**18 + t for t in times]))

@@ -52,8 +52,12 @@ def mcap(body: bytes, compression: str, declared: int) -> bytes:
 
 def bag(body: bytes, compression: str, declared: int) -> bytes:
     """A ROS 1 bag of one bomb and a connection."""
-    names = {b"topic": b"/a", b"type": b"std_msgs/String", b"md5sum": b"x",
-             b"message_definition": b"string data\n"}  # fmt: skip
+    names = {
+        b"topic": b"/a",
+        b"type": b"std_msgs/String",
+        b"md5sum": b"x",
+        b"message_definition": b"string data\n",
+    }
     about = b"".join(header_field(*pair) for pair in names.items())
     return (
         b"#ROSBAG V2.0\n"
@@ -87,8 +91,9 @@ def test_a_bomb_is_refused_with_both_numbers_in_bounded_memory(tmp_path: Path, c
 
     child = subprocess.Popen(
         [sys.executable, "-m", "crosscue.eval.cli", "info", str(path)],
-        stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     assert child.stdout is not None
     said = " ".join(child.stdout.read().split())
     _, status, used = os.wait4(child.pid, 0)

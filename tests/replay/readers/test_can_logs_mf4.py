@@ -55,14 +55,19 @@ def _signals(path: Path, count: int = 1000, compression: int = 0) -> Path:
     with asammdf.MDF(version="4.10") as mdf:
         mdf.append(
             [
-                signal(np.arange(count, dtype=np.uint16), times, name="speed", unit="km/h",
-                       conversion=linear),
+                signal(
+                    np.arange(count, dtype=np.uint16),
+                    times,
+                    name="speed",
+                    unit="km/h",
+                    conversion=linear,
+                ),
                 signal(np.linspace(-1, 1, count), times, name="angle", unit="deg"),
                 signal(-np.arange(count, dtype=np.int32), times, name="torque", unit="Nm"),
                 signal(np.array([b"abc"] * count), times, name="label", encoding="utf-8"),
             ],
             acq_name="drive",
-        )  # fmt: skip
+        )
         mdf.append(
             [signal(np.arange(10, dtype=np.float32), np.arange(10) * 1.0, name="speed")],
             acq_name="drive",

@@ -75,9 +75,13 @@ def _ours(path: Path, start_ns: int) -> tuple[Frames, Ledger]:
             assert rows.is_tx is not None
             bus = int(block.topic.removeprefix("can/"))
             columns = zip(
-                rows.arbitration_id.tolist(), rows.is_extended.tolist(), rows.is_tx.tolist(),
-                rows.length.tolist(), ((block.log_ns - start_ns) * 1e-9).tolist(), strict=True,
-            )  # fmt: skip
+                rows.arbitration_id.tolist(),
+                rows.is_extended.tolist(),
+                rows.is_tx.tolist(),
+                rows.length.tolist(),
+                ((block.log_ns - start_ns) * 1e-9).tolist(),
+                strict=True,
+            )
             for k, (number, ide, is_tx, length, seconds) in enumerate(columns):
                 payload = rows.data[k].tobytes()[:length]
                 found.setdefault((bus, number, ide, is_tx), []).append((seconds, length, payload))
@@ -142,11 +146,14 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "deflated": {"virtual": False, "stretch": 999, "coding": 0, "flags": 0x21},
     "transposed": {"virtual": True, "stretch": 999, "coding": 1, "flags": 0x21},
     "deflated, last blocks missing": {
-        "virtual": True, "stretch": 999, "coding": 0, "flags": 0x31,
+        "virtual": True,
+        "stretch": 999,
+        "coding": 0,
+        "flags": 0x31,
     },
     "finalized": {"virtual": True, "is_finalized": True},
     "finalized, one group": {"virtual": False, "is_finalized": True},
-}  # fmt: skip
+}
 
 
 def _frames(count: int, seed: int = 1, *, virtual: bool) -> list[Sent]:

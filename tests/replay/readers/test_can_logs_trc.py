@@ -46,13 +46,17 @@ T_NS = NOON_NS + 1_600_000
         (V2 + LINE_2, Sent(T_NS, "can/1", 0x300, b"\xc2\x08")),
         (V2 + " 1 1.6 RR 3 0300 Rx - 4\n", Sent(T_NS, "can/3", 0x300, b"", False, REMOTE)),
         (V2 + " 1 1.6 ER 1 - Rx - 2 04 00\n", Sent(T_NS, "can/1", 0, b"\4\0", False, ERROR)),
-        (V2 + " 1 1.6 FB 1 0300 Rx - 9 " + "AB " * 12 + "\n",
-         Sent(T_NS, "can/1", 0x300, b"\xab" * 12, False, DATA, True)),
-        (V2.replace("R,L,D", "l,D") + " 1 1.6 FD 1 0300 Rx 12 " + "AB " * 12 + "\n",
-         Sent(T_NS, "can/1", 0x300, b"\xab" * 12, False, DATA, True)),
+        (
+            V2 + " 1 1.6 FB 1 0300 Rx - 9 " + "AB " * 12 + "\n",
+            Sent(T_NS, "can/1", 0x300, b"\xab" * 12, False, DATA, True),
+        ),
+        (
+            V2.replace("R,L,D", "l,D") + " 1 1.6 FD 1 0300 Rx 12 " + "AB " * 12 + "\n",
+            Sent(T_NS, "can/1", 0x300, b"\xab" * 12, False, DATA, True),
+        ),
         ("; no version\n 1)  1  0480 2 C2 08\n", Sent(1_000_000, "can/1", 0x480, b"\xc2\x08")),
     ],
-)  # fmt: skip
+)
 def test_a_line_says_what_it_says(tmp_path: Path, text: str, frame: Sent) -> None:
     found, ledger = read_back(_log(tmp_path, text))
 
@@ -231,15 +235,27 @@ def _numbered(*numbers: int, head: str = V1) -> str:
         (_numbered(1, 2, 900_003, 4, 5), {MISFIT: 1}, [], 4),
         (_numbered(1, 2) + _numbered(1, 3), {MISSING: 1}, [], 4),
         (_numbered(1) + "gibberish\n" + _numbered(3, head=""), {NOT_UNDERSTOOD: 1}, [], 2),
-        (_numbered(1) + "gibberish\n" + _numbered(4, head=""), {NOT_UNDERSTOOD: 1, MISSING: 1},
-         [], 2),
-        (_numbered(1) + "gibberish\n" + _numbered(2, 4, head=""), {NOT_UNDERSTOOD: 1, MISSING: 1},
-         [], 3),
+        (
+            _numbered(1) + "gibberish\n" + _numbered(4, head=""),
+            {NOT_UNDERSTOOD: 1, MISSING: 1},
+            [],
+            2,
+        ),
+        (
+            _numbered(1) + "gibberish\n" + _numbered(2, 4, head=""),
+            {NOT_UNDERSTOOD: 1, MISSING: 1},
+            [],
+            3,
+        ),
         (_numbered(1, 2) + " 5) 9.0 Warng FFFFFFFF 4 00 00 00 08 BUSHEAVY\n", {MISSING: 2}, [], 2),
-        (_numbered(1, 2) + " 5) 9.0 Rx 0480 1 C2", {MISSING: 2},
-         ["file may be cut after its last frame"], 3),
+        (
+            _numbered(1, 2) + " 5) 9.0 Rx 0480 1 C2",
+            {MISSING: 2},
+            ["file may be cut after its last frame"],
+            3,
+        ),
     ],
-)  # fmt: skip
+)
 def test_numbers_that_do_not_follow_are_reported(
     tmp_path: Path, text: str, lost: dict[str, int], unknown: list[str], rows: int
 ) -> None:

@@ -72,7 +72,7 @@ def test_date_times_come_back_to_the_nanosecond(tmp_path: Path, t_ns: list[int])
         ("timestamp_us\n1000000\n1040000", [S, 1_040_000_000], None),
         ('"name","time"\n"a b.jpg","0.5"', [S // 2], ("a b.jpg",)),
     ],
-)  # fmt: skip
+)
 def test_ways_of_writing(
     tmp_path: Path, text: str, t_ns: list[int], names: tuple[str, ...] | None
 ) -> None:

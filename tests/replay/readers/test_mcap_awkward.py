@@ -64,9 +64,14 @@ def test_a_message_belongs_to_the_channel_valid_where_it_stands(
     tmp_path: Path, is_chunked: bool, summary: bool
 ) -> None:
     records = [
-        *DEFINED, message(1, 1, b"p"), channel(1, 1, "/other"), message(1, 2, b"q"),
-        message(2, 3, b"r"), channel(1, 1, "/a"), message(1, 4, b"s"),
-    ]  # fmt: skip
+        *DEFINED,
+        message(1, 1, b"p"),
+        channel(1, 1, "/other"),
+        message(1, 2, b"q"),
+        message(2, 3, b"r"),
+        channel(1, 1, "/a"),
+        message(1, 4, b"s"),
+    ]
     parts = [ChunkOf(records)] if is_chunked else records
     path = stored(tmp_path / "x.mcap", McapFile(parts, summary=summary))
 
@@ -82,10 +87,14 @@ def test_a_message_belongs_to_the_channel_valid_where_it_stands(
 
 def test_one_name_with_two_types_becomes_two_topics_with_a_notice(tmp_path: Path) -> None:
     records = [
-        schema(1, "a/B"), schema(2, "c/D"),
-        channel(1, 1, "/x"), channel(2, 2, "/x"), channel(3, 1, "/x"), channel(4, 1, "/x", "json"),
+        schema(1, "a/B"),
+        schema(2, "c/D"),
+        channel(1, 1, "/x"),
+        channel(2, 2, "/x"),
+        channel(3, 1, "/x"),
+        channel(4, 1, "/x", "json"),
         *(message(number, number, b"%d" % number) for number in (1, 2, 3, 4)),
-    ]  # fmt: skip
+    ]
     path = stored(tmp_path / "x.mcap", McapFile([ChunkOf(records)]))
 
     with open_mcap(path, Limits()) as log:

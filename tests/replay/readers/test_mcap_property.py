@@ -50,9 +50,16 @@ def test_ours_and_the_mcap_package_agree(
 ) -> None:
     stream = BytesIO()
     writer = Writer(
-        stream, chunk_size, compression, index, repeat, repeat, use_chunking, statistics,
+        stream,
+        chunk_size,
+        compression,
+        index,
+        repeat,
+        repeat,
+        use_chunking,
+        statistics,
         enable_data_crcs=data_crc,
-    )  # fmt: skip
+    )
     writer.start()
     schemas = [writer.register_schema(name, "ros2msg", b"") for name in ("a/B", "c/D")]
     channels = [writer.register_channel(f"/t{i}", "cdr", (0, *schemas)[i % 3]) for i in range(5)]

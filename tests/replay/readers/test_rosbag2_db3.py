@@ -91,8 +91,9 @@ def test_a_real_database_reads_as_rosbags_reads_it() -> None:
 
     assert Counter(reading.rows) == Counter(theirs)
     assert {name: a.found for name, a in reading.ledger.accounts.items()} == {
-        "/tf_static": 1, "/tf": 517,
-    }  # fmt: skip
+        "/tf_static": 1,
+        "/tf": 517,
+    }
     assert all(t.schema_encoding == "ros2msg" and t.schema for t in reading.log.topics)
     assert reading.ledger.is_whole
     assert "no checksums" in reading.ledger.integrity
@@ -457,9 +458,12 @@ def test_a_sound_file_is_gone_through_once(tmp_path: Path, monkeypatch: pytest.M
 def test_payloads_of_topics_not_asked_for_are_not_fetched(tmp_path: Path) -> None:
     path = make(
         tmp_path / "a.db3",
-        (1, 1, b"wanted"), (2, 2, "no blob"), (2, 3, b"y"), (77, 4, b"orphan"),
+        (1, 1, b"wanted"),
+        (2, 2, "no blob"),
+        (2, 3, b"y"),
+        (77, 4, b"orphan"),
         tables=TABLES + "INSERT INTO topics VALUES(2, '/b', 'std_msgs/msg/String', 'cdr');",
-    )  # fmt: skip
+    )
     reading = read_rows(path, Selection(frozenset({"/a"})))
 
     assert reading.rows == (Row("/a", 1, b"wanted"),)

@@ -106,9 +106,16 @@ def test_topics_are_merged_by_log_time(tmp_path: Path) -> None:
             writer.write(stretch(channel, times, [b"x"] * 3))
 
     assert [(name, t) for name, t, *_ in peers_messages(path)] == [
-        ("/a", 1), ("/b", 2), ("/b", 3), ("/a", 4), ("/c", 5), ("/c", 0), ("/c", 6), ("/b", 8),
+        ("/a", 1),
+        ("/b", 2),
+        ("/b", 3),
+        ("/a", 4),
+        ("/c", 5),
+        ("/c", 0),
+        ("/c", 6),
+        ("/b", 8),
         ("/a", 9),
-    ]  # fmt: skip
+    ]
 
 
 def test_publish_time_and_sequence_are_kept(tmp_path: Path) -> None:
@@ -438,12 +445,20 @@ def test_rerun_imports_what_we_write(tmp_path: Path) -> None:
 
     made = subprocess.run(
         [sys.executable, "-c", code, str(out), str(rrd)],
-        capture_output=True, text=True, timeout=60, env=environment, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=environment,
+        check=True,
+    )
     stats = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "stats", str(rrd)],
-        capture_output=True, text=True, timeout=60, env=environment, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=environment,
+        check=True,
+    )
 
     assert "ERROR" not in made.stderr
     (rows,) = [line for line in stats.stdout.splitlines() if line.startswith("num_rows = ")]

@@ -329,8 +329,14 @@ def test_other_tables_get_a_type_of_their_own_and_come_back() -> None:
 
     assert isinstance(back.rows, Table)
     assert list(back.rows.columns) == [
-        "speed_mps", "count", "wheel_fl", "wheel_fl2", "matrix", "is_on", "c_0x1f",
-    ]  # fmt: skip
+        "speed_mps",
+        "count",
+        "wheel_fl",
+        "wheel_fl2",
+        "matrix",
+        "is_on",
+        "c_0x1f",
+    ]
     for ours, theirs in zip(list(table.columns)[:-1], back.rows.columns, strict=True):
         np.testing.assert_array_equal(back.rows[theirs], table[ours])
     assert "words" in ledger.notices[0]
