@@ -207,7 +207,7 @@ class SegmentPass:
 
     def _walk(self) -> Walk:
         segment = self._segment
-        rail = segment.rail(self._file)
+        rail = segment.rail(self._file, self._limits)
         return Walk(
             self._file,
             segment.begin,

@@ -45,6 +45,7 @@ from .records import (
     read_schema,
     read_statistics,
 )
+from .repair import proved_head
 from .rows import NEVER_IN_A_CHUNK, Definition, rows_by_scan
 from .scan import Scanner
 from .walk import Chunk, End, How, Run, Walk
@@ -127,14 +128,14 @@ class Segment:
         """What was known before reading."""
         return Declarations(book, self.schemas, self.channels)
 
-    def rail(self, file: ByteFile) -> Mapping[int, ChunkIndex] | None:
+    def rail(self, file: ByteFile, limits: Limits) -> Mapping[int, ChunkIndex] | None:
         """The chunks known, for a walk; None where not even the end is known."""
         if not self.has_end:
             return None
         if self.summary is None:
             return {}
         is_sure = self.summary.is_verified
-        return self.summary.chunks if is_sure else _confirmed(file, self.summary.chunks)
+        return self.summary.chunks if is_sure else _confirmed(file, self.summary.chunks, limits)
 
 
 def find_segments(
@@ -272,12 +273,15 @@ def _parse_summary(records: bytes, base: int) -> Summary:
     return Summary(schemas, channels, statistics, chunks)
 
 
-def _confirmed(file: ByteFile, chunks: Mapping[int, ChunkIndex]) -> dict[int, ChunkIndex]:
-    """Of an index without checksum, the entries that point to a chunk of the length they say."""
+def _confirmed(
+    file: ByteFile, chunks: Mapping[int, ChunkIndex], limits: Limits
+) -> dict[int, ChunkIndex]:
+    """Of an index without checksum, the entries that a chunk's own length or checksum confirms."""
     confirmed: dict[int, ChunkIndex] = {}
     for at, index in chunks.items():
         raw = file.peek(at, PREFIX.size)
-        if len(raw) == PREFIX.size and PREFIX.unpack(raw) == (CHUNK, index.length - PREFIX.size):
+        is_chunk = bytes(raw) == PREFIX.pack(CHUNK, max(index.length - PREFIX.size, 0))
+        if is_chunk or proved_head(file, index, limits) is not None:
             confirmed[at] = replace(index, index_length=0)
     return confirmed
 
@@ -296,7 +300,7 @@ def _enter(segment: Segment, declarations: Declarations) -> Segment:
 def _survey_named(file: ByteFile, segment: Segment, book: TopicBook, limits: Limits) -> Segment:
     """A segment whose summary does not name all channels: find them in its data section."""
     scanner = Scanner()
-    walk = Walk(file, segment.begin, segment.end, segment.rail(file), limits, scanner)
+    walk = Walk(file, segment.begin, segment.end, segment.rail(file, limits), limits, scanner)
     declarations = Declarations(book, *_declared(segment.summary or Summary()))
     _collect(file, walk, declarations, limits, scanner)
     return _enter(segment, declarations)

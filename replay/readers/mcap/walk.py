@@ -49,6 +49,7 @@ from .records import (
     read_chunk_head,
     read_message_index,
 )
+from .repair import REPAIRED, is_doubtful, proved_head
 from .resync import Plausible, Resync, is_exact
 from .rows import Rows, opcodes, rows_by_scan
 from .scan import Scanner
@@ -411,7 +412,13 @@ class Walk:
         try:
             head = read_chunk_head(raw[PREFIX.size :])
         except BrokenRecordError as error:
-            return self._chunk_without_head(index, outer_end, bound, str(error))
+            head, why = None, str(error)
+        if index is not None and is_doubtful(opcode == CHUNK, head, index):
+            repaired = proved_head(self._file, index, self._limits)
+            if repaired is not None:
+                return self._repaired(index, repaired, bound)
+        if head is None:
+            return self._chunk_without_head(index, outer_end, bound, why)
         body_at = at + PREFIX.size + head.body_at
         inner_end = body_at + head.body_size
         fault = ""
@@ -439,6 +446,14 @@ class Walk:
         # Records found by searching behind damage would be those of an uncompressed chunk.
         self._has_bare &= self._before is not None
         return Chunk(at, body_at, head, index, fault, differs, False, messages, index_fault)
+
+    def _repaired(self, index: ChunkIndex, head: ChunkHead, bound: int) -> Chunk:
+        """A chunk read by the head that the summary gives it."""
+        at = self._at
+        messages, index_fault = self._message_indexes(min(at + index.length, bound), index)
+        self._has_bare &= self._before is not None
+        body_at = at + PREFIX.size + head.body_at
+        return Chunk(at, body_at, head, index, "", REPAIRED, False, messages, index_fault)
 
     def _chunk_without_head(
         self, index: ChunkIndex | None, outer_end: int, bound: int, why: str

@@ -159,6 +159,49 @@ def test_a_damaged_length_costs_no_more_than_its_chunk(tmp_path: Path) -> None:
     assert read_back(path).count() >= 575
 
 
+@pytest.mark.parametrize("compression", ["", "lz4", "zstd"])
+@pytest.mark.parametrize("has_summary_crc", [True, False])
+def test_any_damaged_byte_of_a_chunk_header_is_repaired_by_the_index(
+    tmp_path: Path, compression: str, has_summary_crc: bool
+) -> None:
+    parts = sound_parts(compression, is_chunked=True)
+    third = parts[2]
+    assert isinstance(third, ChunkOf)
+    coded = McapFile(parts, summary_crc=has_summary_crc).coded()
+    path = tmp_path / "log.mcap"
+    path.write_bytes(coded)
+    truth = read_back(path)
+    begin, name = coded.index(third.coded()), len(compression)
+    # Kind, length, both times, size; not the checksum; compression and stored size.
+    for at in (*range(37 - 4), *range(37, 49 + name)):
+        damaged = bytearray(coded)
+        damaged[begin + at] ^= 0x41
+        path.write_bytes(damaged)
+
+        reading = read_back(path)
+
+        assert messages_of(reading) == messages_of(truth), at
+        assert reading.adds_up(), at
+        assert any(f"chunk at byte {begin}" in said for said in reading.ledger.notices), at
+
+
+def test_a_damaged_header_over_damaged_records_is_not_repaired(tmp_path: Path) -> None:
+    parts = sound_parts("zstd", is_chunked=True)
+    third = parts[2]
+    assert isinstance(third, ChunkOf)
+    coded = bytearray(McapFile(parts).coded())
+    begin = coded.index(third.coded())
+    for at in (25, 60):
+        coded[begin + at] ^= 0x41
+    path = tmp_path / "log.mcap"
+    path.write_bytes(coded)
+
+    reading = read_back(path)
+
+    assert reading.count() == 575
+    assert [loss.reason for loss in reading.ledger.drops()] == ["damaged chunk"] * 3
+
+
 @pytest.mark.parametrize(
     ("content", "what"),
     [
