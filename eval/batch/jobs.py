@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -22,7 +22,6 @@ from crosscue.replay.errors import CrosscueError, RunError, UsageError, one_line
 from crosscue.replay.files.identity import as_row, identity_of, identity_of_all
 from crosscue.replay.files.run_folder import MANIFEST, RunFolder, strict_json, write_text
 from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.remote.logs import version_of
 
 JOURNAL: Final = ".drives"
 FORMAT_VERSION: Final = 2
@@ -214,22 +213,6 @@ def fingerprint_of(*settings: object) -> str:
         settings: Values that JSON can hold, as for a manifest.
     """
     return hashlib.sha256(strict_json(settings).encode()).hexdigest()
-
-
-def files_named_in(settings: object) -> dict[str, str]:
-    """Files that settings name, such as DBC files and model cards, with size and time of each.
-
-    A name alone would not tell that a file was edited.
-    """
-    if isinstance(settings, str):
-        # Longer texts are no names, and some systems fail on them.
-        is_file = "/" in settings and len(settings) < 4096 and Path(settings).is_file()
-        return {settings: version_of(settings)} if is_file else {}
-    if isinstance(settings, Mapping):
-        settings = list(settings.values())
-    if isinstance(settings, list | tuple):
-        return {name: of for one in settings for name, of in files_named_in(one).items()}
-    return {}
 
 
 def attempt(work: Callable[[Job], R], job: Job) -> Done[R]:

@@ -19,6 +19,7 @@ from crosscue.eval.pipeline.run_account import is_whole, summed
 from crosscue.replay.errors import RunError, UsageError, one_line
 from crosscue.replay.files.run_folder import (
     MANIFEST,
+    MERGED,
     RunFolder,
     TableSink,
     clear,
@@ -31,7 +32,6 @@ from crosscue.replay.files.run_folder import (
 if TYPE_CHECKING:
     import pyarrow as pa
 
-STAGE: Final = "merged"
 DRIVE: Final = "drive"
 FOLDER: Final = "merged"
 """What the merged run is called among those that it was made of."""
@@ -146,7 +146,7 @@ def _manifest(
     drives: Sequence[_Drive], kinds: Sequence[str], failures: Mapping[str, str]
 ) -> dict[str, object]:
     return {
-        "stage": STAGE,
+        "stage": MERGED,
         "tables": list(kinds),
         "drives": [
             {
@@ -274,4 +274,4 @@ def is_merged(run: RunFolder) -> bool:
     Raises:
         RunError: It has no manifest that can be read.
     """
-    return run.file(MANIFEST).exists() and run.manifest().get("stage") == STAGE
+    return run.file(MANIFEST).exists() and run.manifest().get("stage") == MERGED

@@ -21,8 +21,7 @@ from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.recording import save
 from crosscue.eval.report.page import write_report
-from crosscue.eval.report.summary import summary
-from crosscue.eval.scoring.pose.score import summary as pose_summary
+from crosscue.eval.report.summary import pose_summary, summary
 from crosscue.eval.scoring.pose.score import truth_track
 from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of, write_scores
 from crosscue.replay.errors import UsageError

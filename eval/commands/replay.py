@@ -31,7 +31,6 @@ from crosscue.eval.batch.jobs import (
     Engine,
     Job,
     exit_status_of,
-    files_named_in,
     fingerprint_of,
     run_many,
 )
@@ -51,6 +50,7 @@ from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.pipeline.run_account import account_lines
+from crosscue.eval.pipeline.run_input import files_named_in
 from crosscue.eval.pipeline.scene import ApproachSummary, SceneOutcome
 from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.files.run_folder import create

@@ -36,11 +36,10 @@ from crosscue.eval.pipeline.run_account import account_lines
 from crosscue.eval.report.junit import write_junit
 from crosscue.eval.report.page import REPORT, write_report
 from crosscue.eval.report.score_runs import Failed, Scored, ScoreWork, score_runs
-from crosscue.eval.report.summary import gate_lines, headline, summary, told_line
+from crosscue.eval.report.summary import gate_lines, headline, pose_summary, summary, told_line
 from crosscue.eval.scoring.drives import DEFAULTS, Scores, ScoreSettings
 from crosscue.eval.scoring.gates import Gate, GateResult, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import metric_values
-from crosscue.eval.scoring.pose.score import summary as pose_summary
 from crosscue.eval.scoring.pose.smoother import told
 from crosscue.eval.scoring.runs import FOLDER, metrics_of, scores_of, write_scores
 from crosscue.eval.studies.attribution import (

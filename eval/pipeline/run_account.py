@@ -22,8 +22,6 @@ from crosscue.replay.signals import Signal
 from .accounts import account_of
 
 if TYPE_CHECKING:
-    from crosscue.eval.scoring.runs import RunScored
-
     from .pose import PoseStage
 
 STAGES: Final = ("reading", "detecting", "estimating", "scoring")
@@ -125,30 +123,6 @@ def estimating_of(stage: PoseStage, frames: tuple[int, int] | None) -> dict[str,
     if frames is not None:
         found["frames"] = line(*frames, {})
     return {name: one for name, one in found.items() if one["in"]}
-
-
-def scoring_of(one: RunScored) -> dict[str, Line]:
-    """Frames with truth, cue by cue, and true poses: scored, or why not."""
-    found = {
-        f"cue {cue.cue}": line(
-            cue.frames,
-            cue.frames - sum(cue.left_out["object"].values()),
-            cue.left_out["object"],
-        )
-        for cue in one.judged.cues
-    }
-    if one.pose is not None:
-        of = one.pose.coverage
-        found["poses"] = line(
-            of.truth_poses,
-            of.scored,
-            {
-                "before the first estimate": of.before_estimate,
-                "after the last estimate": of.after_estimate,
-                "no estimate near enough": of.in_gap,
-            },
-        )
-    return found
 
 
 def lines(of: Mapping[str, Any]) -> Iterator[tuple[str, str, Line]]:

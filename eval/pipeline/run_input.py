@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from crosscue.detectors.registry import Choice
-from crosscue.eval.batch.jobs import files_named_in
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.identity import Identity, as_row, identity_of, identity_of_all, of_row
 from crosscue.replay.files.run_folder import INPUT, LOCK, MANIFEST, RunFolder, strict_json
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.remote.logs import version_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .accounts import selection_told, versions
@@ -85,6 +85,22 @@ def refuse_another(run: RunFolder, mine: Mapping[str, Any]) -> None:
             f"{run.path}: holds a run of {theirs} with other settings ({different}), which "
             f"--resume of {ours} would destroy; give another folder or --overwrite"
         )
+
+
+def files_named_in(settings: object) -> dict[str, str]:
+    """Files that settings name, such as DBC files and model cards, with size and time of each.
+
+    A name alone would not tell that a file was edited.
+    """
+    if isinstance(settings, str):
+        # Longer texts are no names, and some systems fail on them.
+        is_file = "/" in settings and len(settings) < 4096 and Path(settings).is_file()
+        return {settings: version_of(settings)} if is_file else {}
+    if isinstance(settings, Mapping):
+        settings = list(settings.values())
+    if isinstance(settings, list | tuple):
+        return {name: of for one in settings for name, of in files_named_in(one).items()}
+    return {}
 
 
 def _read(run: RunFolder) -> Mapping[str, Any] | None:

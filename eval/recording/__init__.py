@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from .drive_time import DriveTime
 
-__all__ = ["TruthTrack", "save"]
+__all__ = ["save"]
 
 
 def save(

@@ -20,6 +20,7 @@ from crosscue.replay.files.run_folder import strict_json, write_text
 from crosscue.replay.vehicle.fusion import CUES
 
 from .html import render_page
+from .pose_figures import draw_all
 from .worst_frames import WorstFrame, worst_frames
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ class _Figures:
 def write_report(
     folder: Path, scored: Sequence[RunScored], scores: Scores, metrics: Mapping[str, Any]
 ) -> Path:
-    """Write ``report.html`` over one run or many; its path comes back.
+    """Write ``report.html`` over one run or many, with figures of a single pose beside it.
 
     Args:
         folder: Where to; for one run its ``score`` folder.
@@ -88,6 +89,8 @@ def write_report(
         RunError: A run's manifest or tables cannot be read.
         OutputError: It cannot be written.
     """
+    if len(scored) == 1 and scored[0].poses is not None:
+        draw_all(scored[0].poses, folder)
     page = render_page(
         TEMPLATE,
         {**_content(folder, scored, metrics), "figures": _figures(scored, scores)},

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from crosscue.eval.scoring.consistency import mean_band
-from crosscue.replay.columns import Floats, Int64s
+from crosscue.eval.scoring.pose.score import ScoredPoses
+from crosscue.replay.columns import Floats
 from crosscue.replay.files.run_folder import write_whole
 
 if TYPE_CHECKING:
@@ -22,54 +22,22 @@ BAND: Final = "#ff7f0e"
 ELLIPSES: Final = 12
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ScoredPoses:
-    """Estimated and true poses at the same times, in the map frame.
-
-    Attributes:
-        t_ns: Shape (N,), int64.
-        estimate_m: Shape (N, 2).
-        truth_m: Shape (N, 2).
-        heading_error_rad: Shape (N,): estimate less truth, wrapped.
-        cov: Shape (N, 3, 3): of x, y, heading as the filter claims it.
-        nees: Shape (N,): normalised estimation error squared of x, y, heading.
-        travelled_m: Shape (N,).
-        major_axis_m: Shape (N,).
-    """
-
-    t_ns: Int64s
-    estimate_m: Floats
-    truth_m: Floats
-    heading_error_rad: Floats
-    cov: Floats
-    nees: Floats
-    travelled_m: Floats
-    major_axis_m: Floats
-
-    @property
-    def seconds(self) -> Floats:
-        """Seconds since the first pose."""
-        seconds: Floats = (self.t_ns - self.t_ns[0]) * 1e-9
-        return seconds
-
-
-def draw_all(poses: ScoredPoses, folder: Path, title: str, lost_above_m: float) -> list[Path]:
+def draw_all(poses: ScoredPoses, folder: Path) -> list[Path]:
     """Write the four figures as PNG files; their paths come back."""
     jobs: dict[str, tuple[Callable[[Axes, ScoredPoses], None], tuple[float, float]]] = {
         "pose_plan.png": (_plan, (7.0, 6.0)),
         "pose_error.png": (_error, (7.0, 3.4)),
         "pose_heading.png": (_heading, (7.0, 3.4)),
         "pose_nees.png": (_nees, (7.0, 3.4)),
-        "pose_major_axis.png": (lambda axes, p: _major_axis(axes, p, lost_above_m), (7.0, 3.4)),
+        "pose_major_axis.png": (_major_axis, (7.0, 3.4)),
     }
-    return [_draw(folder / name, paint, poses, title, size) for name, (paint, size) in jobs.items()]
+    return [_draw(folder / name, paint, poses, size) for name, (paint, size) in jobs.items()]
 
 
 def _draw(
     path: Path,
     paint: Callable[[Axes, ScoredPoses], None],
     poses: ScoredPoses,
-    title: str,
     size: tuple[float, float],
 ) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -79,7 +47,7 @@ def _draw(
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     paint(axes, poses)
-    axes.set_title(title, fontsize=9, loc="left", color="0.35")
+    axes.set_title(poses.title, fontsize=9, loc="left", color="0.35")
     axes.grid(alpha=0.3)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
@@ -149,12 +117,12 @@ def _nees(axes: Axes, poses: ScoredPoses) -> None:
     axes.legend(frameon=False)
 
 
-def _major_axis(axes: Axes, poses: ScoredPoses, lost_above_m: float) -> None:
+def _major_axis(axes: Axes, poses: ScoredPoses) -> None:
     axes.plot(poses.travelled_m, poses.major_axis_m, color=ESTIMATE, lw=1.4)
-    axes.axhline(lost_above_m, color="0.3", ls="--", lw=1.0)
+    axes.axhline(poses.lost_above_m, color="0.3", ls="--", lw=1.0)
     axes.annotate(
         "lost above this",
-        (0.0, lost_above_m),
+        (0.0, poses.lost_above_m),
         xytext=(4, 3),
         textcoords="offset points",
         fontsize=8,

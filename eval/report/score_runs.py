@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from crosscue.eval.scoring.drives import ScoreSettings
+from crosscue.eval.scoring.pose.score import PoseScore, load_truth, measure
 from crosscue.eval.scoring.pose.smoother import SmootherScore, score_smoother
 from crosscue.eval.scoring.runs import (
     FOLDER,
+    METRICS,
     RunScored,
     find_truth,
     judge_run,
@@ -21,9 +23,10 @@ from crosscue.eval.scoring.runs import (
     write_scores,
 )
 from crosscue.replay.errors import CrosscueError
-from crosscue.replay.files.run_folder import locked, open_run
+from crosscue.replay.files.run_folder import RunFolder, locked, open_run, strict_json, write_text
 
 from .page import write_report
+from .pose_figures import draw_all
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +104,21 @@ class ScoreWork:
             return self(path)
         except CrosscueError as error:
             return Failed(path, error)
+
+
+def score_pose(run: RunFolder, truth_path: Path) -> PoseScore:
+    """Score a run's pose alone; metrics, tracks and figures go into its ``score`` folder.
+
+    Raises:
+        RunError: The run's tables are missing or damaged.
+        SchemaError: The truth does not fit the run.
+    """
+    truth, _ = load_truth(truth_path)
+    result, poses = measure(run, truth_path)
+    content = {"truth": truth.model_dump(mode="json"), "pose": asdict(result)}
+    write_text(run.file(FOLDER) / METRICS, strict_json(content) + "\n")
+    draw_all(poses, run.file(FOLDER))
+    return result
 
 
 def score_runs(

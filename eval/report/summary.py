@@ -13,6 +13,7 @@ from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.gates import GateResult
 from crosscue.eval.scoring.intervals import Mean, Share
 from crosscue.eval.scoring.metric_values import MetricValue
+from crosscue.eval.scoring.pose.score import Errors, PoseScore
 from crosscue.eval.scoring.ranges import RangeScore
 from crosscue.replay.safe_text import visible
 
@@ -210,3 +211,47 @@ def headline(name: str, values: Mapping[str, MetricValue]) -> str:
         if not math.isnan(value):
             parts.append(f"{label} {value:.1f} m")
     return f"{visible(name)}: {', '.join(parts) or 'nothing detected'}"
+
+
+def pose_summary(result: PoseScore) -> str:
+    """The score for a person, within 80 columns."""
+    covered = result.coverage
+    left_out = [
+        f"{count} {why}"
+        for count, why in (
+            (covered.before_estimate, "before the first estimate"),
+            (covered.after_estimate, "after the last"),
+            (covered.in_gap, "in a gap of the estimate"),
+        )
+        if count
+    ]
+    lines = [
+        f"truth      {covered.scored} of {covered.truth_poses} poses scored over "
+        f"{result.distance_m:.0f} m" + (f"; not: {', '.join(left_out)}" if left_out else ""),
+        "",
+        "error                       rmse     mean   median      max     rotation rmse",
+    ]
+    lines += [_pose_row(f"APE, aligned: {how}", errors) for how, errors in result.ape.items()]
+    lines += [_pose_row(f"RPE over {size}", errors) for size, errors in result.rpe.items()]
+    lines += ["", *_nees_lines(result)]
+    lost = "never lost" if result.lost_at_m is None else f"lost after {result.lost_at_m:.0f} m"
+    lines.append(f"2-sigma ellipse at the end: {result.major_axis_m:.1f} m long; {lost}")
+    return "\n".join(lines)
+
+
+def _pose_row(name: str, errors: Errors) -> str:
+    t = errors.translation_m
+    numbers = " ".join(f"{value:8.3f}" for value in (t.rmse, t.mean, t.median, t.max))
+    return f"{name:22} {numbers} m {errors.rotation_deg.rmse:9.3f} deg"
+
+
+def _nees_lines(result: PoseScore) -> list[str]:
+    lines = []
+    for name, n in (("x, y", result.nees_xy), ("x, y, heading", result.nees_xyh)):
+        if math.isnan(n.mean):
+            continue
+        lines.append(
+            f"NEES of {name}: mean {n.mean:.2f} (honest for one drive: {n.band_low:.2f} to "
+            f"{n.band_high:.2f}), {100 * n.share_inside_95:.0f} % inside 95 %"
+        )
+    return lines

@@ -12,12 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crosscue.datasets.truth.truth import FILE, Truth
-from crosscue.eval.batch import merge as merge_runs
-from crosscue.eval.pipeline.run_account import Account, check, scoring_of, summed
+from crosscue.eval.pipeline.run_account import Account, Line, check, line, summed
 from crosscue.eval.pipeline.run_logs import place_of
-from crosscue.eval.scoring.pose.score import PoseScore
 from crosscue.replay.errors import RunError, SchemaError, UsageError
-from crosscue.replay.files.run_folder import RunFolder, strict_json, write_text, write_whole
+from crosscue.replay.files.run_folder import MERGED, RunFolder, strict_json, write_text, write_whole
 from crosscue.replay.remote.logs import is_remote
 
 from . import intervals
@@ -25,6 +23,7 @@ from . import truth as score_truth
 from .approaches import FEATURES
 from .drives import DEFAULTS, DriveJudged, Scores, ScoreSettings, as_metrics, judge, score
 from .pose import score as score_pose
+from .pose.score import PoseScore, ScoredPoses
 from .run_tables import RunTables, tables_of
 from .truth import DriveTruth
 
@@ -49,6 +48,7 @@ class RunScored:
         truth: The truth.
         judged: Everything but the pose.
         pose: None where it was not scored.
+        poses: What figures of the pose are drawn of; None where it was not scored.
         why_no_pose: Empty where it was.
     """
 
@@ -57,6 +57,7 @@ class RunScored:
     truth: DriveTruth
     judged: DriveJudged
     pose: PoseScore | None
+    poses: ScoredPoses | None
     why_no_pose: str
 
 
@@ -97,7 +98,7 @@ def judge_run(
     *,
     any_log: bool = False,
 ) -> RunScored:
-    """Lay a run beside its truth; pose tracks and figures go into its ``score`` folder.
+    """Lay a run beside its truth; pose tracks go into its ``score`` folder.
 
     Args:
         run: A finished run.
@@ -110,7 +111,7 @@ def judge_run(
         RunError: A table is damaged, or it holds many drives merged.
         SchemaError: The truth does not fit the run, or there is nothing to score.
     """
-    if run.manifest().get("stage") == merge_runs.STAGE:
+    if run.manifest().get("stage") == MERGED:
         raise RunError(
             f"{run.path}: many drives merged, whose times are mixed; score their run folders"
         )
@@ -121,12 +122,12 @@ def judge_run(
     _check_times(run, truth.truth, tables, truth_path)
     judged = judge(tables, truth, settings)
     why = _why_no_pose(run, truth.truth)
-    pose = None if why else score_pose.measure(run, truth_path, rpe_m)
+    pose, poses = (None, None) if why else score_pose.measure(run, truth_path, rpe_m)
     nothing = judged.coverage.not_scored
     if why and {"cues", "belief", "range"} <= nothing.keys():
         reasons = "; ".join(dict.fromkeys([*nothing.values(), why]))
         raise SchemaError(f"{truth_path}: nothing of {run.path} can be scored: {reasons}")
-    return RunScored(run, truth_path, truth, judged, pose, why)
+    return RunScored(run, truth_path, truth, judged, pose, poses, why)
 
 
 def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
@@ -200,6 +201,30 @@ def _account_of(scored: Sequence[RunScored]) -> Account:
         check(found)
         return found
     return summed(_account_of([one]) for one in scored)
+
+
+def scoring_of(one: RunScored) -> dict[str, Line]:
+    """Frames with truth, cue by cue, and true poses: scored, or why not."""
+    found = {
+        f"cue {cue.cue}": line(
+            cue.frames,
+            cue.frames - sum(cue.left_out["object"].values()),
+            cue.left_out["object"],
+        )
+        for cue in one.judged.cues
+    }
+    if one.pose is not None:
+        of = one.pose.coverage
+        found["poses"] = line(
+            of.truth_poses,
+            of.scored,
+            {
+                "before the first estimate": of.before_estimate,
+                "after the last estimate": of.after_estimate,
+                "no estimate near enough": of.in_gap,
+            },
+        )
+    return found
 
 
 def same_logs(scored: Sequence[RunScored]) -> list[tuple[str, str]]:

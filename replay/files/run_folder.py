@@ -35,6 +35,8 @@ MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
 INPUT: Final = "input.json"
 """What a run is made of, written before anything else: a run cut short has no manifest."""
+MERGED: Final = "merged"
+"""The ``stage`` of a run that many drives were merged into."""
 FORMAT_VERSION: Final = 2
 MAX_MANIFEST_BYTES: Final = 256 << 20
 GROUP_ROWS: Final = 8192

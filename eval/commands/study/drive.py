@@ -52,7 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Drive, draw, write, replay, score."""
     from crosscue.eval.recording import save
-    from crosscue.eval.scoring.pose.score import summary, truth_track
+    from crosscue.eval.report.summary import pose_summary
+    from crosscue.eval.scoring.pose.score import truth_track
     from crosscue.eval.studies.town import drive_figure as drive_picture
     from crosscue.eval.studies.town.replayed import through_log
 
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
             f"{result.decisions} decisions, {result.detected} landmarks weighed in"
         )
         print("\nthe replay of its log against the truth")
-        print(summary(done.score))
+        print(pose_summary(done.score))
         print(f"\npicture    {picture}\nlog        {done.files.log}\nrecording  {recording}")
     return 0 if done.is_whole else 3
 

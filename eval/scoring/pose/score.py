@@ -1,4 +1,4 @@
-"""A run's pose against truth: errors as evo defines them, consistency, figures.
+"""A run's pose against truth: errors as evo defines them, and consistency.
 
 Both tracks are laid into the plane (z, roll and pitch are dropped: the filter has none) and
 compared at the point the truth speaks of. They are written out as TUM files, so that evo gives the
@@ -7,9 +7,8 @@ same numbers from them.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -20,12 +19,10 @@ from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
 from crosscue.eval.pipeline.log_time import pose_in_log_time
-from crosscue.eval.recording import TruthTrack
-from crosscue.eval.report.pose_figures import ScoredPoses, draw_all
 from crosscue.localization.angles import wrap_all
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
-from crosscue.replay.files.run_folder import RunFolder, strict_json, write_text
+from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
 
 from .errors import (
@@ -43,6 +40,7 @@ from .errors import (
     statistics,
     summarise_nees,
 )
+from .truth_track import TruthTrack
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -85,6 +83,41 @@ class PoseScore:
     lost_at_m: float | None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoredPoses:
+    """Estimated and true poses at the same times, in the map frame: what figures are drawn of.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        estimate_m: Shape (N, 2).
+        truth_m: Shape (N, 2).
+        heading_error_rad: Shape (N,): estimate less truth, wrapped.
+        cov: Shape (N, 3, 3): of x, y, heading as the filter claims it.
+        nees: Shape (N,): normalised estimation error squared of x, y, heading.
+        travelled_m: Shape (N,).
+        major_axis_m: Shape (N,).
+        lost_above_m: The vehicle file's limit of the major axis.
+        title: Which run, against which truth.
+    """
+
+    t_ns: Int64s
+    estimate_m: Floats
+    truth_m: Floats
+    heading_error_rad: Floats
+    cov: Floats
+    nees: Floats
+    travelled_m: Floats
+    major_axis_m: Floats
+    lost_above_m: float
+    title: str
+
+    @property
+    def seconds(self) -> Floats:
+        """Seconds since the first pose."""
+        seconds: Floats = (self.t_ns - self.t_ns[0]) * 1e-9
+        return seconds
+
+
 def load_truth(path: Path) -> tuple[Truth, Trajectory]:
     """A truth file and its trajectory.
 
@@ -111,8 +144,10 @@ def truth_track(path: Path, run: RunFolder) -> TruthTrack:
     return TruthTrack(track.t_ns[inside], track.xyz_m[inside, 0], track.xyz_m[inside, 1])
 
 
-def score(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.0)) -> PoseScore:
-    """Score a run's pose alone; metrics, tracks and figures go into its ``score`` folder.
+def measure(
+    run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.0)
+) -> tuple[PoseScore, ScoredPoses]:
+    """Score a run's pose; both tracks go into its ``score`` folder.
 
     Args:
         run: A finished run.
@@ -123,19 +158,10 @@ def score(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.
         RunError: The run's tables are missing or damaged.
         SchemaError: The truth does not fit the run.
     """
-    truth, _ = load_truth(truth_path)
-    result = measure(run, truth_path, rpe_m)
-    content = {"truth": truth.model_dump(mode="json"), "pose": asdict(result)}
-    write_text(run.file("score") / "metrics.json", strict_json(content) + "\n")
-    return result
-
-
-def measure(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.0)) -> PoseScore:
-    """As ``score``, with tracks and figures written but no metrics."""
     truth, track = load_truth(truth_path)
     table = pose_in_log_time(run)
     vehicle = of_manifest(run.manifest()["settings"])
-    inside = _inside(track, table, truth_path)
+    _inside(track, table, truth_path)
     estimate, cov = _estimate(table, vehicle, truth)
     flat = planar(track.t_ns, track.xyz_m[:, 0], track.xyz_m[:, 1], heading_rad(track))
     paired = pair(flat, estimate, MAX_DIFFERENCE_NS, cov)
@@ -153,10 +179,8 @@ def measure(run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 10
     folder = run.file("score")
     write_tum(folder / "estimate.tum", paired.estimate, "crosscue estimate, planar")
     write_tum(folder / "truth.tum", paired.truth, "truth, planar")
-    if inside.any():
-        title = f"{run.path.name} against {truth.source or truth_path.name}"
-        draw_all(_scored(paired, values, table), folder, title, vehicle.lost_above_m)
-    return result
+    title = f"{run.path.name} against {truth.source or truth_path.name}"
+    return result, _scored(paired, values, table, vehicle.lost_above_m, title)
 
 
 def _inside(track: Trajectory, table: pa.Table, path: Path) -> NDArray[np.bool_]:
@@ -245,7 +269,9 @@ def _lost_at(table: pa.Table, limit_m: float) -> float | None:
     return float(table["travelled_m"][int(over[0])].as_py()) if len(over) else None
 
 
-def _scored(paired: Paired, values: Floats, table: pa.Table) -> ScoredPoses:
+def _scored(
+    paired: Paired, values: Floats, table: pa.Table, lost_above_m: float, title: str
+) -> ScoredPoses:
     assert paired.cov_xyh is not None
     at = np.searchsorted(table["t_ns"].to_numpy(), paired.truth.t_ns)
     at = np.minimum(at, table.num_rows - 1)
@@ -260,48 +286,6 @@ def _scored(paired: Paired, values: Floats, table: pa.Table) -> ScoredPoses:
         nees=values,
         travelled_m=table["travelled_m"].to_numpy()[at],
         major_axis_m=table["major_axis_m"].to_numpy()[at],
+        lost_above_m=lost_above_m,
+        title=title,
     )
-
-
-def summary(result: PoseScore) -> str:
-    """The score for a person, within 80 columns."""
-    covered = result.coverage
-    left_out = [
-        f"{count} {why}"
-        for count, why in (
-            (covered.before_estimate, "before the first estimate"),
-            (covered.after_estimate, "after the last"),
-            (covered.in_gap, "in a gap of the estimate"),
-        )
-        if count
-    ]
-    lines = [
-        f"truth      {covered.scored} of {covered.truth_poses} poses scored over "
-        f"{result.distance_m:.0f} m" + (f"; not: {', '.join(left_out)}" if left_out else ""),
-        "",
-        "error                       rmse     mean   median      max     rotation rmse",
-    ]
-    lines += [_row(f"APE, aligned: {how}", errors) for how, errors in result.ape.items()]
-    lines += [_row(f"RPE over {size}", errors) for size, errors in result.rpe.items()]
-    lines += ["", *_nees_lines(result)]
-    lost = "never lost" if result.lost_at_m is None else f"lost after {result.lost_at_m:.0f} m"
-    lines.append(f"2-sigma ellipse at the end: {result.major_axis_m:.1f} m long; {lost}")
-    return "\n".join(lines)
-
-
-def _row(name: str, errors: Errors) -> str:
-    t = errors.translation_m
-    numbers = " ".join(f"{value:8.3f}" for value in (t.rmse, t.mean, t.median, t.max))
-    return f"{name:22} {numbers} m {errors.rotation_deg.rmse:9.3f} deg"
-
-
-def _nees_lines(result: PoseScore) -> list[str]:
-    lines = []
-    for name, n in (("x, y", result.nees_xy), ("x, y, heading", result.nees_xyh)):
-        if math.isnan(n.mean):
-            continue
-        lines.append(
-            f"NEES of {name}: mean {n.mean:.2f} (honest for one drive: {n.band_low:.2f} to "
-            f"{n.band_high:.2f}), {100 * n.share_inside_95:.0f} % inside 95 %"
-        )
-    return lines

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.eval.pipeline.replay import replay_drive
-from crosscue.eval.scoring.pose.score import PoseScore, score
+from crosscue.eval.report.score_runs import score_pose
+from crosscue.eval.scoring.pose.score import PoseScore
 from crosscue.localization.town.drive import Traced, drive_traced
 from crosscue.localization.town.settings import Drive
 from crosscue.replay.files.run_folder import RunFolder, create
@@ -56,5 +57,5 @@ def through_log(folder: Path, settings: Drive, seed: int, *, overwrite: bool = F
         if files.landmarks is not None:
             landmarks = open_.enter_context(open_for(files.landmarks, matcher_for(vehicle)))
         outcome = replay_drive([log], vehicle, run, EVERYTHING, landmarks=landmarks)
-    scored = score(run, files.truth)
+    scored = score_pose(run, files.truth)
     return Replayed(traced, files, run, scored, outcome.exit_status == 0, outcome.landmark_counts)

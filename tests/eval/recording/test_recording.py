@@ -16,13 +16,14 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.images import Encoded
 from crosscue.eval import cli
-from crosscue.eval.recording import TruthTrack, save
+from crosscue.eval.recording import save
 from crosscue.eval.recording.camera import shown
 from crosscue.eval.recording.drive_time import time_of
 from crosscue.eval.recording.layout import Shown, blueprint
 from crosscue.eval.recording.marks import outline, road_lines
 from crosscue.eval.recording.notes import inert
 from crosscue.eval.recording.plan import log_landmarks
+from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from support.scene_run import FRAMES, LABEL, TOPIC, scene_run, write_pictures
 from support.scoring import at, good_truth, truth_folder
 

@@ -16,7 +16,8 @@ from crosscue.eval import cli
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.recording import save as save_recording
 from crosscue.eval.report.page import write_report
-from crosscue.eval.scoring.pose.score import PoseScore, load_truth, score, truth_track
+from crosscue.eval.report.score_runs import score_pose
+from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
 from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of
 from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.errors import RunError, SchemaError
@@ -65,7 +66,7 @@ def _truth(folder: Path, track: Trajectory, **more: object) -> Path:
 def _scored(tmp_path: Path) -> tuple[RunFolder, Path, PoseScore]:
     run = _run(tmp_path / "run")
     path = _truth(tmp_path / "truth", _circle(np.arange(-1.0, 33.0, 0.05)))
-    return run, path, score(run, path)
+    return run, path, score_pose(run, path)
 
 
 def test_a_perfect_run_has_no_error_and_says_what_was_left_out(tmp_path: Path) -> None:
@@ -85,7 +86,7 @@ def test_a_shifted_truth_is_an_error_that_alignment_takes_away(tmp_path: Path) -
     track = _circle(np.arange(0.5, 29.0, 0.05))
     moved = Trajectory(track.t_ns, track.xyz_m + np.array([3.0, 4.0, 7.0]), track.quat_wxyz)
 
-    result = score(_run(tmp_path / "run"), _truth(tmp_path / "truth", moved))
+    result = score_pose(_run(tmp_path / "run"), _truth(tmp_path / "truth", moved))
 
     # Height is no part of a pose in the plane.
     assert result.ape["none"].translation_m.rmse == pytest.approx(5.0, abs=1e-2)
@@ -97,7 +98,7 @@ def test_truth_of_the_camera_is_compared_at_the_camera(tmp_path: Path) -> None:
     vehicle = Vehicle(version=1, start=Start(heading_rad=0.0), camera=Camera(x_m=2.0))
     path = _truth(tmp_path / "truth", _circle(np.arange(0.5, 29.0, 0.05), 2.0), pose_point="camera")
 
-    assert score(_run(tmp_path / "run", vehicle), path).ape["none"].translation_m.max < 1e-2
+    assert score_pose(_run(tmp_path / "run", vehicle), path).ape["none"].translation_m.max < 1e-2
 
 
 def test_evo_gives_the_same_numbers_from_the_files_written(tmp_path: Path) -> None:
@@ -123,7 +124,7 @@ def test_truth_on_another_clock_is_refused(tmp_path: Path) -> None:
     path = _truth(tmp_path / "truth", _circle(np.arange(1000.0, 1030.0)))
 
     with pytest.raises(SchemaError, match="another log or clock"):
-        score(_run(tmp_path / "run"), path)
+        score_pose(_run(tmp_path / "run"), path)
 
 
 @pytest.mark.parametrize(
