@@ -30,7 +30,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from crosscue.eval.cli import run as crosscue
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import open_log
+from crosscue.replay.opening import open_log
 from crosscue.replay.write.convert import LogWriter
 
 FRAME = """std_msgs/Header header

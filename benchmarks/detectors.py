@@ -27,7 +27,8 @@ from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.registry import chosen
 from crosscue.eval.pipeline.detect import detect_drive
 from crosscue.replay.files.run_folder import create
-from crosscue.replay.log import Selection, open_log
+from crosscue.replay.log import Selection
+from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 ROUNDS = 5

@@ -28,7 +28,8 @@ from crosscue.eval.pipeline.reestimate import estimate_run
 from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.files.run_folder import create, open_run
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import EVERYTHING, open_log
+from crosscue.replay.log import EVERYTHING
+from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import parse
 from crosscue.replay.write.convert import LogWriter
 

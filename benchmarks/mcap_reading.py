@@ -308,7 +308,7 @@ PEAK = """
 import sys
 from pathlib import Path
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import open_log
+from crosscue.replay.opening import open_log
 import crosscue.replay.readers.mcap.reader
 
 def peak():

@@ -40,7 +40,7 @@ def ours(log: Path, database: Any) -> dict[str, list[Any]]:
     """Blocks of signals by message."""
     from crosscue.replay.can.decode import BusDecoder, DecodeSettings
     from crosscue.replay.ledger import Ledger
-    from crosscue.replay.log import open_log
+    from crosscue.replay.opening import open_log
 
     ledger = Ledger(str(log))
     found: dict[str, list[Any]] = {}

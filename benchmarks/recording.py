@@ -38,7 +38,8 @@ from crosscue.eval.pipeline.stored_images import camera_of, read_pictures
 from crosscue.eval.recording import save
 from crosscue.replay.columns import Block, Images
 from crosscue.replay.files.run_folder import RunFolder, create, open_run
-from crosscue.replay.log import EVERYTHING, open_log
+from crosscue.replay.log import EVERYTHING
+from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import parse
 
 ROUNDS = 5

@@ -16,7 +16,8 @@ import numpy as np
 from .columns import Block
 from .ledger import Ledger
 from .log import Readable, Selection
-from .signals import Extractor, Plan, Samples, Signal
+from .signals.extractor import Extractor
+from .signals.kinds import Plan, Samples, Signal
 
 WIDTH_NS: Final = 1_000_000_000
 HORIZON_NS: Final = 60_000_000_000

@@ -295,5 +295,5 @@ def _to_ns(seconds: Values) -> Int64s:
 
 
 def open_segment(path: Path, limits: Limits) -> Segment:
-    """Open a segment folder; see ``crosscue.replay.log.FORMATS``."""
+    """Open a segment folder; see ``crosscue.replay.formats.FORMATS``."""
     return Segment(path)

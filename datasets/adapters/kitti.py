@@ -153,7 +153,7 @@ class Drive(Closing):
 
 
 def open_drive(path: Path, limits: Limits) -> Drive:
-    """Open a drive's folder; see ``crosscue.replay.log.FORMATS``.
+    """Open a drive's folder; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
         LogFormatError: No stream with times, or several sequences in one folder.

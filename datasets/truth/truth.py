@@ -28,7 +28,7 @@ CARRIED: Final[dict[str, str]] = {
     "comma2k19": "crosscue.datasets.adapters.comma2k19_truth:write",
     "kitti-raw": "crosscue.datasets.adapters.kitti:write_truth",
 }
-"""From a format of ``crosscue.replay.log.FORMATS`` to the function that writes its truth."""
+"""From a format of ``crosscue.replay.formats.FORMATS`` to the function that writes its truth."""
 
 
 class Section(BaseModel):

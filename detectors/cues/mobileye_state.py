@@ -8,7 +8,7 @@ import numpy as np
 
 from crosscue.replay.columns import Floats
 from crosscue.replay.mobileye.samples import LANE_COLUMNS, OBSTACLE_COLUMNS
-from crosscue.replay.signals import Samples
+from crosscue.replay.signals.kinds import Samples
 from crosscue.replay.vehicle.mobileye_cues import Past
 
 _BURST, _X = OBSTACLE_COLUMNS.index("burst"), OBSTACLE_COLUMNS.index("x_m")

@@ -27,8 +27,8 @@ from crosscue.replay.errors import LogError, UnknownFormatError, UsageError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.identity import SHORT, identity_of, identity_of_all
 from crosscue.replay.files.run_folder import MANIFEST
+from crosscue.replay.formats import FORMATS, format_of
 from crosscue.replay.limits import MIB
-from crosscue.replay.log import FORMATS, format_of
 from crosscue.replay.remote.logs import is_remote, matches
 
 VEHICLE: Final = "vehicle.toml"

@@ -33,7 +33,8 @@ from crosscue.eval.pipeline.empty_result import empty_result
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import LogError, OutputError, UsageError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger, TopicAccount
-from crosscue.replay.log import Log, Selection, open_log, unless_damaged
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.opening import open_log, unless_damaged
 from crosscue.replay.safe_text import table, terminal_width, visible, wrapped
 from crosscue.replay.seal.seal import seal_path
 from crosscue.replay.write.convert import LogWriter

@@ -26,7 +26,8 @@ from crosscue.eval.scoring.pose.score import truth_track
 from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of, write_scores
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.run_folder import create
-from crosscue.replay.log import EVERYTHING, open_log
+from crosscue.replay.log import EVERYTHING
+from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 
 from .replay import Progress

@@ -22,7 +22,6 @@ from crosscue.eval.commands.shared.options import (
     with_progress,
 )
 from crosscue.replay.columns import Block
-from crosscue.replay.log import open_logs
 from crosscue.replay.log_summary import (
     LogSummary,
     Together,
@@ -33,6 +32,7 @@ from crosscue.replay.log_summary import (
     summarise,
     together,
 )
+from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import table, terminal_width, visible, wrapped
 
 LOSSES_SHOWN = 10

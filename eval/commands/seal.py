@@ -19,7 +19,7 @@ from pathlib import Path
 
 from crosscue.eval.commands.shared.options import print_json, with_progress
 from crosscue.replay.errors import CrosscueError, LogError, UsageError
-from crosscue.replay.log import format_of
+from crosscue.replay.formats import format_of
 from crosscue.replay.safe_text import visible
 from crosscue.replay.seal.seal import HASH, SUFFIX, Check, Sealing, read_seal, seal_path, write_seal
 

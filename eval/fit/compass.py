@@ -14,7 +14,9 @@ from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.remote.logs import name_of
-from crosscue.replay.signals import Extractor, Samples, Signal, plan
+from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.kinds import Samples, Signal
+from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.windows import windows
 

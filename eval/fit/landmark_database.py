@@ -26,7 +26,9 @@ from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.run_folder import open_run
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.signals import Extractor, Plan, camera_of, with_pictures
+from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.kinds import Plan
+from crosscue.replay.signals.plan import camera_of, with_pictures
 from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
 
 LEAST_POINTS: Final = 20

@@ -14,11 +14,14 @@ from crosscue.replay.columns import Block, Images
 from crosscue.replay.errors import LogError, VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT
-from crosscue.replay.log import Log, Selection, open_log
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.opening import open_log
 from crosscue.replay.readers.images.files import SUFFIXES
 from crosscue.replay.readers.time_file import find_time_file, read_time_file
 from crosscue.replay.readers.timed_files import list_files, pair
-from crosscue.replay.signals import Extractor, Plan, Source, camera_of
+from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.kinds import Plan, Source
+from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 

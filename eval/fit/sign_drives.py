@@ -14,8 +14,11 @@ from crosscue.replay.errors import LogError, SchemaError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import MIB
-from crosscue.replay.log import Log, Selection, open_log
-from crosscue.replay.signals import Extractor, Plan, Source, camera_of
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.opening import open_log
+from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.kinds import Plan, Source
+from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 from .sign_labels import Boxes, Labelled, coco_boxes

@@ -13,7 +13,7 @@ from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.files.run_folder import RunFolder, TableSink
 from crosscue.replay.ledger import Ledger, TopicAccount
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.signals import Extractor
+from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 
 from .labelled import labelled

@@ -24,7 +24,9 @@ from crosscue.replay.errors import VehicleError
 from crosscue.replay.files.run_folder import RunFolder, clear, locked, write_manifest
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.signals import Extractor, Plan, Source, camera_of
+from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.kinds import Plan, Source
+from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_told, shift_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 

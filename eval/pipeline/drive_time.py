@@ -9,7 +9,9 @@ from crosscue.replay.columns import Topic
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.signals import Extractor, Plan, plan, with_pictures
+from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.kinds import Plan
+from crosscue.replay.signals.plan import plan, with_pictures
 from crosscue.replay.time.scan import scan
 from crosscue.replay.time.segments import Timeline, gaps_told, timeline_of
 from crosscue.replay.vehicle.vehicle import Vehicle

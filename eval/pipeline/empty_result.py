@@ -11,7 +11,7 @@ from crosscue.replay.errors import CrosscueError, EmptyResultError, LogError
 from crosscue.replay.files.run_folder import RunFolder, clear
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.signals import Plan, Signal
+from crosscue.replay.signals.kinds import Plan, Signal
 
 TOPICS_SHOWN: Final = 12
 ROLES: Final[Mapping[Signal, str]] = {

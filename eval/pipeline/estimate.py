@@ -23,7 +23,9 @@ from crosscue.replay.files.run_folder import (
 )
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.signals import Extractor, Plan, Signal, camera_of, plan, with_pictures
+from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.kinds import Plan, Signal
+from crosscue.replay.signals.plan import camera_of, plan, with_pictures
 from crosscue.replay.time.segments import (
     ONE_SEGMENT,
     LogClock,

@@ -20,7 +20,7 @@ from crosscue.fusion.approaches import PastCues
 from crosscue.fusion.intersection_range import RangeBelief, Reference
 from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.mobileye.samples import LANE_COLUMNS, OBSTACLE_COLUMNS
-from crosscue.replay.signals import MOBILEYE_SIGNALS, Samples, Signal
+from crosscue.replay.signals.kinds import MOBILEYE_SIGNALS, Samples, Signal
 from crosscue.replay.time.segments import BEGINNING, LogClock, Timeline
 from crosscue.replay.vehicle.mobileye_cues import Past
 

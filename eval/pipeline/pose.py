@@ -21,7 +21,7 @@ from crosscue.localization.pose_track import (
     TrackState,
 )
 from crosscue.replay.columns import Floats
-from crosscue.replay.signals import Plan, Samples, Signal
+from crosscue.replay.signals.kinds import Plan, Samples, Signal
 from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Segment, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.windows import Window

@@ -13,7 +13,7 @@ from crosscue.replay.columns import Topic
 from crosscue.replay.errors import RunError
 from crosscue.replay.files.run_folder import RunFolder, clear, locked
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.signals import camera_of
+from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.replay.errors import AccountError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
-from crosscue.replay.signals import Signal
+from crosscue.replay.signals.kinds import Signal
 
 from .accounts import account_of
 

@@ -16,7 +16,8 @@ from typing import Any, Final
 from crosscue.replay.errors import CrosscueError, RunError
 from crosscue.replay.files.identity import as_row, identity_of, of_row
 from crosscue.replay.files.run_folder import RunFolder, sha256_of
-from crosscue.replay.log import Log, open_log
+from crosscue.replay.log import Log
+from crosscue.replay.opening import open_log
 from crosscue.replay.remote.logs import RangedLog, RemoteLog, is_remote
 from crosscue.replay.vehicle.roles import Role, role_of
 

@@ -14,8 +14,10 @@ from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.columns import Block, Images, Topic
 from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Selection, open_log
-from crosscue.replay.signals import Extractor, Plan, Source
+from crosscue.replay.log import Selection
+from crosscue.replay.opening import open_log
+from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.time.segments import UNSHIFTED, LogClock, TimedLog
 from crosscue.replay.vehicle.vehicle import Vehicle
 

@@ -160,7 +160,7 @@ def _beside(place: Path) -> list[Path]:
 
 
 def _videos() -> tuple[str, ...]:
-    from crosscue.replay.log import FORMATS
+    from crosscue.replay.formats import FORMATS
 
     return FORMATS["video"].suffixes
 

@@ -10,7 +10,7 @@ import numpy as np
 from crosscue.replay.columns import Block, CanFrames, Floats, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.ros.reader import RosMobileye
-from crosscue.replay.signals import Samples, Signal
+from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.vehicle.vehicle import Mobileye
 
 from .decode import MobileyeDecoder

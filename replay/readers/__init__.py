@@ -1,1 +1,1 @@
-"""One file a format; ``crosscue.replay.log.FORMATS`` is the table that names them."""
+"""One file a format; ``crosscue.replay.formats.FORMATS`` is the table that names them."""

@@ -35,9 +35,10 @@ from crosscue.replay.errors import (
 from crosscue.replay.files.closing import Closing
 from crosscue.replay.files.partial_file import is_still
 from crosscue.replay.files.run_folder import cannot_write
+from crosscue.replay.formats import FORMATS
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
-from crosscue.replay.log import EVERYTHING, FORMATS, Log, Selection
+from crosscue.replay.log import EVERYTHING, Log, Selection
 
 from .ranges import RangedFile
 

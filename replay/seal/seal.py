@@ -118,7 +118,7 @@ def files_of(log: Path) -> dict[str, Path]:
 
 
 def _is_video(log: Path) -> bool:
-    from crosscue.replay.log import FORMATS
+    from crosscue.replay.formats import FORMATS
 
     return log.suffix.lower() in FORMATS["video"].suffixes
 

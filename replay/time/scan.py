@@ -19,7 +19,8 @@ from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.columns import Block
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.signals import Extractor, Plan, Samples, Signal, Source
+from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.kinds import Plan, Samples, Signal, Source
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .segments import BEGINNING, Cause, Epoch, LogClock, Marks, Segment, Timeline

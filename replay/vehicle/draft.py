@@ -16,7 +16,7 @@ from crosscue.replay.decode import decoder_for
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.remote.logs import name_of
-from crosscue.replay.signals import ANGLE_UNITS, SPEED_UNITS
+from crosscue.replay.signals.converters import ANGLE_UNITS, SPEED_UNITS
 
 from .roles import Role, role_of
 

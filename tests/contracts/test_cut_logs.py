@@ -7,7 +7,7 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval import cli
-from crosscue.replay.log import FORMATS
+from crosscue.replay.formats import FORMATS
 from support.every_format import EVERY_FORMAT
 
 INDEX_AT_THE_END = {"mf4", "video"}

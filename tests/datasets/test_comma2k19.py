@@ -10,7 +10,8 @@ from crosscue.datasets.adapters.npy import read_column
 from crosscue.replay.columns import CanFrames, Table
 from crosscue.replay.errors import LogFormatError, UnknownFormatError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Selection, open_log
+from crosscue.replay.log import Selection
+from crosscue.replay.opening import open_log
 from support.data import shared
 
 SEGMENT = ("comma2k19", "Example_1", "b0c9d2329ad1606b_2018-08-02--08-34-47", "40")

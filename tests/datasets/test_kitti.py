@@ -19,7 +19,8 @@ from crosscue.replay.columns import Block, Images, Table
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import DEFAULT
-from crosscue.replay.log import EVERYTHING, Selection, open_log
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.roles import Role, role_of
 from support.data import shared
 from support.kitti_drive import (

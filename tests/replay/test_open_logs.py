@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.replay import log as log_module
+from crosscue.replay import opening
 from crosscue.replay.errors import LogError
 from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import Log, open_logs
+from crosscue.replay.log import Log
+from crosscue.replay.opening import open_logs
 from support.memory_log import MemoryLog
 
 
@@ -35,7 +36,7 @@ class Opened:
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> Opened:
     made = Opened()
-    monkeypatch.setattr(log_module, "open_log", made)
+    monkeypatch.setattr(opening, "open_log", made)
     return made
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from crosscue.replay.errors import LogError, LogTooLargeError, OutputError, UsageError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import open_log
+from crosscue.replay.opening import open_log
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.remote.logs import Store, fetch, is_remote, matches, version_of
 from support.can_files import candump, made

@@ -12,9 +12,11 @@ import pytest
 
 from crosscue.eval.cli import run
 from crosscue.replay.errors import LogError
+from crosscue.replay.formats import FORMATS
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import MIB
-from crosscue.replay.log import FORMATS, Selection, open_log
+from crosscue.replay.log import Selection
+from crosscue.replay.opening import open_log
 from crosscue.replay.seal.log import CHANGED, DIFFERS
 from crosscue.replay.seal.seal import read_seal, seal_path
 from support.accounted import read

@@ -8,7 +8,7 @@ from mcap.writer import Writer
 
 from crosscue.replay.columns import Messages, Table
 from crosscue.replay.errors import UsageError
-from crosscue.replay.log import open_log
+from crosscue.replay.opening import open_log
 from crosscue.replay.topic_part import read_topic
 
 

@@ -11,7 +11,9 @@ from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import EVERYTHING
-from crosscue.replay.signals import Extractor, Signal, plan
+from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.kinds import Signal
+from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.windows import HORIZON_NS, Window, windows
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block

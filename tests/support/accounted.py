@@ -8,7 +8,8 @@ from pathlib import Path
 from crosscue.replay.columns import Block
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import EVERYTHING, Selection, open_log
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.opening import open_log
 
 
 def read(

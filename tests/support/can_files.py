@@ -13,7 +13,8 @@ import can
 
 from crosscue.replay.columns import DATA, ERROR, REMOTE, CanFrames
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import EVERYTHING, Selection, open_log
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.opening import open_log
 
 START_NS = 1_436_529_600_000_000_000
 """Noon of 10 July 2015, which days since 1899 spell exactly."""

@@ -20,7 +20,8 @@ from rosbags.typesys.store import Typestore
 
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import EVERYTHING, Log, Selection, open_log
+from crosscue.replay.log import EVERYTHING, Log, Selection
+from crosscue.replay.opening import open_log
 
 START_NS: Final = 1_700_000_000_000_000_000
 

@@ -31,7 +31,7 @@ from crosscue.localization.landmarks.fit import LandmarkFit, Rate, ScoredPairs, 
 from crosscue.replay.errors import SchemaError, UsageError
 from crosscue.replay.files.run_folder import write_text
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import open_logs
+from crosscue.replay.opening import open_logs
 from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
 
 

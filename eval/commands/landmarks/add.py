@@ -34,7 +34,7 @@ from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.localization.landmarks.features import Matcher
 from crosscue.replay.errors import UsageError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import open_logs
+from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from crosscue.datasets.truth.truth import json_schema, write_carried
 from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
 from crosscue.replay.errors import UsageError
-from crosscue.replay.log import open_log
+from crosscue.replay.opening import open_log
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -31,7 +31,8 @@ from crosscue.eval.studies.attribution import Attribution, Drive, attribute, est
 from crosscue.fusion.message_fit import fit_messages
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.files.run_folder import create, open_run
-from crosscue.replay.log import EVERYTHING, open_log
+from crosscue.replay.log import EVERYTHING
+from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.fusion import Calibrated
 from crosscue.replay.vehicle.vehicle import Vehicle, load, of_manifest
 

@@ -13,7 +13,8 @@ from crosscue.eval.scoring.pose.score import PoseScore
 from crosscue.localization.town.drive import Traced, drive_traced
 from crosscue.localization.town.settings import Drive
 from crosscue.replay.files.run_folder import RunFolder, create
-from crosscue.replay.log import EVERYTHING, open_log
+from crosscue.replay.log import EVERYTHING
+from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 
 from .drive_files import StudyDriveFiles, write_drive_files

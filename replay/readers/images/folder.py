@@ -47,7 +47,7 @@ class ImageFolder(Closing):
 
 
 def open_images(path: Path, limits: Limits) -> ImageFolder:
-    """Open a folder of pictures; see ``crosscue.replay.log.FORMATS``.
+    """Open a folder of pictures; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
         LogFormatError: No picture, no time file, or a time file that cannot be understood.

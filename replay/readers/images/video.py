@@ -296,7 +296,7 @@ class Video(Closing):
 
 
 def open_video(path: Path, limits: Limits) -> Video:
-    """Open a video file; see ``crosscue.replay.log.FORMATS``.
+    """Open a video file; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
         LogFormatError: It is cut or damaged, has no video, or no times.

@@ -13,7 +13,8 @@ from crosscue.replay.columns import Topic
 from crosscue.replay.errors import CrosscueError, LogError
 from crosscue.replay.files.partial_file import Scratch
 from crosscue.replay.limits import MIB, Limits
-from crosscue.replay.log import Log, open_log, open_unsealed
+from crosscue.replay.log import Log
+from crosscue.replay.opening import open_log, open_unsealed
 
 from .db3 import Db3Log
 from .metadata import Metadata

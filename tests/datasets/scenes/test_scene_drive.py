@@ -31,8 +31,8 @@ from crosscue.replay.columns import Block, CanFrames, Images, Table
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.errors import OutputError, SchemaError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import open_log
 from crosscue.replay.mobileye.decode import MobileyeDecoder
+from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
 
 TINY = Camera(width_px=192, height_px=108)

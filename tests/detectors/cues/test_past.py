@@ -20,8 +20,11 @@ from crosscue.detectors.cues.names import Cue
 from crosscue.replay.columns import Block, Floats, Topic
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Selection, open_log
-from crosscue.replay.signals import MOBILEYE_SIGNALS, Extractor, Samples, Signal, plan
+from crosscue.replay.log import Selection
+from crosscue.replay.opening import open_log
+from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.kinds import MOBILEYE_SIGNALS, Samples, Signal
+from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.mobileye_cues import Past
 from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
 from crosscue.replay.windows import Window, windows

@@ -19,7 +19,8 @@ from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.files.run_folder import create
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import EVERYTHING, Log, Selection, open_log
+from crosscue.replay.log import EVERYTHING, Log, Selection
+from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 SECOND = 1_000_000_000

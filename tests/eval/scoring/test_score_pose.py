@@ -23,7 +23,8 @@ from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.errors import RunError, SchemaError
 from crosscue.replay.files.run_folder import RunFolder, create
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import EVERYTHING, open_log
+from crosscue.replay.log import EVERYTHING
+from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import Camera, Start, Vehicle
 from crosscue.replay.write.convert import LogWriter
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block

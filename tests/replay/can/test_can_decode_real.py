@@ -14,7 +14,7 @@ from crosscue.replay.can.decode import TOO_SHORT, UNKNOWN_ID, BusDecoder, Decode
 from crosscue.replay.can.layout import overlaps
 from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import open_log
+from crosscue.replay.opening import open_log
 from support.can_layouts import comma2k19_frames, ford_frames
 from support.data import shared
 

@@ -14,8 +14,9 @@ from crosscue.eval.cli import run
 from crosscue.replay.columns import Block, Images, Topic
 from crosscue.replay.decode.packets import NO_PICTURE, NOT_DECODED
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import open_log
-from crosscue.replay.signals import Extractor, Plan, Source
+from crosscue.replay.opening import open_log
+from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.videos import SIZE_PX, number_of, video
 

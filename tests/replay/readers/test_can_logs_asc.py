@@ -10,7 +10,7 @@ import pytest
 
 from crosscue.replay.columns import DATA, ERROR, REMOTE
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.log import open_log
+from crosscue.replay.opening import open_log
 from support.can_files import Sent, read_back, same_as_python_can
 from support.data import shared
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from crosscue.replay.columns import DATA, ERROR, REMOTE
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.log import Selection, open_log
+from crosscue.replay.log import Selection
+from crosscue.replay.opening import open_log
 from crosscue.replay.readers.can_text import dialect as can_text
 from crosscue.replay.readers.can_text import digits
 from crosscue.replay.readers.can_text.lines import Lines, Overlong, Tail, lines_of

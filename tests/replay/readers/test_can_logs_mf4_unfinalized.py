@@ -13,7 +13,7 @@ import pytest
 
 from crosscue.replay.columns import CanFrames
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import open_log
+from crosscue.replay.opening import open_log
 from support.can_files import Sent, by_bus, made, read_back
 from support.data import shared
 from support.mf4_files import unsorted

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from crosscue.replay.columns import DATA, ERROR, REMOTE
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.log import open_log
+from crosscue.replay.opening import open_log
 from crosscue.replay.readers.can_text.lines import CHUNK_BYTES
 from crosscue.replay.readers.can_text.message_numbers import GO_BACK, MISFIT, MISSING
 from crosscue.replay.readers.can_text.trc import NOT_UNDERSTOOD

@@ -13,7 +13,8 @@ from crosscue.eval.cli import run
 from crosscue.replay.columns import Images
 from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
-from crosscue.replay.log import Selection, open_log
+from crosscue.replay.log import Selection
+from crosscue.replay.opening import open_log
 from support.accounted import read
 from support.videos import number_of, numbers_at_times, video
 

@@ -17,7 +17,8 @@ from crosscue.replay.columns import BLOCK_BYTES, Block, Images
 from crosscue.replay.errors import LogError, LogFormatError, UnknownFormatError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
 from crosscue.replay.limits import Limits
-from crosscue.replay.log import Selection, open_log
+from crosscue.replay.log import Selection
+from crosscue.replay.opening import open_log
 from support.accounted import read
 from support.data import shared
 from support.pictures import picture, picture_folder

@@ -17,7 +17,8 @@ from rosbags.rosbag1 import Reader
 from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
 from crosscue.replay.limits import Limits
-from crosscue.replay.log import Selection, open_log
+from crosscue.replay.log import Selection
+from crosscue.replay.opening import open_log
 from crosscue.replay.readers.rosbag1.reader import open_bag
 from support.data import shared
 from support.rosbag_files import (

@@ -16,7 +16,8 @@ from rosbags.rosbag2 import Reader
 
 from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import NOT_ASKED_TIME
-from crosscue.replay.log import Selection, open_log
+from crosscue.replay.log import Selection
+from crosscue.replay.opening import open_log
 from support.data import shared
 from support.rosbag_files import Row, by_topic, read_rows, rows_of, write_folder
 

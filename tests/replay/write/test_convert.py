@@ -25,7 +25,7 @@ from crosscue.eval.cli import run as crosscue
 from crosscue.replay.columns import Block, CanFrames, Messages, Topic
 from crosscue.replay.errors import OutputError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import open_log
+from crosscue.replay.opening import open_log
 from crosscue.replay.write.convert import BAD_SCHEMA, NO_TYPE, TOO_EARLY, LogWriter
 from crosscue.replay.write.mcap import Compression, McapWriter
 from crosscue.replay.write.mcap_chunks import Stretch, copy_ranges

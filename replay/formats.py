@@ -1,0 +1,121 @@
+"""The table of formats: who reads which file or folder.
+
+A new format is one file and one line in ``FORMATS``: a module with a function
+``open_PATH(path, limits) -> Log``, imported when needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from .errors import LogError, UnknownFormatError
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """One line of the table.
+
+    Attributes:
+        suffixes: Lower-case file suffixes; empty for folders known by ``markers``.
+        markers: Relative paths, one of which a folder must hold (glob patterns allowed).
+        opener: ``module:function``, called with the path and limits.
+        says: What a person calls it.
+    """
+
+    suffixes: tuple[str, ...]
+    markers: tuple[str, ...]
+    opener: str
+    says: str
+
+
+FORMATS: Final[dict[str, Format]] = {
+    "mcap": Format((".mcap",), (), "crosscue.replay.readers.mcap.reader:open_mcap", "MCAP"),
+    "rosbag1": Format(
+        (".bag", ".active"), (), "crosscue.replay.readers.rosbag1.reader:open_bag", "ROS 1 bag"
+    ),
+    "rosbag2-sqlite3": Format(
+        (".db3",), (), "crosscue.replay.readers.rosbag2.db3:open_db3", "ROS 2 bag (sqlite3)"
+    ),
+    "rosbag2": Format(
+        (),
+        ("metadata.yaml", "*.db3", "*.mcap", "*.db3.zstd", "*.mcap.zstd"),
+        "crosscue.replay.readers.rosbag2.folder:open_folder",
+        "ROS 2 bag folder",
+    ),
+    "candump": Format(
+        (".log", ".candump"),
+        (),
+        "crosscue.replay.readers.can_text.candump:open_candump",
+        "candump log",
+    ),
+    "asc": Format((".asc",), (), "crosscue.replay.readers.can_text.asc:open_asc", "Vector ASC log"),
+    "blf": Format((".blf",), (), "crosscue.replay.readers.blf.reader:open_blf", "Vector BLF log"),
+    "trc": Format((".trc",), (), "crosscue.replay.readers.can_text.trc:open_trc", "PEAK TRC log"),
+    "mf4": Format((".mf4",), (), "crosscue.replay.readers.mf4.reader:open_mf4", "ASAM MDF 4"),
+    "comma2k19": Format(
+        (),
+        ("processed_log", "global_pose"),
+        "crosscue.datasets.adapters.comma2k19:open_segment",
+        "comma2k19 segment",
+    ),
+    "kitti-raw": Format(
+        (),
+        ("oxts/data", "oxts/timestamps.txt", "oxts/*.txt"),
+        "crosscue.datasets.adapters.kitti:open_drive",
+        "KITTI raw drive",
+    ),
+    "video": Format(
+        (".mp4", ".avi", ".mkv", ".mov", ".hevc", ".h264"),
+        (),
+        "crosscue.replay.readers.images.video:open_video",
+        "video with a time file",
+    ),
+    "images": Format(
+        (),
+        ("*.png", "*.jpg", "*.jpeg", "*.webp", "*.PNG", "*.JPG", "*.JPEG"),
+        "crosscue.replay.readers.images.folder:open_images",
+        "folder of images with a time file",
+    ),
+}
+"""Folders are tried in this order, so data sets come before loose images."""
+
+
+def format_of(path: Path) -> str:
+    """Which of ``FORMATS`` a file or folder is.
+
+    Raises:
+        UnknownFormatError: No format fits; the message lists those there are.
+        LogError: It is not there, or is no file or folder.
+    """
+    try:
+        is_folder, is_file = path.is_dir(), path.is_file()
+        if not is_folder and not is_file:
+            what = "not a regular file or folder" if path.exists() else "no such file or folder"
+            raise LogError(f"{path}: {what}; give a recording")
+        if is_folder:
+            # A glob in a folder that may not be read finds nothing, and says nothing.
+            next(path.iterdir(), None)
+    except OSError as error:
+        raise LogError(f"{path}: {error.strerror or error}; check the path") from None
+    suffix = path.suffix.lower()
+    for name, known in FORMATS.items():
+        if is_file and suffix in known.suffixes:
+            return name
+        if is_folder and any(_holds(path, marker) for marker in known.markers):
+            return name
+    wanted = ", ".join(
+        f"{f.says} ({' '.join(f.suffixes) if f.suffixes else 'folder'})" for f in FORMATS.values()
+    )
+    what = (
+        "a folder without any known recording in it" if is_folder else f"suffix {suffix!r} unknown"
+    )
+    raise UnknownFormatError(f"{path}: {what}; there are: {wanted}")
+
+
+def _holds(folder: Path, marker: str) -> bool:
+    try:
+        return next(folder.glob(marker), None) is not None
+    except OSError:
+        return False

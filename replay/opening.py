@@ -1,0 +1,80 @@
+"""One way to open any recording: by its suffix, by what lies in its folder, by its URL."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import cast
+
+from .errors import LogError, MissingTopicError
+from .formats import FORMATS, format_of
+from .ledger import Ledger
+from .limits import DEFAULT, Limits
+from .log import Log
+
+
+def open_log(path: Path | str, limits: Limits = DEFAULT) -> Log:
+    """Open any recording by its suffix or, for a folder, by what lies in it.
+
+    A text with ``://`` is a URL: see ``remote``. Of a log with a seal beside
+    it, what is read is held against the seal, see ``sealed_log``.
+
+    Raises:
+        UnknownFormatError: No format fits; the message lists those there are.
+        LogError: It cannot be opened: missing, no permission, not a file or folder, or not one
+            readable record in it.
+    """
+    if isinstance(path, str) and "://" in path:
+        from crosscue.replay.remote.logs import open_remote
+
+        return open_remote(path, lambda fetched: open_log(fetched, limits), limits)
+    from crosscue.replay.seal.log import with_seal
+
+    place = Path(path)
+    return with_seal(place, lambda: open_unsealed(place, limits))
+
+
+def open_unsealed(path: Path, limits: Limits = DEFAULT) -> Log:
+    """As ``open_log`` of a file or folder, without looking at its seal."""
+    name = format_of(path)
+    module, _, function = FORMATS[name].opener.partition(":")
+    opener = cast("Callable[[Path, Limits], Log]", getattr(import_module(module), function))
+    try:
+        return opener(path, limits)
+    except PermissionError:
+        raise LogError(
+            f"{path}: no permission to read it; check the file's owner and mode"
+        ) from None
+    except OSError as error:
+        raise LogError(f"{path}: {error.strerror or error}; check the path and the disk") from None
+
+
+@contextmanager
+def open_logs(paths: Sequence[Path | str], limits: Limits = DEFAULT) -> Iterator[tuple[Log, ...]]:
+    """Several logs of one drive, open as long as the ``with`` block lasts; as ``open_log``."""
+    with ExitStack() as stack:
+        logs = tuple(stack.enter_context(open_log(path, limits)) for path in paths)
+        with unless_damaged(logs):
+            yield logs
+
+
+@contextmanager
+def unless_damaged(logs: Sequence[Log]) -> Iterator[None]:
+    """Blame the log, not who names its topics, where what is missing may be in the damaged part.
+
+    Raises:
+        LogError: Instead of a ``MissingTopicError``, when a log turns out to be damaged.
+    """
+    try:
+        yield
+    except MissingTopicError as error:
+        for log in logs:
+            ledger = Ledger(str(log.path))
+            for _ in log.read(ledger):
+                pass
+            for loss in ledger.drops():
+                detail = f" ({loss.detail})" if loss.detail else ""
+                raise LogError(f"{log.path}: {loss.reason}{detail}; so {error}") from None
+        raise

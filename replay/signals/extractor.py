@@ -1,0 +1,198 @@
+"""Blocks of a log to samples of the signals planned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crosscue.replay.clocks.reports import MAX_OFFSET_NS, Clock, ClockWatch, times_of
+from crosscue.replay.columns import Block, Images, Int64s
+from crosscue.replay.decode import Decoder, decoder_for
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.vehicle.roles import Role, role_of
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .converters import (
+    FROM_TABLE,
+    SPEED_UNITS,
+    angle_samples,
+    check_signals,
+    column_of,
+    database_of,
+    wheel_samples,
+)
+from .kinds import MOBILEYE_SIGNALS, Plan, Samples, Signal, Source
+
+if TYPE_CHECKING:
+    from crosscue.replay.can.decode import BusDecoder
+    from crosscue.replay.decode.packets import PacketDecoder
+    from crosscue.replay.mobileye.samples import MobileyeStream
+
+
+def _no_pictures(block: Block) -> None:
+    """Let them pass."""
+
+
+@dataclass(slots=True)
+class Extractor:
+    """Blocks of one log to samples; keeps what a bus needs from block to block.
+
+    Attributes:
+        planned: Which topics give which signals.
+        vehicle: The vehicle file.
+        log: Index of the log.
+        ledger: Where skips are told.
+        clocks: From a topic to the clock whose times its samples carry; the log's where none is.
+        watch: Sees every block, decoded.
+        on_pictures: Given every block of ``Images``, its ``log_ns`` on the clock chosen.
+        shift_at: From drive time to how far it lies from the log's own, where blocks come in drive
+            time; sensors' stamps are shifted alike.
+    """
+
+    planned: Plan
+    vehicle: Vehicle
+    log: int
+    ledger: Ledger
+    clocks: Mapping[str, Clock] = field(default_factory=dict)
+    watch: ClockWatch = field(default_factory=ClockWatch)
+    on_pictures: Callable[[Block], None] = _no_pictures
+    shift_at: Callable[[Int64s], Int64s] | None = None
+    _decoders: dict[str, Decoder | None] = field(default_factory=dict)
+    _buses: dict[str, BusDecoder] = field(default_factory=dict)
+    _mobileye: MobileyeStream | None = None
+    _packets: dict[str, PacketDecoder] = field(default_factory=dict)
+
+    def __call__(self, block: Block) -> Iterator[Samples]:
+        """The samples of one block; rows that cannot be used are skipped in the ledger."""
+        source = next(
+            (s for s in self.planned.sources if s.log == self.log and s.topic.name == block.topic),
+            None,
+        )
+        if source is None:
+            return
+        if source.topic.encoding != "columns":
+            if block.topic not in self._decoders:
+                self._decoders[block.topic] = decoder_for(source.topic)
+            decode = self._decoders[block.topic]
+            if decode is None:
+                self.ledger.skip(block.topic, "type not understood", len(block))
+                return
+            block = decode(block, self.ledger)
+        if not len(block):
+            return
+        if self.shift_at is not None and block.header_ns is not None:
+            block = replace(block, header_ns=self._shifted(block.header_ns, block.log_ns))
+        self.watch.see(block)
+        clock = self.clocks.get(block.topic, Clock.LOG)
+        block = replace(block, log_ns=times_of(block, clock))
+        if not {*source.signals}.isdisjoint(MOBILEYE_SIGNALS):
+            yield from self._mobileye_stream(source)(block)
+        if role_of(source.topic) is Role.CAN:
+            if not {*source.signals} <= {*MOBILEYE_SIGNALS}:
+                yield from self._from_can(block, source)
+            return
+        if isinstance(block.rows, Images):
+            self._show(block, block.rows)
+        for signal in source.signals:
+            if signal not in MOBILEYE_SIGNALS:
+                yield from FROM_TABLE[signal](block, self.ledger)
+
+    def _shifted(self, header_ns: Int64s, log_ns: Int64s) -> Int64s:
+        """Sensors' stamps in drive time; 0, for none, where they did not follow the log's clock."""
+        assert self.shift_at is not None
+        shifted = header_ns + self.shift_at(log_ns)
+        follows = (header_ns > 0) & (np.abs(shifted - log_ns) <= MAX_OFFSET_NS)
+        return np.where(follows, shifted, 0)
+
+    def finish(self) -> Iterator[tuple[str, Samples]]:
+        """What was held back until it was known to be whole, with its topic; at the log's end.
+
+        The last pictures of a video stream go to ``on_pictures``.
+        """
+        for packets in self._packets.values():
+            for block in packets.flush():
+                self.on_pictures(block)
+        if self._mobileye is not None:
+            source = self._mobileye_sources()[0]
+            for samples in self._mobileye.flush():
+                yield source.topic.name, samples
+
+    def _show(self, block: Block, images: Images) -> None:
+        """Pictures to whoever looks at them, packets of a video decoded first."""
+        from crosscue.replay.decode.packets import PacketDecoder, is_stream
+
+        if self.on_pictures is _no_pictures:
+            return
+        if not is_stream(images):
+            self.on_pictures(block)
+            return
+        if block.topic not in self._packets:
+            self._packets[block.topic] = PacketDecoder(block.topic, self.ledger)
+        for shown in self._packets[block.topic](block):
+            self.on_pictures(shown)
+
+    def _mobileye_sources(self) -> list[Source]:
+        return [
+            source
+            for source in self.planned.sources
+            if source.log == self.log and not {*source.signals}.isdisjoint(MOBILEYE_SIGNALS)
+        ]
+
+    def _mobileye_stream(self, source: Source) -> MobileyeStream:
+        if self._mobileye is None:
+            from crosscue.replay.mobileye.samples import MobileyeStream
+
+            types = {
+                one.topic.name: one.topic.type_name
+                for one in self._mobileye_sources()
+                if role_of(one.topic) is Role.MOBILEYE
+            }
+            self._mobileye = MobileyeStream(
+                source.topic.name,
+                self.ledger,
+                self.vehicle.mobileye,
+                types,
+                is_shared_bus=not {*source.signals} <= {*MOBILEYE_SIGNALS},
+            )
+        return self._mobileye
+
+    def _from_can(self, block: Block, source: Source) -> Iterator[Samples]:
+        decoder = self._bus_decoder(source)
+        tables = {part.topic.rsplit("/", 1)[1]: part for part in decoder(block)}
+        can = self.vehicle.can
+        if can.wheel_speeds is not None:
+            wheels = can.wheel_speeds
+            names = (wheels.front_left, wheels.front_right, wheels.rear_left, wheels.rear_right)
+            scales = dict(SPEED_UNITS)
+            if wheels.wheel_radius_m is not None:
+                scales["rad/s"] = wheels.wheel_radius_m
+            columns = [
+                column_of(tables, name, wheels.unit, scales, "can.wheel_speeds") for name in names
+            ]
+            yield from wheel_samples(columns)
+        for section, signal, key in (
+            (can.yaw_rate, Signal.YAW_RATE, "can.yaw_rate"),
+            (can.steering, Signal.STEERING, "can.steering"),
+        ):
+            if section is not None:
+                yield from angle_samples(tables, section, signal, key)
+
+    def _bus_decoder(self, source: Source) -> BusDecoder:
+        bus = source.topic.name
+        if bus not in self._buses:
+            from crosscue.replay.can.decode import BusDecoder
+            from crosscue.replay.mobileye.admit import all_ids
+            from crosscue.replay.mobileye.samples import settings_of
+
+            database = database_of(self.vehicle.can.dbc)
+            for sentence in database.notices:
+                self.ledger.notice(sentence)
+            wanted = check_signals(database, self.vehicle)
+            is_shared = not {*source.signals}.isdisjoint(MOBILEYE_SIGNALS)
+            settings = settings_of(self.vehicle.mobileye, is_shared_bus=is_shared)
+            elsewhere = all_ids(settings) if is_shared else ()
+            self._buses[bus] = BusDecoder(database, bus, self.ledger, wanted, elsewhere=elsewhere)
+        return self._buses[bus]

@@ -1,0 +1,191 @@
+"""Decides once, from topics and vehicle file, which topic gives which signal, or why none does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import MissingTopicError, VehicleError
+from crosscue.replay.vehicle.roles import Role, role_of
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .kinds import MOBILEYE_SIGNALS, Plan, Signal, Source
+
+
+@dataclass(slots=True)
+class _Planner:
+    topics: Sequence[tuple[int, Topic]]
+    vehicle: Vehicle
+    chosen: dict[tuple[int, str], tuple[Topic, list[Signal]]] = field(default_factory=dict)
+    missing: dict[Signal, str] = field(default_factory=dict)
+
+    def only(self, role: Role, named: str | None, key: str) -> tuple[int, Topic] | None:
+        """The topic named in the vehicle file, or the only one of the role.
+
+        Raises:
+            VehicleError: The named one is not there, or several could be meant.
+        """
+        if named is not None:
+            found = [(log, topic) for log, topic in self.topics if topic.name == named]
+            if not found:
+                names = ", ".join(sorted(topic.name for _, topic in self.topics))
+                raise MissingTopicError(f"{key} = {named!r}: no such topic; there are: {names}")
+            return found[0]
+        found = [(log, topic) for log, topic in self.topics if role_of(topic) is role]
+        if len(found) > 1:
+            names = ", ".join(topic.name for _, topic in found)
+            raise VehicleError(
+                f"several topics could be the {role.value}: {names}; name one as {key} in the "
+                "vehicle file"
+            )
+        return found[0] if found else None
+
+    def choose(self, place: tuple[int, Topic], signal: Signal) -> None:
+        log, topic = place
+        self.chosen.setdefault((log, topic.name), (topic, []))[1].append(signal)
+
+
+def plan(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> Plan:
+    """Choose a topic for every signal.
+
+    Args:
+        topics: All topics of all logs, each with its log's index.
+        vehicle: The vehicle file.
+
+    Raises:
+        VehicleError: A named topic is not there, or several could be meant; lists them.
+    """
+    planner = _Planner(topics, vehicle)
+    _plan_can(planner)
+    _plan_odometry(planner)
+    _plan_imu(planner)
+    _plan_heading(planner)
+    _plan_mobileye(planner)
+    given = {signal for _, signals in planner.chosen.values() for signal in signals}
+    sources = tuple(
+        Source(log, topic, tuple(signals)) for (log, _), (topic, signals) in planner.chosen.items()
+    )
+    missing = {
+        signal: planner.missing.get(signal, "no topic of a fitting type")
+        for signal in Signal
+        if signal not in given
+    }
+    return Plan(sources, missing)
+
+
+def _plan_can(planner: _Planner) -> None:
+    can = planner.vehicle.can
+    wanted = [
+        (can.wheel_speeds, Signal.WHEEL_SPEEDS),
+        (can.yaw_rate, Signal.YAW_RATE),
+        (can.steering, Signal.STEERING),
+    ]
+    if not any(section for section, _ in wanted):
+        return
+    if not can.dbc:
+        raise VehicleError("can.dbc: missing; CAN signals are named but no DBC file to decode them")
+    place = planner.only(Role.CAN, can.bus, "can.bus")
+    for section, signal in wanted:
+        if section is None:
+            continue
+        if place is None:
+            planner.missing[signal] = "the log has no CAN bus"
+        else:
+            planner.choose(place, signal)
+
+
+def _plan_odometry(planner: _Planner) -> None:
+    if planner.vehicle.can.wheel_speeds is not None:
+        return
+    place = planner.only(Role.WHEELS, None, "topics.odometry")
+    if place is not None:
+        planner.choose(place, Signal.WHEEL_SPEEDS)
+        return
+    place = planner.only(Role.ODOMETRY, planner.vehicle.topics.odometry, "topics.odometry")
+    if place is not None:
+        planner.choose(place, Signal.WHEEL_SPEEDS)
+        if planner.vehicle.can.yaw_rate is None:
+            planner.choose(place, Signal.YAW_RATE)
+        return
+    planner.missing[Signal.WHEEL_SPEEDS] = (
+        "no wheel speeds: name the bus, DBC and signals under [can] in the vehicle file"
+    )
+
+
+def _plan_imu(planner: _Planner) -> None:
+    taken = {signal for _, signals in planner.chosen.values() for signal in signals}
+    if Signal.YAW_RATE in taken:
+        return
+    place = planner.only(Role.IMU, planner.vehicle.topics.imu, "topics.imu")
+    if place is not None:
+        planner.choose(place, Signal.YAW_RATE)
+
+
+def _plan_heading(planner: _Planner) -> None:
+    names, compass = planner.vehicle.topics, planner.vehicle.compass
+    if not compass.use:
+        planner.missing[Signal.MAGNETIC_FIELD] = "compass.use is false in the vehicle file"
+        planner.missing[Signal.HEADING] = planner.missing[Signal.MAGNETIC_FIELD]
+    elif names.heading is not None:
+        place = planner.only(Role.IMU, names.heading, "topics.heading")
+        if place is not None:
+            planner.choose(place, Signal.HEADING)
+    else:
+        place = planner.only(Role.MAGNETOMETER, names.magnetometer, "topics.magnetometer")
+        if place is not None:
+            planner.choose(place, Signal.MAGNETIC_FIELD)
+    place = planner.only(Role.GNSS, names.gnss, "topics.gnss")
+    if place is not None:
+        planner.choose(place, Signal.COURSE)
+
+
+def _plan_mobileye(planner: _Planner) -> None:
+    """From the bus that the vehicle file names, else from messages; a log without is no error."""
+    bus = planner.vehicle.mobileye.bus
+    on_bus = [(log, topic) for log, topic in planner.topics if topic.name == bus]
+    if on_bus and role_of(on_bus[0][1]) is Role.CAN:
+        for signal in MOBILEYE_SIGNALS:
+            planner.choose(on_bus[0], signal)
+        return
+    places = {
+        name: [
+            (log, topic)
+            for log, topic in planner.topics
+            if role_of(topic) is Role.MOBILEYE
+            and topic.type_name.rpartition("/")[2] == name
+            and topic.name.startswith(bus or "")
+            and "next" not in topic.name.rpartition("/")[2].lower()
+        ]
+        for name in ("ObstacleStatus", "ObstacleData", "LkaLane")
+    }
+    if not any(places.values()):
+        lacks = "mobileye.bus is not given" if bus is None else f"no topic {bus} (mobileye.bus)"
+        reason = f"{lacks}, and there are no messages of mobileye_560_660_msgs"
+        planner.missing.update(dict.fromkeys(MOBILEYE_SIGNALS, reason))
+        return
+    if len(places["ObstacleData"]) > 1:
+        names = ", ".join(topic.name for _, topic in places["ObstacleData"])
+        raise VehicleError(
+            f"several topics could be the Mobileye's obstacles: {names}; give the beginning of one "
+            "device's topics as mobileye.bus in the vehicle file"
+        )
+    for name, found in places.items():
+        for place in found:
+            lanes = name == "LkaLane"
+            planner.choose(place, Signal.MOBILEYE_LANES if lanes else Signal.MOBILEYE_OBSTACLES)
+
+
+def camera_of(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> tuple[int, Topic] | None:
+    """The camera: the topic that the vehicle file names, or the only one; None where there is none.
+
+    Raises:
+        VehicleError: The named one is not there, or several could be meant.
+    """
+    return _Planner(topics, vehicle).only(Role.CAMERA, vehicle.topics.camera, "topics.camera")
+
+
+def with_pictures(planned: Plan, camera: tuple[int, Topic]) -> Plan:
+    """The same plan, with the camera's pictures read as well; see ``Extractor.on_pictures``."""
+    log, topic = camera
+    return replace(planned, sources=(*planned.sources, Source(log, topic, ())))
