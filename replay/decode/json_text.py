@@ -23,7 +23,7 @@ from .coding import MAGIC_BYTES
 from .foxglove import PICTURES, TABLES, Picture, Source
 from .pictures import PictureRow, images_of
 from .protobuf import MAX_SECONDS
-from .ros import MISFIT
+from .refuse import MISFIT, refuse
 
 MAX_DEPTH: Final = 16
 MAX_COLUMNS: Final = 2048
@@ -115,7 +115,7 @@ class _TableDecoder:
                     raise ValueError(f"over {MAX_COLUMNS} numbers")
             except _BAD as error:
                 why = one_line(error, 120)
-                ledger.skip(block.topic, MISFIT, 1, why, int(block.log_ns[i]))
+                refuse(ledger, block, i, MISFIT, why)
                 continue
             kept.append(i)
             rows.append(row)

@@ -12,7 +12,7 @@ from crosscue.replay.ledger import Ledger
 
 from .coding import STREAMS, coding_of
 from .foxglove import Picture
-from .ros import MISFIT
+from .refuse import EMPTY_PICTURE, IMAGE_CODING, MISFIT, VIDEO_CODING, refuse
 from .standard import MAX_SIDE_PX
 
 _NO_TIME: Final = 0
@@ -50,14 +50,14 @@ def images_of(
     rows: list[PictureRow | str],
     ledger: Ledger,
 ) -> Block:
-    """A block of the pictures among ``rows``; the others, and texts saying why, are skipped.
+    """A block of the pictures among ``rows``; the others, and texts saying why, are refused.
 
     Args:
         block: As read; for its times.
         buffer: What ``start`` and ``stop`` count in.
         picture: Which kind they are.
         rows: One for each row of the block; a text for a message that did not fit.
-        ledger: Takes the skips.
+        ledger: Takes what is skipped or dropped.
     """
     kept: list[int] = []
     good: list[PictureRow] = []
@@ -65,7 +65,7 @@ def images_of(
     for i, row in enumerate(rows):
         coding, reason, why = _judge(row, picture)
         if coding is None or isinstance(row, str):
-            ledger.skip(block.topic, reason, 1, why, int(block.log_ns[i]))
+            refuse(ledger, block, i, reason, why)
             continue
         kept.append(i)
         good.append(row)
@@ -93,11 +93,11 @@ def _judge(row: PictureRow | str, picture: Picture) -> tuple[ImageCoding | None,
     if isinstance(row, str):
         return None, MISFIT, row
     if row.start == row.stop:
-        return None, "empty picture", ""
+        return None, EMPTY_PICTURE, ""
     if picture is Picture.VIDEO:
-        return STREAMS.get(row.label.lower()), "video coding not known", row.label[:40]
+        return STREAMS.get(row.label.lower()), VIDEO_CODING, row.label[:40]
     if picture is Picture.COMPRESSED:
-        return coding_of(row.magic, row.label), "image coding not known", row.label[:40]
+        return coding_of(row.magic, row.label), IMAGE_CODING, row.label[:40]
     sides = (row.width_px, row.height_px)
     if min(sides) < 1 or max(sides) > MAX_SIDE_PX:
         return None, "picture size not plausible", f"{row.width_px} x {row.height_px}"

@@ -31,7 +31,7 @@ from crosscue.replay.limits import DEFAULT
 from .coding import MAGIC_BYTES
 from .foxglove import PICTURES, TABLES, Picture, Source
 from .pictures import PictureRow, images_of
-from .ros import MISFIT
+from .refuse import MISFIT, refuse
 
 MAX_DEPTH: Final = 8
 MAX_LEAVES: Final = 2048
@@ -189,7 +189,7 @@ class _TableDecoder:
                 row = self._row(bytes(block.rows.payload(i)))
             except (DecodeError, ValueError, OverflowError, RecursionError) as error:
                 why = one_line(error, 120)
-                ledger.skip(block.topic, MISFIT, 1, why, int(block.log_ns[i]))
+                refuse(ledger, block, i, MISFIT, why)
                 continue
             kept.append(i)
             parsed.append(row)

@@ -16,6 +16,7 @@ from crosscue.replay.vehicle.roles import ros2_spelling
 from .definition import Definitions, definitions_of, well_known
 from .fields import Fields, Part, WalkedFields
 from .plan import Plan, plan_of
+from .refuse import MISFIT, WRONG_CODING, refuse
 from .repeated import (
     LAYOUTS_KEPT,
     MOST_BYTES,
@@ -31,10 +32,10 @@ from .walk import CDR_PADDING, Bools, Rows, gather, walk
 
 CDR_BE: Final = 0x0000
 CDR_LE: Final = 0x0001
-MISFIT: Final = "does not fit its schema"
 ANY_LENGTH: Final = -1
 """The key of the layout of messages that end in bytes."""
-WRONG_CODING: Final = "CDR representation not supported"
+OTHER_CODINGS: Final = (0x0002, 0x0003, *range(0x0006, 0x000C))
+"""Encapsulations that DDS defines and nothing here decodes; any other number is damage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +77,7 @@ class RosDecoder:
     def walked(self, block: Block, messages: Messages, ledger: Ledger) -> tuple[Fields, Rows]:
         """Fields of the messages that fit, and which of the block they are.
 
-        The others are skipped in ``ledger`` with reason and time.
+        The others go into ``ledger``, dropped or skipped, with reason and time.
         """
         repeated = self._repeated(messages)
         if repeated is not None:
@@ -121,7 +122,7 @@ class RosDecoder:
             whole = len(index) == len(messages)
             found = walk(self.plan, messages if whole else messages.take(index), little=little)
             for refused in found.refused:
-                _skip(ledger, block, index[refused.rows], MISFIT, refused.why)
+                _refuse(ledger, block, index[refused.rows], MISFIT, refused.why)
             fits = np.flatnonzero(found.ok)
             parts.append(Part(found, fits))
             rows.append(index[fits])
@@ -135,7 +136,7 @@ class RosDecoder:
     def _by_order(
         self, block: Block, messages: Messages, ledger: Ledger
     ) -> Iterator[tuple[bool, Rows]]:
-        """Messages by byte order; those coded in a way that we cannot read are skipped."""
+        """Messages by byte order; those coded in a way that we cannot read are refused."""
         everything = np.arange(len(messages))
         if not self.plan.is_cdr:
             yield True, everything
@@ -144,11 +145,13 @@ class RosDecoder:
         head = np.full(len(messages), 0xFFFF, np.int64)
         head[has_head] = gather(messages.buffer, ">u2", 0, messages.start[has_head])
         little, big = head == CDR_LE, head == CDR_BE
-        _skip(ledger, block, everything[~has_head], MISFIT, "shorter than its encapsulation")
+        _refuse(ledger, block, everything[~has_head], MISFIT, "shorter than its encapsulation")
         other = has_head & ~little & ~big
-        if other.any():
-            code = int(head[other][0])
-            _skip(ledger, block, everything[other], WRONG_CODING, f"representation 0x{code:04x}")
+        foreign = other & np.isin(head, OTHER_CODINGS)
+        for which, reason in ((foreign, WRONG_CODING), (other & ~foreign, MISFIT)):
+            if which.any():
+                code = int(head[which][0])
+                _refuse(ledger, block, everything[which], reason, f"representation 0x{code:04x}")
         if little.any() or not big.any():
             yield True, everything[little]
         if big.any():
@@ -160,14 +163,14 @@ def _without_doubts(doubts: Iterable[Doubt], block: Block, kept: Rows, ledger: L
     for bad, reason in doubts:
         if not np.count_nonzero(bad):
             continue
-        _skip(ledger, block, kept[bad & good], reason, "")
+        _refuse(ledger, block, kept[bad & good], reason, "")
         good &= ~bad
     return good
 
 
-def _skip(ledger: Ledger, block: Block, rows: Rows, reason: str, why: str) -> None:
+def _refuse(ledger: Ledger, block: Block, rows: Rows, reason: str, why: str) -> None:
     if len(rows):
-        ledger.skip(block.topic, reason, len(rows), why, int(block.log_ns[rows[0]]))
+        refuse(ledger, block, int(rows[0]), reason, why, len(rows))
 
 
 def ros_decoder(topic: Topic) -> RosDecoder | None:

@@ -29,6 +29,7 @@ from crosscue.replay.errors import SchemaError
 from .coding import JPEG, MAGIC_BYTES, STREAMS, coding_of
 from .fields import Fields
 from .plan import Plan
+from .refuse import BIG_ENDIAN, EMPTY_PICTURE, IMAGE_CODING, LONG_LENS, VIDEO_CODING
 from .walk import Bools, gather
 
 Decoded: TypeAlias = CanFrames | Table | Images
@@ -187,10 +188,10 @@ def _compressed(fields: Fields) -> Images:
 
 
 def _compressed_doubts(fields: Fields) -> Iterator[Doubt]:
-    yield fields.items("data")[1] == 0, "empty picture"
+    yield fields.items("data")[1] == 0, EMPTY_PICTURE
     codings = _codings(fields)
     if None in codings:
-        yield np.array([c is None for c in codings], np.bool_), "image coding not known"
+        yield np.array([c is None for c in codings], np.bool_), IMAGE_CODING
 
 
 def _video(fields: Fields) -> Images:
@@ -199,9 +200,9 @@ def _video(fields: Fields) -> Images:
 
 
 def _video_doubts(fields: Fields) -> Iterator[Doubt]:
-    yield fields.items("data")[1] == 0, "empty picture"
+    yield fields.items("data")[1] == 0, EMPTY_PICTURE
     known = [label.lower() in STREAMS for label in fields.texts("format")]
-    yield ~np.array(known, np.bool_), "video coding not known"
+    yield ~np.array(known, np.bool_), VIDEO_CODING
 
 
 def _raw(fields: Fields) -> Images:
@@ -220,13 +221,13 @@ def _raw_doubts(fields: Fields) -> Iterator[Doubt]:
         fields.number(name).astype(np.int64) for name in ("width", "height", "step")
     )
     size = fields.items("data")[1]
-    yield size == 0, "empty picture"
+    yield size == 0, EMPTY_PICTURE
     small, large = np.minimum(width, height), np.maximum(width, height)
     yield (small < 1) | (large > MAX_SIDE_PX), "picture size not plausible"
     yield (step < width) | (size < step * height), "picture has fewer bytes than its size needs"
     big = fields.number("is_bigendian").astype(np.bool_)
     deep = np.array(["16" in each or "32" in each for each in fields.texts("encoding")], np.bool_)
-    yield big & deep, "big-endian pixels not supported"
+    yield big & deep, BIG_ENDIAN
 
 
 def _camera_info(fields: Fields) -> Table:
@@ -244,7 +245,7 @@ def _camera_info(fields: Fields) -> Table:
 
 def _camera_info_doubts(fields: Fields) -> Iterator[Doubt]:
     lens = "d" if "d" in fields.plan.sequences else "D"
-    yield fields.items(lens)[1] > LENS_COEFFICIENTS, "over 14 lens coefficients"
+    yield fields.items(lens)[1] > LENS_COEFFICIENTS, LONG_LENS
 
 
 _IMU: Final = {

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import Block, Bytes, Int64s, Messages, Topic
 from crosscue.replay.decode.definition import definitions_of
 from crosscue.replay.decode.plan import Items, Plan, Run, Text, jumped, plan_of
-from crosscue.replay.decode.ros import MISFIT
+from crosscue.replay.decode.refuse import MISFIT, refuse
 from crosscue.replay.decode.walk import Bools, Cursor, Found, Rows, Walker
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
@@ -215,7 +215,7 @@ class Ros1ToCdr:
     differs: bool
 
     def __call__(self, block: Block, ledger: Ledger) -> list[Outgoing]:
-        """Transcribe; messages that do not fit their definition are skipped."""
+        """Transcribe; messages that do not fit their definition are dropped."""
         assert isinstance(block.rows, Messages)
         messages = block.rows
         found = Found(messages.buffer, True, np.ones(len(messages), np.bool_))
@@ -226,8 +226,8 @@ class Ros1ToCdr:
         )
         walker.whole(self.plan, cursor)
         for refused in found.refused:
-            first = int(block.log_ns[refused.rows[0]])
-            ledger.skip(block.topic, MISFIT, len(refused.rows), refused.why, first)
+            rows = refused.rows
+            refuse(ledger, block, int(rows[0]), MISFIT, refused.why, len(rows))
         if self.differs:
             ledger.notice(
                 f"{block.topic}: ROS 2 has another {self.type.name} than ROS 1; the file keeps "

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from crosscue.replay.columns import Block, Images, Table, Topic
 from crosscue.replay.decode import decoder_for
-from crosscue.replay.decode.ros import MISFIT
+from crosscue.replay.decode.refuse import MISFIT
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from support.ros_messages import block_of, must_decode
@@ -151,7 +151,7 @@ def test_raw_images_keep_size_and_pixel_format() -> None:
     assert images.pixel_format == ("rgb8",)
     assert images.step_bytes is not None
     assert images.step_bytes.tolist() == [12]
-    assert ledger.topic("/t").skipped == {"picture has fewer bytes than its size needs": 1}
+    assert ledger.topic("/t").dropped == {"picture has fewer bytes than its size needs": 1}
 
 
 def test_location_fixes_get_the_columns_of_navsatfix() -> None:
@@ -174,7 +174,7 @@ def test_location_fixes_get_the_columns_of_navsatfix() -> None:
     np.testing.assert_array_equal(block.rows["covariance_m2"], [range(9), [np.nan] * 9])
     assert block.header_ns is not None
     assert block.header_ns.tolist() == [3_000_000_004, 4_000_000_004]
-    assert ledger.topic("/t").skipped == {MISFIT: 1}
+    assert ledger.topic("/t").dropped == {MISFIT: 1}
 
 
 def test_unknown_protobuf_types_become_dotted_columns_of_their_own_types() -> None:
@@ -243,7 +243,7 @@ def test_something_else_called_a_timestamp_is_refused(name: str) -> None:
 
 @given(raw=st.binary(max_size=80), name=st.sampled_from(["CompressedImage", "LocationFix"]))
 @QUICK
-def test_any_bytes_are_decoded_or_skipped_and_never_more(raw: bytes, name: str) -> None:
+def test_any_bytes_are_decoded_or_refused_and_never_more(raw: bytes, name: str) -> None:
     topic = proto_topic(name, IMAGE if name == "CompressedImage" else FIX)
     ledger = Ledger("made")
     ledger.find("/t", 1)
@@ -287,7 +287,7 @@ def test_json_pictures_and_fixes_match_their_protobuf_twins() -> None:
     assert isinstance(fixes.rows, Table)
     assert fixes.rows["latitude_deg"].tolist() == [1]
     assert fixes.rows["covariance_m2"].shape == (1, 9)
-    assert ledger.topic("/t").skipped == {MISFIT: 3}
+    assert ledger.topic("/t").dropped == {MISFIT: 3}
 
 
 @pytest.mark.parametrize(
@@ -305,13 +305,13 @@ def test_json_pictures_and_fixes_match_their_protobuf_twins() -> None:
         b'{"a": ' + b"9" * 5000 + b"}",
     ],
 )
-def test_bad_json_is_skipped_message_by_message(raw: bytes) -> None:
+def test_bad_json_is_dropped_message_by_message(raw: bytes) -> None:
     ledger = Ledger("made")
 
     block = must_decode(Topic("/t", "made.Thing", "json"))(json_block({"a": 1}, raw), ledger)
 
     assert len(block) == 1
-    assert ledger.topic("/t").skipped == {MISFIT: 1}
+    assert ledger.topic("/t").dropped == {MISFIT: 1}
 
 
 def test_json_numbers_keep_their_kind_and_missing_ones_are_nan() -> None:

@@ -16,7 +16,8 @@ from rosbags.typesys.store import Typestore
 from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.fields import WalkedFields
-from crosscue.replay.decode.ros import MISFIT, WRONG_CODING, RosDecoder
+from crosscue.replay.decode.refuse import MISFIT, WRONG_CODING
+from crosscue.replay.decode.ros import RosDecoder
 from crosscue.replay.decode.standard import Kind, generic
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
@@ -215,7 +216,7 @@ def _rosbags_reads(store: Typestore, raw: bytes, name: str, is_cdr: bool) -> obj
         return None
 
 
-def test_a_message_that_lies_about_a_length_is_skipped_with_field_and_time() -> None:
+def test_a_message_that_lies_about_a_length_is_dropped_with_field_and_time() -> None:
     store = ros2_store()
     good = store.types["std_msgs/msg/String"]("abc")
     raw = serialised(store, good, "std_msgs/msg/String")
@@ -227,13 +228,13 @@ def test_a_message_that_lies_about_a_length_is_skipped_with_field_and_time() -> 
     )
 
     assert len(decoded) == 2
-    assert ledger.topic("/s").skipped == {MISFIT: 1}
+    assert ledger.topic("/s").dropped == {MISFIT: 1}
     assert ledger.details[0].t_ns == 1_000_000
     assert "string data passes the end" in ledger.details[0].detail
 
 
 @pytest.mark.parametrize("head", [b"\x00\x06", b"\x00\x07", b"\x00\x03", b"\x01\x00", b"\xff\xff"])
-def test_other_representations_than_plain_cdr_are_refused_by_name(head: bytes) -> None:
+def test_another_representation_is_skipped_and_a_damaged_head_dropped(head: bytes) -> None:
     store = ros2_store()
     raw = serialised(store, store.types["std_msgs/msg/Float64"](1.5), "std_msgs/msg/Float64")
     ledger = Ledger("made")
@@ -243,7 +244,11 @@ def test_other_representations_than_plain_cdr_are_refused_by_name(head: bytes) -
     )
 
     assert len(decoded) == 1
-    assert ledger.topic("/f").skipped == {WRONG_CODING: 1}
+    account = ledger.topic("/f")
+    if head[0]:
+        assert (account.skipped, account.dropped) == ({}, {MISFIT: 1})
+    else:
+        assert (account.skipped, account.dropped) == ({WRONG_CODING: 1}, {})
 
 
 def test_both_byte_orders_in_one_block_keep_their_order() -> None:
@@ -312,7 +317,7 @@ def test_can_frames_come_as_columns() -> None:
     assert frames.is_extended.tolist() == [False, True, False, False]
     assert decoded.header_ns is not None
     assert decoded.header_ns.tolist() == [7_000_000_005] * 4
-    assert ledger.topic("/can").skipped == {
+    assert ledger.topic("/can").dropped == {
         "identifier has more bits than its frame kind": 1,
         "data length code over 8": 1,
     }
@@ -392,7 +397,7 @@ def test_raw_pictures_must_have_the_bytes_that_their_size_needs() -> None:
     assert images.rows.pixel_format == ("rgb8",)
     assert images.rows.width_px is not None
     assert images.rows.width_px.tolist() == [3]
-    assert ledger.topic("/cam").skipped == {"picture has fewer bytes than its size needs": 1}
+    assert ledger.topic("/cam").dropped == {"picture has fewer bytes than its size needs": 1}
 
 
 STANDARD_COLUMNS = {

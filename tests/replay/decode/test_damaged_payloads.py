@@ -1,0 +1,142 @@
+"""Of any messages with one damaged, exactly that one is dropped; a type nobody knows is skipped."""
+
+import json
+from base64 import b64encode
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pytest
+from google.protobuf import (  # type: ignore[import-untyped]
+    descriptor_pb2,
+    descriptor_pool,
+    message_factory,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+from crosscue.eval import cli
+from crosscue.replay.columns import Topic
+from crosscue.replay.ledger import Ledger
+from support.ros_messages import (
+    block_of,
+    must_decode,
+    random_message,
+    ros1_store,
+    ros1_topic,
+    ros2_store,
+    ros2_topic,
+)
+
+PICTURE: Final = b"\xff\xd8" + bytes(range(64))
+F: Final = descriptor_pb2.FieldDescriptorProto
+
+
+def _ros2(rng: np.random.Generator, name: str) -> tuple[Topic, bytes]:
+    store = ros2_store()
+    return ros2_topic("/t", name), bytes(
+        store.serialize_cdr(random_message(rng, store, name), name)
+    )
+
+
+def _ros1(rng: np.random.Generator, name: str) -> tuple[Topic, bytes]:
+    store = ros1_store()
+    return ros1_topic("/t", name), bytes(
+        store.serialize_ros1(random_message(rng, store, name), name)
+    )
+
+
+def _camera(rng: np.random.Generator, kind: str) -> tuple[Topic, bytes]:
+    store, name = ros2_store(), "sensor_msgs/msg/Image"
+    header: Any = random_message(rng, store, "std_msgs/msg/Header")
+    pixels = np.zeros(18, np.uint8)
+    message = store.types[name](header, 2, 3, "rgb8", 0, 9, pixels)
+    return ros2_topic("/t", name), bytes(store.serialize_cdr(message, name))
+
+
+def _json(rng: np.random.Generator, kind: str) -> tuple[Topic, bytes]:
+    tree = {"timestamp": {"sec": int(rng.integers(1, 99)), "nsec": 7}, "a": float(rng.random())}
+    if kind == "picture":
+        tree |= {"data": b64encode(PICTURE).decode(), "format": "jpeg"}
+    name = "foxglove.CompressedImage" if kind == "picture" else "made.Thing"
+    return Topic("/t", name, "json"), json.dumps(tree).encode()
+
+
+def _protobuf(rng: np.random.Generator, kind: str) -> tuple[Topic, bytes]:
+    files = descriptor_pb2.FileDescriptorSet()
+    file = files.file.add(name="made.proto", package="made", syntax="proto3")
+    thing = file.message_type.add(name="Thing")
+    for number, (name, code) in enumerate(
+        (("value", F.TYPE_DOUBLE), ("text", F.TYPE_STRING)), start=1
+    ):
+        thing.field.add(name=name, number=number, type=code, label=F.LABEL_OPTIONAL)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    message: Any = message_factory.GetMessageClass(pool.FindMessageTypeByName("made.Thing"))()
+    message.value, message.text = float(rng.random()) + 1.0, "words"
+    topic = Topic("/t", "made.Thing", "protobuf", files.SerializeToString(), "protobuf")
+    return topic, message.SerializeToString()
+
+
+KINDS: Final[dict[str, tuple[Callable[[np.random.Generator, str], tuple[Topic, bytes]], str]]] = {
+    "CDR": (_ros2, "sensor_msgs/msg/Imu"),
+    "CDR picture": (_camera, ""),
+    "ROS 1": (_ros1, "sensor_msgs/msg/Imu"),
+    "JSON": (_json, ""),
+    "JSON picture": (_json, "picture"),
+    "protobuf": (_protobuf, ""),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 9))
+@settings(max_examples=15, deadline=None)
+def test_of_messages_with_one_damaged_exactly_one_is_dropped(
+    kind: str, seed: int, count: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    make, name = KINDS[kind]
+    made = [make(rng, name) for _ in range(count)]
+    payloads = [payload for _, payload in made]
+    bad = int(rng.integers(count))
+    payloads[bad] = payloads[bad][: len(payloads[bad]) - int(rng.integers(4, 6))]
+    ledger = Ledger("made")
+    ledger.find("/t", count)
+
+    block = must_decode(made[0][0])(block_of("/t", payloads), ledger)
+
+    account = ledger.topic("/t")
+    assert (account.skipped.total(), account.dropped.total()) == (0, 1)
+    assert (account.in_file, account.used, len(block)) == (count, count - 1, count - 1)
+    assert block.log_ns.tolist() == [t * 1_000_000 for t in range(count) if t != bad]
+
+
+@pytest.mark.parametrize(
+    ("encoding", "cut", "status"), [("cdr", 0, 0), ("cdr", 3, 3), ("odd", 3, 0)]
+)
+@pytest.mark.parametrize("command", ["info", "decode"])
+def test_a_command_ends_with_3_for_a_damaged_message_and_not_for_a_foreign_one(
+    command: str, encoding: str, cut: int, status: int, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(1)
+    log = tmp_path / "made.mcap"
+    with log.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        numbers = {}
+        for name, coding in (("/good", "cdr"), ("/t", encoding)):
+            topic, _ = _ros2(rng, "sensor_msgs/msg/Imu")
+            schema = writer.register_schema(topic.type_name, "ros2msg", topic.schema)
+            numbers[name] = writer.register_channel(name, coding, schema)
+        for i in range(9):
+            for name, number in numbers.items():
+                _, payload = _ros2(rng, "sensor_msgs/msg/Imu")
+                size = len(payload) - (cut if name == "/t" and i == 4 else 0)
+                writer.add_message(number, i * 10**8, payload[:size], i * 10**8)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+    argv = [command, str(log), *(["-o", str(tmp_path / "out")] if command == "decode" else [])]
+
+    assert cli.run(argv) == status
