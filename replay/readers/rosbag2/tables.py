@@ -85,7 +85,8 @@ def read_tables(database: Database, path: Path, limits: Limits) -> Tables:
         _require(database, kinds, path)
         notices: list[str] = []
         stored = _stored(database, notices)
-        is_empty = not fetched(database, "SELECT 1 FROM messages LIMIT 1")
+        # Not through the index, which a cut takes away first.
+        is_empty = not fetched(database, "SELECT 1 FROM messages NOT INDEXED LIMIT 1")
         definitions = _definitions(database, kinds, limits)
         topics = _topics(stored, 0 if is_empty else None, definitions, notices)
         index = _time_index(database)

@@ -225,15 +225,12 @@ def test_pictures_pass_into_the_recording_as_stored(tmp_path: Path) -> None:
     log = tmp_path / "drive.mcap"
     with LogWriter(log, Ledger(str(log))) as writer:
         writer.add_topic(camera)
-        writer.add_topic(WHEELS)
         writer.write(Block("/camera", times, images))
-        for block in _blocks(5):
-            if block.topic == "wheels":
-                writer.write(block)
+    wheels = MemoryLog((WHEELS, GYRO), _blocks(5), path=Path(__file__))
     with open_log(log) as opened:
         vehicle = Vehicle(version=1)
         folder = create(tmp_path / "run", overwrite=False)
-        run = replay_drive([opened], vehicle, folder, EVERYTHING).run
+        run = replay_drive([opened, wheels], vehicle, folder, EVERYTHING).run
 
     save_recording(run, tmp_path / "drive.rrd")
     log.unlink()
