@@ -22,6 +22,8 @@ from .drive_time import timeline_in
 if TYPE_CHECKING:
     import pyarrow as pa
 
+AMBIGUOUS: Final = "log time comes twice"
+"""Why rows of either side of a set-back are not scored."""
 LABELS: Final = frozenset({"segment", "log_t_ns"})
 """Columns that every table has besides its own."""
 
@@ -61,17 +63,12 @@ def pose_in_log_time(run: RunFolder) -> pa.Table:
     return table_in_log_time(run.table("pose"), timeline_in(run.manifest()))
 
 
-def left_out(run: RunFolder) -> int:
-    """How many rows of the run's pose and frames have a log time that comes twice."""
-    timeline = timeline_in(run.manifest())
-    if not was_set_back(timeline):
-        return 0
-    total = 0
-    for name in ("pose", "frames"):
-        if run.file(f"{name}.parquet").exists():
-            table = run.table(name, ["t_ns", "segment", "log_t_ns"])
-            total += table.num_rows - table_in_log_time(table, timeline).num_rows
-    return total
+def comes_twice(timeline: Timeline, log_ns: Int64s) -> NDArray[np.bool_]:
+    """Which moments of the log's clock lie in more than one segment, shape (N,)."""
+    inside = np.zeros(len(log_ns), np.int64)
+    for one in timeline.segments if was_set_back(timeline) else ():
+        inside += (log_ns >= one.log_start_ns) & (log_ns <= one.log_end_ns)
+    return np.asarray(inside > 1)
 
 
 def refuse_set_back(run: RunFolder, what: str) -> None:

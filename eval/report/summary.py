@@ -75,10 +75,15 @@ def _coverage(scores: Scores) -> list[str]:
     truth_s = sum(one.truth_s for one in scores.drives)
     covered_s = sum(one.truth_covered_s for one in scores.drives)
     n = len(scores.drives)
-    return [
+    twice = sum(one.frames_ambiguous for one in scores.drives)
+    lines = [
         _line("drives", f"{n}: of {frames} frames the truth speaks of {told}"),
         _line("truth", f"{truth_s:.1f} s, of which the runs cover {covered_s:.1f} s"),
     ]
+    if twice:
+        why = "a clock was set back, and their log time comes twice"
+        lines.append(_line("ambiguous", f"{twice} frames not scored: {why}"))
+    return lines
 
 
 def _cues(cues: Mapping[str, CueScore]) -> list[str]:
@@ -222,6 +227,7 @@ def pose_summary(result: PoseScore) -> str:
             (covered.before_estimate, "before the first estimate"),
             (covered.after_estimate, "after the last"),
             (covered.in_gap, "in a gap of the estimate"),
+            (covered.ambiguous, "whose log time comes twice"),
         )
         if count
     ]

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.eval.pipeline.log_time import AMBIGUOUS
 from crosscue.replay.columns import Floats, Int64s
 
 from .approaches import FEATURES
@@ -148,6 +149,8 @@ def judge_belief(tables: RunTables, truth: DriveTruth) -> list[BeliefJudged]:
         left, left_out = first_reasons(np.ones(len(values), np.bool_), reasons)
         if silent:
             left_out[SILENT] = silent
+        if "belief" in tables.ambiguous:
+            left_out[AMBIGUOUS] = tables.ambiguous["belief"]
         judged.append(
             BeliefJudged(
                 truth.drive,

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.datasets.truth.truth import CUES, Approach
+from crosscue.eval.pipeline.log_time import AMBIGUOUS
 from crosscue.replay.columns import Floats, Int64s
 
 from .intervals import Share, share
@@ -197,10 +198,11 @@ def judge_cues(tables: RunTables, truth: DriveTruth) -> list[CueJudged]:
         frames = np.union1d(frames, tables.frames_ns)
     told = {one.cue for one in truth.truth.cues}
     others = sorted({*np.unique(rows.cue).tolist(), *told} - {*CUES})
-    return [_judge(cue, rows, frames, truth) for cue in (*CUES, *others)]
+    ambiguous = tables.ambiguous.get("frames", 0)
+    return [_judge(cue, rows, frames, truth, ambiguous) for cue in (*CUES, *others)]
 
 
-def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth) -> CueJudged:
+def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth, ambiguous: int) -> CueJudged:
     looked, count = _largest(rows, cue)
     spans = [one for one in truth.truth.cues if one.cue == cue]
     everywhere = cue_at(spans, frames)
@@ -209,6 +211,7 @@ def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth) -> CueJud
     was_looked = np.zeros(len(frames), np.bool_)
     was_looked[at] = True
     told, crossing = truth.is_told(frames), truth.is_crossing(frames)
+    twice = {AMBIGUOUS: ambiguous} if ambiguous else {}
     moments = np.array([one.t_ns for one in spans if one.t_ns is not None], np.int64)
     return CueJudged(
         drive=truth.drive,
@@ -221,11 +224,11 @@ def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth) -> CueJud
         is_feature=features[at],
         true_count=everywhere.count[at],
         visible=everywhere.visible[at],
-        frames=len(frames),
+        frames=len(frames) + ambiguous,
         moments_unmatched=int((~np.isin(moments, frames)).sum()),
         left_out={
-            "object": _reasons(everywhere.present != NONE, was_looked, told, crossing),
-            "feature": _reasons(features != NONE, was_looked, told, crossing),
+            "object": twice | _reasons(everywhere.present != NONE, was_looked, told, crossing),
+            "feature": twice | _reasons(features != NONE, was_looked, told, crossing),
         },
         conditions={one.id: one.conditions for one in truth.truth.approaches},
     )

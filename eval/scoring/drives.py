@@ -65,6 +65,7 @@ class DriveCoverage:
     Attributes:
         drive: Name.
         frames: In the run.
+        frames_ambiguous: Of which the log time comes twice, so that no truth is theirs.
         frames_told: Of which the truth speaks.
         truth_s: Length of the truth.
         truth_covered_s: Of which the run tells something.
@@ -73,6 +74,7 @@ class DriveCoverage:
 
     drive: str
     frames: int
+    frames_ambiguous: int
     frames_told: int
     truth_s: float
     truth_covered_s: float
@@ -130,9 +132,11 @@ def judge(tables: RunTables, truth: DriveTruth, settings: ScoreSettings = DEFAUL
     approaches = judge_approaches(tables, truth, settings.threshold)
     belief, ranges = tuple(judge_belief(tables, truth)), tuple(judge_range(tables, truth))
     frames = _frames(tables)
+    ambiguous = tables.ambiguous.get("frames", 0)
     coverage = DriveCoverage(
         drive=truth.drive,
-        frames=len(frames),
+        frames=len(frames) + ambiguous,
+        frames_ambiguous=ambiguous,
         frames_told=int(truth.is_told(frames).sum()),
         truth_s=(truth.truth.end_ns - truth.truth.start_ns) * 1e-9,
         truth_covered_s=covered_s,
@@ -213,6 +217,7 @@ def as_metrics(scores: Scores) -> dict[str, Any]:
         "coverage": {
             "drives": len(scores.drives),
             "frames": sum(one.frames for one in scores.drives),
+            "frames_ambiguous": sum(one.frames_ambiguous for one in scores.drives),
             "frames_told": sum(one.frames_told for one in scores.drives),
             "truth_s": sum(one.truth_s for one in scores.drives),
             "truth_covered_s": sum(one.truth_covered_s for one in scores.drives),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.eval.pipeline.log_time import AMBIGUOUS
 from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
 from crosscue.replay.columns import Floats, Int64s
 
@@ -96,7 +97,8 @@ def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
     judged = []
     for reference, true_m in (("start", start), ("end", end)):
         mine = rows.reference == reference
-        if not mine.any():
+        ambiguous = tables.ambiguous.get(reference, 0)
+        if not mine.any() and not ambiguous:
             continue
         reasons = {
             "not a number": ~(np.isfinite(rows.range_m) & np.isfinite(rows.var_m2)),
@@ -105,6 +107,8 @@ def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
             "no true range at this time": ~np.isfinite(true_m),
         }
         mine, left_out = first_reasons(mine, reasons)
+        if ambiguous:
+            left_out[AMBIGUOUS] = ambiguous
         judged.append(
             RangeJudged(
                 truth.drive,

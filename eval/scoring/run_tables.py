@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -14,6 +15,7 @@ from crosscue.eval.pipeline.log_time import LABELS, table_in_log_time
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import RunError
 from crosscue.replay.files.run_folder import RunFolder
+from crosscue.replay.time.segments import Timeline
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -77,12 +79,15 @@ class RunTables:
         cues: From ``cues.parquet``.
         ranges: From ``range.parquet``.
         belief: From ``belief.parquet``.
+        ambiguous: Rows left out, as their log time comes twice: of ``frames``, of ``belief``, and
+            of ranges by reference (``start``, ``end``).
     """
 
     frames_ns: Int64s | None
     cues: CueRows | None
     ranges: RangeRows | None
     belief: BeliefRows | None
+    ambiguous: Mapping[str, int] = field(default_factory=dict)
 
     def span_ns(self) -> tuple[int, int] | None:
         """First and last time in any table, or None for nothing at all."""
@@ -103,13 +108,33 @@ def tables_of(run: RunFolder) -> RunTables:
         RunError: A table is damaged or has other columns.
     """
     timeline = timeline_in(run.manifest())
-    found = {
-        name: table_in_log_time(run.table(name), timeline)
-        if run.file(f"{name}.parquet").exists()
-        else None
-        for name in NAMES
+    found = {name: run.table(name) for name in NAMES if run.file(f"{name}.parquet").exists()}
+    return in_log_time(str(run.path), found, timeline)
+
+
+def in_log_time(where: str, tables: Mapping[str, pa.Table], timeline: Timeline) -> RunTables:
+    """Tables of a run, by name, in the time of its logs, with what that leaves out counted.
+
+    Raises:
+        RunError: A column is missing, or holds what cannot be.
+    """
+    kept = {name: table_in_log_time(table, timeline) for name, table in tables.items()}
+    counts = {
+        what: rows - _rows_by_kind(kept[name], name).get(what, 0)
+        for name, table in tables.items()
+        for what, rows in _rows_by_kind(table, name).items()
     }
-    return run_tables(str(run.path), **{f"{name}_table": table for name, table in found.items()})
+    checked = run_tables(where, **{f"{name}_table": table for name, table in kept.items()})
+    return replace(checked, ambiguous={what: gone for what, gone in counts.items() if gone})
+
+
+def _rows_by_kind(table: pa.Table, name: str) -> Mapping[str, int]:
+    """Rows that are judged one by one: of a range by reference; cues are judged by frame."""
+    if name == "cues":
+        return {}
+    if name == "range":
+        return Counter(table["reference"].to_pylist()) if "reference" in table.column_names else {}
+    return {name: table.num_rows}
 
 
 def run_tables(

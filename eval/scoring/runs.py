@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crosscue.datasets.truth.truth import FILE, Truth
+from crosscue.eval.pipeline.log_time import AMBIGUOUS
 from crosscue.eval.pipeline.run_account import Account, Line, check, line, summed
 from crosscue.eval.pipeline.run_logs import place_of
 from crosscue.replay.errors import RunError, SchemaError, UsageError
@@ -222,6 +223,7 @@ def scoring_of(one: RunScored) -> dict[str, Line]:
                 "before the first estimate": of.before_estimate,
                 "after the last estimate": of.after_estimate,
                 "no estimate near enough": of.in_gap,
+                AMBIGUOUS: of.ambiguous,
             },
         )
     return found

@@ -14,7 +14,6 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 
 from crosscue.eval.pipeline.drive_time import timeline_in
-from crosscue.eval.pipeline.log_time import table_in_log_time
 from crosscue.eval.pipeline.variants import GROUPS, scene_tables
 from crosscue.eval.scoring.approaches import ApproachResult
 from crosscue.eval.scoring.belief import BeliefDifference, compare_belief
@@ -29,7 +28,7 @@ from crosscue.eval.scoring.drives import (
 )
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.metric_values import metric_values
-from crosscue.eval.scoring.run_tables import RunTables, run_tables
+from crosscue.eval.scoring.run_tables import RunTables, in_log_time
 from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -107,10 +106,8 @@ def estimate_of(run: RunFolder, vehicle: Vehicle | None = None) -> EstimateWitho
     def estimate(cues: frozenset[str], /) -> RunTables:
         timeline = timeline_in(run.manifest())
         tables = scene_tables(run, vehicle, cues)
-        columns = {f"{name}_table": table_in_log_time(t, timeline) for name, t in tables.items()}
         frames = run.table("frames", ["t_ns", "segment", "log_t_ns"])
-        frames = table_in_log_time(frames, timeline)
-        return run_tables(str(run.path), frames_table=frames, **columns)
+        return in_log_time(str(run.path), {"frames": frames, **tables}, timeline)
 
     return estimate
 

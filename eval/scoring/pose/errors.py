@@ -37,6 +37,7 @@ class Coverage:
         before_estimate: Earlier than the first estimate.
         after_estimate: Later than the last one.
         in_gap: Within the estimate's time, but none near enough.
+        ambiguous: At moments that come twice on the log's clock.
     """
 
     truth_poses: int
@@ -44,6 +45,7 @@ class Coverage:
     before_estimate: int
     after_estimate: int
     in_gap: int
+    ambiguous: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ same numbers from them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
-from crosscue.eval.pipeline.log_time import pose_in_log_time
+from crosscue.eval.pipeline.drive_time import timeline_in
+from crosscue.eval.pipeline.log_time import comes_twice, pose_in_log_time
 from crosscue.localization.angles import wrap_all
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
@@ -164,7 +165,7 @@ def measure(
     _inside(track, table, truth_path)
     estimate, cov = _estimate(table, vehicle, truth)
     flat = planar(track.t_ns, track.xyz_m[:, 0], track.xyz_m[:, 1], heading_rad(track))
-    paired = pair(flat, estimate, MAX_DIFFERENCE_NS, cov)
+    paired = _paired(flat, estimate, cov, comes_twice(timeline_in(run.manifest()), flat.t_ns))
     values = nees(paired, 3)
     result = PoseScore(
         coverage=paired.coverage,
@@ -181,6 +182,21 @@ def measure(
     write_tum(folder / "truth.tum", paired.truth, "truth, planar")
     title = f"{run.path.name} against {truth.source or truth_path.name}"
     return result, _scored(paired, values, table, vehicle.lost_above_m, title)
+
+
+def _paired(
+    truth: Trajectory, estimate: Trajectory, cov: Floats, twice: NDArray[np.bool_]
+) -> Paired:
+    """Pairs, but for true poses at moments that come twice: those are counted."""
+    if not twice.any():
+        return pair(truth, estimate, MAX_DIFFERENCE_NS, cov)
+    once = ~twice
+    kept = Trajectory(truth.t_ns[once], truth.xyz_m[once], truth.quat_wxyz[once])
+    paired = pair(kept, estimate, MAX_DIFFERENCE_NS, cov)
+    counts = paired.coverage
+    ambiguous = int(twice.sum())
+    total = counts.truth_poses + ambiguous
+    return replace(paired, coverage=replace(counts, truth_poses=total, ambiguous=ambiguous))
 
 
 def _inside(track: Trajectory, table: pa.Table, path: Path) -> NDArray[np.bool_]:

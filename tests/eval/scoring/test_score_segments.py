@@ -1,0 +1,74 @@
+"""What cannot be scored as its log time comes twice has a line of its own everywhere."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.eval.pipeline.drive_time import timeline_in
+from crosscue.eval.pipeline.log_time import AMBIGUOUS, ambiguous
+from crosscue.eval.report.score_runs import ScoreWork
+from crosscue.eval.report.summary import pose_summary, summary
+from crosscue.eval.scoring.drives import ScoreSettings
+from crosscue.eval.scoring.runs import scores_of
+from crosscue.replay.files.run_folder import RunFolder
+from support.gap_drive import Clock, replayed, write_drive
+
+
+def _replayed(folder: Path, clock: Clock) -> RunFolder:
+    return replayed(folder, write_drive(folder, clock))
+
+
+def _ambiguous_rows(run: RunFolder, name: str) -> int:
+    """By hand: rows whose stamp lies in the other segment's time."""
+    timeline = timeline_in(run.manifest())
+    table = run.table(name)
+    log_ns, numbers = table["log_t_ns"].to_numpy(), table["segment"].to_numpy().astype(np.int64)
+    return int(ambiguous(timeline, log_ns, numbers).sum())
+
+
+def test_what_a_set_back_makes_ambiguous_is_counted_everywhere(tmp_path: Path) -> None:
+    run = _replayed(tmp_path, Clock(set_at_s=6, by_s=-3))
+    frames, belief, ranges = (_ambiguous_rows(run, name) for name in ("frames", "belief", "range"))
+    assert min(frames, belief, ranges) > 0
+
+    scored = ScoreWork(tmp_path / "truth.json", ScoreSettings(), (10.0,))(run.path)
+
+    metrics = json.loads(run.file("score/metrics.json").read_text())
+    assert metrics["coverage"]["frames"] == run.table("frames").num_rows
+    assert metrics["coverage"]["frames_ambiguous"] == frames
+    for cue in metrics["cues"].values():
+        for judged in cue["readings"].values():
+            assert judged["left_out"][AMBIGUOUS] == frames
+            assert judged["frames"] == judged["scored"] + sum(judged["left_out"].values())
+    for one in metrics["belief"].values():
+        assert one["left_out"][AMBIGUOUS] == belief
+        assert one["steps"] >= run.table("belief").num_rows
+    told = [one["left_out"].get(AMBIGUOUS, 0) for one in metrics["range"].values()]
+    assert sum(told) == ranges
+    pose = metrics["pose"]["coverage"]
+    assert pose["ambiguous"] > 0
+    assert metrics["account"]["scoring"]["poses"]["skipped"][AMBIGUOUS] == pose["ambiguous"]
+    parts = ("scored", "before_estimate", "after_estimate", "in_gap", "ambiguous")
+    assert pose["truth_poses"] == sum(pose[part] for part in parts)
+    printed = summary(scores_of([scored.one]))
+    assert f"ambiguous  {frames} frames not scored" in printed
+    assert scored.one.pose is not None
+    assert f"{pose['ambiguous']} whose log time comes twice" in pose_summary(scored.one.pose)
+    page = scored.report.read_text()
+    assert f"<b>Ambiguous:</b> {frames} frames" in page
+    assert f"{pose['ambiguous']} lie at moments that come twice" in page
+
+
+@pytest.mark.parametrize("clock", [Clock(), Clock(pause_s=(5.0, 9.1))])
+def test_nothing_is_ambiguous_without_a_set_back(tmp_path: Path, clock: Clock) -> None:
+    run = _replayed(tmp_path, clock)
+
+    scored = ScoreWork(tmp_path / "truth.json", ScoreSettings(), (10.0,))(run.path)
+
+    assert scored.metrics["coverage"]["frames_ambiguous"] == 0
+    assert AMBIGUOUS not in run.file("score/metrics.json").read_text()
+    assert "mbiguous:</b>" not in scored.report.read_text()

@@ -1,0 +1,212 @@
+"""A made-up drive towards a stop sign whose log's clock is set or pauses, small and exact.
+
+Pictures are one grey level, the number of the frame, so that the detector below finds its sign by
+what it sees and not by a time that the clock has changed.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+
+from crosscue.datasets.simulated.drive import dbc_path
+from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
+from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.detectors.base import Detections, Found, Frame, View, nothing_found
+from crosscue.eval.pipeline.detect import choices_of
+from crosscue.eval.pipeline.replay import Detecting, replay_drive
+from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.can.encode import encode
+from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Images, Int64s, Messages, Topic
+from crosscue.replay.files.run_folder import RunFolder, create
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import EVERYTHING
+from crosscue.replay.opening import open_log
+from crosscue.replay.vehicle.vehicle import load
+from crosscue.replay.write.convert import LogWriter
+
+SECOND: Final = 1_000_000_000
+BEGIN: Final = 1_700_000_000 * SECOND
+ROW: Final = SECOND // 10
+"""Ten wheel rows and pictures a second."""
+SPEED_MPS: Final = 6.0
+START_M: Final = 70.0
+"""From the first frame to the intersection."""
+SIGN_M: Final = (8.0, 55.0)
+"""The sign is seen between these distances."""
+SIZE: Final = (160, 90)
+FOCAL_PX: Final = 200.0
+BUS: Final = Topic("/can", "crosscue/CanFrames", "columns")
+CAMERA: Final = Topic("camera", "crosscue/Images", "columns")
+CHOICE: Final = "support.gap_drive:build"
+VEHICLE: Final = f"""version = 1
+[topics]
+camera = "camera"
+[can]
+bus = "/can"
+dbc = ["simulated_car.dbc"]
+[can.wheel_speeds]
+front_left = "WHEEL_SPEEDS.FRONT_LEFT"
+front_right = "WHEEL_SPEEDS.FRONT_RIGHT"
+rear_left = "WHEEL_SPEEDS.REAR_LEFT"
+rear_right = "WHEEL_SPEEDS.REAR_RIGHT"
+[start]
+heading_rad = 0.0
+[camera]
+x_m = 0.0
+z_m = 1.4
+focal_px = {FOCAL_PX}
+center_px = [80.0, 45.0]
+[ranges.stop_sign]
+family = "pinhole"
+parameters = [{FOCAL_PX}]
+residual_sd_m = 0.5
+[detectors.grey]
+kind = "{CHOICE}"
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """What becomes of true times in the log.
+
+    Attributes:
+        set_at_s: The clock is set then,
+        by_s: by so much.
+        pause_s: Rows from the first to before the second of these were never recorded.
+    """
+
+    set_at_s: float = 0.0
+    by_s: float = 0.0
+    pause_s: tuple[float, float] = (0.0, 0.0)
+
+    def recorded(self, t_ns: Int64s) -> tuple[Int64s, Int64s]:
+        """Indices of the rows that were recorded, and their stamps."""
+        first, last = (BEGIN + round(s * SECOND) for s in self.pause_s)
+        rows = np.flatnonzero((t_ns < first) | (t_ns >= last))
+        is_later = t_ns[rows] >= BEGIN + round(self.set_at_s * SECOND)
+        return rows, t_ns[rows] + is_later * round(self.by_s * SECOND)
+
+
+def distance_m(t_ns: Int64s) -> Floats:
+    """True distance still to go, shape (N,)."""
+    left: Floats = START_M - SPEED_MPS * (t_ns - BEGIN) / SECOND
+    return left
+
+
+def write_drive(folder: Path, clock: Clock, seconds: int = 14, rows_a_block: int = 7) -> Path:
+    """Write log, vehicle file and truth; the log's path comes back."""
+    folder.mkdir(parents=True, exist_ok=True)
+    log = folder / "drive.mcap"
+    true_ns = np.arange(seconds * 10) * ROW + BEGIN
+    rows, stamps = clock.recorded(true_ns)
+    with LogWriter(log, Ledger(str(log))) as writer:
+        for topic in (BUS, CAMERA):
+            writer.add_topic(topic)
+        for part in np.array_split(np.arange(len(rows)), max(len(rows) // rows_a_block, 1)):
+            at = stamps[part]
+            writer.write(Block(BUS.name, at, _wheels(len(at))))
+            writer.write(Block(CAMERA.name, at, _pictures(rows[part])))
+    shutil.copyfile(dbc_path(), folder / "simulated_car.dbc")
+    (folder / "car.toml").write_text(VEHICLE, encoding="utf-8")
+    _write_truth(folder, true_ns)
+    return log
+
+
+def replayed(folder: Path, log: Path, run: str = "run") -> RunFolder:
+    """Replay a log with the folder's vehicle file and detector."""
+    vehicle = load(folder / "car.toml")
+    detecting = Detecting(tuple(choices_of(vehicle).values()), cache=folder / "cache.sqlite")
+    with open_log(log) as opened:
+        into = create(folder / run, overwrite=True)
+        return replay_drive([opened], vehicle, into, EVERYTHING, detecting=detecting).run
+
+
+def _wheels(n: int) -> CanFrames:
+    message = CanDatabase.load([dbc_path()]).named("WHEEL_SPEEDS")
+    speed = np.full(n, SPEED_MPS * 3.6)
+    names = ("FRONT_LEFT", "FRONT_RIGHT", "REAR_LEFT", "REAR_RIGHT")
+    payload = encode(message, dict.fromkeys(names, speed))
+    no = np.zeros(n, np.bool_)
+    identifier, length = np.full(n, 176, np.uint32), np.full(n, payload.shape[1], np.uint8)
+    return CanFrames(identifier, no, np.full(n, DATA, np.uint8), length, payload, no)
+
+
+def _pictures(numbers: Sequence[int] | Int64s) -> Images:
+    grey = [np.full(SIZE[::-1], number, np.uint8) for number in numbers]
+    coded = [cv2.imencode(".png", picture)[1].ravel() for picture in grey]
+    edges = np.cumsum([0, *map(len, coded)])
+    messages = Messages(np.concatenate(coded), edges[:-1], edges[1:])
+    return Images(messages, ("png",) * len(coded))
+
+
+def _write_truth(folder: Path, true_ns: Int64s) -> None:
+    left_m = distance_m(true_ns)
+    enter_ns = int(true_ns[left_m > 0.0][-1])
+    save(
+        Truth(
+            version=1,
+            source="made up",
+            start_ns=int(true_ns[0]),
+            end_ns=int(true_ns[-1]) + 1,
+            pose="pose.tum",
+            ranges="ranges.csv",
+            approaches=(
+                Approach(
+                    id=0,
+                    intersection="A",
+                    start_ns=int(true_ns[0]),
+                    enter_ns=enter_ns,
+                    control="stop_sign",
+                    features=Features(left=True, right=True, straight=True),
+                    length_m=10.0,
+                ),
+            ),
+            cues=(
+                CueTruth(cue="stop_sign", present=True, start_ns=int(true_ns[0]), end_ns=enter_ns),
+            ),
+        ),
+        folder,
+    )
+    zero = np.zeros(len(true_ns))
+    write_tum(folder / "pose.tum", planar(true_ns, START_M - left_m, zero, zero), "made up")
+    lines = [f"{t},0,{m:.4f},{m + 10.0:.4f}" for t, m in zip(true_ns, left_m, strict=True)]
+    (folder / "ranges.csv").write_text("\n".join(["t_ns,approach,start_m,end_m", *lines]) + "\n")
+
+
+class GreyNumber:
+    """Reads the frame's number and gives the sign that is seen from there."""
+
+    @property
+    def view(self) -> View:
+        """Grey."""
+        return View(is_grey=True)
+
+    @property
+    def identity(self) -> str:
+        """There is one kind."""
+        return "grey number"
+
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        """Detect."""
+        return [self._one(frame) for frame in frames]
+
+    def _one(self, frame: Frame) -> Found:
+        number = int(np.median(frame.pixels))
+        left_m = float(distance_m(np.array([BEGIN + number * ROW], np.int64))[0])
+        if not SIGN_M[0] < left_m < SIGN_M[1]:
+            return nothing_found(frame)
+        height = FOCAL_PX / left_m
+        box = np.array([[100.0, 40.0, 100.0 + height, 40.0 + height]])
+        return Detections(frame.t_ns, frame.size_px, box, np.ones(1), ("stop sign",), (b"",))
+
+
+def build() -> GreyNumber:
+    """A factory, as ``module:factory`` names it."""
+    return GreyNumber()
