@@ -1,12 +1,14 @@
 """ROS 2 bags in SQLite (.db3): all rows that SQLite can still reach, the rest told.
 
 SQLite has no checksums. What can be known is checked instead: SQLite's own integrity check, the
-time index against the rows, the types and the order of the rows, the file's length.
+time index against the rows, the types and the order of the rows, the file's length. Rows of a file
+without a fault come straight out of its pages as far as they are plain, all others through SQLite.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +24,7 @@ from crosscue.replay.readers.mixed import MixedRows, blocks_of
 from crosscue.replay.readers.timed_files import is_inside
 
 from .inflate import DAMAGED, inflated
+from .pages import page_rows
 from .rows import FIRST_ROWID, LAST_ROWID, Row, RowColumns, RowScan, index_times
 from .sqlite import FAULTS, Database, open_database
 from .tables import Tables, fetched, read_tables
@@ -138,10 +141,22 @@ class _Pass:
         for topic in self._tables.topics.values():
             self._ledger.declare(topic.name, topic.declared)
         self._narrow()
-        problems = self._problems() if self._in_time_by_index is None else ""
+        problems = ""
+        if self._in_time_by_index is None:
+            with _lock(self._database) as is_locked:
+                problems = self._problems()
+                if is_locked and not problems and not self._database.damage:
+                    yield from self._plain_blocks()
         for rows in self._scan.batches():
             yield from self._blocks_of(rows)
         self._finish(problems)
+
+    def _plain_blocks(self) -> Iterator[Block]:
+        """Rows straight out of the pages, as far as they are plain; the scan goes on from there."""
+        for rows in page_rows(self._database, self._fetched, self._limits):
+            self._met += len(rows)
+            self._scan = RowScan(self._database, int(rows.ids[-1]) + 1, LAST_ROWID, self._fetched)
+            yield from self._grouped(rows.messages, self._placed(rows.topics), rows.times)
 
     def _narrow(self) -> None:
         """Scan only the row ids between which the times asked for lie, if the index is complete."""
@@ -328,9 +343,26 @@ def _place_table(places: Mapping[int, int]) -> Int64s:
     return table
 
 
-def _stamp(path: Path) -> tuple[int, int]:
+@contextmanager
+def _lock(database: Database) -> Iterator[bool]:
+    """Keep recorders from writing, as SQLite does while a statement is open; did it succeed?"""
+    try:
+        statement = database.connection.execute("SELECT 1 FROM messages")
+        is_open = statement.fetchone() is not None
+    except FAULTS:
+        yield False
+        return
+    try:
+        yield is_open
+    finally:
+        # An iterator that was left half-way may outlive the connection.
+        with suppress(*FAULTS):
+            statement.close()
+
+
+def _stamp(path: Path) -> tuple[int, int, int]:
     at = path.stat()
-    return at.st_size, at.st_mtime_ns
+    return at.st_ino, at.st_size, at.st_mtime_ns
 
 
 def open_db3(path: Path, limits: Limits = DEFAULT) -> Db3Log:

@@ -51,12 +51,14 @@ class Database:
         notices: What had to be done to open it, for the ledger.
         copy: Place of the temporary copy, or None.
         damage: What is known to be missing, or empty.
+        plain: The file that holds all of it, with no journal beside it, or None.
     """
 
     connection: sqlite3.Connection
     notices: list[str] = field(default_factory=list)
     copy: Scratch | None = None
     damage: str = ""
+    plain: Path | None = None
 
     def close(self) -> None:
         """Close it and remove the temporary copy."""
@@ -120,7 +122,7 @@ def _opened(path: Path, head: bytes, limits: Limits) -> Database:
         if _has_bytes(beside(path, "-journal")):
             return _repaired_copy(path, limits)
         raise
-    return Database(connection, damage=_shortfall(missing))
+    return Database(connection, damage=_shortfall(missing), plain=path)
 
 
 def _shortfall(missing: int) -> str:

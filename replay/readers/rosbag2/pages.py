@@ -1,0 +1,378 @@
+"""Rows of a sound ROS 2 SQLite bag straight out of its pages, some hundred pages at a time.
+
+Through the standard library every row is four Python objects. A recorder's file is simple, though:
+one table of four columns, rows in the order of their ids, a large payload continued in a chain of
+pages. Only what is plainly so is read here, and only after SQLite found no fault in the file. At
+the first thing that is not (a value of another type, a page that is not as expected), reading ends
+and SQLite reads on from there. Layout as in sections 1.5, 1.6 and 2.1 of SQLite's description of
+its file format.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from typing import BinaryIO, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import BLOCK_BYTES, Bytes, Int64s, Messages
+from crosscue.replay.limits import MIB, Limits
+
+from .sqlite import FAULTS, Database
+from .tables import fetched
+
+_COLUMNS: Final = (
+    ("id", "INTEGER", 1, 0),
+    ("topic_id", "INTEGER", 0, 0),
+    ("timestamp", "INTEGER", 0, 0),
+    ("data", "BLOB", 0, 0),
+)
+"""Name, type, place in the primary key and kind of each column of the messages table."""
+_INTERIOR: Final = 5
+_LEAF: Final = 13
+_LEAF_HEAD: Final = 8
+_INTERIOR_HEAD: Final = 12
+_DEEPEST: Final = 20
+_LOT_BYTES: Final = BLOCK_BYTES // 2
+_CHAIN_BYTES: Final = 1 << 20
+_ROOM: Final = 256
+"""Zeros behind the last page, so that a cell that runs over its page can be looked at."""
+_VARINT_BYTES: Final = 9
+_INTEGER_BYTES: Final = np.array([-1, 1, 2, 3, 4, 6, 8, -1, 0, 0] + [-1] * 246, np.int64)
+"""Size of an integer by its serial type; -1 if the type is no integer."""
+_ONE: Final = 9
+"""Serial type of the integer 1, which takes no bytes."""
+_FIRST_BLOB: Final = 12
+
+
+class _UnusualError(Exception):
+    """Something that SQLite itself should read."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PageRows:
+    """N rows, their ids ascending.
+
+    Attributes:
+        ids: Shape (N,), int64.
+        topics: Shape (N,), int64.
+        times: Shape (N,), int64.
+        messages: N payloads; empty for topics not asked for.
+    """
+
+    ids: Int64s
+    topics: Int64s
+    times: Int64s
+    messages: Messages
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cells:
+    """Rows of one lot of leaf pages, as places in its buffer.
+
+    Attributes:
+        page: Shape (N,), int64: which page of the lot holds it; ascending.
+        ids: Shape (N,), int64.
+        topics: Shape (N,), int64.
+        times: Shape (N,), int64.
+        start: Shape (N,), int64: where the payload begins.
+        length: Shape (N,), int64: its bytes; 0 for topics not asked for.
+        local: Shape (N,), int64: how many of them stand here; the rest in a chain of pages.
+    """
+
+    page: Int64s
+    ids: Int64s
+    topics: Int64s
+    times: Int64s
+    start: Int64s
+    length: Int64s
+    local: Int64s
+
+    def span(self, first: int, stop: int) -> _Cells:
+        """Rows ``first`` to ``stop``."""
+        columns = (getattr(self, column.name) for column in fields(self))
+        return _Cells(*(column[first:stop] for column in columns))
+
+
+def page_rows(
+    database: Database, topics: frozenset[int] | None, limits: Limits
+) -> Iterator[PageRows]:
+    """Rows in the order of their ids, as far as they are plain; none if the file is not.
+
+    A statement must be open in the meantime, whose lock keeps a recorder from writing.
+
+    Args:
+        database: One that SQLite found no fault in.
+        topics: Numbers of the topics whose payloads are wanted, or None for all.
+        limits: A longer row is left to SQLite.
+    """
+    if database.plain is None:
+        return
+    try:
+        root = _root(database)
+        with database.plain.open("rb", buffering=0) as file:
+            yield from _Pages(file, root, topics, limits).rows()
+    except (_UnusualError, OSError):
+        return
+
+
+def _root(database: Database) -> int:
+    """Number of the first page of the messages table.
+
+    Raises:
+        _UnusualError: The table has not the columns that recorders give it.
+    """
+    try:
+        columns = fetched(database, "PRAGMA table_xinfo(messages)")
+        found = fetched(database, "SELECT rootpage FROM sqlite_master WHERE name = 'messages'")
+    except FAULTS:
+        raise _UnusualError from None
+    if tuple((name, kind, key, hidden) for _, name, kind, _, _, key, hidden in columns) != _COLUMNS:
+        raise _UnusualError
+    return int(found[0][0])
+
+
+class _Pages:
+    """The pages of an open file."""
+
+    def __init__(
+        self, file: BinaryIO, root: int, topics: frozenset[int] | None, limits: Limits
+    ) -> None:
+        self._file = file.fileno()
+        self._root = root
+        self._topics = None if topics is None else np.array(sorted(topics), np.int64)
+        self._longest = limits.message_bytes + MIB
+        head = os.pread(self._file, 100, 0)
+        if len(head) < 100:
+            raise _UnusualError
+        size = int.from_bytes(head[16:18], "big")
+        self._size = 65536 if size == 1 else size
+        self._usable = self._size - head[20]
+        if self._size < 512 or self._usable < 480:
+            raise _UnusualError
+        self._count = os.fstat(self._file).st_size // self._size
+        self._scratch = np.empty(max(1, _CHAIN_BYTES // self._size) * self._size, np.uint8)
+        self._run = len(self._scratch) // self._size
+        self._left = 3 * self._count
+        self._highest = -(2**63)
+
+    def rows(self) -> Iterator[PageRows]:
+        """All rows.
+
+        Raises:
+            _UnusualError: Those from here on SQLite should read.
+            OSError: The file cannot be read.
+        """
+        for leaves in self._leaves(self._root, 0):
+            many = max(1, _LOT_BYTES // self._size)
+            for first in range(0, len(leaves), many):
+                yield from self._lot(leaves[first : first + many])
+
+    def _leaves(self, page: int, depth: int) -> Iterator[Int64s]:
+        """Numbers of the leaf pages below ``page``, in the order of their rows."""
+        content = self._page(page)
+        if content[0] == _LEAF:
+            yield np.array([page])
+            return
+        children = self._children(content)
+        if self._page(int(children[0]))[0] == _LEAF:
+            yield children
+            return
+        if depth == _DEEPEST:
+            raise _UnusualError
+        for child in children.tolist():
+            yield from self._leaves(child, depth + 1)
+
+    def _page(self, page: int) -> Bytes:
+        self._left -= 1
+        if not 1 < page <= self._count or self._left < 0:
+            raise _UnusualError
+        content = os.pread(self._file, self._size, (page - 1) * self._size)
+        if len(content) < self._size:
+            raise _UnusualError
+        return np.frombuffer(content, np.uint8)
+
+    def _children(self, content: Bytes) -> Int64s:
+        count = int(content[3]) << 8 | int(content[4])
+        if content[0] != _INTERIOR or _INTERIOR_HEAD + 2 * count > self._usable:
+            raise _UnusualError
+        cells = content[_INTERIOR_HEAD : _INTERIOR_HEAD + 2 * count].view(">u2")
+        if count and int(cells.max()) + 4 > self._usable:
+            raise _UnusualError
+        numbers = _shifted(content, ">u4")[cells].astype(np.int64)
+        return np.append(numbers, int.from_bytes(content[8:12].tobytes(), "big"))
+
+    def _lot(self, leaves: Int64s) -> Iterator[PageRows]:
+        buffer = self._read(leaves)
+        cells, is_plain = self._cells(buffer, len(leaves))
+        kept = self._ascending(cells)
+        is_plain &= kept == len(cells.ids)
+        cells = cells.span(0, kept)
+        if kept:
+            self._highest = int(cells.ids[-1])
+            yield from self._whole(buffer, cells)
+        if not is_plain:
+            raise _UnusualError
+
+    def _read(self, leaves: Int64s) -> Bytes:
+        """The pages one after the other, and ``_ROOM``."""
+        if leaves.min() <= 1 or leaves.max() > self._count:
+            raise _UnusualError
+        buffer = np.empty(len(leaves) * self._size + _ROOM, np.uint8)
+        buffer[-_ROOM:] = 0
+        edges = [0, *(np.flatnonzero(np.diff(leaves) != 1) + 1).tolist(), len(leaves)]
+        for first, stop in pairwise(edges):
+            target = buffer[first * self._size : stop * self._size]
+            self._fill(target, int(leaves[first]))
+        return buffer
+
+    def _fill(self, target: Bytes, page: int) -> None:
+        if os.preadv(self._file, [target.data], (page - 1) * self._size) < len(target):
+            raise _UnusualError
+
+    def _cells(self, buffer: Bytes, pages: int) -> tuple[_Cells, bool]:
+        """The rows up to the first that is not plain, and whether those are all."""
+        size, usable = self._size, self._usable
+        shorts, words = _shifted(buffer, ">u2"), _shifted(buffer, ">i8")
+        base = np.arange(pages) * size
+        count = shorts[base + 3].astype(np.int64)
+        is_leaf = (buffer[base] == _LEAF) & (_LEAF_HEAD + 2 * count <= usable)
+        count[~is_leaf] = 0
+        whole = int(count[: _first(~is_leaf)].sum())
+        page = np.repeat(np.arange(pages), count)[:whole]
+        within = np.arange(whole) - (np.cumsum(count) - count)[page]
+        place = shorts[base[page] + _LEAF_HEAD + 2 * within].astype(np.int64)
+        plain = (place >= _LEAF_HEAD + 2 * count[page]) & (place < usable)
+        place[~plain] = 0
+        at = base[page] + place
+        total, head = _varint(buffer, at)
+        ids, head = _varint(buffer, head)
+        plain &= (total >= 0) & (total <= self._longest)
+        total[~plain] = 0
+        local = self._local(total)
+        plain &= place + (head - at) + local + 4 * (local < total) <= usable
+        serial, body = _varint(buffer, head + 4)
+        topic_bytes, time_bytes = _INTEGER_BYTES[buffer[head + 2]], _INTEGER_BYTES[buffer[head + 3]]
+        plain &= (buffer[head] == body - head) & (buffer[head + 1] == 0)
+        plain &= (topic_bytes >= 0) & (time_bytes >= 0)
+        topics = _integers(words, body + topic_bytes, topic_bytes, buffer[head + 2])
+        start = body + topic_bytes + time_bytes
+        times = _integers(words, start, time_bytes, buffer[head + 3])
+        length = (serial - _FIRST_BLOB) >> 1
+        own = local - (start - head)
+        is_blob = (serial >= _FIRST_BLOB) & (serial & 1 == 0) & (start - head + length == total)
+        plain &= own >= 0
+        if self._topics is not None:
+            wanted = np.isin(topics, self._topics)
+            is_blob |= ~wanted
+            length, own = length * wanted, own * wanted
+        plain &= is_blob
+        upto = _first(~plain)
+        cells = _Cells(page, ids, topics, times, start, length, own)
+        return cells.span(0, upto), upto == whole and bool(is_leaf.all())
+
+    def _local(self, total: Int64s) -> Int64s:
+        """Bytes of each row that stand in its leaf page."""
+        usable = self._usable
+        least = (usable - 12) * 32 // 255 - 23
+        part = least + (total - least) % (usable - 4)
+        return np.where(total <= usable - 35, total, np.where(part <= usable - 35, part, least))
+
+    def _ascending(self, cells: _Cells) -> int:
+        """How many rows have ids that ascend, from those before on."""
+        before = np.concatenate(([self._highest], cells.ids[:-1]))
+        return _first(~(cells.ids > before)) if len(cells.ids) else 0
+
+    def _whole(self, buffer: Bytes, cells: _Cells) -> Iterator[PageRows]:
+        """Rows with the rest of their payloads, in parts of bounded size."""
+        far = np.where(cells.local < cells.length, cells.length, 0)
+        sums = np.cumsum(far)
+        first = done = 0
+        while first < len(far):
+            stop = max(first + 1, int(np.searchsorted(sums, done + _LOT_BYTES, side="right")))
+            yield self._part(buffer, cells.span(first, stop), far[first:stop])
+            first, done = stop, int(sums[stop - 1])
+
+    def _part(self, buffer: Bytes, cells: _Cells, far: Int64s) -> PageRows:
+        start = cells.start
+        if far.any():
+            begin, end = int(cells.page[0]) * self._size, (int(cells.page[-1]) + 1) * self._size
+            near = buffer[begin:end]
+            buffer = np.empty(len(near) + int(far.sum()), np.uint8)
+            buffer[: len(near)] = near
+            start, target = start - begin, len(near)
+            for i in np.flatnonzero(far):
+                held, length, source = int(cells.local[i]), int(far[i]), int(start[i])
+                buffer[target : target + held] = near[source : source + held]
+                chain = int.from_bytes(near[source + held : source + held + 4].tobytes(), "big")
+                self._follow(chain, buffer[target + held : target + length])
+                start[i] = target
+                target += length
+        messages = Messages(buffer, start, start + cells.length)
+        return PageRows(cells.ids, cells.topics, cells.times, messages)
+
+    def _follow(self, page: int, target: Bytes) -> None:
+        """Fill ``target`` from a chain of pages, which mostly follow each other in the file."""
+        room, done = self._usable - 4, 0
+        while done < len(target):
+            count = min(-(-(len(target) - done) // room), self._run, self._count + 1 - page)
+            if page <= 1 or count < 1:
+                raise _UnusualError
+            lot = self._scratch[: count * self._size]
+            self._fill(lot, page)
+            pages = lot.reshape(count, self._size)
+            after = pages[:, :4].copy().view(">u4")[:, 0]
+            good = min(count, _first(after != np.arange(page + 1, page + count + 1)) + 1)
+            part = pages[:good, 4 : self._usable].reshape(-1)[: len(target) - done]
+            target[done : done + len(part)] = part
+            done, page = done + len(part), int(after[good - 1])
+            longest = len(self._scratch) // self._size
+            self._run = min(longest, 2 * self._run) if good == count else good
+        if page:
+            raise _UnusualError
+
+
+def _shifted(buffer: Bytes, kind: str) -> NDArray[np.integer]:
+    """The number that begins at each byte."""
+    width = np.dtype(kind).itemsize
+    return np.ndarray((len(buffer) - width + 1,), kind, buffer, 0, (1,))
+
+
+def _first(marked: NDArray[np.bool_]) -> int:
+    """Place of the first one marked, or how many there are."""
+    return int(marked.argmax()) if marked.any() else len(marked)
+
+
+def _varint(buffer: Bytes, at: Int64s) -> tuple[Int64s, Int64s]:
+    """SQLite's numbers of variable length, and the places behind them."""
+    byte = buffer[at]
+    value, at = (byte & 0x7F).astype(np.int64), at + 1
+    more = np.flatnonzero(byte & 0x80)
+    for i in range(1, _VARINT_BYTES):
+        if not len(more):
+            break
+        byte = buffer[at[more]]
+        if i == _VARINT_BYTES - 1:
+            value[more] = value[more] << 8 | byte
+        else:
+            value[more] = value[more] << 7 | byte & 0x7F
+        at[more] += 1
+        more = more[byte >= 0x80]
+    return value, at
+
+
+def _integers(
+    words: NDArray[np.integer], end: Int64s, size: Int64s, serial: NDArray[np.uint8]
+) -> Int64s:
+    """Signed integers of up to eight bytes that end at ``end``."""
+    shift = 8 * (8 - np.clip(size, 1, 8))
+    value = words[np.maximum(end - 8, 0)].astype(np.int64)
+    value = (value << shift) >> shift
+    return np.where(size > 0, value, serial == _ONE)

@@ -1,0 +1,302 @@
+"""Rows straight out of a SQLite file's pages are those that SQLite gives."""
+
+from __future__ import annotations
+
+import os
+import random
+import sqlite3
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.readers.rosbag2 import db3
+from crosscue.replay.readers.rosbag2.db3 import open_db3
+from crosscue.replay.readers.rosbag2.pages import PageRows, page_rows
+from crosscue.replay.readers.rosbag2.sqlite import open_database
+from support.data import shared
+from support.rosbag_files import by_topic, damaged_copies, read_rows, rows_of, write_folder
+
+TOPICS = """
+CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
+INSERT INTO topics VALUES(1, '/a', 'std_msgs/msg/String', 'cdr');
+INSERT INTO topics VALUES(300, '/b', 'std_msgs/msg/String', 'cdr');
+"""
+MESSAGES = """
+CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,
+    timestamp INTEGER NOT NULL, data BLOB NOT NULL);
+"""
+INDEX = "CREATE INDEX timestamp_idx ON messages (timestamp ASC);"
+Stored = tuple[int, int, int, bytes]
+
+
+def stored_rows(path: Path) -> list[Stored]:
+    """The rows as the standard library gives them."""
+    db = sqlite3.connect(path)
+    rows = db.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id").fetchall()
+    db.close()
+    return rows
+
+
+def rows_in_pages(path: Path, topics: frozenset[int] | None = None) -> list[Stored]:
+    """The rows as they come out of the pages."""
+    database = open_database(path, DEFAULT)
+    try:
+        return [row for lot in page_rows(database, topics, DEFAULT) for row in plain(lot)]
+    finally:
+        database.close()
+
+
+def plain(lot: PageRows) -> Iterator[Stored]:
+    for i in range(len(lot)):
+        numbers = int(lot.ids[i]), int(lot.topics[i]), int(lot.times[i])
+        yield (*numbers, bytes(lot.messages.payload(i)))
+
+
+def empty(path: Path, page_bytes: int, reserved: int, auto_vacuum: int = 0) -> sqlite3.Connection:
+    """A database without tables whose pages keep ``reserved`` bytes at their ends to themselves."""
+    db = sqlite3.connect(path, isolation_level=None)
+    db.execute(f"PRAGMA page_size={page_bytes}")
+    db.execute(f"PRAGMA auto_vacuum={auto_vacuum}")
+    db.execute("PRAGMA user_version=1")
+    db.close()
+    head = bytearray(path.read_bytes())
+    head[20] = reserved
+    # Where the first page's cells begin.
+    head[105:107] = ((page_bytes - reserved) & 0xFFFF).to_bytes(2, "big")
+    path.write_bytes(head)
+    return sqlite3.connect(path, isolation_level=None)
+
+
+def fill(db: sqlite3.Connection, seed: int, count: int, largest: int, has_index: bool) -> None:
+    """Rows of all kinds that a plain table can hold, some of them deleted again."""
+    db.executescript(TOPICS + MESSAGES + (INDEX if has_index else ""))
+    chance = random.Random(seed)
+    db.execute("BEGIN")
+    for _ in range(count):
+        row_id = chance.choice([None, None, None, chance.randrange(-(1 << 60), 1 << 60)])
+        bits = chance.randrange(63)
+        t_ns = chance.choice([0, 1, -1, 1 << bits, -(1 << bits), -(1 << 63), (1 << 63) - 1])
+        size = chance.choice([0, 1, 40, chance.randrange(600), chance.randrange(largest)])
+        row = (row_id, chance.choice([0, 1, 2, 300, -70_000]), t_ns, chance.randbytes(size))
+        db.execute("INSERT OR REPLACE INTO messages VALUES(?, ?, ?, ?)", row)
+        if chance.random() < 0.2:
+            db.execute("DELETE FROM messages WHERE id % 7 = ?", (chance.randrange(7),))
+    db.execute("COMMIT")
+    assert db.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+    db.close()
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    page_bytes=st.sampled_from([512, 1024, 2048, 4096, 8192, 16384, 32768, 65536]),
+    reserved=st.integers(0, 32),
+    auto_vacuum=st.integers(0, 2),
+    has_index=st.booleans(),
+    count=st.integers(0, 250),
+    largest=st.sampled_from([10, 5000, 200_000]),
+    seed=st.integers(0, 1 << 30),
+)
+def test_every_row_is_the_one_that_sqlite_gives(
+    tmp_path_factory: pytest.TempPathFactory,
+    page_bytes: int,
+    reserved: int,
+    auto_vacuum: int,
+    has_index: bool,
+    count: int,
+    largest: int,
+    seed: int,
+) -> None:
+    path = tmp_path_factory.mktemp("pages") / "a.db3"
+    fill(empty(path, page_bytes, reserved, auto_vacuum), seed, count, largest, has_index)
+
+    assert rows_in_pages(path) == stored_rows(path)
+
+
+def test_the_rows_of_a_real_database_come_out_of_its_pages() -> None:
+    path = shared("bags", "evo", "tf_example", "tf_example.db3")
+
+    assert rows_in_pages(path) == stored_rows(path)
+    assert len(stored_rows(path)) == 518
+
+
+def test_long_payloads_in_pages_out_of_order_come_whole_and_in_bounded_lots(tmp_path: Path) -> None:
+    path = tmp_path / "a.db3"
+    db = empty(path, 512, 0)
+    db.executescript(TOPICS + MESSAGES + INDEX + "BEGIN;")
+    db.executemany(
+        "INSERT INTO messages VALUES(?, 1, ?, zeroblob(490))", [(i, i) for i in range(4000)]
+    )
+    db.execute("DELETE FROM messages WHERE id % 2")
+    chance = random.Random(5)
+    large = [(10_000 + i, i, chance.randbytes(700_000)) for i in range(12)]
+    db.executemany("INSERT INTO messages VALUES(?, 1, ?, ?)", large)
+    db.execute("COMMIT")
+    db.close()
+    database = open_database(path, DEFAULT)
+    lots = list(page_rows(database, None, DEFAULT))
+    database.close()
+
+    assert [row for lot in lots for row in plain(lot)] == stored_rows(path)
+    assert max(len(lot.messages.buffer) for lot in lots) <= 8 << 20
+
+
+def test_payloads_of_topics_not_asked_for_stay_where_they_are(tmp_path: Path) -> None:
+    path = tmp_path / "a.db3"
+    fill(empty(path, 1024, 0), 3, 200, 9000, has_index=True)
+    rows = [(*row[:3], row[3] if row[1] == 1 else b"") for row in stored_rows(path)]
+
+    assert rows_in_pages(path, frozenset({1})) == rows
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [(1, 5, None), (1, 5, "text"), (1, 5, 7), (1, 2.5, b"x"), (1, "x", b"x"), (b"1", 5, b"x")],
+)
+def test_reading_ends_before_a_value_of_another_type(
+    tmp_path: Path, odd: tuple[object, ...]
+) -> None:
+    path = tmp_path / "a.db3"
+    db = empty(path, 4096, 0)
+    db.executescript(TOPICS + MESSAGES.replace(" NOT NULL", ""))
+    rows: Sequence[tuple[object, ...]] = [(1, 1, b"a"), (1, 2, b"b"), odd, (1, 4, b"d")]
+    db.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", rows)
+    db.close()
+
+    assert rows_in_pages(path) == [(1, 1, 1, b"a"), (2, 1, 2, b"b")]
+    assert [row.payload for row in read_rows(path).rows] == [b"a", b"b", b"d"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("timestamp INTEGER", "timestamp REAL"),
+        (");", ") WITHOUT ROWID;"),
+        (");", ", more TEXT);"),
+        (");", ", more INTEGER AS (id + 1));"),
+        ("id INTEGER PRIMARY KEY", "id INTEGER"),
+        ("id INTEGER PRIMARY KEY", "id TEXT PRIMARY KEY"),
+    ],
+)
+def test_another_table_is_left_to_sqlite(tmp_path: Path, old: str, new: str) -> None:
+    db = empty(tmp_path / "a.db3", 4096, 0)
+    db.executescript(TOPICS + MESSAGES.replace(old, new))
+    db.execute("INSERT INTO messages(id, topic_id, timestamp, data) VALUES(1, 1, 5, x'01')")
+    db.close()
+
+    assert rows_in_pages(tmp_path / "a.db3") == []
+
+
+def test_a_row_with_fewer_values_than_columns_is_left_to_sqlite(tmp_path: Path) -> None:
+    path = tmp_path / "a.db3"
+    db = empty(path, 4096, 0)
+    db.executescript(
+        TOPICS + "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, "
+        "timestamp INTEGER); INSERT INTO messages VALUES(1, 1, 5); "
+        "ALTER TABLE messages ADD COLUMN data BLOB DEFAULT x'0102';"
+    )
+    db.close()
+
+    assert rows_in_pages(path) == []
+    assert [row.payload for row in read_rows(path).rows] == [b"\1\2"]
+
+
+def test_a_write_ahead_log_is_left_to_sqlite(tmp_path: Path) -> None:
+    db = sqlite3.connect(tmp_path / "a.db3", isolation_level=None)
+    db.execute("PRAGMA journal_mode=wal")
+    db.executescript(TOPICS + MESSAGES + "INSERT INTO messages VALUES(1, 1, 5, x'01');")
+
+    assert rows_in_pages(tmp_path / "a.db3") == []
+    assert len(read_rows(tmp_path / "a.db3").rows) == 1
+    db.close()
+
+
+def outcome(path: Path, selection: Selection = EVERYTHING) -> object:
+    """All that reading gave and said."""
+    try:
+        reading = read_rows(path, selection)
+    except CrosscueError as error:
+        return str(error)
+    ledger = reading.ledger
+    said = ledger.accounts, ledger.notices, ledger.integrity, ledger.is_whole
+    return by_topic(reading.rows), *said
+
+
+def test_damaged_copies_read_as_sqlite_alone_reads_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = next(write_folder(tmp_path / "bag", rows_of(250)).glob("*.db3"))
+    came = []
+
+    def counted(*arguments: Any) -> Iterator[PageRows]:
+        for lot in page_rows(*arguments):
+            came.append(len(lot))
+            yield lot
+
+    for how, copy in damaged_copies(path.read_bytes(), cuts=20, flips=150, seed=77):
+        path.write_bytes(copy)
+        with monkeypatch.context() as patch:
+            patch.setattr(db3, "page_rows", counted)
+            ours = outcome(path)
+        with monkeypatch.context() as patch:
+            patch.setattr(db3, "page_rows", lambda *_: iter(()))
+            assert ours == outcome(path), how
+    assert len(came) > 20
+
+
+def test_hostile_pages_end_the_reading_without_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "a.db3"
+    fill(empty(path, 512, 0), 9, 150, 3000, has_index=False)
+    whole, truth = path.read_bytes(), stored_rows(path)
+    counts = set()
+    rng = np.random.default_rng(2)
+    for _ in range(400):
+        copy = bytearray(whole)
+        # Most of what a page says of itself stands at its beginning.
+        at = int(rng.integers(2, len(whole) // 512)) * 512 + int(rng.integers(0, 24))
+        copy[at] = int(rng.integers(0, 256))
+        path.write_bytes(copy)
+        try:
+            ids = [row[0] for row in rows_in_pages(path)]
+        except CrosscueError:
+            continue
+        assert ids == sorted(set(ids))
+        counts.add(len(ids))
+
+    assert max(counts) == len(truth)
+    assert len(counts) > 5
+
+
+def test_a_file_cut_while_it_is_read_is_said_to_have_changed(tmp_path: Path) -> None:
+    path = tmp_path / "a.db3"
+    fill(empty(path, 512, 0), 9, 150, 3000, has_index=True)
+    ledger = Ledger("a")
+    with open_db3(path) as log:
+        blocks = log.read(ledger)
+        next(blocks)
+        os.truncate(path, 2048)
+        list(blocks)
+
+    assert not ledger.is_whole
+
+
+def test_nobody_writes_while_the_pages_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.db3"
+    fill(empty(path, 4096, 0), 9, 150, 3000, has_index=True)
+    writer = sqlite3.connect(path, isolation_level=None, timeout=0)
+    with open_db3(path) as log:
+        blocks = log.read(Ledger("a"))
+        next(blocks)
+        with pytest.raises(sqlite3.OperationalError, match="locked"):
+            writer.execute("DELETE FROM messages")
+        list(blocks)
+        writer.execute("DELETE FROM messages")
+    writer.close()
