@@ -1,0 +1,37 @@
+"""Sphinx settings; ``make docs`` builds the site with warnings as errors."""
+
+import sys
+from importlib.metadata import version as installed
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "extensions"))
+
+project = "crosscue"
+author = "the crosscue developers"
+release = installed("crosscue")
+copyright = "the crosscue developers, Apache-2.0"  # noqa: A001: Sphinx asks for this name
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "crosscue_reference",
+]
+exclude_patterns = ["_build", "extensions"]
+html_theme = "furo"
+html_title = "crosscue"
+nitpicky = True
+nitpick_ignore_regex = [
+    # Types of libraries whose own documentation is not consulted offline.
+    ("py:.*", r"(numpy|np|pyarrow|pa|pathlib|collections|typing|NDArray|polars|pandas)(\..*)?"),
+    ("py:.*", r"(Path|Sequence|Mapping|Callable|Iterator|Iterable|Any|Final|Literal)"),
+]
+myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
+myst_heading_anchors = 3
+autodoc_typehints = "description"
+autodoc_member_order = "bysource"
+napoleon_google_docstring = True
+nb_execution_mode = "cache"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600

@@ -1,0 +1,164 @@
+"""Reference pages made from the code itself: commands, settings, tables.
+
+``{crosscue-commands}`` prints the help of every command, ``{crosscue-settings} MODULE:CLASS`` every
+field of a settings file with its type, default and meaning, ``{crosscue-tables}`` every column of
+the tables in a run folder. Nothing on these pages is written by hand, so none of it can be stale.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import types
+import typing
+from collections.abc import Iterator
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from docutils import nodes
+from pydantic import BaseModel
+from sphinx.util.docutils import SphinxDirective
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from sphinx.application import Sphinx
+
+
+class Commands(SphinxDirective):
+    """``{crosscue-commands}``: the help of every command, as the command prints it."""
+
+    def run(self) -> list[nodes.Node]:
+        """One section for each command."""
+        from crosscue.eval.cli import COMMANDS
+
+        return [self._section(name, says) for name, (_, says) in COMMANDS.items()]
+
+    def _section(self, name: str, says: str) -> nodes.section:
+        section = nodes.section(ids=[nodes.make_id(f"crosscue {name}")])
+        section += nodes.title(text=f"crosscue {name}")
+        section += nodes.paragraph(text=says[:1].upper() + says[1:] + ".")
+        section += nodes.literal_block(text=_help(name), language="text")
+        return section
+
+
+def _help(command: str) -> str:
+    from crosscue.eval import cli
+
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        status = cli.run([*command.split(), "--help"])
+    if status:
+        raise RuntimeError(f"crosscue {command} --help exits with {status}")
+    return out.getvalue()
+
+
+class SettingsFile(SphinxDirective):
+    """``{crosscue-settings} MODULE:CLASS``: every field, section by section."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        """A table for each section of the file."""
+        module, _, name = self.arguments[0].partition(":")
+        model: type[BaseModel] = getattr(import_module(module), name)
+        found: list[nodes.Node] = []
+        for path, section in _sections("", model):
+            title = f"[{path}]" if path else "top of the file"
+            block = nodes.section(ids=[nodes.make_id(f"{name} {title}")])
+            block += nodes.title(text=title)
+            block += nodes.paragraph(text=" ".join((section.__doc__ or "").split("\n\n")[0].split()))
+            block += _table(("field", "type", "default", "meaning"), list(_fields(section)))
+            found.append(block)
+        return found
+
+
+def _sections(path: str, model: type[BaseModel]) -> Iterator[tuple[str, type[BaseModel]]]:
+    yield path, model
+    for name, field in model.model_fields.items():
+        for inner in _models_in(field.annotation):
+            yield from _sections(f"{path}.{name}" if path else name, inner)
+
+
+def _models_in(annotation: object) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for inner in typing.get_args(annotation) for model in _models_in(inner)]
+
+
+def _fields(model: type[BaseModel]) -> Iterator[tuple[str, str, str, str]]:
+    for name, field in model.model_fields.items():
+        if field.is_required():
+            default = "required"
+        else:
+            value = field.get_default(call_default_factory=True)
+            default = "a section" if isinstance(value, BaseModel) else repr(value)
+            default = default if len(default) <= 60 else default[:57] + "..."
+        yield name, _type_name(field.annotation), default, " ".join((field.description or "").split())
+
+
+def _type_name(annotation: Any) -> str:
+    if annotation is type(None):
+        return "nothing"
+    if isinstance(annotation, type) and not typing.get_args(annotation):
+        return annotation.__name__
+    origin, inner = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated:
+        return _type_name(inner[0])
+    if origin is typing.Literal:
+        return ", ".join(repr(one) for one in inner)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_type_name(one) for one in inner)
+    if inner:
+        names = ", ".join("..." if one is Ellipsis else _type_name(one) for one in inner)
+        return f"{getattr(origin, '__name__', origin)} of {names}"
+    return str(annotation)
+
+
+class Tables(SphinxDirective):
+    """``{crosscue-tables}``: the columns of every table in a run folder."""
+
+    def run(self) -> list[nodes.Node]:
+        """One section for each table."""
+        found: list[nodes.Node] = []
+        for name, schema in _schemas().items():
+            block = nodes.section(ids=[nodes.make_id(f"table {name}")])
+            block += nodes.title(text=f"{name}.parquet")
+            block += _table(("column", "type"), [(one.name, str(one.type)) for one in schema])
+            found.append(block)
+        return found
+
+
+def _schemas() -> dict[str, pa.Schema]:
+    from crosscue.eval.pipeline import accounts, detect, measurements, pose_tables, scene
+
+    return {
+        **detect.schemas(),
+        **scene.schemas(),
+        "pose": pose_tables.pose_schema(),
+        measurements.TABLE: measurements.schema(),
+        "skipped": accounts.skipped_schema(),
+    }
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> nodes.table:
+    group = nodes.tgroup(cols=len(head))
+    group += [nodes.colspec(colwidth=1) for _ in head]
+    group += nodes.thead("", _row(head))
+    group += nodes.tbody("", *(_row(row) for row in rows))
+    return nodes.table("", group)
+
+
+def _row(cells: tuple[str, ...]) -> nodes.row:
+    entries = []
+    for place, cell in enumerate(cells):
+        text: nodes.Node = nodes.literal(text=cell) if place == 0 else nodes.Text(cell)
+        entries.append(nodes.entry("", nodes.paragraph("", "", text)))
+    return nodes.row("", *entries)
+
+
+def setup(app: Sphinx) -> dict[str, object]:
+    """Register the directives."""
+    app.add_directive("crosscue-commands", Commands)
+    app.add_directive("crosscue-settings", SettingsFile)
+    app.add_directive("crosscue-tables", Tables)
+    return {"parallel_read_safe": True}
