@@ -4,12 +4,12 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 WORKERS ?= auto
 
-.PHONY: demo test format lint types imports unit clean
+.PHONY: demo test quick docs format lint types imports unit clean
 
 demo: $(VENV)/.ready
 	$(BIN)/crosscue demo -o demo --overwrite
 
-test: lint types imports unit
+test: lint types imports unit docs
 
 lint: $(VENV)/.ready-dev
 	$(BIN)/ruff format --check .
@@ -25,12 +25,22 @@ imports: $(VENV)/.ready-dev
 unit: $(VENV)/.ready-dev
 	$(BIN)/pytest -n $(WORKERS)
 
+# The site, in docs/_build/html; warnings are errors. Reference pages are made from the code.
+docs: $(VENV)/.ready-dev
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet docs docs/_build/html
+
+# Tests of the packages that differ from main: make quick, or make quick IN="replay detectors".
+IN ?= $(shell git diff --name-only $$(git merge-base HEAD origin/main 2>/dev/null || echo HEAD) | cut -d/ -f1 | sort -u | grep -E '^(replay|detectors|fusion|localization|datasets|eval)$$')
+quick: $(VENV)/.ready-dev
+	$(BIN)/ruff check . && $(BIN)/lint-imports
+	$(if $(IN),$(BIN)/pytest -q -n $(WORKERS) -m "not slow" $(addprefix tests/,$(IN)),@echo "no package differs from main; name some: make quick IN=replay")
+
 format: $(VENV)/.ready-dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf $(VENV) demo .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) demo docs/_build docs/notebooks .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

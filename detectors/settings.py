@@ -19,7 +19,9 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 class Settings(BaseModel):
     """Base of every detector's settings."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
+    )
 
 
 S = TypeVar("S", bound=Settings)

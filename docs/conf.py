@@ -1,15 +1,21 @@
 """Sphinx settings; ``make docs`` builds the site with warnings as errors."""
 
+import shutil
 import sys
 from importlib.metadata import version as installed
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent / "extensions"))
+HERE = Path(__file__).parent
+# Sphinx reads only what lies below this folder.
+shutil.rmtree(HERE / "notebooks", ignore_errors=True)
+shutil.copytree(HERE.parent / "notebooks", HERE / "notebooks")
+
+sys.path.insert(0, str(HERE / "extensions"))
 
 project = "crosscue"
 author = "the crosscue developers"
 release = installed("crosscue")
-copyright = "the crosscue developers, Apache-2.0"  # noqa: A001: Sphinx asks for this name
+copyright = "the crosscue developers, Apache-2.0"  # noqa: A001
 
 extensions = [
     "myst_nb",

@@ -34,7 +34,7 @@ CARRIED: Final[dict[str, str]] = {
 class Section(BaseModel):
     """Unknown keys are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class Origin(Section):

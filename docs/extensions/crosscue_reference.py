@@ -66,10 +66,15 @@ class SettingsFile(SphinxDirective):
             title = f"[{path}]" if path else "top of the file"
             block = nodes.section(ids=[nodes.make_id(f"{name} {title}")])
             block += nodes.title(text=title)
-            block += nodes.paragraph(text=" ".join((section.__doc__ or "").split("\n\n")[0].split()))
+            block += nodes.paragraph(text=_summary(section))
             block += _table(("field", "type", "default", "meaning"), list(_fields(section)))
             found.append(block)
         return found
+
+
+def _summary(model: type[BaseModel]) -> str:
+    """The first paragraph of its docstring."""
+    return " ".join((model.__doc__ or "").split("\n\n")[0].split())
 
 
 def _sections(path: str, model: type[BaseModel]) -> Iterator[tuple[str, type[BaseModel]]]:
@@ -93,7 +98,12 @@ def _fields(model: type[BaseModel]) -> Iterator[tuple[str, str, str, str]]:
             value = field.get_default(call_default_factory=True)
             default = "a section" if isinstance(value, BaseModel) else repr(value)
             default = default if len(default) <= 60 else default[:57] + "..."
-        yield name, _type_name(field.annotation), default, " ".join((field.description or "").split())
+        yield (
+            name,
+            _type_name(field.annotation),
+            default,
+            " ".join((field.description or "").split()),
+        )
 
 
 def _type_name(annotation: Any) -> str:
@@ -143,15 +153,15 @@ def _schemas() -> dict[str, pa.Schema]:
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> nodes.table:
     group = nodes.tgroup(cols=len(head))
     group += [nodes.colspec(colwidth=1) for _ in head]
-    group += nodes.thead("", _row(head))
+    group += nodes.thead("", _row(head, is_head=True))
     group += nodes.tbody("", *(_row(row) for row in rows))
     return nodes.table("", group)
 
 
-def _row(cells: tuple[str, ...]) -> nodes.row:
+def _row(cells: tuple[str, ...], *, is_head: bool = False) -> nodes.row:
     entries = []
     for place, cell in enumerate(cells):
-        text: nodes.Node = nodes.literal(text=cell) if place == 0 else nodes.Text(cell)
+        text: nodes.Node = nodes.Text(cell) if place or is_head else nodes.literal(text=cell)
         entries.append(nodes.entry("", nodes.paragraph("", "", text)))
     return nodes.row("", *entries)
 

@@ -54,14 +54,14 @@ def run(args: argparse.Namespace) -> int:
     from crosscue.eval.recording import save
     from crosscue.eval.report.summary import pose_summary
     from crosscue.eval.scoring.pose.score import truth_track
-    from crosscue.eval.studies.town import drive_figure as drive_picture
+    from crosscue.eval.studies.town import drive_figure
     from crosscue.eval.studies.town.replayed import through_log
 
     if not 0 <= args.seed < 1 << 64:
         raise UsageError(f"--seed {args.seed}: want 0 or more, below 2^64")
     settings = _settings(args)
     done = through_log(args.output, settings, args.seed, overwrite=args.overwrite)
-    picture = drive_picture.draw(settings, done.traced, args.seed, args.output)
+    picture = drive_figure.draw(settings, done.traced, args.seed, args.output)
     recording = done.run.file("drive.rrd")
     save(done.run, recording, truth_track(done.files.truth, done.run))
     if args.json:
