@@ -199,7 +199,7 @@ def bare(path: Path, is_checked: bool = False) -> int:
     file = ByteFile(path)
     segment = find_segments(file, path, TopicBook(DEFAULT), DEFAULT)[0]
     inflater = zstandard.ZstdDecompressor()
-    walk = Walk(file, segment.begin, segment.end, segment.rail(file), DEFAULT, Scanner())
+    walk = Walk(file, segment.begin, segment.end, segment.rail(file, DEFAULT), DEFAULT, Scanner())
     for item in walk:
         if isinstance(item, Chunk) and item.head is not None:
             body: bytes | memoryview = file.read(item.body_at, item.head.body_size).data
