@@ -166,6 +166,8 @@ def _with_topics(messages: Iterable[CanMessage]) -> tuple[tuple[CanMessage, ...]
     named = tuple(
         replace(m, topic=f"{m.name}_0x{m.arbitration_id:X}{'x' if m.is_extended else ''}")
         if m.name in repeated
+        else m
+        if m.topic == m.name
         else replace(m, topic=m.name)
         for m in messages
     )
@@ -198,7 +200,7 @@ def _read_layout(source: DatabaseText, form: str) -> tuple[list[CanMessage], lis
         line = lines.get(one.source)
         where = f"{path.name}:{line}" if line else path.name
         problem = one.problem or _problem(one, marked.get(one.source, []))
-        messages.append(replace(one, source=where, problem=problem))
+        messages.append(replace(one, source=where, problem=problem, topic=one.name))
     if not messages:
         raise SchemaError(f"{path}: defines no message; check that the file is whole")
     notices = [*source.notices, *doubts(source, form, [m.name for m in messages])]

@@ -81,7 +81,6 @@ class _Entry:
 
     message: CanMessage
     extractor: Extractor | None
-    units: Mapping[str, str]
     refusal: str
 
 
@@ -130,6 +129,7 @@ class BusDecoder:
         entries = [_entry(message, chosen) for message in database.messages]
         # The engines want the messages that are decoded first.
         self._entries = tuple(sorted(entries, key=lambda entry: bool(entry.refusal)))
+        self._refused = np.array([False, *(bool(entry.refusal) for entry in self._entries)])
         self._rules = [_rules(entry, settings) for entry in self._entries]
         is_compiled = settings.engine == "numba"
         self._engine = compiled_engine(self._rules) if is_compiled else NumpyEngine(self._rules)
@@ -170,7 +170,8 @@ class BusDecoder:
             entry = self._entries[number - 1]
             columns, strange = self._engine.columns(number)
             topic = f"{self._bus}/{entry.message.topic_name}"
-            one = times.block(topic, grouped.rows(number), columns, entry.units)
+            assert entry.extractor is not None
+            one = times.block(topic, grouped.rows(number), columns, entry.extractor.units)
             if strange is not None:
                 key, count = (*entry.message.key, NO_BRANCH), int(strange.sum())
                 if not self._add(key, count):
@@ -199,22 +200,22 @@ class BusDecoder:
             if not self._add((identifier, False, UNKNOWN_ID), count):
                 mine = is_data & (ids == identifier) & ~frames.is_extended
                 self._tell((identifier, False, UNKNOWN_ID), count, log_ns, mine)
-        for at, entry in enumerate(self._entries, start=1):
-            count = int(grouped.seen[at])
-            if entry.refusal and count:
-                left -= count
-                key = (*entry.message.key, entry.refusal)
-                if not self._add(key, count):
-                    self._tell(key, count, log_ns, is_data & (number == at))
+        for at in np.flatnonzero(self._refused & (grouped.seen > 0)).tolist():
+            entry, count = self._entries[at - 1], int(grouped.seen[at])
+            left -= count
+            key = (*entry.message.key, entry.refusal)
+            if not self._add(key, count):
+                self._tell(key, count, log_ns, is_data & (number == at))
         if left:
             self._account_rare(frames, grouped, log_ns)
 
     def _account_rare(self, frames: CanFrames, grouped: Grouped, log_ns: Int64s) -> None:
         """Count the frames of asked-for messages that do not fit, and those that are no data."""
         number, ids, is_data = grouped.number, frames.arbitration_id, frames.kind == DATA
-        refuses = np.array([False, *(bool(e.refusal) for e in self._entries)])
         is_plain_unknown = (number == 0) & ~frames.is_extended & (ids < STANDARD_IDS)
-        rows = np.flatnonzero(~grouped.is_good & ~(is_data & (is_plain_unknown | refuses[number])))
+        rows = np.flatnonzero(
+            ~grouped.is_good & ~(is_data & (is_plain_unknown | self._refused[number]))
+        )
         which = self._which_reason(frames.take(rows), number[rows])
         key = ids[rows].astype(np.int64)
         key |= (frames.is_extended[rows].astype(np.int64) << 32) | (which << 33)
@@ -289,10 +290,13 @@ class _Times:
         )
 
 
-def _chosen(database: CanDatabase, wanted: Wanted | None) -> dict[tuple[int, bool], set[str]]:
-    """From the identifier of a wanted message to the names of its wanted signals."""
+_Chosen: TypeAlias = Mapping[tuple[int, bool], set[str]]
+
+
+def _chosen(database: CanDatabase, wanted: Wanted | None) -> _Chosen | None:
+    """From the identifier of a wanted message to the names of its wanted signals; None for all."""
     if wanted is None:
-        return {m.key: {s.name for s in m.signals} for m in database.messages}
+        return None
     chosen: dict[tuple[int, bool], set[str]] = {}
     for item in wanted:
         name, signal = (item, None) if isinstance(item, str) else item
@@ -305,14 +309,12 @@ def _chosen(database: CanDatabase, wanted: Wanted | None) -> dict[tuple[int, boo
     return chosen
 
 
-def _entry(message: CanMessage, chosen: Mapping[tuple[int, bool], set[str]]) -> _Entry:
-    if message.key not in chosen:
-        return _Entry(message, None, {}, NOT_ASKED_TOPIC)
+def _entry(message: CanMessage, chosen: _Chosen | None) -> _Entry:
+    if chosen is not None and message.key not in chosen:
+        return _Entry(message, None, NOT_ASKED_TOPIC)
     if message.problem:
-        return _Entry(message, None, {}, message.problem)
-    extractor = Extractor(message, chosen[message.key])
-    units = {s.name: s.unit for s in extractor.signals if s.unit}
-    return _Entry(message, extractor, units, "")
+        return _Entry(message, None, message.problem)
+    return _Entry(message, Extractor(message, None if chosen is None else chosen[message.key]), "")
 
 
 def _rules(entry: _Entry, settings: DecodeSettings) -> Rules:

@@ -8,11 +8,11 @@ shape (signals, rows), since a call into NumPy costs more than the work on a few
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from .layout import Arithmetic, CanMessage, CanSignal, is_whole
 Words: TypeAlias = NDArray[np.uint64]
 """Shape (N, W / 8): payloads as little-endian words."""
 Column: TypeAlias = NDArray[Any]
+Number = TypeVar("Number", np.uint64, np.float64)
 
 PRESENT_SUFFIX: Final = "_is_present"
 """Ends the name of the companion column of a signal that may be absent and cannot be NaN."""
@@ -34,8 +35,7 @@ EXPONENT: Final = 0x4330_0000_0000_0000
 _FLOATS: Final = {16: (np.uint16, np.float16), 32: (np.uint32, np.float32)}
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
+class _Place(NamedTuple):
     """What signals taken out together have in common."""
 
     is_big_endian: bool
@@ -51,7 +51,9 @@ class _Place:
 
 def _place(signal: CanSignal) -> _Place:
     word, bit = divmod(signal.first_bit, 64)
-    is_short = is_short_integer(signal)
+    arithmetic = signal.arithmetic
+    is_exact = arithmetic is Arithmetic.FLOAT and not signal.is_float
+    is_short = is_exact and signal.length <= SHORT_BITS
     return _Place(
         signal.is_big_endian,
         word,
@@ -61,7 +63,7 @@ def _place(signal: CanSignal) -> _Place:
         signal.is_float,
         signal.is_float and signal.scale == 1 and signal.offset == 0,
         signal.length if signal.is_float else 0,
-        signal.arithmetic.name,
+        arithmetic.name,
     )
 
 
@@ -72,20 +74,21 @@ class _Together:
         self.place = place
         self.signals = signals
         self.names = tuple(s.name for s in signals)
-        bit = np.array([s.first_bit % 64 for s in signals], dtype=np.uint64)[:, None]
-        length = np.array([s.length for s in signals], dtype=np.uint64)[:, None]
+        turns = [flip_and_bias(s) for s in signals]
+        bit = _column([s.first_bit % 64 for s in signals], np.uint64)
+        length = _column([s.length for s in signals], np.uint64)
+        self._flip = _column([flip for flip, _ in turns], np.uint64)
         self._drop = np.uint64(64) - length
         # Shifted left until only the wanted bits are left of it; then right, with sign or not.
         self._left = bit if place.is_big_endian else np.uint64(64) - (bit + length)
         self._taken = np.uint64(64) - bit  # bits of a split signal in its first word
-        self._is_below_64 = bool((length < 64).all())
-        flips, biases = zip(*(flip_and_bias(s) for s in signals), strict=True)
-        self._flip = np.array(flips, dtype=np.uint64)[:, None]
-        self._bias = np.array(biases, dtype=np.float64)[:, None]
+        self._is_below_64 = all(s.length < 64 for s in signals)
+        self._bias = _column([bias for _, bias in turns], np.float64)
         scales, offsets = [s.scale for s in signals], [s.offset for s in signals]
         is_linear_float = place.is_float and not place.is_plain  # -0.0 + 0 is 0.0
-        self._scale = _factors(scales) if any(x != 1 for x in scales) else None
-        self._offset = _factors(offsets) if any(offsets) or is_linear_float else None
+        self._scale = _column(scales, np.float64) if any(x != 1 for x in scales) else None
+        is_moved = any(offsets) or is_linear_float
+        self._offset = _column(offsets, np.float64) if is_moved else None
 
     def __call__(self, words: Words) -> Column:
         """Physical values, shape (S, N)."""
@@ -160,8 +163,9 @@ def flip_and_bias(signal: CanSignal) -> tuple[int, float]:
     return EXPONENT | -lowest, float(2**SHORT_BITS - lowest)
 
 
-def _factors(numbers: list[float]) -> NDArray[np.float64]:
-    return np.array([float(x) for x in numbers])[:, None]
+def _column(numbers: Sequence[float], kind: type[Number]) -> NDArray[Number]:
+    """Shape (S, 1)."""
+    return np.array(numbers, dtype=kind)[:, None]
 
 
 def _modulo(numbers: list[int]) -> NDArray[np.uint64]:
@@ -192,14 +196,17 @@ class _Flat:
     """Signals that are all there in every row."""
 
     def __init__(self, signals: Iterable[CanSignal]) -> None:
-        ordered = sorted(((_place(s), s) for s in signals), key=lambda pair: str(pair[0]))
+        ordered = sorted(((_place(s), s) for s in signals), key=lambda pair: pair[0])
         self._parts = [
             _Together(place, [s for _, s in pairs])
             for place, pairs in groupby(ordered, key=lambda pair: pair[0])
         ]
+        self.is_in_order = len(self._parts) == 1
 
     def __call__(self, words: Words) -> dict[str, Column]:
         """From signal name to its values, shape (N,)."""
+        if len(self._parts) == 1:
+            return dict(zip(self._parts[0].names, self._parts[0](words), strict=True))
         columns: dict[str, Column] = {}
         for part in self._parts:
             columns.update(zip(part.names, part(words), strict=True))
@@ -243,11 +250,27 @@ class Extractor:
             message: A message without ``problem``.
             wanted: Names of the signals to give, or None for all.
         """
-        names = {s.name for s in message.signals} if wanted is None else set(wanted)
         self.message = message
-        self.signals = tuple(s for s in message.signals if s.name in names)
-        self.is_multiplexed = any(switches_on(message, s) for s in message.signals)
-        self._needed = [s for s in message.signals if s.name in names or s.is_multiplexer]
+        self._wanted = None if wanted is None else frozenset(wanted)
+
+    # What follows is made when the first frame comes: a bus carries few of a large database's
+    # messages, and the signals of the others need not even be read.
+
+    @cached_property
+    def signals(self) -> tuple[CanSignal, ...]:
+        """Those to give, in the database's order."""
+        wanted = self._wanted
+        return tuple(s for s in self.message.signals if wanted is None or s.name in wanted)
+
+    @cached_property
+    def units(self) -> dict[str, str]:
+        """From signal name to its unit, where it has one."""
+        return {s.name: s.unit for s in self.signals if s.unit}
+
+    @cached_property
+    def is_multiplexed(self) -> bool:
+        """Whether any signal rules others in or out."""
+        return any(switches_on(self.message, s) for s in self.message.signals)
 
     def __call__(self, words: Words) -> tuple[dict[str, Column], NDArray[np.bool_] | None]:
         """Decode N payloads.
@@ -261,6 +284,8 @@ class Extractor:
         """
         if not self.is_multiplexed:
             columns = self._root.flat(words)
+            if self._wanted is None and self._root.flat.is_in_order:
+                return columns, None
             return {s.name: columns[s.name] for s in self.signals}, None
         filled = {s.name: _Filled(s, len(words)) for s in self.signals}
         strange = np.zeros(len(words), dtype=np.bool_)
@@ -274,9 +299,10 @@ class Extractor:
 
     @cached_property
     def _root(self) -> _Node:
-        """Made when the first frame comes: a bus carries few of a large database's messages."""
-        here = [s for s in self._needed if s.multiplexer is None]
-        return _node(self.message, here, self._needed)
+        wanted = self._wanted
+        signals = self.message.signals
+        needed = [s for s in signals if wanted is None or s.name in wanted or s.is_multiplexer]
+        return _node(self.message, [s for s in needed if s.multiplexer is None], needed)
 
 
 class _Filled:

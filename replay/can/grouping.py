@@ -64,20 +64,24 @@ class Tables:
                 extended.append((rule.message.arbitration_id, number))
             else:
                 standard[rule.message.arbitration_id] = number
-            for width, table in fits.items():
-                if rule.extractor is not None and rule.message.length <= width:
-                    table[:, number] = _fitting_lengths(rule)
+        decoded = [rule.extractor is not None for rule in rules]
+        sizes = np.array([rule.message.length for rule in rules], dtype=np.int64)
+        longest = np.array([rule.longest for rule in rules], dtype=np.int64).reshape(-1, 2)
+        fitting = _fitting_lengths(sizes, longest.T) & np.array(decoded, dtype=np.bool_)[:, None]
+        for width, table in fits.items():
+            table[:, 1:] = fitting & (sizes <= width)[:, None]
         extended.sort()
         ids = np.array([i for i, _ in extended], dtype=np.uint32)
         numbers = np.array([n for _, n in extended], dtype=np.uint16)
         return cls(standard, ids, numbers, fits)
 
 
-def _fitting_lengths(rule: Rules) -> NDArray[np.bool_]:
-    length, longest = np.arange(256), np.array(rule.longest)[:, None]
-    fits = (length >= rule.message.length) & (length <= longest)
+def _fitting_lengths(sizes: NDArray[np.int64], longest: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Shape (2, M, 256), from shapes (M,) and (2, M): which lengths messages may have."""
+    length, most = np.arange(256), longest[:, :, None]
+    fits: NDArray[np.bool_] = (length >= sizes[:, None]) & (length <= most)
     # Where the log keeps no lengths there is nothing to hold against the database.
-    fits[:, LENGTH_UNKNOWN] |= longest[:, 0] >= 0
+    fits[:, :, LENGTH_UNKNOWN] |= longest >= 0
     return fits
 
 

@@ -8,7 +8,7 @@ numbers, and runs down to bit 0 of a byte and on to bit 7 of the next.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
@@ -97,6 +97,8 @@ class CanSignal:
         """How its values are computed, which also decides the column's type."""
         if self.is_float or not is_whole(self.scale):
             return Arithmetic.FLOAT
+        if self.length <= 32 and abs(self.scale) <= 2**20 and abs(self.offset) <= 2**52:
+            return Arithmetic.FLOAT  # nearly all signals there are; what follows says the same
         products = [raw * int(self.scale) for raw in self.raw_range]
         if not is_whole(self.offset):
             small = _largest([*self.raw_range, *products]) <= EXACT_IN_FLOAT64
@@ -125,7 +127,8 @@ class CanMessage:
         arbitration_id: 11 or 29 bits.
         is_extended: 29-bit identifier; the same number as an 11-bit one is another message.
         length: Payload bytes.
-        signals: In the database's order.
+        signals: In the database's order; from the cache of layouts they are read when first asked
+            for, since a bus carries few of a large database's messages.
         is_fd: CAN FD frame, or None where the database does not say.
         topic: What its decoded rows are called: ``name``, or ``name_0xID`` where several messages
             have one name.
@@ -137,7 +140,7 @@ class CanMessage:
     arbitration_id: int
     is_extended: bool
     length: int
-    signals: tuple[CanSignal, ...]
+    signals: Sequence[CanSignal]
     is_fd: bool | None = None
     topic: str = ""
     problem: str = ""

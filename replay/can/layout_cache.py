@@ -2,7 +2,8 @@
 
 A file's layout is kept under a hash of its text, its name and of all code that made it, cantools
 included, so that no entry ever has to be told to be out of date. Entries are JSON behind their own
-checksum, written whole. What cannot be read or written is as good as not there: the cache never
+checksum, written whole: a line for the messages, then one for the signals of each, which is parsed
+when somebody asks for them. What cannot be read or written is as good as not there: the cache never
 fails, and never answers for another file.
 
 ``$CROSSCUE_DBC_CACHE`` names another folder than ``~/.cache/crosscue/can_layouts``, or is ``off``.
@@ -12,13 +13,13 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import cache
+from functools import cache, cached_property
 from hashlib import blake2b
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, overload
 
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.limits import MIB
@@ -75,9 +76,10 @@ class LayoutEntry:
         if head != _HEAD + _checksum(body):
             return None
         try:
-            found = json.loads(body)
-            messages = [_message(*row) for row in found["messages"]]
-            return messages, list(found["notices"])
+            first, *lines = body.split(b"\n")
+            found = json.loads(first)
+            rows = zip(found["messages"], lines, strict=True)
+            return [_message(line, *row) for row, line in rows], list(found["notices"])
         except (ValueError, KeyError, TypeError, IndexError):
             return None
 
@@ -85,8 +87,9 @@ class LayoutEntry:
         """Keep a layout if the folder can be written."""
         if self._path is None:
             return
-        rows = [_row(message) for message in messages]
-        body = json.dumps({"notices": notices, "messages": rows}, separators=(",", ":")).encode()
+        heads = [_head(message) for message in messages]
+        parts = [{"notices": notices, "messages": heads}, *map(_signals, messages)]
+        body = "\n".join(json.dumps(one, separators=(",", ":")) for one in parts).encode()
         with suppress(OSError):
             folder = self._path.parent
             folder.mkdir(parents=True, exist_ok=True)
@@ -142,8 +145,57 @@ def _version_of_cantools() -> str:
     return f"{' '.join(installed)} {stamp.st_size} {stamp.st_mtime_ns}"
 
 
-def _row(message: CanMessage) -> list[Any]:
-    signals = [
+class _StoredSignals(Sequence[CanSignal]):
+    """The signals of one message, parsed when first asked for."""
+
+    def __init__(self, line: bytes) -> None:
+        self._line = line
+
+    @cached_property
+    def _parsed(self) -> tuple[CanSignal, ...]:
+        return tuple(
+            CanSignal(*[*row[:11], dict(row[11]), *row[12:14], frozenset(row[14])])
+            for row in json.loads(self._line)
+        )
+
+    def __len__(self) -> int:
+        return len(self._parsed)
+
+    def __iter__(self) -> Iterator[CanSignal]:
+        return iter(self._parsed)
+
+    @overload
+    def __getitem__(self, at: int) -> CanSignal: ...
+    @overload
+    def __getitem__(self, at: slice) -> Sequence[CanSignal]: ...
+    def __getitem__(self, at: int | slice) -> CanSignal | Sequence[CanSignal]:
+        return self._parsed[at]
+
+    def __eq__(self, other: object) -> bool:
+        return self._parsed == (other._parsed if isinstance(other, _StoredSignals) else other)
+
+    def __hash__(self) -> int:
+        return hash(self._parsed)
+
+    def __repr__(self) -> str:
+        return repr(self._parsed)
+
+
+def _head(message: CanMessage) -> list[Any]:
+    return [
+        message.name,
+        message.arbitration_id,
+        message.is_extended,
+        message.length,
+        message.is_fd,
+        message.topic,
+        message.problem,
+        message.source,
+    ]
+
+
+def _signals(message: CanMessage) -> list[Any]:
+    return [
         [
             s.name,
             s.start,
@@ -163,28 +215,9 @@ def _row(message: CanMessage) -> list[Any]:
         ]
         for s in message.signals
     ]
-    return [
-        message.name,
-        message.arbitration_id,
-        message.is_extended,
-        message.length,
-        signals,
-        message.is_fd,
-        message.topic,
-        message.problem,
-        message.source,
-    ]
 
 
 def _message(
-    name: str,
-    arbitration_id: int,
-    is_extended: bool,
-    length: int,
-    signals: list[list[Any]],
-    *rest: Any,
+    line: bytes, name: str, arbitration_id: int, is_extended: bool, length: int, *rest: Any
 ) -> CanMessage:
-    made = tuple(
-        CanSignal(*[*row[:11], dict(row[11]), *row[12:14], frozenset(row[14])]) for row in signals
-    )
-    return CanMessage(name, arbitration_id, is_extended, length, made, *rest)
+    return CanMessage(name, arbitration_id, is_extended, length, _StoredSignals(line), *rest)

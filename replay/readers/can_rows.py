@@ -132,12 +132,10 @@ def merged_by_time(streams: Sequence[Iterator[FrameRows]]) -> Iterator[FrameRows
     Holds what each group's next rows are, and no more. A group whose clock was set back comes in
     its own order all the same.
     """
-    held = [_next_by_time(stream) for stream in streams]
     if len(streams) == 1:
-        while (rows := held[0]) is not None:
-            yield rows
-            held[0] = _next_by_time(streams[0], rows)
+        yield from streams[0]
         return
+    held = [_next_by_time(stream) for stream in streams]
     while any(rows is not None for rows in held):
         horizon = min(int(rows.place[-1]) for rows in held if rows is not None)
         ready = []
@@ -157,8 +155,10 @@ def _next_by_time(stream: Iterator[FrameRows], before: FrameRows | None = None) 
     """The stream's next rows, placed by time, after those before; None at its end."""
     for rows in stream:
         if len(rows):
-            place = np.maximum.accumulate(rows.log_ns)
-            if before is not None:
+            place = rows.log_ns
+            if bool((place[1:] < place[:-1]).any()):
+                place = np.maximum.accumulate(place)
+            if before is not None and place[0] < before.place[-1]:
                 place = np.maximum(place, before.place[-1])
             return FrameRows(place, rows.bus, rows.log_ns, rows.frames)
     return None

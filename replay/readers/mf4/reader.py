@@ -415,12 +415,17 @@ class Mf4Log(Closing):
         """With places among the names of buses instead of channel numbers."""
         if not len(rows):
             return rows
-        if rows.bus.min() >= 0 and rows.bus.max() < BUSES_MAX:
+        low, high = int(rows.bus.min()), int(rows.bus.max())
+        if low == high:
+            channels, codes = rows.bus[:1], None
+        elif low >= 0 and high < BUSES_MAX:
             channels, codes = np.flatnonzero(np.bincount(rows.bus)), None
         else:
             channels, codes = np.unique(rows.bus, return_inverse=True)
         numbers = np.array([bus_number(str(c), self._buses) for c in channels.tolist()], np.int64)
-        if codes is None:
+        if low == high:
+            bus = np.full(len(rows), numbers[0])
+        elif codes is None:
             table = np.zeros(BUSES_MAX, np.int64)
             table[channels] = numbers
             bus = table[rows.bus]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import random
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,10 +18,13 @@ from hypothesis import strategies as st
 from crosscue.replay.can import database
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.dbc_text import read_dbc
+from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.can.layout import CanMessage
 from crosscue.replay.can.layout_cache import VARIABLE, cache_folder
 from crosscue.replay.can.sources import DatabaseText, read_text
+from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT
 from support.can_layouts import dbc_text, messages
 from support.data import shared
@@ -194,6 +200,38 @@ def test_a_second_start_parses_nothing(
 
     assert len(parsed) == len(files)
     assert all(_same(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_a_second_start_reads_the_signals_of_the_messages_it_meets_only(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = _file(tmp_path)
+    CanDatabase.load([path])
+    lines: list[bytes] = []
+    loads = json.loads
+
+    def counted(text: bytes) -> Any:
+        lines.append(text)
+        return loads(text)
+
+    monkeypatch.setattr("crosscue.replay.can.layout_cache.json.loads", counted)
+    decoder = BusDecoder(CanDatabase.load([path]), "can/1", Ledger("x"))
+    assert len(lines) == 1
+    one = CanFrames(
+        np.array([100], np.uint32),
+        np.zeros(1, np.bool_),
+        np.zeros(1, np.uint8),
+        np.array([64], np.uint8),
+        np.zeros((1, 64), np.uint8),
+        np.ones(1, np.bool_),
+    )
+
+    (rows,) = decoder(Block("can/1", np.zeros(1, np.int64), one))
+
+    assert isinstance(rows.rows, Table)
+    assert list(rows.rows.columns) == ["real"]
+    assert len(lines) == 2
+    assert b"real" in lines[1]
 
 
 def test_another_text_or_name_or_code_is_another_entry(
