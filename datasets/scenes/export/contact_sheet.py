@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from crosscue.datasets.scenes.drive import SceneSettings, world_of
 from crosscue.datasets.scenes.rendering.render import Renderer
+from crosscue.detectors.overlay import write_label
 
 BEFORE_M: Final = 25.0
 """Where the pictures are taken, before the intersection."""
@@ -37,18 +38,10 @@ def contact_sheet(
         motion = world.approach.motion
         t_s = float(np.argmax(motion.x_m >= -BEFORE_M)) / 100.0
         rgb = _middle(Renderer(world, settings.camera, settings.picture).picture(t_s).rgb)
-        small = np.asarray(cv2.resize(rgb, (width_px, high), interpolation=cv2.INTER_AREA))
-        for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            cv2.putText(
-                small,
-                settings.name,
-                (4, high - 5),
-                cv2.FONT_HERSHEY_SIMPLEX,
-                0.4,
-                colour,
-                thick,
-                cv2.LINE_AA,
-            )
+        small = np.asarray(
+            cv2.resize(rgb, (width_px, high), interpolation=cv2.INTER_AREA), np.uint8
+        )
+        write_label(small, settings.name, (4, high - 5), (255, 255, 255), 0.4)
         y, x = place // columns * high, place % columns * width_px
         sheet[y : y + high, x : x + width_px] = small
     return sheet

@@ -1,76 +1,18 @@
-"""Our own drawings of the signs a US driver meets, as pictures with transparency (RGBA)."""
+"""Our own drawings of the signs a US driver meets, as pictures with transparency (RGBA).
+
+They are read from files, as each version of OpenCV has letters of its own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from importlib.resources import files
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 Rgba = NDArray[np.uint8]
-Rgb = tuple[int, int, int]
-
-RED: Final[Rgb] = (178, 28, 38)
-WHITE: Final[Rgb] = (238, 238, 234)
-BLACK: Final[Rgb] = (22, 22, 22)
-OVER: Final = 4
-"""Drawn so many times larger, then averaged: smooth edges."""
-
-
-def stop(size_px: int = 256) -> Rgba:
-    """A red octagon with white border and the word STOP."""
-    n = size_px * OVER
-    canvas = _blank(n, n)
-    _fill(canvas, _octagon(n, 0.5), WHITE)
-    _fill(canvas, _octagon(n, 0.475), RED)
-    _word(canvas, "STOP", (0.5, 0.5), 0.34, 0.80, WHITE, 0.05)
-    return _shrunk(canvas)
-
-
-def do_not_enter(size_px: int = 256) -> Rgba:
-    """A white square, a red disc with a white bar, DO NOT above it and ENTER below."""
-    import cv2
-
-    n = size_px * OVER
-    canvas = _blank(n, n)
-    _fill(canvas, _box(n, 0.0, 0.0, 1.0, 1.0), WHITE)
-    cv2.circle(canvas, (n // 2, n // 2), round(0.46 * n), (*RED, 255), -1)
-    _fill(canvas, _box(n, 0.16, 0.435, 0.84, 0.565), WHITE)
-    _word(canvas, "DO NOT", (0.5, 0.30), 0.12, 0.52, WHITE, 0.022)
-    _word(canvas, "ENTER", (0.5, 0.70), 0.12, 0.46, WHITE, 0.022)
-    return _shrunk(canvas)
-
-
-def one_way_left(size_px: int = 256) -> Rgba:
-    """A black board with a white arrow to the left, ONE WAY in it."""
-    return _one_way(size_px, points_left=True)
-
-
-def one_way_right(size_px: int = 256) -> Rgba:
-    """A black board with a white arrow to the right, ONE WAY in it."""
-    return _one_way(size_px, points_left=False)
-
-
-def speed_limit(size_px: int = 256) -> Rgba:
-    """A white board: SPEED LIMIT 30."""
-    n = size_px * OVER
-    canvas = _blank(n, n * 5 // 4)
-    high = canvas.shape[0] / n
-    _fill(canvas, _box(n, 0.0, 0.0, 1.0, high), WHITE)
-    _word(canvas, "SPEED", (0.5, 0.18), 0.16, 0.74, BLACK, 0.035)
-    _word(canvas, "LIMIT", (0.5, 0.42), 0.16, 0.66, BLACK, 0.035)
-    _word(canvas, "30", (0.5, 0.85), 0.46, 0.66, BLACK, 0.08)
-    return _shrunk(canvas)
-
-
-SIGNS: Final[Mapping[str, Callable[[int], Rgba]]] = {
-    "stop_sign": stop,
-    "do_not_enter": do_not_enter,
-    "one_way_left": one_way_left,
-    "one_way_right": one_way_right,
-    "speed_limit": speed_limit,
-}
 
 WIDTH_M: Final[Mapping[str, float]] = {
     "stop_sign": 0.76,
@@ -81,86 +23,10 @@ WIDTH_M: Final[Mapping[str, float]] = {
 }
 
 
-def _one_way(size_px: int, *, points_left: bool) -> Rgba:
-    n = size_px * OVER
-    canvas = _blank(n, n // 3)
-    high = canvas.shape[0] / n
-    _fill(canvas, _box(n, 0.0, 0.0, 1.0, high), BLACK)
-    middle = high / 2
-    arrow = np.array(
-        [
-            [0.035, middle],
-            [0.215, 0.045],
-            [0.215, 0.10],
-            [0.965, 0.10],
-            [0.965, high - 0.10],
-            [0.215, high - 0.10],
-            [0.215, high - 0.045],
-        ]
-    )
-    text_at = 0.57
-    if not points_left:
-        arrow[:, 0], text_at = 1.0 - arrow[:, 0], 1.0 - text_at
-    _fill(canvas, arrow * n, WHITE)
-    _word(canvas, "ONE WAY", (text_at, middle), 0.095, 0.66, BLACK, 0.02)
-    return _shrunk(canvas)
-
-
-def _blank(wide: int, high: int) -> Rgba:
-    return np.zeros((high, wide, 4), np.uint8)
-
-
-def _octagon(n: int, radius: float) -> NDArray[np.float64]:
-    # A flat top: corners at odd multiples of 22.5 degrees; radius is half the height.
-    angle = np.deg2rad(22.5 + 45.0 * np.arange(8))
-    corners: NDArray[np.float64] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return n * (0.5 + radius / float(np.cos(np.deg2rad(22.5))) * corners)
-
-
-def _box(n: int, x0: float, y0: float, x1: float, y1: float) -> NDArray[np.float64]:
-    return n * np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-
-
-def _fill(canvas: Rgba, points: NDArray[np.float64], rgb: Rgb) -> None:
+def sign(name: str) -> Rgba:
+    """One of ``WIDTH_M``, 128 pixels wide."""
     import cv2
 
-    cv2.fillPoly(canvas, [np.rint(points).astype(np.int32)], (*rgb, 255))
-
-
-def _word(
-    canvas: Rgba,
-    text: str,
-    middle: tuple[float, float],
-    high: float,
-    wide: float,
-    rgb: Rgb,
-    stroke: float,
-) -> None:
-    """Letters of one stroke, stretched into a box: places and sizes in canvas widths."""
-    import cv2
-
-    n = canvas.shape[1]
-    letters: NDArray[np.uint8] = np.zeros((400, 200 * len(text) + 200), np.uint8)
-    cv2.putText(letters, text, (60, 290), cv2.FONT_HERSHEY_SIMPLEX, 8.0, 255, 1)
-    rows, columns = np.flatnonzero(letters.any(1)), np.flatnonzero(letters.any(0))
-    x = np.array([columns[0], columns[-1]], np.float64)
-    y = np.array([rows[0], rows[-1]], np.float64)
-    size_x, size_y = (wide - stroke) * n, (high - stroke) * n
-    left, top = middle[0] * n - size_x / 2, middle[1] * n - size_y / 2
-    points = np.argwhere(letters > 0)
-    px = np.rint(left + (points[:, 1] - x[0]) / (x[1] - x[0]) * size_x).astype(int)
-    py = np.rint(top + (points[:, 0] - y[0]) / (y[1] - y[0]) * size_y).astype(int)
-    ink: NDArray[np.uint8] = np.zeros(canvas.shape[:2], np.uint8)
-    ink[py.clip(0, ink.shape[0] - 1), px.clip(0, ink.shape[1] - 1)] = 255
-    across = max(3, round(stroke * n)) | 1
-    round_nib = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (across, across))
-    canvas[cv2.dilate(ink, round_nib) > 0] = (*rgb, 255)
-
-
-def _shrunk(canvas: Rgba) -> Rgba:
-    high, wide = canvas.shape[0] // OVER, canvas.shape[1] // OVER
-    blocks = canvas[: high * OVER, : wide * OVER].reshape(high, OVER, wide, OVER, 4)
-    alpha = blocks[..., 3:].astype(np.float64)
-    total = alpha.sum((1, 3))
-    colour = (blocks[..., :3] * alpha).sum((1, 3)) / np.maximum(total, 1.0)
-    return np.concatenate([colour, total / OVER**2], axis=2).round().astype(np.uint8)
+    path = files("crosscue.datasets.scenes.rendering").joinpath("drawings", f"{name}.png")
+    bgra = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    return np.ascontiguousarray(np.asarray(bgra, np.uint8)[..., [2, 1, 0, 3]])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from .signs import SIGNS, Rgba
+from .signs import WIDTH_M, Rgba, sign
 
 LEVELS: Final = 9
 FRONT_M: Final = (8.0, 6.0)
@@ -55,8 +55,8 @@ class Atlas:
 def make_atlas(rng: Generator) -> Atlas:
     """Every texture a scene uses."""
     atlas = Atlas()
-    for name, draw in SIGNS.items():
-        atlas.add(name, draw(128))
+    for name in WIDTH_M:
+        atlas.add(name, sign(name))
     for i in range(4):
         atlas.add(f"leaves_{i}", leaves(rng, needles=False))
     for i in range(8):
