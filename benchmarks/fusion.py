@@ -18,11 +18,11 @@ import gtsam
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from crosscue.detectors.cues.names import Cue
 from crosscue.fusion.approaches import Approaches, FrameEvidence, SignRange
 from crosscue.fusion.belief import Situation, begin, multiply, probabilities, source_speaker
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import RangeBelief, Reference, predict, update
+from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.fusion import Calibrated, Fusion, RangeFilter, Rates
 
 ROUNDS: Final = 7
@@ -30,7 +30,7 @@ FRAMES: Final = 6000
 PEER_FRAMES: Final = 600
 FRAME_NS: Final = 100_000_000
 BETWEEN_M: Final = 130
-ZERO: Final = {cue.value: 0 for cue in Cue if cue not in (Cue.LANES, Cue.VEHICLES)}
+ZERO: Final = {name: 0 for name, cue in CUES.items() if cue.observed_by != "mobileye"}
 SEEN: Final = ("road_left", "road_straight", "parked_left", "cross_traffic_right")
 
 

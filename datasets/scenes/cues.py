@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
 from crosscue.datasets.scenes.rendering.render import Picture
-from crosscue.datasets.truth.truth import CUES, Cue, CueTruth
+from crosscue.datasets.truth.truth import CueTruth
+from crosscue.replay.vehicle.cue_table import CUES
 
 from .layout import Layout
 from .world import Thing
@@ -27,50 +29,86 @@ class Presence(NamedTuple):
 ABSENT: Final = Presence(0, 0.0)
 
 
-def present(layout: Layout, picture: Picture) -> dict[Cue, Presence]:
+Shows = Callable[[Layout, Thing, float], bool]
+Simulated = Callable[[Layout, Picture], Presence]
+
+
+def present(layout: Layout, picture: Picture) -> dict[str, Presence]:
     """Every cue's presence in a picture."""
-    found = dict.fromkeys(CUES, ABSENT)
-    for seen in picture.seen:
-        cue = cue_of(layout, seen.thing, picture.t_s)
-        if cue is not None and seen.mask.sum() >= LEAST_PIXELS:
-            if cue == "vehicles_past" and seen.distance_m > PAST_REACH_M:
+    return {name: SIMULATED[name](layout, picture) for name in CUES if name in SIMULATED}
+
+
+def _things(shows: Shows, most_m: float = math.inf) -> Simulated:
+    """The things in a picture, large enough to be told, that show a cue."""
+
+    def simulated(layout: Layout, picture: Picture) -> Presence:
+        found = ABSENT
+        for seen in picture.seen:
+            if seen.distance_m > most_m or not shows(layout, seen.thing, picture.t_s):
                 continue
-            before = found[cue]
-            found[cue] = Presence(before.things + 1, max(before.visible, seen.visible))
-    x = picture.view.rear_axle[0]
-    roads: dict[Cue, bool] = {
-        "road_left": layout.has_left,
-        "road_straight": layout.has_ahead,
-        "road_right": layout.has_right,
-        "lanes_past": layout.has_ahead and x > layout.end_m - LANES_REACH_M,
-    }
-    for cue, is_there in roads.items():
-        found[cue] = Presence(1, 1.0) if is_there else ABSENT
-    return found
+            if seen.mask.sum() >= LEAST_PIXELS:
+                found = Presence(found.things + 1, max(found.visible, seen.visible))
+        return found
+
+    return simulated
 
 
-def cue_of(layout: Layout, thing: Thing, t_s: float) -> Cue | None:
-    """The cue that a thing is, if it can be seen."""
-    signs: Mapping[str, Cue] = {
-        "stop_sign": "stop_sign",
-        "traffic_light": "traffic_light",
-        "one_way_left": "one_way_left",
-        "one_way_right": "one_way_right",
-        "do_not_enter": "do_not_enter",
-    }
-    if thing.category in signs:
-        return signs[thing.category]
-    goes_left = thing.heading_rad > 0.0
-    if thing.role == "cross":
-        if thing.velocity == (0.0, 0.0):
-            return None
-        return "cross_traffic_left" if goes_left else "cross_traffic_right"
-    if thing.role == "parked_cross":
-        return "parked_left" if goes_left else "parked_right"
-    if thing.role in ("oncoming", "outgoing", "parked_past"):
-        x = thing.at[0] + thing.shift(t_s)[0]
-        return "vehicles_past" if x > layout.end_m else None
-    return None
+def _sign(category: str) -> Simulated:
+    return _things(lambda _, thing, __: thing.category == category)
+
+
+def _goes_left(thing: Thing) -> bool:
+    return thing.heading_rad > 0.0
+
+
+def _crossing(*, left: bool) -> Simulated:
+    def shows(_: Layout, thing: Thing, __: float) -> bool:
+        moves = thing.velocity != (0.0, 0.0)
+        return _is_car(thing, "cross") and moves and _goes_left(thing) == left
+
+    return _things(shows)
+
+
+def _parked(*, left: bool) -> Simulated:
+    return _things(
+        lambda _, thing, __: _is_car(thing, "parked_cross") and _goes_left(thing) == left
+    )
+
+
+def _is_past(layout: Layout, thing: Thing, t_s: float) -> bool:
+    x = thing.at[0] + thing.shift(t_s)[0]
+    return _is_car(thing, "oncoming", "outgoing", "parked_past") and x > layout.end_m
+
+
+def _is_car(thing: Thing, *roles: str) -> bool:
+    return thing.role in roles and thing.category == "car"
+
+
+def _always(is_there: Callable[[Layout, Picture], bool]) -> Simulated:
+    return lambda layout, picture: Presence(1, 1.0) if is_there(layout, picture) else ABSENT
+
+
+def _runs_on(layout: Layout, picture: Picture) -> bool:
+    return layout.has_ahead and picture.view.rear_axle[0] > layout.end_m - LANES_REACH_M
+
+
+SIMULATED: Final[dict[str, Simulated]] = {
+    "stop_sign": _sign("stop_sign"),
+    "traffic_light": _sign("traffic_light"),
+    "road_left": _always(lambda layout, _: layout.has_left),
+    "road_straight": _always(lambda layout, _: layout.has_ahead),
+    "road_right": _always(lambda layout, _: layout.has_right),
+    "cross_traffic_left": _crossing(left=True),
+    "cross_traffic_right": _crossing(left=False),
+    "parked_left": _parked(left=True),
+    "parked_right": _parked(left=False),
+    "lanes_past": _always(_runs_on),
+    "vehicles_past": _things(_is_past, PAST_REACH_M),
+    "one_way_left": _sign("one_way_left"),
+    "one_way_right": _sign("one_way_right"),
+    "do_not_enter": _sign("do_not_enter"),
+}
+"""A function for every cue; a cue of a plug-in without one is left out of simulated truth."""
 
 
 class CueRuns:
@@ -80,10 +118,10 @@ class CueRuns:
         """Begin an approach whose pictures come every ``period_ns``."""
         self._period_ns = period_ns
         self._approach = approach
-        self._open: dict[Cue, tuple[int, int, Presence]] = {}
+        self._open: dict[str, tuple[int, int, Presence]] = {}
         self._done: list[CueTruth] = []
 
-    def add(self, t_ns: int, found: Mapping[Cue, Presence]) -> None:
+    def add(self, t_ns: int, found: Mapping[str, Presence]) -> None:
         """Take in the picture of a time; visibility counts in tenths."""
         for cue, presence in found.items():
             rounded = Presence(presence.things, round(presence.visible, 1))
@@ -94,7 +132,7 @@ class CueRuns:
             self._close(cue)
             self._open[cue] = (t_ns, t_ns, rounded)
 
-    def _close(self, cue: Cue) -> None:
+    def _close(self, cue: str) -> None:
         run = self._open.pop(cue, None)
         if run is not None:
             start, last, presence = run

@@ -19,8 +19,9 @@ import numpy as np
 
 from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import SchemaError, UsageError
+from crosscue.replay.vehicle.cue_table import CUES
 
-from .truth import CUES, CueTruth
+from .truth import CueTruth
 
 OTHER_THINGS: Final = frozenset(
     {"person", "pedestrian", "bicycle", "car", "motorcycle", "bus", "train", "truck", "van",

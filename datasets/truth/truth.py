@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Protocol, cast, get_args
+from typing import Annotated, Any, Final, Literal, Protocol, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -18,6 +18,7 @@ from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.run_folder import strict_json, write_text
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
+from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.validation_errors import explain
 
 VERSION: Final = 1
@@ -43,27 +44,6 @@ class Origin(Section):
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
     longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0)]
     altitude_m: float
-
-
-Cue = Literal[
-    "stop_sign",
-    "traffic_light",
-    "road_left",
-    "road_straight",
-    "road_right",
-    "cross_traffic_left",
-    "cross_traffic_right",
-    "parked_left",
-    "parked_right",
-    "lanes_past",
-    "vehicles_past",
-    "one_way_left",
-    "one_way_right",
-    "do_not_enter",
-]
-CUES: Final[tuple[Cue, ...]] = get_args(Cue)
-"""Cross traffic and parked cars by where their noses point; the last but three and but four are
-lane lines and vehicles past the intersection."""
 
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
@@ -96,10 +76,14 @@ class Approach(Section):
     """From the start of the intersection to its end."""
 
 
+def _examples(schema: dict[str, Any]) -> None:
+    schema["examples"] = [*CUES]
+
+
 class CueTruth(Section):
     """Whether what a cue stands for is there, at one time or over a half-open span."""
 
-    cue: Annotated[Name, Field(json_schema_extra={"examples": [*CUES]})]
+    cue: Annotated[Name, Field(json_schema_extra=_examples)]
     """One of ``CUES``, or of the file's ``own_cues``."""
     present: bool
     t_ns: int | None = None

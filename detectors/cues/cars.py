@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
 from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.vehicle.vehicle import Cars
+from crosscue.replay.vehicle.cue_table import CueSpec
+from crosscue.replay.vehicle.vehicle import Cars, Vehicle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,3 +194,17 @@ def parked_cars(pairs: Pairs, settings: Cars) -> Sides:
     least = settings.still_change * pairs.width_px
     is_still = (np.abs(pairs.step_px) <= least).all(axis=1)
     return Sides(int(np.sum(is_still & (pairs.nose < 0))), int(np.sum(is_still & (pairs.nose > 0))))
+
+
+def count_crossing(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int:
+    """Cars that cross towards the side that the cue supports."""
+    return _of_side(cross_traffic(pairs, vehicle.cars), cue)
+
+
+def count_parked(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int:
+    """Parked cars that face the side that the cue supports."""
+    return _of_side(parked_cars(pairs, vehicle.cars), cue)
+
+
+def _of_side(sides: Sides, cue: CueSpec) -> int:
+    return sides.left if cue.supports == ("left",) else sides.right

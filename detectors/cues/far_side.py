@@ -7,18 +7,18 @@ it moves or stands; what stands far to the side is in a parking lot or driveway 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from crosscue.replay.columns import Floats
 from crosscue.replay.mobileye.geometry import evaluate
 from crosscue.replay.mobileye.samples import LANE_COLUMNS, OBSTACLE_COLUMNS
+from crosscue.replay.vehicle.cue_table import CueSpec
 from crosscue.replay.vehicle.mobileye_cues import Past
 
 from .mobileye_state import MobileyeState
-from .names import Cue
+from .rules import counts_of
 
 _LANE: Final = {name: i for i, name in enumerate(LANE_COLUMNS)}
 _OBSTACLE: Final = {name: i for i, name in enumerate(OBSTACLE_COLUMNS)}
@@ -30,7 +30,19 @@ def end_of(range_m: float, *, is_end: bool, past: Past) -> float:
     return range_m if is_end else range_m + past.intersection_length_m
 
 
-def past_counts(state: MobileyeState, end_m: float | None, past: Past) -> Mapping[Cue, int]:
+class Ahead(NamedTuple):
+    """What rules of Mobileye cues take.
+
+    Attributes:
+        state: What the device said last.
+        end_m: From the rear axle to the intersection's end.
+    """
+
+    state: MobileyeState
+    end_m: float
+
+
+def past_counts(state: MobileyeState, end_m: float | None, past: Past) -> dict[str, int]:
     """How many lane lines (0 or 1) and vehicles there are past the intersection.
 
     Args:
@@ -44,12 +56,19 @@ def past_counts(state: MobileyeState, end_m: float | None, past: Past) -> Mappin
     """
     if end_m is None or end_m <= 0.0:
         return {}
-    counts: dict[Cue, int] = {}
-    if state.lanes is not None:
-        counts[Cue.LANES] = int(lanes_past(state.lanes, end_m, past).any())
-    if state.obstacles is not None:
-        counts[Cue.VEHICLES] = int(vehicles_past(state.obstacles, end_m, past).sum())
-    return counts
+    return counts_of("mobileye", Ahead(state, end_m), past)
+
+
+def count_lanes_past(ahead: Ahead, past: Past, cue: CueSpec) -> int | None:
+    """1 where a lane line runs on past the intersection, else 0."""
+    lanes = ahead.state.lanes
+    return None if lanes is None else int(lanes_past(lanes, ahead.end_m, past).any())
+
+
+def count_vehicles_past(ahead: Ahead, past: Past, cue: CueSpec) -> int | None:
+    """Vehicles past the intersection."""
+    obstacles = ahead.state.obstacles
+    return None if obstacles is None else int(vehicles_past(obstacles, ahead.end_m, past).sum())
 
 
 def lanes_past(

@@ -5,21 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
 
 from crosscue.detectors.base import Detections, Found, RoadMask
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .cars import CarShapes, Tracker, car_shapes, cross_traffic, pair_cars, parked_cars
-from .names import Cue
+from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
+from .labelled import count_labels
 from .road import RoadShares, road_shares
-
-SIGN_CUES: Final[Mapping[str, Cue]] = {
-    "one way left": Cue.ONE_WAY_LEFT,
-    "one way right": Cue.ONE_WAY_RIGHT,
-    "do not enter": Cue.DO_NOT_ENTER,
-}
-"""From the labels that the sign detector gives."""
+from .rules import counts_of
 
 
 class Role(StrEnum):
@@ -103,54 +96,25 @@ class CuePass:
         """The cues of the next frame."""
         counts: dict[str, int] = {}
         if frame.objects:
-            counts |= self._objects(frame.objects) | self._cars(frame.objects)
+            counts |= counts_of("objects", frame.objects, self.vehicle)
+            pairs = self._pairs(frame.objects)
+            if pairs is not None:
+                counts |= counts_of("car pairs", pairs, self.vehicle)
         if frame.signs:
-            counts |= {
-                cue.value: _count(frame.signs, (label,), 0.0) for label, cue in SIGN_CUES.items()
-            }
+            counts |= counts_of("signs", frame.signs, self.vehicle)
         if frame.objects or frame.signs:
             boxes = (*frame.objects, *frame.signs)
             for name, own in self.vehicle.cues.own.items():
-                counts[name] = _count(boxes, own.labels, own.score)
+                counts[name] = count_labels(boxes, own.labels, own.score)
         road = frame.road
         if isinstance(road, RoadMask):
             road = road_shares(road, self.vehicle.regions)
         if road is not None:
-            sides = (Cue.ROAD_LEFT, Cue.ROAD_STRAIGHT, Cue.ROAD_RIGHT)
-            positive = road.positive(self.vehicle.cues.road_share)
-            counts |= {
-                cue.value: int(is_road) for cue, is_road in zip(sides, positive, strict=True)
-            }
+            counts |= counts_of("road", road, self.vehicle)
         return FrameCues(counts, road)
 
-    def _objects(self, boxes: Sequence[Detections]) -> dict[str, int]:
-        cues = self.vehicle.cues
-        return {
-            Cue.STOP_SIGN.value: _count(boxes, cues.stop_sign_labels, cues.stop_sign_score),
-            Cue.TRAFFIC_LIGHT.value: _count(
-                boxes, cues.traffic_light_labels, cues.traffic_light_score
-            ),
-        }
-
-    def _cars(self, boxes: Sequence[Detections]) -> dict[str, int]:
+    def _pairs(self, boxes: Sequence[Detections]) -> Pairs | None:
+        """Cars found again since the frame before; None in the first frame."""
         now = car_shapes(boxes, self.vehicle.cars)
         before, self._before = self._before, now
-        if before is None:
-            return {}
-        pairs = self.tracker(before, now, self.vehicle.cars)
-        moving = cross_traffic(pairs, self.vehicle.cars)
-        parked = parked_cars(pairs, self.vehicle.cars)
-        return {
-            Cue.CROSS_TRAFFIC_LEFT.value: moving.left,
-            Cue.CROSS_TRAFFIC_RIGHT.value: moving.right,
-            Cue.PARKED_LEFT.value: parked.left,
-            Cue.PARKED_RIGHT.value: parked.right,
-        }
-
-
-def _count(boxes: Sequence[Detections], labels: tuple[str, ...], score: float) -> int:
-    return sum(
-        label in labels and bool(s > score)
-        for found in boxes
-        for label, s in zip(found.labels, found.scores.tolist(), strict=True)
-    )
+        return None if before is None else self.tracker(before, now, self.vehicle.cars)

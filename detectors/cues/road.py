@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
-from crosscue.replay.vehicle.vehicle import Polygon, Regions
+from crosscue.replay.vehicle.cue_table import CueSpec
+from crosscue.replay.vehicle.vehicle import Polygon, Regions, Vehicle
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +31,12 @@ class RoadShares:
     def positive(self, least_share: float) -> tuple[bool, bool, bool]:
         """Left, straight and right road: more than ``least_share`` of the region (eq. 14)."""
         return self.left > least_share, self.straight > least_share, self.right > least_share
+
+
+def is_road(shares: RoadShares, vehicle: Vehicle, cue: CueSpec) -> int:
+    """1 where more than the vehicle file's share of the cue's region is road (eq. 14)."""
+    positive = shares.positive(vehicle.cues.road_share)
+    return int(positive[("left", "straight", "right").index(cue.supports[0])])
 
 
 @lru_cache(maxsize=64)

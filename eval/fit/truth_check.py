@@ -27,6 +27,7 @@ from crosscue.datasets.truth.tum import read_tum
 from crosscue.eval.scoring import truth as score_truth
 from crosscue.replay.errors import SchemaError, UsageError
 from crosscue.replay.files.run_folder import sha256_of, strict_json, write_text
+from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .log_images import log_pictures, log_span
@@ -259,6 +260,6 @@ def _truth(
         end_ns=int(pictures.t_ns[-1]) + 1,
         source=f"annotations in {source.name}",
         cues=cue_truths(annotations, placed, cues),
-        own_cues=tuple(sorted({cue for cue in cues.values() if cue} - {*truth_file.CUES})),
+        own_cues=tuple(sorted({cue for cue in cues.values() if cue} - {*CUES})),
         objects=OBJECTS,
     )

@@ -107,8 +107,7 @@ class StoredMobileye:
             if best is None:
                 return {}
             end_m = end_of(best.mean_m, is_end=reference is Reference.END, past=past)
-            found = past_counts(self.at(t_ns), end_m, past)
-            return {cue.value: count for cue, count in found.items()}
+            return past_counts(self.at(t_ns), end_m, past)
 
         return counts
 

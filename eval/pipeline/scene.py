@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.names import Cue
 from crosscue.fusion.approaches import Approaches, FrameEvidence, PastCues, SignRange, Step
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
+from crosscue.replay.vehicle.cue_table import STOP_SIGN, TRAFFIC_LIGHT
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .sign_ranges import sign_ranges
@@ -234,7 +234,7 @@ class _Scene:
             one.reference = str(step.ranges[0].reference)
 
 
-_MEASURES: Final = {Reference.START: Cue.STOP_SIGN.value, Reference.END: Cue.TRAFFIC_LIGHT.value}
+_MEASURES: Final = {Reference.START: STOP_SIGN.name, Reference.END: TRAFFIC_LIGHT.name}
 
 
 def _leaving_out(past: PastCues, without: frozenset[str]) -> PastCues:

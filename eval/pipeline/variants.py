@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from crosscue.replay.errors import RunError
 from crosscue.replay.files.run_folder import RunFolder
@@ -17,19 +16,6 @@ from .scene import estimate_scene, features_of, schemas
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
-    "stop_sign": ("stop_sign",),
-    "traffic_light": ("traffic_light",),
-    "road": ("road_left", "road_straight", "road_right"),
-    "cross_traffic": ("cross_traffic_left", "cross_traffic_right"),
-    "parked": ("parked_left", "parked_right"),
-    "lanes_past": ("lanes_past",),
-    "vehicles_past": ("vehicles_past",),
-    "one_way": ("one_way_left", "one_way_right"),
-    "do_not_enter": ("do_not_enter",),
-}
-"""The nine cues of Table 5 and the columns that each has; left out together."""
 
 
 def scene_tables(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Final
+
+from crosscue.replay.vehicle.cue_table import FEATURE_COLOURS
 
 from .columns import Colour
 
@@ -17,15 +18,9 @@ FAINT: Final[Colour] = (165, 165, 165)
 LANDMARK: Final[Colour] = (170, 70, 190)
 VEHICLE: Final[Colour] = (50, 130, 230)
 LANE: Final[Colour] = (140, 100, 220)
-FEATURES: Final[Mapping[str, Colour]] = {
-    "intersection": (160, 90, 220),
-    "left": (50, 130, 230),
-    "right": (230, 110, 30),
-    "straight": (50, 165, 80),
-}
 OTHERS: Final[tuple[Colour, ...]] = ((200, 120, 255), (250, 220, 90), (90, 220, 220))
 
 
 def of_feature(name: str, number: int) -> Colour:
     """A user's own features take the other colours in turn."""
-    return FEATURES.get(name, OTHERS[number % len(OTHERS)])
+    return FEATURE_COLOURS.get(name, OTHERS[number % len(OTHERS)])

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from crosscue.eval.pipeline.log_time import LABELS
 from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.vehicle import cue_table
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .colours import END, QUIET, START, TRUTH, of_feature
@@ -135,11 +136,13 @@ def log_cues(recording: rr.RecordingStream, time: DriveTime, scene: SceneRows) -
 
 
 def of_cue(cue: str) -> Colour:
-    """By the side that the cue speaks of."""
+    """As the table of cues says; of a user's own by the side in its name."""
+    if cue in cue_table.CUES:
+        return cue_table.CUES[cue].colour
     for number, side in enumerate(("left", "right", "straight")):
         if cue.endswith(side):
             return of_feature(side, number)
-    return of_feature("straight" if cue.endswith("past") else "intersection", 0)
+    return of_feature("intersection", 0)
 
 
 def _changes(t_ns: Int64s, is_found: NDArray[np.bool_], frames_ns: Int64s) -> tuple[Int64s, Int64s]:

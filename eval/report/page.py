@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.files.run_folder import strict_json, write_text
-from crosscue.replay.vehicle.fusion import CUES
+from crosscue.replay.vehicle.cue_table import CUES
 
 from .html import render_page
 from .pose_figures import draw_all
@@ -39,7 +39,6 @@ POSE_FIGURES: Final = {
 BELIEFS: Final = 12
 """Most approaches with a chart of their own."""
 YEAR_2000_NS: Final = 946_684_800_000_000_000
-TUNED: Final = ("one_way_left", "one_way_right", "do_not_enter")
 """Their published precision is what the source tuned them to reach."""
 
 
@@ -153,7 +152,8 @@ def _name(one: RunScored) -> str:
 def _cue(name: str, score: Mapping[str, Any]) -> dict[str, Any]:
     """A cue's scores with what the source published beside them."""
     published = CUES.get(name)
-    bound = "at least " if name in TUNED else ""
+    is_bound = published is not None and published.precision_is_lower_bound
+    bound = "at least " if is_bound else ""
     leading = score["readings"][score["reading"]]
     return {
         **score,

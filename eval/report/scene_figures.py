@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from crosscue.eval.scoring.approaches import THRESHOLD, ApproachResult, Curve
 from crosscue.eval.scoring.belief import BeliefScore
-from crosscue.eval.scoring.cues import READING, CueJudged
+from crosscue.eval.scoring.cues import CueJudged
 from crosscue.eval.scoring.ranges import RangeJudged, RangeScore
 from crosscue.eval.scoring.run_tables import NONE
 from crosscue.replay.columns import Floats
+from crosscue.replay.vehicle.cue_table import CUES
 
 from .svg_plot import Drawing, Panel
 
@@ -160,7 +161,7 @@ def _lane(
 def is_wrong(cue: CueJudged) -> NDArray[np.bool_]:
     """Rows in which the cue was found and, in the reading that leads its score, is not so."""
     readings = [cue.is_object, cue.is_feature]
-    if READING.get(cue.cue) == "feature":
+    if cue.cue in CUES and CUES[cue.cue].scored_as == "feature":
         readings.reverse()
     leading = next((one for one in readings if (one != NONE).any()), readings[0])
     return np.asarray((cue.count > 0) & (leading == 0))

@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.detectors.base import Detections, View
-from crosscue.detectors.cues.frame import SIGN_CUES, FrameCues
-from crosscue.detectors.cues.names import Cue
+from crosscue.detectors.cues.frame import FrameCues
+from crosscue.detectors.cues.labelled import labels_of
 from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.overlay import draw
 from crosscue.detectors.runner import FrameResult
@@ -20,6 +20,7 @@ from crosscue.eval.scoring.cues import CueJudged
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.files.run_folder import RunFolder
+from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
 
 from .scene_figures import is_wrong
@@ -110,15 +111,7 @@ def _mistakes(cue: CueJudged) -> list[np.typing.NDArray[np.intp]]:
 
 
 def _labels(cue: str, vehicle: Vehicle) -> tuple[str, ...]:
-    """Labels of the things that stand behind a cue; none for road and Mobileye."""
-    known: Mapping[str, tuple[str, ...]] = {
-        Cue.STOP_SIGN.value: vehicle.cues.stop_sign_labels,
-        Cue.TRAFFIC_LIGHT.value: vehicle.cues.traffic_light_labels,
-        **{sign.value: (label,) for label, sign in SIGN_CUES.items()},
-    }
-    if cue.startswith(("parked", "cross_traffic")):
-        return vehicle.cars.labels
-    return known.get(cue, ())
+    return labels_of(CUES[cue], vehicle) if cue in CUES else ()
 
 
 def _confidence(rows: Sequence[Mapping[str, Any]], labels: tuple[str, ...]) -> float | None:

@@ -8,8 +8,9 @@ A positive is right in one of two readings, and both are given:
   intersection); for one-way and do-not-enter signs that the way they rule out is closed.
 
 The source compares detections of signs, lights and cars with the things themselves, and what roads,
-lanes and vehicles past the intersection say with the direction of travel (chapter 3). ``READING``
-follows it; where the truth knows only the other reading, that one leads, and the result says so.
+lanes and vehicles past the intersection say with the direction of travel (chapter 3). The table of
+cues says which; where the truth knows only the other reading, that one leads, and the result says
+so.
 """
 
 from __future__ import annotations
@@ -17,51 +18,24 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Final, Literal, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.datasets.truth.truth import CUES, Approach
+from crosscue.datasets.truth.truth import Approach
 from crosscue.eval.pipeline.log_time import AMBIGUOUS
 from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.vehicle.cue_table import CUES, Scoring
 
 from .intervals import Share, share
 from .pooling import cluster_numbers, first_reasons, summed
 from .run_tables import NONE, CueRows, RunTables
 from .truth import DriveTruth, cue_at
 
-Reading = Literal["object", "feature"]
+Reading = Scoring
 
 
-class Claim(NamedTuple):
-    """What a cue says of the intersection ahead."""
-
-    feature: str
-    is_there: bool = True
-
-
-CLAIMS: Final[Mapping[str, Claim]] = {
-    "stop_sign": Claim("intersection"),
-    "traffic_light": Claim("intersection"),
-    "road_left": Claim("left"),
-    "road_straight": Claim("straight"),
-    "road_right": Claim("right"),
-    "cross_traffic_left": Claim("left"),
-    "cross_traffic_right": Claim("right"),
-    "parked_left": Claim("left"),
-    "parked_right": Claim("right"),
-    "lanes_past": Claim("straight"),
-    "vehicles_past": Claim("straight"),
-    "one_way_left": Claim("right", is_there=False),
-    "one_way_right": Claim("left", is_there=False),
-    "do_not_enter": Claim("straight", is_there=False),
-}
-READING: Final[Mapping[str, Reading]] = {
-    "lanes_past": "feature",
-    "vehicles_past": "feature",
-}
-"""The source's definition where it is not ``object``."""
 BINS_M: Final = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
 SEEN: Final = 0.5
 """A thing of which less than this share can be seen does not count in ``recall_seen``."""
@@ -246,15 +220,15 @@ def _largest(rows: CueRows, cue: str) -> tuple[Int64s, Int64s]:
 def _feature_at(cue: str, t_ns: Int64s, truth: DriveTruth) -> NDArray[np.int8]:
     """Whether what the cue stands for is true, at each time; ``NONE`` unknown."""
     found = np.full(len(t_ns), NONE, np.int8)
-    claim = CLAIMS.get(cue)
-    if claim is None or not truth.truth.approaches:
+    if cue not in CUES or not truth.truth.approaches:
         return found
     # Where the truth speaks and no intersection is ahead, a cue of one stands for nothing.
     found[truth.is_told(t_ns)] = 0
     found[truth.is_crossing(t_ns)] = NONE
     at = truth.approach_at(t_ns)
+    feature, is_there = CUES[cue].claim
     for one in truth.truth.approaches:
-        found[at == one.id] = int(has_feature(one, claim.feature) == claim.is_there)
+        found[at == one.id] = int(has_feature(one, feature) == is_there)
     return found
 
 
@@ -342,7 +316,7 @@ def _score(cue: str, rows: Sequence[CueJudged], bins_m: Sequence[float], seed: i
     readings: dict[Reading, Judgement] = {
         reading: _judgement(pooled, reading, bins_m, seed) for reading in ("object", "feature")
     }
-    wanted = READING.get(cue, "object")
+    wanted: Reading = CUES[cue].scored_as if cue in CUES else "object"
     other: Reading = "feature" if wanted == "object" else "object"
     leading = wanted if readings[wanted].scored or not readings[other].scored else other
     return CueScore(

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 
 from crosscue.eval.pipeline.drive_time import timeline_in
-from crosscue.eval.pipeline.variants import GROUPS, scene_tables
+from crosscue.eval.pipeline.variants import scene_tables
 from crosscue.eval.scoring.approaches import ApproachResult
 from crosscue.eval.scoring.belief import BeliefDifference, compare_belief
 from crosscue.eval.scoring.drives import (
@@ -31,6 +31,7 @@ from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.run_tables import RunTables, in_log_time
 from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.replay.files.run_folder import RunFolder
+from crosscue.replay.vehicle import cue_table
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 SHOWN: Final = ("approaches", "belief", "range")
@@ -114,16 +115,18 @@ def estimate_of(run: RunFolder, vehicle: Vehicle | None = None) -> EstimateWitho
 
 def attribute(
     drives: Sequence[Drive],
-    groups: Mapping[str, Sequence[str]] = GROUPS,
+    groups: Mapping[str, Sequence[str]] | None = None,
     settings: ScoreSettings = DEFAULTS,
 ) -> dict[str, Attribution]:
     """Leave out each group of cues in turn, in all drives.
 
     Args:
         drives: Judged with the same settings.
-        groups: From name to the cues that are left out together.
+        groups: From name to the cues that are left out together; the rows of Table 5 if None.
         settings: Of the scores.
     """
+    if groups is None:
+        groups = {name: [cue.name for cue in some] for name, some in cue_table.groups().items()}
     scores = score([one.judged for one in drives], settings)
     return {name: _without(drives, scores, tuple(cues), settings) for name, cues in groups.items()}
 

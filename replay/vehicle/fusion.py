@@ -18,6 +18,7 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
+from .cue_table import CUES
 from .section import NotNegative, Positive, Section
 
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
@@ -89,31 +90,19 @@ FEATURES: Final[Mapping[str, FeatureEntry]] = {
 }
 
 
-def _road(side: str, *, speaks_first: bool) -> CueEntry:
-    return CueEntry(precision=0.77, supports=(side,), speaks_first=speaks_first, dissents=True)
-
-
-def _cars(precision: float, way: str) -> CueEntry:
-    return CueEntry(precision=precision, supports=(way,), counted=True, dissents=True)
-
-
-CUES: Final[Mapping[str, CueEntry]] = {
-    "stop_sign": CueEntry(precision=0.97, supports=("intersection",), speaks_first=True),
-    "traffic_light": CueEntry(precision=0.95, supports=("intersection",), speaks_first=True),
-    "road_left": _road("left", speaks_first=True),
-    "road_straight": _road("straight", speaks_first=False),
-    "road_right": _road("right", speaks_first=True),
-    "cross_traffic_left": _cars(0.86, "left"),
-    "cross_traffic_right": _cars(0.86, "right"),
-    "parked_left": _cars(0.83, "left"),
-    "parked_right": _cars(0.83, "right"),
-    "lanes_past": CueEntry(precision=0.96, supports=("straight",), dissents=True),
-    "vehicles_past": _cars(0.96, "straight"),
-    "one_way_left": CueEntry(precision=0.95, supports=("left",), excludes=("right",)),
-    "one_way_right": CueEntry(precision=0.95, supports=("right",), excludes=("left",)),
-    "do_not_enter": CueEntry(precision=0.95, excludes=("straight",)),
-}
-"""Table 5 and our reading of Fig. 27; signs by the precision to which they are tuned."""
+def usual_cues() -> dict[str, CueEntry]:
+    """Every cue of the table as the source has it (Table 5 and our reading of Fig. 27)."""
+    return {
+        name: CueEntry(
+            precision=cue.precision,
+            supports=cue.supports,
+            excludes=cue.excludes,
+            speaks_first=cue.can_start,
+            counted=cue.per_detection,
+            dissents=cue.absence_counts,
+        )
+        for name, cue in CUES.items()
+    }
 
 
 class Fade(Section):
@@ -204,7 +193,7 @@ class Fusion(Section):
                         f"{name}: no such cue{_near(name, CUES)}; a new one needs precision and "
                         f"supports or excludes; there are: {', '.join(CUES)}"
                     )
-        return _merged(CUES, given)
+        return _merged(usual_cues(), given)
 
     @field_validator("features")
     @classmethod

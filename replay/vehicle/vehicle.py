@@ -19,7 +19,8 @@ from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import toml_tree
 from crosscue.replay.limits import MIB
 
-from .fusion import CUES, Fusion, Name, RangeFilter
+from .cue_table import CUES
+from .fusion import Fusion, Name, RangeFilter
 from .mobileye_cues import Past
 from .section import Finite, NotNegative, Positive, Section
 from .time import Time

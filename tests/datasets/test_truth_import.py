@@ -11,9 +11,10 @@ import pytest
 from crosscue.datasets.truth.annotations import LogPictures, place
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.cvat import read_cvat
-from crosscue.datasets.truth.truth import CUES, Truth, json_schema, load
+from crosscue.datasets.truth.truth import Truth, json_schema, load
 from crosscue.eval import cli
 from crosscue.replay.errors import SchemaError
+from crosscue.replay.vehicle.cue_table import CUES
 
 WIDE, HIGH = 64, 36
 START_NS = 1_700_000_000_000_000_000
@@ -436,4 +437,4 @@ def test_the_schema_is_printed_and_names_every_cue(capsys: pytest.CaptureFixture
     schema = json.loads(capsys.readouterr().out)
 
     assert schema == json_schema() == Truth.model_json_schema()
-    assert tuple(schema["$defs"]["CueTruth"]["properties"]["cue"]["examples"]) == CUES
+    assert tuple(schema["$defs"]["CueTruth"]["properties"]["cue"]["examples"]) == tuple(CUES)

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.detectors.cues.names import Cue
 from crosscue.fusion.approaches import Approaches, FrameEvidence, SignRange, Step
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
+from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.fusion import Calibrated, Fusion, RangeFilter, Rates
 from support.fusion import SECOND_NS, other_side
 
@@ -40,7 +40,7 @@ evidence = st.builds(
     st.none() | number,
     number,
     st.lists(signs, max_size=3).map(tuple),
-    st.dictionaries(st.sampled_from([cue.value for cue in Cue]), st.integers(0, 4)),
+    st.dictionaries(st.sampled_from([*CUES]), st.integers(0, 4)),
     is_new_picture=st.booleans(),
     turned_rad=st.none() | number,
 )

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.detectors.cues.names import Cue
 from crosscue.fusion.belief import Belief, begin, establish, multiply, probabilities, source_speaker
 from crosscue.fusion.factor_graph import (
     CueNode,
@@ -22,7 +21,8 @@ from crosscue.fusion.factor_graph import (
     log_odds,
     probability,
 )
-from crosscue.replay.vehicle.fusion import CUES, Fusion
+from crosscue.replay.vehicle.cue_table import CUES
+from crosscue.replay.vehicle.fusion import Fusion, usual_cues
 from support.fusion import graphs, graphs_heard, other_side, situation
 
 FEW = settings(max_examples=60, deadline=None)
@@ -167,9 +167,7 @@ def test_certainty_has_no_log_odds(bad: float) -> None:
 
 @FEW
 @given(
-    st.lists(
-        st.dictionaries(st.sampled_from([cue.value for cue in Cue]), st.integers(0, 3)), max_size=6
-    ),
+    st.lists(st.dictionaries(st.sampled_from([*CUES]), st.integers(0, 3)), max_size=6),
     st.booleans(),
 )
 def test_in_the_mirror_left_and_right_change_places(
@@ -211,7 +209,7 @@ def test_an_exclusive_edge_sends_the_reverse() -> None:
 
 
 def test_near_by_absent_direct_cues_of_directions_dissent_and_signs_do_not() -> None:
-    absent = heard(USUAL, [{cue.value: 0 for cue in Cue}], near=True)
+    absent = heard(USUAL, [dict.fromkeys(CUES, 0)], near=True)
 
     three = 0.49**3 / (0.49**3 + 0.51**3)
     assert absent == pytest.approx(
@@ -222,9 +220,7 @@ def test_near_by_absent_direct_cues_of_directions_dissent_and_signs_do_not() -> 
 def test_before_presence_is_established_only_four_cues_speak() -> None:
     speaker = source_speaker(USUAL, DISSENT)
 
-    speaking = {
-        cue.value for cue in Cue if any(speaker(situation({cue.value: 1}, established=False)))
-    }
+    speaking = {cue for cue in CUES if any(speaker(situation({cue: 1}, established=False)))}
 
     assert speaking == {"traffic_light", "stop_sign", "road_left", "road_right"}
 
@@ -254,7 +250,7 @@ def test_the_usual_graph_falls_into_three_parts_as_the_source_says() -> None:
 
 
 def test_the_usual_graph_has_every_cue_that_detectors_give() -> None:
-    assert set(CUES) == {cue.value for cue in Cue}
+    assert [*usual_cues()] == [*CUES]
 
 
 def test_a_cue_left_out_is_gone_and_the_rest_stays() -> None:

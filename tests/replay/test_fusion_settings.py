@@ -7,7 +7,7 @@ import pytest
 from crosscue.fusion.approaches import Approaches, FrameEvidence
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.replay.errors import VehicleError
-from crosscue.replay.vehicle.fusion import CUES, Fusion
+from crosscue.replay.vehicle.fusion import Fusion, usual_cues
 from crosscue.replay.vehicle.vehicle import parse
 
 
@@ -17,14 +17,16 @@ def fusion_of(text: str) -> Fusion:
 
 def test_a_file_that_says_nothing_has_the_published_table() -> None:
     assert fusion_of("") == Fusion()
-    assert fusion_of("").cues == dict(CUES)
+    assert fusion_of("").cues == usual_cues()
 
 
 def test_one_number_changes_and_the_rest_of_the_entry_stays() -> None:
     fusion = fusion_of("[fusion.cues]\nstop_sign = { precision = 0.99 }")
 
-    assert fusion.cues["stop_sign"] == CUES["stop_sign"].model_copy(update={"precision": 0.99})
-    assert fusion.cues["traffic_light"] == CUES["traffic_light"]
+    assert fusion.cues["stop_sign"] == usual_cues()["stop_sign"].model_copy(
+        update={"precision": 0.99}
+    )
+    assert fusion.cues["traffic_light"] == usual_cues()["traffic_light"]
 
 
 def test_a_cue_and_a_feature_of_ones_own_are_a_line_each() -> None:
@@ -91,7 +93,9 @@ def test_what_cannot_be_meant_is_refused_with_the_choices(text: str, match: str)
 
 def test_no_cue_that_speaks_first_is_refused() -> None:
     silent = "\n".join(
-        f"{name} = {{ speaks_first = false }}" for name in CUES if CUES[name].speaks_first
+        f"{name} = {{ speaks_first = false }}"
+        for name in usual_cues()
+        if usual_cues()[name].speaks_first
     )
     with pytest.raises(VehicleError, match="none speaks first"):
         fusion_of(f"[fusion.cues]\n{silent}")

@@ -9,16 +9,18 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from crosscue.detectors.cues.names import Cue
 from crosscue.fusion.annotated_approach import AnnotatedApproach
 from crosscue.fusion.approaches import FrameEvidence, SignRange
 from crosscue.fusion.belief import Situation
 from crosscue.fusion.factor_graph import CueNode, Edge, FactorGraph, Feature
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.columns import Floats
+from crosscue.replay.vehicle.cue_table import CUES
 
 SECOND_NS = 1_000_000_000
-NONE_SEEN: Mapping[str, int] = {cue.value: 0 for cue in Cue if cue not in (Cue.LANES, Cue.VEHICLES)}
+NONE_SEEN: Mapping[str, int] = {
+    name: 0 for name, cue in CUES.items() if cue.observed_by != "mobileye"
+}
 
 
 @st.composite
@@ -100,7 +102,7 @@ def drive(
         counts = dict(NONE_SEEN)
         for cue, (within_m, many) in seen.items():
             counts[cue] = many if 0.5 < ahead_m <= within_m else 0
-        signs = (sign(ahead_m),) if counts[Cue.STOP_SIGN] else ()
+        signs = (sign(ahead_m),) if counts["stop_sign"] else ()
         yield FrameEvidence(begin_ns + i * SECOND_NS // 10, step_m, 1e-4, signs, counts)
 
 

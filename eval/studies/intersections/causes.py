@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring.approaches import NEAR_M, ApproachResult
-from crosscue.eval.scoring.cues import CLAIMS, SEEN, CueJudged
+from crosscue.eval.scoring.cues import SEEN, CueJudged
 from crosscue.eval.scoring.drives import DriveJudged
 from crosscue.eval.scoring.intervals import Mean, mean
+from crosscue.replay.vehicle.cue_table import CUES
 
 Failing = Literal["missing", "late", "invented"]
 Cause = Literal[
@@ -218,8 +219,8 @@ def _speaking(
 ) -> tuple[CueEvidence, ...]:
     return tuple(
         cues[name]
-        for name, claim in CLAIMS.items()
-        if name in cues and claim.feature == feature and claim.is_there == is_there
+        for name, cue in CUES.items()
+        if name in cues and cue.claim == (feature, is_there)
     )
 
 

@@ -4,37 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any, Final
 
 from crosscue.eval.scoring.approaches import ApproachResult
 from crosscue.eval.scoring.cues import CueScore
 from crosscue.eval.scoring.intervals import Mean, Share, wilson
+from crosscue.replay.vehicle.cue_table import groups
 
 from .study import StudyScores
-
-
-@dataclass(frozen=True, slots=True)
-class PublishedCue:
-    """A row of Table 5: its precision, and the columns here that it stands for."""
-
-    name: str
-    precision: float
-    columns: tuple[str, ...]
-    is_bound: bool = False
-
-
-PUBLISHED_CUES: Final = (
-    PublishedCue("stop sign", 0.97, ("stop_sign",)),
-    PublishedCue("traffic light", 0.95, ("traffic_light",)),
-    PublishedCue("road", 0.77, ("road_left", "road_straight", "road_right")),
-    PublishedCue("cross traffic", 0.86, ("cross_traffic_left", "cross_traffic_right")),
-    PublishedCue("parked cars", 0.83, ("parked_left", "parked_right")),
-    PublishedCue("lane lines past", 0.96, ("lanes_past",)),
-    PublishedCue("vehicles past", 0.96, ("vehicles_past",)),
-    PublishedCue("one-way sign", 0.95, ("one_way_left", "one_way_right"), is_bound=True),
-    PublishedCue("do-not-enter sign", 0.95, ("do_not_enter",), is_bound=True),
-)
 
 PUBLISHED_DETECTED_M: Final = 34.4
 PUBLISHED_FULL_M: Final = 16.2
@@ -54,8 +32,9 @@ def cue_rows(cues: Mapping[str, CueScore]) -> list[Row]:
     road goes on); ``feature_precision`` whether what the cue says of the intersection is so.
     """
     rows: list[Row] = []
-    for published in PUBLISHED_CUES:
-        some = [cues[name] for name in published.columns if name in cues]
+    for group in groups().values():
+        published = group[0]
+        some = [cues[cue.name] for cue in group if cue.name in cues]
         right = sum(one.precision.right for one in some)
         of = sum(one.precision.of for one in some)
         # Clusters are resampled column by column, so a pooled interval over them is the widest.
@@ -66,9 +45,9 @@ def cue_rows(cues: Mapping[str, CueScore]) -> list[Row]:
         ways = [one.readings["feature"].precision for one in some if "feature" in one.readings]
         rows.append(
             {
-                "cue": published.name,
+                "cue": published.title,
                 "published": published.precision,
-                "published_is_bound": published.is_bound,
+                "published_is_bound": published.precision_is_lower_bound,
                 "precision": right / of if of else math.nan,
                 "wilson_low": low,
                 "wilson_high": high,

@@ -16,7 +16,6 @@ from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.truth.truth import load as load_truth
 from crosscue.detectors.cues.far_side import end_of, past_counts, vehicles_past
 from crosscue.detectors.cues.mobileye_state import MobileyeState, state_at
-from crosscue.detectors.cues.names import Cue
 from crosscue.replay.columns import Block, Floats, Topic
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
@@ -66,7 +65,7 @@ def state(
     ],
 )
 def test_a_vehicle_counts_past_the_end_and_on_the_road(row: list[float], count: int) -> None:
-    assert past_counts(state([row]), 20.0, PAST) == {Cue.VEHICLES: count}
+    assert past_counts(state([row]), 20.0, PAST) == {"vehicles_past": count}
 
 
 @pytest.mark.parametrize(
@@ -80,7 +79,7 @@ def test_a_vehicle_counts_past_the_end_and_on_the_road(row: list[float], count: 
     ],
 )
 def test_a_line_counts_when_it_reaches_past_the_end(row: list[float], count: int) -> None:
-    assert past_counts(state(lanes=[row]), 20.0, PAST) == {Cue.LANES: count}
+    assert past_counts(state(lanes=[row]), 20.0, PAST) == {"lanes_past": count}
 
 
 @pytest.mark.parametrize("end_m", [None, 0.0, -3.0])
@@ -90,7 +89,7 @@ def test_without_a_range_nothing_is_said(end_m: float | None) -> None:
 
 def test_a_device_that_says_nothing_is_neutral_and_one_that_sees_nothing_is_not() -> None:
     assert past_counts(state(), 20.0, PAST) == {}
-    assert past_counts(state([], []), 20.0, PAST) == {Cue.VEHICLES: 0, Cue.LANES: 0}
+    assert past_counts(state([], []), 20.0, PAST) == {"vehicles_past": 0, "lanes_past": 0}
 
 
 def test_a_start_stands_for_an_end_by_the_intersections_length() -> None:
@@ -258,7 +257,7 @@ def test_on_a_simulated_drive_lines_and_vehicles_past_it_are_counted(tmp_path: P
     ranges = np.loadtxt(tmp_path / "ranges.csv", delimiter=",", skiprows=1)
     truth = load_truth(files.truth)
     there = [c for c in truth.cues if c.cue == "road_straight" and c.present]
-    given: dict[Cue, list[int]] = {Cue.LANES: [], Cue.VEHICLES: []}
+    given: dict[str, list[int]] = {"lanes_past": [], "vehicles_past": []}
     seen = [window.samples for window in windows_of(tmp_path, load(files.vehicle))]
     obstacles, lanes = (
         Samples(
@@ -277,4 +276,4 @@ def test_on_a_simulated_drive_lines_and_vehicles_past_it_are_counted(tmp_path: P
     for counts in given.values():
         assert len(counts) > 40
         assert max(counts) > 0
-    assert max(given[Cue.LANES]) == 1
+    assert max(given["lanes_past"]) == 1

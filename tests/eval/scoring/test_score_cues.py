@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.eval.scoring.cues import CLAIMS, judge_cues, score_cues
+from crosscue.eval.scoring.cues import judge_cues, score_cues
 from crosscue.eval.scoring.intervals import mean, resampled, share, wilson
+from crosscue.replay.vehicle.cue_table import CUES
 from support.scoring import (
     ENTER,
     approach,
@@ -94,7 +95,7 @@ def test_frames_sum_up_to_scored_and_reasons_in_every_reading() -> None:
     found = {"stop_sign": {3: 1, 7: 0, 45: 1, 80: 2}, "do_not_enter": {0: 1}}
     scores = score_cues(judge_cues(tables(found, frames=50), good_truth()))
 
-    assert len(scores) == len(CLAIMS)
+    assert len(scores) == len(CUES)
     for score in scores.values():
         for reading in score.readings.values():
             assert reading.scored + sum(reading.left_out.values()) == reading.frames == 51

@@ -11,9 +11,9 @@ import pytest
 from crosscue.eval.batch.jobs import in_turn
 from crosscue.eval.cli import run
 from crosscue.eval.commands.study import intersections as study_intersections
-from crosscue.eval.pipeline.variants import GROUPS
 from crosscue.eval.studies.intersections import study as intersection_study
-from crosscue.eval.studies.intersections.tables import PUBLISHED_CUES, cue_rows
+from crosscue.eval.studies.intersections.tables import cue_rows
+from crosscue.replay.vehicle.cue_table import groups
 from crosscue.replay.vehicle.vehicle import DetectorSection, RangeCurve, Ranges, Vehicle
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
 
@@ -62,7 +62,7 @@ def test_the_tables_say_that_they_are_simulated_and_stand_beside_the_published(s
     assert tables["done"] == tables["wanted"] == 2
     assert tables["published"] == {"detected_m": 34.4, "full_m": 16.2}
     assert [row["intersection"] for row in tables["intersections"]] == ["A", "E"]
-    assert {row["cue"] for row in tables["attribution"]} == set(GROUPS)
+    assert {row["cue"] for row in tables["attribution"]} == set(groups())
     page = (study / "study.html").read_text()
     assert "simulated" in page
     assert "http" not in page.replace("http-equiv", "")
@@ -97,7 +97,7 @@ def test_a_second_start_does_nothing_again(study: Path, monkeypatch: pytest.Monk
 
 
 def test_every_published_cue_has_a_row_even_without_a_single_detection() -> None:
-    assert [row["positives"] for row in cue_rows({})] == [0] * len(PUBLISHED_CUES)
+    assert [row["positives"] for row in cue_rows({})] == [0] * len(groups())
 
 
 @pytest.mark.parametrize(

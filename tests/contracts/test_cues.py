@@ -1,0 +1,107 @@
+"""Every cue is one row of the table and one rule; everything else iterates over the table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.scenes.cues import SIMULATED
+from crosscue.datasets.truth.truth import json_schema
+from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.frame import CuePass, Seen
+from crosscue.detectors.cues.rules import rule_of
+from crosscue.eval.recording.series import of_cue
+from crosscue.eval.report.page import write_report
+from crosscue.eval.report.summary import summary
+from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of
+from crosscue.eval.studies.intersections.tables import cue_rows
+from crosscue.replay.vehicle.cue_table import CUES, CueSpec, groups
+from crosscue.replay.vehicle.fusion import Fusion
+from crosscue.replay.vehicle.vehicle import Vehicle
+from support.scoring import (
+    cue_table,
+    frame_table,
+    good_truth,
+    run_folder,
+    span,
+    truth,
+    truth_folder,
+)
+
+DUMMY = CueSpec(
+    name="zebra",
+    group="zebra",
+    title="zebra crossing",
+    observed_by="objects",
+    rule=f"{__name__}:count_zebras",
+    precision=0.61,
+    precision_is_lower_bound=True,
+    supports=("straight",),
+    scored_as="feature",
+    label="zebra",
+    colour=(1, 2, 3),
+)
+
+
+def count_zebras(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
+    """The one function of the dummy cue: twice as many as there are."""
+    assert vehicle.version == 1
+    return 2 * sum(found.labels.count(cue.label or "") for found in boxes)
+
+
+@pytest.mark.parametrize("cue", CUES.values(), ids=lambda cue: str(cue.name))
+def test_every_cue_has_a_rule_a_simulator_and_a_claim(cue: CueSpec) -> None:
+    assert CUES[cue.name] is cue
+    assert callable(rule_of(cue.rule))
+    assert callable(SIMULATED[cue.name])
+    assert cue.claim[0] in Fusion().features
+    assert 0.5 < cue.precision < 1.0
+
+
+def test_cues_of_a_group_share_its_row_of_table_5() -> None:
+    for group in groups().values():
+        assert len({(cue.title, cue.precision, cue.scored_as) for cue in group}) == 1
+
+
+def test_no_simulator_function_is_left_of_a_cue_that_is_gone() -> None:
+    assert [*SIMULATED] == [*CUES]
+
+
+def test_a_dummy_cue_is_one_row_and_one_function(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(CUES, DUMMY.name, DUMMY)
+
+    # Detected by its own rule, and believed with its own strength.
+    boxes = Detections(
+        t_ns=0,
+        size_px=(64, 48),
+        labels=("zebra", "dog"),
+        scores=np.array([0.9, 0.9]),
+        boxes_px=np.array([[0.0, 0.0, 9.0, 9.0]] * 2),
+        masks=(b"", b""),
+    )
+    assert CuePass(Vehicle(version=1))(Seen(0, objects=(boxes,))).counts["zebra"] == 2
+    assert Fusion().cues["zebra"].precision == 0.61
+    schema = json_schema()
+    assert "zebra" in schema["$defs"]["CueTruth"]["properties"]["cue"]["examples"]
+
+    # Scored as its row says, reported with its published precision, drawn in its colour.
+    found = {"frames": frame_table(40), "cues": cue_table({"zebra": {5: 1, 6: 0}})}
+    settings = Vehicle(version=1).model_dump(mode="json")
+    run = run_folder(tmp_path / "run", found, settings=settings)
+    told = truth([*good_truth().truth.cues, span("zebra", 0, 40, count=1)])
+    one = judge_run(run, truth_folder(tmp_path / "drive", told))
+    scores = scores_of([one])
+    assert scores.cues["zebra"].reading == "feature"
+    assert scores.cues["zebra"].readings["object"].precision.right == 1
+    assert "zebra" in summary(scores)
+    page = write_report(run.file(FOLDER), [one], scores, metrics_of([one], scores)).read_text()
+    assert "<td>zebra</td>" in page
+    assert "at least 0.61" in page
+    (row,) = [row for row in cue_rows(scores.cues) if row["cue"] == "zebra crossing"]
+    assert (row["positives"], row["published"]) == (1, 0.61)
+    assert of_cue("zebra") == (1, 2, 3)
