@@ -308,10 +308,12 @@ class _Pages:
             buffer = np.empty(len(near) + int(far.sum()), np.uint8)
             buffer[: len(near)] = near
             start, target = start - begin, len(near)
-            for i in np.flatnonzero(far):
-                held, length, source = int(cells.local[i]), int(far[i]), int(start[i])
-                buffer[target : target + held] = near[source : source + held]
-                chain = int.from_bytes(near[source + held : source + held + 4].tobytes(), "big")
+            source, whole = near.data, buffer.data
+            rows = np.flatnonzero(far)
+            columns = (rows, start[rows], cells.local[rows], far[rows])
+            for i, at, held, length in np.stack(columns, axis=1).tolist():
+                whole[target : target + held] = source[at : at + held]
+                chain = int.from_bytes(source[at + held : at + held + 4], "big")
                 self._follow(chain, buffer[target + held : target + length])
                 start[i] = target
                 target += length
@@ -325,6 +327,9 @@ class _Pages:
             count = min(-(-(len(target) - done) // room), self._run, self._count + 1 - page)
             if page <= 1 or count < 1:
                 raise _UnusualError
+            if count == 1 and len(target) - done <= room:
+                page = self._last(page, target[done:])
+                break
             lot = self._scratch[: count * self._size]
             self._fill(lot, page)
             pages = lot.reshape(count, self._size)
@@ -337,6 +342,14 @@ class _Pages:
             self._run = min(longest, 2 * self._run) if good == count else good
         if page:
             raise _UnusualError
+
+    def _last(self, page: int, target: Bytes) -> int:
+        """Fill ``target`` from one page; which page is said to follow."""
+        content = os.pread(self._file, self._size, (page - 1) * self._size)
+        if len(content) < self._size:
+            raise _UnusualError
+        target[:] = np.frombuffer(content, np.uint8, len(target), 4)
+        return int.from_bytes(content[:4], "big")
 
 
 def _shifted(buffer: Bytes, kind: str) -> NDArray[np.integer]:
