@@ -19,6 +19,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Final, NoReturn, Protocol, cast
 
 from crosscue.replay.errors import CrosscueError, one_line
+from crosscue.replay.losses import losses_heard
 from crosscue.replay.safe_text import visible
 
 if TYPE_CHECKING:
@@ -192,7 +193,11 @@ def run(argv: Sequence[str]) -> int:
         args = parser.parse_args(list(argv[len(name.split()) :]))
     except SystemExit as stop:
         return int(stop.code or 0)
-    return _guarded(module, args)
+    with losses_heard() as losses:
+        status = _guarded(module, args)
+    for loss in losses:
+        print(visible(f"crosscue: dropped: {loss}"), file=sys.stderr)
+    return 3 if losses and not status else status
 
 
 def _guarded(module: Command, args: argparse.Namespace) -> int:

@@ -28,6 +28,7 @@ from crosscue.replay.files.run_folder import (
     strict_json,
     write_manifest,
 )
+from crosscue.replay.limits import DEFAULT, Limits
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -256,13 +257,19 @@ def _versions(drives: Sequence[_Drive]) -> dict[str, list[str]]:
     return {library: sorted(used) for library, used in sorted(found.items())}
 
 
-def open_one(path: Path, logs: Path | None = None, *, without_pictures: bool = False) -> RunFolder:
+def open_one(
+    path: Path,
+    logs: Path | None = None,
+    *,
+    without_pictures: bool = False,
+    limits: Limits = DEFAULT,
+) -> RunFolder:
     """The run of one drive; arguments as of ``open_run``.
 
     Raises:
         RunError: It holds many drives; else as ``open_run``.
     """
-    run = open_run(path, logs, without_pictures=without_pictures)
+    run = open_run(path, logs, without_pictures=without_pictures, limits=limits)
     if is_merged(run):
         raise RunError(f"{path}: holds the tables of many drives; give one of the runs beside it")
     return run

@@ -21,7 +21,7 @@ from crosscue.eval.commands.shared.options import (
     selection_of,
 )
 from crosscue.eval.pipeline.detect import DetectOutcome, detect_drive
-from crosscue.eval.pipeline.run_account import account_lines
+from crosscue.eval.pipeline.run_account import account_lines, details_of
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.run_folder import create
 from crosscue.replay.opening import open_logs
@@ -75,7 +75,7 @@ def summary(outcome: DetectOutcome) -> str:
         lines.append(f"  {name}: ran on {ran:,}, {counts.from_cache[name]:,} from the cache")
     lines += [f"found    {what}: {count:,}" for what, count in sorted(outcome.objects.items())]
     lines += [f"cue      {cue}: in {count:,} frames" for cue, count in outcome.cues.items()]
-    lines += account_lines(outcome.account)
+    lines += [*account_lines(outcome.account), *details_of([ledger])]
     lines += [f"note     {sentence}" for sentence in (*ledger.notices, *outcome.notices)]
     return "\n".join(visible(line) for line in lines)
 

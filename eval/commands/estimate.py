@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 from crosscue.eval.batch.merge import open_one
-from crosscue.eval.commands.shared.options import add_logs_argument, print_json
+from crosscue.eval.commands.shared.options import add_logs_argument, limits_of, print_json
 from crosscue.eval.pipeline.reestimate import estimate_run
 from crosscue.replay.vehicle.vehicle import load
 
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Estimate; 3 when something was dropped."""
-    folder = open_one(args.run, args.logs)
+    folder = open_one(args.run, args.logs, limits=limits_of(args))
     vehicle = load(args.vehicle) if args.vehicle else None
     progress = Progress("estimating", not args.quiet and sys.stderr.isatty())
     outcome = estimate_run(folder, vehicle, progress.at_time)

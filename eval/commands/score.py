@@ -28,6 +28,7 @@ from typing import Any
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.commands.shared.options import (
     add_logs_argument,
+    limits_of,
     metres,
     print_json,
     with_progress,
@@ -128,6 +129,7 @@ def run(args: argparse.Namespace) -> int:
         args.smoother is not None,
         args.any_log,
         args.logs,
+        limits_of(args),
     )
     scored, failed = _score_all(paths, work, args)
     if len(paths) == 1:

@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from crosscue.eval.batch.merge import open_one
-from crosscue.eval.commands.shared.options import add_logs_arguments
+from crosscue.eval.commands.shared.options import add_logs_arguments, limits_of
 from crosscue.eval.pipeline.run_account import is_whole
 from crosscue.eval.recording import save
 from crosscue.eval.scoring.pose.score import truth_track
@@ -43,7 +43,9 @@ def run(args: argparse.Namespace) -> int:
     """Write drive.rrd into the run, or where asked, and open it; 3 when the run has drops."""
     if args.save is not None and args.save.suffix != ".rrd":
         raise UsageError(f"{args.save}: want a name that ends in .rrd")
-    folder = open_one(args.run, args.logs, without_pictures=args.without_pictures)
+    folder = open_one(
+        args.run, args.logs, without_pictures=args.without_pictures, limits=limits_of(args)
+    )
     path = args.save or folder.file("drive.rrd")
     track, ranges = _truth(args, folder)
     save(folder, path, track, ranges)

@@ -13,6 +13,7 @@ from crosscue.localization.compass_fit import CompassFit, fit_compass
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.losses import warn_of
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Samples, Signal
@@ -42,6 +43,8 @@ def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassF
         for signal, parts in found.items():
             if signal in window.samples:
                 parts.append(window.samples[signal])
+    for extractor in extractors:
+        warn_of(extractor.ledger)
     field = _joined(found[Signal.MAGNETIC_FIELD])
     if field is None:
         raise VehicleError(f"{magnetometer.topic.name}: not one magnetometer reading in this part")

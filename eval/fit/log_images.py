@@ -13,8 +13,9 @@ from crosscue.eval.pipeline.accounts import probe_clocks
 from crosscue.replay.columns import Block, Images
 from crosscue.replay.errors import LogError, VehicleError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT
+from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_log
 from crosscue.replay.readers.images.files import SUFFIXES
 from crosscue.replay.readers.time_file import find_time_file, read_time_file
@@ -25,14 +26,14 @@ from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 
-def log_pictures(path: Path, vehicle: Vehicle) -> LogPictures:
-    """The pictures of the one camera of a log.
+def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT) -> LogPictures:
+    """The pictures of the one camera of a log; warns of what was dropped.
 
     Raises:
         LogError: It cannot be read, or its first picture cannot.
         VehicleError: No camera, or several.
     """
-    with open_log(path) as log:
+    with open_log(path, limits) as log:
         camera = camera_of([(0, topic) for topic in log.topics], vehicle)
         if camera is None:
             raise VehicleError(f"{path}: no camera in the log; annotations need its pictures")
@@ -52,26 +53,28 @@ def log_pictures(path: Path, vehicle: Vehicle) -> LogPictures:
         for block in log.read(extractor.ledger, wanted):
             for _ in extractor(block):
                 pass
+        warn_of(extractor.ledger)
         if not times:
             raise LogError(f"{path}: {topic.name}: not one picture; annotations need them")
         names = _names(log)
     return LogPictures(str(path), np.unique(np.concatenate(times)), sizes[0], names)
 
 
-def log_span(path: Path) -> tuple[int, int]:
+def log_span(path: Path, limits: Limits = DEFAULT) -> tuple[int, int]:
     """Log times of a log's first row and just after its last.
 
     Raises:
         LogError: It cannot be read, or holds no row.
     """
-    first, last = 2**63 - 1, -(2**63)
-    with open_log(path) as log:
-        for block in log.read(Ledger(str(path))):
+    first, last, ledger = 2**63 - 1, -(2**63), Ledger(str(path))
+    with open_log(path, limits) as log:
+        for block in log.read(ledger):
             if len(block):
                 first, last = (
                     min(first, int(block.log_ns.min())),
                     max(last, int(block.log_ns.max())),
                 )
+    warn_of(ledger)
     if last < first:
         raise LogError(f"{path}: holds no row")
     return first, last + 1

@@ -15,6 +15,7 @@ from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import MIB
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Source
@@ -88,3 +89,4 @@ def _camera(log: Log, vehicle: Vehicle) -> Iterator[tuple[int, Encoded]]:
                 for i, t_ns in enumerate(pictures.log_ns.tolist()):
                     yield t_ns, encoded(pictures.rows, i)
         waiting.clear()
+    warn_of(extractor.ledger)

@@ -27,6 +27,7 @@ from crosscue.datasets.truth.tum import read_tum
 from crosscue.eval.scoring import truth as score_truth
 from crosscue.replay.errors import SchemaError, UsageError
 from crosscue.replay.files.run_folder import sha256_of, strict_json, write_text
+from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -87,7 +88,7 @@ class Imported:
     ignored: Mapping[str, int]
 
 
-def check_truth(path: Path, log_path: Path, vehicle: Vehicle) -> TruthFit:
+def check_truth(path: Path, log_path: Path, vehicle: Vehicle, limits: Limits = DEFAULT) -> TruthFit:
     """Check a truth file and all files that it names against a log.
 
     Raises:
@@ -102,7 +103,7 @@ def check_truth(path: Path, log_path: Path, vehicle: Vehicle) -> TruthFit:
         raise SchemaError(
             f"{path}: belongs to {truth.log or 'another log'} by its hash, not to {log_path}"
         )
-    _check_times(truth, log_span(log_path), path, log_path)
+    _check_times(truth, log_span(log_path, limits), path, log_path)
     poses = 0
     if truth.pose is not None:
         track = read_tum(folder / truth.pose)
@@ -111,7 +112,7 @@ def check_truth(path: Path, log_path: Path, vehicle: Vehicle) -> TruthFit:
     moments = np.array([one.t_ns for one in truth.cues if one.t_ns is not None], np.int64)
     pictures, objects = None, 0
     if len(moments) or truth.objects is not None:
-        pictures = log_pictures(log_path, vehicle)
+        pictures = log_pictures(log_path, vehicle, limits)
     if truth.objects is not None:
         assert pictures is not None
         objects = _check_objects(folder / truth.objects, pictures, truth.own_cues)
@@ -195,6 +196,7 @@ def import_annotations(
     own: Mapping[str, str],
     *,
     add: bool = False,
+    limits: Limits = DEFAULT,
 ) -> Imported:
     """Turn annotated pictures of a log into its truth.
 
@@ -205,6 +207,7 @@ def import_annotations(
         vehicle: Names the camera where the log has several, and cues of the user's own.
         own: From label to cue, see ``meanings``.
         add: Keep everything but cues and objects of the truth file that is there.
+        limits: What the log is read with.
 
     Raises:
         SchemaError: The annotations do not fit the log.
@@ -213,7 +216,7 @@ def import_annotations(
     annotations = read_annotations(source)
     cues = meanings(annotations, own, tuple(vehicle.cues.own))
     check_boxes(annotations)
-    pictures = log_pictures(log_path, vehicle)
+    pictures = log_pictures(log_path, vehicle, limits)
     placed = place(annotations, pictures)
     truth = _truth(annotations, placed, cues, pictures, log_path, source)
     if add:

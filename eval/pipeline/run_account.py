@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.replay.errors import AccountError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.seal.log import CHANGED, DIFFERS
 from crosscue.replay.signals.kinds import Signal
 
 from .accounts import account_of
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 STAGES: Final = ("reading", "detecting", "estimating", "scoring")
 REASONS_SHOWN: Final = 20
+DETAILS_SHOWN: Final = 5
 _ROWS: Final = {
     "reading": "rows", "detecting": "frames", "estimating": "readings", "scoring": "judgements",
 }  # fmt: skip
@@ -217,10 +219,19 @@ def account_lines(of: Mapping[str, Any]) -> list[str]:
     said = [text for _, text in sorted(reasons, key=lambda reason: reason[0])]
     if len(said) > REASONS_SHOWN:
         said[REASONS_SHOWN:] = [f"and {len(said) - REASONS_SHOWN} reasons more: manifest.json"]
+    if _has_damaged_logs(of):
+        said.append("to write what can be read: crosscue convert LOG -o OUT.mcap --salvage")
     titles = ["account", *[""] * (len(head) - 1)]
     return [f"{title:9}{text}" for title, text in zip(titles, head, strict=True)] + [
         f"  {text}" for text in said
     ]
+
+
+def details_of(ledgers: Iterable[Ledger]) -> list[str]:
+    """Where and why the first rows were dropped."""
+    found = [one for ledger in ledgers for one in ledger.drops() if one.detail]
+    said = [f"dropped  {one.topic or 'rows'}: {one.reason}: {one.detail}" for one in found]
+    return said[:DETAILS_SHOWN]
 
 
 def _in_words(of: Sequence[Line], noun: str) -> str:
@@ -229,6 +240,15 @@ def _in_words(of: Sequence[Line], noun: str) -> str:
     dropped = sum(n for one in of for n in one["dropped"].values())
     at_least = "at least " if any(one.get("dropped_unknown") for one in of) else ""
     return f"{entered:,} {noun}: {used:,} used, {skipped:,} skipped, {at_least}{dropped:,} dropped"
+
+
+def _has_damaged_logs(of: Mapping[str, Any]) -> bool:
+    """Were rows dropped in reading? Those that differ from a seal, or do not decode, were not."""
+    reasons: dict[str, set[str]] = {"reading": set(), "detecting": set()}
+    for stage, _, one in lines(of):
+        if stage in reasons:
+            reasons[stage] |= {*one["dropped"], *one.get("dropped_unknown", ())}
+    return bool(reasons["reading"] - reasons["detecting"] - {DIFFERS, CHANGED})
 
 
 def _is_dropped(one: Mapping[str, Any]) -> bool:

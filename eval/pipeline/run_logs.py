@@ -127,4 +127,4 @@ def reopened(run: RunFolder, said: Mapping[str, Any]) -> Log:
         RunError: As ``place_of``.
         LogError: It cannot be opened.
     """
-    return open_log(place_of(run, said))
+    return open_log(place_of(run, said), run.limits)

@@ -14,7 +14,9 @@ from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.columns import Block, Images, Topic
 from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import Selection
+from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Source
@@ -38,6 +40,7 @@ class StoredCamera:
         clock: Whose times the run's tables have.
         selection: What part of the log the run looked at.
         time: The log's clock against the times of the run's tables.
+        limits: What the log is read with.
     """
 
     log: Path | str
@@ -45,6 +48,7 @@ class StoredCamera:
     clock: Clock
     selection: Selection
     time: LogClock = UNSHIFTED
+    limits: Limits = DEFAULT
 
 
 def camera_of(run: RunFolder) -> StoredCamera | None:
@@ -71,12 +75,12 @@ def camera_of(run: RunFolder) -> StoredCamera | None:
         return None
     number, entry, name = cameras[0]
     place = place_of(run, entry)
-    with open_log(place) as log:
+    with open_log(place, run.limits) as log:
         topic = next(one for one in log.topics if one.name == name)
     part = manifest.get("selection", {})
     selection = Selection(frozenset({topic.name}), part.get("start_ns"), part.get("end_ns"))
     clock = timeline_in(manifest).clock(number)
-    return StoredCamera(place, topic, _clock(detected, topic.name), selection, clock)
+    return StoredCamera(place, topic, _clock(detected, topic.name), selection, clock, run.limits)
 
 
 def _clock(detected: Mapping[str, Any] | None, topic: str) -> Clock:
@@ -105,7 +109,7 @@ def picture_at(camera: StoredCamera, t_ns: int) -> Encoded | None:
 def read_pictures(
     camera: StoredCamera, on_pictures: Callable[[Block], None], around_ns: int | None = None
 ) -> None:
-    """Give every block of pictures to ``on_pictures``.
+    """Give every block of pictures to ``on_pictures``, and warn of what was dropped.
 
     Args:
         camera: Where they lie.
@@ -130,7 +134,8 @@ def read_pictures(
     if around_ns is not None and camera.topic.name not in camera.time.topics:
         begin, end = around_ns - AROUND_NS, around_ns + AROUND_NS
         selection = Selection(selection.topics, begin, end)
-    with open_log(camera.log) as log:
+    with open_log(camera.log, camera.limits) as log:
         for block in TimedLog(log, camera.time).read(ledger, selection):
             for _ in extractor(block):
                 pass
+    warn_of(ledger)

@@ -24,6 +24,7 @@ from crosscue.eval.scoring.runs import (
 )
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.files.run_folder import RunFolder, locked, open_run, strict_json, write_text
+from crosscue.replay.limits import DEFAULT, Limits
 
 from .page import write_report
 from .pose_figures import draw_all
@@ -70,6 +71,7 @@ class ScoreWork:
         has_smoother: Run the batch smoother as well?
         any_log: Take truth that names the hash of another file?
         logs: Where the runs' logs have moved to, if they have.
+        limits: What the runs' logs are read with.
     """
 
     truth: Path | None
@@ -78,6 +80,7 @@ class ScoreWork:
     has_smoother: bool = False
     any_log: bool = False
     logs: Path | None = None
+    limits: Limits = DEFAULT
 
     def __call__(self, path: Path) -> Scored:
         """Score one run and write its files.
@@ -85,7 +88,7 @@ class ScoreWork:
         Raises:
             CrosscueError: It cannot be scored.
         """
-        folder = open_run(path, self.logs)
+        folder = open_run(path, self.logs, limits=self.limits)
         truth_path = find_truth(folder, self.truth)
         with locked(folder):
             one = judge_run(folder, truth_path, self.settings, self.rpe_m, any_log=self.any_log)

@@ -22,6 +22,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from crosscue.replay.errors import OutputError, RunError
+from crosscue.replay.limits import DEFAULT, Limits
 
 from .bounded import read_at_most
 from .parquet import opened
@@ -51,11 +52,13 @@ class RunFolder:
         path: Where it is.
         logs: A folder that its logs have moved to, or None where they are as the manifest says.
         without_pictures: Is it to be shown without the pictures in its logs?
+        limits: What its logs are read with.
     """
 
     path: Path
     logs: Path | None = None
     without_pictures: bool = False
+    limits: Limits = DEFAULT
 
     def file(self, name: str) -> Path:
         """Path of one of its files."""
@@ -197,18 +200,25 @@ def clear(run: RunFolder, content: Mapping[str, object] | None = None) -> None:
         raise cannot_write(place, error) from None
 
 
-def open_run(path: Path, logs: Path | None = None, *, without_pictures: bool = False) -> RunFolder:
+def open_run(
+    path: Path,
+    logs: Path | None = None,
+    *,
+    without_pictures: bool = False,
+    limits: Limits = DEFAULT,
+) -> RunFolder:
     """An existing run folder, its manifest checked.
 
     Args:
         path: The folder.
         logs: Where its logs have moved to, if they have.
         without_pictures: Show it without the pictures in its logs.
+        limits: What its logs are read with.
 
     Raises:
         RunError: As ``RunFolder.manifest``.
     """
-    run = RunFolder(path, logs, without_pictures)
+    run = RunFolder(path, logs, without_pictures, limits)
     run.manifest()
     return run
 

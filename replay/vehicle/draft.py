@@ -15,6 +15,7 @@ from crosscue.replay.columns import CanFrames
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.losses import warn_of
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.signals.converters import ANGLE_UNITS, SPEED_UNITS
 
@@ -110,15 +111,17 @@ def _buses(logs: Sequence[Log], database: CanDatabase | None) -> list[Bus]:
         for topic in log.topics:
             if role_of(topic) is not Role.CAN:
                 continue
-            ids = frozenset(_ids(log, topic.name))
+            ledger = Ledger(name_of(log))
+            ids = frozenset(_ids(log, topic.name, ledger))
+            warn_of(ledger)
             known = sum(database is not None and database.find(*key) is not None for key in ids)
             buses.append(Bus(topic.name, ids, known))
     return sorted(buses, key=lambda bus: (-bus.known, bus.topic))
 
 
-def _ids(log: Log, name: str) -> Iterator[tuple[int, bool]]:
+def _ids(log: Log, name: str, ledger: Ledger) -> Iterator[tuple[int, bool]]:
     """Identifiers among a bus's first frames."""
-    ledger, seen = Ledger(name_of(log)), 0
+    seen = 0
     topic = next(topic for topic in log.topics if topic.name == name)
     decode = decoder_for(topic) if topic.encoding != "columns" else None
     for block in log.read(ledger, Selection(frozenset({name}))):

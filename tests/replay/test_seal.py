@@ -11,11 +11,15 @@ import numpy as np
 import pytest
 
 from crosscue.eval.cli import run
+from crosscue.eval.fit.log_images import log_span
+from crosscue.eval.pipeline.stored_images import StoredCamera, read_pictures
+from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.errors import LogError
 from crosscue.replay.formats import FORMATS
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import MIB
 from crosscue.replay.log import Selection
+from crosscue.replay.losses import losses_heard
 from crosscue.replay.opening import open_log
 from crosscue.replay.seal.log import CHANGED, DIFFERS
 from crosscue.replay.seal.seal import read_seal, seal_path
@@ -147,6 +151,37 @@ def test_every_command_that_reads_a_sealed_log_reports(
     assert f"can.log: bytes {MIB} to {2 * MIB}" in " ".join(capsys.readouterr().err.split())
     assert run(["info", str(long_log)]) == 3
     assert f"can.log: bytes {MIB} to {2 * MIB}" in " ".join(capsys.readouterr().out.split())
+
+
+def test_who_keeps_no_account_warns_and_the_command_exits_with_3(
+    long_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = f"can.log: bytes {MIB} to {2 * MIB}"
+    draft = ["vehicle", "init", str(long_log), "-o", str(tmp_path / "v.toml"), "--overwrite"]
+    assert run(draft) == 0
+    _flip(long_log, long_log.read_bytes().index(b"#AA", MIB) + 2)
+
+    with losses_heard() as heard:
+        log_span(long_log)
+        log_span(long_log)
+    assert sum(where in loss for loss in heard) == 1
+    assert run(draft) == 3
+    assert where in capsys.readouterr().err
+
+
+def test_stored_pictures_of_a_sealed_log_are_held_against_it(tmp_path: Path) -> None:
+    log = picture_folder(tmp_path / "front", 12, "rate_hz: 10\n")
+    assert run(["seal", str(log)]) == 0
+    with open_log(log) as opened:
+        (topic,) = opened.topics
+    camera = StoredCamera(log, topic, Clock.LOG, Selection())
+    (log / "frame_3.png").write_bytes((log / "frame_4.png").read_bytes())
+
+    with losses_heard() as heard:
+        read_pictures(camera, lambda _: None)
+
+    assert heard
+    assert "frame_3.png" in "".join(heard)
 
 
 @pytest.mark.parametrize("is_cut", [True, False])

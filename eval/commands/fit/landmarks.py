@@ -31,6 +31,7 @@ from crosscue.localization.landmarks.fit import LandmarkFit, Rate, ScoredPairs, 
 from crosscue.replay.errors import SchemaError, UsageError
 from crosscue.replay.files.run_folder import write_text
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_logs
 from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
 
@@ -115,9 +116,12 @@ def _pairs_of_logs(args: argparse.Namespace, vehicle: Vehicle, matcher: Matcher)
     ):
         ledgers = [Ledger(str(log.path)) for log in logs]
         frames = camera_frames(logs, vehicle, selection_of(args, logs), ledgers)
-        return pairs_of_drive(
+        pairs = pairs_of_drive(
             frames, poses, database, matcher, args.every, args.near, args.far, args.most
         )
+    for ledger in ledgers:
+        warn_of(ledger)
+    return pairs
 
 
 def _told(fitted: LandmarkFit) -> str:

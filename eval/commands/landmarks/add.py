@@ -34,6 +34,7 @@ from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.localization.landmarks.features import Matcher
 from crosscue.replay.errors import UsageError
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load
@@ -109,6 +110,8 @@ def _add_logs(
             counts = add_from_log(
                 writer, matcher, frames, poses, args.every, args.sd, source, ledgers[0]
             )
+    for ledger in ledgers:
+        warn_of(ledger)
     return counts, all(ledger.is_whole for ledger in ledgers)
 
 

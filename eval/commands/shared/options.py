@@ -71,7 +71,8 @@ def _mebibytes(text: str) -> int:
 
 
 def add_logs_argument(parser: argparse.ArgumentParser) -> None:
-    """``--logs``."""
+    """``--logs``, and ``--max-chunk`` for reading them."""
+    add_limit_arguments(parser)
     parser.add_argument(
         "--logs",
         type=Path,

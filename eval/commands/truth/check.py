@@ -13,7 +13,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
 from crosscue.eval.fit.truth_check import TruthFit, check_truth
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
@@ -25,13 +25,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--vehicle", type=Path, metavar="V.toml", help="names the camera where the log has several"
     )
+    add_limit_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Check, and tell what the truth holds."""
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
-    found = check_truth(args.truth, args.log, vehicle)
+    found = check_truth(args.truth, args.log, vehicle, limits_of(args))
     if args.json:
         print_json(asdict(found))
     elif not args.quiet:

@@ -19,7 +19,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from crosscue.datasets.truth.truth import FILE
-from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
 from crosscue.eval.fit.truth_check import Imported, import_annotations
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.safe_text import visible
@@ -55,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--add", action="store_true", help="keep approaches and track of the truth that is there"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier truth file")
+    add_limit_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -65,7 +66,9 @@ def run(args: argparse.Namespace) -> int:
         raise OutputError(f"{output}: exists; --add to it, --overwrite it, or give another name")
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     own = dict(_meaning(text) for text in args.map)
-    found = import_annotations(args.source, args.log, output, vehicle, own, add=args.add)
+    found = import_annotations(
+        args.source, args.log, output, vehicle, own, add=args.add, limits=limits_of(args)
+    )
     if args.json:
         print_json(asdict(found) | {"truth": str(found.truth), "objects": str(found.objects)})
     elif not args.quiet:

@@ -348,7 +348,9 @@ class _Pass:
         method, declared = _CONTAINER.unpack(head)
         content, used = None, 0
         if max(declared, body_bytes) > self._limits.chunk_bytes:
-            self.tally.damage("container is over the size limit", f"{place}: {declared} bytes")
+            size_bytes, limit = max(declared, body_bytes), self._limits.chunk_bytes
+            detail = f"{place}: declares {size_bytes} bytes, the limit is {limit} (--max-chunk)"
+            self.tally.damage("container is over the size limit", detail)
         elif method == _STORED:
             content, used = self._stored_content(file, body_bytes, declared, place, is_cut)
         elif method == _DEFLATED:
@@ -405,7 +407,9 @@ class _Pass:
             self.tally.damage("file is cut, or a container's size is wrong", place)
             return b"".join(parts), used
         self._wasted += used
-        self.tally.damage("container differs from its declared size", place)
+        gave = f"more than {declared}" if produced > declared else str(produced)
+        detail = f"{place}: inflates to {gave} bytes, declares {declared}"
+        self.tally.damage("container differs from its declared size", detail)
         return None, 0
 
 

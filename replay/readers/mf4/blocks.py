@@ -327,7 +327,12 @@ class Blocks:
             raise BrokenBlockError(f"compressed block at byte {at} is cut by the file's end")
         method, parameter, original, stored = struct.unpack_from("<2xBxLQQ", head)
         limit = self._limits.chunk_bytes
-        if original > limit or stored > limit or length < HEAD_BYTES + 24 + stored:
+        if max(original, stored) > limit:
+            raise BrokenBlockError(
+                f"compressed block at byte {at} declares {max(original, stored)} bytes, the limit "
+                f"is {limit} (--max-chunk)"
+            )
+        if length < HEAD_BYTES + 24 + stored:
             raise BrokenBlockError(f"compressed block at byte {at} has impossible sizes")
         return Stretch(start, original, at + HEAD_BYTES + 24, stored, method, parameter)
 

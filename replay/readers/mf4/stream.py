@@ -107,7 +107,8 @@ def _inflated(one: Stretch, stored: bytes) -> tuple[bytes, str]:
     except _DAMAGED:
         return b"", "fails its checksum"
     if not inflater.eof or len(content) != one.size:
-        return b"", "is cut or damaged"
+        gave = f"more than {one.size}" if len(content) > one.size else str(len(content))
+        return b"", f"is cut or damaged: inflates to {gave} bytes, declares {one.size}"
     return (_transposed(content, one.parameter) if one.method == 1 else content), ""
 
 

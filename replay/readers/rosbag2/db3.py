@@ -212,10 +212,11 @@ class _Pass:
     def _grouped(self, messages: Messages, place: Int64s, log_ns: Int64s) -> Iterator[Block]:
         for part, plain, damaged in inflated(messages, self._limits):
             topic, times = place[part].copy(), log_ns[part]
-            for i in damaged[topic[damaged] >= 0]:
-                name = self._names[int(topic[i])]
-                self._ledger.drop(name, DAMAGED, 1, "zstd cannot decompress it", int(times[i]))
-            topic[damaged] = -1
+            for i, why in damaged.items():
+                if topic[i] >= 0:
+                    name = self._names[int(topic[i])]
+                    self._ledger.drop(name, DAMAGED, 1, why, int(times[i]))
+            topic[list(damaged)] = -1
             keep = topic >= 0
             start, stop = plain.start[keep], plain.stop[keep]
             rows = MixedRows(plain.buffer, topic[keep], times[keep], start, stop)

@@ -212,13 +212,11 @@ def _unpacked(block: Block, limits: Limits, ledger: Ledger) -> Iterator[Block]:
             yield block
             continue
         stretch = replace(block.take(part), rows=plain)
-        for i in damaged:
+        for i, why in damaged.items():
             ledger.find(block.topic, -1)
-            ledger.drop(
-                block.topic, DAMAGED, 1, "zstd cannot decompress it", int(stretch.log_ns[i])
-            )
-        if len(damaged):
-            stretch = stretch.take(np.delete(np.arange(len(stretch)), damaged))
+            ledger.drop(block.topic, DAMAGED, 1, why, int(stretch.log_ns[i]))
+        if damaged:
+            stretch = stretch.take(np.delete(np.arange(len(stretch)), list(damaged)))
         yield stretch
 
 

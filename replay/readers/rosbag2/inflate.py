@@ -28,29 +28,30 @@ def is_compressed(buffer: Bytes, start: Int64s, stop: Int64s) -> NDArray[np.bool
     return packed
 
 
-def inflated(messages: Messages, limits: Limits) -> Iterator[tuple[slice, Messages, Int64s]]:
+def inflated(
+    messages: Messages, limits: Limits
+) -> Iterator[tuple[slice, Messages, dict[int, str]]]:
     """Messages with the compressed ones decompressed, a bounded stretch at a time.
 
     Yields:
-        The stretch of the rows given, its messages, and which of them are damaged (their numbers
-        within the stretch; their range is empty).
+        The stretch of the rows given, its messages, and what is wrong with those that are damaged,
+        by their number within the stretch; their range is empty.
     """
     packed = is_compressed(messages.buffer, messages.start, messages.stop)
     if not packed.any():
-        yield slice(0, len(messages)), messages, np.empty(0, dtype=np.int64)
+        yield slice(0, len(messages)), messages, {}
         return
-    first, parts, bad, size = 0, list[bytes](), list[int](), 0
+    first, parts, bad, size = 0, list[bytes](), dict[int, str](), 0
     for i in range(len(messages)):
         raw = bytes(messages.payload(i))
-        part = _one(raw, limits.message_bytes) if packed[i] else raw
-        if part is None:
-            bad.append(i - first)
-            part = b""
+        part, fault = _one(raw, limits.message_bytes) if packed[i] else (raw, "")
+        if fault:
+            bad[i - first] = fault
         parts.append(part)
         size += len(part)
         if size >= BLOCK_BYTES or i + 1 == len(messages):
-            yield slice(first, i + 1), _joined(parts), np.array(bad, dtype=np.int64)
-            first, parts, bad, size = i + 1, [], [], 0
+            yield slice(first, i + 1), _joined(parts), bad
+            first, parts, bad, size = i + 1, [], {}, 0
 
 
 def _joined(parts: list[bytes]) -> Messages:
@@ -59,13 +60,23 @@ def _joined(parts: list[bytes]) -> Messages:
     return Messages(np.frombuffer(b"".join(parts), dtype=np.uint8), stop - length, stop)
 
 
-def _one(raw: bytes, largest: int) -> bytes | None:
+def _one(raw: bytes, largest: int) -> tuple[bytes, str]:
+    """The message, or nothing and why; never more than ``largest`` bytes are taken."""
     import zstandard
 
     try:
-        if zstandard.frame_content_size(raw) > largest:
-            return None
+        declared = zstandard.frame_content_size(raw)
+        if declared > largest:
+            return b"", f"declares {declared} bytes, the limit is {largest}"
+        room = largest if declared < 0 else declared
         stream = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
-        return stream.decompress(raw, max_output_size=largest)
-    except (zstandard.ZstdError, MemoryError):
-        return None
+        with stream.stream_reader(raw) as reader:
+            found = reader.read(room + 1)
+    except (zstandard.ZstdError, MemoryError) as error:
+        return b"", f"{len(raw)} bytes, zstd says: {error}"
+    if len(found) > room:
+        said = "" if declared < 0 else f", declares {declared}"
+        return b"", f"decompresses to more than {room} bytes{said}; the limit is {largest}"
+    if 0 <= declared != len(found):
+        return b"", f"decompresses to {len(found)} bytes, declares {declared}"
+    return found, ""

@@ -128,7 +128,8 @@ def unpack(packed: Path, plain: Path, limits: Limits) -> str:
                 for out in unpacking.feed(part):
                     written += target.write(out)
                     if written > most:
-                        return f"grows to over {most} bytes when unpacked"
+                        size = packed.stat().st_size
+                        return f"{size} bytes unpack to over {most}, the limit (--max-chunk)"
             except zstandard.ZstdError as error:
                 return f"compressed file is damaged after {written} bytes ({error})"
     return "" if unpacking.is_at_end else f"compressed file is cut after {written} bytes"

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import bz2
-import os
 import re
 import struct
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +14,7 @@ import zstandard
 
 from crosscue.replay.limits import DEFAULT
 from support.mcap_files import MAGIC, ChunkOf, channel, header, message, record, schema, text
+from support.measured import measured
 from support.rosbag_files import header_field
 from support.rosbag_files import record as bag_record
 
@@ -89,19 +87,10 @@ def test_a_bomb_is_refused_with_both_numbers_in_bounded_memory(tmp_path: Path, c
     path = tmp_path / f"bomb{suffix}"
     path.write_bytes((mcap if suffix == ".mcap" else bag)(body(), compression, declared))
 
-    child = subprocess.Popen(
-        [sys.executable, "-m", "crosscue.eval.cli", "info", str(path)],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert child.stdout is not None
-    said = " ".join(child.stdout.read().split())
-    _, status, used = os.wait4(child.pid, 0)
-    child.stdout.close()
-    child.returncode = os.waitstatus_to_exitcode(status)
+    status, said, peak_mb = measured(["info", str(path)])
 
-    assert child.returncode == 3
-    assert used.ru_maxrss / 1024 < MOST_MB
+    assert status == 3
+    assert peak_mb < MOST_MB
     assert str(declared) in said
     other = str(DEFAULT.chunk_bytes) if "limit" in case else "more"
     assert re.search(rf"\b{other}\b", said)

@@ -269,7 +269,7 @@ def test_a_packed_file_that_grows_without_bound_is_stopped(tmp_path: Path) -> No
     packed.write_bytes(zstandard.ZstdCompressor().compress(bytes(300 << 20)))
     fault = unpack(packed, tmp_path / "a.db3", Limits(chunk_bytes=1 << 20))
 
-    assert "grows to over" in fault
+    assert "the limit (--max-chunk)" in fault
     assert (tmp_path / "a.db3").stat().st_size < 80 << 20
 
 

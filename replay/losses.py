@@ -1,0 +1,45 @@
+"""Losses met where no account is kept: logs read again for their pictures, or for a fit.
+
+Each is a Python warning, so that no caller has to pass a ledger along; a command prints them and
+ends with exit status 3.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .ledger import Ledger
+
+
+class LossWarning(UserWarning):
+    """Something of a log was dropped, in one line."""
+
+
+def warn_of(ledger: Ledger) -> None:
+    """Warn of all that was dropped from a log."""
+    for drop in ledger.drops():
+        detail = f" ({drop.detail})" if drop.detail else ""
+        text = f"{ledger.log}: {drop.topic or 'unknown topics'}: {drop.reason}{detail}"
+        warnings.warn(text, LossWarning, stacklevel=3)
+
+
+@contextmanager
+def losses_heard() -> Iterator[list[str]]:
+    """The losses that are warned of within the ``with`` block, each once, instead of on stderr."""
+    heard: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", LossWarning)
+        before = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+            if not isinstance(message, LossWarning):
+                before(message, category, *rest, **more)
+            elif str(message) not in heard:
+                heard.append(str(message))
+
+        warnings.showwarning = show
+        yield heard

@@ -1,0 +1,157 @@
+"""Bombs of every other kind: BLF, MF4, zstd in ROS 2 bags, pictures; refused in bounded memory."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from crosscue.detectors.images import MOST_PIXELS
+from crosscue.replay.limits import DEFAULT, MIB
+from support.can_files import blf, made
+from support.measured import measured
+from support.pictures import picture_folder
+from support.rosbag_files import rows_of, write_folder
+
+from .test_bombs import BOMB_BYTES, MOST_MB, PIECE, with_zstd
+
+SIDE_PX = 60_000
+MOST_WITH_DETECTOR_MB = 500
+"""OpenCV and the table of detectors are loaded, too; the pictures ask for 10 GB."""
+
+
+def _deflated(size: int) -> bytes:
+    packer = zlib.compressobj(1)
+    return b"".join(packer.compress(PIECE) for _ in range(size >> 20)) + packer.flush()
+
+
+def _blf(declared: int) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        path = folder / "bomb.blf"
+        body = struct.pack("<H6xL4x", 2, declared) + _deflated(BOMB_BYTES)
+        size = 16 + len(body)  # of the object, its header included
+        padded = body + bytes(size % 4)
+        path.write_bytes(blf(made(30)) + struct.pack("<4sHHII", b"LOBJ", 16, 1, size, 10) + padded)
+        return path
+
+    return make
+
+
+def _in_db3(content: Callable[[], bytes]) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        bag = write_folder(folder / "bag", rows_of(40))
+        (path,) = bag.glob("*.db3")
+        with sqlite3.connect(path) as database:
+            database.execute(
+                "UPDATE messages SET data = ? WHERE id = (SELECT max(id) FROM messages)",
+                (content(),),
+            )
+        return path
+
+    return make
+
+
+def _honest() -> bytes:
+    """A frame that says how much is in it."""
+    import zstandard
+
+    packer = zstandard.ZstdCompressor().compressobj(size=BOMB_BYTES)
+    return b"".join(packer.compress(PIECE) for _ in range(BOMB_BYTES >> 20)) + packer.flush()
+
+
+def _packed_file(folder: Path) -> Path:
+    bag = write_folder(folder / "bag", rows_of(40))
+    (plain,) = bag.glob("*.db3")
+    plain.with_name(plain.name + ".zstd").write_bytes(with_zstd())
+    plain.unlink()
+    return bag
+
+
+LOGS: dict[str, tuple[Callable[[Path], Path], int, tuple[str, str]]] = {
+    "BLF over the limit": (
+        _blf(BOMB_BYTES), 3, (str(BOMB_BYTES), str(DEFAULT.chunk_bytes)),
+    ),
+    "BLF more than declared": (_blf(1000), 3, ("more than 1000", "declares 1000")),
+    "db3 message over the limit": (
+        _in_db3(_honest), 3, (str(BOMB_BYTES), str(DEFAULT.message_bytes)),
+    ),
+    "db3 message that says nothing": (
+        _in_db3(with_zstd), 3, (f"more than {DEFAULT.message_bytes}", str(DEFAULT.message_bytes)),
+    ),
+    "zstd file": (_packed_file, 4, (r"\d+ bytes unpack", str(DEFAULT.chunk_bytes))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", list(LOGS), ids=lambda name: name.replace(" ", "-"))
+def test_a_bomb_in_a_log_is_refused_with_both_numbers(tmp_path: Path, case: str) -> None:
+    make, wanted, numbers = LOGS[case]
+    path = make(tmp_path)
+
+    status, said, peak_mb = measured(["info", str(path)])
+
+    assert status == wanted, said
+    assert peak_mb < MOST_MB
+    for number in numbers:
+        assert re.search(number, said), (number, said)
+
+
+def test_max_chunk_moves_the_limit(tmp_path: Path) -> None:
+    path = _blf(3 * MIB)(tmp_path)
+
+    _, said, _ = measured(["info", str(path), "--max-chunk", "2"])
+
+    assert f"the limit is {2 * MIB} (--max-chunk)" in said
+
+
+def _png() -> bytes:
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        )
+
+    head = struct.pack(">IIBBBBB", SIDE_PX, SIDE_PX, 8, 2, 0, 0, 0)
+    parts = chunk(b"IHDR", head) + chunk(b"IDAT", _deflated(64 * MIB)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + parts
+
+
+def _jpeg() -> bytes:
+    size = struct.pack(">BHHB", 8, SIDE_PX, SIDE_PX, 3) + b"\1\x11\0\2\x11\0\3\x11\0"
+    frame = b"\xff\xc0" + struct.pack(">H", 2 + len(size)) + size
+    return b"\xff\xd8" + frame + b"\xff\xda\0\x0c\3\1\0\2\0\3\0\0?\0" + bytes(1000) + b"\xff\xd9"
+
+
+def _webp() -> bytes:
+    body = b"WEBPVP8X" + struct.pack("<I", 10) + bytes(4)
+    body += (SIDE_PX - 1).to_bytes(3, "little") * 2 + bytes(100)
+    return b"RIFF" + struct.pack("<I", len(body)) + body
+
+
+PICTURES = {".png": _png, ".jpg": _jpeg, ".webp": _webp}
+
+
+@pytest.mark.parametrize("suffix", PICTURES)
+@pytest.mark.parametrize("is_in_mcap", [False, True], ids=["folder", "mcap"])
+def test_a_picture_bomb_is_dropped_before_it_is_decoded(
+    tmp_path: Path, suffix: str, is_in_mcap: bool
+) -> None:
+    log = picture_folder(tmp_path / "cam", 5, "rate_hz: 10\n")
+    (log / "frame_2.png").unlink()
+    (log / f"frame_2{suffix}").write_bytes(PICTURES[suffix]())
+    if is_in_mcap:
+        converted = tmp_path / "cam.mcap"
+        status, said, _ = measured(["convert", str(log), "-o", str(converted)])
+        assert status == 0, said
+        log = converted
+    argv = ["detect", str(log), "--detectors", "support.detecting:build", "--no-cache"]
+
+    status, said, peak_mb = measured([*argv, "-o", str(tmp_path / "run")])
+
+    assert status == 3, said
+    assert peak_mb < MOST_WITH_DETECTOR_MB
+    assert f"{SIDE_PX} x {SIDE_PX}" in said
+    assert f"{MOST_PIXELS:,}" in said

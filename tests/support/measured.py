@@ -1,0 +1,31 @@
+"""A command in a process of its own, with its peak of memory."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+_CHILD = """
+import sys
+from pathlib import Path
+from crosscue.eval.cli import run
+status = run(sys.argv[1:])
+peak = next(x for x in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in x)
+print(status, int(peak.split()[1]) // 1024)
+"""
+"""Its own peak: what the system counts for a child begins with the peak of its parent."""
+
+
+def measured(argv: list[str]) -> tuple[int, str, float]:
+    """Exit status, what was said on one line, and the peak of memory in MB."""
+    child = subprocess.run(
+        [sys.executable, "-c", _CHILD, *argv],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    )
+    *said, status, peak_mb = child.stdout.split()
+    return int(status), " ".join(said), int(peak_mb)
