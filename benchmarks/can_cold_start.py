@@ -4,7 +4,8 @@
 
 Each run is a process of its own, so each parses the DBC file anew, but for ours after the first,
 which finds its layout in the user's cache. Two CPU times are taken (user and system, all threads):
-of opening, parsing and decoding, and of the whole process with Python's start and all imports.
+of opening, parsing and decoding, with all imports done before ("work"), and of the whole process
+with Python's start and all imports. Values are counted, not compared; the counts are printed.
 The cases run in rotation; ratios are taken round by round. Ours yields columns, the others a
 dictionary for each frame. hilspy (``pip install hilspy``) is the strongest peer known; a peer that
 is not installed is left out, with a line that says so.
