@@ -55,7 +55,7 @@ def serialised(tensors: Mapping[str, Tensor], words: Mapping[str, str]) -> bytes
 
     content = save(dict(tensors), dict(words))
     start = _start(content)
-    header = json.loads(content[8:start])
+    header = json_tree(content[8:start])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     text += b" " * (-len(text) % 8)

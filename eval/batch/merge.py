@@ -25,6 +25,7 @@ from crosscue.replay.files.run_folder import (
     clear,
     locked,
     open_run,
+    staged,
     strict_json,
     write_manifest,
 )
@@ -88,11 +89,11 @@ def merge_runs(
     """
     drives = [_Drive(name, run, run.manifest()) for name, run in sorted(runs.items())]
     kinds = sorted({path.stem for one in drives for path in one.run.path.glob("*.parquet")})
-    with locked(out):
-        clear(out)
+    with locked(out), staged(out) as new:
+        clear(new)
         for kind in kinds:
-            _merge_table(kind, drives, out)
-        write_manifest(out, _manifest(drives, kinds, failures))
+            _merge_table(kind, drives, new)
+        write_manifest(new, _manifest(drives, kinds, failures))
     rows = {kind: sum(one.rows.get(kind, 0) for one in drives) for kind in kinds}
     return Merged(out, len(drives), rows, sum(one.seconds for one in drives))
 

@@ -17,7 +17,14 @@ from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, T
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.errors import SchemaError
-from crosscue.replay.files.run_folder import RunFolder, TableSink, clear, locked, write_manifest
+from crosscue.replay.files.run_folder import (
+    RunFolder,
+    TableSink,
+    clear,
+    locked,
+    staged,
+    write_manifest,
+)
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.mobileye.admit import all_ids
@@ -87,19 +94,19 @@ def decode_tables(
 
     Raises:
         SchemaError: A DBC file cannot be read.
-        EmptyResultError: Not one row in the part asked for; the folder is empty again.
+        EmptyResultError: Not one row in the part asked for; the folder is as it was.
         OutputError: The disk is full.
     """
     ledgers = tuple(Ledger(name_of(log)) for log in logs)
     tables: dict[str, _Table] = {}
-    with locked(run), nothing_left(run):
-        clear(run)
+    with locked(run), staged(run) as new, nothing_left(new):
+        clear(new)
         with ExitStack() as stack:
             for log, ledger in zip(logs, ledgers, strict=True):
                 for block in _decoded(log, vehicle, ledger, selection):
                     if block.topic not in tables:
                         name = file_name(block.topic, {t.name.lower() for t in tables.values()})
-                        tables[block.topic] = _Table(run, name, stack)
+                        tables[block.topic] = _Table(new, name, stack)
                     tables[block.topic].add(block)
             for table in tables.values():
                 table.write()
@@ -114,7 +121,7 @@ def decode_tables(
             "settings": vehicle.model_dump(mode="json"),
             "account": made,
         }
-        write_manifest(run, content)
+        write_manifest(new, content)
     return rows, made
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,7 @@ from crosscue.detectors.result_cache import ResultCache
 from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
 from crosscue.replay.columns import Block
 from crosscue.replay.errors import VehicleError
-from crosscue.replay.files.run_folder import RunFolder, clear, locked, write_manifest
+from crosscue.replay.files.run_folder import RunFolder, clear, locked, staged, write_manifest
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor
@@ -108,9 +108,10 @@ def detect_drive(
 
     The folder is locked while this works, and cleared first; otherwise as ``detect_into``.
     """
-    with locked(run), nothing_left(run):
-        clear(run, input_of(logs, vehicle, selection, choices, draw, None))
-        return detect_into(logs, vehicle, run, selection, choices, cache, draw, on_frames)
+    with locked(run), staged(run) as new, nothing_left(new):
+        clear(new, input_of(logs, vehicle, selection, choices, draw, None))
+        outcome = detect_into(logs, vehicle, new, selection, choices, cache, draw, on_frames)
+    return replace(outcome, run=run)
 
 
 def detect_into(

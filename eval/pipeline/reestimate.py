@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import MANIFEST, RunFolder, locked, sha256_of, write_input
+from crosscue.replay.files.run_folder import (
+    MANIFEST,
+    RunFolder,
+    locked,
+    sha256_of,
+    staged,
+    write_input,
+)
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
 
@@ -33,6 +41,8 @@ def estimate_run(
 ) -> Outcome:
     """Estimate again into the same run folder; no picture is opened.
 
+    The run stays as it was until the new one is whole.
+
     Args:
         run: A finished run, or one whose detect stage has finished.
         vehicle: Other settings; those of the run, if left out.
@@ -53,19 +63,21 @@ def estimate_run(
         stack.enter_context(locked(run))
         settings = vehicle or of_manifest(manifest["settings"])
         changed = None if vehicle is None else settings_changed(run, vehicle)
+        new = stack.enter_context(staged(run, keep=True, until=detected_part(manifest)))
         if changed is not None:
             # In this order a run cut short between them does not pass for a whole one.
-            begin_again(run, detected_part(manifest))
-            write_input(run, changed)
-        return estimate_into(
+            begin_again(new, detected_part(manifest))
+            write_input(new, changed)
+        outcome = estimate_into(
             logs,
             settings,
-            run,
+            new,
             selection_used(manifest),
             on_time,
             earlier=detected_part(manifest),
             told=manifest["logs"],
         )
+    return replace(outcome, run=run)
 
 
 def _reopened(run: RunFolder, said: Mapping[str, Any]) -> Log:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,7 +11,7 @@ from crosscue.detectors.registry import Choice, make
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import RunFolder, clear, locked
+from crosscue.replay.files.run_folder import RunFolder, clear, locked, staged
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import Timeline
@@ -77,7 +77,7 @@ def replay_drive(
     Raises:
         UsageError: It is to be resumed, and the folder holds a run of other logs or settings.
         VehicleError: The vehicle file does not fit the logs.
-        EmptyResultError: Nothing came of it; the folder is empty again.
+        EmptyResultError: Nothing came of it; the folder is as it was.
         OutputError: The disk is full.
     """
     mine = input_of(
@@ -95,15 +95,17 @@ def replay_drive(
             logs, vehicle, selection, _camera(logs, vehicle, detecting, landmarks)
         )
         earlier = _kept(logs, vehicle, run, selection, detecting) if detecting.resume else None
-        with nothing_left(run):
+        with staged(run, keep=earlier is not None, until=earlier) as new, nothing_left(new):
             if earlier is None:
-                clear(run, mine)
-                found = _detect(logs, vehicle, run, selection, detecting, timeline)
+                clear(new, mine)
+                found = _detect(logs, vehicle, new, selection, detecting, timeline)
             else:
                 found = None
-            return estimate_into(
-                logs, vehicle, run, selection, on_time, landmarks, found, earlier, timeline=timeline
+            outcome = estimate_into(
+                logs, vehicle, new, selection, on_time, landmarks, found, earlier, timeline=timeline
             )
+        detected = None if outcome.detected is None else replace(outcome.detected, run=run)
+        return replace(outcome, run=run, detected=detected)
 
 
 def _camera(

@@ -15,6 +15,7 @@ from crosscue.detectors.registry import Choice
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.identity import Identity, as_row, identity_of, identity_of_all, of_row
 from crosscue.replay.files.run_folder import INPUT, LOCK, MANIFEST, RunFolder, strict_json
+from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.remote.logs import version_of
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -52,7 +53,7 @@ def input_of(
     identity = identity_of_all([identity_of(origin(log)) for log in logs])
     return {
         "identity": as_row(identity),
-        "settings": json.loads(strict_json({**settings, "files": files_named_in(settings)})),
+        "settings": json_tree(strict_json({**settings, "files": files_named_in(settings)})),
     }
 
 
@@ -106,7 +107,7 @@ def files_named_in(settings: object) -> dict[str, str]:
 def _read(run: RunFolder) -> Mapping[str, Any] | None:
     """What the folder's run is made of; None where nothing believable says so."""
     try:
-        found = json.loads(run.file(INPUT).read_text(encoding="utf-8"))
+        found = json_tree(run.file(INPUT).read_text(encoding="utf-8"))
         of_row(found["identity"])
         return found if isinstance(found["settings"], dict) else None
     except (OSError, ValueError, KeyError, TypeError):

@@ -66,7 +66,7 @@ def log_rows(logs: Sequence[Log], run: RunFolder) -> list[dict[str, object]]:
 def relative(place: Path, run: RunFolder) -> str:
     """A path as a run's manifest holds it: from the run's folder."""
     whole = place.absolute()
-    return os.path.relpath(whole.parent.resolve() / whole.name, run.path.resolve())
+    return os.path.relpath(whole.parent.resolve() / whole.name, (run.home or run.path).resolve())
 
 
 def place_of(run: RunFolder, said: Mapping[str, Any]) -> Path | str:
@@ -84,7 +84,7 @@ def place_of(run: RunFolder, said: Mapping[str, Any]) -> Path | str:
     if is_remote(where):
         places: list[Path | str] = [where]
     elif run.logs is None:
-        places = [run.path.resolve() / where]
+        places = [(run.home or run.path).resolve() / where]
     else:
         places = list(_moved(run.logs, Path(where)))
     others = []

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Final, overload
 
 from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
 
 from .layout import CanMessage, CanSignal
@@ -77,7 +78,7 @@ class LayoutEntry:
             return None
         try:
             first, *lines = body.split(b"\n")
-            found = json.loads(first)
+            found = json_tree(first)
             rows = zip(found["messages"], lines, strict=True)
             return [_message(line, *row) for row, line in rows], list(found["notices"])
         except (ValueError, KeyError, TypeError, IndexError):
@@ -155,7 +156,7 @@ class _StoredSignals(Sequence[CanSignal]):
     def _parsed(self) -> tuple[CanSignal, ...]:
         return tuple(
             CanSignal(*[*row[:11], dict(row[11]), *row[12:14], frozenset(row[14])])
-            for row in json.loads(self._line)
+            for row in json_tree(self._line)
         )
 
     def __len__(self) -> int:

@@ -16,7 +16,7 @@ import shutil
 import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -40,6 +40,8 @@ MERGED: Final = "merged"
 """The ``stage`` of a run that many drives were merged into."""
 FORMAT_VERSION: Final = 2
 MAX_MANIFEST_BYTES: Final = 256 << 20
+STAGED: Final = ".new"
+"""Folder inside a run that holds what is to replace it, until that is whole."""
 GROUP_ROWS: Final = 8192
 """Rows of a table held back before they are written."""
 
@@ -53,12 +55,14 @@ class RunFolder:
         logs: A folder that its logs have moved to, or None where they are as the manifest says.
         without_pictures: Is it to be shown without the pictures in its logs?
         limits: What its logs are read with.
+        home: Where it will lie, if it is still being made elsewhere; see ``staged``.
     """
 
     path: Path
     logs: Path | None = None
     without_pictures: bool = False
     limits: Limits = DEFAULT
+    home: Path | None = None
 
     def file(self, name: str) -> Path:
         """Path of one of its files."""
@@ -200,6 +204,73 @@ def clear(run: RunFolder, content: Mapping[str, object] | None = None) -> None:
         raise cannot_write(place, error) from None
 
 
+@contextmanager
+def staged(
+    run: RunFolder, *, keep: bool = False, until: Mapping[str, object] | None = None
+) -> Iterator[RunFolder]:
+    """A place to write what replaces a finished run; that is touched only once this is whole.
+
+    Without a finished run there is nothing to protect, and the place is the run itself. Call it
+    while holding the lock.
+
+    Args:
+        run: The run.
+        keep: Begin with its files, and leave those that nothing replaces.
+        until: What the manifest says while files are replaced; without it there is none so long.
+
+    Raises:
+        OutputError: The folder cannot be written.
+    """
+    if not run.file(MANIFEST).exists():
+        yield run
+        return
+    new = replace(run, path=run.path / STAGED, home=run.home or run.path)
+    try:
+        shutil.rmtree(new.path, ignore_errors=True)
+        new.path.mkdir()
+        if keep:
+            _link_files(run, new)
+    except OSError as error:
+        raise cannot_write(new.path, error) from None
+    try:
+        yield new
+        try:
+            _swap(run, new, keep, until)
+        except OSError as error:
+            raise cannot_write(run.path, error) from None
+    finally:
+        shutil.rmtree(new.path, ignore_errors=True)
+
+
+def _link_files(run: RunFolder, new: RunFolder) -> None:
+    """The run's files under a second name each: a file is never changed, only replaced."""
+    for entry in run.path.iterdir():
+        if entry.name == LOCK or not entry.is_file():
+            continue
+        try:
+            new.file(entry.name).hardlink_to(entry)
+        except OSError:
+            shutil.copy2(entry, new.file(entry.name))
+
+
+def _swap(run: RunFolder, new: RunFolder, keep: bool, until: Mapping[str, object] | None) -> None:
+    """Put the new files in place of the old ones; the manifest goes first and comes last."""
+    if until is None:
+        run.file(MANIFEST).unlink()
+    else:
+        write_manifest(run, until)
+    names = {entry.name for entry in new.path.iterdir()}
+    for entry in run.path.iterdir():
+        if entry.name in (LOCK, STAGED) or (keep and entry.name not in names):
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        elif entry.name not in names | {MANIFEST}:
+            entry.unlink()
+    for name in sorted(names, key=lambda name: name == MANIFEST):
+        new.file(name).replace(run.file(name))
+
+
 def open_run(
     path: Path,
     logs: Path | None = None,
@@ -224,7 +295,7 @@ def open_run(
 
 
 def _looks_like_run(entries: list[Path]) -> bool:
-    ours = {MANIFEST, "score", "view", "pictures"}
+    ours = {MANIFEST, STAGED, "score", "view", "pictures"}
     return all(
         e.name in ours or e.suffix in (".parquet", ".rrd", ".json") or is_partial(e.name)
         for e in entries
@@ -249,6 +320,7 @@ def locked(run: RunFolder) -> Iterator[None]:
         raise cannot_write(path, error) from None
     try:
         sweep(run.path, again=True)
+        shutil.rmtree(run.file(STAGED), ignore_errors=True)
         yield
     finally:
         # Gone from the folder before it is free, so that nobody waits for a file without a name.

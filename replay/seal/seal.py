@@ -22,6 +22,7 @@ import xxhash
 
 from crosscue.replay.errors import LogError, OutputError, one_line
 from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
 
 SUFFIX: Final = ".seal"
@@ -279,7 +280,7 @@ def read_seal(path: Path) -> Seal:
     if raw is None:
         raise _unsound(path, f"larger than {MAX_SEAL_BYTES} bytes")
     try:
-        tree = json.loads(raw)
+        tree = json_tree(raw)
     except (ValueError, RecursionError) as error:
         raise _unsound(path, f"not JSON: {one_line(error, 80)}") from None
     if not isinstance(tree, dict) or tree.get("kind") != KIND:

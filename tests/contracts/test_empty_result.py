@@ -1,5 +1,6 @@
 """An empty result is never exit status 0 in silence, and leaves nothing that looks finished."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -103,3 +104,56 @@ def test_a_camera_without_one_usable_picture(
     said = _fails(capsys, out, "detect", log, "--detectors", "signs", "-o", out)
 
     assert "found no frames" in said
+
+
+def _content(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.mark.parametrize("command", ["replay", "estimate", "decode", "detect"])
+def test_a_finished_run_stays_as_it_was_where_nothing_comes_of_the_next(
+    drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    out, car = tmp_path / "out", tmp_path / "car.toml"
+    first = "replay" if command == "estimate" else command
+    log, flags = str(drive.log), ["--vehicle", str(drive.vehicle), "-o", str(out)]
+    if command == "detect":
+        log = str(picture_folder(tmp_path / "front", 3, "rate_hz: 10\n"))
+        flags = ["--detectors", "signs", "--no-cache", "-o", str(out)]
+    assert cli.run([first, log, *flags]) == 0
+    capsys.readouterr()
+    before = _content(out)
+    car.write_text("version = 1\n")
+    argv = ["--overwrite", "--from", "100000", *flags]
+
+    if command == "estimate":
+        status = cli.run(["estimate", str(out), "--vehicle", str(car)])
+    else:
+        status = cli.run([command, log, *argv])
+
+    assert status in (1, 2)
+    assert capsys.readouterr().err.count("\n") == 1
+    assert _content(out) == before
+
+
+def test_a_run_that_is_replaced_holds_only_what_is_new(
+    drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, fresh = tmp_path / "out", tmp_path / "fresh"
+    argv = ["replay", str(drive.log), "--vehicle", str(drive.vehicle)]
+    assert cli.run([*argv, "-o", str(out)]) == 0
+    (out / "score").mkdir()
+    capsys.readouterr()
+    (out / "old.parquet").write_bytes(b"")
+    assert cli.run([*argv, "-o", str(out), "--overwrite", "--to", "5", "--json"]) == 0
+    said = capsys.readouterr().out
+    assert cli.run([*argv, "-o", str(fresh), "--to", "5"]) == 0
+
+    assert json.loads(said)["run"] == str(out)
+    kept = {name: data for name, data in _content(out).items() if name != MANIFEST}
+    assert kept == {name: data for name, data in _content(fresh).items() if name != MANIFEST}

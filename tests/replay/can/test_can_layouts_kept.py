@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from crosscue.replay.can.layout_cache import VARIABLE, cache_folder
 from crosscue.replay.can.sources import DatabaseText, read_text
 from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.errors import SchemaError
+from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT
 from support.can_layouts import dbc_text, messages
@@ -208,13 +208,13 @@ def test_a_second_start_reads_the_signals_of_the_messages_it_meets_only(
     path = _file(tmp_path)
     CanDatabase.load([path])
     lines: list[bytes] = []
-    loads = json.loads
+    loads = json_tree
 
     def counted(text: bytes) -> Any:
         lines.append(text)
         return loads(text)
 
-    monkeypatch.setattr("crosscue.replay.can.layout_cache.json.loads", counted)
+    monkeypatch.setattr("crosscue.replay.can.layout_cache.json_tree", counted)
     decoder = BusDecoder(CanDatabase.load([path]), "can/1", Ledger("x"))
     assert len(lines) == 1
     one = CanFrames(
