@@ -27,7 +27,7 @@ from crosscue.replay.vehicle.roles import Role, role_of
 from .columns import Block, CanFrames, Messages, Topic
 from .errors import SchemaError
 from .ledger import Detail, Ledger, TopicAccount
-from .log import Log
+from .log import EVERYTHING, Log, Selection
 
 if TYPE_CHECKING:
     from .decode import Decoder
@@ -178,10 +178,12 @@ def quick_summary(log: Log) -> LogSummary:
     return _summary(log, ledger, ClockWatch(), {}, is_quick=True)
 
 
-def summarise(log: Log, progress: Progress | None = None) -> LogSummary:
-    """Read a whole log once, in bounded memory, and say what is in it."""
+def summarise(
+    log: Log, progress: Progress | None = None, selection: Selection = EVERYTHING
+) -> LogSummary:
+    """Read a log once, or a part of it, in bounded memory, and say what is in it."""
     ledger, clocks, can_ids = Ledger(name_of(log)), ClockWatch(), dict[str, _CanIds]()
-    blocks: Iterable[Block] = ledger.handing_on(log.read(ledger))
+    blocks: Iterable[Block] = ledger.handing_on(log.read(ledger, selection))
     if progress is not None:
         blocks = progress(blocks, lambda: _share_done(log, ledger))
     for block in _decoded(log, blocks, ledger):
@@ -264,7 +266,7 @@ def _summary(
     log_clocks = [r.log for r in reports.values() if r.log.rows]
     nameless = ledger.accounts.get("", TopicAccount())
     return LogSummary(
-        path=str(log.path),
+        path=name_of(log),
         format=log.format,
         is_quick=is_quick,
         is_whole=ledger.is_whole,

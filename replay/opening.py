@@ -70,11 +70,13 @@ def unless_damaged(logs: Sequence[Log]) -> Iterator[None]:
     try:
         yield
     except MissingTopicError as error:
+        from crosscue.replay.remote.logs import name_of
+
         for log in logs:
-            ledger = Ledger(str(log.path))
+            ledger = Ledger(name_of(log))
             for _ in log.read(ledger):
                 pass
             for loss in ledger.drops():
                 detail = f" ({loss.detail})" if loss.detail else ""
-                raise LogError(f"{log.path}: {loss.reason}{detail}; so {error}") from None
+                raise LogError(f"{name_of(log)}: {loss.reason}{detail}; so {error}") from None
         raise

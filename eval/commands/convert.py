@@ -45,7 +45,7 @@ SHOWN = 20
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("log", type=Path, metavar="LOG", help="a recording or data-set folder")
+    parser.add_argument("log", metavar="LOG", help="a recording, a data-set folder or a URL")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="OUT.mcap", help="file to write"
     )
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     _check_output(args)
     with open_log(args.log, limits_of(args)) as log, unless_damaged([log]):
         selection = selection_of(args, [log])
-        ledger = Ledger(str(args.log))
+        ledger = Ledger(args.log)
         writer = LogWriter(
             args.output, ledger, compression=args.compression, overwrite=args.overwrite
         )
@@ -91,7 +91,8 @@ def run(args: argparse.Namespace) -> int:
 def _check_output(args: argparse.Namespace) -> None:
     if args.output.suffix.lower() != ".mcap":
         raise UsageError(f"{args.output}: want a name that ends in .mcap")
-    if args.output.exists() and args.log.exists() and args.output.samefile(args.log):
+    log = Path(args.log)
+    if args.output.exists() and log.exists() and args.output.samefile(log):
         raise UsageError(f"{args.output}: is the log itself; give another name")
     if seal_path(args.output).exists():
         raise OutputError(
@@ -159,7 +160,7 @@ def _lost(account: TopicAccount) -> int:
 
 def _as_json(args: argparse.Namespace, ledger: Ledger, writer: LogWriter) -> object:
     return {
-        "log": str(args.log),
+        "log": args.log,
         "output": str(args.output),
         "bytes": args.output.stat().st_size,
         "integrity": ledger.integrity,

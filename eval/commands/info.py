@@ -4,6 +4,7 @@ examples:
   crosscue info drive.mcap
   crosscue info drive.mcap can0.log --json > drive.json
   crosscue info --quick drive.bag      only what the file declares, without reading it
+  crosscue info https://host/drive.mcap --from 60 --to 62
 
 Offset and drift say how the header stamp (else the publish time) runs against the log time.
 """
@@ -16,9 +17,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import Enum
 
 from crosscue.eval.commands.shared.options import (
-    add_limit_arguments,
+    add_part_arguments,
     limits_of,
     print_json,
+    selection_of,
     with_progress,
 )
 from crosscue.replay.columns import Block
@@ -41,7 +43,7 @@ LOSSES_SHOWN = 10
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("logs", nargs="+", metavar="LOG", help="recordings to look at")
-    add_limit_arguments(parser)
+    add_part_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     parser.add_argument(
         "--quick", action="store_true", help="only what the log declares; do not read its body"
@@ -58,7 +60,8 @@ def run(args: argparse.Namespace) -> int:
         if args.quick:
             summaries = [quick_summary(log) for log in logs]
         else:
-            summaries = [summarise(log, _progress(args)) for log in logs]
+            part = selection_of(args, logs)
+            summaries = [summarise(log, _progress(args), part) for log in logs]
     common = together(summaries) if len(summaries) > 1 and not args.quick else None
     if args.json:
         print_json({"logs": [plain(s) for s in summaries], "together": plain(common)})

@@ -11,6 +11,7 @@ from crosscue.replay.errors import CrosscueError, EmptyResultError, LogError
 from crosscue.replay.files.run_folder import RunFolder, clear
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.remote.logs import name_of
 from crosscue.replay.signals.kinds import Plan, Signal
 
 TOPICS_SHOWN: Final = 12
@@ -38,7 +39,7 @@ def empty_result(what: str, logs: Sequence[Log], selection: Selection) -> Crossc
     last_ns: int | None = None
     damage: list[str] = []
     for log in logs:
-        ledger = Ledger(str(log.path))
+        ledger = Ledger(name_of(log))
         for block in log.read(ledger):
             if len(block):
                 rows[block.topic] += len(block)
@@ -57,7 +58,7 @@ def empty_result(what: str, logs: Sequence[Log], selection: Selection) -> Crossc
         asked = (
             f" from {_or(selection.start_ns, 'the start')} to {_or(selection.end_ns, 'the end')}"
         )
-    paths = ", ".join(str(log.path) for log in logs)
+    paths = ", ".join(map(name_of, logs))
     if first_ns is None and damage:
         return LogError(f"{paths}: {damage[0]}, and not one row is left; copy it again")
     return EmptyResultError(

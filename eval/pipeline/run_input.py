@@ -13,7 +13,13 @@ from typing import Any
 
 from crosscue.detectors.registry import Choice
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.identity import Identity, as_row, identity_of, identity_of_all, of_row
+from crosscue.replay.files.identity import (
+    Identity,
+    as_row,
+    identity_of_all,
+    identity_of_log,
+    of_row,
+)
 from crosscue.replay.files.run_folder import INPUT, LOCK, MANIFEST, RunFolder, strict_json
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.log import Log, Selection
@@ -21,7 +27,6 @@ from crosscue.replay.remote.logs import version_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .accounts import selection_told, versions
-from .run_logs import origin
 
 
 def input_of(
@@ -50,7 +55,7 @@ def input_of(
         "landmarks": None if landmarks is None else str(landmarks.resolve()),
         "versions": versions(),
     }
-    identity = identity_of_all([identity_of(origin(log)) for log in logs])
+    identity = identity_of_all([identity_of_log(log) for log in logs])
     return {
         "identity": as_row(identity),
         "settings": json_tree(strict_json({**settings, "files": files_named_in(settings)})),

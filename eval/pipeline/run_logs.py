@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.replay.errors import CrosscueError, RunError
-from crosscue.replay.files.identity import as_row, identity_of, of_row
+from crosscue.replay.files.identity import as_row, identity_of, identity_of_log, of_row
 from crosscue.replay.files.run_folder import RunFolder, sha256_of
 from crosscue.replay.log import Log
 from crosscue.replay.opening import open_log
-from crosscue.replay.remote.logs import RangedLog, RemoteLog, is_remote
+from crosscue.replay.remote.logs import RangedLog, is_remote, origin
 from crosscue.replay.vehicle.roles import Role, role_of
 
 DEPTH: Final = 8
@@ -27,18 +27,12 @@ DEPTH: Final = 8
 
 def log_names(logs: Sequence[Log]) -> list[str]:
     """What the logs of a drive are called in its tables: file names, told apart where equal."""
-    places = [origin(log) for log in logs]
-    names = [place_name(place) for place in places]
+    names = [place_name(origin(log)) for log in logs]
     count = Counter(names)
     return [
-        name if count[name] == 1 else f"{name}#{identity_of(place).short}"
-        for name, place in zip(names, places, strict=True)
+        name if count[name] == 1 else f"{name}#{identity_of_log(log).short}"
+        for name, log in zip(names, logs, strict=True)
     ]
-
-
-def origin(log: Log) -> Path | str:
-    """Where a log comes from: a path or a URL."""
-    return log.url if isinstance(log, RemoteLog | RangedLog) else log.path
 
 
 def place_name(place: Path | str) -> str:
@@ -49,15 +43,18 @@ def place_name(place: Path | str) -> str:
 
 
 def log_rows(logs: Sequence[Log], run: RunFolder) -> list[dict[str, object]]:
-    """Name, place, format, identity, cameras and hashes of every log, for the manifest."""
+    """Name, place, format, identity, cameras and hashes of every log, for the manifest.
+
+    A log that is read by ranges is known by its identity alone: a hash would fetch all of it.
+    """
     return [
         {
             "name": name,
             "path": place if isinstance(place := origin(log), str) else relative(place, run),
             "format": log.format,
-            "identity": as_row(identity_of(place)),
+            "identity": as_row(identity_of_log(log)),
             "cameras": sorted(one.name for one in log.topics if role_of(one) is Role.CAMERA),
-            "sha256": sha256_of(log.path),
+            "sha256": {} if isinstance(log, RangedLog) else sha256_of(log.path),
         }
         for name, log in zip(log_names(logs), logs, strict=True)
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -236,10 +236,17 @@ def same_logs(scored: Sequence[RunScored]) -> list[tuple[str, str]]:
     for one in scored:
         name = str(one.run.path)
         logs = one.run.manifest().get("logs", [])
-        for digest in {digest for log in logs for digest in log.get("sha256", {}).values()}:
+        for digest in {digest for log in logs for digest in _digests(log)}:
             if first.setdefault(digest, name) != name:
                 pairs.append((first[digest], name))
     return sorted(set(pairs))
+
+
+def _digests(log: Mapping[str, Any]) -> Iterator[str]:
+    """What a log is known by: hashes of its files, and its identity."""
+    yield from log.get("sha256", {}).values()
+    if "identity" in log:
+        yield log["identity"]["digest"]
 
 
 def _poses(poses: Mapping[str, PoseScore]) -> dict[str, Any]:

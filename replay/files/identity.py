@@ -3,15 +3,16 @@
 The identity of a log is a SHA-256 over its files, sorted by name: of each its name (a folder's with
 the folder's own in front), its size, and a hash of its content. A log of up to 4 MiB is hashed
 whole. Of a larger one, each file has an equal share of 4 MiB (64 KiB at least), and what is longer
-than its share is hashed in parts: a quarter of the share from the head, a quarter from the tail,
-the rest as 32 blocks spread evenly between them; and the index that MCAP files and ROS 1 bags have
-at their end, whole up to 64 MiB. So a log of 100 GB costs milliseconds, and the same log has the
-same identity wherever it lies and however old it looks.
+than its share is hashed in parts: of a file with an index at its end, as MCAP files and ROS 1 bags
+have, 64 KiB from the head, 64 KiB from the tail, and the index, up to 64 MiB; of others a quarter
+of the share from the head, a quarter from the tail, the rest as 32 blocks spread evenly between
+them. So a log of 100 GB costs milliseconds, and the same log has the same identity wherever it
+lies, on a disk or at a URL, and however old it looks.
 
 Files that readers consult beside a log belong to it: time files of pictures and videos, SQLite's
 journals. Hidden files and what other commands put beside a log (``vehicle.toml``, ``truth.json``,
-``.seal``) do not. Of a URL, the identity is that of the address and of what the store says of it
-(names, sizes, versions): nothing is fetched for it.
+``.seal``) do not. Of a URL only these parts are fetched, where its format is read by ranges; else
+the whole log, which stays in the store for whoever reads it.
 """
 
 from __future__ import annotations
@@ -24,14 +25,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Final, Protocol
 
 from crosscue.replay.errors import LogError
 from crosscue.replay.limits import MIB
-from crosscue.replay.remote.logs import is_remote, version_of
+from crosscue.replay.log import Log
+from crosscue.replay.remote.logs import RangedLog, by_ranges, fetch, is_remote
+from crosscue.replay.remote.ranges import RangedFile
 
 SHARE_BYTES: Final = 4 * MIB
 LEAST_BYTES: Final = 64 << 10
+EDGE_BYTES: Final = 64 << 10
 BLOCKS: Final = 32
 INDEX_BYTES: Final = 64 * MIB
 SHORT: Final = 8
@@ -50,7 +54,7 @@ class Identity:
 
     Attributes:
         name: Of the file or folder.
-        size: Bytes in all; None of a URL.
+        size: Bytes in all; None in runs of earlier versions.
         digest: 64 hex digits.
     """
 
@@ -86,8 +90,7 @@ def identity_of(place: Path | str) -> Identity:
         LogError: It is not there or cannot be read.
     """
     if isinstance(place, str) and is_remote(place):
-        digest = hashlib.sha256(version_of(place).encode()).hexdigest()
-        return Identity(place.rstrip("/").rpartition("/")[2], None, digest)
+        return _identity_of_url(place)
     path = Path(place)
     if path.name in ("", ".."):
         path = path.resolve()
@@ -97,12 +100,45 @@ def identity_of(place: Path | str) -> Identity:
         files = list(_files(path))
         share = max(SHARE_BYTES // max(len(files), 1), LEAST_BYTES)
         for name, file in files:
-            size, content = _hash(file, share)
-            digest_of_all.update(f"{len(name)}\0{size}\0".encode() + name + content)
-            total += size
+            with file.open("rb", buffering=0) as stream:
+                opened = _Local(stream.fileno())
+                digest_of_all.update(_told(name, opened.size, _hash(opened, share)))
+            total += opened.size
     except OSError as error:
         raise LogError(f"{error.filename or path}: {error.strerror or error}; check it") from None
     return Identity(path.name, total, digest_of_all.hexdigest())
+
+
+def identity_of_log(log: Log) -> Identity:
+    """The identity of an open log; of a remote one, what it has fetched is not fetched again.
+
+    Raises:
+        LogError: It is gone or cannot be read.
+    """
+    return _identity_of_ranged(log.ranged) if isinstance(log, RangedLog) else identity_of(log.path)
+
+
+def _identity_of_url(url: str) -> Identity:
+    ranged = by_ranges(url)
+    if ranged is None:
+        with fetch(url) as fetched:
+            return identity_of(fetched.path)
+    try:
+        return _identity_of_ranged(ranged)
+    finally:
+        ranged.close()
+
+
+def _identity_of_ranged(ranged: RangedFile) -> Identity:
+    name = ranged.url.rstrip("/").rpartition("/")[2]
+    file = _Remote(ranged)
+    digest = hashlib.sha256()
+    digest.update(_told(os.fsencode(name), file.size, _hash(file, SHARE_BYTES)))
+    return Identity(name, file.size, digest.hexdigest())
+
+
+def _told(name: bytes, size: int, content: bytes) -> bytes:
+    return f"{len(name)}\0{size}\0".encode() + name + content
 
 
 def identity_of_all(found: Sequence[Identity]) -> Identity:
@@ -165,43 +201,73 @@ def _videos() -> tuple[str, ...]:
     return FORMATS["video"].suffixes
 
 
-def _hash(path: Path, share: int) -> tuple[int, bytes]:
-    """Size and hash of a file's content, or of parts of it if it is longer than ``share``."""
+class _File(Protocol):
+    """Bytes by position."""
+
+    @property
+    def size(self) -> int: ...
+    def read(self, at: int, size: int) -> bytes | memoryview: ...
+
+
+class _Local:
+    """A file of this machine."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor: Final = descriptor
+        self.size: Final = os.fstat(descriptor).st_size
+
+    def read(self, at: int, size: int) -> bytes:
+        return os.pread(self._descriptor, size, at)
+
+
+class _Remote:
+    """A remote object, of which no more than is asked for is fetched."""
+
+    def __init__(self, ranged: RangedFile) -> None:
+        self._ranged: Final = ranged
+        self.size: Final = ranged.size
+
+    def read(self, at: int, size: int) -> memoryview:
+        self._ranged.expect([(at, at + size)])
+        return self._ranged.at_least(at, size)[:size]
+
+
+def _hash(file: _File, share: int) -> bytes:
+    """Hash of a file's content, or of parts of it if it is longer than ``share``."""
     digest = hashlib.sha256()
-    with path.open("rb", buffering=0) as file:
-        size = os.fstat(file.fileno()).st_size
-        for at, end in _parts(file, size, share):
-            file.seek(at)
-            while at < end and (part := file.read(min(end - at, MIB))):
-                digest.update(part)
-                at += len(part)
-    return size, digest.digest()
+    for at, end in _parts(file, share):
+        while at < end and (part := file.read(at, min(end - at, MIB))):
+            digest.update(part)
+            at += len(part)
+    return digest.digest()
 
 
-def _parts(file: BinaryIO, size: int, share: int) -> Iterator[tuple[int, int]]:
+def _parts(file: _File, share: int) -> Iterator[tuple[int, int]]:
     """Spans of the file to hash."""
+    size = file.size
     if size <= share:
         yield 0, size
         return
-    edge, block = share // 4, share // 2 // BLOCKS
+    index = _index_at(file)
+    edge = share // 4 if index is None else min(EDGE_BYTES, share // 4)
     yield 0, edge
-    between = size - 2 * edge - block
-    for i in range(BLOCKS):
-        at = edge + between * i // (BLOCKS - 1)
-        yield at, at + block
-    yield size - edge, size
-    index = _index_at(file, size)
-    if index is not None and index < size - edge:
+    if index is None:
+        block = share // 2 // BLOCKS
+        between = size - 2 * edge - block
+        for i in range(BLOCKS):
+            at = edge + between * i // (BLOCKS - 1)
+            yield at, at + block
+    elif index < size - edge:
         yield index, min(size - edge, index + INDEX_BYTES)
+    yield size - edge, size
 
 
-def _index_at(file: BinaryIO, size: int) -> int | None:
+def _index_at(file: _File) -> int | None:
     """Where the index at a log's end begins, as the file itself says."""
-    file.seek(0)
-    head = file.read(4096)
+    head, size = bytes(file.read(0, EDGE_BYTES))[:4096], file.size
     if head.startswith(_MCAP_MAGIC):
-        file.seek(size - _MCAP_FOOTER.size)
-        opcode, length, start, *_ = _MCAP_FOOTER.unpack(file.read(_MCAP_FOOTER.size))
+        tail = file.read(size - EDGE_BYTES, EDGE_BYTES)
+        opcode, length, start, *_ = _MCAP_FOOTER.unpack(tail[-_MCAP_FOOTER.size :])
         return int(start) if opcode == 2 and length == 20 and 0 < start < size else None
     found = _BAG_INDEX.search(head) if head.startswith(_BAG_MAGIC) else None
     start = int.from_bytes(found[1], "little") if found else 0

@@ -40,7 +40,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, Log, Selection
 
-from .ranges import RangedFile
+from .ranges import RangedFile, Spool
 
 URL: Final = re.compile(r"^[a-z][a-z0-9+.-]+://")
 CHUNK_BYTES: Final = 8 << 20
@@ -367,9 +367,14 @@ class RangedLog:
         return self._whole
 
 
+def origin(log: Log) -> Path | str:
+    """Where a log comes from: a path or a URL."""
+    return log.url if isinstance(log, RemoteLog | RangedLog) else log.path
+
+
 def name_of(log: Log) -> str:
     """What a log is called in accounts: its URL, else its path."""
-    return log.url if isinstance(log, RemoteLog | RangedLog) else str(log.path)
+    return str(origin(log))
 
 
 def open_remote(
@@ -393,7 +398,7 @@ def open_remote(
     suffix = PurePosixPath(address).suffix.lower()
     if _is_local(system) or suffix not in RANGED:
         return whole("its format is read from a local file")
-    ranged = _ranged(url, system, address)
+    ranged = _ranged(url, system, address, store or default_store())
     if ranged is None:
         return whole("its store gives no ranges")
     module, _, function = RANGED[suffix].partition(":")
@@ -412,7 +417,19 @@ def open_remote(
     return RangedLog(url, log, ranged, whole)
 
 
-def _ranged(url: str, system: _System, address: str) -> RangedFile | None:
+def by_ranges(url: str) -> RangedFile | None:
+    """A remote log of a format that is read by ranges; None where it has to be fetched.
+
+    Raises:
+        LogError: As ``fetch``.
+    """
+    system, address = _opened(url)
+    if _is_local(system) or PurePosixPath(address).suffix.lower() not in RANGED:
+        return None
+    return _ranged(url, system, address, default_store())
+
+
+def _ranged(url: str, system: _System, address: str, store: Store) -> RangedFile | None:
     """The object by ranges; None if it is no single object of known size."""
     info = _guarded(url, lambda: system.info(address))
     if info.get("type") == "directory" or not info.get("size") or info.get("partial") is False:
@@ -427,7 +444,7 @@ def _ranged(url: str, system: _System, address: str) -> RangedFile | None:
     def opened() -> BinaryIO:
         return system.open(address, "rb", cache_type="none")
 
-    return RangedFile(url, told.size, opened, changed)
+    return RangedFile(url, told.size, opened, changed, Spool(store.folder, store.max_bytes))
 
 
 def _opened(url: str) -> tuple[_System, str]:

@@ -2,16 +2,21 @@
 
 A reader says beforehand which ranges it is going to need (``expect``); within these, pieces of up
 to 4 MiB are fetched at once. Elsewhere a little more than asked for is fetched, more each time that
-the next read goes on where the last fetch ended. A lost connection is tried again a few times. A
-range that comes back short, or an object whose size or version has changed, is an error.
+the next read goes on where the last fetch ended. Nothing is fetched twice: a replay reads its
+window several times, so what memory does not hold goes to a temporary file with holes, as long as
+the disk takes it. A lost connection is tried again a few times. A range that comes back short, or
+an object whose size or version has changed, is an error.
 """
 
 from __future__ import annotations
 
+import os
+import tempfile
 import time
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from threading import Lock
 from typing import BinaryIO, Final, TypeVar
 
@@ -20,12 +25,77 @@ from crosscue.replay.errors import CrosscueError, LogError, one_line
 PIECE: Final = 4 << 20
 AHEAD: Final = 8 << 10
 AHEAD_MOST: Final = 512 << 10
-KEPT: Final = 8
+KEPT: Final = 64
 KEPT_BYTES: Final = 32 << 20
 WAITS_S: Final = (0.1, 0.5, 2.0)
 """Before each further try after a lost connection."""
 
 T = TypeVar("T")
+
+
+class Spool:
+    """Bytes by position in a temporary file, which is gone when it is closed."""
+
+    def __init__(self, folder: Path, max_bytes: int) -> None:
+        """Nothing yet; the file is made when there is something to hold.
+
+        Args:
+            folder: Where the file lies; made if it is not there.
+            max_bytes: What is more is not held.
+        """
+        self._folder: Final = folder
+        self._left = max_bytes
+        self._file: BinaryIO | None = None
+        self._begins: list[int] = []
+        self._ends: list[int] = []
+
+    def put(self, at: int, content: memoryview) -> None:
+        """Hold bytes for later; on a full disk or above the limit they are let go."""
+        end = at + len(content)
+        if self.end_at(at) >= end or len(content) > self._left:
+            return
+        try:
+            if self._file is None:
+                self._folder.mkdir(parents=True, exist_ok=True)
+                self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115
+            done = 0
+            while done < len(content):
+                done += os.pwrite(self._file.fileno(), content[done:], at + done)
+        except OSError:
+            self._left = 0
+            return
+        self._left -= len(content)
+        # All spans that touch the new one become one with it.
+        first, last = bisect_left(self._ends, at), bisect_right(self._begins, end)
+        begin = min([at, *self._begins[first:last]])
+        end = max([end, *self._ends[first:last]])
+        self._begins[first:last], self._ends[first:last] = [begin], [end]
+
+    def end_at(self, at: int) -> int:
+        """Up to where it holds all bytes from ``at`` on; ``at`` if it does not hold that one."""
+        place = bisect_right(self._begins, at) - 1
+        return max(at, self._ends[place]) if place >= 0 else at
+
+    def next_at(self, at: int) -> int:
+        """Where the next span begins that it holds after ``at``; ``at`` if there is none."""
+        place = bisect_right(self._begins, at)
+        return self._begins[place] if place < len(self._begins) else at
+
+    def read(self, at: int, size: int) -> bytes:
+        """Bytes that it holds; fewer or none if the disk fails, and they are fetched again."""
+        if self._file is None:
+            return b""
+        try:
+            return os.pread(self._file.fileno(), size, at)
+        except OSError:
+            return b""
+
+    def close(self) -> None:
+        """Let go of everything."""
+        self._begins, self._ends = [], []
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
 
 class RangedFile:
@@ -38,7 +108,12 @@ class RangedFile:
     """
 
     def __init__(
-        self, url: str, size: int, opened: Callable[[], BinaryIO], changed: Callable[[], bool]
+        self,
+        url: str,
+        size: int,
+        opened: Callable[[], BinaryIO],
+        changed: Callable[[], bool],
+        spool: Spool,
     ) -> None:
         """Take over an object.
 
@@ -47,12 +122,14 @@ class RangedFile:
             size: Bytes, as the store says.
             opened: Opens it; the file's reads must fetch exactly what they are asked for.
             changed: Asks the store whether size or version are no longer what they were.
+            spool: Holds what memory does not; closed with it.
         """
         self.url: Final = url
         self.size: Final = size
         self.transferred = 0
         self._opened: Final = opened
         self._changed: Final = changed
+        self._spool: Final = spool
         self._file: BinaryIO | None = None
         self._lock: Final = Lock()
         self._kept: deque[tuple[int, memoryview]] = deque()
@@ -93,24 +170,43 @@ class RangedFile:
         """Release the connection."""
         with self._lock:
             self._kept.clear()
+            self._spool.close()
             if self._file is not None:
                 self._file.close()
                 self._file = None
 
     def _fetched(self, at: int, end: int) -> memoryview:
         """The bytes from ``at`` on, to ``end`` at least; what is at hand is not fetched again."""
-        head = next((kept[at - b :] for b, kept in self._kept if b <= at < b + len(kept)), None)
-        begin = at + len(head) if head is not None else at
-        stop = max(end, min(begin + self._reach(begin, end), self.size))
-        found = self._tried(lambda: self._range(begin, stop), f"bytes {begin} to {stop}")
-        self._next_at = stop
-        whole = memoryview(bytes(head) + found if head is not None else found)
+        parts: list[memoryview] = []
+        place = at
+        while place < end:
+            part = self._at_hand(place, end) or self._new(place, end)
+            parts.append(part)
+            place += len(part)
+        whole = parts[0] if len(parts) == 1 else memoryview(b"".join(parts))
         self._kept.append((at, whole))
         while len(self._kept) > KEPT or (
             len(self._kept) > 1 and sum(len(kept) for _, kept in self._kept) > KEPT_BYTES
         ):
-            self._kept.popleft()
+            self._spool.put(*self._kept.popleft())
         return whole
+
+    def _at_hand(self, at: int, end: int) -> memoryview | None:
+        """What memory or the temporary file has from ``at`` on; None if not that byte."""
+        for begin, kept in self._kept:
+            if begin <= at < begin + len(kept):
+                return kept[at - begin : end - begin]
+        stop = min(self._spool.end_at(at), max(end, at + AHEAD_MOST))
+        return memoryview(self._spool.read(at, stop - at)) if stop > at else None
+
+    def _new(self, begin: int, end: int) -> memoryview:
+        """Bytes that are not at hand, fetched, up to those that are."""
+        stop = max(end, min(begin + self._reach(begin, end), self.size))
+        held = [at for at, _ in self._kept] + [self._spool.next_at(begin)]
+        stop = min([stop, *(at for at in held if at > begin)])
+        found = self._tried(lambda: self._range(begin, stop), f"bytes {begin} to {stop}")
+        self._next_at = stop
+        return memoryview(found)
 
     def _reach(self, begin: int, end: int) -> int:
         """How many bytes from ``begin`` on to fetch, if more than up to ``end``."""

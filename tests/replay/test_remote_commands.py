@@ -1,0 +1,222 @@
+"""Commands on parts of logs at URLs: what they transfer, counted by the server."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from crosscue.eval.cli import run as crosscue
+from crosscue.replay.columns import Block, Images, Messages, Topic
+from crosscue.replay.files.identity import identity_of
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Selection
+from crosscue.replay.opening import open_log
+from crosscue.replay.remote import logs as remote
+from crosscue.replay.write.convert import LogWriter
+from support.can_files import candump, made
+from support.memory_log import GYRO, WHEELS, gyro_block, wheel_block
+from support.range_server import Served, serving
+from support.rosbag_files import rows_of, write_bag
+
+MS = 1_000_000
+FIXED_BYTES = 192 << 10
+"""Head and tail of a log, of which its identity is made, and what is read ahead of records."""
+BRIGHT = "support.detecting:build"
+COMMANDS = {
+    "info": ["info"],
+    "convert": ["convert", "-o", "OUT.mcap", "-q"],
+    "decode": ["decode", "-o", "OUT", "-q"],
+    "replay": ["replay", "-o", "OUT", "-q", "--detectors", BRIGHT, "--no-cache"],
+    "detect": ["detect", "-o", "OUT", "-q", "--detectors", BRIGHT, "--no-cache"],
+}
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Wheel speeds, yaw rates and ten pictures of noise each second, in chunks of 100 kB."""
+    folder = tmp_path_factory.mktemp("drive")
+    path = folder / "large_chunks.mcap"
+    rng = np.random.default_rng(5)
+    camera = Topic("camera", "crosscue/Images", "columns")
+    with LogWriter(path, Ledger("made")) as writer:
+        for topic in (WHEELS, GYRO, camera):
+            assert writer.add_topic(topic)
+        for second in range(40):
+            t_ns = [(1_000 + second * 1_000 + i * 100) * MS for i in range(10)]
+            writer.write(wheel_block(t_ns, [10.0] * 10))
+            writer.write(gyro_block(t_ns, [0.01] * 10))
+            pixels = [rng.integers(0, 256, (100, 130, 3), np.uint8) for _ in t_ns]
+            coded = [cv2.imencode(".png", one)[1].tobytes() for one in pixels]
+            stop = np.cumsum([len(one) for one in coded])
+            whole = np.frombuffer(b"".join(coded), np.uint8)
+            start = np.concatenate([[0], stop[:-1]])
+            images = Images(Messages(whole, start, stop), ("png",) * 10)
+            writer.write(Block("camera", np.array(t_ns, np.int64), images))
+    with path.open("rb") as source, (folder / "drive.mcap").open("wb") as target:
+        copy = Writer(target, chunk_size=100_000)
+        copy.start(profile="ros2")
+        known: dict[str, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            assert schema is not None
+            if channel.topic not in known:
+                number = copy.register_schema(schema.name, schema.encoding, schema.data)
+                known[channel.topic] = copy.register_channel(channel.topic, "cdr", number)
+            at = message.log_time
+            copy.add_message(known[channel.topic], at, message.data, at, message.sequence)
+        copy.finish()  # type: ignore[no-untyped-call]
+    return folder / "drive.mcap"
+
+
+@pytest.fixture
+def web(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
+    """A web server; whole logs are kept under ``tmp_path/store``."""
+    pytest.importorskip("aiohttp", reason="aiohttp, by which fsspec reads from the web, is missing")
+    monkeypatch.setenv(remote.STORE_VARIABLE, str(tmp_path / "store"))
+    with serving() as served:
+        yield served
+
+
+def cost(path: Path, start_ns: int, end_ns: int) -> int:
+    """1.5 times the chunks of a span and the summary, as the mcap package finds them.
+
+    The log's first chunk is among them: ``--from`` and ``--to`` count from its first row.
+    """
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    chunks = sorted(summary.chunk_indexes, key=lambda one: one.chunk_start_offset)
+    wanted = [
+        one
+        for i, one in enumerate(chunks)
+        if i == 0 or (one.message_end_time >= start_ns and one.message_start_time < end_ns)
+    ]
+    last = chunks[-1]
+    begin = last.chunk_start_offset + last.chunk_length + last.message_index_length
+    return int(
+        1.5 * sum(one.chunk_length + one.message_index_length for one in wanted)
+        + path.stat().st_size
+        - begin
+    )
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_part_of_a_log_at_a_url_costs_its_chunks(
+    command: str,
+    drive: Path,
+    tmp_path: Path,
+    web: Served,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    web.files["logs/drive.mcap"] = drive.read_bytes()
+    words = [word.replace("OUT", str(tmp_path / "out")) for word in COMMANDS[command]]
+
+    status = crosscue(
+        [words[0], f"{web.base}/logs/drive.mcap", *words[1:], "--from", "30", "--to", "34"]
+    )
+
+    assert status == 0, capsys.readouterr().err
+    assert web.sent <= cost(drive, 31_000 * MS, 35_000 * MS) + FIXED_BYTES
+    assert web.sent < 0.25 * drive.stat().st_size
+    assert not list((tmp_path / "store").glob("*/log"))
+
+
+@pytest.mark.parametrize("command", ["info", "convert", "decode", "replay", "detect"])
+def test_a_log_at_a_url_gives_what_it_gives_on_disk(
+    command: str,
+    drive: Path,
+    tmp_path: Path,
+    web: Served,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    web.files["drive.mcap"] = drive.read_bytes()
+    part = ["--from", "10", "--to", "13"]
+    for name, log in (("here", str(drive)), ("there", f"{web.base}/drive.mcap")):
+        words = [word.replace("OUT", str(tmp_path / name)) for word in COMMANDS[command]]
+        assert crosscue([words[0], log, *words[1:], *part]) == 0
+
+    files = sorted(one.relative_to(tmp_path / "here") for one in tmp_path.glob("here/*.parquet"))
+    assert all(
+        (tmp_path / "there" / one).read_bytes() == (tmp_path / "here" / one).read_bytes()
+        for one in files
+    )
+    if command == "convert":
+        assert (tmp_path / "there.mcap").read_bytes() == (tmp_path / "here.mcap").read_bytes()
+    elif command != "info":
+        assert files
+    capsys.readouterr()
+
+
+def test_a_replay_of_a_long_part_fetches_nothing_twice(
+    drive: Path, tmp_path: Path, web: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Memory holds a tenth of it, so that the rest goes through the temporary file.
+    monkeypatch.setattr("crosscue.replay.remote.ranges.KEPT_BYTES", 1 << 20)
+    monkeypatch.setattr("crosscue.replay.remote.ranges.PIECE", 512 << 10)
+    web.files["drive.mcap"] = drive.read_bytes()
+    call = [f"{web.base}/drive.mcap", "-o", str(tmp_path / "out"), "-q", "--from", "10"]
+
+    status = crosscue(["replay", *call, "--detectors", BRIGHT, "--no-cache"])
+
+    assert status == 0
+    assert web.sent <= drive.stat().st_size + FIXED_BYTES
+
+
+@pytest.mark.parametrize("kind", ["mcap", "bag", "log"])
+def test_the_identity_is_the_same_at_a_url_and_on_disk(
+    kind: str, drive: Path, tmp_path: Path, web: Served
+) -> None:
+    path = drive
+    if kind == "bag":
+        path = write_bag(tmp_path / "a.bag", rows_of(60_000), chunk_bytes=64_000)
+    elif kind == "log":
+        path = tmp_path / "can.log"
+        path.write_bytes(candump(made(300)))
+    web.files[f"deep/{path.name}"] = path.read_bytes()
+
+    there = identity_of(f"{web.base}/deep/{path.name}")
+    sent = web.sent
+
+    assert there == identity_of(path)
+    if kind != "log":
+        assert path.stat().st_size > 4 << 20
+        assert sent < 128 * 1024 + 0.1 * path.stat().st_size
+    web.files[f"deep/{path.name}"] += b"x"
+    assert identity_of(f"{web.base}/deep/{path.name}") != there
+
+
+def test_a_run_of_a_log_at_a_url_can_be_estimated_again_and_resumed(
+    drive: Path, tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
+) -> None:
+    web.files["drive.mcap"] = drive.read_bytes()
+    url, out = f"{web.base}/drive.mcap", str(tmp_path / "out")
+    call = ["replay", url, "-o", out, "-q", "--from", "30", "--to", "34", "--detectors", BRIGHT]
+    assert crosscue([*call, "--no-cache"]) == 0
+
+    assert crosscue([*call, "--no-cache", "--resume"]) == 0
+    logs = json.loads((tmp_path / "out" / "manifest.json").read_text())["logs"]
+    assert logs[0]["identity"]["digest"] == identity_of(drive).digest
+    assert web.sent < 0.5 * drive.stat().st_size
+
+    web.files["drive.mcap"] = drive.read_bytes()[:-9] + b"x" + drive.read_bytes()[-8:]
+    assert crosscue([*call, "--no-cache", "--resume"]) == 2
+    assert "not of drive.mcap" in capsys.readouterr().err
+
+
+def test_a_missing_topic_of_a_log_at_a_url_fetches_its_index_only(
+    drive: Path, web: Served, capsys: pytest.CaptureFixture[str]
+) -> None:
+    web.files["drive.mcap"] = drive.read_bytes()
+
+    with open_log(f"{web.base}/drive.mcap") as log:
+        assert not list(log.read(Ledger(""), Selection(frozenset({"none"}), 0, 1)))
+    assert crosscue(["info", "--quick", f"{web.base}/drive.mcap"]) == 0
+
+    assert web.base in capsys.readouterr().out
+    assert web.sent < 400_000
