@@ -4,12 +4,16 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 WORKERS ?= auto
 
-.PHONY: demo test quick docs format lint types imports unit clean
+.PHONY: demo test lowest quick docs format lint types imports unit clean
 
 demo: $(VENV)/.ready
 	$(BIN)/crosscue demo -o demo --overwrite
 
 test: lint types imports unit docs
+
+# Readers, CAN, detectors and scoring with each dependency at its lowest version, in a folder removed afterwards.
+lowest:
+	PYTHON=$(PYTHON) WORKERS=$(WORKERS) .ci/lowest
 
 lint: $(VENV)/.ready-dev
 	$(BIN)/ruff format --check .

@@ -116,9 +116,10 @@ def _boxes(canvas: Bytes, found: Detections, enlarge: float) -> None:
 
     for box, score, label in zip(found.boxes_px, found.scores, found.labels, strict=True):
         x0, y0, x1, y1 = (round(float(side)) for side in box)
-        cv2.rectangle(canvas, (x0, y0), (x1, y1), GREEN, round(2 * enlarge))
         place = (x0, max(y0 - 4, round(12 * enlarge)))
         write_label(canvas, f"{label} {score:.2f}", place, GREEN, 0.5 * enlarge)
+        # After the label, whose dark box reaches below the letters, with OpenCV 4 over this side.
+        cv2.rectangle(canvas, (x0, y0), (x1, y1), GREEN, round(2 * enlarge))
 
 
 def write_label(

@@ -128,5 +128,6 @@ def assert_same_columns(ours: Block, theirs: Message, frames: CanFrames) -> None
     decoded = [theirs.decode_simple(frames.data[i].tobytes(), decode_choices=False) for i in first]
     for name in theirs.signal_tree:
         assert isinstance(name, str)
-        expected = np.array([row[name] for row in decoded])[inverse]
+        # NumPy 2.0 gives a column here, 2.1 a row.
+        expected = np.array([row[name] for row in decoded])[inverse.reshape(-1)]
         np.testing.assert_array_equal(ours.rows[name], expected)
