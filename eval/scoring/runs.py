@@ -135,7 +135,12 @@ def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
     told = set(truth.log_sha256.values())
     logs = run.manifest().get("logs", [])
     found = {digest for log in logs for digest in log.get("sha256", {}).values()}
-    if told and found and not told & found:
+    if told and logs and not found:
+        raise SchemaError(
+            f"{path}: names its log by hash, and the run read its log by ranges: no hash; "
+            "replay the whole log, or give --any-log if both are the same drive"
+        )
+    if told and not told & found:
         names = ", ".join(log["name"] for log in logs)
         raise SchemaError(
             f"{path}: by its hash it belongs to another {truth.log or 'log'}, not to {names}; "
