@@ -67,7 +67,8 @@ def test_a_log_on_an_object_store_is_replayed_and_fetched_again_for_an_estimate(
     before = (run_path / "pose.parquet").read_bytes()
     (said,) = open_run(run_path).manifest()["logs"]
     assert said["path"] == url
-    shutil.rmtree(store)
+    # Read by ranges, the log leaves nothing in the store that an estimate could lean on.
+    assert not store.exists()
     assert run(["estimate", str(run_path), "-q"]) == 0
 
     assert (run_path / "pose.parquet").read_bytes() == before
