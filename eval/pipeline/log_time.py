@@ -7,6 +7,9 @@ either are left out and counted.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -26,6 +29,44 @@ AMBIGUOUS: Final = "log time comes twice"
 """Why rows of either side of a set-back are not scored."""
 LABELS: Final = frozenset({"segment", "log_t_ns"})
 """Columns that every table has besides its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """A stretch of the log's clock in which nothing was measured, or that comes twice.
+
+    Attributes:
+        start_ns: Log time of the last wheel speeds before it; of what comes twice the first.
+        end_ns: Of the first wheel speeds after it; of what comes twice the last.
+        text: What it is, with its length.
+    """
+
+    start_ns: int
+    end_ns: int
+    text: str
+
+    @property
+    def middle_ns(self) -> int:
+        """Halfway."""
+        return (self.start_ns + self.end_ns) // 2
+
+
+def gaps_of(timeline: Timeline) -> tuple[Gap, ...]:
+    """The gaps of a drive on its log's clock, in order: what charts over time shade."""
+    ordered = sorted(timeline.segments, key=lambda one: one.log_start_ns)
+    found = []
+    for one, other in pairwise(ordered):
+        start_ns, end_ns = sorted((one.log_end_ns, other.log_start_ns))
+        is_silence = other.cause is Cause.SILENCE and other.number == one.number + 1
+        what = f"gap of {(end_ns - start_ns) * 1e-9:.1f} s" if is_silence else Cause.SET_BACK.value
+        found.append(Gap(start_ns, end_ns, what))
+    return tuple(found)
+
+
+def broken_at(gaps: Sequence[Gap], t_ns: Int64s) -> Int64s:
+    """Rows, sorted by time, before which a line is interrupted; shape (K,)."""
+    rows = np.searchsorted(t_ns, [one.middle_ns for one in gaps]).astype(np.int64)
+    return np.unique(rows[(rows > 0) & (rows < len(t_ns))])
 
 
 def was_set_back(timeline: Timeline) -> bool:

@@ -34,7 +34,7 @@ def log_pose(recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, 
     flat = np.stack([pose["x_m"], pose["y_m"], np.zeros(len(t_ns))], axis=1)
     recording.log(
         "plan/estimate",
-        rr.LineStrips3D([flat[thin]], colors=[ESTIMATE]),
+        rr.LineStrips3D(_pieces(flat, pose["segment"], thin), colors=[ESTIMATE]),
         static=True,
     )
     some = _every(t_ns, ELLIPSES_PER_S)
@@ -114,6 +114,12 @@ def log_intersection(
             shapes.add(bars[row], START if references[row] == "start" else END)
     shapes.send(recording, time)
     recording.log("plan/intersection", rr.LineStrips3D.from_fields(radii=[0.5]), static=True)
+
+
+def _pieces(flat: Floats, segment: Floats, thin: slice) -> list[Floats]:
+    """The path in pieces that no gap of the drive interrupts."""
+    breaks = np.flatnonzero(np.diff(segment[thin])) + 1
+    return [np.asarray(part) for part in np.split(flat[thin], breaks)]
 
 
 def _every(t_ns: Int64s, rate_hz: float) -> Int64s:

@@ -20,12 +20,14 @@ class SceneRows:
 
     Attributes:
         frames_ns: Times of frames, each once; empty for a run without camera.
+        gaps_ns: Right after the last frame before each gap of the drive.
         cues: As in ``cues.parquet``.
         ranges: As in ``range.parquet``.
         belief: As in ``belief.parquet``.
     """
 
     frames_ns: Int64s
+    gaps_ns: Int64s
     cues: pa.Table | None
     ranges: pa.Table | None
     belief: pa.Table | None
@@ -38,8 +40,14 @@ def scene_rows(run: RunFolder) -> SceneRows:
         RunError: A table is damaged.
     """
     frames = _table(run, "frames")
-    times = np.empty(0, np.int64) if frames is None else np.unique(frames["t_ns"].to_numpy())
-    return SceneRows(times, _table(run, "cues"), _table(run, "range"), _table(run, "belief"))
+    times, gaps_ns = np.empty(0, np.int64), np.empty(0, np.int64)
+    if frames is not None:
+        times, first = np.unique(frames["t_ns"].to_numpy(), return_index=True)
+        segment = frames["segment"].to_numpy()[first]
+        gaps_ns = times[:-1][segment[1:] != segment[:-1]] + 1
+    return SceneRows(
+        times, gaps_ns, _table(run, "cues"), _table(run, "range"), _table(run, "belief")
+    )
 
 
 def _table(run: RunFolder, name: str) -> pa.Table | None:

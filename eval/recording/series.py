@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -46,11 +46,8 @@ def log_pose_series(
         "heading_sd/heading_sd_deg": np.rad2deg(np.sqrt(pose["cov_hh_rad2"])),
         "ellipse/major_axis_m": pose["major_axis_m"],
     }
-    times = time.column(pose["t_ns"].astype(np.int64))
     for name, values in series.items():
-        recording.send_columns(
-            f"plots/{name}", indexes=times, columns=rr.Scalars.columns(scalars=values)
-        )
+        _send(recording, time, ["plots", *name.split("/")], pose["t_ns"], values, pose["segment"])
 
 
 def log_belief(
@@ -59,11 +56,11 @@ def log_belief(
     """The probability of every feature, and the line above which it counts as established."""
     if scene.belief is None:
         return
-    t_ns, approach = scene.belief["t_ns"].to_numpy(), scene.belief["approach"].to_numpy()
+    t_ns, pieces = scene.belief["t_ns"].to_numpy(), _pieces(scene.belief)
     features = [name for name in scene.belief.column_names if name not in NOT_IN_BELIEF]
     for number, name in enumerate(features):
         _line([*BELIEF, name], name, of_feature(name, number), recording, width=2.0)
-        _send(recording, time, [*BELIEF, name], t_ns, scene.belief[name].to_numpy(), approach)
+        _send(recording, time, [*BELIEF, name], t_ns, scene.belief[name].to_numpy(), *pieces)
     ends = np.array([min(scene.frames_ns[0], t_ns[0]), max(scene.frames_ns[-1], t_ns[-1])])
     entity = [*BELIEF, "established_above"]
     _line(entity, f"{vehicle.fusion.established:g}", QUIET, recording)
@@ -80,7 +77,7 @@ def log_ranges(
         rows = scene.ranges.filter(pc.equal(scene.ranges["reference"], reference))
         if not rows.num_rows:
             continue
-        t_ns, approach = rows["t_ns"].to_numpy(), rows["approach"].to_numpy()
+        t_ns, pieces = rows["t_ns"].to_numpy(), _pieces(rows)
         mean_m = rows["range_m"].to_numpy()
         two_sd_m = 2.0 * np.sqrt(rows["var_m2"].to_numpy())
         for name, values, width in (
@@ -90,7 +87,7 @@ def log_ranges(
         ):
             entity = [*RANGE, _path_part(name)]
             _line(entity, name, colour, recording, width)
-            _send(recording, time, entity, t_ns, values, approach)
+            _send(recording, time, entity, t_ns, values, *pieces)
         _log_measured(recording, time, rows, reference, colour)
     if truth is not None:
         for reference, values in (("start", truth.start_m), ("end", truth.end_m)):
@@ -124,7 +121,7 @@ def log_cues(recording: rr.RecordingStream, time: DriveTime, scene: SceneRows) -
         rows = scene.cues.filter(pc.equal(scene.cues["cue"], cue))
         t_ns, first = np.unique(rows["t_ns"].to_numpy(), return_index=True)
         counts = rows["count"].to_numpy()[first]
-        at, is_found = _changes(t_ns, counts > 0, scene.frames_ns)
+        at, is_found = _changes(t_ns, counts > 0, scene.frames_ns, scene.gaps_ns)
         entity = [*CUES, cue]
         style = rr.StateConfiguration(values=[FOUND], labels=[FOUND], colors=[of_cue(cue)])
         recording.log(rr.new_entity_path([*entity]), style, static=True)
@@ -145,11 +142,22 @@ def of_cue(cue: str) -> Colour:
     return of_feature("intersection", 0)
 
 
-def _changes(t_ns: Int64s, is_found: NDArray[np.bool_], frames_ns: Int64s) -> tuple[Int64s, Int64s]:
-    """Times at which a cue comes or goes, and 1 or 0 from then on; not looked at counts as 0."""
-    everywhere = np.isin(frames_ns, t_ns[is_found]).astype(np.int64)
+def _changes(
+    t_ns: Int64s, is_found: NDArray[np.bool_], frames_ns: Int64s, gaps_ns: Int64s
+) -> tuple[Int64s, Int64s]:
+    """Times at which a cue comes or goes, and 1 or 0 from then on.
+
+    Where it was not looked for, and in gaps of the drive, it counts as 0.
+    """
+    times = np.union1d(frames_ns, gaps_ns)
+    everywhere = np.isin(times, t_ns[is_found]).astype(np.int64)
     turns = np.flatnonzero(np.diff(everywhere, prepend=-1))
-    return frames_ns[turns], everywhere[turns]
+    return times[turns], everywhere[turns]
+
+
+def _pieces(table: pa.Table) -> tuple[NDArray[Any], NDArray[Any]]:
+    """What a line must not run across: approaches and the drive's segments."""
+    return table["approach"].to_numpy(), table["segment"].to_numpy()
 
 
 def _path_part(name: str) -> str:
@@ -167,15 +175,16 @@ def _send(
     recording: rr.RecordingStream,
     time: DriveTime,
     entity: list[str],
-    t_ns: Int64s,
+    t_ns: Int64s | Floats,
     values: Floats,
-    approach: Int64s | None = None,
+    *pieces: NDArray[Any],
 ) -> None:
-    """Send a series, broken between approaches."""
-    if approach is not None:
-        breaks = np.flatnonzero(np.diff(approach)) + 1
-        t_ns = np.insert(t_ns, breaks, t_ns[breaks - 1] + 1)
-        values = np.insert(values, breaks, np.nan)
+    """Send a series, broken wherever one of ``pieces`` changes, shape (N,) each."""
+    t_ns = np.asarray(t_ns, np.int64)
+    changes = [np.flatnonzero(piece[1:] != piece[:-1]) + 1 for piece in pieces]
+    breaks = np.unique(np.concatenate([np.empty(0, np.int64), *changes]))
+    t_ns = np.insert(t_ns, breaks, t_ns[breaks - 1] + 1)
+    values = np.insert(np.asarray(values, np.float64), breaks, np.nan)
     path = rr.new_entity_path([*entity])
     recording.send_columns(
         path, indexes=time.column(t_ns), columns=rr.Scalars.columns(scalars=values)

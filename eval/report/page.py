@@ -14,6 +14,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from crosscue.eval.pipeline.drive_time import timeline_in
+from crosscue.eval.pipeline.log_time import gaps_of
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.files.run_folder import strict_json, write_text
@@ -190,6 +192,7 @@ def _figures(scored: Sequence[RunScored], scores: Scores) -> _Figures:
         if one.judged.approaches is not None
         for curve in one.judged.approaches.curves
     ]
+    gaps = {one.judged.coverage.drive: gaps_of(timeline_in(one.run.manifest())) for one in scored}
     ranges = [part for one in scored for part in one.judged.ranges]
     tracks = sum(len(set(part.approach.tolist())) for part in ranges)
     results = [] if scores.approaches is None else scores.approaches.results
@@ -197,14 +200,16 @@ def _figures(scored: Sequence[RunScored], scores: Scores) -> _Figures:
         distances=scene_figures.draw_distances(results) if results else None,
         beliefs=tuple(
             _Chart(
-                scene_figures.draw_belief(curve, one.judged.cues, threshold),
+                scene_figures.draw_belief(
+                    curve, one.judged.cues, threshold, gaps[one.judged.coverage.drive]
+                ),
                 _told(one, curve.intersection),
             )
             for one, curve in curves[:BELIEFS]
         ),
         beliefs_left_out=max(len(curves) - BELIEFS, 0),
         reliability=scene_figures.draw_reliability(scores.belief) if scores.belief else None,
-        range=scene_figures.draw_range(ranges, scores.range) if scores.range else None,
+        range=scene_figures.draw_range(ranges, scores.range, gaps) if scores.range else None,
         range_is_traced=tracks <= scene_figures.TRACES,
     )
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from crosscue.eval.pipeline.log_time import broken_at
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.scoring.pose.score import ScoredPoses
 from crosscue.replay.columns import Floats
@@ -56,9 +57,39 @@ def _draw(
     return path
 
 
+def _broken(poses: ScoredPoses, *columns: Floats) -> tuple[Floats, ...]:
+    """Columns with a missing value wherever a gap of the drive lies between two rows."""
+    rows = broken_at(poses.gaps, poses.t_ns)
+    return tuple(np.insert(np.asarray(one, np.float64), rows, np.nan) for one in columns)
+
+
+def _time_axis(axes: Axes, poses: ScoredPoses) -> None:
+    """Seconds, with each gap of the drive shaded and its length written into it."""
+    first_ns, last_ns = int(poses.t_ns[0]), int(poses.t_ns[-1])
+    axes.set_xlim(0.0, float(poses.seconds[-1]))
+    shown = [one for one in poses.gaps if first_ns <= one.middle_ns <= last_ns]
+    is_shortened = False
+    for one in shown:
+        ends_s = poses.shown_s(np.array([one.start_ns, one.end_ns], np.int64))
+        is_shortened |= float(np.ptp(ends_s)) < (one.end_ns - one.start_ns) * 0.999e-9
+        axes.axvspan(*ends_s.tolist(), color="0.5", alpha=0.18, lw=0)
+        axes.text(
+            float(ends_s.mean()),
+            0.5,
+            one.text,
+            transform=axes.get_xaxis_transform(),
+            rotation=90,
+            ha="center",
+            va="center",
+            fontsize=8,
+            color="0.3",
+        )
+    axes.set_xlabel("time (s), long gaps shortened" if is_shortened else "time (s)")
+
+
 def _plan(axes: Axes, poses: ScoredPoses) -> None:
-    axes.plot(*poses.truth_m.T, color=TRUTH, lw=3, alpha=0.6, label="truth")
-    axes.plot(*poses.estimate_m.T, color=ESTIMATE, lw=1.2, label="estimate")
+    axes.plot(*_broken(poses, *poses.truth_m.T), color=TRUTH, lw=3, alpha=0.6, label="truth")
+    axes.plot(*_broken(poses, *poses.estimate_m.T), color=ESTIMATE, lw=1.2, label="estimate")
     rows = np.unique(np.linspace(0, len(poses.t_ns) - 1, ELLIPSES).astype(int))
     for i, row in enumerate(rows):
         ring = _ellipse(poses.estimate_m[row], poses.cov[row, :2, :2])
@@ -80,29 +111,22 @@ def _ellipse(centre: Floats, cov: Floats) -> Floats:
 def _error(axes: Axes, poses: ScoredPoses) -> None:
     error = np.linalg.norm(poses.estimate_m - poses.truth_m, axis=1)
     claimed = 2.0 * np.sqrt(np.linalg.eigvalsh(poses.cov[:, :2, :2])[:, 1])
-    axes.fill_between(poses.seconds, 0.0, claimed, color=BAND, alpha=0.25, lw=0, label="2 sigma")
-    axes.plot(poses.seconds, error, color=ESTIMATE, lw=1.2, label="position error")
+    seconds, claimed, error = _broken(poses, poses.seconds, claimed, error)
+    axes.fill_between(seconds, 0.0, claimed, color=BAND, alpha=0.25, lw=0, label="2 sigma")
+    axes.plot(seconds, error, color=ESTIMATE, lw=1.2, label="position error")
     axes.set_ylim(bottom=0.0)
-    axes.set_xlim(0.0, float(poses.seconds[-1]))
-    axes.set_xlabel("time (s)")
+    _time_axis(axes, poses)
     axes.set_ylabel("metres")
     axes.legend(frameon=False)
 
 
 def _heading(axes: Axes, poses: ScoredPoses) -> None:
     claimed = np.rad2deg(2.0 * np.sqrt(poses.cov[:, 2, 2]))
-    axes.fill_between(
-        poses.seconds, -claimed, claimed, color=BAND, alpha=0.25, lw=0, label="2 sigma"
-    )
-    axes.plot(
-        poses.seconds,
-        np.rad2deg(poses.heading_error_rad),
-        color=ESTIMATE,
-        lw=1.2,
-        label="heading error",
-    )
-    axes.set_xlim(0.0, float(poses.seconds[-1]))
-    axes.set_xlabel("time (s)")
+    error = np.rad2deg(poses.heading_error_rad)
+    seconds, claimed, error = _broken(poses, poses.seconds, claimed, error)
+    axes.fill_between(seconds, -claimed, claimed, color=BAND, alpha=0.25, lw=0, label="2 sigma")
+    axes.plot(seconds, error, color=ESTIMATE, lw=1.2, label="heading error")
+    _time_axis(axes, poses)
     axes.set_ylabel("degrees")
     axes.legend(frameon=False)
 
@@ -110,10 +134,14 @@ def _heading(axes: Axes, poses: ScoredPoses) -> None:
 def _nees(axes: Axes, poses: ScoredPoses) -> None:
     low, high = mean_band(3, 1)
     axes.axhspan(low, high, color=BAND, alpha=0.2, lw=0, label="95 % band of chi-square(3)")
-    axes.plot(poses.seconds, poses.nees, color=ESTIMATE, lw=1.0, label="NEES of x, y, heading")
+    axes.plot(
+        *_broken(poses, poses.seconds, poses.nees),
+        color=ESTIMATE,
+        lw=1.0,
+        label="NEES of x, y, heading",
+    )
     axes.set_yscale("log")
-    axes.set_xlim(0.0, float(poses.seconds[-1]))
-    axes.set_xlabel("time (s)")
+    _time_axis(axes, poses)
     axes.legend(frameon=False)
 
 

@@ -10,12 +10,13 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from crosscue.eval.pipeline.log_time import Gap, broken_at
 from crosscue.eval.scoring.approaches import THRESHOLD, ApproachResult, Curve
 from crosscue.eval.scoring.belief import BeliefScore
 from crosscue.eval.scoring.cues import CueJudged
 from crosscue.eval.scoring.ranges import RangeJudged, RangeScore
 from crosscue.eval.scoring.run_tables import NONE
-from crosscue.replay.columns import Floats
+from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.cue_table import CUES
 
 from .svg_plot import Drawing, Panel
@@ -94,13 +95,19 @@ def _known(values: Sequence[float | None]) -> list[float]:
     return [value for value in values if value is not None and math.isfinite(value)]
 
 
-def draw_belief(curve: Curve, cues: Sequence[CueJudged], threshold: float = THRESHOLD) -> Markup:
+def draw_belief(
+    curve: Curve,
+    cues: Sequence[CueJudged],
+    threshold: float = THRESHOLD,
+    gaps: Sequence[Gap] = (),
+) -> Markup:
     """Probability against true distance over one approach, with the cues found on the way.
 
     Args:
         curve: Of the approach.
         cues: Of the same drive.
         threshold: Above it a feature is detected.
+        gaps: Of the drive; shaded.
     """
     shown = [
         (one, found)
@@ -124,12 +131,42 @@ def draw_belief(curve: Curve, cues: Sequence[CueJudged], threshold: float = THRE
         panel, "true distance to the intersection (m)", "", y_ticks=[0.0, 0.25, 0.5, 0.75, 1.0]
     )
     drawing.rule(panel.left, panel.y(threshold), panel.right, panel.y(threshold), "line dash")
+    t_ns, distance_m = _way(curve, cues)
+    for gap, row in _between_rows(gaps, t_ns):
+        _shade(drawing, panel, np.minimum(distance_m[row - 1 : row + 1], far), gap.text)
+    rows = broken_at(gaps, curve.t_ns)
+    distance_m = np.insert(curve.distance_m, rows, np.nan)
     for name, values in curve.features.items():
-        drawing.curve(panel, curve.distance_m, values, f"line {style_of(name)}")
+        drawing.curve(panel, distance_m, np.insert(values, rows, np.nan), f"line {style_of(name)}")
     drawing.legend(10, 14, [(f"line {style_of(name)}", name) for name in curve.features])
     for lane, (one, found) in enumerate(shown):
-        _lane(drawing, lanes, lanes.top + 14.0 * lane, one, found)
+        _lane(drawing, lanes, lanes.top + 14.0 * lane, one, found, gaps)
     return drawing.svg()
+
+
+def _way(curve: Curve, cues: Sequence[CueJudged]) -> tuple[Int64s, Floats]:
+    """Times of an approach, sorted, and the distance still to go, shape (N,) each.
+
+    Frames before the belief's first step belong to it.
+    """
+    mine = [(one, one.approach == curve.approach) for one in cues]
+    times = np.concatenate([curve.t_ns, *(one.t_ns[rows] for one, rows in mine)])
+    distance_m = np.concatenate([curve.distance_m, *(one.distance_m[rows] for one, rows in mine)])
+    t_ns, first = np.unique(times, return_index=True)
+    known = np.isfinite(distance_m[first])
+    return t_ns[known], distance_m[first][known]
+
+
+def _between_rows(gaps: Sequence[Gap], t_ns: Int64s) -> list[tuple[Gap, int]]:
+    """Gaps that lie between two rows, each with the row after it."""
+    return [(one, int(row)) for one in gaps for row in broken_at([one], t_ns)]
+
+
+def _shade(drawing: Drawing, panel: Panel, ends: Floats, text: str) -> None:
+    """A gap between two values of x, with its length beside it."""
+    left, right = sorted(panel.x(value) for value in ends.tolist())
+    drawing.rect(left, panel.top, max(right - left, 2.0), panel.height, "gap")
+    drawing.text((left + right) / 2.0, panel.top + 11, text, "halo")
 
 
 def _told(name: str, curve: Curve, threshold: float) -> str:
@@ -140,7 +177,12 @@ def _told(name: str, curve: Curve, threshold: float) -> str:
 
 
 def _lane(
-    drawing: Drawing, panel: Panel, y: float, cue: CueJudged, found: NDArray[np.bool_]
+    drawing: Drawing,
+    panel: Panel,
+    y: float,
+    cue: CueJudged,
+    found: NDArray[np.bool_],
+    gaps: Sequence[Gap],
 ) -> None:
     """A bar wherever the cue was found in one look after the other."""
     side = next((s for s in ("left", "right", "straight") if cue.cue.endswith(s)), "intersection")
@@ -151,7 +193,8 @@ def _lane(
         (found & is_wrong(cue), "bar wrong"),
     ):
         places = np.flatnonzero(rows)
-        for part in np.split(places, np.flatnonzero(np.diff(places) > 1) + 1):
+        leaps = np.flatnonzero(np.diff(places) > 1) + 1
+        for part in np.split(places, np.union1d(leaps, broken_at(gaps, cue.t_ns[places]))):
             across = [panel.x(d) for d in _known(cue.distance_m[part].tolist())]
             if across:
                 drawing.rect(min(across) - 1, y + 2, max(across) - min(across) + 3, 10, style)
@@ -167,11 +210,16 @@ def is_wrong(cue: CueJudged) -> NDArray[np.bool_]:
     return np.asarray((cue.count > 0) & (leading == 0))
 
 
-def draw_range(judged: Sequence[RangeJudged], scores: Mapping[str, RangeScore]) -> Markup:
+def draw_range(
+    judged: Sequence[RangeJudged],
+    scores: Mapping[str, RangeScore],
+    gaps: Mapping[str, Sequence[Gap]] | None = None,
+) -> Markup:
     """Range error over true distance, and whether the claimed variances are honest.
 
     Above, a line for each approach while they are few, else bias and rms error by bin; below, the
-    mean NEES by bin: 1 is honest, above it the filter is too sure.
+    mean NEES by bin: 1 is honest, above it the filter is too sure. ``gaps`` of each drive by its
+    name are shaded where there is a line for each approach.
     """
     rows = [one for one in judged if len(one.true_m)]
     few = sum(len(np.unique(one.approach)) for one in rows) <= TRACES
@@ -195,7 +243,7 @@ def draw_range(judged: Sequence[RangeJudged], scores: Mapping[str, RangeScore]) 
     for one in rows:
         style = "s2" if one.reference == "start" else "s5"
         if few:
-            _traces(drawing, above, one, style)
+            _traces(drawing, above, one, style, (gaps or {}).get(one.drive, ()))
         else:
             _bins(drawing, above, scores[one.reference], style)
     drawing.axes(below, "true range (m)", "mean NEES, 1 is honest")
@@ -219,15 +267,20 @@ def draw_range(judged: Sequence[RangeJudged], scores: Mapping[str, RangeScore]) 
     return drawing.svg()
 
 
-def _traces(drawing: Drawing, panel: Panel, one: RangeJudged, style: str) -> None:
+def _traces(
+    drawing: Drawing, panel: Panel, one: RangeJudged, style: str, gaps: Sequence[Gap]
+) -> None:
     low, high = panel.y_range
     for number in np.unique(one.approach).tolist():
-        mine = one.approach == number
-        two_sd = np.minimum(2.0 * np.sqrt(one.var_m2[mine]), high)
-        drawing.band(panel, one.true_m[mine], -two_sd, two_sd, f"band {style}")
-        drawing.curve(
-            panel, one.true_m[mine], np.clip(one.error_m[mine], low, high), f"line {style}"
-        )
+        mine = np.flatnonzero(one.approach == number)
+        if one.reference == "start":
+            for gap, row in _between_rows(gaps, one.t_ns[mine]):
+                _shade(drawing, panel, one.true_m[mine[row - 1 : row + 1]], gap.text)
+        for part in np.split(mine, broken_at(gaps, one.t_ns[mine])):
+            two_sd = np.minimum(2.0 * np.sqrt(one.var_m2[part]), high)
+            drawing.band(panel, one.true_m[part], -two_sd, two_sd, f"band {style}")
+            error_m = np.clip(one.error_m[part], low, high)
+            drawing.curve(panel, one.true_m[part], error_m, f"line {style}")
 
 
 def _bins(drawing: Drawing, panel: Panel, score: RangeScore, style: str) -> None:

@@ -11,11 +11,13 @@ import pyarrow as pa
 
 from crosscue.detectors import rle
 from crosscue.eval.pipeline.detect import schemas
+from crosscue.eval.pipeline.labelled import with_labels
 from crosscue.eval.pipeline.pose_tables import pose_schema
 from crosscue.eval.pipeline.run_account import line
 from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.time.segments import ONE_SEGMENT, UNSHIFTED
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.write.convert import LogWriter
 
@@ -163,7 +165,11 @@ def scene_run(folder: Path, *, without: frozenset[str] = frozenset()) -> RunFold
     }
     return run_folder(
         folder / "run",
-        {name: table for name, table in tables.items() if name not in without},
+        {
+            name: with_labels(table, ONE_SEGMENT, UNSHIFTED)
+            for name, table in tables.items()
+            if name not in without
+        },
         stage="estimate",
         detect=detect,
         account={

@@ -19,7 +19,7 @@ from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
 from crosscue.eval.pipeline.drive_time import timeline_in
-from crosscue.eval.pipeline.log_time import comes_twice, pose_in_log_time
+from crosscue.eval.pipeline.log_time import Gap, comes_twice, gaps_of, pose_in_log_time
 from crosscue.localization.angles import wrap_all
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
@@ -46,6 +46,8 @@ from .truth_track import TruthTrack
 if TYPE_CHECKING:
     import pyarrow as pa
 
+LONGEST_GAP_SHOWN: Final = 0.25
+"""A longer gap is drawn as long as this part of the time without gaps."""
 MAX_DIFFERENCE_NS: Final = 100_000_000
 COVARIANCES: Final = ("xx_m2", "xy_m2", "xh_mrad", "yy_m2", "yh_mrad", "hh_rad2")
 ALIGNMENTS: Final[tuple[Alignment, ...]] = ("none", "origin", "yaw")
@@ -99,6 +101,7 @@ class ScoredPoses:
         major_axis_m: Shape (N,).
         lost_above_m: The vehicle file's limit of the major axis.
         title: Which run, against which truth.
+        gaps: Of the drive.
     """
 
     t_ns: Int64s
@@ -111,12 +114,28 @@ class ScoredPoses:
     major_axis_m: Floats
     lost_above_m: float
     title: str
+    gaps: tuple[Gap, ...] = ()
 
     @property
     def seconds(self) -> Floats:
-        """Seconds since the first pose."""
-        seconds: Floats = (self.t_ns - self.t_ns[0]) * 1e-9
-        return seconds
+        """Seconds since the first pose, as ``shown_s``."""
+        return self.shown_s(self.t_ns)
+
+    def shown_s(self, t_ns: Int64s) -> Floats:
+        """Where moments lie on a chart: seconds, long gaps shortened so that the rest is seen."""
+        first_ns, last_ns = int(self.t_ns[0]), int(self.t_ns[-1])
+        inside = [one for one in self.gaps if first_ns <= one.middle_ns <= last_ns]
+        lengths = [one.end_ns - one.start_ns for one in inside]
+        longest_ns = max(last_ns - first_ns - sum(lengths), 0) * LONGEST_GAP_SHOWN
+        knots, shown = [first_ns], [0.0]
+        for one, length in zip(inside, lengths, strict=True):
+            begin_s = shown[-1] + (one.start_ns - knots[-1]) * 1e-9
+            knots += [one.start_ns, one.end_ns]
+            shown += [begin_s, begin_s + min(length, longest_ns) * 1e-9]
+        knots.append(max(last_ns, knots[-1]))
+        shown.append(shown[-1] + (knots[-1] - knots[-2]) * 1e-9)
+        at: Floats = np.interp(t_ns - first_ns, np.array(knots) - first_ns, shown)
+        return at
 
 
 def load_truth(path: Path) -> tuple[Truth, Trajectory]:
@@ -181,7 +200,8 @@ def measure(
     write_tum(folder / "estimate.tum", paired.estimate, "crosscue estimate, planar")
     write_tum(folder / "truth.tum", paired.truth, "truth, planar")
     title = f"{run.path.name} against {truth.source or truth_path.name}"
-    return result, _scored(paired, values, table, vehicle.lost_above_m, title)
+    gaps = gaps_of(timeline_in(run.manifest()))
+    return result, _scored(paired, values, table, vehicle.lost_above_m, title, gaps)
 
 
 def _paired(
@@ -286,7 +306,12 @@ def _lost_at(table: pa.Table, limit_m: float) -> float | None:
 
 
 def _scored(
-    paired: Paired, values: Floats, table: pa.Table, lost_above_m: float, title: str
+    paired: Paired,
+    values: Floats,
+    table: pa.Table,
+    lost_above_m: float,
+    title: str,
+    gaps: tuple[Gap, ...],
 ) -> ScoredPoses:
     assert paired.cov_xyh is not None
     at = np.searchsorted(table["t_ns"].to_numpy(), paired.truth.t_ns)
@@ -304,4 +329,5 @@ def _scored(
         major_axis_m=table["major_axis_m"].to_numpy()[at],
         lost_above_m=lost_above_m,
         title=title,
+        gaps=gaps,
     )

@@ -1,0 +1,128 @@
+"""Charts and recordings of a drive with gaps show the gaps and draw no line across them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from rerun.chunk import RrdReader
+
+from crosscue.eval.pipeline.drive_time import timeline_in
+from crosscue.eval.pipeline.log_time import Gap, broken_at, gaps_of
+from crosscue.eval.recording import save
+from crosscue.eval.report.score_runs import ScoreWork
+from crosscue.eval.scoring.drives import ScoreSettings
+from crosscue.eval.scoring.pose.score import ScoredPoses
+from crosscue.replay.files.run_folder import RunFolder
+from support.gap_drive import BEGIN, ROW, SECOND, Clock, replayed, write_drive
+
+PAUSE = Clock(pause_s=(5.0, 7.1))
+
+
+@pytest.fixture(scope="module")
+def paused(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    folder = tmp_path_factory.mktemp("paused")
+    return replayed(folder, write_drive(folder, PAUSE))
+
+
+def _rows(path: Path, entity: str, component: str) -> list[tuple[int, Any]]:
+    """Time and value of each row of an entity of a recording."""
+    found: list[tuple[int, Any]] = []
+    for chunk in RrdReader(path).stream():
+        if chunk.entity_path == entity and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            name = next(n for n in batch.schema.names if n.endswith(component))
+            times = batch["drive"].cast("int64").to_pylist()
+            found += zip(times, batch[name].to_pylist(), strict=True)
+    return sorted(found, key=lambda row: row[0])
+
+
+def _crosses(rows: Sequence[tuple[int, Any]], gap: Gap) -> bool:
+    """Does a line run from before the gap to after it?"""
+    before = [value for t_ns, value in rows if t_ns < gap.middle_ns]
+    return bool(np.isfinite(before[-1][0]))
+
+
+def test_the_gap_is_where_the_wheels_were_silent(paused: RunFolder) -> None:
+    (gap,) = gaps_of(timeline_in(paused.manifest()))
+
+    assert (gap.start_ns, gap.end_ns) == (BEGIN + 5 * SECOND - ROW, BEGIN + 71 * ROW)
+    assert gap.text == "gap of 2.2 s"
+    assert broken_at([gap], np.array([gap.start_ns, gap.end_ns])).tolist() == [1]
+
+
+def test_no_line_of_a_recording_runs_across_a_gap(paused: RunFolder, tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    save(paused, path)
+
+    (gap,) = gaps_of(timeline_in(paused.manifest()))
+    lines = [
+        "/plots/belief/intersection", "/plots/range/start", "/plots/speed/speed_mps",
+        "/plots/heading/heading_deg", "/plots/ellipse/major_axis_m",
+    ]  # fmt: skip
+    for entity in lines:
+        rows = _rows(path, entity, "scalars")
+        assert len(rows) > 50, entity
+        assert not _crosses(rows, gap), entity
+    states = _rows(path, "/cues/stop_sign", "state")
+    assert [bool(value) for t_ns, value in states if t_ns < gap.middle_ns][-1] is False
+    strips = [
+        chunk.to_record_batch()
+        for chunk in RrdReader(path).stream()
+        if chunk.entity_path == "/plan/estimate"
+    ]
+    name = next(n for n in strips[0].schema.names if n.endswith("strips"))
+    assert len(strips[0][name].to_pylist()[0]) == 2
+
+
+def test_the_report_shades_each_gap_with_its_length(
+    paused: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures: list[Figure] = []
+    draw = Figure.savefig
+
+    def kept(figure: Figure, *args: Any, **more: Any) -> None:
+        figures.append(figure)
+        draw(figure, *args, **more)
+
+    monkeypatch.setattr(Figure, "savefig", kept)
+    work = ScoreWork(paused.path.parent / "truth.json", ScoreSettings(), (10.0,))
+    page = work(paused.path).report.read_text()
+
+    assert page.count('class="bar s0"') == 2, "the sign's lane, before and after"
+    assert page.count('class="gap"') == 2, "belief and range"
+    assert page.count(">gap of 2.2 s</text>") == 2
+    over_time = [f.axes[0] for f in figures if "time" in f.axes[0].get_xlabel()]
+    assert len(over_time) == 3
+    for axes in over_time:
+        assert [text.get_text() for text in axes.texts] == ["gap of 2.2 s"]
+        assert np.isnan(np.asarray(axes.lines[0].get_xdata(), np.float64)).sum() == 1
+
+
+def test_a_long_gap_does_not_squeeze_the_rest() -> None:
+    t_ns = np.concatenate([np.arange(60), np.arange(60, 140) + 12_000]) * ROW
+    n = len(t_ns)
+    gap = Gap(59 * ROW, 12_060 * ROW, "gap of 1200.1 s")
+    zero, two = np.zeros(n), np.zeros((n, 2))
+    poses = ScoredPoses(
+        t_ns, two, two, zero, np.zeros((n, 3, 3)), zero, zero, zero, 1.0, "", (gap,)
+    )
+
+    seconds = poses.seconds
+
+    shown_s = float(seconds[60] - seconds[59])
+    assert shown_s == pytest.approx(0.25 * 13.8, abs=0.1)
+    assert np.allclose(np.diff(seconds)[np.arange(n - 1) != 59], 0.1)
+
+
+def test_what_comes_twice_is_shaded_as_set_back(tmp_path: Path) -> None:
+    run = replayed(tmp_path, write_drive(tmp_path, Clock(set_at_s=6.0, by_s=-3.0)))
+
+    (gap,) = gaps_of(timeline_in(run.manifest()))
+
+    assert gap.text == "clock set back"
+    assert (gap.start_ns, gap.end_ns) == (BEGIN + 3 * SECOND, BEGIN + 6 * SECOND - ROW)
