@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final, NoReturn, Protocol, cast
 from crosscue.replay.errors import CrosscueError, one_line
 from crosscue.replay.losses import losses_heard
 from crosscue.replay.safe_text import visible
+from crosscue.replay.versions import installed
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -170,9 +171,7 @@ def run(argv: Sequence[str]) -> int:
         print(_overview())
         return 0 if argv else 2
     if argv[0] == "--version":
-        from importlib.metadata import version
-
-        print(f"crosscue {version('crosscue')}")
+        print(f"crosscue {installed('crosscue')}")
         return 0
     name = _command_of(argv)
     if name is None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import PurePath
 from typing import Any, Final, Protocol
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from crosscue.detectors.catalog.card import Weights
 from crosscue.replay.errors import VehicleError, one_line
+from crosscue.replay.versions import installed
 
 from .onnx_input import input_shape
 from .openvino import import_openvino
@@ -161,7 +161,7 @@ def _in_litert(weights: Weights, threads: int) -> Network:
         net.invoke()
         return {str(out["name"]): np.asarray(net.get_tensor(out["index"])) for out in outputs}
 
-    return _Function(f"litert {version('ai-edge-litert')}", call)
+    return _Function(f"litert {installed('ai-edge-litert')}", call)
 
 
 def _output_name(output: Any, index: int) -> str:

@@ -12,11 +12,12 @@ import os
 import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
 import torch
+
+from crosscue.replay.versions import installed
 
 LIBRARIES: Final = ("torch", "torchvision", "numpy", "opencv-python-headless")
 CUBLAS_VARIABLE: Final = "CUBLAS_WORKSPACE_CONFIG"
@@ -46,7 +47,7 @@ def reproducible(device: torch.device) -> Iterator[None]:
 
 def decides_bits(device: torch.device) -> dict[str, str | int | float]:
     """What two trainings must have in common to give the same bits, for a checkpoint's recipe."""
-    found: dict[str, str | int | float] = {f"on.{name}": _version(name) for name in LIBRARIES}
+    found: dict[str, str | int | float] = {f"on.{name}": installed(name) for name in LIBRARIES}
     found["on.device"] = device.type
     found["on.threads"] = torch.get_num_threads()
     found["on.cpu"] = f"{_cpu_name()}, {torch.backends.cpu.get_cpu_capability()}"
@@ -57,13 +58,6 @@ def decides_bits(device: torch.device) -> dict[str, str | int | float]:
         "bit for bit" if device.type == "cpu" else "no: RoI Align's gradient adds in any order"
     )
     return found
-
-
-def _version(library: str) -> str:
-    try:
-        return version(library)
-    except ImportError:
-        return "unknown"
 
 
 def _cpu_name() -> str:

@@ -6,7 +6,6 @@ import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.replay.clocks.reports import Clock
@@ -15,6 +14,7 @@ from crosscue.replay.ledger import Ledger, TopicAccount
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
+from crosscue.replay.versions import installed
 
 from .labelled import labelled
 
@@ -112,7 +112,7 @@ def _account(account: TopicAccount) -> dict[str, object]:
 def versions() -> dict[str, str]:
     """Of crosscue, Python and the libraries that results depend on."""
     libraries = ("crosscue", "numpy", "numba", "cantools", "rosbags", "mcap", "pyarrow")
-    return {"python": platform.python_version(), **{name: version(name) for name in libraries}}
+    return {"python": platform.python_version(), **{name: installed(name) for name in libraries}}
 
 
 def write_skipped(

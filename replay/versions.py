@@ -1,0 +1,13 @@
+"""Versions of what is installed, for manifests, model cards and ``crosscue --version``."""
+
+from __future__ import annotations
+
+
+def installed(package: str) -> str:
+    """The version of ``package``, or "unknown" where its metadata is missing or not readable."""
+    from importlib.metadata import version  # 20 ms, which ``crosscue --help`` need not wait for
+
+    try:
+        return version(package)
+    except ImportError:
+        return "unknown"
