@@ -1,10 +1,10 @@
-"""How many frames a second fusion takes, and its parts beside filterpy and GTSAM.
+"""How many frames a second fusion takes, and its belief beside GTSAM.
 
 A made-up drive of ten minutes at ten frames a second passes an intersection every 130 m. The whole
-loop has no peer; its range filter is measured beside filterpy's Kalman filter with one state, its
-belief beside GTSAM's discrete factor graph (the belief before as priors, a factor for each message,
-marginals after each frame). They alternate within one run, since timings of different runs do not
-compare; time is of the process, so that a busy machine counts for little.
+loop has no peer (its range filter is filterpy's); its belief is measured beside GTSAM's discrete
+factor graph (the belief before as priors, a factor for each message, marginals after each frame).
+They alternate within one run, since timings of different runs do not compare; time is of the
+process, so that a busy machine counts for little.
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ from typing import Final
 
 import gtsam
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
 from crosscue.fusion.approaches import Approaches, FrameEvidence, SignRange
 from crosscue.fusion.belief import Situation, begin, multiply, probabilities, source_speaker
 from crosscue.fusion.factor_graph import graph_of
-from crosscue.fusion.intersection_range import RangeBelief, Reference, predict, update
+from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.fusion import Calibrated, Fusion, RangeFilter, Rates
 
@@ -70,27 +69,6 @@ def loop(evidence: list[FrameEvidence], fusion: Fusion) -> int:
     return len(evidence)
 
 
-def our_range(evidence: list[FrameEvidence]) -> int:
-    belief = RangeBelief(80.0, 9.0)
-    for one in evidence:
-        belief = predict(belief, one.travelled_m or 0.0, one.travelled_var_m2)
-        for sign in one.signs:
-            belief = update(belief, sign.range_m, sign.var_m2)
-    return len(evidence)
-
-
-def filterpy_range(evidence: list[FrameEvidence]) -> int:
-    theirs = KalmanFilter(dim_x=1, dim_z=1, dim_u=1)
-    theirs.x, theirs.P = np.array([80.0]), np.array([[9.0]])
-    theirs.B = -np.eye(1)
-    theirs.H = np.eye(1)
-    for one in evidence[:PEER_FRAMES]:
-        theirs.predict(u=np.array([one.travelled_m]), Q=np.array([[one.travelled_var_m2]]))
-        for sign in one.signs:
-            theirs.update(np.array([sign.range_m]), R=np.array([[sign.var_m2]]))
-    return PEER_FRAMES
-
-
 def our_belief(evidence: list[FrameEvidence]) -> int:
     graph = graph_of(Fusion())
     speaker, belief = source_speaker(graph, 0.49), begin(graph)
@@ -127,8 +105,6 @@ def main() -> None:
     jobs: dict[str, Callable[[], int]] = {
         "whole loop, source": lambda: loop(evidence, Fusion()),
         "whole loop, calibrated": lambda: loop(evidence, calibrated),
-        "range, ours": lambda: our_range(evidence),
-        "range, filterpy": lambda: filterpy_range(evidence),
         "belief, ours": lambda: our_belief(evidence),
         "belief, GTSAM": lambda: gtsam_belief(evidence),
     }
@@ -142,9 +118,7 @@ def main() -> None:
     print(f"{'':24} frames/s  median of {ROUNDS}")
     for name, rate in rates.items():
         print(f"{name:24} {rate:9.0f}")
-    for part, peer in (("range", "filterpy"), ("belief", "GTSAM")):
-        ratio = rates[f"{part}, ours"] / rates[f"{part}, {peer}"]
-        print(f"{part}: {ratio:.0f} times {peer}")
+    print(f"belief: {rates['belief, ours'] / rates['belief, GTSAM']:.0f} times GTSAM")
     print(f"ten minutes of drive: {FRAMES / rates['whole loop, source']:.2f} s of loop, source")
 
 
