@@ -27,8 +27,8 @@ from crosscue.detectors.cues.cars import (
 )
 from crosscue.eval.pipeline.estimate import detected_part
 from crosscue.eval.pipeline.stored_frames import stored_frames
+from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.scoring.truth import cue_at
-from crosscue.replay.files.run_folder import RunFolder, open_run
 from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
 
 LEAST_NEAR = 0.5

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.datasets.scenes.layout import SCORED
+from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.runs import judge_run
 from crosscue.eval.studies.intersections.contact_sheet import write_sheet
-from crosscue.replay.files.run_folder import open_run
 
 RUNS: Final = (1, 4, 6, 9)
 QUALITY: Final = 60

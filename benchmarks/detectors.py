@@ -26,7 +26,7 @@ from crosscue.detectors.cues.frame import CuePass, Seen
 from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.registry import chosen
 from crosscue.eval.pipeline.detect import detect_drive
-from crosscue.replay.files.run_folder import create
+from crosscue.eval.runs.folder import create
 from crosscue.replay.log import Selection
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -25,8 +25,8 @@ from crosscue.detectors.base import Detections, Found, Frame, View
 from crosscue.detectors.registry import Choice
 from crosscue.eval.pipeline.detect import detect_drive
 from crosscue.eval.pipeline.reestimate import estimate_run
+from crosscue.eval.runs.folder import create, open_run
 from crosscue.replay.columns import Block, Images, Messages, Topic
-from crosscue.replay.files.run_folder import create, open_run
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.opening import open_log

@@ -28,8 +28,8 @@ from crosscue.datasets.scenes.drive import SceneSettings, write_scene
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.detectors.base import Detections, Found, Frame, View
 from crosscue.eval import cli
+from crosscue.eval.runs.folder import open_run
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import open_run
 
 LEAST_S = 0.001
 

@@ -33,15 +33,8 @@ from crosscue.eval import cli
 from crosscue.eval.batch.jobs import Job, in_turn, run_many
 from crosscue.eval.batch.merge import merge_runs
 from crosscue.eval.batch.processes import Processes
-from crosscue.replay.files.run_folder import (
-    RunFolder,
-    TableSink,
-    clear,
-    create,
-    locked,
-    open_run,
-    write_manifest,
-)
+from crosscue.eval.runs.folder import RunFolder, clear, create, locked, open_run, write_manifest
+from crosscue.eval.runs.table_sink import TableSink
 
 SCHEMA = pa.schema([("t_ns", pa.int64())])
 DETECTOR = """

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors import rle
-from crosscue.replay.files.run_folder import RunFolder, open_run
+from crosscue.eval.runs.folder import RunFolder, open_run
 
 LABELS: Final = (
     "car", "stop sign", "traffic light", "one way left", "one way right", "do not enter",

@@ -36,8 +36,8 @@ from crosscue.eval.pipeline.reestimate import estimate_run
 from crosscue.eval.pipeline.stored_frames import stored_frames
 from crosscue.eval.pipeline.stored_images import camera_of, read_pictures
 from crosscue.eval.recording import save
+from crosscue.eval.runs.folder import RunFolder, create, open_run
 from crosscue.replay.columns import Block, Images
-from crosscue.replay.files.run_folder import RunFolder, create, open_run
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import parse
@@ -48,7 +48,7 @@ MEMORY = """
 import sys
 from pathlib import Path
 from crosscue.eval.recording import save
-from crosscue.replay.files.run_folder import open_run
+from crosscue.eval.runs.folder import open_run
 save(open_run(Path(sys.argv[1])), Path(sys.argv[2]))
 status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
 print(int(status["VmHWM"].split()[0]) // 1024)

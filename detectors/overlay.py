@@ -10,7 +10,7 @@ import numpy as np
 
 from crosscue.detectors.cues.frame import FrameCues
 from crosscue.replay.columns import Bytes
-from crosscue.replay.files.run_folder import write_bytes
+from crosscue.replay.files.whole_file import write_bytes
 
 from . import rle
 from .base import Detections, RoadMask, View

@@ -23,7 +23,7 @@ from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.replay.columns import Block, Images, Int64s, Messages, Topic
 from crosscue.replay.encode.outgoing import standard_type
 from crosscue.replay.encode.template import filled, template_of
-from crosscue.replay.files.run_folder import sha256_of, write_text
+from crosscue.replay.files.whole_file import sha256_of, write_text
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 

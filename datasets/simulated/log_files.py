@@ -14,7 +14,7 @@ from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
 from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table, Topic
-from crosscue.replay.files.run_folder import write_text
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 

@@ -15,8 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from crosscue.replay.errors import SchemaError, UsageError
 from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.run_folder import strict_json, write_text
-from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import MIB
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.validation_errors import explain

@@ -17,7 +17,7 @@ import numpy as np
 
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
-from crosscue.replay.files.run_folder import write_text
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT, Limits
 
 _COLUMNS: Final = 8

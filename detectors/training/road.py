@@ -23,8 +23,8 @@ from crosscue.detectors.networks.road.network import RoadNetwork, logits_of
 from crosscue.detectors.weights_file import serialised
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import SchemaError, one_line
-from crosscue.replay.files.run_folder import write_bytes
 from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.files.whole_file import write_bytes
 
 STATE_KEY: Final = "crosscue_road_training"
 EDGE_WEIGHT: Final = 6.0

@@ -23,10 +23,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from crosscue.eval.runs.folder import MANIFEST
 from crosscue.replay.errors import LogError, UnknownFormatError, UsageError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.identity import SHORT, identity_of, identity_of_all
-from crosscue.replay.files.run_folder import MANIFEST
 from crosscue.replay.formats import FORMATS, format_of
 from crosscue.replay.limits import MIB
 from crosscue.replay.remote.logs import is_remote, matches

@@ -18,10 +18,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
+from crosscue.eval.runs.folder import MANIFEST, RunFolder
 from crosscue.replay.errors import CrosscueError, RunError, UsageError, one_line
 from crosscue.replay.files.identity import as_row, identity_of, identity_of_all
-from crosscue.replay.files.run_folder import MANIFEST, RunFolder, strict_json, write_text
-from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
 
 JOURNAL: Final = ".drives"
 FORMAT_VERSION: Final = 2

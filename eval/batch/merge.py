@@ -16,19 +16,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.eval.pipeline.run_account import is_whole, summed
-from crosscue.replay.errors import RunError, UsageError, one_line
-from crosscue.replay.files.run_folder import (
+from crosscue.eval.runs.folder import (
     MANIFEST,
     MERGED,
     RunFolder,
-    TableSink,
     clear,
     locked,
     open_run,
     staged,
-    strict_json,
     write_manifest,
 )
+from crosscue.eval.runs.table_sink import TableSink
+from crosscue.replay.errors import RunError, UsageError, one_line
+from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.limits import DEFAULT, Limits
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from crosscue.replay.files.run_folder import LOCK
+from crosscue.eval.runs.folder import LOCK
 
 from .jobs import Done, Events, Job, R, after_death, attempt, told
 from .processes import GRACE_S, THREAD_VARIABLES, TICK_S

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 import numpy as np
 
 from crosscue.eval.pipeline.run_account import is_whole
+from crosscue.eval.runs.folder import MANIFEST, RunFolder, open_run
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.eval.scoring.runs import FOLDER, METRICS
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.run_folder import MANIFEST, RunFolder, open_run
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
 

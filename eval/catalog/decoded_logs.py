@@ -13,18 +13,12 @@ import numpy as np
 from crosscue.eval.pipeline.accounts import versions
 from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
 from crosscue.eval.pipeline.run_account import Account, account, reading_of
+from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
+from crosscue.eval.runs.table_sink import TableSink
 from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.errors import SchemaError
-from crosscue.replay.files.run_folder import (
-    RunFolder,
-    TableSink,
-    clear,
-    locked,
-    staged,
-    write_manifest,
-)
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.mobileye.admit import all_ids

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.eval.batch.merge import is_merged
+from crosscue.eval.runs.folder import MANIFEST, RunFolder
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.run_folder import MANIFEST, RunFolder
 
 METRICS: Final = "metrics.json"
 """What a folder of pooled scores holds, which has tables, too."""

@@ -17,7 +17,7 @@ from crosscue.eval.commands.shared.options import (
     selection_of,
 )
 from crosscue.eval.pipeline.run_account import account_lines
-from crosscue.replay.files.run_folder import create
+from crosscue.eval.runs.folder import create
 from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load

@@ -22,10 +22,10 @@ from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.recording import save
 from crosscue.eval.report.page import write_report
 from crosscue.eval.report.summary import pose_summary, summary
+from crosscue.eval.runs.folder import create
 from crosscue.eval.scoring.pose.score import truth_track
 from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of, write_scores
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.run_folder import create
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import load

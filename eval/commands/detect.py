@@ -22,8 +22,8 @@ from crosscue.eval.commands.shared.options import (
 )
 from crosscue.eval.pipeline.detect import DetectOutcome, detect_drive
 from crosscue.eval.pipeline.run_account import account_lines, details_of
+from crosscue.eval.runs.folder import create
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.run_folder import create
 from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load

@@ -15,8 +15,8 @@ from pathlib import Path
 
 from crosscue.eval.batch.merge import gathered, merge_runs
 from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.runs.folder import create
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import create
 from crosscue.replay.safe_text import visible
 
 

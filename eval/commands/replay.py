@@ -52,8 +52,8 @@ from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.pipeline.run_account import account_lines
 from crosscue.eval.pipeline.run_input import files_named_in
 from crosscue.eval.pipeline.scene import ApproachSummary, SceneOutcome
+from crosscue.eval.runs.folder import create
 from crosscue.replay.errors import CrosscueError, UsageError
-from crosscue.replay.files.run_folder import create
 from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import terminal_width, visible, wrapped
 from crosscue.replay.vehicle.vehicle import Vehicle, load

@@ -38,6 +38,7 @@ from crosscue.eval.report.junit import write_junit
 from crosscue.eval.report.page import REPORT, write_report
 from crosscue.eval.report.score_runs import Failed, Scored, ScoreWork, score_runs
 from crosscue.eval.report.summary import gate_lines, headline, pose_summary, summary, told_line
+from crosscue.eval.runs.folder import locked
 from crosscue.eval.scoring.drives import DEFAULTS, Scores, ScoreSettings
 from crosscue.eval.scoring.gates import Gate, GateResult, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import metric_values
@@ -52,7 +53,6 @@ from crosscue.eval.studies.attribution import (
     estimate_of,
 )
 from crosscue.replay.errors import UsageError, one_line
-from crosscue.replay.files.run_folder import locked
 from crosscue.replay.safe_text import visible
 
 

@@ -25,7 +25,7 @@ from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.eval.commands.shared.options import print_json, with_progress
 from crosscue.replay.errors import OutputError, UsageError
-from crosscue.replay.files.run_folder import write_bytes
+from crosscue.replay.files.whole_file import write_bytes
 
 PUBLISHED_RUNS = 10
 

@@ -20,11 +20,11 @@ from crosscue.eval.batch.merge import open_one
 from crosscue.eval.commands.shared.options import add_logs_arguments, limits_of
 from crosscue.eval.pipeline.run_account import is_whole
 from crosscue.eval.recording import save
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.pose.score import truth_track
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges, load
 from crosscue.replay.errors import CrosscueError, UsageError
-from crosscue.replay.files.run_folder import RunFolder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from crosscue.datasets.truth.tum import heading_rad
 from crosscue.detectors.images import Encoded
 from crosscue.eval.pipeline.accounts import probe_clocks
+from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.pose.score import load_truth
 from crosscue.localization.angles import interpolate_angle
 from crosscue.localization.landmarks.database import LandmarkWriter, Place
@@ -23,7 +24,6 @@ from crosscue.localization.landmarks.images import grey_of, picture_of, read_pic
 from crosscue.replay.columns import Block, Floats, Images, Int64s
 from crosscue.replay.errors import LogError, SchemaError, UsageError, VehicleError
 from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.run_folder import open_run
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor

@@ -18,6 +18,7 @@ import numpy as np
 from crosscue.datasets.truth.truth import Truth
 from crosscue.eval.pipeline.log_time import refuse_set_back
 from crosscue.eval.pipeline.travelled import odometer_of
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.intervals import Interval, resampled, wilson
 from crosscue.eval.scoring.truth import CROSSING_NS
 from crosscue.fusion.annotated_approach import NOT_LOOKED, AnnotatedApproach
@@ -25,7 +26,6 @@ from crosscue.fusion.factor_graph import FactorGraph, graph_of
 from crosscue.fusion.message_fit import MessageFit, RateFit, Side
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import RunError, UsageError
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
 
 COVERED: Final = 0.9

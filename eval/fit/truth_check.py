@@ -26,7 +26,8 @@ from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import read_tum
 from crosscue.eval.scoring import truth as score_truth
 from crosscue.replay.errors import SchemaError, UsageError
-from crosscue.replay.files.run_folder import sha256_of, strict_json, write_text
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import sha256_of, write_text
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -8,8 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.table_sink import TableSink
 from crosscue.replay.clocks.reports import Clock
-from crosscue.replay.files.run_folder import RunFolder, TableSink
 from crosscue.replay.ledger import Ledger, TopicAccount
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor

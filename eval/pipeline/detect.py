@@ -19,9 +19,9 @@ from crosscue.detectors.ranging.height_to_range import range_of
 from crosscue.detectors.registry import Choice, make
 from crosscue.detectors.result_cache import ResultCache
 from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
+from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
 from crosscue.replay.columns import Block
 from crosscue.replay.errors import VehicleError
-from crosscue.replay.files.run_folder import RunFolder, clear, locked, staged, write_manifest
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor

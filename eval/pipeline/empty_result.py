@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Final
 
+from crosscue.eval.runs.folder import RunFolder, clear
 from crosscue.replay.errors import CrosscueError, EmptyResultError, LogError
-from crosscue.replay.files.run_folder import RunFolder, clear
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.remote.logs import name_of

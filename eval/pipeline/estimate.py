@@ -12,15 +12,11 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from crosscue.eval.runs.folder import MANIFEST, RunFolder, write_manifest
+from crosscue.eval.runs.table_sink import TableSink
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.columns import Topic
-from crosscue.replay.files.run_folder import (
-    MANIFEST,
-    RunFolder,
-    TableSink,
-    sha256_of,
-    write_manifest,
-)
+from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crosscue.replay.files.run_folder import RunFolder, TableSink
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.table_sink import TableSink
 from crosscue.replay.time.segments import LogClock, Timeline
 
 if TYPE_CHECKING:

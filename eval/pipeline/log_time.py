@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.time.segments import Cause, Timeline
 
 from .drive_time import timeline_in

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.gap import Crossed
 from crosscue.localization.landmarks.update import Sighting
@@ -22,7 +23,6 @@ from crosscue.localization.pose_track import ACCEPTED, HeadingColumns, Headings
 from crosscue.localization.smoother import Fixes
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import RunFolder
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -16,9 +16,9 @@ import numpy as np
 
 from crosscue.detectors.cues.far_side import end_of, past_counts
 from crosscue.detectors.cues.mobileye_state import MobileyeState, state_at
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.fusion.approaches import PastCues
 from crosscue.fusion.intersection_range import RangeBelief, Reference
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.mobileye.samples import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.signals.kinds import MOBILEYE_SIGNALS, Samples, Signal
 from crosscue.replay.time.segments import BEGINNING, LogClock, Timeline

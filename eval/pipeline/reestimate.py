@@ -8,15 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from crosscue.eval.runs.folder import MANIFEST, RunFolder, locked, staged, write_input
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import (
-    MANIFEST,
-    RunFolder,
-    locked,
-    sha256_of,
-    staged,
-    write_input,
-)
+from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.detectors.registry import Choice, make
+from crosscue.eval.runs.folder import RunFolder, clear, locked, staged
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import RunFolder, clear, locked, staged
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import Timeline

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from crosscue.detectors.registry import Choice
+from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, RunFolder
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.identity import (
     Identity,
@@ -20,8 +21,7 @@ from crosscue.replay.files.identity import (
     identity_of_log,
     of_row,
 )
-from crosscue.replay.files.run_folder import INPUT, LOCK, MANIFEST, RunFolder, strict_json
-from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.remote.logs import version_of
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -13,9 +13,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.errors import CrosscueError, RunError
 from crosscue.replay.files.identity import as_row, identity_of, identity_of_log, of_row
-from crosscue.replay.files.run_folder import RunFolder, sha256_of
+from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.log import Log
 from crosscue.replay.opening import open_log
 from crosscue.replay.remote.logs import RangedLog, is_remote, origin

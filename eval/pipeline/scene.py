@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.detectors.cues.frame import CuePass
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.fusion.approaches import Approaches, FrameEvidence, PastCues, SignRange, Step
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle.cue_table import STOP_SIGN, TRAFFIC_LIGHT
 from crosscue.replay.vehicle.vehicle import Vehicle

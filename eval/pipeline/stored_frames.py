@@ -12,8 +12,8 @@ import numpy as np
 from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.cues.frame import Role, Seen
 from crosscue.detectors.cues.road import RoadShares
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Floats
-from crosscue.replay.files.run_folder import RunFolder
 
 NO_BOXES: Final = np.empty((0, 4))
 

@@ -10,9 +10,9 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.detectors.images import Encoded, encoded
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.columns import Block, Images, Topic
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import Selection

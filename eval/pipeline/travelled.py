@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.files.run_folder import RunFolder
 
 from . import measurements
 

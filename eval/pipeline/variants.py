@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
 
 from .drive_time import timeline_in

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crosscue.eval.pipeline.stored_images import StoredCamera, camera_of
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.columns import Floats
-from crosscue.replay.files.run_folder import RunFolder, write_whole
+from crosscue.replay.files.whole_file import write_whole
 from crosscue.replay.vehicle.vehicle import of_manifest
 
 if TYPE_CHECKING:

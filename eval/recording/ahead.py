@@ -13,9 +13,9 @@ import numpy as np
 import rerun as rr
 
 from crosscue.eval.pipeline.mobileye_tables import StoredMobileye
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.columns import Floats
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.mobileye.geometry import evaluate
 from crosscue.replay.mobileye.samples import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.vehicle.vehicle import Vehicle

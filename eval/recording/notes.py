@@ -8,7 +8,7 @@ from typing import Final
 
 import rerun as rr
 
-from crosscue.replay.files.run_folder import RunFolder
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.safe_text import visible
 
 COLOURS: Final = (

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Int64s
-from crosscue.replay.files.run_folder import RunFolder
 
 if TYPE_CHECKING:
     import pyarrow as pa

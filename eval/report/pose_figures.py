@@ -12,7 +12,7 @@ from crosscue.eval.pipeline.log_time import broken_at
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.scoring.pose.score import ScoredPoses
 from crosscue.replay.columns import Floats
-from crosscue.replay.files.run_folder import write_whole
+from crosscue.replay.files.whole_file import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from crosscue.eval.runs.folder import RunFolder, locked, open_run
 from crosscue.eval.scoring.drives import ScoreSettings
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, measure
 from crosscue.eval.scoring.pose.smoother import SmootherScore, score_smoother
@@ -23,7 +24,8 @@ from crosscue.eval.scoring.runs import (
     write_scores,
 )
 from crosscue.replay.errors import CrosscueError
-from crosscue.replay.files.run_folder import RunFolder, locked, open_run, strict_json, write_text
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT, Limits
 
 from .page import write_report

@@ -16,10 +16,10 @@ from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.overlay import draw
 from crosscue.detectors.runner import FrameResult
 from crosscue.eval.pipeline.stored_images import camera_of, picture_at
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.cues import CueJudged
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.errors import CrosscueError
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from crosscue.eval.pipeline.drive_time import timeline_in
 from crosscue.eval.pipeline.log_time import LABELS, table_in_log_time
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.time.segments import Timeline
 
 if TYPE_CHECKING:

@@ -15,8 +15,10 @@ from crosscue.datasets.truth.truth import FILE, Truth
 from crosscue.eval.pipeline.log_time import AMBIGUOUS
 from crosscue.eval.pipeline.run_account import Account, Line, check, line, summed
 from crosscue.eval.pipeline.run_logs import place_of
+from crosscue.eval.runs.folder import MERGED, RunFolder
 from crosscue.replay.errors import RunError, SchemaError, UsageError
-from crosscue.replay.files.run_folder import MERGED, RunFolder, strict_json, write_text, write_whole
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text, write_whole
 from crosscue.replay.remote.logs import is_remote
 
 from . import intervals

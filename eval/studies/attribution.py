@@ -15,6 +15,7 @@ import numpy as np
 
 from crosscue.eval.pipeline.drive_time import timeline_in
 from crosscue.eval.pipeline.variants import scene_tables
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.approaches import ApproachResult
 from crosscue.eval.scoring.belief import BeliefDifference, compare_belief
 from crosscue.eval.scoring.drives import (
@@ -30,7 +31,6 @@ from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.run_tables import RunTables, in_log_time
 from crosscue.eval.scoring.truth import DriveTruth
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.vehicle import cue_table
 from crosscue.replay.vehicle.vehicle import Vehicle
 

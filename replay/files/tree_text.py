@@ -7,9 +7,10 @@ turns a hostile file into one clear line, whatever command reads it.
 from __future__ import annotations
 
 import json
+import math
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -57,6 +58,21 @@ def toml_tree(text: str) -> dict[str, Any]:
     if level:
         raise ValueError(_TOO_DEEP)
     return tree
+
+
+def strict_json(value: object) -> str:
+    """JSON text with sorted keys; NaN and infinities become null."""
+    return json.dumps(_finite(value), sort_keys=True, indent=2, allow_nan=False)
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value
 
 
 def _branches(value: Any) -> list[Any]:

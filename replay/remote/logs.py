@@ -34,7 +34,7 @@ from crosscue.replay.errors import (
 )
 from crosscue.replay.files.closing import Closing
 from crosscue.replay.files.partial_file import is_still
-from crosscue.replay.files.run_folder import cannot_write
+from crosscue.replay.files.whole_file import cannot_write
 from crosscue.replay.formats import FORMATS
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits

@@ -236,16 +236,14 @@ def write_seal(log: Path, seal: Seal, *, overwrite: bool) -> bool:
             f"{path}: the log differs from its seal of {kept.sealed_at}; see "
             f"'crosscue seal --check {log}', and give --overwrite only if the log is right"
         )
-    from crosscue.replay.files.run_folder import (
-        write_text,  # every log that is opened imports this module
-    )
+    from crosscue.replay.files.whole_file import write_text
 
     write_text(path, _as_text(seal))
     return True
 
 
 def _as_text(seal: Seal) -> str:
-    from crosscue.replay.files.run_folder import strict_json
+    from crosscue.replay.files.tree_text import strict_json
 
     tree = {
         "kind": KIND,

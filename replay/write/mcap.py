@@ -23,7 +23,7 @@ from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import OutputError
 from crosscue.replay.files.checksum import crc32
 from crosscue.replay.files.partial_file import PartialFile
-from crosscue.replay.files.run_folder import cannot_write
+from crosscue.replay.files.whole_file import cannot_write
 
 from .mcap_chunks import ChunkRows, Stretch, merged
 

@@ -9,7 +9,7 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval import cli
-from crosscue.replay.files.run_folder import MANIFEST
+from crosscue.eval.runs.folder import MANIFEST
 from support.every_format import EVERY_FORMAT
 from support.pictures import picture_folder
 

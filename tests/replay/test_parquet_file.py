@@ -10,13 +10,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.files.parquet import opened
-from crosscue.replay.files.run_folder import RunFolder
 
 READS = """
 import sys
 from pathlib import Path
-from crosscue.replay.files.run_folder import RunFolder
+from crosscue.eval.runs.folder import RunFolder
 for _ in range(3):
     RunFolder(Path(sys.argv[1])).table("many")
 """

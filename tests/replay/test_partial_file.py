@@ -16,9 +16,10 @@ from pathlib import Path
 import pytest
 
 from crosscue.eval import cli
+from crosscue.eval.runs.folder import create, locked
 from crosscue.replay.files import partial_file
 from crosscue.replay.files.partial_file import PARTIAL, PartialFile, Scratch, is_partial, sweep
-from crosscue.replay.files.run_folder import create, locked, write_text
+from crosscue.replay.files.whole_file import write_text
 from support import faults
 
 
@@ -134,7 +135,7 @@ def test_temporary_folders_of_killed_processes_are_removed(
 def test_a_run_whose_holder_died_is_free_though_its_number_is_in_use(tmp_path: Path) -> None:
     run = create(tmp_path / "run", overwrite=False)
     code = (
-        "from pathlib import Path\nfrom crosscue.replay.files.run_folder import RunFolder, locked\n"
+        "from pathlib import Path\nfrom crosscue.eval.runs.folder import RunFolder, locked\n"
         f"held = locked(RunFolder(Path({str(run.path)!r}))); held.__enter__()"
     )
     with _child(code) as process:

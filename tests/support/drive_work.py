@@ -13,8 +13,9 @@ import pyarrow as pa
 
 from crosscue.eval.batch.jobs import Job
 from crosscue.eval.pipeline.run_account import account, line
+from crosscue.eval.runs.folder import clear, create, locked, write_manifest
+from crosscue.eval.runs.table_sink import TableSink
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.run_folder import TableSink, clear, create, locked, write_manifest
 
 SCHEMA = pa.schema([("t_ns", pa.int64()), ("letter", pa.string())])
 

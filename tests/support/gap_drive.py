@@ -21,10 +21,10 @@ from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.detectors.base import Detections, Found, Frame, View, nothing_found
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
+from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
 from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Images, Int64s, Messages, Topic
-from crosscue.replay.files.run_folder import RunFolder, create
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.opening import open_log

@@ -14,8 +14,8 @@ from crosscue.eval.pipeline.detect import schemas
 from crosscue.eval.pipeline.labelled import with_labels
 from crosscue.eval.pipeline.pose_tables import pose_schema
 from crosscue.eval.pipeline.run_account import line
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Block, Images, Messages, Topic
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.time.segments import ONE_SEGMENT, UNSHIFTED
 from crosscue.replay.vehicle.vehicle import Vehicle

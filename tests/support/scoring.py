@@ -13,10 +13,11 @@ import pyarrow.parquet as pq
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
 from crosscue.eval.pipeline.run_account import account
 from crosscue.eval.pipeline.run_logs import relative
+from crosscue.eval.runs.folder import RunFolder, create, write_manifest
 from crosscue.eval.scoring.run_tables import RunTables, run_tables
 from crosscue.eval.scoring.truth import DriveTruth, TrueRanges
 from crosscue.replay.files.identity import Identity, as_row, identity_of
-from crosscue.replay.files.run_folder import RunFolder, create, write_manifest, write_text
+from crosscue.replay.files.whole_file import write_text
 
 STEP_NS: Final = 100_000_000
 ENTER: Final = 40

@@ -20,7 +20,7 @@ from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.datasets.scenes.world import World
 from crosscue.datasets.simulated.drive import START_NS
 from crosscue.replay.columns import Floats
-from crosscue.replay.files.run_folder import write_bytes
+from crosscue.replay.files.whole_file import write_bytes
 
 from .coco import Objects
 

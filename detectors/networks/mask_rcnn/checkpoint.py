@@ -20,7 +20,7 @@ from crosscue.detectors.settings import Settings
 from crosscue.detectors.weights_file import embedded, packed, unpacked
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.run_folder import write_bytes
+from crosscue.replay.files.whole_file import write_bytes
 
 from .network import Plan, build_network
 

@@ -29,7 +29,7 @@ from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.features import Matcher
 from crosscue.localization.landmarks.fit import LandmarkFit, Rate, ScoredPairs, fit_landmarks
 from crosscue.replay.errors import SchemaError, UsageError
-from crosscue.replay.files.run_folder import write_text
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_logs

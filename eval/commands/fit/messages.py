@@ -19,10 +19,11 @@ from pathlib import Path
 from crosscue.datasets.truth.truth import load
 from crosscue.eval.commands.shared.options import print_json, with_progress
 from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, section_of, told_of
+from crosscue.eval.runs.folder import open_run
 from crosscue.fusion.fade_fit import FadeFit
 from crosscue.fusion.message_fit import MessageFit, RateFit, Side, fit_messages
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.run_folder import open_run, write_text
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.vehicle.fusion import Rates
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from crosscue.replay.errors import MissingTopicError, UsageError
-from crosscue.replay.files.run_folder import strict_json
+from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import Log, Selection

@@ -272,7 +272,7 @@ def _draw(job: Job) -> None:
     from matplotlib import pyplot as plt
 
     from crosscue.detectors.training.job import read_curve
-    from crosscue.replay.files.run_folder import write_whole
+    from crosscue.replay.files.whole_file import write_whole
 
     points = read_curve(job.curve_path)
     figure, (above, below) = plt.subplots(2, 1, sharex=True, figsize=(7, 6))

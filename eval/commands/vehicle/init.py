@@ -11,7 +11,7 @@ from pathlib import Path
 
 from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.run_folder import write_text
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.opening import open_logs
 from crosscue.replay.vehicle.draft import draft
 from crosscue.replay.vehicle.vehicle import parse

@@ -20,10 +20,10 @@ from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
 from crosscue.eval.pipeline.drive_time import timeline_in
 from crosscue.eval.pipeline.log_time import Gap, comes_twice, gaps_of, pose_in_log_time
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.localization.angles import wrap_all
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
 
 from .errors import (

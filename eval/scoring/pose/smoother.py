@@ -12,11 +12,13 @@ import numpy as np
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar
 from crosscue.eval.pipeline.log_time import refuse_set_back
 from crosscue.eval.pipeline.measurements import read_measured
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.smoother import smooth
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
-from crosscue.replay.files.run_folder import RunFolder, strict_json, write_text
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.vehicle.vehicle import of_manifest
 
 from .errors import NeesSummary, nees, pair, summarise_nees

@@ -15,9 +15,10 @@ from crosscue.detectors.overlay import draw, write_label
 from crosscue.detectors.runner import FrameResult
 from crosscue.eval.pipeline.stored_frames import StoredFrame, stored_frames
 from crosscue.eval.pipeline.stored_images import StoredCamera, camera_of, picture_at
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.columns import Bytes, Int64s
-from crosscue.replay.files.run_folder import RunFolder, write_bytes
+from crosscue.replay.files.whole_file import write_bytes
 
 AWAY_M: Final = 18.0
 """True distance to the intersection at which the frame is taken."""

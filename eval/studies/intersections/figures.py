@@ -10,7 +10,7 @@ import numpy as np
 
 from crosscue.eval.scoring.approaches import ApproachResult, Curve
 from crosscue.eval.scoring.belief import BeliefScore
-from crosscue.replay.files.run_folder import write_whole
+from crosscue.replay.files.whole_file import write_whole
 
 from .tables import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
 

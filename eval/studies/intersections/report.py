@@ -15,7 +15,8 @@ from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.report.html import render_page
 from crosscue.eval.scoring.approaches import ApproachScore
 from crosscue.eval.scoring.runs import metrics_of, write_scores
-from crosscue.replay.files.run_folder import strict_json, write_text
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
 
 from .causes import Finding, by_cause, condition_costs, findings
 from .contact_sheet import write_sheet

@@ -24,13 +24,13 @@ from crosscue.eval.pipeline.accounts import versions
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
+from crosscue.eval.runs.folder import create, open_run
 from crosscue.eval.scoring.belief import BeliefDifference, compare_belief
 from crosscue.eval.scoring.drives import Scores, judge, score
 from crosscue.eval.scoring.runs import RunScored, judge_run
 from crosscue.eval.studies.attribution import Attribution, Drive, attribute, estimate_of
 from crosscue.fusion.message_fit import fit_messages
 from crosscue.replay.errors import RunError, UsageError
-from crosscue.replay.files.run_folder import create, open_run
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.fusion import Calibrated

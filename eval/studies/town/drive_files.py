@@ -42,7 +42,7 @@ from crosscue.replay.columns import (
     Table,
     Topic,
 )
-from crosscue.replay.files.run_folder import write_text
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 

@@ -18,14 +18,15 @@ from typing import Final
 
 import numpy as np
 
+from crosscue.eval.runs.folder import RunFolder, locked
 from crosscue.eval.studies.intervals import mean_of, share_of
 from crosscue.eval.studies.page import Table, write_page
 from crosscue.eval.studies.pictures import figure, save
 from crosscue.eval.studies.words import percent
 from crosscue.localization.town.random_stream import key_of
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import RunFolder, locked, strict_json, write_text
-from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
 
 from .replayed import through_log
 from .settings import FieldStudy

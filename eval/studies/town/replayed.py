@@ -9,10 +9,10 @@ from pathlib import Path
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.report.score_runs import score_pose
+from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.score import PoseScore
 from crosscue.localization.town.drive import Traced, drive_traced
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.files.run_folder import RunFolder, create
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import load

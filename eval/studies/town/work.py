@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crosscue.eval.batch.ray_cluster import joined
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.table_sink import TableSink
 from crosscue.localization.compiled import fingerprint
 from crosscue.localization.town import parameters
 from crosscue.localization.town import settings as drive_settings
@@ -29,7 +31,6 @@ from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import CrosscueError, RunError, UsageError
-from crosscue.replay.files.run_folder import RunFolder, TableSink
 
 from .settings import Case
 

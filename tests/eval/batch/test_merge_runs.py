@@ -9,8 +9,9 @@ from crosscue.eval import cli
 from crosscue.eval.batch.jobs import in_turn, run_many
 from crosscue.eval.batch.merge import is_merged, merge_runs
 from crosscue.eval.pipeline.run_account import account
+from crosscue.eval.runs.folder import RunFolder, create, open_run, write_manifest
+from crosscue.eval.runs.table_sink import TableSink
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import RunFolder, TableSink, create, open_run, write_manifest
 from support.drive_work import letters, made_jobs
 from support.trees import tree
 

@@ -15,7 +15,7 @@ from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.cli import run
-from crosscue.replay.files.run_folder import open_run
+from crosscue.eval.runs.folder import open_run
 
 
 @pytest.fixture

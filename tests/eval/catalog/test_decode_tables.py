@@ -9,8 +9,8 @@ import pytest
 
 from crosscue.eval import cli
 from crosscue.eval.catalog.decoded_logs import decode_tables, file_name
+from crosscue.eval.runs.folder import create
 from crosscue.replay.columns import Block, Messages, Table, Topic
-from crosscue.replay.files.run_folder import create
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.mobileye.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from crosscue.eval.catalog.find_runs import runs_of
+from crosscue.eval.runs.folder import FORMAT_VERSION
 from crosscue.replay.errors import CrosscueError
-from crosscue.replay.files.run_folder import FORMAT_VERSION
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from crosscue.eval.cli import run
 from crosscue.eval.commands.info import lines_of, plain
 from crosscue.replay.columns import DATA, Block, CanFrames, Messages, Topic
-from crosscue.replay.files.run_folder import strict_json
+from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import EVERYTHING, Selection
 from crosscue.replay.log_summary import quick_summary, summarise, together

@@ -19,8 +19,8 @@ import pytest
 from crosscue.datasets.scenes.drive import SceneSettings, write_scene
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.eval import cli
+from crosscue.eval.runs.folder import create, locked, open_run
 from crosscue.replay.errors import RunError
-from crosscue.replay.files.run_folder import create, locked, open_run
 from support import faults
 from support.trees import tree
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crosscue.eval.cli import run
-from crosscue.replay.files.run_folder import open_run
+from crosscue.eval.runs.folder import open_run
 from support.data import shared
 from support.detecting import yolox_card
 from support.pictures import picture_folder

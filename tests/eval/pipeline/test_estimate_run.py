@@ -13,7 +13,7 @@ import pytest
 from crosscue.datasets.scenes.drive import SceneSettings, write_scene
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.eval.cli import run
-from crosscue.replay.files.run_folder import RunFolder, open_run
+from crosscue.eval.runs.folder import RunFolder, open_run
 from support.oracle import Oracle
 
 DETECTORS = """

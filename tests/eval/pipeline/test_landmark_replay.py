@@ -21,12 +21,12 @@ from crosscue.detectors.images import Encoded
 from crosscue.eval import cli
 from crosscue.eval.pipeline.landmarks import LandmarkStage, looking
 from crosscue.eval.pipeline.measurements import read_measured
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.localization.landmarks.images import grey_of
 from crosscue.localization.landmarks.update import best_of
 from crosscue.replay.columns import Block, Bytes, Floats, Images, Messages
-from crosscue.replay.files.run_folder import RunFolder
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 from support.data import shared

@@ -9,9 +9,9 @@ import pytest
 from crosscue.eval import cli
 from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.runs.folder import create
 from crosscue.replay.columns import Block
 from crosscue.replay.errors import EmptyResultError, RunError, VehicleError
-from crosscue.replay.files.run_folder import create
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.vehicle.time import Time
 from crosscue.replay.vehicle.vehicle import Start, Vehicle, parse

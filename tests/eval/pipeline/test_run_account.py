@@ -14,8 +14,8 @@ from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval import cli
 from crosscue.eval.pipeline.accounts import account_of, write_skipped
 from crosscue.eval.pipeline.run_account import account, account_lines, check, line, lines, summed
+from crosscue.eval.runs.folder import create, open_run
 from crosscue.replay.errors import AccountError
-from crosscue.replay.files.run_folder import create, open_run
 from crosscue.replay.ledger import DETAILS_KEPT, Ledger
 from support.pictures import picture_folder
 

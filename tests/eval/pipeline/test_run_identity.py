@@ -14,7 +14,7 @@ from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.cli import run
 from crosscue.eval.pipeline.run_input import identity_in
-from crosscue.replay.files.run_folder import open_run
+from crosscue.eval.runs.folder import open_run
 from support.trees import tree
 
 DRIVES: int = 4

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.runs.folder import create
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.pose_track import start_belief
 from crosscue.replay.columns import Block, Int64s
-from crosscue.replay.files.run_folder import create
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.time.stamp_watch import StampWatch
 from crosscue.replay.vehicle.time import Time

@@ -16,8 +16,8 @@ from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.detectors.registry import Choice
 from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
+from crosscue.eval.runs.folder import create
 from crosscue.replay.columns import Block, Topic
-from crosscue.replay.files.run_folder import create
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import EVERYTHING, Log, Selection
 from crosscue.replay.opening import open_log

@@ -24,8 +24,8 @@ from crosscue.eval.report.scene_figures import (
 )
 from crosscue.eval.report.svg_plot import Drawing, Panel, ticks
 from crosscue.eval.report.worst_frames import worst_frames
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.runs import FOLDER, RunScored, judge_run, metrics_of, scores_of
-from crosscue.replay.files.run_folder import RunFolder
 from support.scene_run import SIZE, scene_run
 from support.scoring import approach, at, good_truth, span, truth, truth_folder
 

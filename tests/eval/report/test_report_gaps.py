@@ -15,9 +15,9 @@ from crosscue.eval.pipeline.drive_time import timeline_in
 from crosscue.eval.pipeline.log_time import Gap, broken_at, gaps_of
 from crosscue.eval.recording import save
 from crosscue.eval.report.score_runs import ScoreWork
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.drives import ScoreSettings
 from crosscue.eval.scoring.pose.score import ScoredPoses
-from crosscue.replay.files.run_folder import RunFolder
 from support.gap_drive import BEGIN, ROW, SECOND, Clock, replayed, write_drive
 
 PAUSE = Clock(pause_s=(5.0, 7.1))

@@ -17,11 +17,11 @@ from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.recording import save as save_recording
 from crosscue.eval.report.page import write_report
 from crosscue.eval.report.score_runs import score_pose
+from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
 from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of
 from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.errors import RunError, SchemaError
-from crosscue.replay.files.run_folder import RunFolder, create
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.opening import open_log

@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 
 from crosscue.eval import cli
 from crosscue.eval.report.junit import junit_text
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.gates import Gate, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.run_folder import RunFolder
 from support.scoring import (
     BELIEF,
     CUES,

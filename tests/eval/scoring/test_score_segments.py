@@ -12,9 +12,9 @@ from crosscue.eval.pipeline.drive_time import timeline_in
 from crosscue.eval.pipeline.log_time import AMBIGUOUS, ambiguous
 from crosscue.eval.report.score_runs import ScoreWork
 from crosscue.eval.report.summary import pose_summary, summary
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.drives import ScoreSettings
 from crosscue.eval.scoring.runs import scores_of
-from crosscue.replay.files.run_folder import RunFolder
 from support.gap_drive import Clock, replayed, write_drive
 
 

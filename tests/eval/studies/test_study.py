@@ -15,6 +15,7 @@ import pytest
 from pydantic import ValidationError
 
 from crosscue.eval import cli
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.studies.intervals import (
     logistic,
     mean_of,
@@ -42,7 +43,6 @@ from crosscue.localization.town.drive import Keys, Result, drive_many
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import RunError, UsageError
-from crosscue.replay.files.run_folder import RunFolder
 
 TOWN = Drive(city=City(largest_km2=2.0))
 SMALL = LandmarkStudy(

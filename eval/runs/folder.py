@@ -1,33 +1,27 @@
 """The run folder: where stages meet on disk.
 
-Files get their final name only when whole: written under a temporary name in the same folder,
-flushed to the disk, renamed. One lock file names the process at work. Tables are Parquet with page
-checksums, verified when read.
+Files get their final name only when whole. One lock file names the process at work. Tables are
+Parquet with page checksums, verified when read.
 """
 
 from __future__ import annotations
 
-import errno
-import hashlib
-import json
-import math
 import os
 import shutil
 import socket
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.replay.errors import OutputError, RunError
+from crosscue.replay.errors import RunError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.parquet import opened
+from crosscue.replay.files.partial_file import is_partial, is_still, lock, sweep
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import cannot_write, write_text
 from crosscue.replay.limits import DEFAULT, Limits
-
-from .bounded import read_at_most
-from .parquet import opened
-from .partial_file import PartialFile, is_partial, is_still, lock, sweep
-from .tree_text import json_tree
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -42,8 +36,6 @@ FORMAT_VERSION: Final = 2
 MAX_MANIFEST_BYTES: Final = 256 << 20
 STAGED: Final = ".new"
 """Folder inside a run that holds what is to replace it, until that is whole."""
-GROUP_ROWS: Final = 8192
-"""Rows of a table held back before they are written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -388,50 +380,6 @@ def _started(pid: int) -> str:
     return f"{boot} {ticks}"
 
 
-def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill a temporary file, then give it its final name.
-
-    Raises:
-        OutputError: The disk is full or the folder cannot be written; nothing half is left.
-    """
-    partial: PartialFile | None = None
-    try:
-        if not path.parent.is_dir():
-            path.parent.mkdir(parents=True, exist_ok=True)
-        partial = PartialFile(path)
-        write(partial.path)
-        partial.keep()
-    except OSError as error:
-        if partial is not None:
-            partial.drop()
-        raise cannot_write(path, error) from None
-    except BaseException:
-        if partial is not None:
-            partial.drop()
-        raise
-
-
-def cannot_write(path: Path, error: OSError) -> OutputError:
-    """The error to raise when writing ``path`` failed with ``error``."""
-    if error.errno == errno.ENOSPC:
-        try:
-            free = shutil.disk_usage(path.parent).free // (1 << 20)
-        except OSError:
-            free = 0
-        return OutputError(f"{path}: the disk is full ({free} MiB free); make room and run again")
-    return OutputError(f"{path}: {error.strerror or error}; choose a place you may write to")
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all."""
-    write_whole(path, lambda partial: partial.write_bytes(content))
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
-    write_bytes(path, text.encode("utf-8"))
-
-
 def write_manifest(run: RunFolder, content: Mapping[str, object]) -> None:
     """Write the manifest, last of all: a folder that has one is a finished run."""
     whole = {"format_version": FORMAT_VERSION, **content}
@@ -442,118 +390,3 @@ def write_input(run: RunFolder, content: Mapping[str, object]) -> None:
     """Write what the run is made of."""
     whole = {"format_version": FORMAT_VERSION, **content}
     write_text(run.file(INPUT), strict_json(whole) + "\n")
-
-
-def strict_json(value: object) -> str:
-    """JSON text with sorted keys; NaN and infinities become null."""
-    return json.dumps(_finite(value), sort_keys=True, indent=2, allow_nan=False)
-
-
-def _finite(value: object) -> object:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return value
-
-
-class TableSink:
-    """A Parquet file written a batch at a time and named when whole; a context manager.
-
-    Small batches are held back until they make a row group worth its header.
-    """
-
-    def __init__(self, run: RunFolder, name: str, schema: pa.Schema) -> None:
-        """Begin ``NAME.parquet``."""
-        import pyarrow.parquet as pq
-
-        self._path: Final = run.file(f"{name}.parquet")
-        self._schema: Final = schema
-        self._held: list[pa.Table] = []
-        self._rows = 0
-        try:
-            self._partial: Final = PartialFile(self._path)
-            self._file: Final = self._partial.open()
-        except OSError as error:
-            raise cannot_write(self._path, error) from None
-        try:
-            self._writer: Final = pq.ParquetWriter(
-                self._file, schema, compression="zstd", write_page_checksum=True
-            )
-        except OSError as error:
-            self._give_up()
-            raise cannot_write(self._path, error) from None
-
-    def write(self, columns: Mapping[str, object]) -> None:
-        """Append rows given as columns.
-
-        Raises:
-            OutputError: The disk is full.
-        """
-        import pyarrow as pa
-
-        table = pa.table(dict(columns), schema=self._schema)
-        self._held.append(table)
-        self._rows += table.num_rows
-        if self._rows < GROUP_ROWS:
-            return
-        try:
-            self._flush()
-        except OSError as error:
-            raise cannot_write(self._path, error) from None
-
-    def _flush(self) -> None:
-        import pyarrow as pa
-
-        held, self._held, self._rows = self._held, [], 0
-        if held:
-            self._writer.write_table(pa.concat_tables(held).combine_chunks())
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if kind is not None:
-            # The disk may be full: what matters is that nothing half stays and the cause is kept.
-            with suppress(OSError, ValueError):
-                self._writer.close()
-            self._give_up()
-            return
-        try:
-            self._flush()
-            self._writer.close()
-            self._file.close()
-            self._partial.keep()
-        except OSError as error:
-            self._give_up()
-            raise cannot_write(self._path, error) from None
-
-    def _give_up(self) -> None:
-        """Leave nothing half."""
-        with suppress(OSError):
-            self._file.close()
-        self._partial.drop()
-
-
-def sha256_of(path: Path) -> dict[str, str]:
-    """SHA-256 of a file, or of every file below a folder, by relative name.
-
-    Raises:
-        OSError: A file cannot be read.
-    """
-    if path.is_file():
-        return {path.name: _sha256(path)}
-    files = sorted(entry for entry in path.rglob("*") if entry.is_file())
-    return {entry.relative_to(path).as_posix(): _sha256(entry) for entry in files}
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -10,9 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from crosscue.eval.runs import folder
+from crosscue.eval.runs.folder import create, locked, open_run
+from crosscue.eval.runs.table_sink import TableSink
 from crosscue.replay.errors import OutputError, RunError
-from crosscue.replay.files import run_folder
-from crosscue.replay.files.run_folder import TableSink, create, locked, open_run, write_text
+from crosscue.replay.files.whole_file import write_text, write_whole
 
 SCHEMA = pa.schema([("t_ns", pa.int64())])
 
@@ -25,7 +27,7 @@ def test_a_writer_that_fails_leaves_the_old_file_alone(tmp_path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with pytest.raises(OutputError, match="disk is full"):
-        run_folder.write_whole(tmp_path / "a.txt", fail)
+        write_whole(tmp_path / "a.txt", fail)
 
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "old"
@@ -75,7 +77,7 @@ def test_where_the_kernel_keeps_no_locks_the_text_tells_who_holds_it(
     boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     parent = os.getppid()
     ticks = Path(f"/proc/{parent}/stat").read_text().rpartition(")")[2].split()[19]
-    monkeypatch.setattr(run_folder, "lock", lambda _: None)
+    monkeypatch.setattr(folder, "lock", lambda _: None)
 
     run.file(".lock").write_text(f"{parent} {socket.gethostname()} {boot} {ticks}")
     with pytest.raises(RunError, match=f"process {parent} "), locked(run):

@@ -1,0 +1,78 @@
+"""Files written whole or not at all, and their hashes.
+
+A file gets its final name only when whole: written under a temporary name in the same folder,
+flushed to the disk, renamed.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from crosscue.replay.errors import OutputError
+
+from .partial_file import PartialFile
+
+
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Let ``write`` fill a temporary file, then give it its final name.
+
+    Raises:
+        OutputError: The disk is full or the folder cannot be written; nothing half is left.
+    """
+    partial: PartialFile | None = None
+    try:
+        if not path.parent.is_dir():
+            path.parent.mkdir(parents=True, exist_ok=True)
+        partial = PartialFile(path)
+        write(partial.path)
+        partial.keep()
+    except OSError as error:
+        if partial is not None:
+            partial.drop()
+        raise cannot_write(path, error) from None
+    except BaseException:
+        if partial is not None:
+            partial.drop()
+        raise
+
+
+def cannot_write(path: Path, error: OSError) -> OutputError:
+    """The error to raise when writing ``path`` failed with ``error``."""
+    if error.errno == errno.ENOSPC:
+        try:
+            free = shutil.disk_usage(path.parent).free // (1 << 20)
+        except OSError:
+            free = 0
+        return OutputError(f"{path}: the disk is full ({free} MiB free); make room and run again")
+    return OutputError(f"{path}: {error.strerror or error}; choose a place you may write to")
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all."""
+    write_whole(path, lambda partial: partial.write_bytes(content))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def sha256_of(path: Path) -> dict[str, str]:
+    """SHA-256 of a file, or of every file below a folder, by relative name.
+
+    Raises:
+        OSError: A file cannot be read.
+    """
+    if path.is_file():
+        return {path.name: _sha256(path)}
+    files = sorted(entry for entry in path.rglob("*") if entry.is_file())
+    return {entry.relative_to(path).as_posix(): _sha256(entry) for entry in files}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
