@@ -1,13 +1,17 @@
 """Replay a recorded drive, score every cue and the pose, and see it in Rerun.
 
+What ``__all__`` lists is the public interface: stable, and in the changelog when it changes. Each
+name is imported when it is first used, so ``import crosscue`` costs nothing.
+
 The six packages ``replay``, ``detectors``, ``fusion``, ``localization``, ``datasets`` and ``eval``
 lie at the top of the repository and are linked here, so that only ``crosscue`` is ever installed.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 _LINKED: Final = ("replay", "detectors", "fusion", "localization", "datasets", "eval")
 
@@ -24,3 +28,63 @@ if _missing := _broken_links(Path(__file__).parent):
         "crosscue/; try 'git config core.symlinks true' and 'git checkout -- crosscue', or "
         "'pip install' a wheel"
     )
+
+_EXPORTS: Final = {
+    "open": "eval.interface.logs",
+    "Log": "eval.interface.logs",
+    "Topics": "eval.interface.logs",
+    "LogTopic": "eval.interface.logs",
+    "CameraFrame": "eval.interface.logs",
+    "Signals": "eval.interface.logs",
+    "CrosscueError": "replay.errors",
+    "UsageError": "replay.errors",
+    "LogError": "replay.errors",
+    "LogFormatError": "replay.errors",
+    "LogTooLargeError": "replay.errors",
+    "UnknownFormatError": "replay.errors",
+    "SchemaError": "replay.errors",
+    "VehicleError": "replay.errors",
+    "MissingTopicError": "replay.errors",
+    "RunError": "replay.errors",
+    "OutputError": "replay.errors",
+    "EmptyResultError": "replay.errors",
+    "AccountError": "replay.errors",
+    "LossWarning": "replay.losses",
+}
+"""From a public name to its module."""
+
+__all__ = [*_EXPORTS]
+
+if TYPE_CHECKING:
+    from crosscue.eval.interface.logs import CameraFrame as CameraFrame
+    from crosscue.eval.interface.logs import Log as Log
+    from crosscue.eval.interface.logs import LogTopic as LogTopic
+    from crosscue.eval.interface.logs import Signals as Signals
+    from crosscue.eval.interface.logs import Topics as Topics
+    from crosscue.eval.interface.logs import open as open  # noqa: A004
+    from crosscue.replay.errors import AccountError as AccountError
+    from crosscue.replay.errors import CrosscueError as CrosscueError
+    from crosscue.replay.errors import EmptyResultError as EmptyResultError
+    from crosscue.replay.errors import LogError as LogError
+    from crosscue.replay.errors import LogFormatError as LogFormatError
+    from crosscue.replay.errors import LogTooLargeError as LogTooLargeError
+    from crosscue.replay.errors import MissingTopicError as MissingTopicError
+    from crosscue.replay.errors import OutputError as OutputError
+    from crosscue.replay.errors import RunError as RunError
+    from crosscue.replay.errors import SchemaError as SchemaError
+    from crosscue.replay.errors import UnknownFormatError as UnknownFormatError
+    from crosscue.replay.errors import UsageError as UsageError
+    from crosscue.replay.errors import VehicleError as VehicleError
+    from crosscue.replay.losses import LossWarning as LossWarning
+else:
+
+    def __getattr__(name: str) -> object:
+        """Import a public name when it is first asked for."""
+        if name not in _EXPORTS:
+            raise AttributeError(f"module 'crosscue' has no attribute {name!r}")
+        found = getattr(import_module(f"crosscue.{_EXPORTS[name]}"), name)
+        globals()[name] = found
+        return found
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__all__})

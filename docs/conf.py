@@ -31,6 +31,9 @@ nitpicky = True
 nitpick_ignore_regex = [
     # Types of libraries whose own documentation is not consulted offline.
     ("py:.*", r"(numpy|np|pyarrow|pa|pathlib|collections|typing|NDArray|polars|pandas)(\..*)?"),
+    # Private modules: the interface documents what is public of them under its public name.
+    ("py:.*", r"crosscue\.(replay|detectors|fusion|localization|datasets|eval)\..*"),
+    ("py:.*", r"(contextlib|ExitStack|Bytes)(\..*)?"),
     ("py:.*", r"(Path|Sequence|Mapping|Callable|Iterator|Iterable|Any|Final|Literal)"),
 ]
 myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]

@@ -5,11 +5,15 @@ Only what the log's index says may hold it is read; see ``Log.read``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.replay.remote.logs import name_of
 
-from .columns import Block, Topic
+from .columns import Block, CanFrames, Table, Topic
 from .decode import decoder_for
 from .errors import UsageError
 from .ledger import Ledger
@@ -58,3 +62,38 @@ def read_topic(
     if decode is None:
         return TopicPart(topic, tuple(blocks), ledger)
     return TopicPart(topic, tuple(decode(block, ledger) for block in blocks), ledger)
+
+
+def columns_of(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:
+    """The rows of one topic as flat columns of equal length: its times, then what it holds.
+
+    A column of vectors becomes one for each component: ``gyro.0``, ``gyro.1``.
+
+    Args:
+        blocks: Of ``Table`` or ``CanFrames``, at least one, all with the same columns; payloads of
+            CAN frames are left out.
+    """
+    columns: dict[str, NDArray[np.generic]] = {"log_ns": np.concatenate([b.log_ns for b in blocks])}
+    for name in ("publish_ns", "header_ns"):
+        parts = [part for block in blocks if (part := getattr(block, name)) is not None]
+        if len(parts) == len(blocks):
+            columns[name] = np.concatenate(parts)
+    rows = [_named(block.rows) for block in blocks]
+    for name in rows[0]:
+        joined = np.concatenate([one[name] for one in rows])
+        if joined.ndim == 1:
+            columns[name] = joined
+            continue
+        flat = joined.reshape(len(joined), -1)
+        columns |= {f"{name}.{i}": flat[:, i] for i in range(flat.shape[1])}
+    return columns
+
+
+def _named(rows: object) -> dict[str, NDArray[np.generic]]:
+    if isinstance(rows, Table):
+        return dict(rows.columns)
+    assert isinstance(rows, CanFrames)
+    return {
+        name: getattr(rows, name)
+        for name in ("arbitration_id", "is_extended", "kind", "length", "is_fd")
+    }

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
-import numpy as np
-
 from crosscue.eval.pipeline.accounts import versions
 from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
 from crosscue.eval.pipeline.run_account import Account, account, reading_of
@@ -26,10 +24,12 @@ from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.mobileye.samples import settings_of
 from crosscue.replay.remote.logs import name_of
+from crosscue.replay.topic_part import columns_of
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
+    import numpy as np
     import pyarrow as pa
     from numpy.typing import NDArray
 
@@ -63,7 +63,7 @@ class _Table:
         """Write the rows that wait."""
         if not self.held:
             return
-        columns = _joined(self.held)
+        columns = columns_of(self.held)
         if self.sink is None:
             sink = TableSink(self.run, self.name, _schema_of(columns))
             self.sink = self.stack.enter_context(sink)
@@ -208,23 +208,6 @@ def file_name(topic: str, taken: Collection[str]) -> str:
     while name.lower() in taken:
         name, number = f"{plain}-{number}", number + 1
     return name
-
-
-def _joined(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:
-    columns: dict[str, NDArray[np.generic]] = {"log_ns": np.concatenate([b.log_ns for b in blocks])}
-    for name in ("publish_ns", "header_ns"):
-        parts = [getattr(block, name) for block in blocks]
-        if all(part is not None for part in parts):
-            columns[name] = np.concatenate(parts)
-    tables = [block.rows for block in blocks if isinstance(block.rows, Table)]
-    for name in tables[0].columns:
-        joined = np.concatenate([table.columns[name] for table in tables])
-        if joined.ndim == 1:
-            columns[name] = joined
-            continue
-        flat = joined.reshape(len(joined), -1)
-        columns |= {f"{name}.{i}": flat[:, i] for i in range(flat.shape[1])}
-    return columns
 
 
 def _schema_of(columns: Mapping[str, NDArray[np.generic]]) -> pa.Schema:

@@ -39,7 +39,6 @@ from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
 from crosscue.eval.batch.processes import Processes
 from crosscue.eval.commands.shared.options import (
     add_part_arguments,
-    first_ns,
     limits_of,
     print_json,
     selection_of,
@@ -54,6 +53,7 @@ from crosscue.eval.pipeline.run_input import files_named_in
 from crosscue.eval.pipeline.scene import ApproachSummary, SceneOutcome
 from crosscue.eval.runs.folder import create
 from crosscue.replay.errors import CrosscueError, UsageError
+from crosscue.replay.log_part import first_ns
 from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import terminal_width, visible, wrapped
 from crosscue.replay.vehicle.vehicle import Vehicle, load

@@ -12,12 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from crosscue.replay.errors import MissingTopicError, UsageError
+from crosscue.replay.errors import UsageError
 from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import Log, Selection
-from crosscue.replay.remote.logs import RangedLog, name_of
+from crosscue.replay.log_part import first_ns, named_topics
 
 T = TypeVar("T")
 
@@ -112,15 +111,7 @@ def selection_of(args: argparse.Namespace, logs: Sequence[Log]) -> Selection:
     Raises:
         UsageError: A time that cannot be read, an empty span, or a topic that no log has.
     """
-    topics = None
-    if args.topics:
-        known = {topic.name for log in logs for topic in log.topics}
-        for name in args.topics:
-            if name not in known:
-                raise MissingTopicError(
-                    f"--topics {name}: no such topic; there are: {', '.join(sorted(known))}"
-                )
-        topics = frozenset(args.topics)
+    topics = named_topics(logs, args.topics, "--topics") if args.topics else None
     if args.start is None and args.end is None:
         return Selection(topics)
     start_ns = _time_ns("--from", args.start, logs)
@@ -144,26 +135,6 @@ def _time_ns(flag: str, text: str | None, logs: Sequence[Log]) -> int | None:
             f"{flag} {text}: want seconds after the start (12.5) or absolute time (17...ns)"
         )
     return first_ns(logs) + round(seconds * 1e9)
-
-
-def first_ns(logs: Sequence[Log]) -> int:
-    """Log time of the first stored row of the earliest log.
-
-    Raises:
-        UsageError: No log holds a single row.
-    """
-    starts: list[int] = []
-    for log in logs:
-        blocks = log.first_blocks if isinstance(log, RangedLog) else log.read
-        for block in blocks(Ledger(name_of(log))):
-            if len(block):
-                starts.append(int(block.log_ns.min()))
-                break
-    if not starts:
-        raise MissingTopicError(
-            "--from, --to: the log holds no row, so it has no start; leave them out"
-        )
-    return min(starts)
 
 
 def print_json(value: object) -> None:

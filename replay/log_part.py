@@ -1,0 +1,80 @@
+"""Which part of open logs is wanted: topics, and a span in seconds after the first row."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+from crosscue.replay.remote.logs import RangedLog, name_of
+
+from .errors import MissingTopicError, UsageError
+from .ledger import Ledger
+from .log import Log, Selection
+
+
+def part_of(
+    logs: Sequence[Log],
+    start_s: float | None = None,
+    end_s: float | None = None,
+    topics: Iterable[str] | None = None,
+) -> Selection:
+    """The rows of ``topics`` from ``start_s`` until before ``end_s``.
+
+    Args:
+        logs: Of one drive; seconds count from the first row of the earliest.
+        start_s: Seconds after the first row, or None for the beginning.
+        end_s: Seconds after the first row, no longer wanted; None for the end.
+        topics: Names, or None for all.
+
+    Raises:
+        UsageError: Not a finite time, or an empty span.
+        MissingTopicError: No log has a topic of that name, or no log has a row.
+    """
+    wanted = None if topics is None else named_topics(logs, topics, "topics")
+    if start_s is None and end_s is None:
+        return Selection(wanted)
+    for name, value in (("start_s", start_s), ("end_s", end_s)):
+        if value is not None and not math.isfinite(value):
+            raise UsageError(f"{name}: {value}; expected seconds after the first row, 12.5")
+    if start_s is not None and end_s is not None and end_s <= start_s:
+        raise UsageError(f"end_s: {end_s} is not after start_s, {start_s}; try a later time")
+    begin_ns = first_ns(logs)
+    start_ns, end_ns = (
+        None if value is None else begin_ns + round(value * 1e9) for value in (start_s, end_s)
+    )
+    return Selection(wanted, start_ns, end_ns)
+
+
+def named_topics(logs: Sequence[Log], names: Iterable[str], flag: str) -> frozenset[str]:
+    """The names, each of which a log has.
+
+    Raises:
+        MissingTopicError: No log has one of them; the message lists those there are.
+    """
+    known = {topic.name for log in logs for topic in log.topics}
+    wanted = frozenset(names)
+    for name in sorted(wanted - known):
+        raise MissingTopicError(
+            f"{flag} {name}: no such topic; there are: {', '.join(sorted(known))}"
+        )
+    return wanted
+
+
+def first_ns(logs: Sequence[Log]) -> int:
+    """Log time of the first stored row of the earliest log.
+
+    Raises:
+        MissingTopicError: No log holds a single row.
+    """
+    starts: list[int] = []
+    for log in logs:
+        blocks = log.first_blocks if isinstance(log, RangedLog) else log.read
+        for block in blocks(Ledger(name_of(log))):
+            if len(block):
+                starts.append(int(block.log_ns.min()))
+                break
+    if not starts:
+        raise MissingTopicError(
+            "--from, --to: the log holds no row, so it has no start; leave them out"
+        )
+    return min(starts)

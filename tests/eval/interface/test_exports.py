@@ -1,0 +1,66 @@
+"""The public interface: what is listed exists, is documented, and costs nothing to import."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+import crosscue
+
+ROOT: Final = Path(__file__).parents[3]
+HEAVY: Final = ("torch", "rerun", "ray", "matplotlib", "numba", "pyarrow", "numpy", "pydantic")
+
+
+def test_importing_crosscue_imports_nothing_heavy() -> None:
+    code = f"import sys, crosscue; print(sorted(set({HEAVY!r}) & sys.modules.keys()))"
+
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", crosscue.__all__)
+def test_every_public_name_exists_and_says_what_it_is(name: str) -> None:
+    found = getattr(crosscue, name)
+
+    assert (found.__doc__ or "").strip()
+    assert name in dir(crosscue)
+
+
+def test_the_reference_pages_list_the_public_names_and_no_others() -> None:
+    listed = [
+        name
+        for page in ("interface", "errors")
+        for name in re.findall(
+            r"^\.\. auto(?:function|class|exception|data):: crosscue\.(\w+)(?:\(\))?$",
+            (ROOT / "docs" / "reference" / f"{page}.md").read_text(encoding="utf-8"),
+            re.MULTILINE,
+        )
+    ]
+
+    assert sorted(listed) == sorted(crosscue.__all__)
+
+
+def test_type_checkers_see_what_is_imported() -> None:
+    """The imports under TYPE_CHECKING are those of the table."""
+    source = (ROOT / "crosscue" / "__init__.py").read_text(encoding="utf-8")
+    seen = {
+        alias.asname: f"{node.module}"
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if alias.asname is not None
+    }
+
+    assert seen == {name: f"crosscue.{module}" for name, module in crosscue._EXPORTS.items()}
+
+
+def test_a_name_that_does_not_exist_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="nonsense"):
+        getattr(crosscue, "nonsense")  # noqa: B009

@@ -1,0 +1,186 @@
+"""A recorded drive through ``crosscue.open``: tables, frames, signals, and what was lost."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import crosscue
+from crosscue.datasets.simulated.drive import DriveSettings
+from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
+from crosscue.eval import cli
+from crosscue.eval.runs.folder import RunFolder
+from support.every_format import EVERY_FORMAT
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
+    """A short simulated drive."""
+    return write_drive(tmp_path_factory.mktemp("drive"), DriveSettings(seed=3, blocks=1))
+
+
+def test_topics_are_a_table_in_print(drive: DriveFiles) -> None:
+    with crosscue.open(drive.log) as log:
+        head, *lines = repr(log.topics).splitlines()
+
+        assert head.split() == ["topic", "type", "encoding", "count"]
+        assert [line.split()[0] for line in lines] == list(log.topics)
+        assert "/can" in log.topics
+        assert log["/can"].type_name in repr(log["/can"])
+
+
+@pytest.mark.parametrize("name", sorted(EVERY_FORMAT))
+def test_every_format_gives_tables_and_frames(name: str, tmp_path: Path) -> None:
+    rows = 0
+    with (
+        warnings.catch_warnings(record=True) as heard,
+        crosscue.open(EVERY_FORMAT[name](tmp_path)) as log,
+    ):
+        warnings.simplefilter("always", crosscue.LossWarning)
+        for topic in log.topics.values():
+            if "mage" in topic.type_name:
+                rows += sum(frame.rgb.shape[2] == 3 for frame in topic.frames())
+                continue
+            table = topic.table()
+            (told,) = json.loads(table.schema.metadata[b"crosscue"]).values()
+            assert len(table) == told["used"] == sum(map(len, topic.batches()))
+            assert table.column_names[0] == "log_ns"
+            rows += len(table)
+    assert rows or heard
+
+
+def test_a_table_equals_what_decode_writes(drive: DriveFiles, tmp_path: Path) -> None:
+    assert cli.run(["decode", str(drive.log), "-o", str(tmp_path / "out"), "-q"]) == 0
+    decoded = RunFolder(tmp_path / "out")
+
+    with crosscue.open(drive.log) as log:
+        name = next(n for n in log.topics if n != "/can" and "mage" not in log[n].type_name)
+        table = log[name].table()
+
+    written = decoded.table(decoded.manifest()["tables"][name].removesuffix(".parquet"))
+    assert table.replace_schema_metadata() == written.replace_schema_metadata()
+
+
+def test_a_span_is_half_open_and_parts_intersect(drive: DriveFiles) -> None:
+    with crosscue.open(drive.log) as log:
+        name = next(n for n in log.topics if n != "/can")
+        whole = log[name].table()["log_ns"].to_numpy()
+        zero = min(log[one].table()["log_ns"].to_numpy().min() for one in log.topics)
+        some = log[name].table(start_s=1, end_s=2)["log_ns"].to_numpy()
+        parts = log.part(end_s=2)[name].table(start_s=1)["log_ns"].to_numpy()
+
+        inside = (whole >= zero + 1_000_000_000) & (whole < zero + 2_000_000_000)
+        np.testing.assert_array_equal(some, whole[inside])
+        np.testing.assert_array_equal(parts, some)
+        with pytest.raises(crosscue.UsageError, match="not after start_s"):
+            log.part(start_s=2, end_s=2)
+        with pytest.raises(crosscue.UsageError, match="seconds after"):
+            log.part(start_s=float("nan"))
+
+
+def test_signals_are_a_table_for_each_message_with_units(drive: DriveFiles) -> None:
+    dbc = next(drive.vehicle.parent.glob("*.dbc"))
+    with crosscue.open(drive.log) as log:
+        signals = log.signals(dbc)
+        frames = log["/can"].table()
+
+        assert "message" in repr(signals).splitlines()[0]
+        name = next(iter(signals))
+        units = {field.name: field.metadata for field in signals[name].schema}
+        assert any(one and one.get(b"unit") for one in units.values())
+        assert len(frames) >= max(map(len, signals.values()))
+        assert [*log.signals(dbc, messages=[name])] == [name]
+        with pytest.raises(crosscue.UsageError, match="messages"):
+            log.signals(dbc, messages=["NOT_THERE"])
+        with pytest.raises(crosscue.MissingTopicError, match="did you mean"):
+            signals[name + "x"]
+
+
+def test_payloads_are_as_long_as_the_frame_says(tmp_path: Path) -> None:
+    with crosscue.open(EVERY_FORMAT["candump"](tmp_path)) as log:
+        for topic in log.topics.values():
+            table = topic.table()
+            assert [len(one) for one in table["data"].to_pylist()] == table["length"].to_pylist()
+
+
+def test_what_is_missing_is_warned_of_and_stands_in_the_table(
+    tmp_path: Path, drive: DriveFiles
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    whole = drive.log.read_bytes()
+    cut.write_bytes(whole[: len(whole) // 2])
+
+    with crosscue.open(cut) as log, pytest.warns(crosscue.LossWarning):
+        table = log["/can"].table()
+
+    told = json.loads(table.schema.metadata[b"crosscue"])[str(cut)]
+    assert told["used"] == len(table)
+    lost = (told, told["unattributed"])
+    assert any(one["dropped"] or one["dropped_unknown"] for one in lost)
+
+
+def test_the_account_of_a_whole_topic_adds_up(drive: DriveFiles) -> None:
+    with crosscue.open(drive.log) as log:
+        table = log["/can"].table(end_s=1)
+
+    told = json.loads(table.schema.metadata[b"crosscue"])[str(drive.log)]
+    assert told["used"] == len(table)
+    assert told["found"] == told["used"] + sum(told["skipped"].values())
+    assert not told["dropped"]
+
+
+def test_logs_of_one_drive_are_read_one_after_another(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    first, second = (EVERY_FORMAT["candump"](tmp_path / name) for name in ("a", "b"))
+
+    with crosscue.open(first, second) as both, crosscue.open(first) as one:
+        name = next(iter(one.topics))
+        assert len(both[name].table()) == 2 * len(one[name].table())
+
+
+def test_pictures_are_frames_and_not_a_table(tmp_path: Path) -> None:
+    with crosscue.open(EVERY_FORMAT["images"](tmp_path)) as log:
+        camera = next(iter(log.topics.values()))
+        frame = next(camera.frames())
+
+        decoded = cv2.imdecode(np.frombuffer(frame.encoded, np.uint8), cv2.IMREAD_COLOR)
+        assert decoded is not None
+        np.testing.assert_array_equal(frame.rgb, np.asarray(decoded)[:, :, ::-1])
+        assert "png" in repr(frame)
+        with pytest.raises(crosscue.UsageError, match="use frames"):
+            camera.table()
+        assert [one.t_ns for one in camera.frames(start_s=0.1, end_s=0.3)] == [
+            one.t_ns for one in camera.frames()
+        ][1:3]
+
+
+@pytest.mark.parametrize(
+    ("paths", "error"),
+    [
+        ((), crosscue.UsageError),
+        (("gone.mcap",), crosscue.LogError),
+        (("x.unknown",), crosscue.UnknownFormatError),
+    ],
+)
+def test_what_cannot_be_opened_is_an_error_of_ours(
+    paths: tuple[str, ...], error: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("x.unknown").write_bytes(b"?")
+
+    with pytest.raises(error):
+        crosscue.open(*paths)
+
+
+def test_a_topic_that_is_not_there_is_named_with_the_nearest(drive: DriveFiles) -> None:
+    with (
+        crosscue.open(drive.log) as log,
+        pytest.raises(crosscue.MissingTopicError, match="did you mean /can"),
+    ):
+        log["/cam"]
