@@ -38,7 +38,6 @@ from crosscue.replay.limits import DEFAULT
 from crosscue.replay.readers.mcap.bytes import ByteFile
 from crosscue.replay.readers.mcap.channels import TopicBook
 from crosscue.replay.readers.mcap.reader import open_mcap
-from crosscue.replay.readers.mcap.scan import Scanner
 from crosscue.replay.readers.mcap.segments import find_segments
 from crosscue.replay.readers.mcap.walk import Chunk, Walk
 
@@ -205,7 +204,7 @@ def bare(path: Path, is_checked: bool = False) -> int:
     file = ByteFile(path)
     segment = find_segments(file, path, TopicBook(DEFAULT), DEFAULT)[0]
     inflater = zstandard.ZstdDecompressor()
-    walk = Walk(file, segment.begin, segment.end, segment.rail(file, DEFAULT), DEFAULT, Scanner())
+    walk = Walk(file, segment.begin, segment.end, segment.rail(file, DEFAULT), DEFAULT)
     for item in walk:
         if isinstance(item, Chunk) and item.head is not None:
             body: bytes | memoryview = file.read(item.body_at, item.head.body_size).data

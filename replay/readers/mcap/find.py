@@ -28,7 +28,6 @@ from .records import (
     read_chunk_head,
 )
 from .rows import NEVER_IN_A_CHUNK, rows_by_scan
-from .scan import Scanner
 
 HEAD_MOST: Final = PREFIX.size + CHUNK_FIXED + 32
 FIRST_PIECE: Final = 4 << 10
@@ -124,7 +123,7 @@ def _proves_itself(file: ByteFile, at: int, limits: Limits) -> bool:
 
 def _is_filled(records: Bytes, head: ChunkHead, limits: Limits) -> bool:
     """Without a checksum: do records fill the chunk, with messages of the time it declares?"""
-    rows = rows_by_scan(records, Scanner(), NEVER_IN_A_CHUNK, limits.records_per_chunk)
+    rows = rows_by_scan(records, NEVER_IN_A_CHUNK, limits.records_per_chunk)
     if rows.end != len(records) or not len(rows):
         return False
     return bool(rows.log.min() == head.start and rows.log.max() == head.end)

@@ -24,7 +24,6 @@ from .load import Load, Loader, Stretch
 from .records import PREFIX, BrokenRecordError
 from .resync import Plausible, Resync
 from .rows import NEVER_IN_A_CHUNK, Rows, contradicts, join, rows_by_index, rows_by_scan
-from .scan import Scanner
 from .segments import Segment, Summary
 from .walk import (
     STOPS_A_RUN,
@@ -78,7 +77,7 @@ def read_segments(
     selection: Selection,
 ) -> Iterator[Block]:
     """All blocks of a file; afterwards the ledger is settled."""
-    checks, scanner = Checks(), Scanner()
+    checks = Checks()
     if len(segments) > 1:
         ledger.notice(f"the file holds {len(segments)} recordings in a row; all are read")
     declared: Counter[str] | None = Counter()
@@ -86,7 +85,7 @@ def read_segments(
         where = "" if len(segments) == 1 else f"recording at byte {segment.base}: "
         with Loader(file, limits) as loader:
             part = SegmentPass(
-                file, segment, book, limits, ledger, selection, checks, scanner, loader, where
+                file, segment, book, limits, ledger, selection, checks, loader, where
             )
             yield from part.blocks()
             counts = part.settle()
@@ -114,7 +113,6 @@ class SegmentPass:
         ledger: Ledger,
         selection: Selection,
         checks: Checks,
-        scanner: Scanner,
         loader: Loader,
         where: str,
     ) -> None:
@@ -128,7 +126,6 @@ class SegmentPass:
         self._inside: Window | None = None
         self._doubt = ""
         self._checks = checks
-        self._scanner = scanner
         self._loader = loader
         self._where = where
         self._damages: list[Damage] = []
@@ -178,7 +175,7 @@ class SegmentPass:
             self._segment = replace(self._segment, data_crc=0)
         self._inside = window
         self._file.expect(window.ranges())
-        yield from self._walked(window.items(self._file, self._limits, self._scanner))
+        yield from self._walked(window.items(self._file, self._limits))
         self._inside = None
         held = self._giver.met + self._giver.dropped
         doubt = self._doubt or ("it has damage" if self._damages else "")
@@ -188,7 +185,7 @@ class SegmentPass:
             self._notice(
                 f"the index was not trusted after all ({doubt}); every chunk was looked at"
             )
-            yield from self._walked(window.others(self._file, self._limits, self._scanner))
+            yield from self._walked(window.others(self._file, self._limits))
             return
         self._checks.chunks += window.left
         self._checks.chunks_unread += window.left
@@ -214,7 +211,6 @@ class SegmentPass:
             segment.end,
             rail,
             self._limits,
-            self._scanner,
             self._plausible(),
         )
 
@@ -297,7 +293,7 @@ class SegmentPass:
         if rows is None:
             if chunk.messages or chunk.index_fault:
                 self._checks.bad_indexes.add(f"that of the chunk at byte {chunk.at}")
-            rows = rows_by_scan(buffer, self._scanner, NEVER_IN_A_CHUNK, most)
+            rows = rows_by_scan(buffer, NEVER_IN_A_CHUNK, most)
             if rows.end != len(buffer):
                 raise BrokenRecordError(f"its records break off at {rows.end} of {len(buffer)}")
         self._vouch(chunk, rows)
@@ -331,7 +327,7 @@ class SegmentPass:
             raise BrokenRecordError(f"has no checksum, and {doubt}")
 
     def _cut_rows(self, chunk: Chunk, buffer: Bytes) -> Rows:
-        rows = rows_by_scan(buffer, self._scanner, NEVER_IN_A_CHUNK, self._limits.records_per_chunk)
+        rows = rows_by_scan(buffer, NEVER_IN_A_CHUNK, self._limits.records_per_chunk)
         head = chunk.head
         assert head is not None, "a chunk with rows has a head"
         has = self._file.size - chunk.body_at
@@ -389,7 +385,7 @@ class SegmentPass:
             definitions = [one for one in rows.definitions if one.at < begin]
             yield at, replace(rows.take(slice(i)), definitions=definitions)
             at, buffer = at + begin, rows.buffer[begin : rows.end]
-            rows = rows_by_scan(buffer, self._scanner, STOPS_A_RUN, len(buffer))
+            rows = rows_by_scan(buffer, STOPS_A_RUN, len(buffer))
         yield at, rows
 
     def _is_some_missing(self) -> bool:

@@ -35,7 +35,7 @@ from .records import (
     MessageIndex,
     heads_at,
 )
-from .scan import Scan, Scanner
+from .scan import Scan, scan_of
 
 GAPS_WORTH_A_LOOK: Final = 256
 """Stretches between indexed messages beyond which scanning everything is as fast."""
@@ -241,19 +241,18 @@ def join(whole: Bytes, parts: Sequence[tuple[Rows, int]]) -> Rows:
     )
 
 
-def rows_by_scan(buffer: Bytes, scanner: Scanner, stop_at: NDArray[np.bool_], most: int) -> Rows:
+def rows_by_scan(buffer: Bytes, stop_at: NDArray[np.bool_], most: int) -> Rows:
     """The messages of a stretch up to where it cannot be followed any further (``Rows.end``).
 
     Args:
         buffer: Shape (B,).
-        scanner: Does the stepping.
         stop_at: Operation codes before which to stop.
         most: Records allowed.
 
     Raises:
         BrokenRecordError: More than ``most`` records, or too many definitions.
     """
-    scan = scanner(buffer, stop_at, most + 1)
+    scan = scan_of(buffer, stop_at, most + 1)
     if len(scan.offset) > most:
         raise BrokenRecordError(f"holds more than {most} records")
     is_message = scan.opcode == MESSAGE

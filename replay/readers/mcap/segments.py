@@ -47,7 +47,6 @@ from .records import (
 )
 from .repair import proved_head
 from .rows import NEVER_IN_A_CHUNK, Definition, rows_by_scan
-from .scan import Scanner
 from .walk import Chunk, End, How, Run, Walk
 
 HEADER_MOST: Final = 1 << 16
@@ -299,22 +298,21 @@ def _enter(segment: Segment, declarations: Declarations) -> Segment:
 
 def _survey_named(file: ByteFile, segment: Segment, book: TopicBook, limits: Limits) -> Segment:
     """A segment whose summary does not name all channels: find them in its data section."""
-    scanner = Scanner()
-    walk = Walk(file, segment.begin, segment.end, segment.rail(file, limits), limits, scanner)
+    walk = Walk(file, segment.begin, segment.end, segment.rail(file, limits), limits)
     declarations = Declarations(book, *_declared(segment.summary or Summary()))
-    _collect(file, walk, declarations, limits, scanner)
+    _collect(file, walk, declarations, limits)
     return _enter(segment, declarations)
 
 
 def _survey(file: ByteFile, book: TopicBook, limits: Limits) -> tuple[Segment, ...]:
     """All segments, found by walking over the file's outer records."""
     segments: list[Segment] = []
-    scanner, base = Scanner(), 0
+    base = 0
     while base < file.size:
         begin = _begin(file, base)
-        walk = Walk(file, begin, file.size, None, limits, scanner)
+        walk = Walk(file, begin, file.size, None, limits)
         declarations = Declarations(book)
-        end = _collect(file, walk, declarations, limits, scanner)
+        end = _collect(file, walk, declarations, limits)
         segment, after = _close(file, base, begin, end, limits)
         summary = segment.summary or Summary()
         for channel in summary.channels.values():
@@ -331,9 +329,7 @@ def _survey(file: ByteFile, book: TopicBook, limits: Limits) -> tuple[Segment, .
     return tuple(segments)
 
 
-def _collect(
-    file: ByteFile, walk: Walk, declarations: Declarations, limits: Limits, scanner: Scanner
-) -> End:
+def _collect(file: ByteFile, walk: Walk, declarations: Declarations, limits: Limits) -> End:
     """Walk to the end, taking the definitions met; chunks are read only where one is new."""
     for item in walk:
         if isinstance(item, End):
@@ -341,7 +337,7 @@ def _collect(
         if isinstance(item, Run):
             _take(declarations, item.rows.definitions)
         elif isinstance(item, Chunk) and not _is_known(item, declarations):
-            _take(declarations, _definitions_in(file, item, limits, scanner))
+            _take(declarations, _definitions_in(file, item, limits))
     raise AssertionError("a walk ends with an End")
 
 
@@ -350,9 +346,7 @@ def _is_known(chunk: Chunk, declarations: Declarations) -> bool:
     return bool(ids) and ids <= declarations.complete
 
 
-def _definitions_in(
-    file: ByteFile, chunk: Chunk, limits: Limits, scanner: Scanner
-) -> list[Definition]:
+def _definitions_in(file: ByteFile, chunk: Chunk, limits: Limits) -> list[Definition]:
     """Schemas and channels of a chunk; none if it cannot be read."""
     head = chunk.head
     if head is None or chunk.fault or max(head.size, head.body_size) > limits.chunk_bytes:
@@ -364,7 +358,7 @@ def _definitions_in(
             if chunk.is_cut
             else inflate(body, head, file.buffers.take(head.size + 1))
         )
-        rows = rows_by_scan(buffer, scanner, NEVER_IN_A_CHUNK, limits.records_per_chunk)
+        rows = rows_by_scan(buffer, NEVER_IN_A_CHUNK, limits.records_per_chunk)
     except BrokenRecordError:
         return []
     return list(rows.definitions)

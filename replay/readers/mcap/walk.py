@@ -52,7 +52,6 @@ from .records import (
 from .repair import REPAIRED, is_doubtful, proved_head
 from .resync import Plausible, Resync, is_exact
 from .rows import Rows, opcodes, rows_by_scan
-from .scan import Scanner
 
 RUN_BYTES: Final = 4 << 20
 """Most bytes outside chunks taken at once, unless one record is larger."""
@@ -174,7 +173,6 @@ class Walk:
         end: int,
         chunks: Mapping[int, ChunkIndex] | None,
         limits: Limits,
-        scanner: Scanner,
         plausible: Plausible | None = None,
     ) -> None:
         """A walk from ``begin``.
@@ -186,7 +184,6 @@ class Walk:
                 another recording begins.
             chunks: By offset, what a trusted summary says; None where no end is known.
             limits: Sizes above which nothing is read.
-            scanner: Does the stepping within runs.
             plausible: What is known of messages outside chunks before the walk.
         """
         self._file = file
@@ -196,7 +193,6 @@ class Walk:
         self._chunks = chunks or {}
         self._known = sorted(self._chunks)
         self._limits = limits
-        self._scanner = scanner
         self._run_bytes = 0
         self._is_over = False
         self._last_at = begin
@@ -362,7 +358,7 @@ class Walk:
             self._at = at + size
             return self._oversized(at, opcode, length)
         buffer = self._run_buffer(at, size, bound)
-        rows = rows_by_scan(buffer, self._scanner, STOPS_A_RUN, len(buffer))
+        rows = rows_by_scan(buffer, STOPS_A_RUN, len(buffer))
         if not rows.end:
             raise BrokenRecordError("the file became shorter while being read")
         rows = self._without_hidden(at, rows)

@@ -23,7 +23,6 @@ from crosscue.replay.log import Selection
 from .bytes import ByteFile
 from .channels import Declarations
 from .chunk_table import ChunkTable
-from .scan import Scanner
 from .segments import Segment, Summary
 from .walk import End, Item, Walk
 
@@ -59,25 +58,23 @@ class Window:
         filled = end > begin
         return list(zip(begin[filled].tolist(), end[filled].tolist(), strict=True))
 
-    def items(self, file: ByteFile, limits: Limits, scanner: Scanner) -> Iterator[Item]:
+    def items(self, file: ByteFile, limits: Limits) -> Iterator[Item]:
         """What lies in those ranges, in the order of the file."""
         for begin, end in self.ranges():
-            yield from self._walk(begin, end, file, limits, scanner)
+            yield from self._walk(begin, end, file, limits)
 
-    def others(self, file: ByteFile, limits: Limits, scanner: Scanner) -> Iterator[Item]:
+    def others(self, file: ByteFile, limits: Limits) -> Iterator[Item]:
         """The chunks left out, in the order of the file."""
         out = ~self.is_read
         for begin, end in zip(
             self.chunks.at[out].tolist(), self.chunks.after[out].tolist(), strict=True
         ):
-            yield from self._walk(begin, end, file, limits, scanner)
+            yield from self._walk(begin, end, file, limits)
 
-    def _walk(
-        self, begin: int, end: int, file: ByteFile, limits: Limits, scanner: Scanner
-    ) -> Iterator[Item]:
+    def _walk(self, begin: int, end: int, file: ByteFile, limits: Limits) -> Iterator[Item]:
         rows = slice(*np.searchsorted(self.chunks.at, (begin, end)).tolist())
         rail = self.chunks.take(rows)
-        for item in Walk(file, begin, end, rail, limits, scanner):
+        for item in Walk(file, begin, end, rail, limits):
             if not isinstance(item, End):
                 yield item
 
