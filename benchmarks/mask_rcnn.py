@@ -32,6 +32,7 @@ from torchvision.models.detection.transform import GeneralizedRCNNTransform
 from crosscue.datasets.scenes.drive import SceneSettings, world_of
 from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Calibration, Checkpoint, Facts
 from crosscue.detectors.networks.mask_rcnn.detector import (
     MaskRcnnDetector,
@@ -48,7 +49,6 @@ from crosscue.detectors.networks.mask_rcnn.network import (
     build_network,
     set_limits,
 )
-from crosscue.detectors.networks.model_detector import overlaps
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import VehicleError
 

@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from crosscue.datasets.scenes.drive import SceneSettings, world_of
 from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.detectors.base import Detections, Frame
-from crosscue.detectors.networks.model_detector import overlaps
+from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.signs.detector import POINTS_DRAWN, SignSettings, build, orb_points
 from crosscue.detectors.signs.templates import AMERICAN, Kind, drawings
 from crosscue.replay.columns import Bytes, Floats

@@ -10,7 +10,7 @@ height_px = 416
 fit = "letterbox"                # or "stretch"
 
 [output]
-kind = "yolox"                   # or "segmentation"
+kind = "yolox"                   # or another of detectors/decoders, or "segmentation"
 classes = ["person", "bicycle", "car"]
 """
 
@@ -18,10 +18,11 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
+from crosscue.detectors.decoders.table import AnyBoxOutput
 from crosscue.detectors.settings import Settings, Share
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.files.bounded import read_at_most
@@ -47,24 +48,29 @@ class Input(Settings):
     colour: Literal["bgr", "rgb"] = "bgr"
     mean: Colour = (0.0, 0.0, 0.0)
     scale: Colour = (1.0, 1.0, 1.0)
-    fit: Literal["stretch", "letterbox"] = "stretch"
-    """Letterbox: at the top left, proportions kept, the rest grey 114."""
-    layout: Literal["nchw", "nhwc"] = "nchw"
+    fit: Literal["stretch", "letterbox", "letterbox-center", "crop"] = "stretch"
+    """Letterbox: proportions kept, at the top left or in the center, the rest filled with ``pad``;
+    crop: proportions kept, the middle of the picture."""
+    pad: Annotated[int, Field(ge=0, le=255)] = 114
+    layout: Literal["nchw", "nhwc", "chw"] = "nchw"
+    """``chw`` has no batch axis, as torchvision exports its detectors."""
     dtype: Literal["float32", "uint8"] = "float32"
+    is_resizable: bool = False
+    """A network without fully connected layers runs at other sizes than its file declares, and
+    then gives as many candidates more."""
+    max_batch: Annotated[int, Field(gt=0, le=64)] = 1
+    """Pictures given to the network at once, where its batch axis is free."""
 
 
-class YoloxOutput(Settings):
-    """Boxes of the YOLOX kind: rows (x, y, w, h, objectness, classes...) over grids of strides."""
+class Tiles(Settings):
+    """Besides the whole picture, tiles of the input's size at the picture's own resolution."""
 
-    kind: Literal["yolox"]
-    name: str | None = None
-    """Which of the outputs; the only one, if left out."""
-    strides: tuple[Side, ...] = (8, 16, 32)
-    classes: tuple[str, ...]
-    score: Share = 0.3
-    """Boxes below are dropped."""
-    overlap: Share = 0.45
-    """Of two boxes of one class that overlap more (intersection over union), the better stays."""
+    top: Share = 0.3
+    """Upper edge of the band covered, as a fraction of the picture's height."""
+    bottom: Share = 0.7
+    """Its lower edge."""
+    overlap: Annotated[float, Field(ge=0.0, lt=0.9)] = 0.2
+    """Of neighbouring tiles, as a fraction of their size."""
 
 
 class SegmentationOutput(Settings):
@@ -88,7 +94,28 @@ class ModelCard(Settings):
     licence: str = ""
     source: str = ""
     input: Input
-    output: Annotated[YoloxOutput | SegmentationOutput, Field(discriminator="kind")]
+    output: Annotated[AnyBoxOutput | SegmentationOutput, Field(discriminator="kind")]
+    labels: dict[str, str] = Field(default_factory=dict)
+    """What a class means to crosscue, where its own name says something else: the cues count
+    "stop sign", "traffic light", "car", "truck", "bus", "one way left" and so on."""
+    tiles: Tiles | None = None
+    """Left out: the whole picture only."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        """Refuse labels of classes that are not listed, no classes, and one class twice."""
+        classes = self.output.classes
+        if not classes:
+            raise ValueError("output.classes is empty; list the network's classes in their order")
+        unknown = [name for name in self.labels if name not in classes]
+        if unknown:
+            raise ValueError(f"labels: {unknown[0]!r} is not one of output.classes")
+        return self
+
+    def meaning(self, number: int) -> str:
+        """The label that a detection of a class gets."""
+        name = self.output.classes[number]
+        return self.labels.get(name, name)
 
 
 class Weights(Settings):

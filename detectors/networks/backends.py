@@ -21,6 +21,7 @@ from crosscue.detectors.catalog.card import Weights
 from crosscue.replay.errors import VehicleError, one_line
 from crosscue.replay.versions import installed
 
+from .free_size import Size, free_size, resized
 from .onnx_input import input_shape
 from .openvino import import_openvino
 
@@ -53,13 +54,20 @@ class _Function:
         return self.call(batch)
 
 
-def load_network(weights: Weights, backend: str | None = None, threads: int = 1) -> Network:
+def load_network(
+    weights: Weights,
+    backend: str | None = None,
+    threads: int = 1,
+    size_px: tuple[int, int] | None = None,
+) -> Network:
     """Make weights ready to run.
 
     Args:
         weights: Verified.
         backend: ``onnxruntime``, ``opencv``, ``openvino``, ``litert``; None for the best.
         threads: How many the back end may use, where it can be told.
+        size_px: Width and height to run at instead of those that the file declares, for networks
+            that allow it.
 
     Raises:
         VehicleError: No installed back end reads them, or they are damaged.
@@ -81,7 +89,7 @@ def load_network(weights: Weights, backend: str | None = None, threads: int = 1)
             f"pip install {_PROJECT.get(name, name)}"
         )
     try:
-        return _LOADERS[name](weights, threads)
+        return _LOADERS[name](weights, threads, size_px)
     except VehicleError:
         raise
     except Exception as error:
@@ -90,13 +98,14 @@ def load_network(weights: Weights, backend: str | None = None, threads: int = 1)
         ) from None
 
 
-def _in_onnxruntime(weights: Weights, threads: int) -> Network:
+def _in_onnxruntime(weights: Weights, threads: int, size_px: Size | None) -> Network:
     ort: Any = import_module("onnxruntime")
 
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 4
-    session = ort.InferenceSession(weights.content, options, providers=_ort_providers(ort))
+    content = weights.content if size_px is None else free_size(weights.content)
+    session = ort.InferenceSession(content, options, providers=_ort_providers(ort))
     given, names = session.get_inputs()[0].name, [out.name for out in session.get_outputs()]
 
     def call(batch: Array) -> Mapping[str, Array]:
@@ -110,7 +119,7 @@ def _ort_providers(ort: Any) -> list[str]:
     return [name for name in wanted if name in ort.get_available_providers()]
 
 
-def _in_opencv(weights: Weights, threads: int) -> Network:
+def _in_opencv(weights: Weights, threads: int, size_px: Size | None) -> Network:
     import cv2
 
     net = cv2.dnn.readNetFromONNX(np.frombuffer(weights.content, np.uint8))
@@ -118,7 +127,7 @@ def _in_opencv(weights: Weights, threads: int) -> Network:
     wanted = input_shape(weights.content)
 
     def call(batch: Array) -> Mapping[str, Array]:
-        if wanted is not None and not _fits(batch.shape, wanted):
+        if size_px is None and wanted is not None and not _fits(batch.shape, wanted):
             raise ValueError(f"got {batch.shape}, the network's own input is {wanted}")
         net.setInput(np.asarray(batch))
         outputs = net.forward(names)
@@ -133,13 +142,17 @@ def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
     )
 
 
-def _in_openvino(weights: Weights, threads: int) -> Network:
+def _in_openvino(weights: Weights, threads: int, size_px: Size | None) -> Network:
     ov = import_openvino()
     core = ov.Core()
     core.set_property("CPU", {"INFERENCE_NUM_THREADS": threads})
     # Speed hints may pick half precision, and results must not depend on the processor.
     core.set_property("CPU", {"INFERENCE_PRECISION_HINT": "f32"})
     model = core.read_model(weights.content, weights.second)
+    if size_px is not None:
+        model.reshape(
+            resized([side.get_length() for side in model.input(0).partial_shape], size_px)
+        )
     compiled = core.compile_model(model, "CPU")
     names = [_output_name(out, i) for i, out in enumerate(compiled.outputs)]
 
@@ -150,9 +163,12 @@ def _in_openvino(weights: Weights, threads: int) -> Network:
     return _Function(f"openvino {ov.__version__}", call)
 
 
-def _in_litert(weights: Weights, threads: int) -> Network:
+def _in_litert(weights: Weights, threads: int, size_px: Size | None) -> Network:
     litert: Any = import_module("ai_edge_litert.interpreter")
     net = litert.Interpreter(model_content=weights.content, num_threads=threads)
+    if size_px is not None:
+        first = net.get_input_details()[0]
+        net.resize_tensor_input(first["index"], resized(first["shape"].tolist(), size_px))
     net.allocate_tensors()
     given, outputs = net.get_input_details()[0], net.get_output_details()
 
@@ -178,7 +194,7 @@ BACKENDS: Final[Mapping[str, tuple[str, ...]]] = {
 _PACKAGE: Final = {"onnxruntime": "onnxruntime", "opencv": "cv2", "openvino": "openvino",
              "litert": "ai_edge_litert"}  # fmt: skip
 _PROJECT: Final = {"opencv": "opencv-python-headless", "litert": "ai-edge-litert"}
-_LOADERS: Final[Mapping[str, Callable[[Weights, int], Network]]] = {
+_LOADERS: Final[Mapping[str, Callable[[Weights, int, Size | None], Network]]] = {
     "onnxruntime": _in_onnxruntime,
     "opencv": _in_opencv,
     "openvino": _in_openvino,

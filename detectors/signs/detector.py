@@ -255,7 +255,7 @@ def _apart(
     hardly ever. So a window's score is its share of the drawing's points, times
     S / (S + 1), where S sums the shares of all windows of its kind over the same place.
     """
-    from crosscue.detectors.networks.model_detector import overlaps
+    from crosscue.detectors.boxes import overlaps
 
     if not candidates:
         return []

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections
+from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Calibration
-from crosscue.detectors.networks.model_detector import overlaps
 from crosscue.detectors.rle import area_px
 from crosscue.replay.columns import Floats
 

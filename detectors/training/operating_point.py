@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.networks.model_detector import overlaps
+from crosscue.detectors.boxes import overlaps
 from crosscue.replay.columns import Floats
 
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.detectors.base import Detections, Frame
-from crosscue.detectors.networks.model_detector import overlaps
+from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.signs.detector import build, orb_points
 from crosscue.detectors.signs.matching import nearest, window_counts
 from crosscue.detectors.signs.templates import AMERICAN, Kind

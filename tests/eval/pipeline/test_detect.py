@@ -209,7 +209,10 @@ def test_an_unknown_setting_is_refused_with_a_suggestion(
     ("changes", "said"),
     [
         ({"sha256": '"' + "0" * 64 + '"'}, "the card's sha256 says 0000"),
-        ({"classes": '["car"]'}, "want (1, 3549, 6) for 1 classes, got (1, 3549, 85)"),
+        (
+            {"classes": '["car"]'},
+            "expected (1, 3549, 6) for 1 classes at 416 x 416",
+        ),
         ({"width_px": "320"}, "the network does not run on input 320 x 416"),
         ({"weights": '"gone.onnx"'}, "put the weights next to the card"),
     ],

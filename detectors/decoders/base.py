@@ -1,0 +1,166 @@
+"""What every decoder takes and gives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.detectors.settings import Settings, Share
+from crosscue.replay.columns import Floats, Int64s
+
+Array: TypeAlias = NDArray[np.generic]
+Outputs: TypeAlias = Mapping[str, Array]
+"""Raw outputs by name, for one picture: the batch axis is there and has length 1."""
+Size: TypeAlias = tuple[int, int]
+"""Width and height in pixels."""
+
+
+class Masks(Protocol):
+    """Object masks of some candidates, computed only for those that stay."""
+
+    def __call__(self, kept: Int64s, /) -> Floats:
+        """Shape (K, h, w): probability of the object over the network's whole input, coarser."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Everything a network proposes for one picture, before thresholds, as columns of length N.
+
+    Attributes:
+        boxes_px: Shape (N, 4), float64: x0, y0, x1, y1 in pixels of the network's input.
+        scores: Shape (N,), float64.
+        classes: Shape (N,), int64: index into the card's ``classes``.
+        masks: Gives their masks; None where the network has none.
+    """
+
+    boxes_px: Floats
+    scores: Floats
+    classes: Int64s
+    masks: Masks | None = None
+
+    def __len__(self) -> int:
+        """How many candidates."""
+        return len(self.scores)
+
+
+@dataclass(frozen=True, slots=True)
+class Tensor:
+    """An input or output as a model file declares it; None for a size left open."""
+
+    name: str
+    shape: tuple[int | str | None, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Interface:
+    """What a model file says of itself.
+
+    Attributes:
+        inputs: In the file's order.
+        outputs: Likewise.
+        metadata: Text by key, as an exporter left it.
+        class_names: From the metadata, empty where it has none.
+    """
+
+    inputs: tuple[Tensor, ...]
+    outputs: tuple[Tensor, ...]
+    metadata: Mapping[str, str]
+    class_names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """A layout that a model file may have.
+
+    Attributes:
+        settings: Keys of the card's ``[output]`` and their values.
+        class_count: How many classes it then has; None where the shapes do not tell.
+        reasons: What in the file says so.
+        assumptions: What nothing in the file says.
+        input: Keys of the card's ``[input]`` that networks of this layout usually have.
+    """
+
+    settings: Mapping[str, object]
+    class_count: int | None
+    reasons: tuple[str, ...]
+    assumptions: tuple[str, ...] = ()
+    input: Mapping[str, object] | None = None
+
+
+class BoxOutput(Settings):
+    """The part of a card's ``[output]`` that every layout has."""
+
+    kind: str
+    classes: tuple[str, ...]
+    """Names in the order of the network's class numbers."""
+    score: Share = 0.3
+    """Candidates with a lower score are not reported."""
+    overlap: Share = 0.45
+    """Of two boxes of one class that overlap more (intersection over union), the better stays."""
+
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+        """Decode the outputs for one picture of ``size_px``, the network's input.
+
+        Raises:
+            ValueError: The outputs do not have the shape that the card asks for.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def recognise(cls, model: Interface, /) -> Guess | None:
+        """What a model file would have to be for this layout; None where it cannot be."""
+        raise NotImplementedError
+
+
+def named(outputs: Outputs, name: str | None, key: str = "name") -> Array:
+    """One output by the card's name for it, the only one where the card gives none.
+
+    Raises:
+        ValueError: No such output, or several and no name.
+    """
+    if name is None and len(outputs) == 1:
+        return next(iter(outputs.values()))
+    if name is None or name not in outputs:
+        raise ValueError(f"{key}: expected one of {', '.join(sorted(outputs))}, got {name!r}")
+    return outputs[name]
+
+
+def rows_of(output: Array, columns: int, what: str) -> Floats:
+    """An output (1, N, columns) as a table (N, columns), float64.
+
+    Raises:
+        ValueError: Another shape.
+    """
+    if output.ndim != 3 or output.shape[0] != 1 or output.shape[2] != columns:
+        raise ValueError(f"expected (1, N, {columns}) for {what}, got {output.shape}")
+    return np.asarray(output[0], np.float64)
+
+
+def from_centers(table: Floats) -> Floats:
+    """Boxes (N, 4) as center x, center y, width, height turned into corners."""
+    center, half = table[:, :2], table[:, 2:4] / 2.0
+    return np.hstack([center - half, center + half])
+
+
+def best_class(scores: Floats) -> tuple[Floats, Int64s]:
+    """Of scores (N, C), each row's highest and its class."""
+    if not scores.shape[1]:
+        raise ValueError("0 classes; a detector needs at least one")
+    classes = scores.argmax(axis=1)
+    return scores[np.arange(len(scores)), classes], classes.astype(np.int64)
+
+
+def sigmoid(values: Floats) -> Floats:
+    """Logistic function, without overflow."""
+    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * values)), np.float64)
+
+
+def static(shape: tuple[int | str | None, ...], axis: int) -> int | None:
+    """A declared size as a number; None where it is open or has no such axis."""
+    size = shape[axis] if -len(shape) <= axis < len(shape) else None
+    return size if isinstance(size, int) else None

@@ -1,0 +1,74 @@
+"""Networks that suppress double boxes themselves: YOLOv10, YOLO26, exports with built-in NMS."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from typing_extensions import override
+
+from crosscue.replay.columns import Floats, Int64s
+
+from .base import BoxOutput, Candidates, Guess, Interface, Outputs, Size, named, rows_of, static
+from .yolo import PICTURE, PrototypeMasks, prototype_output, prototypes_of
+
+
+class EndToEndOutput(BoxOutput):
+    """One output (1, N, 6): x0, y0, x1, y1 in input pixels, score, class; then mask weights."""
+
+    kind: Literal["end-to-end"]
+    name: str | None = None
+    """The output with the boxes; the only one, if left out."""
+    prototypes: str | None = None
+    """The output with prototype masks, where there are masks."""
+
+    @override
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+        if self.prototypes is None:
+            table = rows_of(named(outputs, self.name), 6, "x0, y0, x1, y1, score, class")
+            return self._of(table, None)
+        prototypes = prototypes_of(named(outputs, self.prototypes, "prototypes"))
+        table = rows_of(named(outputs, self.name), 6 + len(prototypes), "boxes and mask weights")
+        return self._of(table, PrototypeMasks(table[:, 6:], prototypes))
+
+    def _of(self, table: Floats, masks: PrototypeMasks | None) -> Candidates:
+        return Candidates(
+            table[:, :4], table[:, 4], class_numbers(table[:, 5], len(self.classes)), masks
+        )
+
+    @override
+    @classmethod
+    def recognise(cls, model: Interface, /) -> Guess | None:
+        prototypes = prototype_output(model)
+        columns = 6 + (prototypes[1] if prototypes else 0)
+        output = next((o for o in model.outputs if len(o.shape) == 3), None)
+        if output is None or static(output.shape, 2) != columns:
+            return None
+        settings: dict[str, object] = {"kind": "end-to-end", "name": output.name, "overlap": 1.0}
+        if prototypes:
+            settings["prototypes"] = prototypes[0]
+        names = len(model.class_names)
+        return Guess(
+            settings,
+            names or None,
+            (f"rows of {columns}: box, score, class" + (", mask weights" if prototypes else ""),),
+            ("boxes are in input pixels",),
+            PICTURE,
+        )
+
+
+def class_numbers(values: Floats, count: int) -> Int64s:
+    """Class numbers that came as floating-point values or integers, checked.
+
+    Raises:
+        ValueError: One that is no index of ``count`` classes.
+    """
+    bad = len(values) - int(np.isfinite(values).sum())
+    if bad:
+        raise ValueError(f"{bad} of {len(values)} candidates are not finite numbers")
+    numbers: Int64s = values.astype(np.int64)
+    if len(numbers) and not (numbers.min() >= 0 and numbers.max() < count):
+        raise ValueError(
+            f"class numbers {numbers.min()} to {numbers.max()}, but {count} classes are listed"
+        )
+    return numbers

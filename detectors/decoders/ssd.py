@@ -1,0 +1,100 @@
+"""SSD as TensorFlow's and OpenVINO's model zoos export it, boxes already suppressed."""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+import numpy as np
+from typing_extensions import override
+
+from .base import BoxOutput, Candidates, Guess, Interface, Outputs, Size, named, static
+from .end_to_end import class_numbers
+
+_BOXES: Final = "detection_boxes"
+
+
+class TensorflowSsdOutput(BoxOutput):
+    """Boxes (1, N, 4) as y0, x0, y1, x1 in fractions, class numbers (1, N), scores (1, N)."""
+
+    kind: Literal["ssd-tensorflow"]
+    boxes: str = _BOXES
+    labels: str = "detection_classes"
+    scores: str = "detection_scores"
+    first_class: int = 1
+    """Number of the first listed class; TFLite exports start at 0."""
+
+    @override
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+        boxes = np.asarray(named(outputs, self.boxes, "boxes"), np.float64)
+        scores = np.asarray(named(outputs, self.scores, "scores"), np.float64)
+        labels = np.asarray(named(outputs, self.labels, "labels"), np.float64)
+        n = boxes.shape[1] if boxes.ndim == 3 else 0
+        if boxes.shape != (1, n, 4) or scores.shape != (1, n) or labels.shape != (1, n):
+            raise ValueError(
+                f"expected boxes (1, N, 4), labels (1, N), scores (1, N), got {boxes.shape}, "
+                f"{labels.shape}, {scores.shape}"
+            )
+        corners = boxes[0][:, [1, 0, 3, 2]] * np.tile(size_px, 2)
+        # Rows beyond the detections are filled with zeros, whose class need not exist.
+        kept = scores[0] > 0.0
+        numbers = class_numbers(labels[0][kept] - self.first_class, len(self.classes))
+        return Candidates(corners[kept], scores[0][kept], numbers)
+
+    @override
+    @classmethod
+    def recognise(cls, model: Interface, /) -> Guess | None:
+        if not any(out.name.split(":")[0] == _BOXES for out in model.outputs):
+            return None
+        names = {out.name.split(":")[0]: out.name for out in model.outputs}
+        if not {"detection_classes", "detection_scores"} <= names.keys():
+            return None
+        return Guess(
+            {
+                "kind": "ssd-tensorflow",
+                "boxes": names[_BOXES],
+                "labels": names["detection_classes"],
+                "scores": names["detection_scores"],
+                "overlap": 1.0,
+            },
+            len(model.class_names) or None,
+            ("its outputs have the names of TensorFlow's detection API",),
+            ("class numbers start at 1 (TFLite: first_class = 0)",),
+            {"colour": "rgb", "fit": "stretch", "layout": "nhwc", "dtype": "uint8"},
+        )
+
+
+class DetectionOutput(BoxOutput):
+    """One output (1, 1, N, 7): picture, class, score, x0, y0, x1, y1 in fractions."""
+
+    kind: Literal["ssd"]
+    name: str | None = None
+    """Which of the outputs; the only one, if left out."""
+    first_class: int = 1
+    """Number of the first listed class; 0 is the background."""
+
+    @override
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+        output = named(outputs, self.name)
+        if output.ndim != 4 or output.shape[:2] != (1, 1) or output.shape[3] != 7:
+            raise ValueError(f"expected (1, 1, N, 7), got {output.shape}")
+        table = np.asarray(output[0, 0], np.float64)
+        # A picture number of -1 ends the list.
+        end = np.flatnonzero(table[:, 0] < 0)
+        table = table[: end[0]] if len(end) else table
+        numbers = class_numbers(table[:, 1] - self.first_class, len(self.classes))
+        return Candidates(table[:, 3:7] * np.tile(size_px, 2), table[:, 2], numbers)
+
+    @override
+    @classmethod
+    def recognise(cls, model: Interface, /) -> Guess | None:
+        if len(model.outputs) != 1 or len(model.outputs[0].shape) != 4:
+            return None
+        if static(model.outputs[0].shape, 3) != 7:
+            return None
+        return Guess(
+            {"kind": "ssd", "name": model.outputs[0].name, "overlap": 1.0},
+            len(model.class_names) or None,
+            ("rows of 7, as the operation DetectionOutput gives",),
+            ("class 0 is the background, the classes start at 1",),
+            {"colour": "bgr", "fit": "stretch"},
+        )

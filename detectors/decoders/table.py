@@ -1,0 +1,30 @@
+"""The one table of box layouts."""
+
+from __future__ import annotations
+
+from typing import Final, TypeAlias, get_args
+
+from .base import BoxOutput
+from .detr import DetrOutput
+from .end_to_end import EndToEndOutput
+from .picodet import PicodetOutput
+from .ssd import DetectionOutput, TensorflowSsdOutput
+from .torchvision_export import TorchvisionOutput
+from .yolo import YoloV5Output, YoloV8Output, YoloV8SegOutput
+from .yolox import YoloxOutput
+
+AnyBoxOutput: TypeAlias = (
+    YoloxOutput
+    | YoloV5Output
+    | YoloV8Output
+    | YoloV8SegOutput
+    | EndToEndOutput
+    | DetrOutput
+    | TorchvisionOutput
+    | PicodetOutput
+    | TensorflowSsdOutput
+    | DetectionOutput
+)
+
+DECODERS: Final[tuple[type[BoxOutput], ...]] = get_args(AnyBoxOutput)
+"""In the order in which ``crosscue model init`` lists candidates."""

@@ -1,0 +1,189 @@
+"""YOLOv5 to v11 as their projects export them: boxes in input pixels, with or without masks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from typing_extensions import override
+
+from crosscue.replay.columns import Floats, Int64s
+
+from .base import (
+    Array,
+    BoxOutput,
+    Candidates,
+    Guess,
+    Interface,
+    Outputs,
+    Size,
+    best_class,
+    from_centers,
+    named,
+    rows_of,
+    sigmoid,
+    static,
+)
+
+PICTURE: Final = {"colour": "rgb", "fit": "letterbox-center", "scale": (1 / 255,) * 3}
+_COEFFICIENTS: Final = 32
+
+
+class YoloV5Output(BoxOutput):
+    """YOLOv5, v7: one output (1, N, 5 + classes): center, size, objectness, class scores."""
+
+    kind: Literal["yolov5"]
+    name: str | None = None
+    """Which of the outputs; the only one, if left out."""
+
+    @override
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+        classes = len(self.classes)
+        table = rows_of(named(outputs, self.name), 5 + classes, f"{classes} classes")
+        best, numbers = best_class(table[:, 5:])
+        return Candidates(from_centers(table), table[:, 4] * best, numbers)
+
+    @override
+    @classmethod
+    def recognise(cls, model: Interface, /) -> Guess | None:
+        output = next((out for out in model.outputs if len(out.shape) == 3), None)
+        columns = None if output is None else static(output.shape, 2)
+        if (
+            output is None
+            or columns is None
+            or columns < 6
+            or any(len(out.shape) == 4 for out in model.outputs)
+        ):
+            return None
+        rows = static(output.shape, 1)
+        if rows is not None and rows <= columns:
+            return None
+        names = len(model.class_names)
+        if names and names != columns - 5:
+            return None
+        why = f"rows of {columns}: 5 and {columns - 5} classes"
+        return Guess(
+            {"kind": "yolov5", "name": output.name},
+            columns - 5,
+            (why, *((f"its metadata names {names} classes",) if names else ())),
+            () if names else ("boxes are in input pixels, with an objectness",),
+            PICTURE,
+        )
+
+
+class YoloV8Output(BoxOutput):
+    """YOLOv8, v9, v11: one output (1, 4 + classes, N): center, size, class scores."""
+
+    kind: Literal["yolov8"]
+    name: str | None = None
+    """Which of the outputs; the only one, if left out."""
+
+    @override
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+        table = _columns(named(outputs, self.name), 4 + len(self.classes))
+        scores, classes = best_class(table[:, 4:])
+        return Candidates(from_centers(table), scores, classes)
+
+    @override
+    @classmethod
+    def recognise(cls, model: Interface, /) -> Guess | None:
+        found = _transposed(model)
+        if found is None or len(model.outputs) != 1:
+            return None
+        name, rows = found
+        names = len(model.class_names)
+        if rows < 5 or (names and names != rows - 4):
+            return None
+        why = f"{rows} rows: 4 and {rows - 4} classes"
+        return Guess(
+            {"kind": "yolov8", "name": name},
+            rows - 4,
+            (why, *((f"its metadata names {names} classes",) if names else ())),
+            () if names else ("class scores without an objectness",),
+            PICTURE,
+        )
+
+
+class YoloV8SegOutput(BoxOutput):
+    """YOLOv8-seg, v11-seg: as YOLOv8, then 32 mask weights; and prototypes (1, 32, h, w)."""
+
+    kind: Literal["yolov8-seg"]
+    name: str
+    """The output with the boxes."""
+    prototypes: str
+    """The output with the prototype masks."""
+
+    @override
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+        prototypes = prototypes_of(named(outputs, self.prototypes, "prototypes"))
+        classes = len(self.classes)
+        table = _columns(named(outputs, self.name), 4 + classes + len(prototypes))
+        scores, numbers = best_class(table[:, 4 : 4 + classes])
+        masks = PrototypeMasks(table[:, 4 + classes :], prototypes)
+        return Candidates(from_centers(table), scores, numbers, masks)
+
+    @override
+    @classmethod
+    def recognise(cls, model: Interface, /) -> Guess | None:
+        found, prototypes = _transposed(model), prototype_output(model)
+        if found is None or prototypes is None:
+            return None
+        name, rows = found
+        classes = rows - 4 - prototypes[1]
+        if classes < 1:
+            return None
+        return Guess(
+            {"kind": "yolov8-seg", "name": name, "prototypes": prototypes[0]},
+            classes,
+            (f"{rows} rows: 4, {classes} classes and {prototypes[1]} mask weights",),
+            (),
+            PICTURE,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PrototypeMasks:
+    """Masks as weighted sums of prototypes: weights (N, K), prototypes (K, h, w)."""
+
+    weights: Floats
+    prototypes: Floats
+
+    def __call__(self, kept: Int64s, /) -> Floats:
+        """Shape (len(kept), h, w)."""
+        return sigmoid(np.tensordot(self.weights[kept], self.prototypes, axes=1))
+
+
+def prototype_output(model: Interface) -> tuple[str, int] | None:
+    """Name and count of the prototype masks that a file has."""
+    for out in model.outputs:
+        count = static(out.shape, 1)
+        if len(out.shape) == 4 and count == _COEFFICIENTS:
+            return out.name, count
+    return None
+
+
+def prototypes_of(output: Array) -> Floats:
+    """Prototype masks (1, K, h, w) without their batch axis.
+
+    Raises:
+        ValueError: Another shape.
+    """
+    if output.ndim != 4 or output.shape[0] != 1:
+        raise ValueError(f"prototypes: expected (1, K, h, w), got {output.shape}")
+    return np.asarray(output[0], np.float64)
+
+
+def _columns(output: Array, rows: int) -> Floats:
+    if output.ndim != 3 or output.shape[:2] != (1, rows):
+        raise ValueError(f"expected (1, {rows}, N) for these classes, got {output.shape}")
+    return np.asarray(output[0].T, np.float64)
+
+
+def _transposed(model: Interface) -> tuple[str, int] | None:
+    """Name and rows of the output whose columns are the candidates."""
+    for out in model.outputs:
+        rows, columns = static(out.shape, 1), static(out.shape, 2)
+        if len(out.shape) == 3 and rows is not None and (columns is None or columns > rows):
+            return out.name, rows
+    return None

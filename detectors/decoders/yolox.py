@@ -1,0 +1,61 @@
+"""YOLOX: boxes relative to the cells of grids, with objectness."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from typing_extensions import override
+
+from crosscue.replay.columns import Floats
+
+from .base import BoxOutput, Candidates, Guess, Interface, Outputs, Size, best_class, named, static
+from .grids import cell_count, cells
+
+_STRIDES = (8, 16, 32)
+
+
+class YoloxOutput(BoxOutput):
+    """One output (1, cells, 5 + classes): offset x and y, log width and height, objectness."""
+
+    kind: Literal["yolox"]
+    name: str | None = None
+    """Which of the outputs; the only one, if left out."""
+    strides: tuple[int, ...] = _STRIDES
+
+    @override
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+        rows = named(outputs, self.name)
+        shape = (1, cell_count(size_px, self.strides), 5 + len(self.classes))
+        if rows.shape != shape:
+            raise ValueError(
+                f"expected {shape} for {len(self.classes)} classes at {size_px[0]} x {size_px[1]}, "
+                f"got {rows.shape}"
+            )
+        table: Floats = np.asarray(rows[0], np.float64)
+        corner, stride = cells(size_px, self.strides)
+        center = (table[:, :2] + corner) * stride
+        # A width of e^20 cells is wider than any picture; more would overflow.
+        half = np.exp(np.minimum(table[:, 2:4], 20.0)) * stride / 2.0
+        best, classes = best_class(table[:, 5:])
+        return Candidates(np.hstack([center - half, center + half]), table[:, 4] * best, classes)
+
+    @override
+    @classmethod
+    def recognise(cls, model: Interface, /) -> Guess | None:
+        if len(model.outputs) != 1 or len(model.outputs[0].shape) != 3:
+            return None
+        rows, columns = (static(model.outputs[0].shape, axis) for axis in (1, 2))
+        given = model.inputs[0].shape
+        height, width = static(given, -2), static(given, -1)
+        if columns is None or columns < 6 or rows is None or width is None or height is None:
+            return None
+        if rows != cell_count((width, height), _STRIDES):
+            return None
+        return Guess(
+            {"kind": "yolox"},
+            columns - 5,
+            (f"{rows} rows are the cells of strides 8, 16, 32 at {width} x {height}",),
+            ("rows are relative to their cells, as YOLOX exports without --decode_in_inference",),
+            {"colour": "bgr", "fit": "letterbox"},
+        )

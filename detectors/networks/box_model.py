@@ -1,0 +1,216 @@
+"""A model card's boxes as a detector: batches, tiles, suppression, masks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections, Found, Frame, View
+from crosscue.detectors.boxes import best_of
+from crosscue.detectors.catalog.card import ModelCard
+from crosscue.detectors.decoders.base import Array, BoxOutput, Candidates
+from crosscue.replay.columns import Bytes, Floats, Int64s
+from crosscue.replay.errors import VehicleError
+
+from .backends import Network
+from .picture_input import Placement, prepared
+from .tiles import Corner, corners, is_whole
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """A picture, or a tile of one, as given to the network."""
+
+    frame: int
+    pixels: Bytes
+    corner: Corner | None
+    """Of a tile, in decoded pixels; None for the whole picture."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """What stays of one part's candidates: boxes in decoded pixels of the frame."""
+
+    boxes: Floats
+    scores: Floats
+    classes: Int64s
+    masks: list[bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class BoxModel:
+    """Boxes, and masks where the network has them.
+
+    Attributes:
+        card: How to prepare pictures.
+        output: The card's, how to read results.
+        score: Lower ones are not reported.
+        network: What runs.
+        where: The card's file, for errors.
+        identity: Of card, settings and back end.
+    """
+
+    card: ModelCard
+    output: BoxOutput
+    score: float
+    network: Network
+    where: str
+    identity: str
+
+    @property
+    def view(self) -> View:
+        """No finer than the network's input; the full size for tiles."""
+        if self.card.tiles is not None:
+            return View()
+        return View(least_width_px=self.card.input.width_px)
+
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        """Detect."""
+        parts = [part for i, frame in enumerate(frames) for part in self._parts(i, frame)]
+        found: list[list[_Found]] = [[] for _ in frames]
+        step = self.card.input.max_batch
+        for start in range(0, len(parts), step):
+            batch = parts[start : start + step]
+            for part, one in zip(batch, self._run(batch, frames), strict=True):
+                found[part.frame].append(one)
+        return [self._merged(frame, some) for frame, some in zip(frames, found, strict=True)]
+
+    def _parts(self, number: int, frame: Frame) -> Iterator[_Part]:
+        yield _Part(number, frame.pixels, None)
+        if self.card.tiles is None:
+            return
+        height, width = frame.pixels.shape[:2]
+        wide, high = self.card.input.width_px, self.card.input.height_px
+        if width <= wide and height <= high:
+            return
+        for x, y in corners((width, height), (wide, high), self.card.tiles):
+            yield _Part(number, frame.pixels[y : y + high, x : x + wide], (x, y))
+
+    def _run(self, parts: Sequence[_Part], frames: Sequence[Frame]) -> Iterator[_Found]:
+        given = [prepared(part.pixels, self.card.input) for part in parts]
+        is_bare = self.card.input.layout == "chw"
+        batch = given[0][0] if len(given) == 1 else np.concatenate([one for one, _ in given])
+        outputs = self.network(batch[0] if is_bare else batch)
+        for i, (part, (_, placement)) in enumerate(zip(parts, given, strict=True)):
+            try:
+                mine = outputs if len(parts) == 1 else _share(outputs, i, len(parts))
+                yield self._kept(mine, part, placement, frames[part.frame])
+            except ValueError as error:
+                raise VehicleError(f"{self.where}: output: {error}; mend the card") from None
+
+    def _kept(
+        self, outputs: Mapping[str, Array], part: _Part, placement: Placement, frame: Frame
+    ) -> _Found:
+        size = (self.card.input.width_px, self.card.input.height_px)
+        some = self.output.candidates(outputs, size)
+        bad = len(some) - int(
+            np.isfinite(np.column_stack([some.boxes_px, some.scores])).all(1).sum()
+        )
+        if bad:
+            raise ValueError(f"{bad} of {len(some)} candidates are not finite numbers")
+        keep = best_of(some.boxes_px, some.scores, some.classes, self.score, self.output.overlap)
+        boxes = placement.to_picture(some.boxes_px[keep])
+        if part.corner is not None:
+            boxes = boxes + np.tile(part.corner, 2)
+            height, width = frame.pixels.shape[:2]
+            is_kept = is_whole(boxes, part.corner, size, (width, height))
+            boxes, keep = boxes[is_kept], keep[is_kept]
+        masks = self._masks(some, keep, boxes, part, placement, frame)
+        return _Found(boxes, some.scores[keep], some.classes[keep], masks)
+
+    def _masks(
+        self, some: Candidates, keep: Int64s, boxes: Floats, part: _Part, placement: Placement,
+        frame: Frame,
+    ) -> list[bytes]:  # fmt: skip
+        if some.masks is None:
+            return [b""] * len(keep)
+        texts = []
+        for i, box in zip(keep, boxes, strict=True):
+            (grid,) = some.masks(np.array([i]))
+            per_input = (
+                grid.shape[1] / self.card.input.width_px,
+                grid.shape[0] / self.card.input.height_px,
+            )
+            corner = part.corner or (0, 0)
+            affine = [
+                (
+                    placement.scale[a] * per_input[a] / frame.scale[a],
+                    (placement.offset[a] - corner[a] * placement.scale[a]) * per_input[a],
+                )
+                for a in (0, 1)
+            ]
+            texts.append(_mask_text(grid, box * np.tile(frame.scale, 2), affine, frame.size_px))
+        return texts
+
+    def _merged(self, frame: Frame, some: Sequence[_Found]) -> Detections:
+        boxes = np.vstack([one.boxes for one in some])
+        scores = np.concatenate([one.scores for one in some])
+        classes = np.concatenate([one.classes for one in some])
+        masks = [mask for one in some for mask in one.masks]
+        keep = np.arange(len(scores))
+        if len(some) > 1:
+            overlap = min(self.output.overlap, 0.45) if self.card.tiles else self.output.overlap
+            keep = best_of(boxes, scores, classes, self.score, overlap)
+        width, height = frame.size_px
+        inside = np.clip(boxes * np.tile(frame.scale, 2), 0.0, [width, height, width, height])
+        is_seen = (inside[keep, 2:] > inside[keep, :2]).all(axis=1)
+        keep = keep[is_seen]
+        return Detections(
+            frame.t_ns,
+            frame.size_px,
+            inside[keep],
+            np.clip(scores[keep], 0.0, 1.0),
+            tuple(self.card.meaning(i) for i in classes[keep].tolist()),
+            tuple(masks[i] for i in keep.tolist()),
+        )
+
+
+def _share(outputs: Mapping[str, Array], number: int, count: int) -> dict[str, Array]:
+    """One picture's part of a batch's outputs.
+
+    Raises:
+        ValueError: The outputs are not one for each picture.
+    """
+    for name, values in outputs.items():
+        if not values.ndim or len(values) != count:
+            raise ValueError(
+                f"{name}: expected {count} pictures' results, got {values.shape}; "
+                "set input.max_batch = 1"
+            )
+    return {name: values[number : number + 1] for name, values in outputs.items()}
+
+
+def _mask_text(
+    grid: Floats, box_px: Floats, affine: Sequence[tuple[float, float]], size_px: tuple[int, int]
+) -> bytes:
+    """An object's mask inside its box, from probabilities over the network's input.
+
+    Args:
+        grid: Shape (h, w).
+        box_px: x0, y0, x1, y1 in the camera's pixels.
+        affine: For x and y, grid coordinate = factor * camera pixel + offset.
+        size_px: Of the camera's picture.
+    """
+    import cv2
+
+    low = np.clip(np.floor(box_px[:2]), 0, size_px).astype(int)
+    high = np.clip(np.ceil(box_px[2:]), 0, size_px).astype(int)
+    width, height = (high - low).tolist()
+    if width <= 0 or height <= 0:
+        return b""
+    (fx, ox), (fy, oy) = affine
+    # Pixel centres lie half a pixel inside, in the camera's picture and in the grid.
+    shift = ((low[0] + 0.5) * fx + ox - 0.5, (low[1] + 0.5) * fy + oy - 0.5)
+    matrix = np.array([[fx, 0.0, shift[0]], [0.0, fy, shift[1]]])
+    part = cv2.warpAffine(
+        grid.astype(np.float32),
+        matrix,
+        (width, height),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    mask = part > 0.5
+    return rle.encode(mask, (int(low[0]), int(low[1])), size_px) if mask.any() else b""

@@ -1,0 +1,46 @@
+"""Networks without fully connected layers at other sizes than their file declares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import Any
+
+from crosscue.replay.errors import VehicleError
+
+Size = tuple[int, int]
+
+
+def free_size(content: bytes) -> bytes:
+    """An ONNX file whose input takes pictures of any size.
+
+    Raises:
+        VehicleError: The package that edits such files is not installed.
+    """
+    if find_spec("onnx") is None:
+        raise VehicleError(
+            "input.is_resizable: other sizes than the file declares need the package onnx: "
+            "pip install 'crosscue[onnx]'"
+        )
+    import onnx
+
+    model: Any = onnx.load_model_from_string(content)
+    weights = {tensor.name for tensor in model.graph.initializer}
+    given = [one for one in model.graph.input if one.name not in weights]
+    for value in given:
+        for dimension in value.type.tensor_type.shape.dim[1:]:
+            if dimension.dim_value != 3:
+                dimension.ClearField("value")
+    for value in model.graph.output:
+        for dimension in value.type.tensor_type.shape.dim:
+            dimension.ClearField("value")
+    # Shapes between layers are only hints, and no longer true.
+    del model.graph.value_info[:]
+    freed: bytes = model.SerializeToString()
+    return freed
+
+
+def resized(shape: Sequence[int], size_px: Size) -> list[int]:
+    """An input's shape (1, 3, h, w) or (1, h, w, 3) with another width and height."""
+    width, height = size_px
+    return [shape[0], 3, height, width] if shape[1] == 3 else [shape[0], height, width, 3]

@@ -1,0 +1,85 @@
+"""Small ONNX networks made on the spot, whose answers are known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+Array = NDArray[np.generic]
+OPSET = 17
+
+
+def constant_model(shape: tuple[int, ...], outputs: Mapping[str, Array]) -> bytes:
+    """A network that gives the same outputs for every input of a shape."""
+    nodes = [
+        helper.make_node("Constant", [], [name], value=numpy_helper.from_array(values))
+        for name, values in outputs.items()
+    ]
+    declared = [
+        helper.make_tensor_value_info(
+            name, helper.np_dtype_to_tensor_dtype(values.dtype), values.shape
+        )
+        for name, values in outputs.items()
+    ]
+    given = helper.make_tensor_value_info("images", TensorProto.FLOAT, shape)
+    return _file(helper.make_graph(nodes, "constant", [given], declared))
+
+
+def bright_box_model() -> bytes:
+    """One box (N, 1, 6) around all pixels above 127, with score 1 if there are any, class 0.
+
+    Input (N, 3, H, W) of any size: ranges of bright columns and rows by arg max from both ends.
+    """
+    nodes = [
+        helper.make_node("Constant", [], ["half"], value=_scalar(127.0)),
+        helper.make_node("ReduceMax", ["images"], ["grey"], axes=[1], keepdims=0),
+        helper.make_node("Greater", ["grey", "half"], ["bright"]),
+        helper.make_node("Cast", ["bright"], ["light"], to=TensorProto.FLOAT),
+        helper.make_node("ReduceMax", ["light"], ["columns"], axes=[1], keepdims=0),
+        helper.make_node("ReduceMax", ["light"], ["rows"], axes=[2], keepdims=0),
+        helper.make_node("ReduceMax", ["columns"], ["score"], axes=[1], keepdims=1),
+    ]
+    ends = []
+    for name in ("columns", "rows"):
+        for last in (0, 1):
+            end = f"{name}{last}"
+            nodes.append(
+                helper.make_node(
+                    "ArgMax", [name], [f"{end}_index"], axis=1, keepdims=1, select_last_index=last
+                )
+            )
+            nodes.append(
+                helper.make_node("Cast", [f"{end}_index"], [f"{end}_raw"], to=TensorProto.FLOAT)
+            )
+            nodes.append(
+                helper.make_node("Constant", [], [f"{end}_plus"], value=_scalar(float(last)))
+            )
+            nodes.append(helper.make_node("Add", [f"{end}_raw", f"{end}_plus"], [end]))
+            ends.append(end)
+    nodes += [
+        helper.make_node("Constant", [], ["zero"], value=_scalar(0.0)),
+        helper.make_node("Mul", ["score", "zero"], ["class"]),
+        helper.make_node(
+            "Concat", [ends[0], ends[2], ends[1], ends[3], "score", "class"], ["row"], axis=1
+        ),
+        helper.make_node("Constant", [], ["axis"], value=numpy_helper.from_array(np.array([1]))),
+        helper.make_node("Unsqueeze", ["row", "axis"], ["boxes"]),
+    ]
+    given = helper.make_tensor_value_info("images", TensorProto.FLOAT, ["n", 3, "h", "w"])
+    out = helper.make_tensor_value_info("boxes", TensorProto.FLOAT, ["n", 1, 6])
+    return _file(helper.make_graph(nodes, "bright box", [given], [out]))
+
+
+def _scalar(value: float) -> TensorProto:
+    return numpy_helper.from_array(np.array(value, np.float32))
+
+
+def _file(graph: onnx.GraphProto) -> bytes:
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=8)
+    onnx.checker.check_model(model)
+    content: bytes = model.SerializeToString()
+    return content
