@@ -20,8 +20,8 @@ from crosscue.replay.decode.walk import Bools, Cursor, Found, Rows, Walker
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.roles import ros2_spelling
-from crosscue.replay.write.mcap_chunks import copy_ranges
 
+from .copy_ranges import copy_ranges
 from .definitions import as_ros2, differs_in_ros2, text_of
 from .outgoing import Outgoing, Ros2Type
 from .template import ENCAPSULATION

@@ -16,8 +16,7 @@ from crosscue.replay.encode import Encoder, Encoders, Outgoing
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 
-from .mcap import Compression, McapWriter
-from .mcap_chunks import Stretch
+from .mcap import Compression, McapWriter, Stretch
 
 NO_TYPE: Final = "type not known, so ROS 2 cannot hold it"
 BAD_SCHEMA: Final = "its definition is damaged"

@@ -1,88 +1,62 @@
 """Writes MCAP whole or not at all: chunks, message indexes, statistics, every checksum.
 
-The same rows give the same bytes. While it is written the file has another name in the same
-folder; the final name appears when everything is on the disk.
+The mcap package writes the file; what is ours is the order of messages and the file's name. The
+same rows give the same bytes with the same version of mcap. While it is written the file has
+another name in the same folder; the final name appears when everything is on the disk.
 """
 
 from __future__ import annotations
 
-import struct
-from collections import Counter, deque
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Literal, Self, TypeAlias
 
 import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
 
-from crosscue.replay.columns import Int64s
+from crosscue.replay.columns import Int64s, Messages
 from crosscue.replay.errors import OutputError
-from crosscue.replay.files.checksum import crc32
 from crosscue.replay.files.partial_file import PartialFile
 from crosscue.replay.files.whole_file import cannot_write
 
-from .mcap_chunks import ChunkRows, Stretch, merged
-
-MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = "crosscue"
 CHUNK_BYTES: Final = 4 << 20
 """Uncompressed bytes that a chunk aims at."""
 WINDOW_BYTES: Final = 8 << 20
-"""Bytes that wait to be merged by time before they are cut into chunks."""
-CHUNKS_AHEAD: Final = 3
-"""Chunks being compressed while others are written."""
-THREADS: Final = 2
-
-HEADER, FOOTER, SCHEMA, CHANNEL = 0x01, 0x02, 0x03, 0x04
-CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 0x06, 0x07, 0x08
-STATISTICS, SUMMARY_OFFSET, DATA_END = 0x0B, 0x0E, 0x0F
+"""Bytes of payload that wait to be merged by time."""
 
 Compression: TypeAlias = Literal["zstd", "lz4", "none"]
 
 
-def _text(text: str) -> bytes:
-    raw = text.encode("utf-8")
-    return struct.pack("<I", len(raw)) + raw
-
-
-def _record(opcode: int, content: bytes) -> bytes:
-    return struct.pack("<BQ", opcode, len(content)) + content
-
-
-def _map(pairs: Mapping[str, str]) -> bytes:
-    content = b"".join(_text(key) + _text(value) for key, value in sorted(pairs.items()))
-    return struct.pack("<I", len(content)) + content
-
-
-@dataclass(frozen=True, slots=True)
-class _Packed:
-    """A chunk ready to be written.
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretch:
+    """N messages of one channel, in the order in which they are to be stored.
 
     Attributes:
-        rows: What it holds; ``offset`` counts from the chunk's first record.
-        head: The chunk record up to its records.
-        stored: The records as stored.
-        plain_size: Bytes of its records before compression.
+        channel: Number of the channel.
+        log_ns: Shape (N,), int64.
+        publish_ns: Shape (N,), int64.
+        sequence: Shape (N,), uint32.
+        messages: N payloads.
     """
 
-    rows: ChunkRows
-    head: bytes
-    stored: bytes | memoryview
-    plain_size: int
+    channel: int
+    log_ns: Int64s
+    publish_ns: Int64s
+    sequence: NDArray[np.uint32]
+    messages: Messages
 
-
-@dataclass(slots=True)
-class _Summary:
-    schemas: list[bytes] = field(default_factory=list)
-    channels: list[bytes] = field(default_factory=list)
-    chunks: list[bytes] = field(default_factory=list)
-    counts: Counter[int] = field(default_factory=Counter)
-    first_ns: int | None = None
-    last_ns: int = 0
+    def rows(self) -> Iterator[tuple[int, int, bytes, int, int]]:
+        """Channel, log time, payload, publish time and sequence number of each message."""
+        times = zip(self.log_ns.tolist(), self.publish_ns.tolist(), strict=True)
+        for i, ((log_ns, publish_ns), number) in enumerate(
+            zip(times, self.sequence.tolist(), strict=True)
+        ):
+            yield self.channel, log_ns, bytes(self.messages.payload(i)), publish_ns, number
 
 
 class McapWriter:
@@ -115,32 +89,23 @@ class McapWriter:
         if path.exists() and not overwrite:
             raise OutputError(f"{path}: exists; give another name or --overwrite")
         self.path = path
-        self._compress = _compressor(compression)
-        self._compression = "" if compression == "none" else compression
-        self._chunk_bytes = chunk_bytes
         self._ids: dict[tuple[str, str], int] = {}
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
-        self._new: list[bytes] = []
         self._waiting: list[Stretch] = []
         self._waiting_bytes = 0
-        self._summary = _Summary()
-        self._data_crc = 0
-        self._at = 0
-        self._ahead: deque[Future[_Packed]] = deque()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._partial = PartialFile(path)
             self._file = self._partial.open()
         except OSError as error:
             raise cannot_write(path, error) from None
-        self._pool = ThreadPoolExecutor(THREADS)
-        self._guarded(lambda: self._data(MAGIC))
-        self._guarded(lambda: self._data(_record(HEADER, _text("ros2") + _text(LIBRARY))))
-
-    @property
-    def counts(self) -> Mapping[int, int]:
-        """Messages taken so far, by channel number."""
-        return self._summary.counts
+        self._writer = Writer(
+            self._file,
+            chunk_size=chunk_bytes,
+            compression=CompressionType[compression.upper()],
+            enable_data_crcs=True,
+        )
+        self._guarded(lambda: self._writer.start("ros2", LIBRARY))
 
     def add_channel(
         self, topic: str, type_name: str, schema: bytes, schema_encoding: str = "ros2msg"
@@ -157,28 +122,18 @@ class McapWriter:
             OutputError: More topics than an MCAP file can number.
         """
         key = (topic, type_name)
-        if key in self._ids:
-            return self._ids[key]
-        if len(self._ids) >= 0xFFFF:
-            raise OutputError(f"{self.path}: over 65535 topics; choose some with --topics")
-        schema_id = self._schema(type_name, schema_encoding, schema)
-        number = self._ids[key] = len(self._ids) + 1
-        content = struct.pack("<HH", number, schema_id) + _text(topic) + _text("cdr") + _map({})
-        self._define(self._summary.channels, _record(CHANNEL, content))
-        return number
+        if key not in self._ids:
+            if len(self._ids) >= 0xFFFF:
+                raise OutputError(f"{self.path}: over 65535 topics; choose some with --topics")
+            schema_id = self._schema(type_name, schema_encoding, schema)
+            self._ids[key] = self._writer.register_channel(topic, "cdr", schema_id)
+        return self._ids[key]
 
     def _schema(self, name: str, encoding: str, schema: bytes) -> int:
         key = (name, encoding, schema)
         if key not in self._schema_ids:
-            number = self._schema_ids[key] = len(self._schema_ids) + 1
-            content = struct.pack("<H", number) + _text(name) + _text(encoding)
-            content += struct.pack("<I", len(schema)) + schema
-            self._define(self._summary.schemas, _record(SCHEMA, content))
+            self._schema_ids[key] = self._writer.register_schema(name, encoding, schema)
         return self._schema_ids[key]
-
-    def _define(self, known: list[bytes], record: bytes) -> None:
-        known.append(record)
-        self._new.append(record)
 
     def write(self, stretch: Stretch) -> None:
         """Take messages; times must not be negative.
@@ -192,115 +147,22 @@ class McapWriter:
         if int(stretch.log_ns.min()) < 0 or int(stretch.publish_ns.min()) < 0:
             raise ValueError("MCAP has no times before 1970")
         self._waiting.append(stretch)
-        self._waiting_bytes += stretch.stored_bytes
-        self._summary.counts[stretch.channel] += len(stretch.messages)
+        self._waiting_bytes += int((stretch.messages.stop - stretch.messages.start).sum())
         if self._waiting_bytes >= WINDOW_BYTES:
             self._guarded(self._flush)
 
     def _flush(self) -> None:
-        """Merge what waits, and hand it on chunk by chunk."""
+        """Merge what waits by time, and hand it on message by message."""
         waiting, self._waiting, self._waiting_bytes = self._waiting, [], 0
-        for rows in merged(waiting, self._chunk_bytes):
-            definitions, self._new = b"".join(self._new), []
-            self._ahead.append(self._pool.submit(self._pack, rows, definitions))
-            while len(self._ahead) > CHUNKS_AHEAD:
-                self._put(self._ahead.popleft().result())
-
-    def _pack(self, rows: ChunkRows, definitions: bytes) -> _Packed:
-        records: bytes | memoryview = rows.records.data
-        if definitions:
-            records = definitions + rows.records.tobytes()
-            rows = ChunkRows(
-                rows.records, rows.channel, rows.log_ns, rows.offset + len(definitions)
-            )
-        stored = self._compress(records)
-        head = struct.pack(
-            "<QQQI",
-            int(rows.log_ns.min()),
-            int(rows.log_ns.max()),
-            len(records),
-            crc32(records),
-        )
-        head += _text(self._compression) + struct.pack("<Q", len(stored))
-        whole = struct.pack("<BQ", CHUNK, len(head) + len(stored)) + head
-        return _Packed(rows, whole, stored, len(records))
-
-    def _put(self, chunk: _Packed) -> None:
-        begin = self._at
-        self._data(chunk.head)
-        self._data(chunk.stored)
-        index_begin = self._at
-        places: dict[int, int] = {}
-        for channel, log_ns, offset in _by_channel(chunk.rows):
-            places[channel] = self._at
-            self._data(_message_index(channel, log_ns, offset))
-        first, last = int(chunk.rows.log_ns.min()), int(chunk.rows.log_ns.max())
-        offsets = b"".join(struct.pack("<HQ", *pair) for pair in places.items())
-        content = struct.pack("<QQQQ", first, last, begin, index_begin - begin)
-        content += struct.pack("<I", len(offsets)) + offsets
-        content += struct.pack("<Q", self._at - index_begin) + _text(self._compression)
-        content += struct.pack("<QQ", len(chunk.stored), chunk.plain_size)
-        self._summary.chunks.append(_record(CHUNK_INDEX, content))
-        known = self._summary.first_ns
-        self._summary.first_ns = first if known is None else min(known, first)
-        self._summary.last_ns = max(self._summary.last_ns, last)
-
-    def _data(self, content: bytes | memoryview) -> None:
-        self._data_crc = crc32(content, self._data_crc)
-        self._at += len(content)
-        self._file.write(content)
+        rows = [stretch.rows() for stretch in waiting]
+        for which in _order(waiting):
+            self._writer.add_message(*next(rows[which]))
 
     def _finish(self) -> None:
         self._flush()
-        while self._ahead:
-            self._put(self._ahead.popleft().result())
-        for record in self._new:
-            self._data(record)
-        end = _record(DATA_END, struct.pack("<I", self._data_crc))
-        self._file.write(end)
-        start = self._at + len(end)
-        body, offsets = self._summary_section(start)
-        offset_start = start + len(body)
-        tail = struct.pack("<BQQQ", FOOTER, 20, start, offset_start)
-        crc = crc32(tail, crc32(body + offsets))
-        self._file.write(body + offsets + tail + struct.pack("<I", crc) + MAGIC)
+        self._writer.finish()  # type: ignore[no-untyped-call]
         self._file.close()
         self._partial.keep()
-
-    def _summary_section(self, start: int) -> tuple[bytes, bytes]:
-        summary = self._summary
-        groups = (
-            (SCHEMA, b"".join(summary.schemas)),
-            (CHANNEL, b"".join(summary.channels)),
-            (STATISTICS, _record(STATISTICS, self._statistics())),
-            (CHUNK_INDEX, b"".join(summary.chunks)),
-        )
-        body, offsets = b"", b""
-        for opcode, content in groups:
-            if content:
-                place = struct.pack("<BQQ", opcode, start + len(body), len(content))
-                offsets += _record(SUMMARY_OFFSET, place)
-                body += content
-        return body, offsets
-
-    def _statistics(self) -> bytes:
-        summary = self._summary
-        counts = b"".join(struct.pack("<HQ", *pair) for pair in sorted(summary.counts.items()))
-        return (
-            struct.pack(
-                "<QHIIIIQQ",
-                summary.counts.total(),
-                len(summary.schemas),
-                len(summary.channels),
-                0,
-                0,
-                len(summary.chunks),
-                summary.first_ns or 0,
-                summary.last_ns,
-            )
-            + struct.pack("<I", len(counts))
-            + counts
-        )
 
     def _guarded(self, step: Callable[[], None]) -> None:
         try:
@@ -316,11 +178,9 @@ class McapWriter:
             OutputError: The disk is full.
         """
         self._guarded(self._finish)
-        self._pool.shutdown()
 
     def discard(self) -> None:
         """Leave nothing behind."""
-        self._pool.shutdown(cancel_futures=True)
         # Bytes that cannot be flushed now belong to a file that is removed anyway.
         with suppress(OSError):
             self._file.close()
@@ -341,32 +201,19 @@ class McapWriter:
             self.discard()
 
 
-def _by_channel(rows: ChunkRows) -> list[tuple[int, Int64s, Int64s]]:
-    order = np.argsort(rows.channel, kind="stable")
-    channel = rows.channel[order]
-    edges = [0, *(np.flatnonzero(np.diff(channel)) + 1).tolist(), len(channel)]
-    return [
-        (int(channel[a]), rows.log_ns[order[a:b]], rows.offset[order[a:b]])
-        for a, b in pairwise(edges)
-    ]
+def _order(stretches: Sequence[Stretch]) -> list[int]:
+    """From which of ``stretches`` each next message comes, so that they are merged by log time.
 
-
-def _message_index(channel: int, log_ns: Int64s, offset: Int64s) -> bytes:
-    pairs = np.stack([log_ns, offset], axis=1).astype("<u8").tobytes()
-    return _record(MESSAGE_INDEX, struct.pack("<HI", channel, len(pairs)) + pairs)
-
-
-def _compressor(compression: Compression) -> Callable[[bytes | memoryview], bytes | memoryview]:
-    if compression == "zstd":
-        from zstandard import ZstdCompressor
-
-        # A compressor must not be shared by threads.
-        return lambda records: ZstdCompressor().compress(records)
-    if compression == "lz4":
-        from lz4.frame import compress
-
-        def squeeze(records: bytes | memoryview) -> bytes:
-            return bytes(compress(records))
-
-        return squeeze
-    return lambda records: records
+    A channel whose clock goes back keeps its order: each of its messages counts as no earlier than
+    those before it.
+    """
+    latest: dict[int, int] = {}
+    keys = [np.empty(0, np.int64)]
+    for stretch in stretches:
+        key = np.maximum.accumulate(stretch.log_ns)
+        key = np.maximum(key, latest.get(stretch.channel, 0))
+        latest[stretch.channel] = int(key[-1])
+        keys.append(key)
+    origin = np.repeat(np.arange(len(stretches)), [len(s.log_ns) for s in stretches])
+    ordered: list[int] = origin[np.argsort(np.concatenate(keys), kind="stable")].tolist()
+    return ordered

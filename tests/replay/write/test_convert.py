@@ -23,12 +23,13 @@ from rosbags.highlevel import AnyReader
 
 from crosscue.eval.cli import run as crosscue
 from crosscue.replay.columns import Block, CanFrames, Messages, Topic
+from crosscue.replay.encode.copy_ranges import copy_ranges
 from crosscue.replay.errors import OutputError
+from crosscue.replay.files.partial_file import PartialFile
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.opening import open_log
 from crosscue.replay.write.convert import BAD_SCHEMA, NO_TYPE, TOO_EARLY, LogWriter
-from crosscue.replay.write.mcap import Compression, McapWriter
-from crosscue.replay.write.mcap_chunks import Stretch, copy_ranges
+from crosscue.replay.write.mcap import Compression, McapWriter, Stretch
 from support.data import shared
 from support.ros_messages import (
     messages_of,
@@ -154,25 +155,33 @@ class FailingFile:
         return getattr(self.inner, name)
 
 
-def _write_with_failure(path: Path, nth: int) -> None:
+def _write_with_failure(path: Path, nth: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = PartialFile.open
+    with monkeypatch.context() as patch:
+        patch.setattr(PartialFile, "open", lambda self: FailingFile(opened(self), nth))
+        _write_twenty(path)
+
+
+def _write_twenty(path: Path) -> None:
     with McapWriter(path, chunk_bytes=100) as writer:
-        writer._file = FailingFile(writer._file, nth)  # type: ignore[assignment]
         channel = writer.add_channel("/a", "std_msgs/msg/Float64", SCHEMA)
         writer.write(stretch(channel, list(range(20)), [b"payload"] * 20))
 
 
-def test_a_disk_that_fills_up_at_any_write_leaves_no_file_and_one_line(tmp_path: Path) -> None:
+def test_a_disk_that_fills_up_at_any_write_leaves_no_file_and_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, nth = tmp_path / "o.mcap", 0
     while not path.exists():
         with suppress(OutputError):
-            _write_with_failure(path, nth)
+            _write_with_failure(path, nth, monkeypatch)
         assert path.exists() or list(tmp_path.iterdir()) == []
         nth += 1
 
     assert nth > 10
     assert len(peers_messages(path)) == 20
     with pytest.raises(OutputError, match=r"^[^\n]*disk is full[^\n]*$"):
-        _write_with_failure(tmp_path / "other.mcap", 3)
+        _write_with_failure(tmp_path / "other.mcap", 3, monkeypatch)
 
 
 def _write_and_stop(path: Path) -> None:

@@ -1,0 +1,46 @@
+"""Copies many ranges of bytes from one buffer into another, whole columns of messages at a time."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Bytes, Int64s
+
+FEW_LENGTHS: Final = 32
+"""Copies of as many different lengths are made length by length; of more, one by one."""
+LARGE: Final = 4096
+"""Mean bytes from which copying one by one is as fast."""
+
+
+def copy_ranges(
+    target: Bytes, target_start: Int64s, source: Bytes, source_start: Int64s, length: Int64s
+) -> None:
+    """Copy N ranges of bytes; ranges of one length together, where there are few lengths."""
+    if not len(length):
+        return
+    mean = int(length.sum()) // len(length)
+    are_equal = bool((length == length[0]).all())
+    lengths = length[:1] if are_equal or mean >= LARGE else np.unique(length)
+    if mean >= LARGE or len(lengths) > FEW_LENGTHS:
+        to, of = target.data, source.data
+        rows = zip(target_start.tolist(), source_start.tolist(), length.tolist(), strict=True)
+        for put, take, size in rows:
+            to[put : put + size] = of[take : take + size]
+        return
+    for size in lengths.tolist():
+        if size == 0:
+            continue
+        rows_ = slice(None) if len(lengths) == 1 else length == size
+        to_view, of_view = _windows(target, size), _windows(source, size)
+        to_view[target_start[rows_]] = of_view[source_start[rows_]]
+
+
+def _windows(buffer: Bytes, width: int) -> NDArray[np.void]:
+    """Every stretch of ``width`` bytes of a buffer, as one view of it."""
+    view: NDArray[np.void] = np.ndarray(
+        (len(buffer) - width + 1,), f"V{width}", buffer.data, strides=(1,)
+    )
+    return view
