@@ -43,7 +43,7 @@ from crosscue.eval.scoring.drives import DEFAULTS, Scores, ScoreSettings
 from crosscue.eval.scoring.gates import Gate, GateResult, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.pose.smoother import told
-from crosscue.eval.scoring.runs import FOLDER, metrics_of, scores_of, write_scores
+from crosscue.eval.scoring.runs import FOLDER, RunScored, metrics_of, scores_of, write_scores
 from crosscue.eval.studies.attribution import (
     Attribution,
     Drive,
@@ -107,6 +107,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--workers", type=int, default=1, metavar="N", help="runs scored at a time (default: 1)"
     )
+    parser.add_argument(
+        "--without-figures",
+        dest="has_figures",
+        action="store_false",
+        help="a report of tables alone, in a fraction of the time",
+    )
     parser.add_argument("--json", action="store_true", help="print the metrics as JSON")
 
 
@@ -130,6 +136,7 @@ def run(args: argparse.Namespace) -> int:
         args.any_log,
         args.logs,
         limits_of(args),
+        args.has_figures,
     )
     scored, failed = _score_all(paths, work, args)
     if len(paths) == 1:
@@ -186,10 +193,10 @@ def _tell_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) 
     if worth:
         with locked(one.run):
             write_scores(one.run.file(FOLDER), [one], found.metrics)
-            write_report(one.run.file(FOLDER), [one], scores, found.metrics)
+            _report(one.run.file(FOLDER), [one], scores, found.metrics, args)
     if args.output is not None:
         write_scores(args.output, [one], found.metrics)
-        report = write_report(args.output, [one], scores, found.metrics)
+        report = _report(args.output, [one], scores, found.metrics, args)
     if args.json or args.quiet:
         return found.metrics
     print(f"run        {visible(str(one.run.path))}")
@@ -201,6 +208,16 @@ def _tell_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) 
         print(told(found.smoothed))
     print(f"written to {visible(str(report))}")
     return found.metrics
+
+
+def _report(
+    folder: Path,
+    scored: Sequence[RunScored],
+    scores: Scores,
+    metrics: dict[str, Any],
+    args: argparse.Namespace,
+) -> Path:
+    return write_report(folder, scored, scores, metrics, has_figures=args.has_figures)
 
 
 def _print_scores(scores: Scores, why_no_pose: str, worth: dict[str, Attribution]) -> None:
@@ -239,7 +256,7 @@ def _pool(
     worth = _attribution(scored, tree, settings, args)
     if args.output is not None:
         write_scores(args.output, ones, tree)
-        write_report(args.output, ones, scores, tree)
+        _report(args.output, ones, scores, tree, args)
     if args.json or args.quiet:
         return tree
     print()

@@ -76,8 +76,16 @@ class _Figures:
     range_is_traced: bool
 
 
+NO_FIGURES: Final = _Figures(None, (), 0, None, None, False)
+
+
 def write_report(
-    folder: Path, scored: Sequence[RunScored], scores: Scores, metrics: Mapping[str, Any]
+    folder: Path,
+    scored: Sequence[RunScored],
+    scores: Scores,
+    metrics: Mapping[str, Any],
+    *,
+    has_figures: bool = True,
 ) -> Path:
     """Write ``report.html`` over one run or many, with figures of a single pose beside it.
 
@@ -86,25 +94,27 @@ def write_report(
         scored: All runs, at least one.
         scores: Of all of them together.
         metrics: From ``metrics_of``, with whatever the command added.
+        has_figures: Draw, which imports matplotlib? Tables and frames are there without.
 
     Raises:
         RunError: A run's manifest or tables cannot be read.
         OutputError: It cannot be written.
     """
-    if len(scored) == 1 and scored[0].poses is not None:
+    if has_figures and len(scored) == 1 and scored[0].poses is not None:
         draw_all(scored[0].poses, folder)
+    content = _content(scored, metrics)
+    content["figures"] = _figures(scored, scores) if has_figures else NO_FIGURES
+    content["pose_figures"] = _pose_figures(folder) if has_figures and len(scored) == 1 else []
     page = render_page(
         TEMPLATE,
-        {**_content(folder, scored, metrics), "figures": _figures(scored, scores)},
+        content,
         {"number": _number, "signed": _signed, "never": _never, "span": _span, "ends": _ends},
     )
     write_text(folder / REPORT, page)
     return folder / REPORT
 
 
-def _content(
-    folder: Path, scored: Sequence[RunScored], metrics: Mapping[str, Any]
-) -> dict[str, Any]:
+def _content(scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> dict[str, Any]:
     runs = [_run(one) for one in scored]
     sources = [one.truth.truth.source for one in scored]
     cues = [_cue(name, one) for name, one in metrics["cues"].items()]
@@ -131,7 +141,6 @@ def _content(
         "frames": [_frame(one) for one in worst_frames(scored)],
         "pose": pose if is_alone else None,
         "poses": None if is_alone else pose,
-        "pose_figures": _pose_figures(folder) if is_alone else [],
     }
 
 

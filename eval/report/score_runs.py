@@ -74,6 +74,7 @@ class ScoreWork:
         any_log: Take truth that names the hash of another file?
         logs: Where the runs' logs have moved to, if they have.
         limits: What the runs' logs are read with.
+        has_figures: Draw figures into the report?
     """
 
     truth: Path | None
@@ -83,6 +84,7 @@ class ScoreWork:
     any_log: bool = False
     logs: Path | None = None
     limits: Limits = DEFAULT
+    has_figures: bool = True
 
     def __call__(self, path: Path) -> Scored:
         """Score one run and write its files.
@@ -100,7 +102,9 @@ class ScoreWork:
             if smoothed is not None:
                 metrics["smoother"] = asdict(smoothed)
             write_scores(folder.file(FOLDER), [one], metrics)
-            report = write_report(folder.file(FOLDER), [one], scores, metrics)
+            report = write_report(
+                folder.file(FOLDER), [one], scores, metrics, has_figures=self.has_figures
+            )
         return Scored(one, metrics, report, smoothed)
 
     def attempt(self, path: Path) -> Scored | Failed:
