@@ -11,8 +11,8 @@ lies, on a disk or at a URL, and however old it looks.
 
 Files that readers consult beside a log belong to it: time files of pictures and videos, SQLite's
 journals. Hidden files and what other commands put beside a log (``vehicle.toml``, ``truth.json``,
-``.seal``) do not. Of a URL only these parts are fetched, where its format is read by ranges; else
-the whole log, which stays in the store for whoever reads it.
+``.seal``) do not. Of a URL only these parts are fetched, unless they are half of the log or
+more: then the whole log, which stays in the store for whoever reads it.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ import hashlib
 import os
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Final, Protocol
 
 from crosscue.replay.errors import LogError
 from crosscue.replay.limits import MIB
 from crosscue.replay.log import Log
-from crosscue.replay.remote.logs import RangedLog, by_ranges, fetch, is_remote
+from crosscue.replay.remote.logs import RangedLog, RemoteFiles, by_ranges, fetch, is_remote
 from crosscue.replay.remote.ranges import RangedFile
 
 SHARE_BYTES: Final = 4 * MIB
@@ -98,7 +98,7 @@ def identity_of(place: Path | str) -> Identity:
     try:
         path.stat()
         files = list(_files(path))
-        share = max(SHARE_BYTES // max(len(files), 1), LEAST_BYTES)
+        share = _share(len(files))
         for name, file in files:
             with file.open("rb", buffering=0) as stream:
                 opened = _Local(stream.fileno())
@@ -120,13 +120,51 @@ def identity_of_log(log: Log) -> Identity:
 
 def _identity_of_url(url: str) -> Identity:
     ranged = by_ranges(url)
-    if ranged is None:
+    if ranged is not None:
+        with closing(ranged):
+            return _identity_of_ranged(ranged)
+    found = _identity_of_parts(url)
+    if found is None:
         with fetch(url) as fetched:
             return identity_of(fetched.path)
-    try:
-        return _identity_of_ranged(ranged)
-    finally:
-        ranged.close()
+    return found
+
+
+def _identity_of_parts(url: str) -> Identity | None:
+    """The identity of a remote log of any format; None where fetching all of it is as well."""
+    remote = RemoteFiles(url)
+    name = url.rstrip("/").rpartition("/")[2]
+    names = sorted(_names_of(name, remote.sizes).items(), key=lambda one: os.fsencode(one[0]))
+    share = _share(len(names))
+    sizes = [remote.sizes[at] for _, at in names]
+    total = sum(sizes)
+    if not names or remote.is_at_hand or total < 2 * sum(min(size, share) for size in sizes):
+        return None
+    digest = hashlib.sha256()
+    for told, at in names:
+        content = hashlib.sha256().digest()
+        if remote.sizes[at]:
+            ranged = remote.ranged(at)
+            if ranged is None:
+                return None
+            with closing(ranged):
+                content = _hash(_Remote(ranged), share)
+        digest.update(_told(os.fsencode(told), remote.sizes[at], content))
+    return Identity(name, total, digest.hexdigest())
+
+
+def _names_of(name: str, sizes: Mapping[str, int]) -> dict[str, str]:
+    """What a remote log's files are called in its identity, and in its store."""
+    if name not in sizes:
+        parts = {at: PurePosixPath(at).parts[1:] for at in sizes}
+        return {at: at for at in sizes if parts[at] and _is_of_log(parts[at])}
+    beside = _names_beside(name, lambda other: other in sizes)
+    return {name: name} | {f"beside/{other}": other for other in beside}
+
+
+def _share(files: int) -> int:
+    """Bytes of each file that are hashed."""
+    return max(SHARE_BYTES // max(files, 1), LEAST_BYTES)
 
 
 def _identity_of_ranged(ranged: RangedFile) -> Identity:
@@ -171,10 +209,15 @@ def _below(folder: Path) -> dict[str, Path]:
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in names:
             path = Path(place, name)
-            is_log = not name.startswith(".") and name not in BESIDE and path.suffix != ".seal"
-            if is_log and path.is_file():
+            if _is_of_log((name,)) and path.is_file():
                 found[f"{folder.name}/{path.relative_to(folder).as_posix()}"] = path
     return found
+
+
+def _is_of_log(parts: Sequence[str]) -> bool:
+    """Does a file below a log's folder belong to the log?"""
+    is_ours = parts[-1] in BESIDE or PurePosixPath(parts[-1]).suffix == ".seal"
+    return not is_ours and not any(part.startswith(".") for part in parts)
 
 
 def _raise(error: OSError) -> None:
@@ -182,7 +225,7 @@ def _raise(error: OSError) -> None:
 
 
 def _beside(place: Path) -> list[Path]:
-    from crosscue.replay.readers.time_file import find_time_file, time_file_of_video
+    from crosscue.replay.readers.time_file import find_time_file
 
     if place.is_dir():
         with suppress(LogError):
@@ -190,9 +233,20 @@ def _beside(place: Path) -> list[Path]:
             if time_file is not None and place not in time_file.parents:
                 return [time_file]
         return []
-    journals = [place.with_name(place.name + suffix) for suffix in ("-wal", "-journal")]
-    time_file = time_file_of_video(place) if place.suffix.lower() in _videos() else None
-    return [path for path in [*journals, time_file] if path is not None and path.is_file()]
+    return [
+        place.with_name(name)
+        for name in _names_beside(place.name, lambda name: place.with_name(name).is_file())
+    ]
+
+
+def _names_beside(name: str, is_there: Callable[[str], bool]) -> list[str]:
+    """What lies beside a file and belongs to it: journals, and the time file of a video."""
+    from crosscue.replay.readers.time_file import times_of_video
+
+    times = times_of_video(name) if PurePosixPath(name).suffix.lower() in _videos() else ()
+    time_file = next(filter(is_there, times), None)
+    journals = [name + suffix for suffix in ("-wal", "-journal") if is_there(name + suffix)]
+    return [*journals, *([] if time_file is None else [time_file])]
 
 
 def _videos() -> tuple[str, ...]:

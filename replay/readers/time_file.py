@@ -91,10 +91,15 @@ def find_time_file(folder: Path) -> Path | None:
 
 
 def time_file_of_video(video: Path) -> Path | None:
-    """``<video>.txt`` or ``<video>.csv``, with the video's suffix or in its place."""
-    names = [video.name + suffix for suffix in (".txt", ".csv")]
-    names += [video.stem + suffix for suffix in (".txt", ".csv")]
-    return next((video.with_name(name) for name in names if video.with_name(name).is_file()), None)
+    """The time file beside a video."""
+    places = (video.with_name(name) for name in times_of_video(video.name))
+    return next((place for place in places if place.is_file()), None)
+
+
+def times_of_video(name: str) -> tuple[str, ...]:
+    """``<video>.txt``, ``<video>.csv``, with or without its suffix, by precedence."""
+    stems = (name, PurePosixPath(name).stem)
+    return tuple(stem + suffix for stem in stems for suffix in (".txt", ".csv"))
 
 
 def read_time_file(path: Path, limits: Limits) -> TimeFile:

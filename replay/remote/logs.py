@@ -429,6 +429,45 @@ def by_ranges(url: str) -> RangedFile | None:
     return _ranged(url, system, address, default_store())
 
 
+class RemoteFiles:
+    """A remote log's files as its store lists them; none of them is fetched by looking at it.
+
+    Attributes:
+        sizes: Bytes by the file's name in the log, as it would lie on this machine.
+    """
+
+    def __init__(self, url: str) -> None:
+        """Ask the store.
+
+        Raises:
+            LogError: As ``fetch``.
+        """
+        self._url: Final = url
+        self._store: Final = default_store()
+        self._system, self._address = _opened(url)
+        self._objects: Final = (
+            []
+            if _is_local(self._system)
+            else _guarded(url, lambda: _objects(self._system, self._address))
+        )
+        self.sizes: Final = {one.name: one.size for one in self._objects}
+
+    @property
+    def is_at_hand(self) -> bool:
+        """Is it on this machine, so that ``fetch`` transfers nothing?"""
+        entry = self._store.folder / _key(self._url, self._objects)
+        return not self._objects or (entry / "log").exists()
+
+    def ranged(self, name: str) -> RangedFile | None:
+        """One of the files by ranges; None where the store gives none.
+
+        Raises:
+            LogError: As ``fetch``.
+        """
+        address = next(one.address for one in self._objects if one.name == name)
+        return _ranged(self._url, self._system, address, self._store)
+
+
 def _ranged(url: str, system: _System, address: str, store: Store) -> RangedFile | None:
     """The object by ranges; None if it is no single object of known size."""
     info = _guarded(url, lambda: system.info(address))

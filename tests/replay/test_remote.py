@@ -5,9 +5,11 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from crosscue.replay.errors import LogError, LogTooLargeError, OutputError, UsageError
+from crosscue.replay.files.identity import SHARE_BYTES, identity_of
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.opening import open_log
 from crosscue.replay.remote import logs as remote
@@ -88,6 +90,32 @@ def test_a_folder_comes_whole_and_a_file_with_its_companions(bucket: str) -> Non
             "v.mp4",
             "v.mp4.txt",
         ]
+
+
+@pytest.mark.parametrize(
+    ("log", "files"),
+    [
+        ("images", ["images/a.png", "images/deep/b.png", "images/.c/d.png", "images/truth.json"]),
+        ("v.mp4", ["v.mp4", "v.csv", "v.mp4.txt", "v.other"]),
+        ("a.db3", ["a.db3", "a.db3-wal", "a.yaml"]),
+    ],
+)
+def test_the_identity_of_a_log_of_several_files_takes_parts_of_them(
+    log: str, files: list[str], bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = np.random.default_rng(3).bytes(3 * SHARE_BYTES)
+    for name in files:
+        place = tmp_path / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(content)
+        _put(f"{bucket}/drive/{name}", content)
+    here = identity_of(tmp_path / log)
+
+    with fetch(f"{bucket}/drive/{log}") as fetched:
+        assert identity_of(fetched.path) == here
+    monkeypatch.setenv(remote.STORE_VARIABLE, str(tmp_path / "empty"))
+    assert identity_of(f"{bucket}/drive/{log}") == here
+    assert not list((tmp_path / "empty").glob("*/log"))
 
 
 def test_the_longest_unused_goes_first_and_one_in_use_never(bucket: str, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from mcap.writer import Writer
 
 from crosscue.eval.cli import run as crosscue
 from crosscue.replay.columns import Block, Images, Messages, Topic
-from crosscue.replay.files.identity import identity_of
+from crosscue.replay.files.identity import SHARE_BYTES, identity_of
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Selection
 from crosscue.replay.opening import open_log
@@ -191,7 +191,60 @@ def test_the_identity_is_the_same_at_a_url_and_on_disk(
     assert identity_of(f"{web.base}/deep/{path.name}") != there
 
 
-def test_a_run_of_a_log_at_a_url_can_be_estimated_again_and_resumed(
+@pytest.mark.parametrize("name", ["can.log", "can.blf", "can.MF4", "drive.db3", "front.mp4"])
+def test_the_identity_of_a_large_log_of_any_format_takes_a_part_of_it(
+    name: str, tmp_path: Path, web: Served
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(np.random.default_rng(3).bytes(3 * SHARE_BYTES))
+    web.files[f"deep/{name}"] = path.read_bytes()
+
+    assert identity_of(f"{web.base}/deep/{name}") == identity_of(path)
+    assert web.sent <= 1.02 * SHARE_BYTES
+    assert not list((tmp_path / "store").glob("*/log"))
+
+
+def test_a_run_of_a_part_of_a_log_at_a_url_is_estimated_again_from_that_part(
+    drive: Path, tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
+) -> None:
+    web.files["drive.mcap"] = drive.read_bytes()
+    out = tmp_path / "out"
+    call = [f"{web.base}/drive.mcap", "-o", str(out), "-q", "--from", "30", "--to", "34"]
+    assert crosscue(["replay", *call, "--detectors", BRIGHT, "--no-cache"]) == 0
+    before = {one.name: one.read_bytes() for one in out.glob("*.parquet")}
+    assert before
+    web.sent = 0
+
+    assert crosscue(["estimate", str(out), "-q"]) == 0
+
+    assert {one.name: one.read_bytes() for one in out.glob("*.parquet")} == before
+    assert web.sent <= cost(drive, 31_000 * MS, 35_000 * MS) + FIXED_BYTES
+    web.files["drive.mcap"] = drive.read_bytes()[:-9] + b"x" + drive.read_bytes()[-8:]
+    assert crosscue(["estimate", str(out), "-q"]) == 1
+    assert "has changed since" in capsys.readouterr().err
+    del web.files["drive.mcap"]
+    assert crosscue(["estimate", str(out), "-q"]) == 1
+    assert {one.name: one.read_bytes() for one in out.glob("*.parquet")} == before
+
+
+def test_a_run_of_a_whole_log_at_a_url_is_estimated_again_from_the_copy_here(
+    drive: Path, tmp_path: Path, web: Served
+) -> None:
+    web.files["drive.mcap"] = drive.read_bytes()
+    out = tmp_path / "out"
+    call = ["replay", f"{web.base}/drive.mcap", "-o", str(out), "-q", "--detectors", BRIGHT]
+    assert crosscue([*call, "--no-cache"]) == 0
+    before = {one.name: one.read_bytes() for one in out.glob("*.parquet")}
+    assert before
+    web.sent = 0
+
+    assert crosscue(["estimate", str(out), "-q"]) == 0
+
+    assert {one.name: one.read_bytes() for one in out.glob("*.parquet")} == before
+    assert web.sent <= 2 * FIXED_BYTES
+
+
+def test_a_run_of_a_log_at_a_url_can_be_resumed(
     drive: Path, tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
 ) -> None:
     web.files["drive.mcap"] = drive.read_bytes()
