@@ -65,6 +65,8 @@ class FrameEvidence:
         objects: From cue to identities of the counted things, where a tracker gives them.
         is_new_picture: Not the same picture as the frame before.
         turned_rad: Change of heading since the evidence before, counter-clockwise, where known.
+        assumed_m: How much of the way was assumed across a gap in time: on it nobody looked, so no
+            approach becomes stale by it.
     """
 
     t_ns: int
@@ -75,6 +77,7 @@ class FrameEvidence:
     objects: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     is_new_picture: bool = True
     turned_rad: float | None = None
+    assumed_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +216,7 @@ class Approaches:
         if has < had:
             self.counts["ranges dropped: too unsure"] += had - has
         at_hand.way_m += moved_m
-        at_hand.since_evidence_m += moved_m
+        at_hand.since_evidence_m += max(moved_m - evidence.assumed_m, 0.0)
         at_hand.since_dissent_m += moved_m
         if evidence.turned_rad is not None and math.isfinite(evidence.turned_rad):
             kept = at_hand.turned_rad * math.exp(-moved_m / TURN_FADES_M)

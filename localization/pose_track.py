@@ -143,7 +143,7 @@ class TrackState:
 
     Attributes:
         belief: At the end of the odometry driven so far.
-        travelled_m: Distance driven so far, forth and back both counted.
+        travelled_m: Distance measured so far, forth and back both counted.
         counted_ns: Time of the last heading that counted, or None.
         counted_m: ``travelled_m`` then.
         waiting: Headings later than the belief.
@@ -170,7 +170,7 @@ class PoseColumns:
         speed_mps: Shape (N,), negative in reverse.
         cov_xyh: Shape (N, 6): covariance of x, y, heading: xx, xy, xh, yy, yh, hh.
         major_axis_m: Shape (N,): full major axis of the 2-sigma position ellipse.
-        travelled_m: Shape (N,): distance driven so far.
+        travelled_m: Shape (N,): distance measured so far.
     """
 
     t_ns: Int64s
@@ -404,6 +404,7 @@ class _Run:
         self.t_ns = to_ns
 
     def _coast(self, stop_ns: int) -> None:
+        """Go on at the last speed; what is assumed of the way is not travelled distance."""
         self.tally["coasts"] += 1
         self.tally["coast_ns"] += stop_ns - self.t_ns
         while self.t_ns < stop_ns:
@@ -413,7 +414,6 @@ class _Run:
             after = coast(
                 before, dt_s, self.settings.accel_var_m2ps3, self.settings.coast_turn_var_rad2ps
             )
-            self.travelled_m += abs(self.state[SPEED]) * dt_s
             self.state, self.t_ns = packed(after), to_ns
             if to_ns < stop_ns:
                 self._handle_events()

@@ -208,7 +208,7 @@ class _Scene:
         way = self.odometer.until(t_ns)
         gap_ns = 0 if self._last_ns is None else t_ns - self._last_ns
         is_covered = way.covered_ns >= 0.9 * gap_ns
-        self.without_odometry += not is_covered
+        self.without_odometry += way.covered_ns - way.assumed_ns < 0.9 * gap_ns
         self._last_ns = t_ns if self._last_ns is None else max(t_ns, self._last_ns)
         return FrameEvidence(
             t_ns=t_ns,
@@ -217,6 +217,7 @@ class _Scene:
             signs=signs,
             counts=counts,
             turned_rad=way.turn_rad if is_covered else None,
+            assumed_m=way.assumed_m,
         )
 
     def _sum_up(self, step: Step) -> None:

@@ -1,7 +1,8 @@
 """How far the car went between two times, from the odometry a run has stored.
 
 A run keeps the odometry its pose filter was given (``measurements.parquet``); estimators that work
-at camera rate take their increments from there, so they never read the log again.
+at camera rate take their increments from there, so they never read the log again. Where a short gap
+was crossed at the last speed, the way says so: it was assumed, not measured.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Floats, Int64s
@@ -27,13 +29,29 @@ class Way(NamedTuple):
         distance_m: Signed: forwards is positive.
         var_m2: Its variance.
         turn_rad: Counter-clockwise.
-        covered_ns: How much of the stretch odometry covers.
+        covered_ns: How much of the stretch odometry covers, or what was assumed across a gap.
+        assumed_ns: How much of that was assumed.
+        assumed_m: The part of the way that was assumed, without sign.
     """
 
     distance_m: float
     var_m2: float
     turn_rad: float
     covered_ns: int
+    assumed_ns: int = 0
+    assumed_m: float = 0.0
+
+
+class _Row(NamedTuple):
+    start_ns: int
+    stop_ns: int
+    distance_m: float
+    turn_rad: float
+    var_m2: float
+    is_gap: bool
+
+
+_Part = tuple[Int64s, Int64s, Floats, Floats, Floats, NDArray[np.bool_]]
 
 
 @dataclass(slots=True)
@@ -41,13 +59,13 @@ class Odometer:
     """Reads a run's odometry once, forwards in time; memory holds one batch.
 
     Attributes:
-        parts: Batches of columns in ``COLUMNS``' order, by time.
+        parts: Batches of columns in ``COLUMNS``' order and whether a row is a gap, by time.
         at_ns: How far it has been read.
     """
 
-    parts: Iterator[tuple[Int64s, Int64s, Floats, Floats, Floats]]
+    parts: Iterator[_Part]
     at_ns: int | None = None
-    _rows: list[tuple[int, int, float, float, float]] = field(default_factory=list)
+    _rows: list[_Row] = field(default_factory=list)
     _next: int = 0
 
     def until(self, t_ns: int) -> Way:
@@ -58,34 +76,39 @@ class Odometer:
         if self.at_ns is not None and t_ns <= self.at_ns:
             return Way(0.0, 0.0, 0.0, 0)
         begin = self.at_ns
-        distance = var = turn = 0.0
-        covered = 0
+        distance = var = turn = assumed_m = 0.0
+        covered = assumed = 0
         while (row := self._peek()) is not None:
-            start, stop, metres, radians, variance = row
-            first = start if begin is None else max(start, begin)
-            last = min(stop, t_ns)
+            first = row.start_ns if begin is None else max(row.start_ns, begin)
+            last = min(row.stop_ns, t_ns)
             if last > first:
-                share = (last - first) / (stop - start)
-                distance += share * metres
-                turn += share * radians
-                var += share * variance
+                share = (last - first) / (row.stop_ns - row.start_ns)
+                distance += share * row.distance_m
+                turn += share * row.turn_rad
+                var += share * row.var_m2
                 covered += last - first
-            if stop > t_ns:
+                assumed += (last - first) * row.is_gap
+                assumed_m += abs(share * row.distance_m) * row.is_gap
+            if row.stop_ns > t_ns:
                 break
             self._next += 1
         self.at_ns = t_ns
-        return Way(distance, var, turn, covered)
+        return Way(distance, var, turn, covered, assumed, assumed_m)
 
     def skip_to(self, t_ns: int) -> None:
-        """Leave out all odometry before ``t_ns``."""
+        """Leave out all odometry before ``t_ns``, and all of a gap that it lies in."""
         self.until(t_ns)
+        row = self._peek()
+        if row is not None and row.is_gap and row.start_ns < t_ns:
+            self._next += 1
 
-    def _peek(self) -> tuple[int, int, float, float, float] | None:
+    def _peek(self) -> _Row | None:
         while self._next == len(self._rows):
             part = next(self.parts, None)
             if part is None:
                 return None
-            self._rows = list(zip(*(column.tolist() for column in part), strict=True))
+            columns = (column.tolist() for column in part)
+            self._rows = [_Row(*row) for row in zip(*columns, strict=True)]
             self._next = 0
         return self._rows[self._next]
 
@@ -99,16 +122,20 @@ def odometer_of(run: RunFolder) -> Odometer:
     return Odometer(_parts(run))
 
 
-def _parts(run: RunFolder) -> Iterator[tuple[Int64s, Int64s, Floats, Floats, Floats]]:
+def _parts(run: RunFolder) -> Iterator[_Part]:
+    import pyarrow as pa
     import pyarrow.compute as pc
 
+    kinds = pa.array(["odometry", "gap"])
     for batch in run.batches(measurements.TABLE, ["kind", *COLUMNS]):
         kind = batch["kind"].cast("string")
-        part = batch.filter(pc.equal(kind, "odometry"))
+        is_way = pc.is_in(kind, kinds)
+        part = batch.filter(is_way)
         if part.num_rows:
             start, stop, metres, radians, variance = (
                 part[name].to_numpy(zero_copy_only=False) for name in COLUMNS
             )
+            is_gap = pc.equal(kind.filter(is_way), "gap").to_numpy(zero_copy_only=False)
             moves = stop > start
             yield (
                 start[moves].astype(np.int64),
@@ -116,4 +143,5 @@ def _parts(run: RunFolder) -> Iterator[tuple[Int64s, Int64s, Floats, Floats, Flo
                 metres[moves],
                 radians[moves],
                 variance[moves],
+                is_gap[moves],
             )

@@ -390,6 +390,18 @@ def test_odometry_missing_for_long_drops_the_range_and_then_the_approach() -> No
     assert taken[-1].approach is None
 
 
+@pytest.mark.parametrize(("assumed_m", "is_kept"), [(0.0, False), (65.0, True)])
+def test_a_way_on_which_nobody_looked_makes_no_approach_stale(
+    assumed_m: float, is_kept: bool
+) -> None:
+    loop = approaches(Fusion(longest_m=1e3))
+    steps(standing(30, 0, stop_sign=1), loop)
+
+    step = loop(replace(frame(40, 65.0), assumed_m=assumed_m))
+
+    assert (step.approach is not None) is is_kept
+
+
 def test_ranges_follow_a_drive_without_odometry_from_its_signs() -> None:
     seen = [replace(one, travelled_m=None) for one in drive(60.0, 10.0, {"stop_sign": (60.0, 1)})]
 

@@ -303,6 +303,7 @@ def test_time_without_odometry_is_driven_blind_and_told() -> None:
     assert done.counts.coasts == 1
     assert done.counts.coast_ns == 2_000_000_000
     assert done.poses.x_m[0] == pytest.approx(21.0)
+    assert done.poses.travelled_m[0] == pytest.approx(1.0)
     assert done.poses.cov_xyh[0, 0] > (0.5 * 2.0) ** 2
 
 

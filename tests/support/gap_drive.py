@@ -20,13 +20,14 @@ from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, s
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.detectors.base import Detections, Found, Frame, View, nothing_found
 from crosscue.eval.pipeline.detect import choices_of
+from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
 from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Images, Int64s, Messages, Topic
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import EVERYTHING
+from crosscue.replay.log import EVERYTHING, Selection
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 from crosscue.replay.write.convert import LogWriter
@@ -100,13 +101,19 @@ def distance_m(t_ns: Int64s) -> Floats:
     return left
 
 
-def write_drive(folder: Path, clock: Clock, seconds: int = 14, rows_a_block: int = 7) -> Path:
+def write_drive(
+    folder: Path,
+    clock: Clock,
+    seconds: int = 14,
+    rows_a_block: int = 7,
+    name: str = "drive.mcap",
+) -> Path:
     """Write log, vehicle file and truth; the log's path comes back."""
     folder.mkdir(parents=True, exist_ok=True)
-    log = folder / "drive.mcap"
+    log = folder / name
     true_ns = np.arange(seconds * 10) * ROW + BEGIN
     rows, stamps = clock.recorded(true_ns)
-    with LogWriter(log, Ledger(str(log))) as writer:
+    with LogWriter(log, Ledger(str(log)), overwrite=True) as writer:
         for topic in (BUS, CAMERA):
             writer.add_topic(topic)
         for part in np.array_split(np.arange(len(rows)), max(len(rows) // rows_a_block, 1)):
@@ -119,13 +126,18 @@ def write_drive(folder: Path, clock: Clock, seconds: int = 14, rows_a_block: int
     return log
 
 
-def replayed(folder: Path, log: Path, run: str = "run") -> RunFolder:
+def replay(folder: Path, log: Path, run: str = "run", selection: Selection = EVERYTHING) -> Outcome:
     """Replay a log with the folder's vehicle file and detector."""
     vehicle = load(folder / "car.toml")
     detecting = Detecting(tuple(choices_of(vehicle).values()), cache=folder / "cache.sqlite")
     with open_log(log) as opened:
         into = create(folder / run, overwrite=True)
-        return replay_drive([opened], vehicle, into, EVERYTHING, detecting=detecting).run
+        return replay_drive([opened], vehicle, into, selection, detecting=detecting)
+
+
+def replayed(folder: Path, log: Path, run: str = "run") -> RunFolder:
+    """The run of ``replay``."""
+    return replay(folder, log, run).run
 
 
 def _wheels(n: int) -> CanFrames:

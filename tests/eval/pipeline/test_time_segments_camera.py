@@ -1,118 +1,124 @@
-"""Cues of a drive whose clock is set are those of its two halves replayed alone."""
+"""Cues, ranges and beliefs of a drive whose clock is set are those of its halves replayed alone."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import Final
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import strategies as st
 
-from crosscue.datasets.scenes.drive import SceneSettings, write_scene
-from crosscue.datasets.scenes.rendering.camera import Camera
-from crosscue.detectors.registry import Choice
 from crosscue.eval.pipeline.estimate import Outcome
-from crosscue.eval.pipeline.replay import Detecting, replay_drive
-from crosscue.eval.runs.folder import create
-from crosscue.replay.columns import Block, Topic
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import EVERYTHING, Log, Selection
-from crosscue.replay.opening import open_log
-from crosscue.replay.vehicle.vehicle import Vehicle, load
+from support.gap_drive import ROW, SECOND, Clock, distance_m, replay, write_drive
 
-SECOND = 1_000_000_000
+LABELLED: Final = ("frames", "detections", "road", "cues", "range", "belief", "pose", "skipped")
+NEVER_S: Final = 1e6
+RESTART_MS: Final = 5_000
+"""A longer gap is not crossed: ``time.restart_after_s``."""
+ONE_ROW_MS: Final = ROW // 1_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class Reset:
-    """A log whose clock is set by ``by_ns`` at a time, cut to a span of its true time."""
-
-    log: Log
-    at_ns: int
-    by_ns: int = 0
-    first_ns: int = 0
-    last_ns: int = 1 << 62
-    format: str = "mcap"
-
-    @property
-    def path(self) -> Path:
-        """Of the log itself."""
-        return self.log.path
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """Of the log itself, without counts."""
-        return tuple(replace(topic, declared=None) for topic in self.log.topics)
-
-    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """As of a recorder whose clock was set."""
-        for block in self.log.read(Ledger(""), selection):
-            part = block.take((block.log_ns >= self.first_ns) & (block.log_ns < self.last_ns))
-            if not len(part):
-                continue
-            ledger.find(part.topic, len(part))
-            by_ns = np.where(part.log_ns >= self.at_ns, self.by_ns, 0)
-            publish_ns = None if part.publish_ns is None else part.publish_ns + by_ns
-            yield replace(part, log_ns=part.log_ns + by_ns, publish_ns=publish_ns)
-
-    def close(self) -> None:
-        """Close the log."""
-        self.log.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
+def _columns(
+    outcome: Outcome, name: str, segment: int = 0, by_ms: int = 0
+) -> dict[str, list[object]]:
+    """A table's rows in one segment: stamps as before the clock was set, counters from 0."""
+    table = outcome.run.table(name)
+    table = table.filter([number == segment for number in table["segment"].to_pylist()])
+    columns: dict[str, list[object]] = table.to_pydict()
+    columns["t_ns"] = (table["log_t_ns"].to_numpy() - by_ms * 1_000_000).tolist()
+    for counter in columns.keys() & {"approach", "frame"}:
+        numbers = table[counter].to_pylist()
+        first = min((one for one in numbers if one is not None), default=0)
+        columns[counter] = [None if one is None else one - first for one in numbers]
+    return {key: rows for key, rows in columns.items() if key not in ("segment", "log_t_ns")}
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("drive")
-    write_scene(folder, SceneSettings("A", camera=Camera(width_px=320, height_px=180)))
-    return folder
+def _are_the_same(one: dict[str, list[object]], other: dict[str, list[object]]) -> None:
+    assert one.keys() == other.keys()
+    for name, mine in one.items():
+        if any(isinstance(value, float) for value in mine):
+            ours, theirs = (np.array(rows, np.float64) for rows in (mine, other[name]))
+            np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9, err_msg=name)
+        else:
+            assert mine == other[name], name
 
 
-def _replay(drive: Path, run: Path, vehicle: Vehicle, log: Reset) -> Outcome:
-    detecting = Detecting((Choice("signs", "signs", {}),), cache=drive / "cache.sqlite")
-    folder = create(run, overwrite=True)
-    return replay_drive([log], vehicle, folder, EVERYTHING, detecting=detecting)
+@settings(
+    max_examples=4,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],
+)
+@given(
+    cut=st.integers(40, 95),
+    by_ms=st.one_of(st.integers(-4_000_000, -350), st.integers(1_100, 4_000_000)),
+    rows_a_block=st.sampled_from([3, 7, 50]),
+)
+@example(cut=60, by_ms=3_000, rows_a_block=7)
+@example(cut=60, by_ms=-3_000, rows_a_block=7)
+def test_what_is_seen_on_both_sides_of_a_cut_is_that_of_the_halves(
+    tmp_path: Path, cut: int, by_ms: int, rows_a_block: int
+) -> None:
+    cut_s = cut * ROW / SECOND
 
+    def run(name: str, clock: Clock) -> Outcome:
+        log = write_drive(tmp_path, clock, rows_a_block=rows_a_block, name=f"{name}.mcap")
+        return replay(tmp_path, log, name)
 
-def _cues(outcome: Outcome, segment: int = 0) -> list[tuple[str, int]]:
-    table = outcome.run.table("cues")
-    names = ("segment", "cue", "count")
-    rows = zip(*(table[name].to_pylist() for name in names), strict=True)
-    return [(cue, count) for number, cue, count in rows if number == segment]
-
-
-@pytest.mark.parametrize("by_s", [-3600, -7, 1200])
-def test_cues_and_distance_are_those_of_the_halves(drive: Path, tmp_path: Path, by_s: int) -> None:
-    vehicle = load(drive / "vehicle.toml")
-    with open_log(drive / "drive.mcap") as log:
-        blocks = list(log.read(Ledger("")))
-        begin_ns = min(int(block.log_ns.min()) for block in blocks)
-        cut_ns = begin_ns + 4 * SECOND + 12_345_678
-        by_ns = by_s * SECOND
-        first = _replay(drive, tmp_path / "a", vehicle, Reset(log, cut_ns, last_ns=cut_ns))
-        second = _replay(drive, tmp_path / "b", vehicle, Reset(log, cut_ns, first_ns=cut_ns))
-        whole = _replay(drive, tmp_path / "whole", vehicle, Reset(log, cut_ns, by_ns))
+    first = run("first", Clock(pause_s=(cut_s, NEVER_S)))
+    second = run("second", Clock(pause_s=(0.0, cut_s)))
+    whole = run("whole", Clock(set_at_s=cut_s, by_s=by_ms / 1000))
 
     assert len(whole.segments) == 2
     assert whole.exit_status == 3
     assert whole.travelled_m == pytest.approx(first.travelled_m + second.travelled_m, abs=1e-9)
-    assert _cues(whole, 0) == _cues(first)
-    assert _cues(whole, 1) == _cues(second)
-    for name in ("frames", "detections", "road", "cues", "range", "belief", "pose", "skipped"):
+    assert whole.detected is not None
+    assert set(whole.detected.counts.from_cache.values()) == {140}
+    assert all(_columns(half, "range")["t_ns"] for half in (first, second))
+    assert all(half.scene and half.scene.positive["stop_sign"] for half in (first, second))
+    for name in ("frames", "detections", "cues", "range", "belief"):
+        _are_the_same(_columns(whole, name, 0), _columns(first, name))
+    begins_anew = by_ms < 0 or by_ms + ONE_ROW_MS > RESTART_MS
+    for name in ("cues", "range", "belief") if begins_anew else ("detections",):
+        _are_the_same(_columns(whole, name, 1, by_ms), _columns(second, name))
+
+
+@pytest.mark.parametrize("by_s", [-3600.0, -7.0, 1200.0])
+def test_every_table_says_its_segment_and_its_stamp(tmp_path: Path, by_s: float) -> None:
+    whole = replay(tmp_path, write_drive(tmp_path, Clock(set_at_s=6.0, by_s=by_s)))
+
+    for name in LABELLED:
         assert {"segment", "log_t_ns"} <= set(whole.run.schema(name).names)
     frames = whole.run.table("frames")
     assert np.all(np.diff(frames["t_ns"].to_numpy()) > 0)
     assert set(frames["segment"].to_pylist()) == {0, 1}
+
+
+@pytest.mark.parametrize("pause_s", [1.5, 3.0])
+def test_a_short_gap_keeps_the_approach_and_its_range(tmp_path: Path, pause_s: float) -> None:
+    begin_s = 5.0
+    log = write_drive(tmp_path, Clock(pause_s=(begin_s, begin_s + pause_s)))
+
+    outcome = replay(tmp_path, log)
+
+    assert len(outcome.segments) == 2
+    assert outcome.scene is not None
+    assert outcome.scene.counts["approaches opened"] == 1
+    assert "approaches closed: stale" not in outcome.scene.counts
+    assert outcome.scene.without_odometry == 1
+    after = outcome.run.table("range").to_pylist()
+    after = [row for row in after if row["segment"] == 1]
+    # A new range would begin with the second look; this one was carried over the gap.
+    assert after[0]["t_ns"] == outcome.segments[1].start_ns
+    left_m = float(distance_m(np.array([after[0]["t_ns"]]))[0])
+    assert after[0]["range_m"] == pytest.approx(left_m, abs=1.0)
+
+
+def test_a_long_gap_begins_anew(tmp_path: Path) -> None:
+    outcome = replay(tmp_path, write_drive(tmp_path, Clock(pause_s=(4.0, 9.2))))
+
+    assert outcome.scene is not None
+    assert outcome.scene.counts["approaches opened"] == 2
+    assert outcome.scene.counts["approaches closed: a gap in time"] == 1

@@ -1,0 +1,36 @@
+"""The odometry a run has stored, read as ways between times."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from crosscue.eval.pipeline.travelled import Odometer, Way
+
+SECOND = 1_000_000_000
+
+
+def _odometer() -> Odometer:
+    """10 m/s for two seconds, a gap of two crossed at that speed, and two seconds more."""
+    start = np.array([0, 1, 2, 4, 5]) * SECOND
+    stop = np.array([1, 2, 4, 5, 6]) * SECOND
+    way = np.array([10.0, 10.0, 20.0, 10.0, 10.0])
+    is_gap = np.array([False, False, True, False, False])
+    return Odometer(iter([(start, stop, way, 0.1 * way, 0.01 * way, is_gap)]))
+
+
+def test_a_way_says_how_much_of_it_was_assumed() -> None:
+    odometer = _odometer()
+
+    assert odometer.until(SECOND) == Way(10.0, 0.1, 1.0, SECOND)
+    assert odometer.until(3 * SECOND) == Way(20.0, 0.2, 2.0, 2 * SECOND, SECOND, 10.0)
+    rest = odometer.until(6 * SECOND)
+    assert (rest.distance_m, rest.assumed_m) == pytest.approx((30.0, 10.0))
+
+
+def test_after_a_skip_nothing_of_the_gap_counts() -> None:
+    odometer = _odometer()
+
+    odometer.skip_to(3 * SECOND)
+
+    assert odometer.until(5 * SECOND) == Way(10.0, 0.1, 1.0, SECOND)
