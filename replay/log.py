@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Protocol, Self
+from typing import Final, Protocol, Self, runtime_checkable
 
 from .columns import Block, Topic
 from .ledger import Ledger
@@ -90,3 +90,21 @@ class Log(Protocol):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None: ...
+
+
+@runtime_checkable
+class KnowsItsEnd(Protocol):
+    """A log that can tell without reading its body that something is missing."""
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """Drop what its opening, or a look at its end, shows to be missing.
+
+        Reading the log reports it as well, with more detail; only one of both is asked for.
+        """
+        ...
+
+
+def report_missing(log: Log, ledger: Ledger) -> None:
+    """As ``KnowsItsEnd.report_missing``, of a log that knows; else nothing."""
+    if isinstance(log, KnowsItsEnd):
+        log.report_missing(ledger)

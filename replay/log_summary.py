@@ -27,7 +27,7 @@ from crosscue.replay.vehicle.roles import Role, role_of
 from .columns import Block, CanFrames, Messages, Topic
 from .errors import SchemaError
 from .ledger import Detail, Ledger, TopicAccount
-from .log import EVERYTHING, Log, Selection
+from .log import EVERYTHING, Log, Selection, report_missing
 
 if TYPE_CHECKING:
     from .decode import Decoder
@@ -171,10 +171,11 @@ Progress = Callable[[Iterable[Block], Callable[[], float]], Iterable[Block]]
 
 
 def quick_summary(log: Log) -> LogSummary:
-    """What a log says of itself; its body is not read."""
+    """What a log says of itself, and whether its end is missing; its body is not read."""
     ledger = Ledger(name_of(log))
     for topic in log.topics:
         ledger.declare(topic.name, topic.declared)
+    report_missing(log, ledger)
     return _summary(log, ledger, ClockWatch(), {}, is_quick=True)
 
 

@@ -33,6 +33,7 @@ from crosscue.replay.log import EVERYTHING, Selection
 
 from .npy import Column, read_column
 
+CUT, UNREADABLE = "array file is cut", "array cannot be read"
 STEP_NS: Final = 1_000_000_000
 LATEST_NS: Final = 1 << 62
 NO_TIME: Final = -(1 << 63)
@@ -159,7 +160,7 @@ class Segment(Closing):
         """All streams side by side, a second at a time; see ``Log.read``."""
         ledger.integrity = "not checkable: .npy files carry no checksum; lengths were compared"
         for sentence in self._unreadable:
-            ledger.drop("", "array cannot be read", None, sentence)
+            ledger.drop("", UNREADABLE, None, sentence)
         for source in self._sources:
             ledger.declare(source.topic.name, source.topic.declared)
         if any(source.topic.type_name == "crosscue/CanFrames" for source in self._sources):
@@ -186,7 +187,15 @@ class Segment(Closing):
                         f"{column.path.relative_to(self.path)}: cut: {len(column.rows)} of "
                         f"{column.declared} rows are there"
                     )
-            ledger.settle(source.topic.name, "array file is cut")
+            ledger.settle(source.topic.name, CUT)
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """Arrays that are cut or cannot be read; see ``KnowsItsEnd``."""
+        for sentence in self._unreadable:
+            ledger.drop("", UNREADABLE, None, sentence)
+        for source in self._sources:
+            missing = (source.topic.declared or 0) - len(source.t_ns)
+            ledger.drop(source.topic.name, CUT, missing)
 
     def close(self) -> None:
         """Let the mapped files go."""
@@ -274,7 +283,7 @@ def _block(source: _Source, part: slice, ledger: Ledger, selection: Selection) -
     block = Block(name, source.t_ns[part], source.rows(part))
     wanted = block.log_ns != NO_TIME
     timeless = int(count - wanted.sum())
-    ledger.skip(name, "a row without a possible time", timeless)
+    ledger.spoil(name, "a row without a possible time", timeless)
     if selection.start_ns is not None:
         wanted &= block.log_ns >= selection.start_ns
     if selection.end_ns is not None:

@@ -148,6 +148,18 @@ class Drive(Closing):
             if part
         )
 
+    def report_missing(self, ledger: Ledger) -> None:
+        """Files without a time, times without a file; see ``KnowsItsEnd``."""
+        for loss in self._unreadable:
+            ledger.drop(*loss)
+        for camera in self._cameras:
+            camera.report_missing(ledger)
+        if self._oxts is not None:
+            files = self._oxts.files
+            for name in TOPICS:
+                ledger.drop(name, "a packet without its time", int(np.sum(files.t_ns < 0)))
+                ledger.drop(name, "a time without its packet", len(files.missing_ns))
+
     def close(self) -> None:
         """Nothing is held open."""
 
@@ -326,7 +338,7 @@ def _account(
         ledger.skip(name, NOT_ASKED_TOPIC, n)
     else:
         timeless = int(np.count_nonzero(packets.t_ns < 0))
-        ledger.skip(name, "a packet without its time", timeless)
+        ledger.spoil(name, "a packet without its time", timeless)
         ledger.skip(name, NOT_ASKED_TIME, n - timeless - int(np.count_nonzero(wanted)))
     for place, t_ns, raw in some:
         why = raw if isinstance(raw, str) else parse(raw)

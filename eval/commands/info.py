@@ -3,7 +3,7 @@
 examples:
   crosscue info drive.mcap
   crosscue info drive.mcap can0.log --json > drive.json
-  crosscue info --quick drive.bag      only what the file declares, without reading it
+  crosscue info --quick drive.bag      only what the file declares, and whether its end is missing
   crosscue info https://host/drive.mcap --from 60 --to 62
 
 Offset and drift say how the header stamp (else the publish time) runs against the log time.
@@ -46,7 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_part_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     parser.add_argument(
-        "--quick", action="store_true", help="only what the log declares; do not read its body"
+        "--quick",
+        action="store_true",
+        help="only what the log declares, and whether its end is missing; do not read its body",
     )
 
 

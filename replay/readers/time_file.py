@@ -11,6 +11,9 @@ the one whose name has ``time`` or ``stamp`` is the time, and a unit there (``ti
 * a date-time (``2011-09-26 13:02:25.964389445``, ``...T13:02:25Z``, ``...+02:00``), UTC where it
   names no zone.
 
+A last line without a line end that is no time, or has fewer decimals than all lines above it, was
+cut while it was written: it gives no time, and a notice says so.
+
 Instead of times, one line ``rate_hz: 15`` says that they were not kept and pictures came at that
 rate. Times are computed in integers and fractions, never in floats.
 """
@@ -18,13 +21,13 @@ rate. Times are computed in integers and fractions, never in floats.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from pathlib import Path, PurePosixPath
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -57,18 +60,29 @@ class TimeFile:
         t_ns: Shape (N,), int64; empty where only a rate is given.
         names: N file names without folders, or None where lines hold times only.
         period: Nanoseconds between pictures where only a rate is given, else None.
+        notices: What is odd about the file, a sentence each.
     """
 
     path: Path
     t_ns: Int64s
     names: tuple[str, ...] | None
     period: Fraction | None
+    notices: tuple[str, ...] = ()
 
     def times_at(self, index: Int64s) -> Int64s:
         """Times of the pictures with these numbers, counted from 0; shape (N,)."""
         if self.period is None:
             return self.t_ns[index]
         return np.array([round(int(i) * self.period) for i in index], dtype=np.int64)
+
+
+class _Line(NamedTuple):
+    """A line's time and file name; is it an integer without a unit; digits behind its point."""
+
+    t_ns: int
+    name: str | None
+    is_bare: bool
+    decimals: int
 
 
 def find_time_file(folder: Path) -> Path | None:
@@ -109,13 +123,12 @@ def read_time_file(path: Path, limits: Limits) -> TimeFile:
         LogFormatError: A line cannot be understood; the message names it.
         LogTooLargeError: The file is larger than one message may be.
     """
-    lines = list(_lines(path, limits))
+    lines, has_end = _lines(path, limits)
     if len(lines) == 1 and (rate := _RATE.fullmatch(lines[0][1])):
         return TimeFile(path, np.zeros(0, np.int64), None, _period(path, lines[0][0], rate[1]))
-    times: list[int] = []
-    names: list[str] = []
+    times: list[_Line] = []
     columns: tuple[str, ...] = ()
-    integers = True
+    notices: tuple[str, ...] = ()
     for number, line in lines:
         where = f"{path}: line {number}"
         parts = _split(line)
@@ -127,23 +140,39 @@ def read_time_file(path: Path, limits: Limits) -> TimeFile:
                     "nanoseconds or a date-time), alone or with a file name"
                 )
             continue
-        t_ns, name, is_integer = _one_line(parts, columns, where)
-        times.append(t_ns)
-        integers &= is_integer
-        if name is not None:
-            names.append(name)
-        if names and len(names) != len(times):
+        may_be_cut = number == lines[-1][0] and not has_end and len(times) > 1
+        try:
+            one = _one_line(parts, columns, where)
+        except LogFormatError:
+            if not may_be_cut:
+                raise
+            one = None
+        if one is None or (may_be_cut and _is_shorter(one, times)):
+            notices = (
+                f"{path.name}: line {number}, the last one, is cut: {line[:80]!r}; it gives no "
+                "time (end the line if it is whole)",
+            )
+            continue
+        times.append(one)
+        if (one.name is None) != (times[0].name is None):
             raise LogFormatError(f"{where}: {line[:80]!r}: names a file or not, unlike line above")
     if not times:
         raise LogFormatError(f"{path}: no time in it; want one line for each picture")
-    t_ns_column = np.array(times, dtype=np.int64)
-    _check_period(path, t_ns_column, integers=integers)
+    t_ns = np.array([one.t_ns for one in times], dtype=np.int64)
+    names = tuple(one.name for one in times if one.name is not None)
+    _check_period(path, t_ns, integers=all(one.is_bare for one in times))
     _check_twins(path, names)
-    return TimeFile(path, t_ns_column, tuple(names) or None, None)
+    return TimeFile(path, t_ns, names or None, None, notices)
 
 
-def _lines(path: Path, limits: Limits) -> Iterator[tuple[int, str]]:
-    """Numbers and text of the lines that say something."""
+def _is_shorter(last: _Line, above: list[_Line]) -> bool:
+    """Has a line fewer decimals than all those above it, which have equally many?"""
+    usual = {one.decimals for one in above}
+    return len(usual) == 1 and last.decimals < max(usual)
+
+
+def _lines(path: Path, limits: Limits) -> tuple[list[tuple[int, str]], bool]:
+    """Numbers and text of the lines that say something, and whether the file ends with a line."""
     raw = read_at_most(path, limits.message_bytes)
     if raw is None:
         raise LogTooLargeError(
@@ -154,10 +183,9 @@ def _lines(path: Path, limits: Limits) -> Iterator[tuple[int, str]]:
     except UnicodeDecodeError as error:
         bad = raw[: error.start].count(b"\n") + 1
         raise LogFormatError(f"{path}: line {bad}: not UTF-8 text; want a text file") from None
-    for number, whole in enumerate(text.split("\n"), start=1):
-        line = whole.strip()
-        if line and not line.startswith("#"):
-            yield number, line
+    stripped = ((n, line.strip()) for n, line in enumerate(text.split("\n"), start=1))
+    said = [(n, line) for n, line in stripped if line and not line.startswith("#")]
+    return said, not text or text.endswith("\n")
 
 
 def _split(line: str) -> list[str]:
@@ -171,10 +199,7 @@ def _split(line: str) -> list[str]:
     return [cell.strip('"') for cell in line.split()]
 
 
-def _one_line(
-    parts: list[str], columns: tuple[str, ...], where: str
-) -> tuple[int, str | None, bool]:
-    """Time, name or None, and whether the time was an integer without a unit."""
+def _one_line(parts: list[str], columns: tuple[str, ...], where: str) -> _Line:
     at = [i for i, column in enumerate(columns) if _names_a_time(column)]
     if columns:
         if len(parts) != len(columns):
@@ -192,7 +217,8 @@ def _one_line(
     name = PurePosixPath(others[0].replace("\\", "/")).name if others else None
     text = parts[at[0]]
     is_bare = unit_ns is None and re.fullmatch(r"[+-]?\d+", text) is not None
-    return _time_ns(text, unit_ns, where), name, is_bare
+    decimals = len(text.replace(",", ".").partition(".")[2].rstrip("Z"))
+    return _Line(_time_ns(text, unit_ns, where), name, is_bare, decimals)
 
 
 def _is_time(text: str) -> bool:
@@ -249,7 +275,7 @@ def _check_period(path: Path, t_ns: Int64s, *, integers: bool) -> None:
         )
 
 
-def _check_twins(path: Path, names: list[str]) -> None:
+def _check_twins(path: Path, names: Sequence[str]) -> None:
     seen: set[str] = set()
     for name in names:
         if name in seen:

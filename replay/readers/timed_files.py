@@ -57,7 +57,7 @@ def pair(paths: Sequence[Path], times: TimeFile) -> TimedFiles:
     Raises:
         LogFormatError: Not one file gets a time.
     """
-    notices: list[str] = []
+    notices = list(times.notices)
     if times.names is not None:
         index = _by_name(paths, times.names)
     else:

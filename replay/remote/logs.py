@@ -38,7 +38,7 @@ from crosscue.replay.files.whole_file import cannot_write
 from crosscue.replay.formats import FORMATS
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
-from crosscue.replay.log import EVERYTHING, Log, Selection
+from crosscue.replay.log import EVERYTHING, KnowsItsEnd, Log, Selection, report_missing
 
 from .ranges import RangedFile, Spool
 
@@ -253,6 +253,10 @@ class RemoteLog:
             ledger.notice(f"fetched whole: {self._why}")
         return self._log.read(ledger, selection)
 
+    def report_missing(self, ledger: Ledger) -> None:
+        """As of the log."""
+        report_missing(self._log, ledger)
+
     def close(self) -> None:
         """Close the log, then let its file go."""
         try:
@@ -336,6 +340,11 @@ class RangedLog:
         self.ranged.verify()
         took = self.ranged.transferred - before
         ledger.notice(f"{took} of {self.ranged.size} bytes were fetched")
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """As of the log."""
+        if isinstance(self._log, KnowsItsEnd):
+            self._log.report_missing(ledger)
 
     def first_blocks(self, ledger: Ledger) -> Iterator[Block]:
         """What the first chunk holds, for whoever looks at the beginning only."""

@@ -16,7 +16,7 @@ from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import LogError
 from crosscue.replay.files.closing import Closing
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import EVERYTHING, Log, Selection
+from crosscue.replay.log import EVERYTHING, Log, Selection, report_missing
 
 from .seal import HASH, Check, Seal, read_seal, seal_path
 from .touched import Blocks, Touched
@@ -109,6 +109,12 @@ class SealedLog(Closing):
                     _exhaust(check.everything())
         finally:
             _report(check, ledger)
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """As of the log; also files that are missing, new or of another size."""
+        for sentence in Check(self.path, self.seal).oddities:
+            ledger.drop("", CHANGED, None, sentence)
+        report_missing(self._log, ledger)
 
     def _checked(
         self, touched: Touched, check: Check, ledger: Ledger, selection: Selection

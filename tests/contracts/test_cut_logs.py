@@ -7,13 +7,23 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval import cli
+from crosscue.replay.errors import LogError
 from crosscue.replay.formats import FORMATS
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import report_missing
+from crosscue.replay.opening import open_log
+from support.accounted import read
 from support.every_format import EVERY_FORMAT
 
 INDEX_AT_THE_END = {"mf4", "video"}
 """Files whose writer puts at their end what is needed to read any of it, if it gets there."""
-CUT_TIMES = {"kitti-raw"}
-"""Its largest file is a list of times; what has none is skipped, and so told."""
+TIME_FILES = {
+    "kitti-raw": ("oxts/timestamps.txt", "image_02/timestamps.txt"),
+    "comma2k19": ("processed_log/IMU/gyro/t", "processed_log/IMU/gyro/value"),
+    "video": ("front.txt",),
+    "images": ("timestamps.txt",),
+}
+"""Formats that keep the times of their rows in a file of their own, and these files."""
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +37,54 @@ def test_every_format_is_here() -> None:
     assert EVERY_FORMAT.keys() == FORMATS.keys()
 
 
-@pytest.mark.parametrize("name", sorted(EVERY_FORMAT.keys() - CUT_TIMES))
+BODY_UNSEEN = {"images": "pictures are not opened"}
+"""Formats whose cut ``info --quick`` cannot see, and why."""
+
+
+@pytest.mark.parametrize("name", sorted(EVERY_FORMAT))
+def test_a_quick_look_at_a_cut_log_says_so(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = EVERY_FORMAT[name](tmp_path)
+    assert cli.run(["info", "--quick", str(log)]) == 0
+    files = [log] if log.is_file() else [path for path in log.rglob("*") if path.is_file()]
+    largest = max(files, key=lambda path: path.stat().st_size)
+    largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
+    capsys.readouterr()
+
+    status = cli.run(["info", "--quick", str(log)])
+
+    captured = capsys.readouterr()
+    if name in BODY_UNSEEN:
+        assert status == 0
+        assert cli.run(["info", str(log)]) == 3
+    elif status == 3:
+        assert "losses" in captured.out
+    else:
+        assert status == 4
+        assert name in INDEX_AT_THE_END
+        assert captured.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", sorted(EVERY_FORMAT))
+def test_a_quick_look_never_reports_what_reading_does_not(name: str, tmp_path: Path) -> None:
+    log = EVERY_FORMAT[name](tmp_path)
+    files = [log] if log.is_file() else [path for path in log.rglob("*") if path.is_file()]
+    largest = max(files, key=lambda path: path.stat().st_size)
+    raw = largest.read_bytes()
+    for size in range(len(raw), len(raw) // 8, -max(1, len(raw) // 19)):
+        largest.write_bytes(raw[:size])
+        quick = Ledger(str(log))
+        try:
+            with open_log(log) as opened:
+                report_missing(opened, quick)
+        except LogError:
+            continue
+        assert quick.is_whole or not read(log)[1].is_whole, size
+        assert quick.is_whole or size < len(raw)
+
+
+@pytest.mark.parametrize("name", sorted(EVERY_FORMAT))
 @pytest.mark.parametrize("command", ["info", "convert"])
 def test_a_log_cut_in_the_middle(
     name: str, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -47,6 +104,44 @@ def test_a_log_cut_in_the_middle(
         assert status == 3 or name in INDEX_AT_THE_END
     elif status == 4:
         assert not (tmp_path / "o.mcap").exists()
+
+
+def _times(log: Path) -> tuple[dict[str, set[int]], Ledger]:
+    times: dict[str, set[int]] = {}
+    blocks, ledger = read(log)
+    for block in blocks:
+        times.setdefault(block.topic, set()).update(block.log_ns.tolist())
+    return times, ledger
+
+
+@pytest.mark.parametrize(
+    ("name", "file"), [(name, file) for name in TIME_FILES for file in TIME_FILES[name]]
+)
+def test_rows_whose_times_are_cut_off_are_dropped_and_no_time_is_invented(
+    name: str, file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = EVERY_FORMAT[name](tmp_path)
+    if name == "images":
+        (log / file).write_text("".join(f"{0.1 * i:.3f}\n" for i in range(12)))
+    whole, _ = _times(log)
+    path = log / file if log.is_dir() else log.with_name(file)
+    raw = path.read_bytes()
+    seen = set[str]()
+    for size in range(len(raw) // 2, len(raw), max(1, len(raw) // 60)):
+        path.write_bytes(raw[:size])
+        cut, ledger = _times(log)
+
+        for topic, times in whole.items():
+            assert cut[topic] <= times, (size, topic)
+            account = ledger.topic(topic)
+            assert account.used + account.dropped.total() == len(times), (size, topic)
+            seen.update(account.dropped)
+    assert seen
+
+    path.write_bytes(raw[: len(raw) // 2])
+    assert cli.run(["info", str(log)]) == 3
+    said = " ".join(capsys.readouterr().out.split())
+    assert any(reason in said for reason in seen)
 
 
 @pytest.mark.parametrize(
@@ -72,6 +167,23 @@ def test_a_log_cut_before_its_first_topic_is_unreadable_and_not_wrong_usage(
     err = capsys.readouterr().err
     assert err.startswith(f"crosscue: {log}: ")
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "flags", ["replay -o {out} --vehicle {car}", "decode -o {out}", "convert -o {out}.mcap"]
+)
+def test_commands_that_read_a_damaged_log_name_salvage(
+    drive: DriveFiles, flags: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "damaged.mcap"
+    log.write_bytes(drive.log.read_bytes()[: drive.log.stat().st_size * 3 // 4])
+    command, _, rest = flags.partition(" -")
+    argv = f"-{rest}".format(out=tmp_path / "out", car=drive.vehicle).split()
+
+    assert cli.run([command, str(log), *argv]) == 3
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert "crosscue convert" in said
+    assert "--salvage" in said
 
 
 def test_a_topic_that_a_whole_log_lacks_is_wrong_usage(

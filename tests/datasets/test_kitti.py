@@ -116,7 +116,7 @@ def test_the_tracking_layout_gives_made_up_times_and_says_so(tmp_path: Path) -> 
 
     assert times(by_topic["oxts/gnss"]) == [100_000_000 * i for i in range(30)]
     assert times(by_topic["image_02"]) == [100_000_000 * i for i in range(30) if i != 4]
-    assert ledger.topic("image_02").skipped == {"a picture without its time": 1}
+    assert ledger.topic("image_02").dropped == {"a picture without its time": 1}
     assert ledger.notices == [
         "0003: the tracking set keeps no times; they are made from frame numbers at 10 Hz, "
         "starting at 0 (distance over speed says 100.0 ms a frame)"

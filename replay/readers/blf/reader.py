@@ -50,6 +50,7 @@ _PIECE_BYTES: Final = 1 << 16
 _WASTE: Final = 8
 """How many times the file's size may be read from containers that turn out damaged."""
 _NOT_READ: Final = "outside the window"
+NOT_CLOSED: Final = "file was not closed by its writer"
 _UNCLOSED: Final = "the writer never closed the file: what it had not yet written is missing"
 
 
@@ -115,6 +116,16 @@ class BlfLog(Closing):
 
     def close(self) -> None:
         """Nothing stays open between passes."""
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """Bytes that the header declares and the file lacks; see ``KnowsItsEnd``."""
+        declared, size = self._header.file_bytes, self._path.stat().st_size
+        if not self._header.objects:
+            if self._names:
+                ledger.drop("", NOT_CLOSED, None, _UNCLOSED)
+        elif size + PADDING_MAX < declared:
+            detail = f"the header declares {declared} bytes, the file has {size}"
+            ledger.drop("", "file is cut", None, detail)
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """All frames, a stretch of containers at a time; see ``Log.read``."""
@@ -195,7 +206,7 @@ class _Pass:
         detail = "; ".join(tally.places)
         missing = header.objects - tally.counted
         if not header.objects and tally.counted:
-            ledger.drop("", "file was not closed by its writer", None, _UNCLOSED)
+            ledger.drop("", NOT_CLOSED, None, _UNCLOSED)
         if not header.objects and not tally.counted:
             ledger.notice("no objects: nothing was recorded, or the writer was stopped early")
         if self._skips and missing > 0:

@@ -92,6 +92,8 @@ _STEP_MAX_NS: Final = 86_400 * NANOS
 _IDENTIFIER: Final = re.compile(r"([0-9A-Fa-f]{1,10})([xX]?)")
 _TWO_HEX: Final = re.compile(r"[0-9A-Fa-f]{2}")
 NOT_UNDERSTOOD: Final = "line not understood"
+NOT_ENDED: Final = "no 'End TriggerBlock': the log may be cut"
+_BEGIN_WORDS, _END_WORDS = b"begin triggerblock", b"end triggerblock"
 _CANFD: Final = np.uint64(int.from_bytes(b"CANFD", "little"))
 _BEGINS, _ENDS = "begins", "ends"
 
@@ -180,6 +182,12 @@ class Asc(Dialect):
         out[begin:] = self._stretch(t_ns[begin:])
         return out
 
+    def unended(self, head: bytes, tail: bytes) -> str:
+        """An ``End TriggerBlock`` after the last beginning of one."""
+        begins = max(head.lower().rfind(_BEGIN_WORDS), tail.lower().rfind(_BEGIN_WORDS))
+        is_open = tail.lower().rfind(_END_WORDS) <= tail.lower().rfind(_BEGIN_WORDS)
+        return NOT_ENDED if begins >= 0 and is_open else ""
+
     def finish(self, ledger: Ledger) -> None:
         """Say what the clock rests on, and whether the writer came to its end."""
         if self._has_date:
@@ -193,7 +201,7 @@ class Asc(Dialect):
         if self._is_relative and not ledger.is_whole:
             ledger.notice("times are relative to the line before: each lost line shifts later ones")
         if self._block == _BEGINS:
-            ledger.drop("", "no 'End TriggerBlock': the log may be cut", None)
+            ledger.drop("", NOT_ENDED, None)
         elif not self._block and not self._has_events:
             ledger.drop("", "a header and nothing after it: the log may be cut", None)
 

@@ -164,6 +164,11 @@ class Dialect(ABC):
         del met
         return _NO_INTS
 
+    def unended(self, head: bytes, tail: bytes) -> str:
+        """What a whole log has and this one lacks, as its first and last bytes show; or empty."""
+        del head, tail
+        return ""
+
     def finish(self, ledger: Ledger) -> None:
         """Say what the whole file showed, once it is read."""
         del ledger
@@ -235,6 +240,21 @@ class TextCanLog(Closing):
             ledger.drop("", "file changed while it was read", None, f"had {size} bytes before")
         scribe.dialect.finish(ledger)
         ledger.integrity = scribe.dialect.integrity
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """What the last 64 KiB show; see ``KnowsItsEnd``."""
+        head, dialect = head_of(self._path), self._dialect()
+        with self._path.open("rb") as file:
+            file.seek(max(0, self._path.stat().st_size - HEAD_BYTES))
+            tail = file.read(HEAD_BYTES)
+        last = tail[tail.rfind(b"\n") + 1 :]
+        if last not in (b"", _DOS_END):
+            outcome = dialect.last(last) if len(last) <= LINE_MAX else None
+            if outcome is None or isinstance(outcome, Frame | Damage):
+                detail = f"{len(last)} bytes without a line end: {last[:_EXCERPT]!r}"
+                ledger.drop("", "file may be cut in its last line", None, detail)
+        if missing := dialect.unended(head, tail):
+            ledger.drop("", missing, None)
 
     def _peek(self, dialect: Dialect) -> None:
         ledger = Ledger(str(self._path))

@@ -14,7 +14,7 @@ from crosscue.replay.columns import BLOCK_BYTES, Block, Images, Messages, Topic
 from crosscue.replay.decode.coding import MAGIC_BYTES, coding_of
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
-from crosscue.replay.log import Selection
+from crosscue.replay.log import EVERYTHING, Selection
 from crosscue.replay.readers.timed_files import TimedFiles, is_inside
 
 from .damage import CHECKED, damage_of
@@ -46,19 +46,34 @@ class PictureFiles:
             for sentence in self.files.notices:
                 ledger.notice(sentence)
             yield from self._blocks(ledger, selection, limits)
-        missing = self.files.missing_ns[is_inside(self.files.missing_ns, selection)]
-        first_ns = int(missing[0]) if len(missing) else None
-        ledger.drop(name, "a time without its picture", len(missing), "", first_ns)
+        self._drop_missing(ledger, selection)
         if selection.start_ns is None and selection.end_ns is None:
             ledger.settle(name)
 
+    def report_missing(self, ledger: Ledger) -> None:
+        """Pictures without a time, times without a picture; no picture is opened."""
+        for sentence in self.files.notices:
+            ledger.notice(sentence)
+        self._drop_timeless(ledger)
+        self._drop_missing(ledger, EVERYTHING)
+
+    def _drop_timeless(self, ledger: Ledger) -> int:
+        """Drop the pictures without a time, and count them."""
+        without = [p.name for p, t in zip(self.files.paths, self.files.t_ns, strict=True) if t < 0]
+        reason = "a picture without its time"
+        ledger.drop(self.topic.name, reason, len(without), _few(without))
+        return len(without)
+
+    def _drop_missing(self, ledger: Ledger, selection: Selection) -> None:
+        missing = self.files.missing_ns[is_inside(self.files.missing_ns, selection)]
+        first_ns = int(missing[0]) if len(missing) else None
+        ledger.drop(self.topic.name, "a time without its picture", len(missing), "", first_ns)
+
     def _blocks(self, ledger: Ledger, selection: Selection, limits: Limits) -> Iterator[Block]:
         name = self.topic.name
-        without = [p.name for p, t in zip(self.files.paths, self.files.t_ns, strict=True) if t < 0]
-        ledger.find(name, len(without))
-        ledger.skip(name, "a picture without its time", len(without), _few(without))
+        without = self._drop_timeless(ledger)
         wanted = is_inside(self.files.t_ns, selection) & (self.files.t_ns >= 0)
-        outside = len(self.files.paths) - len(without) - int(np.count_nonzero(wanted))
+        outside = len(self.files.paths) - without - int(np.count_nonzero(wanted))
         ledger.find(name, outside)
         ledger.skip(name, NOT_ASKED_TIME, outside)
         batch = _Batch(name)

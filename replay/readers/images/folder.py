@@ -42,6 +42,10 @@ class ImageFolder(Closing):
         """The pictures in natural order of their names; see ``Log.read``."""
         yield from self._pictures.read(ledger, selection, self._limits)
 
+    def report_missing(self, ledger: Ledger) -> None:
+        """Pictures without a time, times without a picture; see ``KnowsItsEnd``."""
+        self._pictures.report_missing(ledger)
+
     def close(self) -> None:
         """Nothing is held open."""
 

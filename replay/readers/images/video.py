@@ -131,6 +131,17 @@ class Video(Closing):
         ledger.drop(topic.name, "a time without its picture", index.missing)
         self._settle(index, ledger)
 
+    def report_missing(self, ledger: Ledger) -> None:
+        """Where container and time file count differently; see ``KnowsItsEnd``."""
+        (topic,) = self.topics
+        if self._times is None or self._times.period is not None or topic.declared is None:
+            return
+        for sentence in self._times.notices:
+            ledger.notice(sentence)
+        surplus = topic.declared - len(self._times.t_ns)
+        ledger.drop(topic.name, "a picture without its time", max(surplus, 0))
+        ledger.drop(topic.name, "a time without its picture", max(-surplus, 0))
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()
@@ -177,6 +188,7 @@ class Video(Closing):
             t_ns = np.array(own, dtype=np.int64)
             self._shown_order(pts, notices)
             return _Index(t_ns, tuple(is_damaged), stopped, tuple(notices), 0)
+        notices += self._times.notices
         shown = self._shown_order(pts, notices)
         lines = len(self._times.t_ns) if self._times.period is None else len(pts)
         if self._times.period is not None:
@@ -243,10 +255,11 @@ class Video(Closing):
         if index.is_damaged[i]:
             ledger.drop(name, "packet damaged", 1, f"packet {i}", t_ns)
             return False
-        reason = None
         if t_ns == NO_TIME:
-            reason = "a picture without its time"
-        elif not wanted:
+            ledger.drop(name, "a picture without its time", 1, f"packet {i}: {size} bytes")
+            return False
+        reason = None
+        if not wanted:
             reason = NOT_ASKED_TIME
         elif size > self._limits.message_bytes:
             reason = "picture over the size limit"

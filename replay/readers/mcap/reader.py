@@ -30,7 +30,7 @@ from crosscue.replay.seal.touched import Touched
 
 from .bytes import ByteFile, RangedByteFile
 from .channels import TopicBook
-from .recording_pass import read_segments
+from .recording_pass import CUT, INCOMPLETE, read_segments
 from .segments import Segment, find_segments, has_whole_summary
 from .window import find_window
 
@@ -95,6 +95,15 @@ class McapLog(Closing):
         yield from read_segments(
             self._file, self._segments, self._book, self._limits, ledger, selection
         )
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """Recordings in it without an end; see ``KnowsItsEnd``."""
+        for segment in self._segments:
+            if segment.after:
+                ledger.drop("", INCOMPLETE, None, segment.after)
+            elif not segment.has_end:
+                detail = f"no data end record and footer up to byte {segment.end}"
+                ledger.drop("", CUT, None, detail)
 
     @property
     def beginning(self) -> Selection:

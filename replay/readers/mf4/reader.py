@@ -186,6 +186,21 @@ class Mf4Log(Closing):
             _settle(source, account, ledger)
         self._close_account(accounts.values(), ledger)
 
+    def report_missing(self, ledger: Ledger) -> None:
+        """Blocks that are damaged or beyond the file's end, and records; see ``KnowsItsEnd``."""
+        if self._broken:
+            ledger.drop("", "structure damaged", None, self._broken)
+        for stored in self._stored:
+            if stored.stream.missing:
+                ledger.drop("", "damaged data", None, stored.stream.missing)
+            elif not stored.unsorted:
+                for source in stored.sources:
+                    size = source.group.record_bytes
+                    there = stored.stream.size // size if size else 0
+                    _settle(source, _Account(met=min(there, source.declared or 0)), ledger)
+        if not self._header.is_finalized:
+            ledger.notice("not finalized by the logger; only reading it shows whether it is cut")
+
     def _sources(self) -> Iterator[_Source]:
         return (source for stored in self._stored for source in stored.sources)
 

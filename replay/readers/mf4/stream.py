@@ -49,6 +49,16 @@ class Stream:
         last = self._stretches[-1] if self._stretches else None
         self.size = last.start + last.size if last else 0
 
+    @property
+    def missing(self) -> str:
+        """What is damaged or beyond the file's end, known without reading; empty if nothing is."""
+        for k, one in enumerate(self._stretches):
+            if k in self._damage:
+                return self._damage[k]
+            if one.at + one.stored > self._blocks.size:
+                return f"the file ends before byte {one.at + one.stored}"
+        return self.broken
+
     def read(self, start: int, count: int) -> bytes:
         """The bytes from ``start`` on: ``count``, or fewer up to damage or the stream's end."""
         parts: list[bytes] = []

@@ -37,6 +37,7 @@ NumPy asks the kernel for huge pages from 4 MiB on; a buffer of its own for each
 page faults than the copy.
 """
 
+DAMAGED_RECORD: Final = "damaged record"
 OTHER_TYPE: Final = "another message type on the same topic"
 NO_CONNECTION: Final = "message of an unknown connection"
 TWO_RECORDS: Final = "the records of a connection differ"
@@ -102,12 +103,13 @@ class Roster:
 
 @dataclass(slots=True)
 class _Checked:
-    """How many chunks could be checked, by how."""
+    """How many chunks could be checked, by how, and how many messages lie outside chunks."""
 
     bz2: int = 0
     lz4: int = 0
     unchecked: int = 0
     left: int = 0
+    loose: int = 0
 
     def words(self) -> str:
         """The sentence for ``Ledger.integrity``."""
@@ -120,6 +122,11 @@ class _Checked:
             said.append(
                 f"{self.unchecked} chunks carry no checksum: a changed payload byte in them cannot "
                 "be seen"
+            )
+        if self.loose:
+            said.append(
+                f"{self.loose} messages outside chunks carry no checksum: a changed byte in them "
+                "cannot be seen"
             )
         if self.left:
             read = self.bz2 + self.lz4 + self.unchecked
@@ -188,6 +195,8 @@ class Pass:
         self._ledger = ledger
         self._selection = selection
         self._batch = _Batch()
+        self._owed = Counter[int]()
+        self._owed_by: tuple[int, int] | None = None
         self._checked = _Checked()
 
     def blocks(self, index_at: int) -> Iterator[Block]:
@@ -205,7 +214,8 @@ class Pass:
             if window is None:
                 known = sorted(self._contents.infos)
                 yield from self._taken(
-                    units(self._file, self._first, known, self._limits), index_at
+                    units(self._file, self._first, known, self._limits, self._contents.connections),
+                    index_at,
                 )
             else:
                 yield from self._windowed(window, index_at)
@@ -232,13 +242,14 @@ class Pass:
         """Blocks of the chunks that the index names; the others are looked at if it is wrong."""
         self._inside = window
         self._file.expect(window.ranges())
-        yield from self._taken(window.units(self._file, self._limits), index_at)
+        connections = self._contents.connections
+        yield from self._taken(window.units(self._file, self._limits, connections), index_at)
         self._inside = None
         if self._doubt:
             self._ledger.notice(
                 f"the index was not trusted after all ({self._doubt}); every chunk was looked at"
             )
-            others = window.units(self._file, self._limits, is_read=False)
+            others = window.units(self._file, self._limits, connections, is_read=False)
             yield from self._taken(others, index_at)
             return
         for info in window.left:
@@ -248,6 +259,8 @@ class Pass:
     def _taken(self, found: Iterator[ChunkUnit | Record | Gap], index_at: int) -> Iterator[Block]:
         for unit in found:
             taken = None
+            if not isinstance(unit, Record):
+                self._settle_owed()
             if isinstance(unit, ChunkUnit):
                 taken = self._chunk(unit)
             elif isinstance(unit, Gap):
@@ -259,6 +272,7 @@ class Pass:
                 if not self._batch.has_room(taken[0]):
                     yield from self._flush()
                 self._batch.add(*taken)
+        self._settle_owed()
 
     def _pass_over(self, info: ChunkInfo, asked: Selection) -> None:
         """Account for a chunk's messages, none of which is asked for, without reading them."""
@@ -271,9 +285,17 @@ class Pass:
     def _record(self, record: Record) -> tuple[bytes, ChunkRows] | None:
         """Take in a record outside chunks; a message as a chunk of its own."""
         if record.op == MESSAGE:
+            self._checked.loose += 1
+            conn_number = record.u32(b"conn")
+            if not self._roster.knows(conn_number):
+                where = f"connection {conn_number}, bytes {record.at} to {record.end}"
+                self._ledger.drop("", NO_CONNECTION, 1, where)
+                return None
+            if self._owed[conn_number] > 0:
+                self._owed[conn_number] -= 1
             if record.size > self._limits.message_bytes:
                 self._ledger.drop(
-                    self._roster.topic_of(record.u32(b"conn")),
+                    self._roster.topic_of(conn_number),
                     "message over the size limit",
                     1,
                     f"{record.size} bytes at byte {record.at}",
@@ -282,7 +304,7 @@ class Pass:
             raw = self._file.bytes_at(record.body, record.end)
             conn, log_ns, start, stop = (
                 np.array([value], dtype=np.int64)
-                for value in (record.u32(b"conn"), record.time_ns(b"time"), 0, len(raw))
+                for value in (conn_number, record.time_ns(b"time"), 0, len(raw))
             )
             return raw, ChunkRows(conn, log_ns, start, stop)
         if record.op == CONNECTION and record.size <= 2 * self._limits.schema_bytes:
@@ -319,17 +341,27 @@ class Pass:
 
     def _gap(self, gap: Gap, index_at: int) -> None:
         where = f"bytes {gap.at} to {gap.stop}"
-        if self._contents.infos and self._contents.is_complete:
-            missing: Counter[int] = Counter()
-            for info in self._contents.infos.values():
-                if gap.at <= info.at < gap.stop:
-                    missing.update(info.counts)
-            self._lose(missing, "damaged record", where)
+        within = [info for at, info in self._contents.infos.items() if gap.at <= at < gap.stop]
+        if (
+            self._contents.infos
+            and self._contents.is_complete
+            and (within or not self._checked.loose)
+        ):
+            # Messages of a chunk without its head may be found behind the gap one by one.
+            self._owed_by = gap.at, gap.stop
+            for info in within:
+                self._owed.update(info.counts)
         elif 0 < index_at <= gap.at:
             self._ledger.notice(f"the index section is damaged: {where}")
         else:
-            reason = CUT if gap.stop == self._file.size else "damaged record"
+            reason = CUT if gap.stop == self._file.size else DAMAGED_RECORD
             self._ledger.drop("", reason, None, where)
+
+    def _settle_owed(self) -> None:
+        """Account for what a gap hid, once all that could be found behind it was met."""
+        if self._owed_by is not None:
+            self._lose(self._owed, DAMAGED_RECORD, "bytes {} to {}".format(*self._owed_by))
+        self._owed, self._owed_by = Counter(), None
 
     def _lose(self, missing: Counter[int], reason: str, detail: str) -> None:
         """Account for a known number of rows by connection; none at all is only a notice."""
@@ -359,9 +391,26 @@ class Pass:
         rows = read_chunk(inflated, unit.entries, limits.schema_bytes, limits.records_per_chunk)
         for connection in rows.connections:
             self._meet(connection, inflated.is_checked)
+        self._say_if_misframed(unit, inflated, where)
         self._count_check(unit, inflated)
         self._compare(unit, inflated, rows, where)
-        return inflated.raw, rows
+        return inflated.raw, self._of_known(rows, where)
+
+    def _say_if_misframed(self, unit: ChunkUnit, inflated: Inflated, where: str) -> None:
+        """Its own length was wrong: say so, and account for bytes between it and what follows."""
+        if unit.record.end != unit.stored_stop:
+            self._ledger.notice(f"the length of the {where} is damaged; its content was found")
+        if inflated.unused and not unit.is_framed:
+            begin = unit.stored_stop - inflated.unused
+            self._ledger.drop("", DAMAGED_RECORD, None, f"bytes {begin} to {unit.stored_stop}")
+
+    def _of_known(self, rows: ChunkRows, where: str) -> ChunkRows:
+        """Without messages of connections that no record describes; these are dropped."""
+        unknown = [conn for conn in rows.counts() if not self._roster.knows(conn)]
+        for conn in unknown:
+            count = rows.counts()[conn]
+            self._ledger.drop("", NO_CONNECTION, count, f"connection {conn}, {where}")
+        return rows.take(~np.isin(rows.conn, unknown)) if unknown else rows
 
     def _count_check(self, unit: ChunkUnit, inflated: Inflated) -> None:
         if not inflated.is_checked:
@@ -431,9 +480,7 @@ class Pass:
         place: dict[int, int] = {}
         for number, count in tally(conn).items():
             name = self._roster.topic_of(number)
-            if not self._roster.knows(number):
-                self._ledger.drop("", NO_CONNECTION, count, f"connection {number}")
-            elif not self._roster.fits_topic(number):
+            if not self._roster.fits_topic(number):
                 self._ledger.find(name, count)
                 self._ledger.skip(name, OTHER_TYPE, count, f"connection {number}")
             else:

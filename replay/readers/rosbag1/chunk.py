@@ -59,12 +59,14 @@ class Inflated:
         is_checked: A checksum over all of ``raw`` was verified.
         fault: Why ``raw`` is not the whole chunk, or empty.
         sizes: What was declared and what came out, where they differ; else empty.
+        unused: Stored bytes behind the end of the compressed content.
     """
 
     raw: bytes
     is_checked: bool
     fault: str = ""
     sizes: str = ""
+    unused: int = 0
 
 
 def inflate(compression: bytes, stored: bytes, size: int, is_framed: bool) -> Inflated:
@@ -92,7 +94,7 @@ def inflate(compression: bytes, stored: bytes, size: int, is_framed: bool) -> In
 def _inflate_bz2(stored: bytes, size: int) -> Inflated:
     stream = bz2.BZ2Decompressor()
     raw = stream.decompress(stored, max_length=size + 1)
-    return _ended(raw, size, stream.eof, is_checked=True)
+    return _ended(raw, size, stream.eof, True, stream.unused_data)
 
 
 def _inflate_lz4(stored: bytes, size: int) -> Inflated:
@@ -101,12 +103,14 @@ def _inflate_lz4(stored: bytes, size: int) -> Inflated:
     stream = LZ4FrameDecompressor()
     raw = stream.decompress(stored, max_length=size + 1)
     is_checked = len(stored) > 4 and bool(stored[4] & 0x14)
-    return _ended(raw, size, bool(stream.eof), is_checked)
+    return _ended(raw, size, bool(stream.eof), is_checked, stream.unused_data)
 
 
-def _ended(raw: bytes, size: int, is_at_end: bool, is_checked: bool) -> Inflated:
+def _ended(
+    raw: bytes, size: int, is_at_end: bool, is_checked: bool, unused: bytes | None
+) -> Inflated:
     if is_at_end and len(raw) == size:
-        return Inflated(raw, is_checked)
+        return Inflated(raw, is_checked, unused=len(unused or b""))
     if is_at_end or len(raw) > size:
         produced = "more" if len(raw) > size else f"{len(raw)} bytes"
         sizes = f"inflates to {produced}, declares {size} bytes"
@@ -139,6 +143,11 @@ class ChunkRows:
     def counts(self) -> dict[int, int]:
         """Messages by connection."""
         return tally(self.conn)
+
+    def take(self, keep: NDArray[np.bool_]) -> ChunkRows:
+        """Some of the messages, and all else."""
+        columns = (self.conn[keep], self.log_ns[keep], self.start[keep], self.stop[keep])
+        return ChunkRows(*columns, self.connections, self.fault, self.fault_at)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

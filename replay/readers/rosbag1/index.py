@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -24,6 +24,7 @@ from .records import (
     entries_of,
     record_at,
 )
+from .resync import Resync
 
 ENTRY_BYTES: Final = 12
 _SEARCHED_AT_ONCE: Final = 4 << 20
@@ -37,7 +38,8 @@ class ChunkUnit:
     Attributes:
         record: The chunk record.
         stored_stop: One past the last byte that may belong to its body.
-        is_framed: Its length leads to another record or the file's end, so it is right.
+        is_framed: Its length, or the size of its plain content, leads to another record or to the
+            file's end, so it is right.
         end: Where the next unit begins.
         entries: Index records, or None if there are none or they are damaged.
     """
@@ -55,7 +57,7 @@ class Gap:
 
     Attributes:
         at: First of them.
-        stop: Where the next chunk was found, or the file's end.
+        stop: Where reading goes on, or the file's end.
     """
 
     at: int
@@ -70,11 +72,13 @@ class Contents:
         connections: By number; the first record met of each.
         infos: By byte offset of the chunk.
         is_complete: ``infos`` name every chunk of the file.
+        gaps: Stretches without a readable record, met on a walk; from byte, to byte.
     """
 
     connections: dict[int, Connection] = field(default_factory=dict)
     infos: dict[int, ChunkInfo] = field(default_factory=dict)
     is_complete: bool = False
+    gaps: list[tuple[int, int]] = field(default_factory=list)
 
 
 def read_index(file: BagFile, index_at: int, largest: int) -> Contents | None:
@@ -104,7 +108,7 @@ def learn(file: BagFile, record: Record, contents: Contents, largest: int) -> bo
 
 
 def units(
-    file: BagFile, first: int, known: list[int], limits: Limits
+    file: BagFile, first: int, known: list[int], limits: Limits, connections: Collection[int]
 ) -> Iterator[ChunkUnit | Record | Gap]:
     """Everything in the file in order: chunks with their index, other records, gaps.
 
@@ -113,31 +117,38 @@ def units(
         first: Byte offset of the first record.
         known: Sorted byte offsets at which the index says that a chunk begins.
         limits: Bounds on what an index may hold.
+        connections: Numbers of the connections known so far; may grow.
     """
-    at = first
+    at, resync = first, Resync(file, known, connections)
     while at < file.size:
         record = file.record(at)
         if record is not None and record.op == CHUNK:
-            unit = _chunk_unit(file, record, known, limits)
+            unit = _chunk_unit(file, record, known, limits, resync)
             yield unit
             at = unit.end
-        elif record is not None and record.end <= file.size:
+        elif record is not None and resync.is_believed(record):
             yield record
             at = record.end
         else:
-            onward = next_chunk(file, at + 1, known)
-            stop = file.size if onward is None else onward
+            after = resync.next(at + 1)
+            stop = file.size if after is None else after
             yield Gap(at, stop)
             at = stop
 
 
-def _chunk_unit(file: BagFile, record: Record, known: list[int], limits: Limits) -> ChunkUnit:
-    if record.end == file.size:
-        return ChunkUnit(record, record.end, is_framed=True, end=record.end)
-    if record.end < file.size and file.record(record.end) is not None:
-        entries, end = _index_records(file, record.end, limits)
-        return ChunkUnit(record, record.end, True, end, entries)
-    onward = next_chunk(file, record.body, known)
+def _chunk_unit(
+    file: BagFile, record: Record, known: list[int], limits: Limits, resync: Resync
+) -> ChunkUnit:
+    is_plain = record.fields[b"compression"] == b"none"
+    ends = [record.end, record.body + record.u32(b"size")] if is_plain else [record.end]
+    for end in ends:
+        if end == file.size:
+            return ChunkUnit(record, end, is_framed=True, end=end)
+        if end < file.size and resync.is_head(end):
+            entries, after = _index_records(file, end, limits)
+            return ChunkUnit(record, end, True, after, entries)
+    # The records of a plain chunk would be taken for such that lie outside of chunks.
+    onward = next_chunk(file, record.body, known) if is_plain else resync.next(record.body)
     stop = file.size if onward is None else onward
     if record.end <= stop and record.u32(b"size") == record.size:
         return ChunkUnit(record, record.end, is_framed=True, end=record.end)
@@ -196,9 +207,11 @@ def walk(file: BagFile, first: int, limits: Limits) -> Contents:
     contents = Contents()
     chunks: set[int] = set()
     is_whole = True
-    for unit in units(file, first, [], limits):
+    for unit in units(file, first, [], limits, contents.connections):
         if isinstance(unit, ChunkUnit):
             chunks.add(unit.record.at)
+            if unit.record.end > file.size and not unit.is_framed:
+                contents.gaps.append((unit.record.at, file.size))
             is_whole &= unit.is_framed
             if unit.entries is None or not unit.entries.counts().keys() <= (
                 contents.connections.keys()
@@ -206,6 +219,7 @@ def walk(file: BagFile, first: int, limits: Limits) -> Contents:
                 _learn_from_chunk(file, unit, contents, limits)
         elif isinstance(unit, Gap):
             is_whole = False
+            contents.gaps.append((unit.at, unit.stop))
         elif unit.op in (CONNECTION, CHUNK_INFO):
             is_whole &= learn(file, unit, contents, limits.schema_bytes)
     contents.is_complete = is_whole and bool(chunks) and chunks == contents.infos.keys()

@@ -20,7 +20,8 @@ from crosscue.replay.log import EVERYTHING, Selection
 from crosscue.replay.remote.ranges import RangedFile
 from crosscue.replay.seal.touched import Touched
 
-from .bag_pass import Pass, Roster
+from .bag_pass import DAMAGED_RECORD, Pass, Roster
+from .chunk import CUT
 from .index import Contents, read_index, walk
 from .records import BAG_HEADER, MAGIC, BagFile, RangedBagFile, Record
 from .window import find_bag_window
@@ -92,6 +93,15 @@ class BagLog(Closing):
             self._chunk_count,
         )
         yield from one.blocks(self._index_at)
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """What the index or the walk over the records found missing; see ``KnowsItsEnd``."""
+        for reason, detail in self._losses:
+            ledger.drop("", reason, None, detail)
+        for start, stop in () if self._losses else self._contents.gaps:
+            if not 0 < self._index_at <= start:
+                reason = CUT if stop == self._file.size else DAMAGED_RECORD
+                ledger.drop("", reason, None, f"bytes {start} to {stop}")
 
     @property
     def beginning(self) -> Selection:

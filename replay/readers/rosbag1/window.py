@@ -8,7 +8,7 @@ looked at and says something else itself.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -46,13 +46,18 @@ class BagWindow:
         return [edge for edge, asked in zip(edges, self.is_asked, strict=True) if asked]
 
     def units(
-        self, file: BagFile, limits: Limits, *, is_read: bool = True
+        self,
+        file: BagFile,
+        limits: Limits,
+        connections: Collection[int],
+        *,
+        is_read: bool = True,
     ) -> Iterator[ChunkUnit | Record | Gap]:
         """What lies in the chunks that are read, or in the others, in the order of the file."""
         known = [info.at for info in self.infos]
         after = dict(pairwise([*known, self.index_at]))
         for info in self._those(is_read=is_read):
-            for unit in units(file, info.at, known, limits):
+            for unit in units(file, info.at, known, limits, connections):
                 yield unit
                 end = unit.stop if isinstance(unit, Gap) else unit.end
                 if end >= after[info.at]:

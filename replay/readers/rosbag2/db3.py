@@ -93,6 +93,11 @@ class Db3Log(Closing):
         if _stamp(self._path) != self._stamp:
             ledger.drop("", "file changed while it was read", None, "read it again")
 
+    def report_missing(self, ledger: Ledger) -> None:
+        """Bytes or committed rows out of SQLite's reach; see ``KnowsItsEnd``."""
+        if self._database.damage:
+            ledger.drop("", DAMAGED_PAGE, None, self._database.damage)
+
     def close(self) -> None:
         """Release the file and any temporary copy."""
         self._database.close()

@@ -23,8 +23,8 @@ from crosscue.replay.log import EVERYTHING, Selection
 
 from .inflate import DAMAGED, inflated
 from .merge import Stream, merged
-from .metadata import read_metadata
-from .split import PACKED, Split, look_into, opened, stored_files
+from .metadata import SplitHint, read_metadata
+from .split import PACKED, PACKED_DAMAGED, Split, look_into, opened, stored_files
 
 MISSING: Final = "storage file is missing"
 UNREADABLE: Final = "storage file cannot be opened"
@@ -101,6 +101,16 @@ class FolderLog(Closing):
             for said, names in integrity.items()
         )
 
+    def report_missing(self, ledger: Ledger) -> None:
+        """Storage files that are missing, cannot be opened or are cut; see ``KnowsItsEnd``."""
+        for split in self._splits:
+            if split.fault:
+                ledger.drop("", UNREADABLE, None, split.fault)
+            for one in split.missing:
+                ledger.drop(one.topic, one.reason, one.count, f"{split.path.name}: {one.detail}")
+        for hint in self._absent():
+            ledger.drop("", MISSING, hint.count, hint.name)
+
     def close(self) -> None:
         """Nothing stays open between reads."""
 
@@ -109,7 +119,7 @@ class FolderLog(Closing):
     ) -> Stream:
         log, fault = stack.enter_context(opened(split.path, self._limits))
         if fault:
-            ledger.drop("", "compressed file", None, fault)
+            ledger.drop("", PACKED_DAMAGED, None, fault)
         elif split.path.name.endswith(PACKED):
             ledger.notice("was unpacked to a temporary file")
         names = frozenset(topic.name for topic in split.topics)
@@ -131,12 +141,16 @@ class FolderLog(Closing):
             else:
                 yield from _unpacked(block, self._limits, ledger)
 
+    def _absent(self) -> list[SplitHint]:
+        """Storage files that ``metadata.yaml`` lists and the folder lacks."""
+        held = {split.path.name for split in self._splits}
+        present = held | {name.removesuffix(PACKED) for name in held} | {n + PACKED for n in held}
+        return [hint for hint in self._metadata.splits if hint.name not in present]
+
     def _settle(self, ledger: Ledger) -> None:
         """Compare with what ``metadata.yaml`` says and account for files that are not there."""
         metadata = self._metadata
-        held = {split.path.name for split in self._splits}
-        present = held | {name.removesuffix(PACKED) for name in held} | {n + PACKED for n in held}
-        absent = [hint for hint in metadata.splits if hint.name not in present]
+        absent = self._absent()
         shut = [split for split in self._splits if split.fault]
         gone = [(hint.name, MISSING) for hint in absent] + [
             (split.path.name, UNREADABLE) for split in shut

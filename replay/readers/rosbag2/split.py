@@ -12,8 +12,9 @@ from typing import Final
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import CrosscueError, LogError
 from crosscue.replay.files.partial_file import Scratch
+from crosscue.replay.ledger import Detail, Ledger
 from crosscue.replay.limits import MIB, Limits
-from crosscue.replay.log import Log
+from crosscue.replay.log import Log, report_missing
 from crosscue.replay.opening import open_log, open_unsealed
 
 from .db3 import Db3Log
@@ -21,6 +22,7 @@ from .metadata import Metadata
 
 STORED: Final = (".db3", ".mcap")
 PACKED: Final = ".zstd"
+PACKED_DAMAGED: Final = "compressed file"
 INFLATE_RATIO: Final = 1000
 """A packed file may grow to this many times its size, or to ``Limits.chunk_bytes`` if larger."""
 
@@ -39,12 +41,14 @@ class Split:
         topics: What it holds.
         range_ns: First and last log time where known.
         fault: Why it cannot be opened, or empty.
+        missing: What its opening shows to be missing.
     """
 
     path: Path
     topics: tuple[Topic, ...] = ()
     range_ns: tuple[int, int] | None = None
     fault: str = ""
+    missing: tuple[Detail, ...] = ()
 
 
 def stored_files(folder: Path, metadata: Metadata, notices: list[str]) -> list[Path]:
@@ -77,9 +81,16 @@ def look_into(path: Path, metadata: Metadata, limits: Limits) -> Split:
     """Open a storage file for a moment to learn what it holds."""
     hint = next((hint for hint in metadata.splits if hint.name == path.name), None)
     try:
-        with opened(path, limits, open_unsealed) as (log, _):
+        with opened(path, limits, open_unsealed) as (log, fault):
             range_ns = log.time_range_ns if isinstance(log, Db3Log) else None
-            return Split(path, log.topics, range_ns or (hint.range_ns if hint else None))
+            ledger = Ledger(str(path))
+            if fault:
+                ledger.drop("", PACKED_DAMAGED, None, fault)
+            report_missing(log, ledger)
+            missing = tuple(ledger.drops())
+            return Split(
+                path, log.topics, range_ns or (hint.range_ns if hint else None), missing=missing
+            )
     except (CrosscueError, OSError) as error:
         return Split(path, fault=str(error))
 

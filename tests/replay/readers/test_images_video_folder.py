@@ -69,8 +69,8 @@ def test_names_in_the_time_file_decide_and_the_rest_is_told(tmp_path: Path) -> N
 
     assert shades(blocks) == [(1.5, picture(0)), (0.5, picture(2))]
     account = ledger.topic("front")
-    assert account.skipped == {"a picture without its time": 1}
-    assert account.dropped == {"a time without its picture": 1}
+    assert account.dropped["a picture without its time"] == 1
+    assert account.dropped["a time without its picture"] == 1
     assert "frame_1.png" in ledger.details[0].detail
 
 
@@ -95,7 +95,7 @@ def test_counts_that_differ_without_a_reason_are_never_zipped_in_silence(tmp_pat
 
     assert of_fewer.topic("fewer").dropped == {"a time without its picture": 2}
     assert "paired in order from the first" in of_fewer.notices[0]
-    assert of_more.topic("more").skipped == {"a picture without its time": 2}
+    assert of_more.topic("more").dropped == {"a picture without its time": 2}
     assert any("7 files and 5 times" in notice for notice in of_more.notices)
 
 

@@ -1,0 +1,144 @@
+"""Where the records of a ROS 1 bag go on behind damaged bytes outside its chunks.
+
+Outside chunks nothing but its own length says where a record ends. A message there is believed if
+it leads to another record, to one whose head is damaged but still recognisable, or to the file's
+end. Behind damage, reading goes on at the next chunk that the index names, or at the first records
+before it that stand in a row and are plausible: kinds, sizes, known connections, near times.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Sequence
+from typing import Final
+
+from .records import (
+    BAG_HEADER,
+    CHUNK,
+    CHUNK_INFO,
+    INDEX,
+    MESSAGE,
+    BagFile,
+    Record,
+    record_at,
+)
+
+IN_A_ROW: Final = 3
+"""Plausible records in a row that are believed, or fewer up to the file's end."""
+_SEARCHED_AT_ONCE: Final = 4 << 20
+_OP: Final = b"\x04\x00\x00\x00op="
+_BEFORE_OP: Final = 128
+_HEADER_MAX: Final = 256
+"""Longest header of a record to go on at."""
+_DAY_NS: Final = 86_400 * 10**9
+_FIELD: Final = re.compile(
+    rb"(.{4})(op|conn|time|compression|size|ver|count|topic|chunk_pos|start_time|end_time)=",
+    re.DOTALL,
+)
+
+
+class Resync:
+    """Judges the records outside chunks and finds the next ones behind damage."""
+
+    def __init__(self, file: BagFile, known: Sequence[int], connections: Collection[int]) -> None:
+        """Nothing is read yet.
+
+        Args:
+            file: The bag.
+            known: Sorted byte offsets at which the index says that a chunk begins.
+            connections: Numbers of the connections met so far; may grow. If empty, any is taken.
+        """
+        self._file = file
+        self._known = known
+        self._connections = connections
+        self._near_ns: int | None = None
+
+    def is_believed(self, record: Record) -> bool:
+        """Does a record outside chunks end where its length says?"""
+        if record.end > self._file.size:
+            return False
+        if record.op != MESSAGE:
+            return True
+        is_right = record.end == self._file.size or self.is_head(record.end)
+        if is_right:
+            self._near_ns = record.time_ns(b"time")
+        return is_right
+
+    def next(self, at: int) -> int | None:
+        """Where reading goes on at or after ``at``; None if nowhere."""
+        place = next((k for k in self._known if k >= at and self._is_chunk(k)), None)
+        found = self._searched(at, self._file.size if place is None else place)
+        return place if found is None else found
+
+    def _is_chunk(self, at: int) -> bool:
+        record = self._file.record(at)
+        return record is not None and record.op == CHUNK
+
+    def is_head(self, at: int) -> bool:
+        """Does a record begin at ``at``, perhaps with a damaged head?"""
+        return self._file.record(at) is not None or _was_head(
+            self._file.bytes_at(at, at + _HEADER_MAX)
+        )
+
+    def _searched(self, at: int, stop: int) -> int | None:
+        """The first plausible records from ``at`` on that begin before ``stop``."""
+        while at < stop:
+            window = self._file.bytes_at(at, at + _SEARCHED_AT_ONCE + _HEADER_MAX)
+            found = -1
+            while (found := window.find(_OP, found + 1)) >= 0:
+                for start in range(max(0, found - _BEFORE_OP), found):
+                    if at + start >= stop:
+                        return None
+                    if _heads_record(window, start, found) and self._goes_on(at + start):
+                        return at + start
+            at += _SEARCHED_AT_ONCE
+        return None
+
+    def _goes_on(self, at: int) -> bool:
+        """Do plausible records in a row begin at ``at``?"""
+        near_ns = self._near_ns
+        for n in range(IN_A_ROW):
+            if at == self._file.size:
+                return n > 0
+            record = self._file.record(at)
+            if record is None or not self._is_plausible(record, near_ns):
+                return False
+            if record.end > self._file.size:
+                return n > 0
+            if record.op == CHUNK:
+                return True
+            near_ns = record.time_ns(b"time") if record.op == MESSAGE else near_ns
+            at = record.end
+        return True
+
+    def _is_plausible(self, record: Record, near_ns: int | None) -> bool:
+        if record.op == INDEX:
+            return record.u32(b"ver") == 1 and record.size == 12 * record.u32(b"count")
+        if record.op == CHUNK_INFO:
+            return record.u32(b"ver") == 1 and record.size == 8 * record.u32(b"count")
+        if record.op != MESSAGE:
+            return record.op != BAG_HEADER
+        if self._connections and record.u32(b"conn") not in self._connections:
+            return False
+        return near_ns is None or abs(record.time_ns(b"time") - near_ns) <= _DAY_NS
+
+
+def _heads_record(window: bytes, start: int, op_at: int) -> bool:
+    length = int.from_bytes(window[start : start + 4], "little")
+    if not op_at + len(_OP) <= start + 4 + length <= start + _HEADER_MAX:
+        return False
+    return record_at(window, start) is not None
+
+
+def _was_head(head: bytes) -> bool:
+    """Are these the first bytes of a record whose header has one damaged field, or length?"""
+    fields = [
+        (found[2], found.start(), found.start() + 4 + int.from_bytes(found[1], "little"))
+        for found in _FIELD.finditer(head)
+    ]
+    if len(fields) < 2 or fields[0][1] < 4:
+        return False
+    if any(end == 4 + int.from_bytes(head[:4], "little") for _, _, end in fields):
+        return True
+    first, second = fields[:2]
+    return first[0] == b"op" and first[1] == 4 and first[2] == second[1]
