@@ -36,6 +36,11 @@ _EXPORTS: Final = {
     "LogTopic": "eval.interface.logs",
     "CameraFrame": "eval.interface.logs",
     "Signals": "eval.interface.logs",
+    "plugins": "eval.interface.plugins",
+    "CueSpec": "replay.vehicle.cue_spec",
+    "Format": "replay.formats",
+    "DataSet": "replay.formats",
+    "PluginWarning": "replay.plugins",
     "CrosscueError": "replay.errors",
     "UsageError": "replay.errors",
     "LogError": "replay.errors",
@@ -62,6 +67,7 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.logs import Signals as Signals
     from crosscue.eval.interface.logs import Topics as Topics
     from crosscue.eval.interface.logs import open as open  # noqa: A004
+    from crosscue.eval.interface.plugins import plugins as plugins
     from crosscue.replay.errors import AccountError as AccountError
     from crosscue.replay.errors import CrosscueError as CrosscueError
     from crosscue.replay.errors import EmptyResultError as EmptyResultError
@@ -75,7 +81,11 @@ if TYPE_CHECKING:
     from crosscue.replay.errors import UnknownFormatError as UnknownFormatError
     from crosscue.replay.errors import UsageError as UsageError
     from crosscue.replay.errors import VehicleError as VehicleError
+    from crosscue.replay.formats import DataSet as DataSet
+    from crosscue.replay.formats import Format as Format
     from crosscue.replay.losses import LossWarning as LossWarning
+    from crosscue.replay.plugins import PluginWarning as PluginWarning
+    from crosscue.replay.vehicle.cue_spec import CueSpec as CueSpec
 else:
 
     def __getattr__(name: str) -> object:

@@ -15,10 +15,11 @@ from importlib.metadata import entry_points
 from typing import Any, Final, cast
 
 from crosscue.replay.errors import UsageError, VehicleError
+from crosscue.replay.plugins import GROUPS
 
 from .base import Detector
 
-GROUP: Final = "crosscue.detectors"
+GROUP: Final = GROUPS["detector"]
 
 BUILTIN: Final[Mapping[str, str]] = {
     "mask-rcnn": "crosscue.detectors.networks.mask_rcnn.detector:build",

@@ -63,6 +63,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "study landmarks": ("study.landmarks", "who reaches the goal, by strategy, density and rate"),
     "study field": ("study.field", "the field protocol, simulated, through logs and the replay"),
     "study drive": ("study.drive", "one simulated drive: picture, log, replay, recording"),
+    "plugins": ("plugins", "detectors, cues, readers and data sets of other packages"),
     "demo": ("demo", "make a small drive, replay it, score it, show it"),
 }
 

@@ -6,11 +6,15 @@ A new format is one file and one line in ``FORMATS``: a module with a function
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
 from .errors import LogError, UnknownFormatError
+from .plugins import loaded
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +32,20 @@ class Format:
     markers: tuple[str, ...]
     opener: str
     says: str
+
+
+@dataclass(frozen=True, slots=True)
+class DataSet:
+    """A data set: a format whose logs carry their own truth.
+
+    Attributes:
+        format: How its logs are known and opened.
+        truth: ``module:function`` from a log's path and a folder to the ``truth.json`` that it
+            writes there.
+    """
+
+    format: Format
+    truth: str
 
 
 FORMATS: Final[dict[str, Format]] = {
@@ -82,6 +100,23 @@ FORMATS: Final[dict[str, Format]] = {
 """Folders are tried in this order, so data sets come before loose images."""
 
 
+def known_formats() -> dict[str, Format]:
+    """Every format by name: our own, then those of installed readers and data sets."""
+    return _formats_on(tuple(sys.path))
+
+
+@lru_cache(maxsize=4)
+def _formats_on(path: tuple[str, ...]) -> dict[str, Format]:
+    """Looked up once for each ``sys.path``: reading all installed packages' names takes 30 ms."""
+    found = FORMATS | dict(loaded("reader", Format, FORMATS))
+    return found | {name: one.format for name, one in data_sets(found).items()}
+
+
+def data_sets(taken: Collection[str] = ()) -> dict[str, DataSet]:
+    """The data sets of installed packages, by name."""
+    return dict(loaded("dataset", DataSet, {*FORMATS, *taken}))
+
+
 def format_of(path: Path) -> str:
     """Which of ``FORMATS`` a file or folder is.
 
@@ -100,18 +135,30 @@ def format_of(path: Path) -> str:
     except OSError as error:
         raise LogError(f"{path}: {error.strerror or error}; check the path") from None
     suffix = path.suffix.lower()
-    for name, known in FORMATS.items():
-        if is_file and suffix in known.suffixes:
-            return name
-        if is_folder and any(_holds(path, marker) for marker in known.markers):
-            return name
+    formats = FORMATS
+    name = _fitting(path, is_folder, formats)
+    if name is None:
+        formats = known_formats()
+        name = _fitting(path, is_folder, formats)
+    if name is not None:
+        return name
     wanted = ", ".join(
-        f"{f.says} ({' '.join(f.suffixes) if f.suffixes else 'folder'})" for f in FORMATS.values()
+        f"{f.says} ({' '.join(f.suffixes) if f.suffixes else 'folder'})" for f in formats.values()
     )
     what = (
         "a folder without any known recording in it" if is_folder else f"suffix {suffix!r} unknown"
     )
     raise UnknownFormatError(f"{path}: {what}; there are: {wanted}")
+
+
+def _fitting(path: Path, is_folder: bool, formats: Mapping[str, Format]) -> str | None:
+    suffix = path.suffix.lower()
+    for name, known in formats.items():
+        if not is_folder and suffix in known.suffixes:
+            return name
+        if is_folder and any(_holds(path, marker) for marker in known.markers):
+            return name
+    return None
 
 
 def _holds(folder: Path, marker: str) -> bool:

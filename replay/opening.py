@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import cast
 
 from .errors import LogError, MissingTopicError
-from .formats import FORMATS, format_of
+from .formats import FORMATS, format_of, known_formats
 from .ledger import Ledger
 from .limits import DEFAULT, Limits
 from .log import Log
@@ -39,7 +39,7 @@ def open_log(path: Path | str, limits: Limits = DEFAULT) -> Log:
 def open_unsealed(path: Path, limits: Limits = DEFAULT) -> Log:
     """As ``open_log`` of a file or folder, without looking at its seal."""
     name = format_of(path)
-    module, _, function = FORMATS[name].opener.partition(":")
+    module, _, function = (FORMATS.get(name) or known_formats()[name]).opener.partition(":")
     opener = cast("Callable[[Path, Limits], Log]", getattr(import_module(module), function))
     try:
         return opener(path, limits)

@@ -17,6 +17,7 @@ from crosscue.replay.errors import SchemaError, UsageError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.formats import data_sets
 from crosscue.replay.limits import MIB
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.validation_errors import explain
@@ -139,10 +140,13 @@ def write_carried(format_name: str, path: Path, folder: Path) -> Path:
     Raises:
         UsageError: The format carries none.
     """
-    if format_name not in CARRIED:
-        known = ", ".join(sorted(CARRIED))
+    carried = CARRIED
+    if format_name not in carried:
+        carried = CARRIED | {name: one.truth for name, one in data_sets().items()}
+    if format_name not in carried:
+        known = ", ".join(sorted(carried))
         raise UsageError(f"{path}: a {format_name} log carries no truth; those that do: {known}")
-    module, _, function = CARRIED[format_name].partition(":")
+    module, _, function = carried[format_name].partition(":")
     return cast("Writer", getattr(import_module(module), function))(path, folder)
 
 

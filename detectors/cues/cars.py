@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
 from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.vehicle.cue_table import CueSpec
+from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.vehicle import Cars, Vehicle
 
 
@@ -146,18 +146,19 @@ def pair_cars(before: CarShapes, now: CarShapes, settings: Cars) -> Pairs:
     width = now.size_px[0]
     is_apart = not 0.0 < gap_s <= settings.most_gap_s or before.size_px != now.size_px
     if is_apart or not len(before) or not len(now):
-        return _no_pairs(width)
+        return no_pairs(width)
     steps = now.center_px[None, :, :] - before.center_px[:, None, :]
     distance = np.hypot(steps[:, :, 0], steps[:, :, 1])
     change = np.abs(now.area_px[None, :] - before.area_px[:, None]) / before.area_px[:, None]
     fits = (change < settings.area_change) & (distance < settings.position_change * width)
     if not fits.any():
-        return _no_pairs(width)
+        return no_pairs(width)
     first, second = _nearest(np.where(fits, distance, np.inf))
     return Pairs(steps[first, second], now.center_px[second], now.nose[second], width)
 
 
-def _no_pairs(width_px: int) -> Pairs:
+def no_pairs(width_px: int) -> Pairs:
+    """Of two frames without a car that is in both."""
     return Pairs(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), width_px)
 
 

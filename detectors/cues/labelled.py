@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from crosscue.detectors.base import Detections
-from crosscue.replay.vehicle.cue_table import CueSpec
+from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 

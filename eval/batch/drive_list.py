@@ -27,7 +27,7 @@ from crosscue.eval.runs.folder import MANIFEST
 from crosscue.replay.errors import LogError, UnknownFormatError, UsageError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.identity import SHORT, identity_of, identity_of_all
-from crosscue.replay.formats import FORMATS, format_of
+from crosscue.replay.formats import format_of, known_formats
 from crosscue.replay.limits import MIB
 from crosscue.replay.remote.logs import is_remote, matches
 
@@ -137,7 +137,7 @@ def _plain(text: str) -> _Found:
 def _stem(name: str) -> str:
     """A recording's name without its suffix; a folder's may hold dots."""
     suffix = Path(name).suffix
-    known = any(suffix.lower() in one.suffixes for one in FORMATS.values())
+    known = any(suffix.lower() in one.suffixes for one in known_formats().values())
     return name[: -len(suffix)] if known else name
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar, TypeVar, overload
 
 from crosscue.replay.safe_text import table, terminal_width
+
+T = TypeVar("T")
 
 
 def listing(head: Sequence[str], rows: Sequence[Sequence[object]], text_columns: int = 1) -> str:
@@ -23,3 +26,30 @@ def _cell(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+class Listing(Sequence[T]):
+    """Records in order, printed as a table of text."""
+
+    head: ClassVar[tuple[str, ...]]
+
+    def __init__(self, rows: Sequence[T]) -> None:
+        """Keep the records."""
+        self._rows = tuple(rows)
+
+    def cells(self, row: T) -> tuple[object, ...]:
+        """What is printed of a record, in the order of ``head``."""
+        raise NotImplementedError
+
+    @overload
+    def __getitem__(self, which: int) -> T: ...
+    @overload
+    def __getitem__(self, which: slice) -> Sequence[T]: ...
+    def __getitem__(self, which: int | slice) -> T | Sequence[T]:
+        return self._rows[which]
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __repr__(self) -> str:
+        return listing(self.head, [self.cells(row) for row in self], len(self.head))

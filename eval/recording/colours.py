@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from crosscue.replay.vehicle.cue_table import FEATURE_COLOURS
+from crosscue.replay.vehicle.cue_spec import FEATURE_COLOURS
 
 from .columns import Colour
 

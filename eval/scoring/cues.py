@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from crosscue.datasets.truth.truth import Approach
 from crosscue.eval.pipeline.log_time import AMBIGUOUS
 from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.vehicle.cue_table import CUES, Scoring
+from crosscue.replay.vehicle.cue_spec import Scoring
+from crosscue.replay.vehicle.cue_table import CUES
 
 from .intervals import Share, share
 from .pooling import cluster_numbers, first_reasons, summed

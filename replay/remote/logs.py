@@ -35,7 +35,7 @@ from crosscue.replay.errors import (
 from crosscue.replay.files.closing import Closing
 from crosscue.replay.files.partial_file import is_still
 from crosscue.replay.files.whole_file import cannot_write
-from crosscue.replay.formats import FORMATS
+from crosscue.replay.formats import known_formats
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, KnowsItsEnd, Log, Selection, report_missing
@@ -555,7 +555,7 @@ def _objects(system: _System, address: str) -> list[_Object]:
 def _is_folder(system: _System, address: str) -> bool:
     """Is it a folder? To a web server every address is both, and asking costs the whole file."""
     suffix = PurePosixPath(address).suffix.lower()
-    if any(suffix in known.suffixes for known in FORMATS.values()):
+    if any(suffix in known.suffixes for known in known_formats().values()):
         try:
             return system.info(address).get("type") == "directory"
         except FileNotFoundError:

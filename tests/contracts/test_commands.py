@@ -48,7 +48,14 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "study landmarks": ("-o out --settings gone.toml", SETTINGS),
     "study field": ("-o out --settings gone.toml", SETTINGS),
 }
-READS_NOTHING: Final = {"truth schema", "simulate", "train frames", "study drive", "demo"}
+READS_NOTHING: Final = {
+    "truth schema",
+    "simulate",
+    "train frames",
+    "study drive",
+    "demo",
+    "plugins",
+}
 ALWAYS_JSON: Final = {"truth schema"}
 PRINTS_NO_RESULT: Final = {"view"}
 

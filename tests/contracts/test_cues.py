@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +20,11 @@ from crosscue.eval.report.page import write_report
 from crosscue.eval.report.summary import summary
 from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of
 from crosscue.eval.studies.intersections.tables import cue_rows
-from crosscue.replay.vehicle.cue_table import CUES, CueSpec, groups
+from crosscue.replay.vehicle.cue_spec import CueSpec
+from crosscue.replay.vehicle.cue_table import CUES, groups
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.testing import check_cue
 from support.scoring import (
     cue_table,
     frame_table,
@@ -59,6 +63,38 @@ def test_every_cue_has_a_rule_a_simulator_and_a_claim(cue: CueSpec) -> None:
     assert callable(SIMULATED[cue.name])
     assert cue.claim[0] in Fusion().features
     assert 0.5 < cue.precision < 1.0
+
+
+@pytest.mark.parametrize("cue", CUES.values(), ids=lambda cue: str(cue.name))
+def test_every_cue_keeps_the_contract(cue: CueSpec) -> None:
+    check_cue(cue)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"name": "Zebra"}, "want a_lower_name"),
+        ({"precision": 1.0}, "precision"),
+        ({"supports": ()}, "supports and excludes nothing"),
+        ({"excludes": ("straight",)}, "supports and excludes"),
+        ({"rule": "crosscue.detectors.cues.labelled:nothing"}, "rule"),
+        ({"rule": f"{__name__}:always"}, "counts 1 where nothing is"),
+        ({"rule": f"{__name__}:a_share"}, "want a count"),
+    ],
+)
+def test_a_cue_that_breaks_the_contract_is_told(changes: dict[str, Any], match: str) -> None:
+    with pytest.raises(AssertionError, match=match):
+        check_cue(replace(DUMMY, **changes))
+
+
+def always(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
+    """A rule that finds its cue where nothing is."""
+    return 1
+
+
+def a_share(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> float:
+    """A rule that counts no whole number."""
+    return 0.5
 
 
 def test_cues_of_a_group_share_its_row_of_table_5() -> None:

@@ -121,3 +121,14 @@ def test_as_many_as_declared_is_neither_a_loss_nor_worth_a_word() -> None:
         assert ledger.topic("/t").dropped.total() == missing
         assert len(ledger.details) == missing
         assert len(ledger.notices) == notices
+
+
+def test_rows_that_are_dropped_already_are_not_missing_again() -> None:
+    ledger = Ledger("log")
+    ledger.declare("/t", 5)
+    ledger.find("/t", 3)
+    ledger.drop("/t", "damaged", 2)
+    ledger.settle("/t")
+
+    assert ledger.topic("/t").dropped == {"damaged": 2}
+    assert not ledger.notices

@@ -1,0 +1,58 @@
+"""What installed packages add to crosscue, and why it does not load if it does not."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from crosscue.detectors.registry import BUILTIN
+from crosscue.eval.interface.show import Listing
+from crosscue.replay.formats import FORMATS, DataSet, Format
+from crosscue.replay.plugins import GROUPS, Kind, Plugin, described, load, offered
+from crosscue.replay.vehicle.cue_spec import CueSpec
+from crosscue.replay.vehicle.cue_table import BUILTIN_CUES
+
+
+class Plugins(Listing[Plugin]):
+    """Plug-ins, printed as a table."""
+
+    head = ("name", "kind", "package", "version", "state")
+
+    def cells(self, row: Plugin) -> tuple[object, ...]:
+        """One line."""
+        return (row.name, row.kind, row.package, row.version, row.problem or "loaded")
+
+
+def plugins() -> Plugins:
+    """The detectors, cues, readers and data sets that installed packages offer.
+
+    Each is loaded, so that ``problem`` says why one cannot be.
+    """
+    taken: dict[Kind, Collection[str]] = {
+        "detector": BUILTIN,
+        "cue": BUILTIN_CUES,
+        "reader": FORMATS,
+        "dataset": FORMATS,
+    }
+    wanted: dict[Kind, type[object]] = {
+        "detector": object,
+        "cue": CueSpec,
+        "reader": Format,
+        "dataset": DataSet,
+    }
+    found: list[Plugin] = []
+    for kind in GROUPS:
+        seen = {*taken[kind]}
+        for point in offered(kind):
+            problem = ""
+            try:
+                made = load(point, wanted[kind])
+                if kind == "detector" and not callable(made):
+                    problem = f"{point.value} cannot be called; expected a factory"
+            except ImportError as error:
+                problem = str(error)
+            if not problem and point.name in seen:
+                problem = "its name is taken; give it another"
+            if not problem:
+                seen.add(point.name)
+            found.append(described(point, kind, problem))
+    return Plugins(found)

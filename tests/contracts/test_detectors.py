@@ -1,0 +1,79 @@
+"""Every detector of the table keeps the contract of ``crosscue.testing.check_detector``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pytest
+
+from crosscue.detectors.base import Detections, Found, Frame
+from crosscue.detectors.registry import BUILTIN, Choice, make
+from crosscue.testing import check_detector
+from support.detecting import BrightBlob, BrightSettings, build, too_few, yolox_card
+
+NEEDS_A_CARD: Final = {"model"}
+
+
+@pytest.mark.parametrize("name", sorted(BUILTIN.keys() - NEEDS_A_CARD))
+def test_every_detector_keeps_the_contract(name: str) -> None:
+    check_detector(lambda: make(Choice(name, name)))
+
+
+def test_a_model_card_keeps_the_contract(tmp_path: Path) -> None:
+    card = str(yolox_card(tmp_path))
+
+    check_detector(lambda: make(Choice("yolox", "model", {"card": card})))
+
+
+class _OfAnotherTime(BrightBlob):
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        return [replace(self._one(frame), t_ns=frame.t_ns + 1) for frame in frames]
+
+
+class _Outside(BrightBlob):
+    def _one(self, frame: Frame) -> Detections:
+        found = super()._one(frame)
+        return replace(found, boxes_px=found.boxes_px + 1.0)
+
+
+class _OverSure(BrightBlob):
+    def _one(self, frame: Frame) -> Detections:
+        found = super()._one(frame)
+        return replace(found, scores=found.scores * 1.01)
+
+
+class _Painting(BrightBlob):
+    def _one(self, frame: Frame) -> Detections:
+        found = super()._one(frame)
+        np.asarray(frame.pixels)[0] = 0
+        return found
+
+
+class _Remembering(BrightBlob):
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        return [self._one(frames[0]) for _ in frames]
+
+
+@pytest.mark.parametrize(
+    ("kind", "match"),
+    [
+        (_OfAnotherTime, "time is"),
+        (_Outside, "outside the picture"),
+        (_OverSure, "outside 0 to 1"),
+        (_Painting, "changed a frame's pixels"),
+        (_Remembering, "frame 17: the result's time"),
+    ],
+)
+def test_a_detector_that_breaks_the_contract_is_told(kind: type[BrightBlob], match: str) -> None:
+    with pytest.raises(AssertionError, match=match):
+        check_detector(lambda: kind(BrightSettings()))
+
+
+def test_a_detector_that_forgets_frames_is_told() -> None:
+    check_detector(build)
+    with pytest.raises(AssertionError, match="3 frames, 0 results"):
+        check_detector(too_few)
