@@ -34,7 +34,7 @@ nitpick_ignore_regex = [
     # Private modules: the interface documents what is public of them under its public name.
     ("py:.*", r"crosscue\.(replay|detectors|fusion|localization|datasets|eval)\..*"),
     ("py:.*", r"(contextlib|ExitStack|Bytes)(\..*)?"),
-    ("py:.*", r"(Path|Sequence|Mapping|Callable|Iterator|Iterable|Any|Final|Literal)"),
+    ("py:.*", r"(Path|Sequence|Mapping|Callable|Iterator|Iterable|Any|Final|Literal|Detector)"),
 ]
 myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
