@@ -3,7 +3,7 @@
 Range follows from the height of a sign's or light's mask, a parked car's direction from which end
 of its mask is lower. Takes what crosscue train frames writes:
 
-    crosscue train frames L900-L959 L1000-L1059 --each 5 -o held_out
+    crosscue train frames L900-L959 L1000-L1059 --per-layout 5 -o held_out
     python benchmarks/mask_shapes.py held_out --after 300
 """
 

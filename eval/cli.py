@@ -8,12 +8,13 @@ and one line in ``COMMANDS``.
 from __future__ import annotations
 
 import argparse
+import difflib
 import errno
 import io
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 from types import FrameType
 from typing import TYPE_CHECKING, Final, NoReturn, Protocol, cast
@@ -27,44 +28,45 @@ if TYPE_CHECKING:
     from typing_extensions import Buffer
 
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
-    "info": ("info", "topics, counts, clocks, gaps and health of a log"),
-    "convert": ("convert", "any log or data set to MCAP with ROS 2 types"),
-    "seal": ("seal", "a hash of each MiB beside a log, or check a log against it"),
-    "vehicle init": ("vehicle.init", "write a first vehicle file from what a log holds"),
-    "decode": ("decode", "every stream as columns: a Parquet file for each topic or CAN message"),
-    "detect": ("detect", "run detectors over the camera: detections, road, cues"),
-    "estimate": ("estimate", "estimate a run again, from what detectors found before"),
-    "replay": ("replay", "the main job: from a log to a run folder"),
-    "score": ("score", "runs against truth: metrics, figures, report, gates"),
-    "compare": ("compare", "what changed between two runs, with tolerances"),
-    "merge": ("merge", "the runs of batches as one folder of tables"),
-    "view": ("view", "a run in Rerun"),
-    "fit compass": ("fit.compass", "compass mounting, hard and soft iron from a drive"),
-    "fit signs": ("fit.signs", "the sign threshold for a wanted precision"),
-    "fit ranges": ("fit.ranges", "from heights in pixels to ranges, with residuals"),
-    "fit messages": ("fit.messages", "how far each cue is to be believed, from annotated drives"),
-    "fit landmarks": ("fit.landmarks", "the match threshold for a wanted false-match rate"),
-    "landmarks add": ("landmarks.add", "pictures and where they were taken into a database"),
-    "landmarks list": ("landmarks.list", "what a landmark database holds"),
-    "landmarks match": ("landmarks.match", "one picture against a landmark database"),
-    "truth": ("truth.write", "write the truth that a data set carries"),
-    "truth import": ("truth.import_annotations", "annotations from COCO or CVAT as truth"),
-    "truth check": ("truth.check", "does a truth file fit its log?"),
-    "truth schema": ("truth.schema", "the JSON Schema of truth.json"),
-    "simulate": ("simulate", "drives up to intersections, with camera, CAN, Mobileye and truth"),
-    "train road": ("train.road", "the road network, on simulated or own pictures"),
+    "info": ("info", "list topics, counts, clocks, gaps and damage of a log"),
+    "convert": ("convert", "convert a log or data set to MCAP with ROS 2 types"),
+    "seal": ("seal", "write a checksum of each MiB beside a log, or verify a log with it"),
+    "vehicle init": ("vehicle.init", "write a first vehicle file from the contents of a log"),
+    "decode": ("decode", "decode every topic and CAN message into a Parquet file"),
+    "detect": ("detect", "run detectors on the camera images of a log"),
+    "estimate": ("estimate", "repeat the estimate of a run from its stored detections"),
+    "replay": ("replay", "detect and estimate: from a log to a run folder"),
+    "score": ("score", "score runs against truth: metrics, figures, report, gates"),
+    "compare": ("compare", "compare two runs, with tolerances"),
+    "merge": ("merge", "merge the runs of several batches into one folder of tables"),
+    "view": ("view", "show a run in Rerun"),
+    "fit compass": ("fit.compass", "fit compass mounting, hard iron and soft iron to a drive"),
+    "fit signs": ("fit.signs", "fit the sign threshold to a required precision"),
+    "fit ranges": ("fit.ranges", "fit the curve from heights in pixels to ranges"),
+    "fit messages": ("fit.messages", "fit the reliability of each cue to annotated drives"),
+    "fit landmarks": ("fit.landmarks", "fit the match threshold to a required false-match rate"),
+    "landmarks add": ("landmarks.add", "add images with positions to a landmark database"),
+    "landmarks list": ("landmarks.list", "list the contents of a landmark database"),
+    "landmarks match": ("landmarks.match", "match one image against a landmark database"),
+    "truth": ("truth.write", "write the truth that a data set contains"),
+    "truth import": ("truth.import_annotations", "import annotations from COCO or CVAT as truth"),
+    "truth check": ("truth.check", "check a truth file against its log"),
+    "truth schema": ("truth.schema", "print the JSON Schema of truth.json"),
+    "simulate": ("simulate", "simulate drives up to intersections, with all sensors and truth"),
+    "train frames": ("train.frames", "render annotated images of intersections to train on"),
+    "train mask-rcnn": ("train.mask_rcnn", "train a Mask R-CNN on COCO annotations"),
+    "train road": ("train.road", "train the road network on simulated or your own images"),
     "study intersections": (
         "study.intersections",
-        "the published experiment on simulated drives, table beside table",
+        "repeat the published experiment on simulated drives",
     ),
-    "train frames": ("train.frames", "pictures of simulated intersections to train on, with COCO"),
-    "train mask-rcnn": ("train.mask_rcnn", "a Mask R-CNN on COCO annotations"),
-    "study range": ("study.range", "how far without landmarks: thousands of simulated drives"),
-    "study landmarks": ("study.landmarks", "who reaches the goal, by strategy, density and rate"),
-    "study field": ("study.field", "the field protocol, simulated, through logs and the replay"),
-    "study drive": ("study.drive", "one simulated drive: picture, log, replay, recording"),
-    "plugins": ("plugins", "detectors, cues, readers and data sets of other packages"),
-    "demo": ("demo", "make a small drive, replay it, score it, show it"),
+    "study range": ("study.range", "measure how far a vehicle gets without landmarks"),
+    "study landmarks": ("study.landmarks", "measure the success rate with landmarks"),
+    "study field": ("study.field", "repeat the field protocol on simulated drives"),
+    "study drive": ("study.drive", "simulate, replay and record one drive of a study"),
+    "demo": ("demo", "simulate, replay, score and show a small drive"),
+    "plugins": ("plugins", "list the extensions that installed packages register"),
+    "completion": ("completion", "print a completion script for bash, zsh or fish"),
 }
 
 EXIT_STATUS: Final = """\
@@ -80,17 +82,24 @@ exit status:
 class _Parser(argparse.ArgumentParser):
     """Wrong usage is one line, like every other error."""
 
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong, with the nearest option to one that does not exist."""
-        import difflib
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse; an unknown option is the first thing to report, before what it leaves missing."""
+        known = [name for action in self._actions for name in action.option_strings]
+        for word in args or ():
+            if word == "--":
+                break
+            name = word.partition("=")[0]
+            if name.startswith("--") and name not in known:
+                close = difflib.get_close_matches(name, known, n=1)
+                self.error(f"no option {name}" + (f"; did you mean {close[0]}?" if close else ""))
+        return super().parse_known_args(args, namespace)
 
-        hint = f"see {self.prog} --help"
-        if message.startswith("unrecognized arguments: -"):
-            known = [name for action in self._actions for name in action.option_strings]
-            asked = message.partition(": ")[2].split()[0].partition("=")[0]
-            close = difflib.get_close_matches(asked, known, n=1)
-            hint = f"did you mean {close[0]}? {hint}" if close else hint
-        line = one_line(ValueError(f"crosscue: {message}; {hint}"))
+    def error(self, message: str) -> NoReturn:
+        """Report wrong usage and exit."""
+        end = "" if message.endswith("?") else ";"
+        line = one_line(ValueError(f"crosscue: {message}{end} see {self.prog} --help"))
         self.exit(2, f"{visible(line)}\n")
 
 
@@ -109,6 +118,10 @@ class Command(Protocol):
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit status."""
     _prepare_streams()
+    if "_ARGCOMPLETE" in os.environ:
+        from crosscue.eval.commands.completion import complete
+
+        complete(COMMANDS, lambda name: parser_of(name)[1])
     try:
         status = run(sys.argv[1:] if argv is None else argv)
         sys.stdout.flush()
@@ -177,6 +190,20 @@ def run(argv: Sequence[str]) -> int:
     name = _command_of(argv)
     if name is None:
         return _unknown(argv)
+    module, parser = parser_of(name)
+    try:
+        args = parser.parse_args(list(argv[len(name.split()) :]))
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    with losses_heard() as losses:
+        status = _guarded(module, args)
+    for loss in losses:
+        print(visible(f"crosscue: dropped: {loss}"), file=sys.stderr)
+    return 3 if losses and not status else status
+
+
+def parser_of(name: str) -> tuple[Command, argparse.ArgumentParser]:
+    """The module of one command and the parser of its options."""
     module = cast("Command", import_module(f"crosscue.eval.commands.{COMMANDS[name][0]}"))
     parser = _Parser(
         prog=f"crosscue {name}",
@@ -187,17 +214,9 @@ def run(argv: Sequence[str]) -> int:
     )
     module.add_arguments(parser)
     talk = parser.add_mutually_exclusive_group()
-    talk.add_argument("-q", "--quiet", action="store_true", help="say nothing but errors")
-    talk.add_argument("-v", "--verbose", action="store_true", help="tracebacks with errors")
-    try:
-        args = parser.parse_args(list(argv[len(name.split()) :]))
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    with losses_heard() as losses:
-        status = _guarded(module, args)
-    for loss in losses:
-        print(visible(f"crosscue: dropped: {loss}"), file=sys.stderr)
-    return 3 if losses and not status else status
+    talk.add_argument("-q", "--quiet", action="store_true", help="print only errors")
+    talk.add_argument("-v", "--verbose", action="store_true", help="print tracebacks with errors")
+    return module, parser
 
 
 def _guarded(module: Command, args: argparse.Namespace) -> int:
@@ -264,25 +283,39 @@ def _command_of(argv: Sequence[str]) -> str | None:
 
 
 def _unknown(argv: Sequence[str]) -> int:
-    import difflib
-
-    asked = " ".join(argv[:2]) if any(n.startswith(argv[0] + " ") for n in COMMANDS) else argv[0]
-    close = difflib.get_close_matches(asked, COMMANDS, n=1, cutoff=0.5)
-    hint = f"did you mean {close[0]!r}?" if close else "see crosscue --help"
+    members = [name for name in COMMANDS if name.startswith(argv[0] + " ")]
+    if members and len(argv) > 1 and argv[1] in ("-h", "--help"):
+        print("\n".join(_lines(members)))
+        return 0
+    if members and len(argv) == 1:
+        print(f"crosscue: {argv[0]}: needs one of: {', '.join(members)}", file=sys.stderr)
+        return 2
+    asked = " ".join(argv[:2]) if members else argv[0]
+    # "fti compass": the first of two words is the misspelt one.
+    known = [*COMMANDS, "--help", "--version"]
+    close = [
+        match
+        for text in dict.fromkeys((asked, " ".join(argv[:2])))
+        for match in difflib.get_close_matches(text, known, n=1, cutoff=0.6)
+    ]
+    hint = f"did you mean {close[-1]!r}?" if close else "see crosscue --help"
     print(f"crosscue: no command {visible(asked)!r}; {hint}", file=sys.stderr)
     return 2
 
 
-def _overview() -> str:
+def _lines(names: Iterable[str]) -> list[str]:
     width = max(map(len, COMMANDS))
-    lines = [f"  {name:{width}}  {what}" for name, (_, what) in COMMANDS.items()]
+    return [f"  {name:{width}}  {COMMANDS[name][1]}" for name in names]
+
+
+def _overview() -> str:
     return "\n".join(
         [
-            "crosscue COMMAND ...      replay a drive log, score it, see it",
+            "crosscue COMMAND ...      replay drive logs, score them, show them",
             "",
-            *lines,
+            *_lines(COMMANDS),
             "",
-            "crosscue COMMAND --help explains one, with an example; --version says which this is.",
+            "crosscue COMMAND --help describes a command; crosscue --version prints the version.",
             "",
             EXIT_STATUS,
         ]

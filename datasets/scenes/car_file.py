@@ -15,8 +15,8 @@ STOP_SIGN_M: Final = (0.71690, 2.79455)
 """Range is focal length times the first over the height in pixels, plus the second.
 
 Fitted to what the embedded network finds, not to true outlines, since that is what it is used on:
-``crosscue fit ranges --run --score 0.9 --family pinhole-offset`` on L201, L203, L204 and L209, 187
-pairs, residual 1.56 m.
+``crosscue fit ranges --runs --min-score 0.9 --family pinhole-offset`` on L201, L203, L204 and L209,
+187 pairs, residual 1.56 m.
 """
 TRAFFIC_LIGHT_M: Final = (1.00036, 4.00404)
 """The same on L206, L207, L210 and L213: 1162 pairs, residual 3.44 m."""

@@ -145,8 +145,8 @@ class Training:
         self._bad += 1
         if self._bad >= BAD_STEPS:
             raise CrosscueError(
-                f"step {self.done}: {BAD_STEPS} losses in a row are no numbers; lower --rate and "
-                "begin anew"
+                f"step {self.done}: {BAD_STEPS} losses in a row are not finite; "
+                "lower --learning-rate and begin anew"
             )
 
     @torch.no_grad()

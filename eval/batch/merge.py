@@ -262,7 +262,7 @@ def open_one(
     path: Path,
     logs: Path | None = None,
     *,
-    without_pictures: bool = False,
+    without_images: bool = False,
     limits: Limits = DEFAULT,
 ) -> RunFolder:
     """The run of one drive; arguments as of ``open_run``.
@@ -270,7 +270,7 @@ def open_one(
     Raises:
         RunError: It holds many drives; else as ``open_run``.
     """
-    run = open_run(path, logs, without_pictures=without_pictures, limits=limits)
+    run = open_run(path, logs, without_images=without_images, limits=limits)
     if is_merged(run):
         raise RunError(f"{path}: holds the tables of many drives; give one of the runs beside it")
     return run

@@ -38,16 +38,16 @@ MOST_LINES = 20
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("first", type=Path, metavar="RUN_A", help="the run that was good")
-    parser.add_argument("second", type=Path, metavar="RUN_B", help="the run to judge")
+    parser.add_argument("first", type=Path, metavar="RUN_A", help="reference run")
+    parser.add_argument("second", type=Path, metavar="RUN_B", help="run to compare with it")
     parser.add_argument(
         "--tolerance",
         nargs="+",
         default=[],
         metavar="T",
-        help="how much worse metrics may be: 0.01, 2%% or PATTERN=0.01",
+        help="allowed deterioration of metrics: 0.01, 2%% or PATTERN=0.01",
     )
-    parser.add_argument("--json", action="store_true", help="print everything that differs as JSON")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -47,19 +47,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("log", metavar="LOG", help="a recording, a data-set folder or a URL")
     parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="OUT.mcap", help="file to write"
+        "-o", "--output", type=Path, required=True, metavar="OUT.mcap", help="MCAP file to write"
     )
     add_part_arguments(parser)
     parser.add_argument(
-        "--compression", choices=("zstd", "lz4", "none"), default="zstd", help="of the chunks"
+        "--compression",
+        choices=("zstd", "lz4", "none"),
+        default="zstd",
+        help="compression of the chunks (default: zstd)",
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace OUT.mcap if it is there")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing OUT.mcap")
     parser.add_argument(
         "--salvage",
         action="store_true",
-        help="the log is damaged: list every place where something was dropped",
+        help="list every damaged place where messages were dropped",
     )
-    parser.add_argument("--json", action="store_true", help="print the account as JSON")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -26,9 +26,13 @@ from crosscue.replay.vehicle.vehicle import Vehicle, load
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     add_log_arguments(parser)
-    parser.add_argument("-o", "--output", required=True, type=Path, metavar="DIR", help="a folder")
-    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="DBC files, buses, mounting")
-    parser.add_argument("--overwrite", action="store_true", help="replace earlier tables")
+    parser.add_argument(
+        "-o", "--output", required=True, type=Path, metavar="DIR", help="folder for the tables"
+    )
+    parser.add_argument(
+        "--vehicle", type=Path, metavar="V.toml", help="vehicle file: DBC files, buses, mounting"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace existing tables")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 

@@ -44,12 +44,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for drive, run and report (default: demo)",
     )
-    parser.add_argument("--layout", default="C", choices=SCORED, help="which intersection")
-    parser.add_argument("--run", type=int, default=1, metavar="N", help="which drive up to it")
-    parser.add_argument("--seed", type=int, default=0, help="of what differs from run to run")
-    parser.add_argument("--width", type=int, default=1280, help="of the picture (9/16 high)")
-    parser.add_argument("--overwrite", action="store_true", help="replace an earlier demo")
-    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
+    parser.add_argument("--layout", default="C", choices=SCORED, help="layout of the intersection")
+    parser.add_argument("--run", type=int, default=1, metavar="N", help="run of the layout, from 1")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=1280,
+        metavar="PX",
+        help="image width in pixels; height is 9/16",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing demo")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

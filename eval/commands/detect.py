@@ -37,9 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", required=True, type=Path, metavar="RUN", help="run folder"
     )
-    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="the vehicle file")
+    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="vehicle file")
     add_detector_arguments(parser)
-    parser.add_argument("--overwrite", action="store_true", help="replace an earlier run")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing run")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 

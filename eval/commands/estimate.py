@@ -22,9 +22,12 @@ from .replay import Progress, as_json, summary
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="a run folder")
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
     parser.add_argument(
-        "--vehicle", type=Path, metavar="V.toml", help="other settings; the run's, if left out"
+        "--vehicle",
+        type=Path,
+        metavar="V.toml",
+        help="vehicle file with other settings (default: those of the run)",
     )
     add_logs_argument(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")

@@ -42,13 +42,13 @@ LOSSES_SHOWN = 10
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("logs", nargs="+", metavar="LOG", help="recordings to look at")
+    parser.add_argument("logs", nargs="+", metavar="LOG", help="recordings; paths or URLs")
     add_part_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
     parser.add_argument(
         "--quick",
         action="store_true",
-        help="only what the log declares, and whether its end is missing; do not read its body",
+        help="print what the log declares, and whether its end is missing, without reading its body",
     )
 
 

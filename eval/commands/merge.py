@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", required=True, type=Path, metavar="ALL", help="folder for the tables"
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace earlier tables")
+    parser.add_argument("--overwrite", action="store_true", help="replace existing tables")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 

@@ -74,32 +74,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         type=Path,
         metavar="RUN",
-        help="run folder; for many drives, the folder that gets one for each",
+        help="run folder; for many drives, the folder that gets one run folder per drive",
     )
     parser.add_argument(
         "--vehicle",
         type=Path,
         metavar="V.toml",
-        help="the vehicle file (default: vehicle.toml beside a drive's logs)",
+        help="vehicle file (default: vehicle.toml beside a drive's logs)",
     )
-    parser.add_argument("--each", action="store_true", help="every LOG is a drive of its own")
+    parser.add_argument("--each", action="store_true", help="treat each LOG as a separate drive")
     parser.add_argument(
         "--workers",
         type=int,
         metavar="N",
-        help="drives at a time (default: 1; with --ray, as many as the cluster has cores)",
+        help="number of drives in parallel (default: 1; with --ray, the cores of the cluster)",
     )
-    parser.add_argument("--ray", metavar="ADDRESS", help="on a Ray cluster; local starts one here")
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help="run on a Ray cluster: its address, auto, or local"
+    )
     add_detector_arguments(parser)
     parser.add_argument(
         "--landmarks",
         type=Path,
         metavar="DB",
-        help="landmark database that camera frames are compared with",
+        help="landmark database to match camera frames against",
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace an earlier run")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing run")
     parser.add_argument(
-        "--resume", action="store_true", help="go on with an interrupted run, keeping what is done"
+        "--resume", action="store_true", help="continue an interrupted run and keep finished parts"
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
@@ -109,17 +111,27 @@ def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--detectors",
         metavar="NAMES",
-        help="comma-separated; all of the vehicle file's, if left out; none: pose alone",
+        help="comma-separated names (default: all in the vehicle file); "
+        "none estimates only the pose",
     )
     parser.add_argument(
         "--draw",
         type=int,
         default=0,
         metavar="N",
-        help="write up to N pictures with what was found, spread over the drive",
+        help="write up to N camera images with detections, spread over the drive",
     )
-    parser.add_argument("--cache", type=Path, metavar="FILE", help="where results are kept")
-    parser.add_argument("--no-cache", action="store_true", help="run every detector again")
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        metavar="FILE",
+        help="detection cache (default: ~/.cache/crosscue/detections.sqlite)",
+    )
+    parser.add_argument(
+        "--no-cache",
+        action="store_true",
+        help="run every detector again instead of using the cache",
+    )
 
 
 def detectors_of(args: argparse.Namespace, vehicle: Vehicle) -> tuple[Choice, ...]:

@@ -63,12 +63,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--truth",
         type=Path,
         metavar="T.json",
-        help="the truth of all runs (default: the truth.json beside each run's log)",
+        help="truth of all runs (default: truth.json beside each run's log)",
     )
     parser.add_argument(
         "--any-log",
         action="store_true",
-        help="take truth that names the hash of another file: the same drive, converted",
+        help="accept truth made for another file of the same drive, such as a converted log",
     )
     add_logs_argument(parser)
     parser.add_argument(
@@ -78,13 +78,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for metrics, report and junit.xml, pooled over all runs",
     )
-    parser.add_argument("--gate", type=Path, metavar="G.toml", help="bounds on metrics")
+    parser.add_argument(
+        "--gate",
+        type=Path,
+        metavar="G.toml",
+        help="file of bounds on metrics; exit with 1 when one is violated",
+    )
     parser.add_argument(
         "--threshold",
         type=float,
         default=DEFAULTS.threshold,
         metavar="P",
-        help="a feature is detected above this probability (default: 0.9)",
+        help="probability above which a feature counts as detected (default: 0.9)",
     )
     parser.add_argument(
         "--rpe",
@@ -92,28 +97,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=metres,
         default=[10.0, 100.0],
         metavar="M",
-        help="distances of the relative pose error in metres (default: 10 100)",
+        help="distances of the relative pose error, in metres (default: 10 100)",
     )
     parser.add_argument(
         "--attribution",
         action="store_true",
-        help="estimate again with each cue left out, and score what it was worth",
+        help="run an ablation: estimate without each cue and report the change in every metric",
     )
     parser.add_argument(
         "--smoother",
         choices=("gtsam",),
-        help="beside the filter, a batch smoother over the same measurements",
+        help="also run a batch smoother on the same measurements and compare its error",
     )
     parser.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="runs scored at a time (default: 1)"
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="number of runs in parallel (default: 1)",
     )
     parser.add_argument(
         "--without-figures",
         dest="has_figures",
         action="store_false",
-        help="a report of tables alone, in a fraction of the time",
+        help="write a report without figures, in a fraction of the time",
     )
-    parser.add_argument("--json", action="store_true", help="print the metrics as JSON")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

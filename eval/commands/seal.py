@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", nargs="+", metavar="LOG", help="recordings on this machine")
     parser.add_argument("--check", action="store_true", help="verify against the seal")
     parser.add_argument(
-        "--overwrite", action="store_true", help="replace a seal that the log differs from"
+        "--overwrite", action="store_true", help="replace a seal that does not match the log"
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

@@ -32,22 +32,47 @@ PUBLISHED_RUNS = 10
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("layouts", nargs="*", metavar="LAYOUT", help="A to H, or L0, L1, ...")
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="folder that gets one folder a drive"
+        "layouts", nargs="*", metavar="LAYOUT", help="layouts: A to H, or L0, L1 and so on"
     )
     parser.add_argument(
-        "--sheet", type=Path, metavar="JPEG", help="no drives: one picture with a frame of each"
+        "-o", "--output", type=Path, metavar="DIR", help="folder that gets one folder per drive"
     )
-    parser.add_argument("--run", type=int, metavar="N", help="one run, from 1")
-    parser.add_argument("--runs", type=int, metavar="N", help="the first N runs (default: 1)")
-    parser.add_argument("--all", action="store_true", help="A to H, ten runs each")
-    parser.add_argument("--seed", type=int, default=0, help="of what differs from run to run")
-    parser.add_argument("--rate", type=int, default=10, help="pictures a second: 10, 20, 25, 50")
-    parser.add_argument("--width", type=int, default=1280, help="of the picture (9/16 high)")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="drives made at a time")
-    parser.add_argument("--overwrite", action="store_true", help="replace earlier drives")
-    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
+    parser.add_argument(
+        "--sheet",
+        type=Path,
+        metavar="JPEG",
+        help="write only a contact sheet with one frame per drive",
+    )
+    parser.add_argument("--run", type=int, metavar="N", help="simulate only this run, from 1")
+    parser.add_argument(
+        "--runs", type=int, metavar="N", help="simulate the first N runs (default: 1)"
+    )
+    parser.add_argument("--all", action="store_true", help="simulate A to H, ten runs each")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument(
+        "--fps",
+        type=int,
+        default=10,
+        metavar="N",
+        help="camera images per second: 10, 20, 25 or 50 (default: 10)",
+    )
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=1280,
+        metavar="PX",
+        help="image width in pixels; height is 9/16 (default: 1280)",
+    )
+    parser.add_argument(
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="number of drives in parallel (default: 1)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace existing drives")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -75,11 +100,11 @@ def _made(
     """Drives in the order asked for, several made at a time."""
     folders = [args.output / settings.name for settings in wanted]
     make = partial(write_scene, overwrite=args.overwrite)
-    if args.jobs == 1:
+    if args.workers == 1:
         yield from zip(wanted, map(make, folders, wanted), strict=True)
         return
     fresh = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(args.jobs, len(wanted)), mp_context=fresh) as pool:
+    with ProcessPoolExecutor(min(args.workers, len(wanted)), mp_context=fresh) as pool:
         yield from zip(wanted, pool.map(make, folders, wanted), strict=True)
 
 
@@ -103,8 +128,8 @@ def _wanted(args: argparse.Namespace) -> list[SceneSettings]:
         raise UsageError("simulate: a layout is named twice; name each once")
     if (args.output is None) == (args.sheet is None):
         raise UsageError("simulate: give -o DIR for drives, or --sheet JPEG for pictures of them")
-    if args.jobs < 1:
-        raise UsageError(f"--jobs {args.jobs}: want 1 or more")
+    if args.workers < 1:
+        raise UsageError(f"--workers {args.workers}: want 1 or more")
     if args.run is not None and (args.runs is not None or args.all):
         raise UsageError("--run: not together with --runs or --all; give one of them")
     if not 64 <= args.width <= 3840 or args.width % 16:
@@ -117,7 +142,7 @@ def _wanted(args: argparse.Namespace) -> list[SceneSettings]:
     camera = Camera(width_px=args.width, height_px=args.width * 9 // 16)
     try:
         return [
-            SceneSettings(layout=layout, run=run, seed=args.seed, rate_hz=args.rate, camera=camera)
+            SceneSettings(layout=layout, run=run, seed=args.seed, rate_hz=args.fps, camera=camera)
             for layout in layouts
             for run in runs
         ]

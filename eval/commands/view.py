@@ -2,7 +2,7 @@
 
 examples:
   crosscue view runs/drive                    open Rerun's viewer
-  crosscue view runs/drive --save drive.rrd   write the recording, open nothing
+  crosscue view runs/drive -o drive.rrd       write the recording, open nothing
   crosscue view runs/drive --web              serve the viewer to a browser on this machine
 """
 
@@ -17,7 +17,12 @@ from contextlib import suppress
 from pathlib import Path
 
 from crosscue.eval.batch.merge import open_one
-from crosscue.eval.commands.shared.options import add_logs_arguments, limits_of
+from crosscue.eval.commands.shared.options import (
+    add_logs_arguments,
+    limits_of,
+    print_json,
+    refuse_existing,
+)
 from crosscue.eval.pipeline.run_account import is_whole
 from crosscue.eval.recording import save
 from crosscue.eval.runs.folder import RunFolder
@@ -31,26 +36,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
     how = parser.add_mutually_exclusive_group()
-    how.add_argument("--save", type=Path, metavar="X.rrd", help="write the recording only")
-    how.add_argument("--web", action="store_true", help="serve it on 127.0.0.1 for a browser")
+    how.add_argument(
+        "-o", "--output", type=Path, metavar="X.rrd", help="write the recording and open nothing"
+    )
+    how.add_argument(
+        "--web", action="store_true", help="serve the viewer on 127.0.0.1 for a browser"
+    )
     add_logs_arguments(parser)
     parser.add_argument(
-        "--truth", type=Path, metavar="T.json", help="draw the true track and ranges too"
+        "--truth",
+        type=Path,
+        metavar="T.json",
+        help="truth file, to draw the true track and ranges as well",
     )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing recording")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Write drive.rrd into the run, or where asked, and open it; 3 when the run has drops."""
-    if args.save is not None and args.save.suffix != ".rrd":
-        raise UsageError(f"{args.save}: want a name that ends in .rrd")
+    if args.output is not None and args.output.suffix != ".rrd":
+        raise UsageError(f"{args.output}: want a name that ends in .rrd")
+    refuse_existing(args)
     folder = open_one(
-        args.run, args.logs, without_pictures=args.without_pictures, limits=limits_of(args)
+        args.run, args.logs, without_images=args.without_images, limits=limits_of(args)
     )
-    path = args.save or folder.file("drive.rrd")
+    path = args.output or folder.file("drive.rrd")
     track, ranges = _truth(args, folder)
     save(folder, path, track, ranges)
-    if args.save is not None:
-        if not args.quiet:
+    if args.output is not None:
+        if args.json:
+            print_json({"recording": str(path)})
+        elif not args.quiet:
             print(path)
     else:
         _open(path, args.web)

@@ -58,7 +58,7 @@ def camera_of(run: RunFolder) -> StoredCamera | None:
         RunError: The manifest cannot be read; its log is gone, or another lies in its place.
         LogError: The log cannot be opened.
     """
-    if run.without_pictures:
+    if run.without_images:
         return None
     manifest = run.manifest()
     detected = manifest if manifest.get("stage") == "detect" else manifest.get("detect")

@@ -45,14 +45,14 @@ class RunFolder:
     Attributes:
         path: Where it is.
         logs: A folder that its logs have moved to, or None where they are as the manifest says.
-        without_pictures: Is it to be shown without the pictures in its logs?
+        without_images: Is it to be shown without the pictures in its logs?
         limits: What its logs are read with.
         home: Where it will lie, if it is still being made elsewhere; see ``staged``.
     """
 
     path: Path
     logs: Path | None = None
-    without_pictures: bool = False
+    without_images: bool = False
     limits: Limits = DEFAULT
     home: Path | None = None
 
@@ -267,7 +267,7 @@ def open_run(
     path: Path,
     logs: Path | None = None,
     *,
-    without_pictures: bool = False,
+    without_images: bool = False,
     limits: Limits = DEFAULT,
 ) -> RunFolder:
     """An existing run folder, its manifest checked.
@@ -275,13 +275,13 @@ def open_run(
     Args:
         path: The folder.
         logs: Where its logs have moved to, if they have.
-        without_pictures: Show it without the pictures in its logs.
+        without_images: Show it without the pictures in its logs.
         limits: What its logs are read with.
 
     Raises:
         RunError: As ``RunFolder.manifest``.
     """
-    run = RunFolder(path, logs, without_pictures, limits)
+    run = RunFolder(path, logs, without_images, limits)
     run.manifest()
     return run
 

@@ -1,5 +1,7 @@
 """What holds for every command of the table: help, wrong usage, missing input, pipes, JSON."""
 
+import argparse
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -28,7 +30,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "score": ("gone", RUN),
     "compare": ("gone gone2", RUN),
     "merge": ("gone -o out", RUN),
-    "view": ("gone --save x.rrd", RUN),
+    "view": ("gone -o x.rrd", RUN),
     "fit compass": ("gone.mcap --vehicle gone.toml", SETTINGS),
     "fit signs": ("gone.json --label a", SETTINGS),
     "fit ranges": ("--cue stop_sign --truth gone.json", RUN),
@@ -55,9 +57,21 @@ READS_NOTHING: Final = {
     "study drive",
     "demo",
     "plugins",
+    "completion",
 }
 ALWAYS_JSON: Final = {"truth schema"}
-PRINTS_NO_RESULT: Final = {"view"}
+PRINTS_NO_RESULT: Final = {"completion"}
+
+NAMED_BY_COMMAND: Final = {
+    "--output",
+    "--data",
+    "--init",
+    "--runs",
+    "--layouts",
+    "--truth",
+    "--test",
+}
+"""Options whose value is a file, folder or name of the command's own kind."""
 
 STREAMS: Final = {
     "reader gone": "| true",
@@ -70,6 +84,21 @@ STREAMS: Final = {
     "stdout full": "> /dev/full",
     "stderr full": "2> /dev/full",
 }
+
+
+def actions(name: str) -> list[argparse.Action]:
+    """Arguments and options of one command, without ``--help``."""
+    _, parser = cli.parser_of(name)
+    return [one for one in parser._actions if "--help" not in one.option_strings]
+
+
+OPTIONS: Final = sorted(
+    (name, option)
+    for name in cli.COMMANDS
+    for action in actions(name)
+    for option in action.option_strings
+    if option.startswith("--")
+)
 
 
 def test_the_table_of_this_test_is_whole() -> None:
@@ -145,9 +174,126 @@ def test_no_stream_that_is_gone_or_full_brings_a_traceback(
         assert found == "1"
 
 
-def test_an_option_with_a_slip_gets_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["info", "x.mcap", "--jsno"]) == 2
-    assert "did you mean --json?" in capsys.readouterr().err
+@pytest.mark.parametrize(("name", "option"), OPTIONS)
+def test_a_misspelt_option_is_answered_with_the_nearest(
+    name: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    misspelt = option + "x"
+
+    # Also where a required argument is missing, or the misspelt option was one.
+    assert cli.run([*name.split(), misspelt]) == 2
+    said = capsys.readouterr().err
+    _is_one_line(said)
+    assert f"no option {misspelt}; did you mean {option}?" in said
+
+
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
+def test_a_misspelt_command_is_answered_with_the_nearest(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, _, second = name.partition(" ")
+    misspelt = [first[1] + first[0] + first[2:], *second.split()]
+
+    assert cli.run(misspelt) == 2
+    said = capsys.readouterr().err
+    _is_one_line(said)
+    assert f"did you mean {name!r}?" in said
+
+
+def test_the_first_word_alone_lists_its_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["fit"]) == 2
+    assert "fit: needs one of: fit compass, fit signs" in capsys.readouterr().err
+    assert cli.run(["fit", "--help"]) == 0
+    assert capsys.readouterr().out.startswith("  fit compass ")
+
+
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
+def test_every_argument_is_described_in_one_plain_phrase(name: str) -> None:
+    for action in actions(name):
+        where = f"{name} {'/'.join(action.option_strings) or action.dest}"
+        assert action.help, where
+        assert not action.help.rstrip().endswith((".", ";", ",")), where
+        assert action.help.splitlines() == [action.help], where
+        starts = action.help.split()[0]
+        assert starts.islower() or any(c.isupper() for c in starts[1:]) or starts[0] in "0<", where
+        takes_value = action.nargs != 0 and not action.choices
+        assert not takes_value or action.metavar, f"{where}: no metavar"
+
+
+def test_the_overview_describes_every_command_as_a_task() -> None:
+    for name, (_, what) in cli.COMMANDS.items():
+        assert what[0].islower(), name
+        assert what[-1].isalnum(), name
+        assert len(what) <= 75, name
+        # A verb first: "compare two runs", not "what changed between two runs".
+        assert what.split()[0] not in {"a", "an", "the", "what", "how", "who", "any", "every"}, name
+
+
+def test_an_option_takes_the_same_kind_of_value_in_every_command() -> None:
+    kinds: dict[str, dict[object, list[str]]] = {}
+    for name, option in OPTIONS:
+        action = next(one for one in actions(name) if option in one.option_strings)
+        kind = (type(action).__name__, action.type, str(action.metavar))
+        if option in NAMED_BY_COMMAND:
+            kind = kind[:1] + ("",) * 2
+        kinds.setdefault(option, {}).setdefault(kind, []).append(name)
+
+    assert {option: list(of.values()) for option, of in kinds.items() if len(of) > 1} == {}
+
+
+def test_options_have_the_names_agreed_on() -> None:
+    options = {option for _, option in OPTIONS}
+    assert not options & {"--jobs", "--threads-per-job", "--write", "--save", "--out", "--force"}
+    for name in cli.COMMANDS:
+        for action in actions(name):
+            if "--output" in action.option_strings or "-o" in action.option_strings:
+                assert action.option_strings == ["-o", "--output"], name
+            if "--json" in action.option_strings:
+                assert action.help == "print the result as JSON", name
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_scripts_are_printed(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["completion", shell]) == 0
+    assert "crosscue" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("crosscue re", {"replay"}),
+        ("crosscue ", {name.split()[0] for name in cli.COMMANDS}),
+        ("crosscue fit ", {"compass", "signs", "ranges", "messages", "landmarks"}),
+        ("crosscue truth c", {"check"}),
+        ("crosscue truth check t.json --lo", {"--log"}),
+        ("crosscue replay drive.mcap --wor", {"--workers"}),
+        ("crosscue convert a.mcap --compression ", {"zstd", "lz4", "none"}),
+        ("crosscue completion z", {"zsh"}),
+        ("crosscue info dri", {"drive.mcap"}),
+        ("crosscue truth dri", {"drive.mcap"}),
+        ("crosscue info 'dri", {"drive.mcap"}),
+    ],
+)
+def test_the_shell_is_offered_what_can_follow(line: str, offered: set[str], tmp_path: Path) -> None:
+    (tmp_path / "drive.mcap").touch()
+    out = tmp_path / "offered"
+    environment = {
+        **os.environ,
+        "_ARGCOMPLETE": "1",
+        "_ARGCOMPLETE_STDOUT_FILENAME": str(out),
+        "COMP_LINE": line,
+        "COMP_POINT": str(len(line)),
+    }
+    subprocess.run(
+        [sys.executable, "-m", "crosscue.eval.cli"],
+        cwd=tmp_path,
+        env=environment,
+        check=True,
+        timeout=60,
+    )
+
+    found = {word.strip() for word in out.read_text().split("\013")}
+    assert found - {"--help", "--version", "offered"} == offered
 
 
 def _is_one_line(text: str) -> None:

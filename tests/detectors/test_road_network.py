@@ -215,14 +215,14 @@ def test_a_picture_without_its_mask_or_of_another_size_is_told(tmp_path: Path) -
     ("flags", "says"),
     [
         (["--layouts", "A"], "only for scoring"),
-        (["--layouts", "L1", "--held", "L1"], "also trained on"),
+        (["--layouts", "L1", "--val-layouts", "L1"], "also trained on"),
         (["--layouts", "Q"], "is no layout"),
         (["--layouts", "L2-L1"], "want the lower one first"),
-        (["--layouts", "L1", "--score", "Z"], "is no layout"),
+        (["--layouts", "L1", "--test-layouts", "Z"], "is no layout"),
         (["--layouts", "L1", "L0-L3"], "L1: named twice"),
         (["--layouts", "L1", "--seed", "-1"], "want 0 or more"),
         (["--layouts", "L1", "--threads", "-1"], "want 0 or more"),
-        (["--measure", "embedded", "--score", "A"], "not with -o"),
+        (["--measure", "embedded", "--test-layouts", "A"], "not with -o"),
         ([], "give --layouts"),
     ],
 )
@@ -236,12 +236,12 @@ def test_wrong_usage_is_told(
 def test_a_network_is_measured_without_training(capsys: pytest.CaptureFixture[str]) -> None:
     measure = ["train", "road", "--measure", "embedded"]
 
-    assert run([*measure, "--score", "L640", "--each", "2", "--json"]) == 0
+    assert run([*measure, "--test-layouts", "L640", "--per-layout", "2", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["measured_pictures"] == 2
     assert told["measured_iou"] > 0.95
     assert run(measure) == 2
-    assert "give --score with layouts" in capsys.readouterr().err
+    assert "give --test-layouts with layouts" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")

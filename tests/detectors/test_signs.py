@@ -165,7 +165,9 @@ def test_fit_signs_chooses_on_some_frames_and_measures_on_others(
     assert "least_score = " in told
     assert "precision 1.00 (4 of 4; 95 % interval 0.51 to 1.00)" in told
     printed = told.split()[2]
-    assert run(["fit", "signs", str(labels), "--label", "one way left", "--score", printed]) == 0
+    assert (
+        run(["fit", "signs", str(labels), "--label", "one way left", "--threshold", printed]) == 0
+    )
     assert capsys.readouterr().out == told
 
 
@@ -251,7 +253,7 @@ def test_drives_measure_a_threshold_with_an_interval_by_drive(
 
     assert run(["fit", "signs", str(fitted), "--test", *drives, *left]) == 0
     whole = json.loads(capsys.readouterr().out)["other_frames"]
-    assert run(["fit", "signs", drives[0], "--test", *drives, *left, "--every", "2"]) == 0
+    assert run(["fit", "signs", drives[0], "--test", *drives, *left, "--test-every", "2"]) == 0
     half = json.loads(capsys.readouterr().out)
 
     assert whole["signs"] == half["other_frames"]["signs"] == 5
@@ -275,7 +277,7 @@ def test_a_given_threshold_is_measured_not_chosen(
 ) -> None:
     fitted = str(coco(tmp_path / "a", range(4)))
 
-    assert run(["fit", "signs", fitted, "--label", "one way left", "--score", "0.99"]) == 0
+    assert run(["fit", "signs", fitted, "--label", "one way left", "--threshold", "0.99"]) == 0
 
     told = capsys.readouterr().out
     assert "least_score = 0.99\n" in told

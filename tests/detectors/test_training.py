@@ -248,7 +248,7 @@ def test_losses_that_are_no_numbers_end_the_training(tmp_path: Path) -> None:
     with torch.no_grad():
         training.network.rpn.head.cls_logits.bias.fill_(float("nan"))
 
-    with pytest.raises(CrosscueError, match="lower --rate"):
+    with pytest.raises(CrosscueError, match="lower --learning-rate"):
         list(training.steps(sampler))
 
 
@@ -322,7 +322,10 @@ def test_from_simulated_pictures_to_a_checkpoint_by_commands_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frames, out = tmp_path / "frames", tmp_path / "mine.safetensors"
-    assert run(["train", "frames", "L3", "--each", "4", "--width", "320", "-o", str(frames)]) == 0
+    assert (
+        run(["train", "frames", "L3", "--per-layout", "4", "--width", "320", "-o", str(frames)])
+        == 0
+    )
     learn = [
         "train",
         "mask-rcnn",
@@ -343,7 +346,7 @@ def test_from_simulated_pictures_to_a_checkpoint_by_commands_alone(
         "64",
         "--check-every",
         "1",
-        "--check-pictures",
+        "--check-images",
         "1",
     ]
 
@@ -375,7 +378,7 @@ def test_nothing_is_rendered_for_training_of_what_is_scored(
     [
         (["-o", "x.pth"], "ends in .safetensors"),
         (["--steps", "0"], "--steps: want 1 or more"),
-        (["--rate", "nan"], "--rate"),
+        (["--learning-rate", "nan"], "--learning-rate"),
         (["--window", "100", "64"], "multiples of 32"),
         (["--window", "64", "1000000000"], "multiples of 32 from 64 to 4096"),
         (["--classes", "car", "car"], "named twice"),
@@ -383,7 +386,7 @@ def test_nothing_is_rendered_for_training_of_what_is_scored(
         (["--width", "10"], "width_px: input should be greater than or equal to 64"),
         (["--measure", "embedded"], "not with -o"),
         (["--val-data", "x.json"], "give both or none"),
-        (["--top", "0.6", "--bottom", "0.6"], "less than a tenth"),
+        (["--crop-top", "0.6", "--crop-bottom", "0.6"], "less than a tenth"),
     ],
 )
 def test_wrong_flags_are_told_before_any_work(
@@ -421,7 +424,7 @@ def test_a_network_is_measured_without_training(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frames = tmp_path / "frames"
-    run(["train", "frames", "L901", "--each", "3", "-o", str(frames), "-q"])
+    run(["train", "frames", "L901", "--per-layout", "3", "-o", str(frames), "-q"])
     base = [
         "train",
         "mask-rcnn",
@@ -433,7 +436,7 @@ def test_a_network_is_measured_without_training(
         str(frames / "images"),
     ]
 
-    assert run([*base, "--pictures", "1:", "--proposals", "100", "200", "--json"]) == 0
+    assert run([*base, "--subset", "1:", "--proposals", "100", "200", "--json"]) == 0
     tree = json.loads(capsys.readouterr().out)
     assert tree["pictures"] == 2
     assert [row["proposals"] for row in tree["measured"]] == [100, 200]
@@ -454,9 +457,9 @@ def test_a_network_is_measured_without_training(
 @pytest.mark.parametrize(
     ("flags", "why"),
     [
-        (["--pictures", "9"], "want A:B:N"),
-        (["--pictures", "::0"], "want A:B:N"),
-        (["--pictures", "90:"], "none of 4 pictures"),
+        (["--subset", "9"], "want A:B:N"),
+        (["--subset", "::0"], "want A:B:N"),
+        (["--subset", "90:"], "none of 4 pictures"),
         (["--proposals", "0"], "want 1 to 2000"),
     ],
 )

@@ -166,7 +166,7 @@ def _simulate(folder: Path) -> list[str]:
         str(folder / "out"),
         "--width",
         "192",
-        "--rate",
+        "--fps",
         "10",
         "--overwrite",
         "-q",

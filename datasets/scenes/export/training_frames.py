@@ -66,15 +66,15 @@ def frames_of(settings: SceneSettings, count: int, folder: Path) -> Objects:
 
 
 def frames(
-    runs: Sequence[SceneSettings], count: int, folder: Path, jobs: int = 1
+    runs: Sequence[SceneSettings], count: int, folder: Path, workers: int = 1
 ) -> Iterator[Objects]:
     """``frames_of`` for each run, in order, several made at a time."""
     make = partial(frames_of, count=count, folder=folder)
-    if jobs == 1:
+    if workers == 1:
         yield from map(make, runs)
         return
     fresh = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(runs)), mp_context=fresh) as pool:
+    with ProcessPoolExecutor(min(workers, len(runs)), mp_context=fresh) as pool:
         yield from pool.map(make, runs)
 
 

@@ -4,7 +4,7 @@ The reference is the GNSS course. What a drive cannot show keeps its value and i
 drive shows the mounting alone.
 
 example:
-  crosscue fit compass drive.mcap --vehicle car.toml --write
+  crosscue fit compass drive.mcap --vehicle car.toml -o car.toml
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from pathlib import Path
 
 from crosscue.eval.commands.shared.options import (
     add_log_arguments,
+    add_vehicle_output,
+    check_vehicle_output,
     limits_of,
     print_json,
     selection_of,
 )
 from crosscue.eval.fit.compass import fit, section_of, with_section
 from crosscue.localization.compass_fit import CompassFit
-from crosscue.replay.errors import UsageError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.opening import open_logs
 from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
@@ -30,28 +31,27 @@ from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     add_log_arguments(parser)
-    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="the vehicle file")
-    parser.add_argument("--write", action="store_true", help="put the fit into the vehicle file")
+    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="vehicle file")
+    add_vehicle_output(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Fit, tell, and write where asked."""
-    if args.write and args.vehicle is None:
-        raise UsageError("--write: give the file to write into with --vehicle V.toml")
+    check_vehicle_output(args)
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     with open_logs(args.logs, limits_of(args)) as logs:
         fitted = fit(logs, vehicle, selection_of(args, logs))
-    if args.write:
+    if args.output is not None:
         text = with_section(args.vehicle.read_text(encoding="utf-8"), fitted)
         parse(text, str(args.vehicle))
-        write_text(args.vehicle, text)
+        write_text(args.output, text)
     if args.json:
         print_json(_as_json(fitted))
     elif not args.quiet:
         print(_told(fitted))
-        if args.write:
-            print(f"written to {args.vehicle}")
+        if args.output is not None:
+            print(f"written to {args.output}")
     return 0
 
 

@@ -7,7 +7,7 @@ against a database that another drive made.
 example:
   crosscue fit landmarks --pairs pairs.csv --false-match-rate 0.01
   crosscue fit landmarks second.mcap --database town.sqlite --poses truth.json \
---vehicle car.toml --write
+--vehicle car.toml -o car.toml
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from pathlib import Path
 
 from crosscue.eval.commands.shared.options import (
     add_part_arguments,
+    add_vehicle_output,
+    check_vehicle_output,
     limits_of,
     metres,
     print_json,
@@ -39,35 +41,48 @@ from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("logs", nargs="*", type=Path, metavar="LOG", help="recordings of one drive")
-    parser.add_argument("--pairs", type=Path, metavar="FILE.csv", help="labelled pairs of pictures")
-    parser.add_argument("--database", type=Path, metavar="DB", help="landmarks of another drive")
-    parser.add_argument("--poses", type=Path, metavar="RUN|T.json", help="where the drive went")
+    parser.add_argument("--pairs", type=Path, metavar="FILE.csv", help="labelled pairs of images")
+    parser.add_argument(
+        "--database", type=Path, metavar="DB", help="landmark database made from another drive"
+    )
+    parser.add_argument(
+        "--poses",
+        type=Path,
+        metavar="RUN|T.json",
+        help="poses of the vehicle: a run or a truth file",
+    )
     parser.add_argument(
         "--false-match-rate",
-        type=_share,
+        type=_fraction,
         default=0.001,
         metavar="P",
-        help="share of two-place pairs that may match (default: 0.001)",
+        help="max fraction of pairs from different places that match (default: 0.001)",
     )
     for flag, default, what in (
-        ("--every", 5.0, "distance between frames taken"),
-        ("--near", 5.0, "landmarks up to here show the same place"),
-        ("--far", 50.0, "landmarks from here on show another"),
+        ("--every", 5.0, "distance between the frames used, in metres"),
+        ("--same-within", 5.0, "max distance of a landmark of the same place, in metres"),
+        ("--different-beyond", 50.0, "min distance of a landmark of another place, in metres"),
     ):
         parser.add_argument(
             flag, type=metres, default=default, metavar="M", help=f"{what} (default: {default:g})"
         )
     parser.add_argument(
-        "--most", type=int, default=50, metavar="N", help="landmarks for one frame (default: 50)"
+        "--max-landmarks",
+        type=int,
+        default=50,
+        metavar="N",
+        help="max landmarks per frame (default: 50)",
     )
-    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="camera and matcher")
-    parser.add_argument("--matcher", metavar="NAME", help="orb, or module:factory of your own")
-    parser.add_argument("--write", action="store_true", help="put it into the vehicle file")
+    parser.add_argument(
+        "--vehicle", type=Path, metavar="V.toml", help="vehicle file: camera and matcher"
+    )
+    parser.add_argument("--matcher", metavar="NAME", help="orb, or your own module:factory")
+    add_vehicle_output(parser)
     add_part_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
-def _share(text: str) -> float:
+def _fraction(text: str) -> float:
     value = float(text)
     if not 0.0 <= value < 1.0:
         raise ValueError(text)
@@ -79,12 +94,14 @@ def run(args: argparse.Namespace) -> int:
     given = (bool(args.pairs), bool(args.logs), bool(args.database), bool(args.poses))
     if given not in ((True, False, False, False), (False, True, True, True)):
         raise UsageError("fit landmarks: give --pairs, or LOG... with --database and --poses")
-    if args.write and args.vehicle is None:
-        raise UsageError("--write: give the file to write into with --vehicle V.toml")
-    if args.most < 1:
-        raise UsageError(f"--most {args.most}: want 1 or more")
-    if args.near >= args.far:
-        raise UsageError(f"--near {args.near:g}: want less than --far {args.far:g}")
+    check_vehicle_output(args)
+    if args.max_landmarks < 1:
+        raise UsageError(f"--max-landmarks {args.max_landmarks}: want 1 or more")
+    if args.same_within >= args.different_beyond:
+        raise UsageError(
+            f"--same-within {args.same_within:g}: want less than --different-beyond "
+            f"{args.different_beyond:g}"
+        )
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     matcher = matcher_for(vehicle, args.matcher)
     if args.pairs:
@@ -95,16 +112,16 @@ def run(args: argparse.Namespace) -> int:
         fitted = fit_landmarks(pairs, args.false_match_rate)
     except ValueError as error:
         raise SchemaError(f"fit landmarks: {error}; give more labelled pictures") from None
-    if args.write:
+    if args.output is not None:
         text = with_min_score(args.vehicle.read_text(encoding="utf-8"), fitted.min_score)
         parse(text, str(args.vehicle))
-        write_text(args.vehicle, text)
+        write_text(args.output, text)
     if args.json:
         print_json({**asdict(fitted), "is_shown": fitted.is_shown, "matcher": matcher.kind})
     elif not args.quiet:
         print(_told(fitted))
-        if args.write:
-            print(f"written to {args.vehicle}")
+        if args.output is not None:
+            print(f"written to {args.output}")
     return 0
 
 
@@ -117,7 +134,14 @@ def _pairs_of_logs(args: argparse.Namespace, vehicle: Vehicle, matcher: Matcher)
         ledgers = [Ledger(str(log.path)) for log in logs]
         frames = camera_frames(logs, vehicle, selection_of(args, logs), ledgers)
         pairs = pairs_of_drive(
-            frames, poses, database, matcher, args.every, args.near, args.far, args.most
+            frames,
+            poses,
+            database,
+            matcher,
+            args.every,
+            args.same_within,
+            args.different_beyond,
+            args.max_landmarks,
         )
     for ledger in ledgers:
         warn_of(ledger)

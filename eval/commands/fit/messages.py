@@ -17,7 +17,7 @@ from collections import Counter
 from pathlib import Path
 
 from crosscue.datasets.truth.truth import load
-from crosscue.eval.commands.shared.options import print_json, with_progress
+from crosscue.eval.commands.shared.options import print_json, refuse_existing, with_progress
 from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, section_of, told_of
 from crosscue.eval.runs.folder import open_run
 from crosscue.fusion.fade_fit import FadeFit
@@ -36,9 +36,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         type=Path,
         metavar="T.json",
-        help="the truth of each run, in the same order",
+        help="truth of each run, in the same order",
     )
-    parser.add_argument("-o", "--output", type=Path, metavar="TOML", help="write the section here")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="TOML",
+        help="file to write the section to (default: print it)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -49,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
             f"fit messages: {len(args.runs)} runs, {len(args.truth)} truth files; give one "
             "for each, in the same order"
         )
+    refuse_existing(args)
     runs = [open_run(path) for path in args.runs]
     graph, vehicle = graph_of_runs(runs)
     found = Annotated([], Counter())

@@ -1,14 +1,14 @@
 """Fit a curve from an object's height in pixels to its range, with the residual by distance.
 
 Pairs come from a TABLE (CSV or Parquet with height_px and range_m, to the rear axle), from the
-annotated objects of drives (--truth), or from what a run's detectors found (--run beside --truth).
+annotated objects of drives (--truth), or from what a run's detectors found (--runs beside --truth).
 All families are fitted; the one with the smallest residual is offered as a section for the vehicle
 file. --test measures that curve on other drives.
 
 examples:
   crosscue fit ranges stop_signs.csv --cue stop_sign
   crosscue fit ranges --cue traffic_light --truth drives/L* --test drives/A-01 --figure light.png
-  crosscue fit ranges --cue stop_sign --run runs/A-01 --truth drives/A-01
+  crosscue fit ranges --cue stop_sign --runs runs/A-01 --truth drives/A-01
 """
 
 from __future__ import annotations
@@ -33,10 +33,17 @@ PUBLISHED_SD_M = {"stop_sign": 1.7, "traffic_light": 5.9}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument(
-        "table", nargs="?", type=Path, metavar="TABLE", help="height_px and range_m"
+        "table",
+        nargs="?",
+        type=Path,
+        metavar="TABLE",
+        help="CSV or Parquet file with the columns height_px and range_m",
     )
     parser.add_argument(
-        "--cue", required=True, choices=tuple(PUBLISHED_SD_M), help="what was measured"
+        "--cue",
+        required=True,
+        choices=tuple(PUBLISHED_SD_M),
+        help="cue whose objects were measured",
     )
     parser.add_argument(
         "--truth",
@@ -47,14 +54,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="drives with annotated objects and ranges",
     )
     parser.add_argument(
-        "--run",
+        "--runs",
         nargs="+",
         type=Path,
         metavar="RUN",
         default=[],
-        help="take heights from these runs, one for each --truth",
+        help="take heights from these run folders, one per --truth",
     )
-    parser.add_argument("--score", type=float, default=0.9, help="least score of a run's detection")
+    parser.add_argument(
+        "--min-score",
+        type=float,
+        default=0.9,
+        metavar="P",
+        help="min score of a detection (default: 0.9)",
+    )
     parser.add_argument(
         "--test",
         nargs="+",
@@ -63,10 +76,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="other drives to measure the curve on",
     )
-    parser.add_argument("--family", choices=FAMILIES, help="fit this one only")
-    parser.add_argument("--bin-m", type=float, default=10.0, help="width of the distance bins")
-    parser.add_argument("--figure", type=Path, metavar="PNG", help="draw pairs, curves, residuals")
-    parser.add_argument("--overwrite", action="store_true", help="replace the figure")
+    parser.add_argument("--family", choices=FAMILIES, help="fit only this family")
+    parser.add_argument(
+        "--bin-m",
+        type=float,
+        default=10.0,
+        metavar="M",
+        help="width of the distance bins (default: 10)",
+    )
+    parser.add_argument(
+        "--figure", type=Path, metavar="PNG", help="figure of pairs, curves and residuals to write"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing figure")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -107,14 +128,14 @@ def _pairs(args: argparse.Namespace) -> RangePairs:
         raise UsageError("fit ranges: give a TABLE, or --truth with drives")
     if args.table is not None:
         return pairs_of_table(args.table)
-    if args.run and len(args.run) != len(args.truth):
-        raise UsageError(f"--run: {len(args.run)} runs for {len(args.truth)} drives; pair them")
+    if args.runs and len(args.runs) != len(args.truth):
+        raise UsageError(f"--runs: {len(args.runs)} runs for {len(args.truth)} drives; pair them")
     parts = (
         [
-            pairs_of_run(r, t, args.cue, args.score)
-            for r, t in zip(args.run, args.truth, strict=True)
+            pairs_of_run(r, t, args.cue, args.min_score)
+            for r, t in zip(args.runs, args.truth, strict=True)
         ]
-        if args.run
+        if args.runs
         else [pairs_of_truth(path, args.cue) for path in args.truth]
     )
     pairs = together(parts)

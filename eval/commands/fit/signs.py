@@ -3,7 +3,7 @@
 LABELS is a CSV file: picture,label,x0,y0,x1,y1 with one row for each sign (or an empty label for a
 picture without any), a COCO file as crosscue train frames writes it, or the folder of a drive with
 annotated objects. Every second picture chooses the threshold, the others measure it, unless --test
-names other files or drives. --score measures a threshold instead of choosing one.
+names other files or drives. --threshold measures a threshold instead of choosing one.
 
 examples:
   crosscue fit signs labels.csv --label "do not enter" --kinds "no entry" --precision 0.95
@@ -49,10 +49,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="other frames to measure on",
     )
     parser.add_argument(
-        "--every", type=int, default=1, metavar="N", help="measure on every Nth picture only"
+        "--test-every", type=int, default=1, metavar="N", help="measure on every Nth image"
     )
     parser.add_argument(
-        "--label", required=True, nargs="+", help="the labels to choose one threshold for"
+        "--label", required=True, nargs="+", metavar="LABEL", help="labels that share the threshold"
     )
     parser.add_argument(
         "--kinds",
@@ -60,26 +60,65 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=list(AMERICAN),
         choices=KINDS,
         metavar="KIND",
-        help=f"drawings to look for, of: {', '.join(KINDS)}",
-    )
-    parser.add_argument("--crop-top", type=float, default=0.0, help="share not searched")
-    parser.add_argument("--crop-bottom", type=float, default=0.25, help="share not searched")
-    parser.add_argument(
-        "--enlarge", type=float, default=2.5, help="the first level, for small signs"
-    )
-    parser.add_argument("--levels", type=int, default=9, help="of the pyramid, each 1.25 smaller")
-    parser.add_argument("--points", type=int, default=4000, help="kept at a level")
-    parser.add_argument("--precision", type=float, default=0.95, help="wanted, 0 to 1")
-    parser.add_argument("--score", type=float, help="take this threshold, choose none")
-    parser.add_argument(
-        "--overlap", type=float, default=0.4, help="with the true box, to be right (0 to 1)"
+        help=f"templates to search for, from: {', '.join(KINDS)}",
     )
     parser.add_argument(
-        "--least-height",
+        "--crop-top",
+        type=float,
+        default=0.0,
+        metavar="FRACTION",
+        help="top fraction of the image to skip",
+    )
+    parser.add_argument(
+        "--crop-bottom",
+        type=float,
+        default=0.25,
+        metavar="FRACTION",
+        help="bottom fraction of the image to skip",
+    )
+    parser.add_argument(
+        "--enlarge",
+        type=float,
+        default=2.5,
+        metavar="X",
+        help="magnification of the first pyramid level (default: 2.5)",
+    )
+    parser.add_argument(
+        "--levels",
+        type=int,
+        default=9,
+        metavar="N",
+        help="pyramid levels, each smaller by 1.25 (default: 9)",
+    )
+    parser.add_argument(
+        "--points", type=int, default=4000, metavar="N", help="keypoints per level (default: 4000)"
+    )
+    parser.add_argument(
+        "--precision",
+        type=float,
+        default=0.95,
+        metavar="P",
+        help="required precision (default: 0.95)",
+    )
+    parser.add_argument(
+        "--threshold",
+        type=float,
+        metavar="P",
+        help="measure this threshold instead of choosing one",
+    )
+    parser.add_argument(
+        "--overlap",
+        type=float,
+        default=0.4,
+        metavar="IOU",
+        help="min IoU with the true box of a true positive (default: 0.4)",
+    )
+    parser.add_argument(
+        "--min-height",
         type=float,
         default=0.0,
         metavar="PX",
-        help="lower true signs count neither as found nor as missed",
+        help="ignore true signs lower than this, in pixels",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
@@ -89,16 +128,16 @@ def run(args: argparse.Namespace) -> int:
     for name in ("precision", "overlap"):
         if not 0.0 < getattr(args, name) <= 1.0:
             raise UsageError(f"--{name} {getattr(args, name)}: want above 0, at most 1")
-    if args.every < 1:
-        raise UsageError(f"--every {args.every}: want 1 or more")
-    if args.score is not None and not LOWEST <= args.score <= 1.0:
-        raise UsageError(f"--score {args.score}: want {LOWEST} to 1")
+    if args.test_every < 1:
+        raise UsageError(f"--test-every {args.test_every}: want 1 or more")
+    if args.threshold is not None and not LOWEST <= args.threshold <= 1.0:
+        raise UsageError(f"--threshold {args.threshold}: want {LOWEST} to 1")
     fitted, tested = _judged(args)
     if not sum(part.signs for part in fitted):
         raise UsageError(
             f"{args.labels[0]}: no {' or '.join(args.label)} in the pictures that choose; add some"
         )
-    score = args.score
+    score = args.threshold
     if score is None:
         score = _shown(threshold_for(together(fitted), args.precision))
     if args.json:
@@ -124,9 +163,9 @@ def _judged(args: argparse.Namespace) -> tuple[list[Judged], list[Judged]]:
         levels=args.levels,
         points=args.points,
     )
-    rules = Rules(args.label, args.overlap, args.least_height)
+    rules = Rules(args.label, args.overlap, args.min_height)
     fit = slice(0, None, 1 if args.test else 2)
-    rest = slice(0 if args.test else 1, None, args.every * fit.step)
+    rest = slice(0 if args.test else 1, None, args.test_every * fit.step)
     work = [(path, fit) for path in args.labels]
     work += [(path, rest) for path in args.test or args.labels]
     parts: list[Judged] = []

@@ -42,35 +42,44 @@ from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("database", type=Path, metavar="DB", help="made where it is not there")
+    parser.add_argument(
+        "database", type=Path, metavar="DB", help="landmark database; created if missing"
+    )
     parser.add_argument("logs", nargs="*", type=Path, metavar="LOG", help="recordings of one drive")
     parser.add_argument(
-        "--poses", type=Path, metavar="RUN|T.json", help="where the car was: a run, or a truth"
+        "--poses",
+        type=Path,
+        metavar="RUN|T.json",
+        help="poses of the vehicle: a run or a truth file",
     )
-    parser.add_argument("--images", type=Path, metavar="DIR", help="folder of pictures")
+    parser.add_argument("--images", type=Path, metavar="DIR", help="folder of images")
     parser.add_argument(
-        "--coordinates", type=Path, metavar="FILE.csv", help="where each picture was taken"
+        "--coordinates", type=Path, metavar="FILE.csv", help="position of each image"
     )
     parser.add_argument(
         "--every",
         type=metres,
         default=10.0,
         metavar="M",
-        help="distance between landmarks from a log (default: 10)",
+        help="distance between landmarks from a log, in metres (default: 10)",
     )
     parser.add_argument(
         "--sd",
         type=metres,
         default=3.0,
         metavar="M",
-        help="how far the car may be off when it matches, added to the poses' own error "
-        "(default: 3)",
+        help="standard deviation of the vehicle's position at a match, in metres, added to the "
+        "error of the poses (default: 3)",
     )
-    parser.add_argument("--source", metavar="NAME", help="who took them (default: the log's name)")
-    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="camera and matcher")
-    parser.add_argument("--matcher", metavar="NAME", help="orb, or module:factory of your own")
+    parser.add_argument(
+        "--source", metavar="NAME", help="name of the source (default: the log's name)"
+    )
+    parser.add_argument(
+        "--vehicle", type=Path, metavar="V.toml", help="vehicle file: camera and matcher"
+    )
+    parser.add_argument("--matcher", metavar="NAME", help="orb, or your own module:factory")
     add_part_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="print the counts as JSON")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -22,12 +22,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("database", type=Path, metavar="DB", help="landmark database")
     parser.add_argument(
-        "--near", metavar="X,Y,R", help="within R metres of a place; --near=-5,3,10 where x < 0"
+        "--near",
+        metavar="X,Y,R",
+        help="only landmarks within R metres of a place; --near=-5,3,10 for x < 0",
     )
     parser.add_argument(
-        "--limit", type=int, default=100, metavar="N", help="no more than N (default: 100)"
+        "--limit", type=int, default=100, metavar="N", help="max landmarks to list (default: 100)"
     )
-    parser.add_argument("--json", action="store_true", help="print the list as JSON")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -25,13 +25,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("database", type=Path, metavar="DB", help="landmark database")
     parser.add_argument("image", type=Path, metavar="IMAGE", help="PNG, JPEG or WebP")
     parser.add_argument(
-        "--near", metavar="X,Y,R", help="within R metres of a place; --near=-5,3,10 where x < 0"
+        "--near",
+        metavar="X,Y,R",
+        help="only landmarks within R metres of a place; --near=-5,3,10 for x < 0",
     )
     parser.add_argument(
-        "--best", type=int, default=5, metavar="N", help="show the N best (default: 5)"
+        "--best", type=int, default=5, metavar="N", help="number of matches to show (default: 5)"
     )
-    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="camera and matcher")
-    parser.add_argument("--matcher", metavar="NAME", help="orb, or module:factory of your own")
+    parser.add_argument(
+        "--vehicle", type=Path, metavar="V.toml", help="vehicle file: camera and matcher"
+    )
+    parser.add_argument("--matcher", metavar="NAME", help="orb, or your own module:factory")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import Log, Selection
@@ -35,10 +35,12 @@ def add_part_arguments(parser: argparse.ArgumentParser) -> None:
         "--from",
         dest="start",
         metavar="T",
-        help="begin here: seconds after the log's first row (12.5) or absolute nanoseconds (...ns)",
+        help="start time: seconds from the first message (12.5) or absolute nanoseconds (17...ns)",
     )
-    parser.add_argument("--to", dest="end", metavar="T", help="end before this time")
-    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="only these topics")
+    parser.add_argument(
+        "--to", dest="end", metavar="T", help="end time, exclusive, in the same form"
+    )
+    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="read only these topics")
     add_limit_arguments(parser)
 
 
@@ -49,7 +51,7 @@ def add_limit_arguments(parser: argparse.ArgumentParser) -> None:
         type=_mebibytes,
         default=DEFAULT.chunk_bytes,
         metavar="MIB",
-        help="the largest chunk, container or page that is decompressed "
+        help="largest chunk, container or page to decompress, in MiB "
         f"(default: {DEFAULT.chunk_bytes >> 20})",
     )
 
@@ -76,18 +78,56 @@ def add_logs_argument(parser: argparse.ArgumentParser) -> None:
         "--logs",
         type=Path,
         metavar="DIR",
-        help="the run's logs have moved to this folder; each is known by its content",
+        help="folder that the run's logs have moved to; they are recognised by content",
     )
 
 
 def add_logs_arguments(parser: argparse.ArgumentParser) -> None:
-    """``--logs`` and ``--without-pictures``."""
+    """``--logs`` and ``--without-images``."""
     add_logs_argument(parser)
     parser.add_argument(
-        "--without-pictures",
+        "--without-images",
         action="store_true",
-        help="leave out the pictures in the run's logs, which may be gone",
+        help="leave out camera images, so the run's logs are not needed",
     )
+
+
+def add_vehicle_output(parser: argparse.ArgumentParser) -> None:
+    """``-o`` and ``--overwrite`` of a command that writes its fit into a vehicle file."""
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="V.toml",
+        help="vehicle file to write: --vehicle with the fit; may be the same file",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace another existing file")
+
+
+def check_vehicle_output(args: argparse.Namespace) -> None:
+    """Refuse, before any work, an output that cannot be written as asked.
+
+    Raises:
+        UsageError: There is no vehicle file to put the fit into.
+        OutputError: The output is another file that exists.
+    """
+    if args.output is None:
+        return
+    if args.vehicle is None:
+        raise UsageError("-o: needs the vehicle file that gets the fit; give it as --vehicle")
+    if not args.output.exists() or args.output.samefile(args.vehicle):
+        return
+    refuse_existing(args)
+
+
+def refuse_existing(args: argparse.Namespace) -> None:
+    """Refuse an output that exists, without ``--overwrite``.
+
+    Raises:
+        OutputError: It exists.
+    """
+    if args.output is not None and args.output.exists() and not args.overwrite:
+        raise OutputError(f"{args.output}: exists; give another name or --overwrite")
 
 
 def metres(text: str) -> float:

@@ -32,18 +32,24 @@ def add_study_arguments(parser: argparse.ArgumentParser, folder: str) -> None:
         metavar="DIR",
         help=f"folder for drives, summary, figures, page (default: {folder})",
     )
-    parser.add_argument("--settings", type=Path, metavar="X.toml", help="a study of one's own")
-    parser.add_argument("--seed", type=int, help="everything random comes from it")
-    parser.add_argument("--workers", type=int, metavar="N", help="cores (default: all)")
-    parser.add_argument("--overwrite", action="store_true", help="replace another study's results")
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    parser.add_argument(
+        "--settings", type=Path, metavar="X.toml", help="settings of your own study"
+    )
+    parser.add_argument("--seed", type=int, metavar="N", help="random seed")
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="number of threads (default: all cores)"
+    )
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace existing results of another study"
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def add_cluster_arguments(parser: argparse.ArgumentParser) -> None:
     """``--drives`` and ``--ray``."""
-    parser.add_argument("--drives", type=int, metavar="N", help="with each combination")
+    parser.add_argument("--drives", type=int, metavar="N", help="drives per combination")
     parser.add_argument(
-        "--ray", metavar="ADDRESS", help="drive on a Ray cluster: its address, auto, or local"
+        "--ray", metavar="ADDRESS", help="run on a Ray cluster: its address, auto, or local"
     )
 
 
@@ -89,7 +95,7 @@ def workers_of(args: argparse.Namespace) -> int:
 def run_study(
     args: argparse.Namespace, study: S, finish: Callable[[S, Path], Made], what: str
 ) -> int:
-    """Drive, summarise, tell."""
+    """Simulate the drives, summarise and print."""
     from crosscue.eval.studies.town.whole import PAGE, SUMMARY, drive_study
 
     done = [0.0]

@@ -5,7 +5,7 @@ drive.
 
 examples:
   crosscue study drive --seed 7 -o drive
-  crosscue study drive --seed 7 --strategy "landmark to landmark" --landmarks 1 -o drive
+  crosscue study drive --seed 7 --strategy "landmark to landmark" --landmark-density 1 -o drive
   crosscue view drive/run --truth drive/truth.json
 """
 
@@ -34,19 +34,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for log, truth, picture and run (default: study-drive)",
     )
-    parser.add_argument("--seed", type=int, default=7, help="of the drive")
+    parser.add_argument("--seed", type=int, default=7, metavar="N", help="random seed (default: 7)")
     parser.add_argument(
         "--compass",
         type=float,
         default=30.0,
         metavar="DEG",
-        help="2-sigma of the compass; 0: none (default: 30)",
+        help="2-sigma error of the compass in degrees; 0 for no compass (default: 30)",
     )
-    parser.add_argument("--strategy", choices=STRATEGIES, default=STRATEGIES[0])
-    parser.add_argument("--landmarks", type=float, default=0.0, metavar="N", help="per km2")
-    parser.add_argument("--rate", type=float, default=0.6, help="share of landmarks recognised")
-    parser.add_argument("--overwrite", action="store_true", help="replace an earlier drive")
-    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
+    parser.add_argument(
+        "--strategy",
+        choices=STRATEGIES,
+        default=STRATEGIES[0],
+        help="navigation strategy (default: straight to goal)",
+    )
+    parser.add_argument(
+        "--landmark-density",
+        type=float,
+        default=0.0,
+        metavar="N",
+        help="landmarks per square kilometre (default: 0)",
+    )
+    parser.add_argument(
+        "--detection-rate",
+        type=float,
+        default=0.6,
+        metavar="P",
+        help="probability that a landmark in view is recognised (default: 0.6)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing drive")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -94,14 +111,16 @@ def _settings(args: argparse.Namespace) -> Drive:
 
     flags = {
         "compass_2sigma_deg": "compass",
-        "detection_rate": "rate",
-        "landmarks_per_km2": "landmarks",
+        "detection_rate": "detection-rate",
+        "landmarks_per_km2": "landmark-density",
     }
     try:
         return Drive(
-            sensors=Sensors(compass_2sigma_deg=args.compass or None, detection_rate=args.rate),
+            sensors=Sensors(
+                compass_2sigma_deg=args.compass or None, detection_rate=args.detection_rate
+            ),
             navigation=Navigation(strategy=args.strategy),
-            landmarks_per_km2=args.landmarks,
+            landmarks_per_km2=args.landmark_density,
         )
     except ValidationError as error:
         first = error.errors()[0]

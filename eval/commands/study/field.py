@@ -23,9 +23,11 @@ from crosscue.replay.errors import UsageError
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     add_study_arguments(parser, "study-field")
-    parser.add_argument("--range-runs", type=int, metavar="N", help="without landmarks")
-    parser.add_argument("--landmark-runs", type=int, metavar="N", help="with")
-    parser.add_argument("--minutes", type=float, metavar="M", help="longest run")
+    parser.add_argument("--range-runs", type=int, metavar="N", help="runs without landmarks")
+    parser.add_argument("--landmark-runs", type=int, metavar="N", help="runs with landmarks")
+    parser.add_argument(
+        "--minutes", type=float, metavar="M", help="max duration of a run, in minutes"
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -31,34 +31,50 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         type=Path,
         metavar="DIR",
-        help="drives, runs, tables and page go there",
+        help="folder for drives, runs, tables and page",
     )
     parser.add_argument(
         "--layouts",
         default=",".join(SCORED),
         metavar="NAMES",
-        help="comma-separated, of A to H (default: all)",
+        help="comma-separated layouts, A to H (default: all)",
     )
-    parser.add_argument("--runs", type=int, default=10, metavar="N", help="of each (default: 10)")
-    parser.add_argument("--seed", type=int, default=0, help="of what differs from run to run")
-    parser.add_argument("--width", type=int, default=1280, help="of the picture (9/16 high)")
     parser.add_argument(
-        "--vehicle", type=Path, metavar="V.toml", help="replay with it instead of each drive's own"
+        "--runs", type=int, default=10, metavar="N", help="runs per layout (default: 10)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=1280,
+        metavar="PX",
+        help="image width in pixels; height is 9/16 (default: 1280)",
+    )
+    parser.add_argument(
+        "--vehicle", type=Path, metavar="V.toml", help="vehicle file (default: that of each drive)"
     )
     parser.add_argument(
         "--detectors",
         default=EMBEDDED,
         metavar="NAMES",
-        help=f"comma-separated (default: {EMBEDDED})",
-    )
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help="drives at a time")
-    parser.add_argument(
-        "--ray", metavar="ADDRESS", help="on a Ray cluster that shares DIR; local starts one here"
+        help=f"comma-separated names (default: {EMBEDDED})",
     )
     parser.add_argument(
-        "--no-attribution", action="store_true", help="leave out what each cue is worth"
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="number of drives in parallel (default: 1)",
     )
-    parser.add_argument("--json", action="store_true", help="print the tables as JSON")
+    parser.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help="run on a Ray cluster that shares DIR: its address, auto, or local",
+    )
+    parser.add_argument(
+        "--no-attribution", action="store_true", help="skip the ablation of each cue"
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -32,8 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--calibrate",
         action="store_true",
-        help="no study: find the compass interval that gives the published 9.3 km at 30 degrees, "
-        "on seeds of its own",
+        help="find the compass interval that gives the published 9.3 km at 30 degrees, with "
+        "separate seeds, instead of running the study",
     )
 
 

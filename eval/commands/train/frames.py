@@ -4,8 +4,8 @@ Takes a few pictures of each of many runs: OUT/coco.json and OUT/images. Layouts
 A to H are those that crosscue is scored on, so nothing may learn from them.
 
 examples:
-  crosscue train frames L0-L299 --each 8 -o frames
-  crosscue train frames L900-L949 --each 4 -o held_out
+  crosscue train frames L0-L299 --per-layout 8 -o frames
+  crosscue train frames L900-L949 --per-layout 4 -o held_out
 """
 
 from __future__ import annotations
@@ -24,19 +24,42 @@ from crosscue.replay.errors import OutputError, UsageError
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("layouts", nargs="+", metavar="LAYOUT", help="L0, L17 or a span: L0-L99")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--each", type=int, default=8, help="pictures of each layout")
-    parser.add_argument("--seed", type=int, default=0, help="of what differs from run to run")
-    parser.add_argument("--width", type=int, default=1280, help="of the picture (9/16 high)")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="layouts at a time")
-    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
+    parser.add_argument(
+        "layouts", nargs="+", metavar="LAYOUT", help="layouts: L0, L17 or a span, L0-L99"
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder for images and annotations",
+    )
+    parser.add_argument(
+        "--per-layout", type=int, default=8, metavar="N", help="images per layout (default: 8)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=1280,
+        metavar="PX",
+        help="image width in pixels; height is 9/16 (default: 1280)",
+    )
+    parser.add_argument(
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="number of layouts in parallel (default: 1)",
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Render and write."""
-    if args.each < 1 or args.jobs < 1 or args.seed < 0:
-        raise UsageError("--each, --jobs: want 1 or more; --seed: want 0 or more")
+    if args.per_layout < 1 or args.workers < 1 or args.seed < 0:
+        raise UsageError("--per-layout, --workers: want 1 or more; --seed: want 0 or more")
     wanted = [_settings(name, args) for name in learnt_layouts_of(args.layouts, "train frames")]
     target = args.output / "coco.json"
     if target.exists():
@@ -44,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     images = args.output / "images"
     check_place(images / "any")
     parts: list[Objects] = []
-    made = frames(wanted, args.each, images, args.jobs)
+    made = frames(wanted, args.per_layout, images, args.workers)
     for part in with_progress(made, lambda: len(parts) / len(wanted), args, "rendering"):
         parts.append(part)
     whole = joined(parts)

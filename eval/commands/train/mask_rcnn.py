@@ -5,11 +5,11 @@ PNG) and, until the training ends, the state that --resume goes on with. --measu
 it tells average precision (COCO's rules), and precision and recall at the scores that cues take.
 
 examples:
-  crosscue train frames L0-L319 --each 8 -o frames
-  crosscue train frames L900-L959 --each 5 -o held_out
+  crosscue train frames L0-L319 --per-layout 8 -o frames
+  crosscue train frames L900-L959 --per-layout 5 -o held_out
   crosscue train mask-rcnn --data frames/coco.json --images frames/images \
       --val-data held_out/coco.json --val-images held_out/images -o mine.safetensors
-  crosscue train mask-rcnn --data own.json --images photos --from resnet50 -o own.safetensors
+  crosscue train mask-rcnn --data own.json --images photos --init resnet50 -o own.safetensors
   crosscue train mask-rcnn --measure embedded --data held_out/coco.json --images held_out/images
 """
 
@@ -40,21 +40,29 @@ MOST_WINDOW_PX = 4096
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("--data", type=Path, required=True, metavar="COCO", help="annotations")
-    parser.add_argument("--images", type=Path, required=True, metavar="DIR", help="their pictures")
+    parser.add_argument(
+        "--data", type=Path, required=True, metavar="COCO", help="annotations to train on"
+    )
+    parser.add_argument(
+        "--images", type=Path, required=True, metavar="DIR", help="folder of their images"
+    )
     parser.add_argument(
         "--val-data",
         type=Path,
         metavar="COCO",
-        help=f"held out (default: every {EVERY}th picture of --data)",
+        help=f"annotations to validate on (default: every {EVERY}th image of --data)",
     )
-    parser.add_argument("--val-images", type=Path, metavar="DIR", help="their pictures")
-    parser.add_argument("-o", "--output", type=Path, metavar="OUT")
+    parser.add_argument("--val-images", type=Path, metavar="DIR", help="folder of their images")
     parser.add_argument(
-        "--measure", metavar="NETWORK", help="train nothing, measure this one: as --from"
+        "-o", "--output", type=Path, metavar="OUT.safetensors", help="checkpoint to write"
     )
     parser.add_argument(
-        "--pictures", metavar="A:B:N", help="measure on these of --data: ::4 is every 4th"
+        "--measure",
+        metavar="NETWORK",
+        help="measure this network instead of training; names as for --init",
+    )
+    parser.add_argument(
+        "--subset", metavar="A:B:N", help="measure on these images of --data: ::4 is every 4th"
     )
     parser.add_argument(
         "--proposals",
@@ -62,50 +70,98 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[PROPOSALS],
         metavar="N",
-        help="measure with so many places looked at; several in turn",
+        help="measure with N region proposals; several values in turn (default: 100)",
     )
     parser.add_argument(
-        "--from",
-        dest="start",
+        "--init",
         default="compact",
         metavar="NETWORK",
-        help="compact, resnet50, resnet50-v2, embedded, or a file",
+        help="initial weights: compact, resnet50, resnet50-v2, embedded, or a file",
     )
     parser.add_argument(
         "--backend",
         default="torch",
-        choices=["torch", "openvino"],
-        help="measure with the detector's layers run by this one",
+        choices=("torch", "openvino"),
+        help="inference engine to measure with (default: torch)",
     )
-    parser.add_argument("--classes", nargs="+", default=list(CLASSES), metavar="NAME")
-    parser.add_argument("--steps", type=int, default=4000, help="batches altogether")
-    parser.add_argument("--batch", type=int, default=8, help="samples in one")
-    parser.add_argument("--rate", type=float, default=1e-3, help="highest learning rate")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--width", type=int, default=1280, help="pictures are scaled to")
-    parser.add_argument("--top", type=float, default=0.0, help="share not looked at")
-    parser.add_argument("--bottom", type=float, default=0.0, help="share not looked at")
+    parser.add_argument(
+        "--classes", nargs="+", default=list(CLASSES), metavar="NAME", help="classes to train"
+    )
+    parser.add_argument(
+        "--steps", type=int, default=4000, metavar="N", help="training steps (default: 4000)"
+    )
+    parser.add_argument(
+        "--batch", type=int, default=8, metavar="N", help="images per batch (default: 8)"
+    )
+    parser.add_argument(
+        "--learning-rate",
+        type=float,
+        default=1e-3,
+        metavar="R",
+        help="max learning rate (default: 0.001)",
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=1280,
+        metavar="PX",
+        help="width that images are scaled to (default: 1280)",
+    )
+    parser.add_argument(
+        "--crop-top",
+        type=float,
+        default=0.0,
+        metavar="FRACTION",
+        help="top fraction of the image to skip",
+    )
+    parser.add_argument(
+        "--crop-bottom",
+        type=float,
+        default=0.0,
+        metavar="FRACTION",
+        help="bottom fraction of the image to skip",
+    )
     parser.add_argument(
         "--window",
         type=int,
         nargs=2,
         default=[544, 288],
         metavar=("W", "H"),
-        help="size of the parts of pictures learnt from",
+        help="width and height of the training windows, in pixels",
     )
     parser.add_argument(
         "--balance",
         type=float,
         default=1.0,
-        metavar="SHARE",
-        help="0 learns from each object as often, 1 from each class",
+        metavar="FRACTION",
+        help="0 samples every object equally often, 1 every class",
     )
-    parser.add_argument("--check-every", type=int, default=500, help="steps between validations")
-    parser.add_argument("--check-pictures", type=int, default=60, help="in validations on the way")
-    parser.add_argument("--device", default="auto", choices=["auto", "cpu", "cuda", "mps"])
-    parser.add_argument("--threads", type=int, default=1, help="on a CPU")
-    parser.add_argument("--resume", action="store_true", help="go on after a kill")
-    parser.add_argument("--overwrite", action="store_true", help="begin anew over earlier results")
+    parser.add_argument(
+        "--check-every",
+        type=int,
+        default=500,
+        metavar="N",
+        help="steps between validations (default: 500)",
+    )
+    parser.add_argument(
+        "--check-images",
+        type=int,
+        default=60,
+        metavar="N",
+        help="images per validation during training (default: 60)",
+    )
+    parser.add_argument(
+        "--device",
+        default="auto",
+        choices=("auto", "cpu", "cuda", "mps"),
+        help="device to train on (default: auto)",
+    )
+    parser.add_argument(
+        "--threads", type=int, default=1, metavar="N", help="CPU threads (default: 1)"
+    )
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted training")
+    parser.add_argument("--overwrite", action="store_true", help="replace existing results")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -152,11 +208,13 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("train mask-rcnn: give -o OUT.safetensors, or --measure")
     if args.output.suffix != ".safetensors":
         raise UsageError(f"-o {args.output}: want a name that ends in .safetensors")
-    for name in ("steps", "batch", "check_every", "check_pictures", "threads"):
+    for name in ("steps", "batch", "check_every", "check_images", "threads"):
         if getattr(args, name) < 1:
             raise UsageError(f"--{name.replace('_', '-')}: want 1 or more")
-    if not 0.0 < args.rate < 1.0 or args.seed < 0:
-        raise UsageError("--rate, --seed: want a rate between 0 and 1, and a seed of 0 or more")
+    if not 0.0 < args.learning_rate < 1.0 or args.seed < 0:
+        raise UsageError(
+            "--learning-rate, --seed: want a rate between 0 and 1, and a seed of 0 or more"
+        )
     if not 0.0 <= args.balance <= 1.0:
         raise UsageError(f"--balance {args.balance}: want 0 to 1")
     if any(side % 32 or not 64 <= side <= MOST_WINDOW_PX for side in args.window):
@@ -184,10 +242,10 @@ def _measure(args: argparse.Namespace) -> int:
     checkpoint = checkpoint_named(args.measure)
     classes = [name for name in checkpoint.facts.plan.classes if name]
     whole = read_coco(args.data, args.images, classes)
-    labelled = replace(whole, pictures=whole.pictures[_slice(args.pictures)])
+    labelled = replace(whole, pictures=whole.pictures[_slice(args.subset)])
     if not labelled.pictures:
         count = len(whole.pictures)
-        raise UsageError(f"--pictures {args.pictures}: none of {count} pictures; name others")
+        raise UsageError(f"--subset {args.subset}: none of {count} pictures; name others")
     told = []
     for proposals in args.proposals:
         settings = MaskRcnnSettings(proposals=proposals, threads=args.threads, backend=args.backend)
@@ -208,7 +266,7 @@ def _slice(text: str | None) -> slice:
     """
     match = re.fullmatch(r"(\d{0,9}):(\d{0,9})(?::([1-9]\d{0,8})?)?", text or ":")
     if match is None:
-        raise UsageError(f"--pictures {text}: want A:B:N, as 300: or 300:600 or ::4")
+        raise UsageError(f"--subset {text}: want A:B:N, as 300: or 300:600 or ::4")
     return slice(*(int(part) if part else None for part in match.groups()))
 
 
@@ -238,27 +296,29 @@ def _job(args: argparse.Namespace) -> Job:
     try:
         plan = Plan.model_validate(
             {
-                "architecture": architecture_of(args.start),
+                "architecture": architecture_of(args.init),
                 "classes": args.classes,
                 "width_px": args.width,
-                "top": args.top,
-                "bottom": args.bottom,
+                "top": args.crop_top,
+                "bottom": args.crop_bottom,
             }
         )
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        name = ".".join(str(part) for part in first["loc"]) or "--top, --bottom"
+        name = ".".join(str(part) for part in first["loc"]) or "--crop-top, --crop-bottom"
         raise UsageError(f"train mask-rcnn: {name}: {first['msg'].lower()}") from None
-    schedule = Schedule(args.steps, args.batch, args.rate, min(100, args.steps), seed=args.seed)
+    schedule = Schedule(
+        args.steps, args.batch, args.learning_rate, min(100, args.steps), seed=args.seed
+    )
     window = Window(args.window[0], args.window[1], balance=args.balance)
     return Job(
-        args.start,
+        args.init,
         plan,
         schedule,
         window,
         args.output,
         args.check_every,
-        args.check_pictures,
+        args.check_images,
         args.device,
         args.threads,
         {"data": args.data.parent.name, "window": str(args.window), "balance": args.balance},

@@ -1,14 +1,15 @@
-"""Train the road network, on simulated intersections or on pictures with masks of one's own.
+r"""Train the road network on simulated intersections or on your own images with masks.
 
-Simulated: renders --each pictures of each layout of --layouts (L and a number), and measures on
-layouts it has not seen, --held. A to H may only be --score-d, never trained on. One's own: a folder
---data with images/NAME.jpg and masks/NAME.png, white where road is; every tenth is held out.
---measure trains nothing: it tells how well a network does on --score or --data.
+Simulated: renders --per-layout images of each layout of --layouts (L and a number) and validates on
+other layouts, --val-layouts. Layouts A to H are for --test-layouts only. Your own: a folder --data
+with images/NAME.jpg and masks/NAME.png, white where road is; every tenth image is held out.
+--measure reports how well a network does on --test-layouts or --data, without training.
 
 examples:
-  crosscue train road --layouts L400-L519 --held L600-L611 --score A-H -o road.safetensors
-  crosscue train road --data my_frames --from road.safetensors -o mine.safetensors
-  crosscue train road --measure embedded --score A-H
+  crosscue train road --layouts L400-L519 --val-layouts L600-L611 \
+      --test-layouts A-H -o road.safetensors
+  crosscue train road --data my_frames --init road.safetensors -o mine.safetensors
+  crosscue train road --measure embedded --test-layouts A-H
 """
 
 from __future__ import annotations
@@ -40,43 +41,71 @@ SAVED_EVERY = 100
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("--layouts", nargs="+", metavar="LAYOUT", help="L400 or a span: L400-L519")
     parser.add_argument(
-        "--held",
+        "--layouts",
+        nargs="+",
+        metavar="LAYOUT",
+        help="layouts to train on: L400 or a span, L400-L519",
+    )
+    parser.add_argument(
+        "--val-layouts",
         nargs="+",
         metavar="LAYOUT",
         default=[],
-        help="layouts to measure on, none of them trained on",
+        help="layouts to validate on, none of them trained on",
     )
     parser.add_argument(
-        "--score",
+        "--test-layouts",
         nargs="+",
         metavar="LAYOUT",
         default=[],
-        help="further layouts to measure on at the end: A-H",
-    )
-    parser.add_argument("--data", type=Path, metavar="DIR", help="images/ and masks/ of one's own")
-    parser.add_argument("-o", "--output", type=Path, metavar="OUT.safetensors")
-    parser.add_argument(
-        "--measure", metavar="NETWORK", help="train nothing, measure this one: embedded, or a file"
+        help="further layouts to measure on at the end, such as A-H",
     )
     parser.add_argument(
-        "--from", dest="start", type=Path, metavar="FILE", help="begin with these weights"
+        "--data", type=Path, metavar="DIR", help="folder with your own images/ and masks/"
     )
     parser.add_argument(
-        "--resume", action="store_true", help="go on after an interruption, from OUT.state"
+        "-o", "--output", type=Path, metavar="OUT.safetensors", help="checkpoint to write"
     )
-    parser.add_argument("--each", type=int, default=12, help="pictures of each layout")
-    parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument(
-        "--stop-at", type=int, metavar="N", help="end after so many of the schedule's steps"
+        "--measure",
+        metavar="NETWORK",
+        help="measure this network instead of training: embedded, or a file",
     )
-    parser.add_argument("--batch", type=int, default=12)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--width", type=int, default=384, help="of the network's input (9/16 high)")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda", "mps"), default="auto")
-    parser.add_argument("--threads", type=int, default=0, help="on a CPU; 0 for as many as it has")
-    parser.add_argument("--overwrite", action="store_true", help="replace OUT")
+    parser.add_argument("--init", type=Path, metavar="FILE", help="initial weights")
+    parser.add_argument(
+        "--resume", action="store_true", help="continue an interrupted training from OUT.state"
+    )
+    parser.add_argument(
+        "--per-layout", type=int, default=12, metavar="N", help="images per layout (default: 12)"
+    )
+    parser.add_argument(
+        "--steps", type=int, default=1500, metavar="N", help="training steps (default: 1500)"
+    )
+    parser.add_argument(
+        "--stop-at", type=int, metavar="N", help="stop after N steps of the schedule"
+    )
+    parser.add_argument(
+        "--batch", type=int, default=12, metavar="N", help="images per batch (default: 12)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=384,
+        metavar="PX",
+        help="input width in pixels; height is 9/16 (default: 384)",
+    )
+    parser.add_argument(
+        "--device",
+        choices=("auto", "cpu", "cuda", "mps"),
+        default="auto",
+        help="device to train on (default: auto)",
+    )
+    parser.add_argument(
+        "--threads", type=int, default=0, metavar="N", help="CPU threads; 0 for all (default: 0)"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing OUT")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -101,8 +130,8 @@ def run(args: argparse.Namespace) -> int:
     device = chosen_device(args.device, "train road")
     with reproducible(device):
         training = RoadTraining(schedule, device)
-        if args.start is not None:
-            training.network.load_state_dict(load_road(args.start).network.state_dict())
+        if args.init is not None:
+            training.network.load_state_dict(load_road(args.init).network.state_dict())
         loss = _trained(training, learn, args)
     recipe: dict[str, str | int | float] = {
         "layouts": " ".join(args.layouts or []),
@@ -126,16 +155,16 @@ def run(args: argparse.Namespace) -> int:
 def _check(args: argparse.Namespace) -> None:
     if args.width % 16 or not 128 <= args.width <= 1024:
         raise UsageError(f"--width {args.width}: want a multiple of 16 from 128 to 1024")
-    if min(args.each, args.steps, args.batch, args.stop_at or 1) < 1:
-        raise UsageError("--each, --steps, --stop-at, --batch: want 1 or more")
+    if min(args.per_layout, args.steps, args.batch, args.stop_at or 1) < 1:
+        raise UsageError("--per-layout, --steps, --stop-at, --batch: want 1 or more")
     if min(args.seed, args.threads) < 0:
         raise UsageError("--seed, --threads: want 0 or more")
-    layouts_of(args.score, "--score")
+    layouts_of(args.test_layouts, "--test-layouts")
     if args.measure is not None:
         if args.output is not None or args.layouts is not None:
             raise UsageError("--measure: trains nothing, so not with -o or --layouts; leave those")
-        if (args.data is None) == (not args.score):
-            raise UsageError("--measure: give --score with layouts, or --data with pictures")
+        if (args.data is None) == (not args.test_layouts):
+            raise UsageError("--measure: give --test-layouts with layouts, or --data with pictures")
         return
     if args.output is None:
         raise UsageError("train road: give -o OUT.safetensors, or --measure")
@@ -219,9 +248,9 @@ def _frames(args: argparse.Namespace) -> tuple[RoadFrames, RoadFrames | None]:
         held = RoadFrames(whole.pixels[out], whole.road[out]) if out else None
         return RoadFrames(whole.pixels[kept], whole.road[kept]), held
     layouts = learnt_layouts_of(args.layouts, "--layouts")
-    held_out = layouts_of(args.held, "--held")
+    held_out = layouts_of(args.val_layouts, "--val-layouts")
     if both := sorted({*layouts} & {*held_out}):
-        raise UsageError(f"--held {both[0]}: also trained on; hold out others")
+        raise UsageError(f"--val-layouts {both[0]}: also trained on; hold out others")
     learn = _rendered(layouts, size, args)
     return learn, _rendered(held_out, size, args) if held_out else None
 
@@ -231,7 +260,7 @@ def _size(args: argparse.Namespace) -> Size:
 
 
 def _scored(args: argparse.Namespace, size: Size) -> RoadFrames | None:
-    names = layouts_of(args.score, "--score")
+    names = layouts_of(args.test_layouts, "--test-layouts")
     return _rendered(names, size, args) if names else None
 
 
@@ -249,7 +278,7 @@ def _rendered(names: list[str], size: Size, args: argparse.Namespace) -> RoadFra
             for run in range(1, 11)
         ]
     parts: list[RoadFrames] = []
-    made: Iterator[RoadFrames] = rendered(runs, args.each, size)
+    made: Iterator[RoadFrames] = rendered(runs, args.per_layout, size)
     for part in with_progress(made, lambda: len(parts) / len(runs), args, "rendering"):
         parts.append(part)
     return joined(parts)

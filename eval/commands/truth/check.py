@@ -20,11 +20,11 @@ from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("truth", type=Path, metavar="T.json", help="the truth file")
-    parser.add_argument("--log", type=Path, required=True, metavar="LOG", help="its log")
+    parser.add_argument("truth", type=Path, metavar="T.json", help="truth file")
     parser.add_argument(
-        "--vehicle", type=Path, metavar="V.toml", help="names the camera where the log has several"
+        "--log", type=Path, required=True, metavar="LOG", help="the log it belongs to"
     )
+    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="vehicle file: camera topic")
     add_limit_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

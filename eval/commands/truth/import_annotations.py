@@ -29,32 +29,36 @@ from crosscue.replay.vehicle.vehicle import Vehicle, load
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("source", type=Path, metavar="ANNOTATIONS", help="COCO .json, CVAT .xml")
-    parser.add_argument("--log", type=Path, required=True, metavar="LOG", help="the annotated log")
+    parser.add_argument(
+        "--log", type=Path, required=True, metavar="LOG", help="the log that was annotated"
+    )
     parser.add_argument(
         "-o",
         "--output",
         type=Path,
         required=True,
         metavar="T.json",
-        help="the truth file, or a folder for it",
+        help="truth file, or its folder",
     )
     parser.add_argument(
         "--vehicle",
         type=Path,
         metavar="V.toml",
-        help="names the camera of several, and cues of your own",
+        help="vehicle file: camera topic and your own cues",
     )
     parser.add_argument(
         "--map",
         nargs="+",
         default=[],
         metavar="LABEL=CUE",
-        help="what labels mean; nothing after = for no cue",
+        help="cue of a label; LABEL= for no cue",
     )
     parser.add_argument(
-        "--add", action="store_true", help="keep approaches and track of the truth that is there"
+        "--add",
+        action="store_true",
+        help="keep the approaches and the track of an existing truth file",
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace an earlier truth file")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing truth file")
     add_limit_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

@@ -9,8 +9,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
-from crosscue.replay.errors import UsageError
+from crosscue.eval.commands.shared.options import (
+    add_limit_arguments,
+    limits_of,
+    print_json,
+    refuse_existing,
+)
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.opening import open_logs
 from crosscue.replay.vehicle.draft import draft
@@ -26,18 +30,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=[],
         metavar="FILE",
-        help="DBC, KCD, ARXML or SYM files of its buses",
+        help="DBC, KCD, ARXML or SYM files of the CAN buses",
     )
     add_limit_arguments(parser)
-    parser.add_argument("-o", "--output", type=Path, metavar="V.toml", help="default: print it")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="V.toml",
+        help="vehicle file to write (default: print it)",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Draft the file, check that it reads back, write or print it."""
-    if args.output is not None and args.output.exists() and not args.overwrite:
-        raise UsageError(f"{args.output}: exists; give another name or --overwrite")
+    refuse_existing(args)
     folder = args.output.parent if args.output is not None else Path.cwd()
     with open_logs(args.logs, limits_of(args)) as logs:
         text = draft(logs, args.dbc, folder)

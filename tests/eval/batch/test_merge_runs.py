@@ -90,7 +90,7 @@ def test_commands_for_one_drive_refuse_many(
 ) -> None:
     merged = str(_merged(tmp_path, ["abc", "de"]).path)
 
-    for argv in (["estimate", merged], ["view", merged, "--save", str(tmp_path / "x.rrd")]):
+    for argv in (["estimate", merged], ["view", merged, "-o", str(tmp_path / "x.rrd")]):
         assert cli.run(argv) == 1
         assert "holds the tables of many drives" in capsys.readouterr().err
 

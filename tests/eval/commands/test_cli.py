@@ -89,7 +89,7 @@ def test_usage(
 
 @pytest.mark.parametrize("length", ["0", "-1", "inf", "nan", "far"])
 @pytest.mark.parametrize(
-    "flag", ["score run --rpe", "landmarks add db --every", "fit landmarks --near"]
+    "flag", ["score run --rpe", "landmarks add db --every", "fit landmarks --same-within"]
 )
 def test_a_length_is_above_nothing(
     flag: str, length: str, capsys: pytest.CaptureFixture[str]

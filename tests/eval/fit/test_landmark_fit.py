@@ -121,7 +121,7 @@ def test_pairs_from_a_table_fit_a_threshold_and_write_it(
     car = tmp_path / "car.toml"
     car.write_text("version = 1 # mine\n")
     command = ["fit", "landmarks", "--pairs", str(tmp_path / "pairs.csv"), "--vehicle", str(car)]
-    assert cli.run([*command, "--write", "--json"]) == 0
+    assert cli.run([*command, "-o", str(car), "--json"]) == 0
 
     fitted = json.loads(capsys.readouterr().out)
     assert (fitted["held_out_found"]["hits"], fitted["held_out_found"]["of"]) == (4, 4)
@@ -152,7 +152,11 @@ def test_bad_tables_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("flags", "why"), [(["--most", "0"], "--most 0"), (["--near", "60"], "--near 60: want less")]
+    ("flags", "why"),
+    [
+        (["--max-landmarks", "0"], "--max-landmarks 0"),
+        (["--same-within", "60"], "--same-within 60: want less"),
+    ],
 )
 def test_flags_that_leave_no_pairs_are_refused(
     capsys: pytest.CaptureFixture[str], flags: list[str], why: str
@@ -184,7 +188,16 @@ def test_a_real_drive_with_poses_fits_a_threshold(
     add = ["landmarks", "add", database, str(tmp_path / "even"), *poses, "--every", "1"]
     assert cli.run(add) == 0
     fit = ["fit", "landmarks", str(tmp_path / "odd"), "--database", database, *poses]
-    near = ["--every", "0.5", "--near", "3", "--far", "25", "--false-match-rate", "0.05"]
+    near = [
+        "--every",
+        "0.5",
+        "--same-within",
+        "3",
+        "--different-beyond",
+        "25",
+        "--false-match-rate",
+        "0.05",
+    ]
     capsys.readouterr()
     assert cli.run([*fit, *near, "--json"]) == 0
 

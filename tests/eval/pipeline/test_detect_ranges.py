@@ -204,7 +204,7 @@ def test_truth_without_objects_or_ranges_is_told(tmp_path: Path) -> None:
 def test_runs_and_drives_come_in_pairs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     here = str(drive(tmp_path / "a"))
 
-    assert run(["fit", "ranges", "--cue", "stop_sign", "--truth", here, here, "--run", here]) == 2
+    assert run(["fit", "ranges", "--cue", "stop_sign", "--truth", here, here, "--runs", here]) == 2
     assert "1 runs for 2 drives" in capsys.readouterr().err
     assert run(["fit", "ranges", "--cue", "stop_sign"]) == 2
     assert "give a TABLE, or --truth" in capsys.readouterr().err

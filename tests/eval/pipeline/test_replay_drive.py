@@ -136,7 +136,7 @@ def test_the_real_minute_from_the_command_line(
 
     # One array of this recording is cut, and whoever reads it reports that: exit status 3.
     assert cli.run(["vehicle", "init", str(segment), "--dbc", str(dbc), "-o", str(car)]) == 3
-    assert cli.run(["fit", "compass", str(segment), "--vehicle", str(car), "--write"]) == 3
+    assert cli.run(["fit", "compass", str(segment), "--vehicle", str(car), "-o", str(car)]) == 3
     assert "hard iron: headings cover" in capsys.readouterr().out
     status = cli.run(["replay", str(segment), "--vehicle", str(car), "-o", str(run)])
 

@@ -83,7 +83,7 @@ def test_replay_and_estimate_of_a_damaged_log(
         assert not found["is_whole"]
         assert found["estimating"]["wheel speeds"]["used"] > 0
 
-    assert cli.run(["view", str(run), "--save", str(tmp_path / "x.rrd"), "-q"]) == 3
+    assert cli.run(["view", str(run), "-o", str(tmp_path / "x.rrd"), "-q"]) == 3
     assert cli.run(["compare", str(run), str(run), "-q"]) == 3
     assert cli.run(["estimate", str(run)]) == 3
     text = capsys.readouterr().out

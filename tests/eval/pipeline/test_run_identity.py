@@ -94,7 +94,7 @@ def test_a_run_of_the_old_format_is_refused(
 
     for argv in (
         ["estimate", "old"],
-        ["view", "old", "--save", "x.rrd"],
+        ["view", "old", "-o", "x.rrd"],
         ["score", "old"],
         ["merge", "old", "-o", "all"],
     ):

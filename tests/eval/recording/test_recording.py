@@ -158,7 +158,7 @@ def test_a_recording_never_replaces_what_is_no_recording(
     letter = tmp_path / "letter.md"
     letter.write_text("keep me")
 
-    assert cli.run(["view", str(tmp_path), "--save", str(letter)]) == 2
+    assert cli.run(["view", str(tmp_path), "-o", str(letter)]) == 2
 
     assert "letter.md: want a name that ends in .rrd" in capsys.readouterr().err
     assert letter.read_text() == "keep me"
@@ -171,7 +171,7 @@ def test_view_takes_truth_without_a_track(
     truth = truth_folder(tmp_path / "truth")
     out = tmp_path / "out.rrd"
 
-    assert cli.run(["view", str(run.path), "--save", str(out), "--truth", str(truth)]) == 3
+    assert cli.run(["view", str(run.path), "-o", str(out), "--truth", str(truth)]) == 3
     assert capsys.readouterr().out == f"{out}\n"
     rows = _rows(out)
     assert rows["/plots/range/true_start"] == rows["/plots/range/true_end"] == 40

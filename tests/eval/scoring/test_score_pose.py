@@ -236,7 +236,7 @@ def test_pictures_pass_into_the_recording_as_stored(tmp_path: Path) -> None:
     log.unlink()
     with pytest.raises(RunError, match="is gone; say where it is with --logs DIR"):
         save_recording(run, tmp_path / "without.rrd")
-    save_recording(replace(run, without_pictures=True), tmp_path / "without.rrd")
+    save_recording(replace(run, without_images=True), tmp_path / "without.rrd")
 
     sizes = [(tmp_path / f"{name}.rrd").stat().st_size for name in ("drive", "without")]
     assert edges[-1] <= sizes[0] - sizes[1] < 1.02 * edges[-1] + 20_000

@@ -257,7 +257,8 @@ def test_a_study_file_that_never_ends_is_not_read() -> None:
 
 
 @pytest.mark.parametrize(
-    ("flag", "value"), [("--compass", "-5"), ("--rate", "1.5"), ("--landmarks", "101")]
+    ("flag", "value"),
+    [("--compass", "-5"), ("--detection-rate", "1.5"), ("--landmark-density", "101")],
 )
 def test_a_drive_that_cannot_be_names_its_flag(
     tmp_path: Path, flag: str, value: str, capsys: pytest.CaptureFixture[str]
