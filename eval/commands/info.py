@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--quick",
         action="store_true",
-        help="print what the log declares, and whether its end is missing, without reading its body",
+        help="print what the log declares and whether its end is missing, without reading its body",
     )
 
 
