@@ -30,12 +30,19 @@ IMU: Final = {
     "gyro_x_radps": "wx", "gyro_y_radps": "wy", "gyro_z_radps": "wz",
 }  # fmt: skip
 GNSS: Final = {
-    "latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt",
-    "position_sd_m": "pos_accuracy", "satellites": "numsats", "position_mode": "posmode",
-}  # fmt: skip
+    "latitude_deg": "lat",
+    "longitude_deg": "lon",
+    "altitude_m": "alt",
+    "position_sd_m": "pos_accuracy",
+    "satellites": "numsats",
+    "position_mode": "posmode",
+}
 INS_SPEED: Final = {
-    "speed_mps": "vf", "speed_left_mps": "vl", "speed_up_mps": "vu", "speed_sd_mps": "vel_accuracy",
-}  # fmt: skip
+    "speed_mps": "vf",
+    "speed_left_mps": "vl",
+    "speed_up_mps": "vu",
+    "speed_sd_mps": "vel_accuracy",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -48,9 +48,11 @@ class PicodetOutput(BoxOutput):
             [rows_of(named(outputs, name, "scores"), classes, name) for name in self.scores]
         )
         logits = np.vstack(
-            [rows_of(named(outputs, name, "distances"), 4 * self.bins, name)
-             for name in self.distances]
-        )  # fmt: skip
+            [
+                rows_of(named(outputs, name, "distances"), 4 * self.bins, name)
+                for name in self.distances
+            ]
+        )
         corner, stride = cells(size_px, self.strides, round_up=True)
         if not len(corner) == len(scores) == len(logits):
             raise ValueError(

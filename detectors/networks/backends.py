@@ -191,8 +191,12 @@ BACKENDS: Final[Mapping[str, tuple[str, ...]]] = {
     ".tflite": ("litert",),
 }
 """From the weights' suffix to the back ends that run them, the preferred first."""
-_PACKAGE: Final = {"onnxruntime": "onnxruntime", "opencv": "cv2", "openvino": "openvino",
-             "litert": "ai_edge_litert"}  # fmt: skip
+_PACKAGE: Final = {
+    "onnxruntime": "onnxruntime",
+    "opencv": "cv2",
+    "openvino": "openvino",
+    "litert": "ai_edge_litert",
+}
 _PROJECT: Final = {"opencv": "opencv-python-headless", "litert": "ai-edge-litert"}
 _LOADERS: Final[Mapping[str, Callable[[Weights, int, Size | None], Network]]] = {
     "onnxruntime": _in_onnxruntime,

@@ -122,9 +122,14 @@ class BoxModel:
         return _Found(boxes, some.scores[keep], some.classes[keep], masks)
 
     def _masks(
-        self, some: Candidates, keep: Int64s, boxes: Floats, part: _Part, placement: Placement,
+        self,
+        some: Candidates,
+        keep: Int64s,
+        boxes: Floats,
+        part: _Part,
+        placement: Placement,
         frame: Frame,
-    ) -> list[bytes]:  # fmt: skip
+    ) -> list[bytes]:
         if some.masks is None:
             return [b""] * len(keep)
         texts = []

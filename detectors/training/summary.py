@@ -9,8 +9,13 @@ if TYPE_CHECKING:
     from .measure import Measured
     from .operating_point import Rates
 
-COLUMNS: Final = (("", "AP"), ("50", "AP50"), (" small", "small"), (" medium", "medium"),
-                  (" large", "large"))  # fmt: skip
+COLUMNS: Final = (
+    ("", "AP"),
+    ("50", "AP50"),
+    (" small", "small"),
+    (" medium", "medium"),
+    (" large", "large"),
+)
 """How a kind's name goes on, and what stands above the column."""
 
 

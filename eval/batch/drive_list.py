@@ -37,10 +37,25 @@ LIST_BYTES: Final = 64 * MIB
 DEPTH: Final = 8
 """Of folders within folders of drives."""
 NAME_LENGTH: Final = 150
-SAYS_NOTHING: Final = frozenset({
-    "bag", "camera", "can", "can0", "can1", "data", "drive", "images", "log", "logs", "record",
-    "recording", "rosbag", "rosbag2", "video",
-})  # fmt: skip
+SAYS_NOTHING: Final = frozenset(
+    {
+        "bag",
+        "camera",
+        "can",
+        "can0",
+        "can1",
+        "data",
+        "drive",
+        "images",
+        "log",
+        "logs",
+        "record",
+        "recording",
+        "rosbag",
+        "rosbag2",
+        "video",
+    }
+)
 """Names of logs that tell no drive from another."""
 
 

@@ -40,8 +40,15 @@ BETTER: Final[Mapping[str, Direction]] = {
     ),
 }  # fmt: skip
 """By the last part of a metric's path; metrics of other names are shown but not judged."""
-PARTS: Final = ("by_distance", "by_condition", "by_intersection", "by_drive", "readings", "things",
-         "attribution")  # fmt: skip
+PARTS: Final = (
+    "by_distance",
+    "by_condition",
+    "by_intersection",
+    "by_drive",
+    "readings",
+    "things",
+    "attribution",
+)
 """Metrics below these stand on few rows each; they are shown but not judged."""
 COMPARED: Final = ("versions", "settings", "detectors", "camera", "selection", "logs", "landmarks")
 MOST_BYTES: Final = 256 * MIB

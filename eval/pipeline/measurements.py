@@ -29,9 +29,20 @@ if TYPE_CHECKING:
 
 TABLE: Final = "measurements"
 _NUMBERS: Final = (
-    "distance_m", "turn_rad", "distance_var_m2", "turn_var_rad2", "speed_mps", "speed_var_m2ps2",
-    "heading_rad", "heading_var_rad2", "x_m", "y_m", "xx_m2", "xy_m2", "yy_m2",
-)  # fmt: skip
+    "distance_m",
+    "turn_rad",
+    "distance_var_m2",
+    "turn_var_rad2",
+    "speed_mps",
+    "speed_var_m2ps2",
+    "heading_rad",
+    "heading_var_rad2",
+    "x_m",
+    "y_m",
+    "xx_m2",
+    "xy_m2",
+    "yy_m2",
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -30,8 +30,17 @@ APART_NS: Final = 2_000_000_000
 """Wrong frames of one cue closer than this are one mistake; its most confident frame is shown."""
 WIDTH_PX: Final = 640
 QUALITY: Final = 80
-FOUND: Final = ("t_ns", "label", "score", "x0", "y0", "x1", "y1", "picture_width_px",
-                "picture_height_px")  # fmt: skip
+FOUND: Final = (
+    "t_ns",
+    "label",
+    "score",
+    "x0",
+    "y0",
+    "x1",
+    "y1",
+    "picture_width_px",
+    "picture_height_px",
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,8 +35,9 @@ from crosscue.replay.vehicle import cue_table
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 SHOWN: Final = ("approaches", "belief", "range")
-PASSED_OVER: Final = frozenset({"by_intersection", "by_condition", "by_distance", "by_control",
-                                    "failures"})  # fmt: skip
+PASSED_OVER: Final = frozenset(
+    {"by_intersection", "by_condition", "by_distance", "by_control", "failures"}
+)
 
 
 class EstimateWithout(Protocol):

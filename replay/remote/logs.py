@@ -45,9 +45,18 @@ from .ranges import RangedFile, Spool
 URL: Final = re.compile(r"^[a-z][a-z0-9+.-]+://")
 CHUNK_BYTES: Final = 8 << 20
 VERSION_KEYS: Final = (
-    "ETag", "etag", "version_id", "generation", "md5Hash", "LastModified", "Last-Modified",
-    "last_modified", "mtime", "updated", "created",
-)  # fmt: skip
+    "ETag",
+    "etag",
+    "version_id",
+    "generation",
+    "md5Hash",
+    "LastModified",
+    "Last-Modified",
+    "last_modified",
+    "mtime",
+    "updated",
+    "created",
+)
 """What stores call the version of an object; the first that is there is taken."""
 LOCK: Final = ".lock"
 SIZE: Final = ".size"

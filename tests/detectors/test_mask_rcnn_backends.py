@@ -332,6 +332,7 @@ assert "openvino.tools.ovc.telemetry_stub" in sys.modules
 """
 
 
+@pytest.mark.slow
 def test_openvino_sends_nothing_and_leaves_nothing_in_the_home_folder(tmp_path: Path) -> None:
     _needs("openvino")
     hidden = {"CI", "TF_BUILD", "JENKINS_URL"}

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from crosscue.detectors.training.reproducible import decides_bits, reproducible
@@ -37,6 +38,7 @@ def _road_set(folder: Path, numbers: list[int]) -> None:
         (folder / "set" / "masks" / f"{number}.png").write_bytes(mask)
 
 
+@pytest.mark.slow
 def test_two_trainings_of_the_road_network_are_the_same_bytes(tmp_path: Path) -> None:
     argv = [
         "train",
@@ -63,6 +65,7 @@ def test_two_trainings_of_the_road_network_are_the_same_bytes(tmp_path: Path) ->
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_two_trainings_of_mask_rcnn_are_the_same_bytes(tmp_path: Path) -> None:
     argv = [
         "train",

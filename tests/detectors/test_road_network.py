@@ -40,6 +40,7 @@ def scenes(n: int, seed: int = 0) -> tuple[Bytes, Bytes]:
     return pixels, road
 
 
+@pytest.mark.slow
 def test_it_learns_what_road_looks_like() -> None:
     training = RoadTraining(RoadSchedule(steps=60, batch=6, warm_up=5), CPU)
     held = scenes(6, seed=1)
@@ -53,6 +54,7 @@ def test_it_learns_what_road_looks_like() -> None:
     assert after.pictures == 6
 
 
+@pytest.mark.slow
 def test_going_on_after_an_interruption_is_as_if_there_was_none(tmp_path: Path) -> None:
     pixels, road = scenes(8)
     whole = RoadTraining(RoadSchedule(steps=6, batch=2), CPU)
@@ -166,6 +168,7 @@ def folder(at: Path, n: int) -> Path:
     return at
 
 
+@pytest.mark.slow
 def test_own_pictures_with_masks_train_too(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -233,6 +236,7 @@ def test_wrong_usage_is_told(
     assert says in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_network_is_measured_without_training(capsys: pytest.CaptureFixture[str]) -> None:
     measure = ["train", "road", "--measure", "embedded"]
 

@@ -31,6 +31,7 @@ def _signs(grey: Bytes, **changes: object) -> Detections:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", AMERICAN)
 def test_each_american_sign_is_found_where_it_is_and_called_what_it_is(kind: Kind) -> None:
     hits = 0
@@ -244,6 +245,7 @@ def drive(folder: Path, seeds: range) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_drives_measure_a_threshold_with_an_interval_by_drive(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -177,6 +177,7 @@ def test_all_spellings_of_a_mask_mean_the_same_pixels(tmp_path: Path) -> None:
         assert (got ^ mask).sum() <= (0 if number else 2 * (30 + 60) + 4)
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10_000))
 def test_in_a_sample_every_box_encloses_its_mask_and_shows_its_object(
@@ -201,6 +202,7 @@ def _training(folder: Path, schedule: Schedule) -> tuple[Training, Sampler]:
     return training, Sampler(_bars(folder), plan, WINDOW, schedule.seed)
 
 
+@pytest.mark.slow
 def test_a_network_learns(tmp_path: Path) -> None:
     training, sampler = _training(tmp_path, Schedule(16, batch=2, rate=2e-3, warm_up=4))
 
@@ -209,6 +211,7 @@ def test_a_network_learns(tmp_path: Path) -> None:
     assert np.mean(losses[-4:]) < 0.85 * np.mean(losses[:3])
 
 
+@pytest.mark.slow
 def test_going_on_after_a_kill_ends_as_if_none_had_come(tmp_path: Path) -> None:
     schedule = Schedule(4, batch=2, warm_up=1)
     whole, sampler = _training(tmp_path / "a", schedule)
@@ -243,6 +246,7 @@ def test_a_state_of_another_training_or_none_is_refused(tmp_path: Path) -> None:
         one.resume(path)
 
 
+@pytest.mark.slow
 def test_losses_that_are_no_numbers_end_the_training(tmp_path: Path) -> None:
     training, sampler = _training(tmp_path, Schedule(40, batch=1))
     with torch.no_grad():
@@ -318,6 +322,7 @@ def test_too_few_detections_leave_scores_as_they_are() -> None:
     assert (fitted(rows).slope, fitted(rows).offset) == (1.0, 0.0)
 
 
+@pytest.mark.slow
 def test_from_simulated_pictures_to_a_checkpoint_by_commands_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

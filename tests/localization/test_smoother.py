@@ -125,6 +125,7 @@ def errors(truth: Truth, t_ns: Int64s, xyh: Floats) -> Floats:
     return error
 
 
+@pytest.mark.slow
 def test_simulated_errors_are_as_claimed_and_no_larger_than_the_filters() -> None:
     """Seeds 0 to 29: at the end both know the same; in the middle the smoother knows more."""
     nees, filter_m2, smoother_m2, ends = [], [], [], []
@@ -148,6 +149,7 @@ def test_simulated_errors_are_as_claimed_and_no_larger_than_the_filters() -> Non
     assert np.median(ends) < 0.2
 
 
+@pytest.mark.slow
 def test_at_the_end_of_hours_without_landmarks_it_knows_what_the_filter_knows() -> None:
     """Position is held a hundred million times more loosely than each step: seed 5, 24 km."""
     rng, n = np.random.default_rng(5), 12_000

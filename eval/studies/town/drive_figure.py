@@ -30,8 +30,11 @@ MARGIN_M: Final = 250.0
 TRUTH: Final = "#2ca02c"
 ESTIMATE: Final = "#1f77b4"
 ELLIPSE: Final = "#ff7f0e"
-ENDS: Final = {Outcome.REACHED: "reached its goal", Outcome.LOST: "lost",
-               Outcome.GIVEN_UP: "given up"}  # fmt: skip
+ENDS: Final = {
+    Outcome.REACHED: "reached its goal",
+    Outcome.LOST: "lost",
+    Outcome.GIVEN_UP: "given up",
+}
 
 
 def draw(settings: Drive, traced: Traced, seed: int, folder: Path) -> Path:

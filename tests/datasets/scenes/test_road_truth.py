@@ -18,6 +18,7 @@ def picture(layout: str, x_m: float) -> Picture:
     return renderer(of).picture(when_at(of, x_m), with_road=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("layout", "x_m"), [("D", -30.0), ("D", -8.0), ("A", -15.0)])
 def test_a_point_of_the_ground_is_road_where_the_map_says_so(layout: str, x_m: float) -> None:
     of, shown = world(layout), picture(layout, x_m)

@@ -96,6 +96,7 @@ def test_masks_fill_their_boxes_and_say_who_owns_each_pixel(layout: str) -> None
         assert 0.0 < seen.in_picture <= 1.0
 
 
+@pytest.mark.slow
 def test_the_mirror_image_of_a_world_is_the_mirror_image_of_its_picture() -> None:
     plain = world("F", 2)
     one, other = picture_at(plain, -22.0), picture_at(mirrored(plain), -22.0)
@@ -126,6 +127,7 @@ def test_what_is_beside_the_camera_is_not_seen() -> None:
     assert all(one.thing.category != "stop_sign" for one in picture.seen)
 
 
+@pytest.mark.slow
 def test_dusk_is_darker_than_noon_and_glare_brighter_at_the_sun() -> None:
     noon, dusk = picture_at(world("D", 1), -30.0), picture_at(world("D", 10), -30.0)
     glare = picture_at(world("D", 4), -30.0)

@@ -61,9 +61,12 @@ def test_no_line_of_a_recording_runs_across_a_gap(paused: RunFolder, tmp_path: P
 
     (gap,) = gaps_of(timeline_in(paused.manifest()))
     lines = [
-        "/plots/belief/intersection", "/plots/range/start", "/plots/speed/speed_mps",
-        "/plots/heading/heading_deg", "/plots/ellipse/major_axis_m",
-    ]  # fmt: skip
+        "/plots/belief/intersection",
+        "/plots/range/start",
+        "/plots/speed/speed_mps",
+        "/plots/heading/heading_deg",
+        "/plots/ellipse/major_axis_m",
+    ]
     for entity in lines:
         rows = _rows(path, entity, "scalars")
         assert len(rows) > 50, entity

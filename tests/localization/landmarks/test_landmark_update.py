@@ -168,6 +168,7 @@ def nees(done: Advance, truth: Truth) -> float:
 SEEDS = 50
 
 
+@pytest.mark.slow
 def test_simulated_errors_are_as_large_as_claimed(tmp_path: Path) -> None:
     """NEES of the last pose and NIS of all landmarks, seeds 0 to 49."""
     runs = [run(tmp_path, seed) for seed in range(SEEDS)]
@@ -180,6 +181,7 @@ def test_simulated_errors_are_as_large_as_claimed(tmp_path: Path) -> None:
     assert low < nis.mean() < high
 
 
+@pytest.mark.slow
 def test_a_camera_ahead_of_the_axle_is_no_bias(tmp_path: Path) -> None:
     """Heading errors swing the camera: the covariance swings along."""
     runs = [run(tmp_path, seed, (2.0, 0.5)) for seed in range(SEEDS)]

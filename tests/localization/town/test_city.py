@@ -51,6 +51,7 @@ def reachable(streets: Streets, start: int, *, backward: bool = False) -> set[in
     return seen
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**63))
 @checked(deadline=None, max_examples=25)
 def test_every_goal_can_be_reached_from_wherever_the_car_may_go(seed: int) -> None:

@@ -79,6 +79,7 @@ def many(settings: Drive, count: int, first: int = 0) -> Floats:
         return np.concatenate(list(pool.map(lambda part: drive_many(settings, part), parts)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_the_compiled_drive_is_the_plain_one(kind: str) -> None:
     plain = np.array([drive(KINDS[kind], seed) for seed in range(3)], np.float64)

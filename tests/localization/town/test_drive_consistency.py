@@ -56,6 +56,7 @@ def landmark_nis(traced: Traced) -> list[float]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("goals", [1, 1_000_000], ids=["to the goal", "as far as allowed"])
 def test_nees_at_ten_degrees_is_in_its_band(goals: int) -> None:
     count = 2000 if goals == 1 else 300

@@ -74,17 +74,23 @@ def _packed_file(folder: Path) -> Path:
 
 LOGS: dict[str, tuple[Callable[[Path], Path], int, tuple[str, str]]] = {
     "BLF over the limit": (
-        _blf(BOMB_BYTES), 3, (str(BOMB_BYTES), str(DEFAULT.chunk_bytes)),
+        _blf(BOMB_BYTES),
+        3,
+        (str(BOMB_BYTES), str(DEFAULT.chunk_bytes)),
     ),
     "BLF more than declared": (_blf(1000), 3, ("more than 1000", "declares 1000")),
     "db3 message over the limit": (
-        _in_db3(_honest), 3, (str(BOMB_BYTES), str(DEFAULT.message_bytes)),
+        _in_db3(_honest),
+        3,
+        (str(BOMB_BYTES), str(DEFAULT.message_bytes)),
     ),
     "db3 message that says nothing": (
-        _in_db3(with_zstd), 3, (f"more than {DEFAULT.message_bytes}", str(DEFAULT.message_bytes)),
+        _in_db3(with_zstd),
+        3,
+        (f"more than {DEFAULT.message_bytes}", str(DEFAULT.message_bytes)),
     ),
     "zstd file": (_packed_file, 4, (r"\d+ bytes unpack", str(DEFAULT.chunk_bytes))),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", list(LOGS), ids=lambda name: name.replace(" ", "-"))

@@ -19,10 +19,15 @@ def _unchunked() -> bytes:
     rows = np.zeros(
         RECORDS,
         dtype=[
-            ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"),
-            ("log", "<u8"), ("publish", "<u8"), ("payload", f"V{len(PAYLOAD)}"),
+            ("opcode", "u1"),
+            ("length", "<u8"),
+            ("channel", "<u2"),
+            ("sequence", "<u4"),
+            ("log", "<u8"),
+            ("publish", "<u8"),
+            ("payload", f"V{len(PAYLOAD)}"),
         ],
-    )  # fmt: skip
+    )
     rows["opcode"], rows["length"] = MESSAGE, rows.dtype.itemsize - 9
     rows["channel"], rows["payload"] = 1, np.void(PAYLOAD)
     rows["log"] = rows["publish"] = 10**18 + 1000 * np.arange(RECORDS)
