@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -13,7 +14,7 @@ from crosscue.replay.columns import Bytes
 from crosscue.replay.files.whole_file import write_bytes
 
 from . import rle
-from .base import Detections, RoadMask, View
+from .base import Detections, Found, RoadMask, View
 from .images import decode
 from .runner import FrameResult
 
@@ -77,17 +78,30 @@ def draw(pixels: Bytes, result: FrameResult, cues: FrameCues, enlarge: float = 1
         cues: And what follows.
         enlarge: Text and lines, for a picture that will be shrunk.
     """
-    canvas = pixels.copy()
-    for found in result.found:
-        if isinstance(found, RoadMask):
-            _tint(canvas, found)
-    for found in result.found:
-        if isinstance(found, Detections):
-            _boxes(canvas, found, enlarge)
+    canvas = _drawn(pixels, result.found, enlarge)
     positive = [f"{cue} {count}" for cue, count in cues.counts.items() if count]
     text = "  ".join(positive) or "no cue"
     scale = _fitting(text, canvas.shape[1] - 2 * MARGIN_PX, 0.6 * enlarge)
     write_label(canvas, text, (MARGIN_PX, canvas.shape[0] - 14), (255, 255, 255), scale)
+    return canvas
+
+
+def picture_of(pixels: Bytes, found: Found) -> bytes:
+    """A JPEG of a picture with what one detector found in it: boxes with labels, or road."""
+    import cv2
+
+    _, encoded = cv2.imencode(".jpg", _drawn(pixels, (found,), max(pixels.shape[1] / 1280, 0.6)))
+    return encoded.tobytes()
+
+
+def _drawn(pixels: Bytes, results: Sequence[Found], enlarge: float) -> Bytes:
+    canvas = pixels.copy()
+    for found in results:
+        if isinstance(found, RoadMask):
+            _tint(canvas, found)
+    for found in results:
+        if isinstance(found, Detections):
+            _boxes(canvas, found, enlarge)
     return canvas
 
 

@@ -1,8 +1,9 @@
 """Detectors by name, each imported only when it is asked for.
 
-A name is one of ``BUILTIN``, one that an installed package offers under the entry point group
-``crosscue.detectors``, a ``module:factory``, or the file name of a model card (``.toml``). A
-factory takes settings by name, as the vehicle file spells them, and gives a ``Detector``.
+A name is one of ``BUILTIN``, a model of the catalog (``crosscue model list``), one that an
+installed package offers under the entry point group ``crosscue.detectors``, a ``module:factory``,
+or the file name of a model card (``.toml``). A factory takes settings by name, as the vehicle file
+spells them, and gives a ``Detector``.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.plugins import GROUPS
 
 from .base import Detector
+from .catalog import entries as catalog
 
 GROUP: Final = GROUPS["detector"]
 
@@ -78,7 +80,8 @@ def _choice(name: str, sections: Mapping[str, Choice]) -> Choice:
 
 def known(sections: Mapping[str, Choice]) -> list[str]:
     """All names that can be asked for."""
-    return sorted({*sections, *BUILTIN, *(point.name for point in entry_points(group=GROUP))})
+    offered = (point.name for point in entry_points(group=GROUP))
+    return sorted({*sections, *BUILTIN, *catalog.names(), *offered})
 
 
 def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
@@ -88,6 +91,9 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
         UsageError: No such detector, or it cannot be imported.
         VehicleError: Its settings do not fit.
     """
+    if choice.kind in catalog.names() and choice.kind not in table:
+        card = str(catalog.card_path(choice.kind))
+        choice = Choice(choice.name, "model", {**choice.settings, "card": card})
     place = table.get(choice.kind) or _offered(choice.kind) or choice.kind
     module, colon, factory = place.partition(":")
     if not colon:

@@ -83,10 +83,34 @@ class SegmentationOutput(Settings):
     """Names of the classes that one can drive on."""
 
 
+class WeightFile(Settings):
+    """A file that the publisher offers, for ``crosscue model fetch``."""
+
+    name: Annotated[str, Field(pattern=r"^[\w.-]+$")]
+    url: Annotated[str, Field(pattern="^https?://")]
+    size_bytes: Annotated[int, Field(gt=0, le=MOST_BYTES)]
+    sha256: Hash
+
+
+class Evidence(Settings):
+    """One measurement of the network: on which pictures, with which result."""
+
+    pictures: str
+    """Which, how many, by whom labelled."""
+    metric: str
+    value: Finite
+    low: Finite | None = None
+    """Lower end of the 95 % interval."""
+    high: Finite | None = None
+    note: str = ""
+
+
 class ModelCard(Settings):
     """A whole card."""
 
     version: Literal[1]
+    about: str = ""
+    """What the network is, in a line."""
     weights: str
     sha256: Hash
     sha256_bin: Hash | None = None
@@ -100,6 +124,10 @@ class ModelCard(Settings):
     "stop sign", "traffic light", "car", "truck", "bus", "one way left" and so on."""
     tiles: Tiles | None = None
     """Left out: the whole picture only."""
+    files: tuple[WeightFile, ...] = ()
+    """Where the weights can be had; the first is ``weights``."""
+    evidence: tuple[Evidence, ...] = ()
+    """What was measured, for ``crosscue model show``."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

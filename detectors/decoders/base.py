@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +115,12 @@ class BoxOutput(Settings):
     def recognise(cls, model: Interface, /) -> Guess | None:
         """What a model file would have to be for this layout; None where it cannot be."""
         raise NotImplementedError
+
+
+def kind_of(decoder: type[BoxOutput]) -> str:
+    """The name that cards give a layout."""
+    (kind,) = get_args(decoder.model_fields["kind"].annotation)
+    return str(kind)
 
 
 def named(outputs: Outputs, name: str | None, key: str = "name") -> Array:

@@ -25,6 +25,7 @@ from .base import (
     sigmoid,
     static,
 )
+from .grids import cell_count
 
 PICTURE: Final = {"colour": "rgb", "fit": "letterbox-center", "scale": (1 / 255,) * 3}
 _COEFFICIENTS: Final = 32
@@ -56,8 +57,9 @@ class YoloV5Output(BoxOutput):
             or any(len(out.shape) == 4 for out in model.outputs)
         ):
             return None
-        rows = static(output.shape, 1)
-        if rows is not None and rows <= columns:
+        rows, cells = static(output.shape, 1), _cells(model)
+        # Three anchors a cell; one where the boxes of YOLOX are decoded in the network.
+        if rows is not None and (rows <= columns or (cells and rows not in (cells, 3 * cells))):
             return None
         names = len(model.class_names)
         if names and names != columns - 5:
@@ -178,6 +180,12 @@ def _columns(output: Array, rows: int) -> Floats:
     if output.ndim != 3 or output.shape[:2] != (1, rows):
         raise ValueError(f"expected (1, {rows}, N) for these classes, got {output.shape}")
     return np.asarray(output[0].T, np.float64)
+
+
+def _cells(model: Interface) -> int | None:
+    """Cells of the strides 8, 16 and 32, where the file fixes its input's size."""
+    height, width = (static(model.inputs[0].shape, axis) for axis in (-2, -1))
+    return cell_count((width, height), (8, 16, 32)) if width and height else None
 
 
 def _transposed(model: Interface) -> tuple[str, int] | None:

@@ -21,6 +21,7 @@ from crosscue.detectors.catalog.card import (
     read_card,
     read_weights,
 )
+from crosscue.detectors.catalog.entries import weights_folder
 from crosscue.detectors.decoders.base import Array, named
 from crosscue.detectors.settings import Settings, Share, identity_of, settings_of
 from crosscue.replay.errors import VehicleError, one_line
@@ -54,7 +55,7 @@ def build(**given: Any) -> Detector:
     path = Path(settings.card)
     card = read_card(path)
     size = (card.input.width_px, card.input.height_px) if card.input.is_resizable else None
-    weights = read_weights(card, path.parent)
+    weights = read_weights(card, weights_folder(card, path))
     network = load_network(weights, settings.backend, settings.threads, size)
     identity = _identity(card, settings, network)
     if isinstance(card.output, SegmentationOutput):

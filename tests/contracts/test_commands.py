@@ -45,6 +45,10 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "train road": ("--data gone -o x.safetensors", SETTINGS),
     "train mask-rcnn": ("--data gone.json --images gone -o x.safetensors", RUN),
     "seal": ("gone.mcap", RECORDING),
+    "model show": ("gone", SETTINGS),
+    "model check": ("gone.toml", SETTINGS),
+    "model init": ("gone.onnx", SETTINGS),
+    "model fetch": ("gone", SETTINGS),
     "study intersections": ("-o out --vehicle gone.toml", SETTINGS),
     "study range": ("-o out --settings gone.toml", SETTINGS),
     "study landmarks": ("-o out --settings gone.toml", SETTINGS),
@@ -52,6 +56,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
 }
 READS_NOTHING: Final = {
     "truth schema",
+    "model list",
     "simulate",
     "train frames",
     "study drive",

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from crosscue.detectors.decoders.base import Array, BoxOutput, Interface, Tensor
+from crosscue.detectors.decoders.base import Array, BoxOutput, Interface, Tensor, kind_of
 from crosscue.detectors.decoders.table import DECODERS
 
 SIZE = (640, 320)
@@ -167,11 +167,6 @@ SAMPLES = {
     "ssd-tensorflow": _ssd_tensorflow,
     "ssd": _ssd,
 }
-
-
-def kind_of(decoder: type[BoxOutput]) -> str:
-    (kind,) = decoder.model_fields["kind"].annotation.__args__  # type: ignore[union-attr]
-    return str(kind)
 
 
 @pytest.fixture(params=DECODERS, ids=kind_of)

@@ -1,0 +1,67 @@
+"""COCO's class names, and what class names of other vocabularies mean to crosscue's cues."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+COCO_80: Final = (
+    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
+    "traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog",
+    "horse", "sheep", "cow", "elephant", "bear", "zebra", "giraffe", "backpack", "umbrella",
+    "handbag", "tie", "suitcase", "frisbee", "skis", "snowboard", "sports ball", "kite",
+    "baseball bat", "baseball glove", "skateboard", "surfboard", "tennis racket", "bottle",
+    "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple", "sandwich", "orange",
+    "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair", "couch", "potted plant",
+    "bed", "dining table", "toilet", "tv", "laptop", "mouse", "remote", "keyboard", "cell phone",
+    "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors",
+    "teddy bear", "hair drier", "toothbrush",
+)  # fmt: skip
+_GAPS: Final = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
+"""Numbers below 91 that COCO's numbering of its 80 classes leaves out."""
+
+
+def _coco_90() -> tuple[str, ...]:
+    names = iter(COCO_80)
+    return tuple(f"unused {n}" if n in _GAPS else next(names) for n in range(1, 91))
+
+
+COCO_90: Final = _coco_90()
+"""Number n of COCO's own numbering, which has gaps, at place n - 1."""
+
+CUE_LABELS: Final = (
+    "stop sign",
+    "traffic light",
+    "car",
+    "truck",
+    "bus",
+    "one way left",
+    "one way right",
+    "do not enter",
+)
+"""Labels that the default cues count."""
+
+_MEANINGS: Final = {
+    "stop": "stop sign",
+    "stopsign": "stop sign",
+    "trafficsignal": "traffic light",
+    "signal": "traffic light",
+    "light": "traffic light",
+    "trafficlight": "traffic light",
+    "vehicle": "car",
+    "auto": "car",
+    "sedan": "car",
+    "suv": "car",
+    "lorry": "truck",
+    "onewayleft": "one way left",
+    "onewayright": "one way right",
+    "noentry": "do not enter",
+    "donotenter": "do not enter",
+}
+
+
+def meaning_of(name: str) -> str | None:
+    """The cue label that a class name of another vocabulary means; None where none is plain."""
+    bare = re.sub(r"[^a-z]", "", name.lower())
+    by_spelling = {re.sub(r"[^a-z]", "", label): label for label in CUE_LABELS}
+    return by_spelling.get(bare) or _MEANINGS.get(bare)

@@ -1,0 +1,191 @@
+"""A first card for a model file: what the file says, and what had to be assumed."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from crosscue.detectors.decoders.base import Guess, Interface, static
+from crosscue.replay.errors import UsageError
+
+from .class_names import COCO_80, COCO_90, meaning_of
+
+DEFAULT_SIDE_PX: Final = 640
+_LINE: Final = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A card's text, and what a person should look at.
+
+    Attributes:
+        text: TOML.
+        kind: Of its output.
+        certain: What the file says.
+        assumed: What it does not.
+    """
+
+    text: str
+    kind: str
+    certain: tuple[str, ...]
+    assumed: tuple[str, ...]
+
+
+def draft(
+    path: Path,
+    model: Interface,
+    guess: Guess,
+    names: Sequence[str] = (),
+    size_px: tuple[int, int] | None = None,
+) -> Draft:
+    """Write a card.
+
+    Args:
+        path: The model file.
+        model: What it says of itself.
+        guess: Its layout.
+        names: Class names, where the file has none.
+        size_px: Width and height of the input, where the file leaves them open or allows others.
+
+    Raises:
+        UsageError: There are no class names, or not as many as the output has.
+    """
+    certain, assumed = list(guess.reasons), list(guess.assumptions)
+    classes = _classes(path, model, guess, names, certain, assumed)
+    given = _input(model, guess, size_px, certain, assumed)
+    output = {**guess.settings, "score": 0.3, "classes": classes}
+    labels = {name: label for name in classes if (label := meaning_of(name)) and label != name}
+    lines = [
+        f"# Written by crosscue model init for {path.name}.",
+        *(f"# The file says: {reason}." for reason in certain),
+        *(f"# Assumed, please check: {one}." for one in assumed),
+        "version = 1",
+        f"weights = {_value(path.name)}",
+        f'sha256 = "{hashlib.sha256(path.read_bytes()).hexdigest()}"',
+    ]
+    second = path.with_suffix(".bin")
+    if path.suffix == ".xml" and second.exists():
+        lines.append(f'sha256_bin = "{hashlib.sha256(second.read_bytes()).hexdigest()}"')
+    licence = model.metadata.get("license", "")
+    lines += [
+        f"licence = {_value(licence)}" + ("" if licence else "  # not in the file"),
+        "",
+        "[input]",
+        *(f"{key} = {_value(value)}" for key, value in given.items()),
+        "",
+        "[output]",
+        *(f"{key} = {_value(value)}" for key, value in output.items()),
+    ]
+    if labels:
+        lines += ["", "[labels]  # what a class means to the cues", *_table(labels)]
+    return Draft(
+        "\n".join(lines) + "\n", str(guess.settings["kind"]), tuple(certain), tuple(assumed)
+    )
+
+
+def _classes(
+    path: Path,
+    model: Interface,
+    guess: Guess,
+    names: Sequence[str],
+    certain: list[str],
+    assumed: list[str],
+) -> tuple[str, ...]:
+    count = guess.class_count
+    if names:
+        if count is not None and len(names) != count:
+            raise UsageError(f"{path}: {count} classes, but {len(names)} names are given")
+        return tuple(names)
+    if model.class_names:
+        certain.append(f"{len(model.class_names)} class names in its metadata")
+        return model.class_names
+    for known in (COCO_80, COCO_90):
+        if count == len(known) or (count is None and known is COCO_90):
+            assumed.append(f"the {len(known)} classes are COCO's, in its order")
+            return known
+    if count == len(COCO_90) + 1:
+        assumed.append("the 91 classes are COCO's numbers, 0 unused")
+        return ("unused 0", *COCO_90)
+    raise UsageError(
+        f"{path}: {count} classes and no names in the file; give one a line: --classes FILE"
+    )
+
+
+def _input(
+    model: Interface,
+    guess: Guess,
+    size_px: tuple[int, int] | None,
+    certain: list[str],
+    assumed: list[str],
+) -> dict[str, object]:
+    shape = model.inputs[0].shape
+    usual = dict(guess.input or {})
+    layout = _layout(shape) or str(usual.get("layout", "nchw"))
+    rows, columns = {"nchw": (2, 3), "chw": (1, 2), "nhwc": (1, 2)}[layout]
+    declared = (static(shape, columns), static(shape, rows))
+    given: dict[str, object] = {}
+    width, height = size_px or declared
+    if size_px is not None:
+        if None not in declared and declared != size_px:
+            given["is_resizable"] = True
+            assumed.append("the network is fully convolutional, so it may run at another size")
+    elif width is not None and height is not None:
+        certain.append(f"its input is {width} x {height}")
+    else:
+        width, height = _size_in(model.metadata) or (DEFAULT_SIDE_PX, DEFAULT_SIDE_PX)
+        assumed.append(f"its size is open; {width} x {height} (--size WxH)")
+    usual.pop("layout", None)
+    if "colour" in usual and not model.class_names:
+        assumed.append(f"colours are {usual['colour']}, pictures fitted by {usual.get('fit')}")
+    return {"width_px": width, "height_px": height, "layout": layout, **usual, **given}
+
+
+def _layout(shape: Sequence[int | str | None]) -> str | None:
+    if len(shape) == 3:
+        return "chw"
+    if len(shape) == 4 and 3 in (shape[1], shape[3]):
+        return "nchw" if shape[1] == 3 else "nhwc"
+    return None
+
+
+def _size_in(metadata: Mapping[str, str]) -> tuple[int, int] | None:
+    """Width and height that an exporter left as ``imgsz``: height first."""
+    try:
+        height, width = ast.literal_eval(metadata.get("imgsz", "")[:100])
+        return int(width), int(height)
+    except (ValueError, SyntaxError, TypeError):
+        return None
+
+
+def _value(value: object) -> str:
+    """A TOML value; long lists over several lines."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, tuple | list):
+        items = [_value(one) for one in value]
+        line = f"[{', '.join(items)}]"
+        return line if len(line) < _LINE - 20 else _over_lines(items)
+    raise TypeError(f"no TOML for {value!r}")
+
+
+def _over_lines(items: Sequence[str]) -> str:
+    lines, current = [], " "
+    for item in items:
+        if len(current) + len(item) + 2 > _LINE:
+            lines.append(current)
+            current = " "
+        current += f" {item},"
+    return "\n".join(["[", *lines, current, "]"])
+
+
+def _table(values: Mapping[str, str]) -> list[str]:
+    return [f"{_value(key)} = {_value(value)}" for key, value in values.items()]

@@ -1,0 +1,92 @@
+"""The catalog: known models, one card each in ``models``, and where their weights are kept.
+
+Weights of others are never in this repository. ``crosscue model fetch`` puts them below the cache
+folder (``$CROSSCUE_MODELS``, else the user's cache), under their hash, so that two versions of a
+model lie side by side.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+from crosscue.replay.errors import UsageError, VehicleError
+
+from .card import ModelCard, WeightFile, read_card
+
+FOLDER: Final = Path(__file__).parent / "models"
+VARIABLE: Final = "CROSSCUE_MODELS"
+
+
+def cache_folder(environment: Mapping[str, str] = os.environ) -> Path:
+    """Where fetched weights are kept.
+
+    Raises:
+        UsageError: No such place can be named: the machine has no home folder.
+    """
+    asked = environment.get(VARIABLE)
+    if asked:
+        return Path(asked)
+    base = Path(environment.get("XDG_CACHE_HOME", ""))
+    try:
+        base = base if base.is_absolute() else Path.home() / ".cache"
+    except RuntimeError:
+        raise UsageError(
+            f"no home folder to keep models in; name one in the variable {VARIABLE}"
+        ) from None
+    return base / "crosscue" / "models"
+
+
+@cache
+def names() -> tuple[str, ...]:
+    """Of all models, sorted."""
+    return tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
+
+
+def card_path(name: str) -> Path:
+    """The card of a model in the catalog.
+
+    Raises:
+        UsageError: No such model; the nearest is named.
+    """
+    if name not in names():
+        close = difflib.get_close_matches(name, names(), n=1)
+        hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names())}"
+        raise UsageError(f"model {name!r}: not in the catalog; {hint}")
+    return FOLDER / f"{name}.toml"
+
+
+def entry(name: str) -> ModelCard:
+    """A model's card.
+
+    Raises:
+        UsageError: No such model.
+    """
+    return read_card(card_path(name))
+
+
+def place_of(card: ModelCard, file: WeightFile) -> Path:
+    """Where a file of a model's weights is, or would be, in the cache."""
+    return cache_folder() / card.sha256[:16] / file.name
+
+
+def weights_folder(card: ModelCard, path: Path) -> Path:
+    """The folder with a card's weights: beside the card, or the cache for a catalog's model.
+
+    Raises:
+        VehicleError: They are not fetched yet; with size, licence and the command.
+    """
+    if not card.files or (path.parent / card.weights).exists():
+        return path.parent
+    missing = [file for file in card.files if not place_of(card, file).exists()]
+    if missing:
+        size = sum(file.size_bytes for file in card.files) / 1e6
+        raise VehicleError(
+            f"model {path.stem}: not fetched yet ({size:.1f} MB, licence {card.licence}); "
+            f"crosscue model fetch {path.stem}"
+        )
+    return place_of(card, card.files[0]).parent

@@ -1,0 +1,164 @@
+"""What a model file says of itself, and the layouts that it may have."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from crosscue.detectors.decoders.base import Guess, Interface, Tensor, kind_of, static
+from crosscue.detectors.decoders.table import DECODERS
+from crosscue.detectors.networks.backends import Network, load_network
+from crosscue.detectors.networks.openvino import import_openvino
+from crosscue.detectors.networks.picture_input import prepared
+from crosscue.replay.errors import UsageError, one_line
+from crosscue.replay.files.bounded import read_at_most
+
+from .card import MOST_BYTES, Input, Weights
+
+_MAX_NAMES_CHARACTERS: Final = 100_000
+SENSIBLE_FRACTION: Final = 0.99
+"""Of boxes that a network gives for noise, where their layout is read rightly."""
+_REFUSED: Final = {
+    ".pt": "a pickle runs code when it is read; export it to ONNX",
+    ".pth": "a pickle runs code when it is read; export it to ONNX, or give a state dict to the "
+    "detector mask-rcnn",
+    ".pkl": "a pickle runs code when it is read; export it to ONNX",
+    ".torchscript": "a TorchScript archive carries code; export it to ONNX",
+}
+
+
+def read_interface(path: Path) -> Interface:
+    """Inputs, outputs and metadata of an ONNX file or an OpenVINO .xml.
+
+    Raises:
+        UsageError: Another kind of file, damaged, or the package that reads it is missing.
+    """
+    suffix = path.suffix.lower()
+    if suffix in _REFUSED:
+        raise UsageError(f"{path}: {_REFUSED[suffix]}")
+    if suffix not in _READERS:
+        raise UsageError(f"{path}: expected {' or '.join(_READERS)}")
+    try:
+        content = read_at_most(path, MOST_BYTES)
+        if content is None:
+            raise UsageError(f"{path}: over {MOST_BYTES >> 20} MiB; not read")
+        return _READERS[suffix](content, path)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}; give a model file") from None
+    except UsageError:
+        raise
+    except Exception as error:
+        raise UsageError(f"{path}: not a whole model file: {one_line(error, 160)}") from None
+
+
+def _of_onnx(content: bytes, path: Path) -> Interface:
+    _need("onnx", path)
+    import onnx
+
+    model: Any = onnx.load_model_from_string(content)
+    weights = {tensor.name for tensor in model.graph.initializer}
+    metadata = {prop.key: prop.value for prop in model.metadata_props}
+    return Interface(
+        tuple(_tensor(value) for value in model.graph.input if value.name not in weights),
+        tuple(_tensor(value) for value in model.graph.output),
+        metadata,
+        class_names(metadata),
+    )
+
+
+def _tensor(value: Any) -> Tensor:
+    sides = value.type.tensor_type.shape.dim
+    return Tensor(value.name, tuple(side.dim_value or side.dim_param or None for side in sides))
+
+
+def _of_openvino(content: bytes, path: Path) -> Interface:
+    _need("openvino", path)
+    ov = import_openvino()
+    second = path.with_suffix(".bin")
+    weights = read_at_most(second, MOST_BYTES) if second.exists() else b""
+    model = ov.Core().read_model(content, weights or b"")
+
+    def tensor(port: Any) -> Tensor:
+        names = sorted(port.get_names())
+        sides = (side.get_length() if side.is_static else None for side in port.partial_shape)
+        return Tensor(names[0] if names else "output0", tuple(sides))
+
+    return Interface(
+        tuple(tensor(port) for port in model.inputs),
+        tuple(tensor(port) for port in model.outputs),
+        {},
+    )
+
+
+_READERS: Final = {".onnx": _of_onnx, ".xml": _of_openvino}
+
+
+def _need(package: str, path: Path) -> None:
+    if find_spec(package) is None:
+        raise UsageError(f"{path}: needs the package {package}: pip install 'crosscue[{package}]'")
+
+
+def class_names(metadata: Mapping[str, str]) -> tuple[str, ...]:
+    """Class names that an exporter left under ``names``, as Ultralytics does; else empty."""
+    text = metadata.get("names", "")
+    if not text or len(text) > _MAX_NAMES_CHARACTERS:
+        return ()
+    try:
+        # Only literals: this runs nothing.
+        found = ast.literal_eval(text)
+    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        return ()
+    if isinstance(found, dict):
+        found = [found.get(i) for i in range(len(found))]
+    if not isinstance(found, list | tuple) or not all(isinstance(name, str) for name in found):
+        return ()
+    return tuple(found)
+
+
+def plausible(path: Path, model: Interface, found: list[Guess]) -> list[Guess]:
+    """Those layouts by which the network's answer to noise is boxes of sensible sizes.
+
+    Raises:
+        VehicleError: The network does not run at all.
+    """
+    second = path.with_suffix(".bin")
+    weights = Weights(
+        name=str(path),
+        content=path.read_bytes(),
+        second=second.read_bytes() if path.suffix == ".xml" and second.exists() else b"",
+    )
+    network = load_network(weights)
+    kept = [guess for guess in found if _is_plausible(network, model, guess)]
+    return kept or found
+
+
+def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
+    height, width = (static(model.inputs[0].shape, axis) for axis in (-2, -1))
+    if height is None or width is None or guess.class_count is None:
+        return True
+    given = Input.model_validate(
+        {"width_px": width, "height_px": height, **dict(guess.input or {})}
+    )
+    noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    classes = tuple(str(i) for i in range(guess.class_count))
+    decoder = next(one for one in DECODERS if kind_of(one) == guess.settings["kind"])
+    output = decoder.model_validate({**guess.settings, "classes": classes})
+    try:
+        found = output.candidates(network(prepared(noise, given)[0]), (width, height))
+    except ValueError:
+        return False
+    sides = found.boxes_px[:, 2:] - found.boxes_px[:, :2]
+    is_sensible = (sides >= 0.0) & (sides <= 4.0 * np.array([width, height]))
+    return bool(is_sensible.mean() > SENSIBLE_FRACTION)
+
+
+def guesses(model: Interface) -> list[Guess]:
+    """All layouts that a model file may have, in the order of the table."""
+    if not model.inputs or not model.outputs:
+        return []
+    return [guess for decoder in DECODERS if (guess := decoder.recognise(model)) is not None]

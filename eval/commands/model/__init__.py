@@ -1,0 +1,1 @@
+"""Commands about networks: the catalog, and cards for one's own."""

@@ -1,0 +1,58 @@
+"""Fetch the weights of models of the catalog, checked by their SHA-256 before they are used.
+
+What is already at hand below $CROSSCUE_DATA/weights is taken from there. A transfer that was cut
+goes on where it stopped. $CROSSCUE_MODEL_MIRROR names a server to ask instead of the publisher,
+$CROSSCUE_MODELS the folder to keep them in.
+
+example:
+  crosscue model fetch yolox-nano
+  crosscue model fetch yolox-s --from Downloads/object_detection_yolox_2022nov.onnx
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from crosscue.detectors.catalog.fetch import Fetched, fetch
+from crosscue.eval.commands.shared.options import print_json
+from crosscue.replay.errors import UsageError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("models", nargs="+", metavar="MODEL", help="names from crosscue model list")
+    parser.add_argument(
+        "--from", dest="given", type=Path, metavar="FILE",
+        help="take the weights from this file, or a folder with them; no network is used",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fetch."""
+    if args.given is not None and len(args.models) > 1:
+        raise UsageError("--from: one model at a time")
+    shown = _Shown(sys.stderr.isatty() and not args.quiet)
+    found: dict[str, list[Fetched]] = {}
+    for name in args.models:
+        found[name] = fetch(name, args.given, shown)
+        if not args.quiet and not args.json:
+            for file in found[name]:
+                print(f"{name}: {file.path} (from {file.came_from})")
+    if args.json:
+        print_json({name: [str(file.path) for file in files] for name, files in found.items()})
+    return 0
+
+
+class _Shown:
+    """One line with the fraction done, on a terminal."""
+
+    def __init__(self, is_on: bool) -> None:
+        self._is_on = is_on
+
+    def __call__(self, name: str, done: int, total: int) -> None:
+        if self._is_on:
+            end = "\n" if done >= total else ""
+            print(f"\r{name} {done / 1e6:.1f} of {total / 1e6:.1f} MB", end=end, file=sys.stderr)

@@ -1,0 +1,40 @@
+"""What the model commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from crosscue.detectors.base import Detections, Detector, Frame, View
+from crosscue.detectors.catalog.entries import card_path
+from crosscue.detectors.images import decode, read_file
+from crosscue.detectors.overlay import picture_of
+from crosscue.replay.errors import LogError, UsageError
+from crosscue.replay.files.whole_file import write_bytes
+
+
+def card_of(name: str) -> Path:
+    """A card's file, from its name or the catalog's.
+
+    Raises:
+        UsageError: The catalog has no such model.
+    """
+    return Path(name) if name.endswith(".toml") else card_path(name)
+
+
+def look(detector: Detector, picture: Path, output: Path) -> Detections | None:
+    """Run a detector over one picture and draw what it finds; None where it finds road.
+
+    Raises:
+        UsageError: The picture is not there.
+        LogError: It cannot be decoded.
+        OutputError: The drawing cannot be written.
+    """
+    try:
+        pixels, size = decode(read_file(picture), View())
+    except OSError as error:
+        raise UsageError(f"{picture}: {error.strerror}; give a JPEG, PNG or WebP file") from None
+    except LogError as error:
+        raise type(error)(f"{picture}: {error}") from None
+    (found,) = detector([Frame(0, "", pixels, size)])
+    write_bytes(output, picture_of(pixels, found))
+    return found if isinstance(found, Detections) else None

@@ -1,0 +1,219 @@
+"""The catalog's law: every entry is a whole card; fetching is checked and resumes."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from crosscue.detectors.catalog import entries, fetch
+from crosscue.detectors.catalog.card import ModelCard, WeightFile
+from crosscue.detectors.catalog.class_names import COCO_80, COCO_90, meaning_of
+from crosscue.detectors.registry import Choice, make
+from crosscue.eval.cli import run
+from crosscue.replay.errors import CrosscueError, UsageError, VehicleError
+from support.data import shared
+from support.range_server import Served, serving
+
+CONTENT = bytes(range(256)) * 4096
+SHA256 = hashlib.sha256(CONTENT).hexdigest()
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "cache"
+    monkeypatch.setenv(entries.VARIABLE, str(folder))
+    monkeypatch.delenv(fetch.DATA, raising=False)
+    monkeypatch.delenv(fetch.MIRROR, raising=False)
+    return folder
+
+
+@pytest.fixture
+def server() -> Iterator[Served]:
+    with serving() as served:
+        served.files["net.onnx"] = CONTENT
+        yield served
+
+
+@pytest.fixture
+def card(server: Served, cache: Path, monkeypatch: pytest.MonkeyPatch) -> ModelCard:
+    """The catalog has one model, ``net``, whose weights the server has."""
+    whole = entries.entry("yolox-nano")
+    file = WeightFile(
+        name="net.onnx", url=f"{server.base}/net.onnx", size_bytes=len(CONTENT), sha256=SHA256
+    )
+    changed = whole.model_copy(
+        update={"weights": "net.onnx", "sha256": SHA256, "files": (file,), "licence": "MIT"}
+    )
+    monkeypatch.setattr(fetch, "entry", lambda name: changed)
+    return changed
+
+
+@pytest.mark.parametrize("name", entries.names())
+def test_every_entry_says_what_it_is_and_where_its_weights_are(name: str) -> None:
+    card = entries.entry(name)
+
+    assert card.about
+    assert card.licence
+    assert card.source
+    assert card.files[0].name == card.weights
+    assert card.files[0].sha256 == card.sha256
+    assert len(set(card.output.classes)) == len(card.output.classes)
+
+
+@pytest.mark.parametrize("name", entries.names())
+def test_every_entry_at_hand_runs(name: str, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the very file of its hash, from the data folder."""
+    monkeypatch.setenv(fetch.DATA, str(shared("weights").parent))
+    monkeypatch.setenv(fetch.MIRROR, "http://127.0.0.1:9")
+    try:
+        fetch.fetch(name)
+    except CrosscueError:
+        pytest.skip(f"the weights of {name} are not at hand")
+
+    detector = make(Choice(name, name))
+
+    assert detector.identity.startswith("model-")
+
+
+def test_a_model_that_is_not_fetched_is_one_line_with_the_command(cache: Path) -> None:
+    with pytest.raises(VehicleError) as error:
+        make(Choice("objects", "yolox-nano"))
+
+    said = "model yolox-nano: not fetched yet (3.7 MB, licence Apache-2.0); crosscue model fetch"
+    assert said in str(error.value)
+
+
+def test_a_name_with_a_typo_gets_the_nearest() -> None:
+    with pytest.raises(UsageError, match="did you mean yolox-nano"):
+        entries.card_path("yolo-nano")
+
+
+def test_it_comes_from_the_server_once(card: ModelCard, server: Served) -> None:
+    (first,) = fetch.fetch("net")
+    (second,) = fetch.fetch("net")
+
+    assert first.path.read_bytes() == CONTENT
+    assert second.came_from == "the cache"
+    assert len(server.gets) == 1
+    assert [path.name for path in first.path.parent.iterdir()] == ["net.onnx"]
+
+
+def test_a_cut_transfer_goes_on_where_it_stopped(card: ModelCard, server: Served) -> None:
+    server.failing = 1
+    with pytest.raises(CrosscueError, match="cut after 524288 of 1048576 bytes"):
+        fetch.fetch("net")
+    assert not entries.place_of(card, card.files[0]).exists()
+
+    (found,) = fetch.fetch("net")
+
+    assert server.gets == ["all", "bytes=524288-1048575"]
+    assert found.path.read_bytes() == CONTENT
+    assert [path.name for path in found.path.parent.iterdir()] == ["net.onnx"]
+
+
+@pytest.mark.parametrize("content", [CONTENT[:-1] + b"x", CONTENT + b"more", b"<html>404</html>"])
+def test_another_file_than_the_catalog_means_is_not_kept(
+    card: ModelCard, server: Served, content: bytes
+) -> None:
+    server.files["net.onnx"] = content
+
+    for _ in range(2):
+        if content.startswith(CONTENT):
+            (found,) = fetch.fetch("net")
+            assert found.path.read_bytes() == CONTENT
+            continue
+        with pytest.raises(CrosscueError, match=r"what came is not net\.onnx|cut after 16"):
+            fetch.fetch("net")
+        assert not entries.place_of(card, card.files[0]).exists()
+
+
+def test_without_a_network_the_line_says_what_else_there_is(
+    card: ModelCard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(fetch.MIRROR, "http://127.0.0.1:9/")
+
+    with pytest.raises(CrosscueError) as error:
+        fetch.fetch("net")
+
+    assert str(error.value).startswith("http://127.0.0.1:9/net.onnx: not fetched: ")
+    assert "--from FILE" in str(error.value)
+    assert fetch.MIRROR in str(error.value)
+
+
+def test_a_mirror_is_asked_instead(
+    card: ModelCard, server: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.files["mirror/net.onnx"] = server.files.pop("net.onnx")
+    monkeypatch.setenv(fetch.MIRROR, f"{server.base}/mirror")
+
+    (found,) = fetch.fetch("net")
+
+    assert found.path.read_bytes() == CONTENT
+
+
+def test_from_a_file_or_its_folder(card: ModelCard, server: Served, tmp_path: Path) -> None:
+    file = tmp_path / "net.onnx"
+    file.write_bytes(CONTENT)
+
+    for given in (file, tmp_path):
+        (found,) = fetch.fetch("net", given)
+        assert found.path.read_bytes() == CONTENT
+        shutil.rmtree(found.path.parent)
+    assert not server.gets
+
+    file.write_bytes(CONTENT[1:])
+    with pytest.raises(UsageError, match="model net needs"):
+        fetch.fetch("net", file)
+    with pytest.raises(UsageError, match="No such file"):
+        fetch.fetch("net", tmp_path / "gone.onnx")
+
+
+def test_the_data_folder_is_looked_through(
+    card: ModelCard, server: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "data" / "weights" / "net"
+    folder.mkdir(parents=True)
+    (folder / "net.onnx").write_bytes(CONTENT)
+    monkeypatch.setenv(fetch.DATA, str(tmp_path / "data"))
+
+    (found,) = fetch.fetch("net")
+
+    assert found.came_from == str(folder / "net.onnx")
+    assert not server.gets
+
+
+def test_list_and_show_print_every_model(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["model", "list"]) == 0
+    listed = capsys.readouterr().out
+    for name in entries.names():
+        assert name in listed
+        assert run(["model", "show", name]) == 0
+        assert entries.entry(name).sha256 in capsys.readouterr().out
+
+
+def test_coco_s_numbers_have_their_gaps() -> None:
+    assert len(COCO_80) == 80
+    assert len(COCO_90) == 90
+    # Numbers from COCO's own annotation files.
+    for number, name in {3: "car", 10: "traffic light", 13: "stop sign", 90: "toothbrush"}.items():
+        assert COCO_90[number - 1] == name
+
+
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [
+        ("Traffic_Light", "traffic light"),
+        ("StopSign", "stop sign"),
+        ("stop-sign", "stop sign"),
+        ("vehicle", "car"),
+        ("no entry", "do not enter"),
+        ("giraffe", None),
+        ("stop light", None),
+    ],
+)
+def test_class_names_of_other_vocabularies(name: str, label: str | None) -> None:
+    assert meaning_of(name) == label
