@@ -166,8 +166,9 @@ class _CanIds:
         )
 
 
-Progress = Callable[[Iterable[Block], Callable[[], float]], Iterable[Block]]
-"""Hands blocks through while showing how far the work is; the second argument tells the share."""
+Progress = Callable[[Iterable[Block], Callable[[], tuple[int, int]]], Iterable[Block]]
+"""Hands blocks through while showing how far the work is; the second argument returns rows read,
+and rows declared."""
 
 
 def quick_summary(log: Log) -> LogSummary:
@@ -186,7 +187,7 @@ def summarise(
     ledger, clocks, can_ids = Ledger(name_of(log)), ClockWatch(), dict[str, _CanIds]()
     blocks: Iterable[Block] = ledger.handing_on(log.read(ledger, selection))
     if progress is not None:
-        blocks = progress(blocks, lambda: _share_done(log, ledger))
+        blocks = progress(blocks, lambda: (rows_read(ledger), rows_declared(log)))
     for block in _decoded(log, blocks, ledger):
         clocks.see(block)
         if isinstance(block.rows, CanFrames):
@@ -210,9 +211,14 @@ def together(summaries: Iterable[LogSummary]) -> Together:
     return Together(start_ns, end_ns, apart(spans))
 
 
-def _share_done(log: Log, ledger: Ledger) -> float:
-    declared = sum(topic.declared or 0 for topic in log.topics)
-    return sum(account.found for account in ledger.accounts.values()) / max(declared, 1)
+def rows_declared(log: Log) -> int:
+    """Rows that a log says it holds."""
+    return sum(topic.declared or 0 for topic in log.topics)
+
+
+def rows_read(ledger: Ledger) -> int:
+    """Rows found so far."""
+    return sum(account.found for account in ledger.accounts.values())
 
 
 def _decoded(log: Log, blocks: Iterable[Block], ledger: Ledger) -> Iterator[Block]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +19,7 @@ from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
+from crosscue.replay.log_summary import rows_declared, rows_read
 from crosscue.replay.mobileye.admit import all_ids
 from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.ros.reader import RosMobileye
@@ -73,7 +74,11 @@ class _Table:
 
 
 def decode_tables(
-    logs: Sequence[Log], vehicle: Vehicle, run: RunFolder, selection: Selection
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    run: RunFolder,
+    selection: Selection,
+    on_rows: Callable[[int, int], None] = lambda _rows, _of: None,
 ) -> tuple[dict[str, int], Account]:
     """Write all streams of a drive as tables.
 
@@ -82,6 +87,7 @@ def decode_tables(
         vehicle: DBC files, buses and the Mobileye's mounting.
         run: Folder for the tables; cleared first.
         selection: What part.
+        on_rows: Called with the rows read, and those that the logs declare.
 
     Returns:
         Rows for each file written, and the account.
@@ -93,6 +99,7 @@ def decode_tables(
     """
     ledgers = tuple(Ledger(name_of(log)) for log in logs)
     tables: dict[str, _Table] = {}
+    declared = sum(map(rows_declared, logs))
     with locked(run), staged(run) as new, nothing_left(new):
         clear(new)
         with ExitStack() as stack:
@@ -102,6 +109,7 @@ def decode_tables(
                         name = file_name(block.topic, {t.name.lower() for t in tables.values()})
                         tables[block.topic] = _Table(new, name, stack)
                     tables[block.topic].add(block)
+                    on_rows(sum(map(rows_read, ledgers)), declared)
             for table in tables.values():
                 table.write()
         rows = {f"{table.name}.parquet": table.rows for table in tables.values()}

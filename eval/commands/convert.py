@@ -27,8 +27,8 @@ from crosscue.eval.commands.shared.options import (
     limits_of,
     print_json,
     selection_of,
-    with_progress,
 )
+from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.pipeline.empty_result import empty_result
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import LogError, OutputError, UsageError
@@ -110,11 +110,11 @@ def _copy(
     declared = sum(topic.declared or 0 for topic in log.topics)
     done = 0
 
-    def share() -> float:
-        return done / declared if declared else 0.0
+    def at() -> Done:
+        return Done(done, declared, "rows")
 
     blocks = ledger.handing_on(log.read(ledger, selection))
-    for block in with_progress(blocks, share, args, "converting"):
+    for block in with_progress(blocks, at, args, "converting"):
         done += len(block)
         # A topic may come to light only while a damaged log is read.
         for topic in log.topics:

@@ -16,6 +16,7 @@ from crosscue.eval.commands.shared.options import (
     print_json,
     selection_of,
 )
+from crosscue.eval.commands.shared.progress import Done, progress_line
 from crosscue.eval.pipeline.run_account import account_lines
 from crosscue.eval.runs.folder import create
 from crosscue.replay.opening import open_logs
@@ -41,7 +42,11 @@ def run(args: argparse.Namespace) -> int:
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     with open_logs(args.logs, limits_of(args)) as logs:
         folder = create(args.output, overwrite=args.overwrite)
-        rows, account = decode_tables(logs, vehicle, folder, selection_of(args, logs))
+        selection = selection_of(args, logs)
+        with progress_line(args, "decoding") as shown:
+            rows, account = decode_tables(
+                logs, vehicle, folder, selection, lambda n, of: shown.at(Done(n, of, "rows"))
+            )
     if args.json:
         print_json({"tables": rows, "account": account})
     elif not args.quiet:

@@ -10,13 +10,13 @@ example:
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from crosscue.datasets.scenes.drive import SceneSettings, write_scene
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.detectors.registry import EMBEDDED, chosen
 from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.progress import DriveLine, is_shown
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.recording import save
@@ -30,7 +30,6 @@ from crosscue.replay.log import EVERYTHING
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 
-from .replay import Progress
 from .replay import summary as replay_summary
 
 
@@ -62,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     """Simulate, replay, score, show."""
     talk = not (args.quiet or args.json)
     settings = _settings(args)
-    progress = Progress("replaying", not args.quiet and sys.stderr.isatty())
+    line = DriveLine("replaying", is_shown=is_shown(args))
     if talk:
         print(f"simulating a drive up to intersection {args.layout} ...", flush=True)
     files = write_scene(args.output / "drive", settings, overwrite=args.overwrite)
@@ -71,12 +70,11 @@ def run(args: argparse.Namespace) -> int:
     folder = create(args.output / "run", overwrite=args.overwrite)
     vehicle = load(files.vehicle)
     choices = chosen(EMBEDDED, choices_of(vehicle))
-    detecting = Detecting(choices, on_frames=progress.at_frame)
-    with open_log(files.log) as log:
+    detecting = Detecting(choices, on_frames=line.at_frame)
+    with open_log(files.log) as log, line:
         outcome = replay_drive(
-            [log], vehicle, folder, EVERYTHING, progress.at_time, detecting=detecting
+            [log], vehicle, folder, EVERYTHING, line.at_time, detecting=detecting
         )
-    progress.end()
     one = judge_run(folder, files.truth)
     scores = scores_of([one])
     metrics = metrics_of([one], scores)

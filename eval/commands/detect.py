@@ -10,7 +10,6 @@ example:
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from crosscue.detectors.registry import known
@@ -20,6 +19,7 @@ from crosscue.eval.commands.shared.options import (
     print_json,
     selection_of,
 )
+from crosscue.eval.commands.shared.progress import DriveLine, is_shown
 from crosscue.eval.pipeline.detect import DetectOutcome, detect_drive
 from crosscue.eval.pipeline.run_account import account_lines, details_of
 from crosscue.eval.runs.folder import create
@@ -28,7 +28,7 @@ from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
-from .replay import Progress, add_detector_arguments, cache_of, detectors_of
+from .replay import add_detector_arguments, cache_of, detectors_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,11 +54,10 @@ def run(args: argparse.Namespace) -> int:
     with open_logs(args.logs, limits_of(args)) as logs:
         selection = selection_of(args, logs)
         folder = create(args.output, overwrite=args.overwrite)
-        progress = Progress("detecting", not args.quiet and sys.stderr.isatty())
-        outcome = detect_drive(
-            logs, vehicle, folder, selection, choices, cache_of(args), args.draw, progress.at_frame
-        )
-        progress.end()
+        with DriveLine("detecting", is_shown=is_shown(args)) as line:
+            outcome = detect_drive(
+                logs, vehicle, folder, selection, choices, cache_of(args), args.draw, line.at_frame
+            )
     if args.json:
         print_json(_as_json(outcome))
     elif not args.quiet:

@@ -9,15 +9,15 @@ example:
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from crosscue.eval.batch.merge import open_one
 from crosscue.eval.commands.shared.options import add_logs_argument, limits_of, print_json
+from crosscue.eval.commands.shared.progress import DriveLine, is_shown
 from crosscue.eval.pipeline.reestimate import estimate_run
 from crosscue.replay.vehicle.vehicle import load
 
-from .replay import Progress, as_json, summary
+from .replay import as_json, summary
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,9 +37,8 @@ def run(args: argparse.Namespace) -> int:
     """Estimate; 3 when something was dropped."""
     folder = open_one(args.run, args.logs, limits=limits_of(args))
     vehicle = load(args.vehicle) if args.vehicle else None
-    progress = Progress("estimating", not args.quiet and sys.stderr.isatty())
-    outcome = estimate_run(folder, vehicle, progress.at_time)
-    progress.end()
+    with DriveLine("estimating", is_shown=is_shown(args)) as line:
+        outcome = estimate_run(folder, vehicle, line.at_time)
     if args.json:
         print_json(as_json(outcome))
     elif not args.quiet:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from enum import Enum
 
 from crosscue.eval.commands.shared.options import (
@@ -21,11 +21,11 @@ from crosscue.eval.commands.shared.options import (
     limits_of,
     print_json,
     selection_of,
-    with_progress,
 )
-from crosscue.replay.columns import Block
+from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.replay.log_summary import (
     LogSummary,
+    Progress,
     Together,
     TopicSummary,
     quick_summary,
@@ -209,7 +209,7 @@ def _or_dash(count: int | None) -> str:
     return "-" if count is None else str(count)
 
 
-def _progress(
-    args: argparse.Namespace,
-) -> Callable[[Iterable[Block], Callable[[], float]], Iterable[Block]]:
-    return lambda blocks, share: with_progress(blocks, share, args, "reading")
+def _progress(args: argparse.Namespace) -> Progress:
+    return lambda blocks, rows: with_progress(
+        blocks, lambda: Done(*rows(), "rows"), args, "reading"
+    )

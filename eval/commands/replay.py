@@ -17,8 +17,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
-import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -34,7 +32,6 @@ from crosscue.eval.batch.jobs import (
     fingerprint_of,
     run_many,
 )
-from crosscue.eval.batch.jobs import Progress as DrivesDone
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
 from crosscue.eval.batch.processes import Processes
 from crosscue.eval.commands.shared.options import (
@@ -43,6 +40,7 @@ from crosscue.eval.commands.shared.options import (
     print_json,
     selection_of,
 )
+from crosscue.eval.commands.shared.progress import DriveLine, DrivesLine, is_shown
 from crosscue.eval.pipeline.accounts import versions
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.estimate import Outcome
@@ -53,7 +51,6 @@ from crosscue.eval.pipeline.run_input import files_named_in
 from crosscue.eval.pipeline.scene import ApproachSummary, SceneOutcome
 from crosscue.eval.runs.folder import create
 from crosscue.replay.errors import CrosscueError, UsageError
-from crosscue.replay.log_part import first_ns
 from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import terminal_width, visible, wrapped
 from crosscue.replay.vehicle.vehicle import Vehicle, load
@@ -161,9 +158,8 @@ def run(args: argparse.Namespace) -> int:
         return _run_many(args, drives)
     if args.workers is not None or args.ray is not None:
         raise UsageError("--workers, --ray: for many drives; this is one (--each makes it many)")
-    progress = Progress("replaying", not args.quiet and sys.stderr.isatty())
-    outcome = _replay(drives.drives[0], args.output, args, progress)
-    progress.end()
+    with DriveLine("replaying", is_shown=is_shown(args)) as line:
+        outcome = _replay(drives.drives[0], args.output, args, line)
     if args.json:
         print_json(as_json(outcome))
     elif not args.quiet:
@@ -177,11 +173,11 @@ def _vehicle(path: Path | None, own: Path | None) -> Vehicle:
 
 
 def _replay(
-    drive: DriveInput | Job, output: Path, args: argparse.Namespace, progress: Progress
+    drive: DriveInput | Job, output: Path, args: argparse.Namespace, line: DriveLine
 ) -> Outcome:
     vehicle = _vehicle(args.vehicle, drive.vehicle)
     detecting = Detecting(
-        detectors_of(args, vehicle), cache_of(args), args.draw, args.resume, progress.at_frame
+        detectors_of(args, vehicle), cache_of(args), args.draw, args.resume, line.at_frame
     )
     with ExitStack() as stack:
         logs = stack.enter_context(open_logs(drive.logs, limits_of(args)))
@@ -190,14 +186,12 @@ def _replay(
         if args.landmarks:
             landmarks = stack.enter_context(open_for(args.landmarks, matcher_for(vehicle)))
         run_folder = create(output, overwrite=args.overwrite or args.resume)
-        if progress.is_shown:
-            progress.start_ns = first_ns(logs)
         return replay_drive(
             logs,
             vehicle,
             run_folder,
             selection,
-            progress.at_time,
+            line.at_time,
             landmarks,
             detecting,
             overwrite=args.overwrite,
@@ -213,7 +207,7 @@ class _Work:
     def __call__(self, job: Job) -> Outcome:
         # Whether a folder may be replaced was decided before the drive was handed out.
         args = argparse.Namespace(**{**vars(self.args), "overwrite": True})
-        return _replay(job, job.run, args, Progress("", False))
+        return _replay(job, job.run, args, DriveLine("", is_shown=False))
 
 
 def _run_many(args: argparse.Namespace, drives: DriveList) -> int:
@@ -229,8 +223,8 @@ def _run_many(args: argparse.Namespace, drives: DriveList) -> int:
         )
         for drive in drives.drives
     ]
-    line = DriveProgress(not args.quiet and sys.stderr.isatty())
-    done = run_many(jobs, _Work(args), engine, overwrite=args.overwrite, on_progress=line)
+    with DrivesLine("replaying", is_shown=is_shown(args)) as line:
+        done = run_many(jobs, _Work(args), engine, overwrite=args.overwrite, on_progress=line)
     line.end()
     status = exit_status_of(done)
     where, why = str(args.output / FOLDER), None
@@ -288,29 +282,6 @@ def engine_of(workers: int | None, ray: str | None) -> Engine:
     return Processes(workers or 1)
 
 
-class DriveProgress:
-    """One line on a terminal: drives done, failed, and the time left."""
-
-    def __init__(self, is_shown: bool) -> None:
-        """Say nothing unless ``is_shown``."""
-        self._is_shown = is_shown
-
-    def __call__(self, at: DrivesDone) -> None:
-        """Told how far it has come."""
-        if not self._is_shown:
-            return
-        left = "" if at.seconds_left is None else f", {at.seconds_left:.0f} s left"
-        failed = f", {at.failed} failed" if at.failed else ""
-        sys.stderr.write(f"\r{at.earlier + at.done} of {at.total} drives{failed}{left} \x1b[K")
-        sys.stderr.flush()
-
-    def end(self) -> None:
-        """Take the line away."""
-        if self._is_shown:
-            sys.stderr.write("\r\x1b[K")
-            sys.stderr.flush()
-
-
 def _drive_lines(done: Sequence[Done[Outcome]]) -> list[str]:
     lines = []
     for one in done:
@@ -337,44 +308,6 @@ def _drive_as_json(one: Done[Outcome]) -> dict[str, object]:
         "seconds": one.seconds,
         "result": None if one.result is None else as_json(one.result),
     }
-
-
-class Progress:
-    """One line on a terminal: frames done with the time left, then the log time reached."""
-
-    def __init__(self, what: str, is_shown: bool) -> None:
-        """Say nothing unless ``is_shown``."""
-        self.is_shown = is_shown
-        self.start_ns: int | None = None
-        self._what = what
-        self._began = self._shown = time.monotonic()
-
-    def at_frame(self, done: int, of: int | None) -> None:
-        """A frame has been looked at."""
-        if of is None or of < done:
-            self._show(f"detecting: {done:,} frames")
-            return
-        left_s = (time.monotonic() - self._began) * (of - done) / max(done, 1)
-        self._show(f"detecting: {done:,} of {of:,} frames, {left_s:.0f} s left")
-
-    def at_time(self, t_ns: int) -> None:
-        """The log has been read so far."""
-        if self.start_ns is None:
-            self.start_ns = t_ns
-        self._show(f"{self._what}: {(t_ns - self.start_ns) * 1e-9:.0f} s of log")
-
-    def end(self) -> None:
-        """Take the line away."""
-        if self.is_shown:
-            sys.stderr.write("\r\x1b[K")
-            sys.stderr.flush()
-
-    def _show(self, text: str) -> None:
-        now = time.monotonic()
-        if self.is_shown and now - self._shown > 0.2:
-            self._shown = now
-            sys.stderr.write(f"\r{text} \x1b[K")
-            sys.stderr.flush()
 
 
 def summary(outcome: Outcome) -> str:

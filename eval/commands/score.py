@@ -31,8 +31,8 @@ from crosscue.eval.commands.shared.options import (
     limits_of,
     metres,
     print_json,
-    with_progress,
 )
+from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.pipeline.run_account import account_lines
 from crosscue.eval.report.junit import write_junit
 from crosscue.eval.report.page import REPORT, write_report
@@ -175,10 +175,10 @@ def _score_all(
     scored: list[Scored] = []
     failed: list[Failed] = []
 
-    def share() -> float:
-        return (len(scored) + len(failed)) / len(paths)
+    def at() -> Done:
+        return Done(len(scored) + len(failed), len(paths), "runs")
 
-    for one in with_progress(score_runs(paths, work, args.workers), share, args, "scoring"):
+    for one in with_progress(score_runs(paths, work, args.workers), at, args, "scoring"):
         if isinstance(one, Scored):
             scored.append(one)
             if len(paths) > 1 and not (args.json or args.quiet):

@@ -17,13 +17,15 @@ import argparse
 import sys
 from pathlib import Path
 
-from crosscue.eval.commands.shared.options import print_json, with_progress
+from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.replay.errors import CrosscueError, LogError, UsageError
 from crosscue.replay.formats import format_of
 from crosscue.replay.safe_text import visible
 from crosscue.replay.seal.seal import HASH, SUFFIX, Check, Sealing, read_seal, seal_path, write_seal
 
 SHOWN = 20
+MEGABYTE = 1_000_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,9 +64,11 @@ def _place(text: str) -> Path:
 
 def _seal(log: Path, args: argparse.Namespace) -> dict[str, object]:
     sealing = Sealing(log)
-    for _ in with_progress(
-        sealing, lambda: sealing.done / max(sealing.total, 1), args, f"sealing {log.name}"
-    ):
+
+    def at() -> Done:
+        return Done(sealing.done / MEGABYTE, sealing.total / MEGABYTE, "MB")
+
+    for _ in with_progress(sealing, at, args, f"sealing {log.name}"):
         pass
     seal, path = sealing.seal, seal_path(log)
     is_new = write_seal(log, seal, overwrite=args.overwrite)
@@ -94,12 +98,11 @@ def _check(log: Path, args: argparse.Namespace) -> dict[str, object]:
         check = Check(log, seal)
     except OSError as error:
         raise LogError(f"{error.filename or log}: {error.strerror or error}") from None
-    for _ in with_progress(
-        check.everything(),
-        lambda: check.checked / max(seal.blocks, 1),
-        args,
-        f"checking {log.name}",
-    ):
+
+    def at() -> Done:
+        return Done(check.checked, seal.blocks, "MiB")
+
+    for _ in with_progress(check.everything(), at, args, f"checking {log.name}"):
         pass
     spans = list(check.damaged())
     is_whole = not spans and not check.oddities

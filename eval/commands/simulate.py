@@ -23,7 +23,8 @@ from crosscue.datasets.scenes.drive import SceneFiles, SceneSettings, write_scen
 from crosscue.datasets.scenes.export.contact_sheet import contact_sheet, sheet_jpeg
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.camera import Camera
-from crosscue.eval.commands.shared.options import print_json, with_progress
+from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.whole_file import write_bytes
 
@@ -82,10 +83,10 @@ def run(args: argparse.Namespace) -> int:
         return _sheet(wanted, args)
     written: list[dict[str, object]] = []
 
-    def share() -> float:
-        return len(written) / len(wanted)
+    def at() -> Done:
+        return Done(len(written), len(wanted), "drives")
 
-    for settings, files in with_progress(_made(wanted, args), share, args, "simulating"):
+    for settings, files in with_progress(_made(wanted, args), at, args, "simulating"):
         written.append(_told(settings, files))
         if not args.quiet and not args.json:
             print(f"{files.log.parent}: {files.seconds:.1f} s, {files.pictures} pictures")

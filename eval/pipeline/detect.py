@@ -178,7 +178,7 @@ def detect_into(
 
         def declared() -> int | None:
             is_whole = selection.start_ns is None and selection.end_ns is None
-            return ledger.topic(topic.name).declared if is_whole else None
+            return topic.declared if is_whole else None
 
         with tables:
             extractor.on_pictures = lambda block: _through(

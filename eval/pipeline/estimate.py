@@ -7,7 +7,7 @@ the run's own tables.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -47,7 +47,15 @@ from .accounts import (
     write_skipped,
 )
 from .detect import DetectOutcome
-from .drive_time import drive_timeline, selections_of, time_told, timeline_in
+from .drive_time import (
+    OnTime,
+    drive_timeline,
+    report_time,
+    selections_of,
+    time_told,
+    timeline_in,
+    unwatched_time,
+)
 from .empty_result import empty_result, silent_roles
 from .labelled import LabelledSink
 from .landmarks import looking
@@ -118,7 +126,7 @@ def estimate_into(
     vehicle: Vehicle,
     run: RunFolder,
     selection: Selection,
-    on_time: Callable[[int], None] = lambda _: None,
+    on_time: OnTime = unwatched_time,
     landmarks: LandmarkDatabase | None = None,
     detected: DetectOutcome | None = None,
     earlier: Mapping[str, Any] | None = None,
@@ -132,7 +140,7 @@ def estimate_into(
         vehicle: What the vehicle file says.
         run: With the detect stage's tables, or without any.
         selection: Which part of the logs.
-        on_time: Told the log time that has been reached.
+        on_time: Called with the seconds done, and those there are.
         landmarks: Camera frames are compared with these, where given.
         detected: The detect stage, if it ran just now.
         earlier: The manifest's part on the detect stage, if it ran earlier.
@@ -315,9 +323,7 @@ class _Reading:
         return self.timeline.clock(0 if source is None else source.log)
 
 
-def _pose(
-    reading: _Reading, stage: PoseStage, run: RunFolder, on_time: Callable[[int], None]
-) -> PoseTally:
+def _pose(reading: _Reading, stage: PoseStage, run: RunFolder, on_time: OnTime) -> PoseTally:
     tally = PoseTally()
     timeline, clock = reading.timeline, reading.clock_of(Signal.WHEEL_SPEEDS)
     with (
@@ -333,7 +339,7 @@ def _pose(
                 tally.add(poses)
             _write_all(measured, stage.take_measured())
             mobileye.write(window.samples)
-            on_time(window.end_ns)
+            report_time(on_time, timeline, window.end_ns)
         for poses in stage.finish():
             sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
             tally.add(poses)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
 
+from .drive_time import OnTime, unwatched_time
 from .estimate import Outcome, begin_again, detected_part, estimate_into
 from .run_input import settings_changed
 from .run_logs import reopened
@@ -31,7 +32,7 @@ def selection_used(manifest: Mapping[str, Any]) -> Selection:
 def estimate_run(
     run: RunFolder,
     vehicle: Vehicle | None = None,
-    on_time: Callable[[int], None] = lambda _: None,
+    on_time: OnTime = unwatched_time,
 ) -> Outcome:
     """Estimate again into the same run folder; no picture is opened.
 
@@ -40,7 +41,7 @@ def estimate_run(
     Args:
         run: A finished run, or one whose detect stage has finished.
         vehicle: Other settings; those of the run, if left out.
-        on_time: Told the log time that has been reached.
+        on_time: Called with the seconds done, and those there are.
 
     Raises:
         RunError: Its logs are gone or have changed, or it was made with landmarks.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -19,7 +19,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .accounts import selection_told
 from .detect import DetectOutcome, OnFrames, detect_into, unwatched
-from .drive_time import drive_timeline
+from .drive_time import OnTime, drive_timeline, unwatched_time
 from .empty_result import nothing_left
 from .estimate import Outcome, detected_part, estimate_into
 from .run_input import input_of, refuse_another
@@ -56,7 +56,7 @@ def replay_drive(
     vehicle: Vehicle,
     run: RunFolder,
     selection: Selection,
-    on_time: Callable[[int], None] = lambda _: None,
+    on_time: OnTime = unwatched_time,
     landmarks: LandmarkDatabase | None = None,
     detecting: Detecting = NO_DETECTORS,
     *,
@@ -69,7 +69,7 @@ def replay_drive(
         vehicle: What the vehicle file says.
         run: Where to; locked while this works, cleared first unless its detections are kept.
         selection: Which part of the logs.
-        on_time: Told the log time that has been reached, for progress.
+        on_time: Called with the seconds done, and those there are.
         landmarks: Camera frames are compared with these, where given.
         detecting: Detectors to run over the camera; without any, the run has pose alone.
         overwrite: Replace a run of other logs or settings, though ``detecting`` says to resume.

@@ -21,6 +21,7 @@ from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle.cue_table import STOP_SIGN, TRAFFIC_LIGHT
 from crosscue.replay.vehicle.vehicle import Vehicle
 
+from .drive_time import OnTime, report_time, unwatched_time
 from .sign_ranges import sign_ranges
 from .stored_frames import StoredFrame, stored_frames
 from .travelled import Odometer, odometer_of
@@ -90,7 +91,7 @@ def estimate_scene(
     sink: Sink,
     past: Callable[[int], PastCues | None] = nothing_past,
     without: frozenset[str] = frozenset(),
-    on_time: Callable[[int], None] = lambda _: None,
+    on_time: OnTime = unwatched_time,
     timeline: Timeline = ONE_SEGMENT,
     on_restart: Callable[[int], None] = lambda _: None,
 ) -> SceneOutcome:
@@ -103,7 +104,7 @@ def estimate_scene(
         sink: Given the rows of ``cues``, ``range`` and ``belief``.
         past: From a time to the Mobileye's cues past the intersection then.
         without: Cues to leave out as if nothing had looked for them, with the ranges they give.
-        on_time: Told the log time reached.
+        on_time: Called with the seconds done, and those there are.
         timeline: Where the drive has gaps; beyond a long one everything starts anew.
         on_restart: Told the drive time from which on a new start counts.
 
@@ -126,7 +127,7 @@ def estimate_scene(
             scene.restart(fresh_ns)
             on_restart(fresh_ns)
         scene.step(frame, past(frame.seen.t_ns), without)
-        on_time(frame.seen.t_ns)
+        report_time(on_time, timeline, frame.seen.t_ns)
     scene.rows.flush()
     scene.approaches.finish()
     return SceneOutcome(

@@ -17,7 +17,8 @@ from collections import Counter
 from pathlib import Path
 
 from crosscue.datasets.truth.truth import load
-from crosscue.eval.commands.shared.options import print_json, refuse_existing, with_progress
+from crosscue.eval.commands.shared.options import print_json, refuse_existing
+from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, section_of, told_of
 from crosscue.eval.runs.folder import open_run
 from crosscue.fusion.fade_fit import FadeFit
@@ -62,11 +63,11 @@ def run(args: argparse.Namespace) -> int:
     found = Annotated([], Counter())
     done = 0
 
-    def share() -> float:
-        return done / len(runs)
+    def at() -> Done:
+        return Done(done, len(runs), "runs")
 
     pairs = zip(runs, args.truth, strict=True)
-    for folder, path in with_progress(pairs, share, args, "reading"):
+    for folder, path in with_progress(pairs, at, args, "reading"):
         annotate(folder, load(path), vehicle, found)
         done += 1
     if not found.approaches:

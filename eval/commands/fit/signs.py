@@ -23,7 +23,8 @@ import numpy as np
 from crosscue.detectors.signs.detector import build
 from crosscue.detectors.signs.templates import AMERICAN, KINDS
 from crosscue.detectors.training.operating_point import Judged, rates_at, threshold_for, together
-from crosscue.eval.commands.shared.options import print_json, with_progress
+from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.fit.sign_scores import Rules, judged_pictures
 from crosscue.eval.scoring.intervals import Share, share
 from crosscue.replay.errors import UsageError
@@ -170,7 +171,7 @@ def _judged(args: argparse.Namespace) -> tuple[list[Judged], list[Judged]]:
     work += [(path, rest) for path in args.test or args.labels]
     parts: list[Judged] = []
     made = (judged_pictures(path, detector, rules, which) for path, which in work)
-    for part in with_progress(made, lambda: len(parts) / len(work), args, "looking"):
+    for part in with_progress(made, lambda: Done(len(parts), len(work), "sets"), args, "looking"):
         parts.append(part)
     return parts[: len(args.labels)], parts[len(args.labels) :]
 

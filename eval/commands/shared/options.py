@@ -5,20 +5,15 @@ from __future__ import annotations
 import argparse
 import math
 import re
-import sys
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.log_part import first_ns, named_topics
-
-T = TypeVar("T")
 
 
 def add_log_arguments(parser: argparse.ArgumentParser) -> None:
@@ -180,33 +175,3 @@ def _time_ns(flag: str, text: str | None, logs: Sequence[Log]) -> int | None:
 def print_json(value: object) -> None:
     """Strict JSON on stdout: sorted keys, NaN and infinities as null."""
     print(strict_json(value))
-
-
-def with_progress(
-    items: Iterable[T], done_share: Callable[[], float], args: argparse.Namespace, what: str
-) -> Iterator[T]:
-    """Yield ``items``; on a terminal, keep one line with share done and time left on stderr.
-
-    Args:
-        items: What is worked through.
-        done_share: Asked at most five times a second; gives the share done, 0 to 1.
-        args: With ``quiet``.
-        what: The word before the bar.
-    """
-    if args.quiet or not sys.stderr.isatty():
-        yield from items
-        return
-    began = shown = time.monotonic()
-    try:
-        for item in items:
-            yield item
-            now = time.monotonic()
-            if now - shown > 0.2:
-                shown = now
-                share = min(max(done_share(), 1e-6), 1.0)
-                left_s = (now - began) * (1.0 - share) / share
-                sys.stderr.write(f"\r{what} {100 * share:3.0f} %  {left_s:5.0f} s left \x1b[K")
-                sys.stderr.flush()
-    finally:
-        sys.stderr.write("\r\x1b[K")
-        sys.stderr.flush()

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.tree_text import json_tree
 
-from .options import print_json, with_progress
+from .options import print_json
+from .progress import Done, with_progress
 
 if TYPE_CHECKING:
     from crosscue.eval.studies.town.settings import FieldStudy, LandmarkStudy, RangeStudy
@@ -100,7 +101,7 @@ def run_study(
 
     done = [0.0]
     shares = drive_study(study, args.output, workers_of(args), args.ray, overwrite=args.overwrite)
-    for share in with_progress(shares, lambda: done[0], args, what):
+    for share in with_progress(shares, lambda: Done(100.0 * done[0], 100.0, "percent"), args, what):
         done[0] = share
     made = finish(study, args.output)
     if args.json:

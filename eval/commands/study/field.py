@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import argparse
 
-from crosscue.eval.commands.shared.options import print_json, with_progress
+from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.commands.shared.study import add_study_arguments, study_of, workers_of
 from crosscue.replay.errors import UsageError
 
@@ -40,7 +41,11 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("study field: no runs; give --range-runs or --landmark-runs")
     done, runs = [0.0], []
     shares = drive_field(study, args.output, workers_of(args), overwrite=args.overwrite)
-    for share, one in with_progress(shares, lambda: done[0], args, "driving and replaying"):
+
+    def at() -> Done:
+        return Done(100.0 * done[0], 100.0, "percent")
+
+    for share, one in with_progress(shares, at, args, "driving and replaying"):
         done[0] = share
         runs.append(one)
     tables = finish_field(study, runs, args.output)

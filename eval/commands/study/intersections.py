@@ -10,13 +10,13 @@ example:
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.detectors.registry import EMBEDDED
 from crosscue.eval.batch.jobs import exit_status_of
-from crosscue.eval.commands.replay import DriveProgress, engine_of
+from crosscue.eval.commands.replay import engine_of
+from crosscue.eval.commands.shared.progress import DrivesLine, is_shown
 from crosscue.eval.studies.intersections.report import TABLES, summary, write_study
 from crosscue.eval.studies.intersections.study import StudySettings, run_drives, score_study
 from crosscue.replay.errors import RunError
@@ -88,9 +88,8 @@ def run(args: argparse.Namespace) -> int:
         vehicle=args.vehicle,
         detectors=args.detectors,
     )
-    line = DriveProgress(not args.quiet and sys.stderr.isatty())
-    done = run_drives(args.output, settings, engine, line)
-    line.end()
+    with DrivesLine("driving", is_shown=is_shown(args)) as line:
+        done = run_drives(args.output, settings, engine, line)
     names = [one.job.name for one in done if one.error is None]
     if not names:
         raise RunError(f"{args.output}: every drive failed; the first: {done[0].error}")

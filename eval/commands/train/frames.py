@@ -17,7 +17,8 @@ from crosscue.datasets.scenes.drive import SOURCE, SceneSettings
 from crosscue.datasets.scenes.export.coco import Objects
 from crosscue.datasets.scenes.export.training_frames import frames, joined
 from crosscue.datasets.scenes.rendering.camera import Camera
-from crosscue.eval.commands.shared.options import print_json, with_progress
+from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.commands.shared.training import check_place, learnt_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 
@@ -68,7 +69,11 @@ def run(args: argparse.Namespace) -> int:
     check_place(images / "any")
     parts: list[Objects] = []
     made = frames(wanted, args.per_layout, images, args.workers)
-    for part in with_progress(made, lambda: len(parts) / len(wanted), args, "rendering"):
+
+    def at() -> Done:
+        return Done(len(parts), len(wanted), "runs")
+
+    for part in with_progress(made, at, args, "rendering"):
         parts.append(part)
     whole = joined(parts)
     whole.save(target, f"{SOURCE}; layouts {' '.join(args.layouts)}, seed {args.seed}")

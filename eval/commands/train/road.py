@@ -23,7 +23,8 @@ from crosscue.datasets.scenes.drive import SceneSettings
 from crosscue.datasets.scenes.export.road_frames import RoadFrames, joined, rendered
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.camera import Camera
-from crosscue.eval.commands.shared.options import print_json, with_progress
+from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.commands.shared.training import check_place, layouts_of, learnt_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 
@@ -210,7 +211,11 @@ def _trained(training: RoadTraining, learn: RoadFrames, args: argparse.Namespace
     if args.resume and state.exists():
         training.resume(state)
     steps = training.steps(learn.pixels, learn.road)
-    for done, now in with_progress(steps, lambda: training.done / args.steps, args, "training"):
+
+    def at() -> Done:
+        return Done(training.done, args.steps, "steps")
+
+    for done, now in with_progress(steps, at, args, "training"):
         loss = now
         if done % SAVED_EVERY == 0:
             training.save(state)
@@ -279,6 +284,6 @@ def _rendered(names: list[str], size: Size, args: argparse.Namespace) -> RoadFra
         ]
     parts: list[RoadFrames] = []
     made: Iterator[RoadFrames] = rendered(runs, args.per_layout, size)
-    for part in with_progress(made, lambda: len(parts) / len(runs), args, "rendering"):
+    for part in with_progress(made, lambda: Done(len(parts), len(runs), "runs"), args, "rendering"):
         parts.append(part)
     return joined(parts)
