@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
-from crosscue.eval.pipeline.accounts import versions
+from crosscue.eval.pipeline.accounts import versions, write_skipped
+from crosscue.eval.pipeline.drive_time import time_told, whole_timeline
 from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
 from crosscue.eval.pipeline.run_account import Account, account, reading_of
 from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
@@ -25,6 +26,7 @@ from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.mobileye.samples import settings_of
 from crosscue.replay.remote.logs import name_of
+from crosscue.replay.time.segments import LogClock, TimedLog, Timeline
 from crosscue.replay.topic_part import columns_of
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -36,6 +38,8 @@ if TYPE_CHECKING:
 
 ROWS_HELD: Final = 8192
 """Rows of one table held back until they are worth a row group."""
+RESERVED: Final = "skipped"
+"""The table of what was left out."""
 
 
 class _BlockDecoder(Protocol):
@@ -49,6 +53,8 @@ class _Table:
     run: RunFolder
     name: str
     stack: ExitStack
+    timeline: Timeline
+    clock: LogClock
     rows: int = 0
     sink: TableSink | None = None
     held: list[Block] = field(default_factory=list)
@@ -64,7 +70,7 @@ class _Table:
         """Write the rows that wait."""
         if not self.held:
             return
-        columns = columns_of(self.held)
+        columns = _labelled(columns_of(self.held), self.timeline, self.clock)
         if self.sink is None:
             sink = TableSink(self.run, self.name, _schema_of(columns))
             self.sink = self.stack.enter_context(sink)
@@ -73,13 +79,33 @@ class _Table:
         self.held, self.held_rows = [], 0
 
 
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """What was written.
+
+    Attributes:
+        rows: For each file of a stream.
+        account: What became of every row.
+        timeline: Time segments.
+    """
+
+    rows: dict[str, int]
+    account: Account
+    timeline: Timeline
+
+    @property
+    def exit_status(self) -> int:
+        """3 when anything was dropped or the logs have gaps, else 0."""
+        return 3 if self.timeline.has_gaps or not self.account["is_whole"] else 0
+
+
 def decode_tables(
     logs: Sequence[Log],
     vehicle: Vehicle,
     run: RunFolder,
     selection: Selection,
     on_rows: Callable[[int, int], None] = lambda _rows, _of: None,
-) -> tuple[dict[str, int], Account]:
+) -> Decoded:
     """Write all streams of a drive as tables.
 
     Args:
@@ -89,25 +115,26 @@ def decode_tables(
         selection: What part.
         on_rows: Called with the rows read, and those that the logs declare.
 
-    Returns:
-        Rows for each file written, and the account.
-
     Raises:
         SchemaError: A DBC file cannot be read.
+        AccountError: A topic's rows do not add up.
         EmptyResultError: Not one row in the part asked for; the folder is as it was.
         OutputError: The disk is full.
     """
     ledgers = tuple(Ledger(name_of(log)) for log in logs)
     tables: dict[str, _Table] = {}
     declared = sum(map(rows_declared, logs))
+    timeline = whole_timeline(logs, vehicle, selection)
     with locked(run), staged(run) as new, nothing_left(new):
         clear(new)
         with ExitStack() as stack:
-            for log, ledger in zip(logs, ledgers, strict=True):
-                for block in _decoded(log, vehicle, ledger, selection):
+            for number, (log, ledger) in enumerate(zip(logs, ledgers, strict=True)):
+                clock = timeline.clock(number)
+                for block in _decoded(TimedLog(log, clock), vehicle, ledger, selection):
                     if block.topic not in tables:
-                        name = file_name(block.topic, {t.name.lower() for t in tables.values()})
-                        tables[block.topic] = _Table(new, name, stack)
+                        taken = {RESERVED, *(t.name.lower() for t in tables.values())}
+                        name = file_name(block.topic, taken)
+                        tables[block.topic] = _Table(new, name, stack, timeline, clock)
                     tables[block.topic].add(block)
                     on_rows(sum(map(rows_read, ledgers)), declared)
             for table in tables.values():
@@ -116,23 +143,28 @@ def decode_tables(
         if not any(rows.values()):
             raise empty_result("no topic gave a row for a table", logs, selection)
         made = account(reading_of(ledgers))
+        write_skipped(new, ledgers, made["reading"], timeline=timeline)
         content = {
             "versions": versions(),
             "tables": {topic: f"{table.name}.parquet" for topic, table in tables.items()},
             "rows": rows,
             "settings": vehicle.model_dump(mode="json"),
             "account": made,
+            "time": time_told(timeline),
         }
         write_manifest(new, content)
-    return rows, made
+    return Decoded(rows, made, timeline)
 
 
-def _decoded(log: Log, vehicle: Vehicle, ledger: Ledger, selection: Selection) -> Iterator[Block]:
+def _decoded(
+    timed: TimedLog, vehicle: Vehicle, ledger: Ledger, selection: Selection
+) -> Iterator[Block]:
+    log = timed.log
     topics = {topic.name: topic for topic in log.topics}
     mobileye = _ros_mobileye(log, vehicle, ledger)
     decoders: dict[str, Decoder | None] = {}
     buses: dict[str, tuple[list[_BlockDecoder], list[MobileyeDecoder]]] = {}
-    for block in ledger.handing_on(log.read(ledger, selection)):
+    for block in ledger.handing_on(timed.read(ledger, selection)):
         topic = topics.get(block.topic) or _late_topic(log, block.topic)
         if isinstance(block.rows, Messages):
             if block.topic not in decoders:
@@ -216,6 +248,32 @@ def file_name(topic: str, taken: Collection[str]) -> str:
     while name.lower() in taken:
         name, number = f"{plain}-{number}", number + 1
     return name
+
+
+def _labelled(
+    columns: Mapping[str, NDArray[np.generic]], timeline: Timeline, clock: LogClock
+) -> dict[str, NDArray[np.generic]]:
+    """Columns with drive time, segment and the stamps as recorded in front.
+
+    A stream's own ``t_ns`` (the Mobileye's time of the image) stays; other fields of its own with
+    these names get an underscore behind.
+    """
+    import numpy as np
+
+    t_ns = np.asarray(columns["log_ns"], np.int64)
+    log_t_ns = clock.log_times(t_ns)
+    found: dict[str, NDArray[np.generic]] = {
+        "t_ns": t_ns,
+        "segment": timeline.numbers(t_ns),
+        "log_t_ns": log_t_ns,
+    }
+    for name, values in columns.items():
+        if name == "log_ns":
+            continue
+        if name == "publish_ns":
+            values = np.asarray(values, np.int64) - (t_ns - log_t_ns)
+        found[f"{name}_" if name in ("segment", "log_t_ns") else name] = values
+    return found
 
 
 def _schema_of(columns: Mapping[str, NDArray[np.generic]]) -> pa.Schema:

@@ -17,10 +17,12 @@ from crosscue.eval.commands.shared.options import (
     selection_of,
 )
 from crosscue.eval.commands.shared.progress import Done, progress_line
+from crosscue.eval.pipeline.drive_time import time_told
 from crosscue.eval.pipeline.run_account import account_lines
 from crosscue.eval.runs.folder import create
 from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import visible
+from crosscue.replay.time.segments import gaps_told
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 
@@ -38,17 +40,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Decode; 3 when something was dropped."""
+    """Decode; 3 when something was dropped or the clock has gaps."""
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     with open_logs(args.logs, limits_of(args)) as logs:
         folder = create(args.output, overwrite=args.overwrite)
         selection = selection_of(args, logs)
         with progress_line(args, "decoding") as shown:
-            rows, account = decode_tables(
+            done = decode_tables(
                 logs, vehicle, folder, selection, lambda n, of: shown.at(Done(n, of, "rows"))
             )
+    rows, account = done.rows, done.account
     if args.json:
-        print_json({"tables": rows, "account": account})
+        print_json({"tables": rows, "account": account, "time": time_told(done.timeline)})
     elif not args.quiet:
         width = max(map(len, rows), default=0)
         for name, count in rows.items():
@@ -58,4 +61,6 @@ def run(args: argparse.Namespace) -> int:
         for log in account["reading"]:
             for sentence in log["notices"]:
                 print(f"note     {visible(sentence)}")
-    return 0 if account["is_whole"] else 3
+        for sentence in gaps_told(done.timeline.segments):
+            print(f"note     {sentence}")
+    return done.exit_status

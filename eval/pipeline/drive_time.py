@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor
-from crosscue.replay.signals.kinds import Plan
+from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import plan, with_pictures
 from crosscue.replay.time.scan import scan
 from crosscue.replay.time.segments import Timeline, gaps_told, timeline_of
@@ -81,6 +82,35 @@ def camera_timeline(
         planned = with_pictures(Plan((), {}), camera)
         selections = selections_of(logs, planned, selection)
         return scan(logs, planned, vehicle, selections, [{} for _ in logs])
+
+
+def whole_timeline(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> Timeline:
+    """As ``drive_timeline``, over every topic: for who writes all of them."""
+    planned, clocks = plan_for_time(logs, vehicle, selection)
+    return scan(logs, planned, vehicle, [selection] * len(logs), clocks)
+
+
+def plan_for_time(
+    logs: Sequence[Log], vehicle: Vehicle, selection: Selection
+) -> tuple[Plan, list[dict[str, Clock]]]:
+    """Where the wheel speeds come from, and the clock of each log's topics.
+
+    Without wheel speeds to choose, nothing is planned: set-backs are found all the same.
+    """
+    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
+    try:
+        planned = plan(topics, vehicle)
+    except VehicleError:
+        return Plan((), {}), [{} for _ in logs]
+    wheels = planned.source_of(Signal.WHEEL_SPEEDS)
+    planned = Plan(() if wheels is None else (wheels,), {})
+    selections = selections_of(logs, planned, selection)
+    return planned, [
+        probe_clocks(log, Extractor(planned, vehicle, i, Ledger("")), selections[i])
+        if selections[i].topics
+        else {}
+        for i, log in enumerate(logs)
+    ]
 
 
 def selections_of(logs: Sequence[Log], planned: Plan, selection: Selection) -> list[Selection]:

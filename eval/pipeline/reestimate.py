@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, locked, staged, write_input
-from crosscue.replay.errors import RunError
+from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
@@ -46,6 +46,7 @@ def estimate_run(
     Raises:
         RunError: Its logs are gone or have changed, or it was made with landmarks.
         VehicleError: The settings do not fit the logs.
+        UsageError: They split the drive otherwise than detections are labelled.
     """
     manifest = run.manifest()
     if manifest.get("landmarks"):
@@ -53,6 +54,8 @@ def estimate_run(
             f"{run.path}: landmarks are looked for in pictures, which estimate does not open; run "
             "crosscue replay --landmarks again"
         )
+    if vehicle is not None:
+        _refuse_other_time(run, manifest, vehicle)
     with ExitStack() as stack:
         logs = [stack.enter_context(_reopened(run, said)) for said in manifest["logs"]]
         stack.enter_context(locked(run))
@@ -73,6 +76,19 @@ def estimate_run(
             told=manifest["logs"],
         )
     return replace(outcome, run=run)
+
+
+def _refuse_other_time(run: RunFolder, manifest: Mapping[str, Any], vehicle: Vehicle) -> None:
+    """Frames and detections carry segments by the ``[time]`` they were detected with."""
+    found = detected_part(manifest)
+    wanted = vehicle.time.model_dump(mode="json")
+    there = wanted if found is None else found["settings"]["time"]
+    for name, value in wanted.items():
+        if there[name] != value:
+            raise UsageError(
+                f"{run.path}: its frames are split into segments by time.{name} = "
+                f"{there[name]:g}, not {value:g}; estimate keeps that: run crosscue replay again"
+            )
 
 
 def _reopened(run: RunFolder, said: Mapping[str, Any]) -> Log:

@@ -130,6 +130,7 @@ def _content(scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> dict[st
         "same_log": metrics["coverage"].get("same_log", ()),
         "dropped": sum(not account["is_whole"] for account in accounts),
         "coverage": metrics["coverage"],
+        "scoring": metrics["account"]["scoring"],
         "settings": metrics["settings"],
         "approaches": metrics["approaches"],
         "cues": [one for one in cues if one["scored"]],

@@ -138,50 +138,65 @@ def scan(
         known: An earlier timeline of these logs: its shifts are kept, so that tables of both go
             together.
     """
+    watches = [LogWatch(number, planned, vehicle, clocks[number]) for number in range(len(logs))]
+    for watch, log, selection in zip(watches, logs, selections, strict=True):
+        if selection.topics is None or selection.topics:
+            for block in log.read(Ledger(""), selection):
+                watch.add(block)
+    return timeline_from(watches, planned, vehicle, known)
+
+
+class LogWatch:
+    """Takes the blocks of one log in stored order: the stamps of its topics, and its wheel speeds.
+
+    For who reads the log anyway; ``scan`` reads it for this alone.
+    """
+
+    def __init__(
+        self, number: int, planned: Plan, vehicle: Vehicle, clocks: Mapping[str, Clock]
+    ) -> None:
+        """Watch the log with this number in the plan."""
+        wheels = planned.source_of(Signal.WHEEL_SPEEDS)
+        self.topics: Final[dict[str, StampWatch]] = {}
+        self._wheels: Final = wheels if wheels is not None and wheels.log == number else None
+        self._vehicle: Final = vehicle
+        self._clocks: Final = clocks
+        self._following: _WheelRuns | None = None
+
+    def add(self, block: Block) -> None:
+        """Look at the next block."""
+        if not len(block):
+            return
+        watch = self.topics.setdefault(block.topic, StampWatch())
+        watch.add(block.log_ns)
+        if self._wheels is None or block.topic != self._wheels.topic.name:
+            return
+        if self._following is None:
+            extractor = _wheels_only(self._wheels, self._vehicle, self._clocks)
+            limit_ns = round(self._vehicle.time.max_silence_s * 1e9)
+            self._following = _WheelRuns(extractor, limit_ns, watch)
+        self._following.add(block)
+
+    def finish(self) -> list[_Run]:
+        """Decide the last rows; runs of wheel speeds come back where the log has them."""
+        for watch in self.topics.values():
+            watch.finish()
+        if self._following is None:
+            return []
+        self._following.settle()
+        return self._following.runs
+
+
+def timeline_from(
+    watches: Sequence[LogWatch], planned: Plan, vehicle: Vehicle, known: Timeline | None = None
+) -> Timeline:
+    """The time segments of logs that have been watched to their ends, in the plan's order."""
     limit_ns = round(vehicle.time.max_silence_s * 1e9)
     wheels = planned.source_of(Signal.WHEEL_SPEEDS)
-    watches: list[dict[str, StampWatch]] = []
-    runs: list[_Run] = []
-    for number, (log, selection) in enumerate(zip(logs, selections, strict=True)):
-        source = wheels if wheels is not None and wheels.log == number else None
-        found, of_wheels = _watched(log, selection, source, vehicle, clocks[number], limit_ns)
-        watches.append(found)
-        runs += of_wheels
-    aligned = [_Aligned(found) for found in watches]
+    runs = [run for watch in watches for run in watch.finish()]
+    aligned = [_Aligned(watch.topics) for watch in watches]
     log_clocks = _clocks(aligned, round(vehicle.time.unknown_gap_s * 1e9), known)
-    segments = _segments(aligned, log_clocks, runs, wheels, limit_ns)
-    return Timeline(segments, log_clocks)
-
-
-def _watched(
-    log: Log,
-    selection: Selection,
-    wheels: Source | None,
-    vehicle: Vehicle,
-    clocks: Mapping[str, Clock],
-    limit_ns: int,
-) -> tuple[dict[str, StampWatch], list[_Run]]:
-    """The stamps of one log, and its runs of wheel speeds where it has them."""
-    watches: dict[str, StampWatch] = {}
-    following: _WheelRuns | None = None
-    if selection.topics is not None and not selection.topics:
-        return {}, []
-    for block in log.read(Ledger(""), selection):
-        if not len(block):
-            continue
-        watch = watches.setdefault(block.topic, StampWatch())
-        watch.add(block.log_ns)
-        if wheels is not None and block.topic == wheels.topic.name:
-            if following is None:
-                extractor = _wheels_only(wheels, vehicle, clocks)
-                following = _WheelRuns(extractor, limit_ns, watch)
-            following.add(block)
-    for watch in watches.values():
-        watch.finish()
-    if following is None:
-        return watches, []
-    following.settle()
-    return watches, following.runs
+    return Timeline(_segments(aligned, log_clocks, runs, wheels, limit_ns), log_clocks)
 
 
 def _wheels_only(source: Source, vehicle: Vehicle, clocks: Mapping[str, Clock]) -> Extractor:

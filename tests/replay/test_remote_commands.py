@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -142,10 +143,14 @@ def test_a_log_at_a_url_gives_what_it_gives_on_disk(
         assert crosscue([words[0], log, *words[1:], *part]) == 0
 
     files = sorted(one.relative_to(tmp_path / "here") for one in tmp_path.glob("here/*.parquet"))
-    assert all(
-        (tmp_path / "there" / one).read_bytes() == (tmp_path / "here" / one).read_bytes()
-        for one in files
-    )
+    for one in files:
+        here, there = tmp_path / "here" / one, tmp_path / "there" / one
+        if one.name == "skipped.parquet":
+            # Its rows name the log.
+            tables = (pq.read_table(path).drop(["log"]) for path in (here, there))
+            assert next(tables).equals(next(tables))
+            continue
+        assert there.read_bytes() == here.read_bytes()
     if command == "convert":
         assert (tmp_path / "there.mcap").read_bytes() == (tmp_path / "here.mcap").read_bytes()
     elif command != "info":

@@ -1,5 +1,6 @@
 """``crosscue decode``: every stream as a Parquet file, every frame accounted for."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,13 +10,14 @@ import pytest
 
 from crosscue.eval import cli
 from crosscue.eval.catalog.decoded_logs import decode_tables, file_name
-from crosscue.eval.runs.folder import create
+from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.replay.columns import Block, Messages, Table, Topic
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.mobileye.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting
 from crosscue.replay.vehicle.vehicle import Mobileye, Vehicle
 from support.data import shared
+from support.gap_drive import BEGIN, ROW, Clock, write_drive
 from support.memory_log import MemoryLog, wheel_block
 
 EYE = Topic("eye", "crosscue/CanFrames", "columns")
@@ -62,14 +64,41 @@ def test_what_is_not_understood_is_counted_not_dropped(tmp_path: Path) -> None:
     blocks = [block, wheel_block([3], [1.0]), *_mobileye_drive()]
     log = MemoryLog((odd, wheels, EYE), blocks, path=Path(__file__))
 
-    rows_of, account = decode_tables(
+    done = decode_tables(
         [log], Vehicle(version=1), create(tmp_path / "out", overwrite=False), EVERYTHING
     )
 
-    assert rows_of == {"wheels.parquet": 1}
-    topics = account["reading"][0]["topics"]
+    assert done.rows == {"wheels.parquet": 1}
+    topics = done.account["reading"][0]["topics"]
     assert topics["odd"]["skipped"] == {"type not understood": 2}
     assert topics["eye"]["used"] == 0
+
+
+@pytest.mark.parametrize("by_s", [-7.0, 0.0, 30.0])
+def test_tables_say_segment_and_stamp_and_rows_add_up(
+    tmp_path: Path, by_s: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=by_s))
+    out = tmp_path / "out"
+    car = str(tmp_path / "car.toml")
+
+    status = cli.run(["decode", str(log), "--vehicle", car, "-o", str(out), "--json"])
+
+    told = json.loads(capsys.readouterr().out)
+    assert status == (3 if by_s else 0)
+    assert len(told["time"]["segments"]) == (2 if by_s else 1)
+    speed = pq.read_table(out / "can_WHEEL_SPEEDS.parquet")
+    recorded = Clock(set_at_s=6.0, by_s=by_s).recorded(np.arange(140) * ROW + BEGIN)[1]
+    assert speed["log_t_ns"].to_pylist() == recorded.tolist()
+    assert np.all(np.diff(speed["t_ns"].to_numpy()) > 0)
+    assert speed["segment"].to_pylist() == [0] * 60 + [1 if by_s else 0] * 80
+    skipped = RunFolder(out).table("skipped").to_pylist()
+    for name, topic in told["account"]["reading"][0]["topics"].items():
+        counts = [topic["used"], *topic["skipped"].values(), *topic["dropped"].values()]
+        assert topic["in"] == sum(counts)
+        rows = [row["count"] for row in skipped if row["topic"] == name]
+        assert sum(rows) == topic["in"] - topic["used"]
+    assert any(row["reason"] == "pictures are not tables" for row in skipped)
 
 
 def test_two_topics_never_share_a_file_and_none_leaves_the_folder() -> None:

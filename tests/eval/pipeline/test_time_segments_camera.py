@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
+from crosscue.eval import cli
 from crosscue.eval.pipeline.estimate import Outcome
 from support.gap_drive import ROW, SECOND, Clock, distance_m, replay, write_drive
 
@@ -122,3 +123,22 @@ def test_a_long_gap_begins_anew(tmp_path: Path) -> None:
     assert outcome.scene is not None
     assert outcome.scene.counts["approaches opened"] == 2
     assert outcome.scene.counts["approaches closed: a gap in time"] == 1
+
+
+@pytest.mark.parametrize("line", ["max_silence_s = 9.0", "restart_after_s = 2.0"])
+def test_estimate_refuses_another_split_than_the_frames_carry(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str
+) -> None:
+    run = replay(tmp_path, write_drive(tmp_path, Clock(pause_s=(5.0, 8.0)))).run
+    before = run.file("manifest.json").read_bytes()
+    other = tmp_path / "other.toml"
+    other.write_text((tmp_path / "car.toml").read_text() + f"[time]\n{line}\n")
+
+    assert cli.run(["estimate", str(run.path), "--vehicle", str(other)]) == 2
+
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"time.{line.split()[0]}" in said
+    assert "run crosscue replay again" in said
+    assert run.file("manifest.json").read_bytes() == before
+    assert cli.run(["estimate", str(run.path), "--vehicle", str(tmp_path / "car.toml")]) == 3

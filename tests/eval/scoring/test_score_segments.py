@@ -59,6 +59,11 @@ def test_what_a_set_back_makes_ambiguous_is_counted_everywhere(tmp_path: Path) -
     assert scored.one.pose is not None
     assert f"{pose['ambiguous']} whose log time comes twice" in pose_summary(scored.one.pose)
     page = scored.report.read_text()
+    assert metrics["account"]["scoring"]
+    for name, one in metrics["account"]["scoring"].items():
+        row = f'<td>scoring</td><td class="text">{name}</td><td>{one["in"]}</td><td>{one["used"]}'
+        assert row in page
+        assert one["in"] == one["used"] + sum(one["skipped"].values())
     assert f"<b>Ambiguous:</b> {frames} frames" in page
     assert f"{pose['ambiguous']} lie at moments that come twice" in page
 
