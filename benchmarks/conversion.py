@@ -1,7 +1,6 @@
 """ROS 1 bag to MCAP: ours beside ``rosbags.convert``, doing the same work in one run.
 
     python benchmarks/conversion.py [rounds]
-    python benchmarks/conversion.py memory [minutes]  # peak of `convert`, 22 minutes are 3 GB
 
 Two simulated logs: a drive (30 s: 450 pictures of 150 kB of noise, which is as incompressible as
 JPEG, 60,000 CAN frames, 3,000 IMU messages) and the same without pictures. Both write zstd chunks;
@@ -13,12 +12,10 @@ ratios are taken round by round. Before timing, the messages of both outputs are
 from __future__ import annotations
 
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -153,41 +150,7 @@ def measure(name: str, bag: Path, rounds: int) -> None:
         )
 
 
-PEAK = """
-import sys
-from pathlib import Path
-from crosscue.eval.cli import run
-
-status = run(["convert", *sys.argv[1:], "--overwrite", "-q"])
-print(status, Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
-"""
-
-
-def memory(minutes: int) -> None:
-    """Peak memory of `convert` for MCAP logs of vectors, CAN frames and pictures, by length."""
-    # A script's own folder is where Python looks first.
-    write_log = import_module("window_reading").write_log
-    with tempfile.TemporaryDirectory() as folder:
-        for length in (max(1, minutes // 10), minutes):
-            path = Path(folder) / "log.mcap"
-            write_log(path, length, 145_000)
-            for compression in ("zstd", "lz4", "none"):
-                out = str(path.with_name("out.mcap"))
-                call = [sys.executable, "-c", PEAK, str(path), "-o", out]
-                call += ["--compression", compression]
-                said = subprocess.run(call, check=True, capture_output=True, text=True).stdout
-                status, peak_kib = said.split()
-                print(
-                    f"{path.stat().st_size / 1e6:5.0f} MB to {compression:4}: status {status}, "
-                    f"peak {int(peak_kib) * 1024 / 1e6:.0f} MB",
-                    flush=True,
-                )
-
-
 def main() -> None:
-    if sys.argv[1:2] == ["memory"]:
-        memory(int(sys.argv[2]) if len(sys.argv) > 2 else 22)
-        return
     rounds = int(sys.argv[1]) if len(sys.argv) > 1 else ROUNDS
     if rounds < 5:
         raise SystemExit("at least 5 rounds, so that a median means something")

@@ -14,6 +14,7 @@ from .records import (
     CHUNK_INFO,
     CONNECTION,
     INDEX,
+    AheadBagFile,
     BagFile,
     ChunkInfo,
     Connection,
@@ -85,6 +86,7 @@ def read_index(file: BagFile, index_at: int, largest: int) -> Contents | None:
     """The index section at ``index_at``; None unless its records fill the file to its end."""
     contents = Contents(is_complete=True)
     at = index_at
+    file = AheadBagFile(file.fd, file.size, file)
     while at < file.size:
         record = file.whole_record(at)
         if record is None or not learn(file, record, contents, largest):

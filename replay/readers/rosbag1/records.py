@@ -35,6 +35,7 @@ HEADER_BYTES: Final = 1 << 20
 _U32 = struct.Struct("<I")
 _U64 = struct.Struct("<Q")
 _FIRST_LOOK: Final = 512
+_AHEAD: Final = 1 << 20
 _NEEDED: Final[dict[int, dict[bytes, int | None]]] = {
     MESSAGE: {b"conn": 4, b"time": 8},
     BAG_HEADER: {b"index_pos": 8, b"conn_count": 4, b"chunk_count": 4},
@@ -194,6 +195,29 @@ class RangedBagFile(BagFile):
     def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
         """These ranges, sorted, are going to be read, and may be fetched in larger pieces."""
         self.ranged.expect(ranges)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AheadBagFile(BagFile):
+    """The same, read ahead by a MiB, for many small records one after another.
+
+    Attributes:
+        source: Where the bytes come from.
+        held: Those read last, and where they begin.
+    """
+
+    source: BagFile
+    held: list[tuple[int, bytes]] = field(default_factory=list)
+
+    def bytes_at(self, start: int, stop: int) -> bytes:
+        """Bytes of the file from ``start`` to ``stop``, fewer at its end."""
+        stop = min(stop, self.size)
+        for begin, raw in self.held:
+            if begin <= start and stop <= begin + len(raw):
+                return raw[start - begin : stop - begin]
+        raw = self.source.bytes_at(start, max(stop, min(start + _AHEAD, self.size)))
+        self.held[:] = [(start, raw)]
+        return raw[: max(0, stop - start)]
 
 
 @dataclass(frozen=True, slots=True)
