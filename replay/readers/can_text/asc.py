@@ -5,6 +5,10 @@ are counted as no frames. Times count from the header's date. The date has no ti
 taken as UTC, with a notice, whatever the machine's own zone. ``timestamps relative`` times, each
 counted from the line before, are summed up over all lines that have one.
 
+``Statistic`` lines count data, remote and error frames of a channel. No public description says
+over which time, and a logging filter takes frames out of the log but not out of these counts: they
+prove nothing about the log's lines and are not used.
+
 The format has no checksum. A line holds its length, so a cut one is seen; ``End TriggerBlock``
 says that the writer came to its end.
 """
@@ -113,7 +117,10 @@ class Asc(Dialect):
 
     format = "asc"
     says = "Vector ASC log"
-    integrity = "ASC text has no checksums or counts: a changed digit cannot be seen"
+    integrity = (
+        "ASC text has no checksums and no usable counts (its Statistic lines count what was on the "
+        "bus, over a time that they do not state): a changed digit or a missing line cannot be seen"
+    )
 
     def __init__(self, head: bytes) -> None:
         """Read base, time mode and date from the file's head."""

@@ -39,7 +39,10 @@ class Busmaster(Dialect):
 
     format = "candump"
     says = "BUSMASTER log"
-    integrity = "BUSMASTER text has no checksums or counts: a changed digit cannot be seen"
+    integrity = (
+        "BUSMASTER text has no checksums or counts: a changed digit or a missing line cannot be "
+        "seen"
+    )
 
     def __init__(self, head: bytes) -> None:
         """Read how times and numbers are written from the file's head."""

@@ -100,7 +100,10 @@ class Candump(Dialect):
 
     format = "candump"
     says = "candump log"
-    integrity = "candump text has no checksums, lengths or counts: a changed digit cannot be seen"
+    integrity = (
+        "candump text has no checksums, lengths or counts: a changed digit or a missing line "
+        "cannot be seen"
+    )
 
     def fast(self, lines: Lines) -> Fast:
         """Data frames, CAN FD frames included, as ``candump -l`` spells them."""

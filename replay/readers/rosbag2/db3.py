@@ -37,6 +37,7 @@ NOT_A_TIME: Final = "timestamp is not an integer"
 NOT_BYTES: Final = "payload is not a blob"
 OTHER_TYPE: Final = "another message type on the same topic"
 _SMALL: Final = 1 << 16
+DELETED: Final = "row numbers left out"
 INDEX_DIFFERS: Final = "row and time index disagree"
 
 
@@ -287,6 +288,8 @@ class _Pass:
             self._skip_rest()
         for name in self._names:
             ledger.settle(name, DAMAGED_PAGE)
+        if not is_part and not problems and ledger.is_whole:
+            self._drop_deleted()
         if scan.disordered and ledger.is_whole:
             ledger.drop("", DISORDER, scan.disordered)
         if scan.holes and ledger.is_whole:
@@ -303,6 +306,17 @@ class _Pass:
                 ledger.drop("", UNSOUND, None, problems)
             else:
                 ledger.notice(f"{UNSOUND}: {problems}")
+
+    def _drop_deleted(self) -> None:
+        """Recorders number rows one by one: a number left out in between is a row taken out."""
+        try:
+            query = "SELECT MIN(rowid), MAX(rowid), COUNT(*) FROM messages"
+            first, last, count = fetched(self._database, query)[0]
+        except FAULTS:
+            return
+        if count:
+            detail = f"rows {first} to {last}, of which {count} are there"
+            self._ledger.drop("", DELETED, last - first + 1 - count, detail)
 
     def _missing(self) -> int | None:
         """Rows that the time index lists beyond those met, or None if it cannot say."""

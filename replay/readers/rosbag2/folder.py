@@ -1,7 +1,7 @@
 """ROS 2 bag folders: every storage file in them, listed or not, in the order of time.
 
-``metadata.yaml`` is a hint. What it lists and the folder lacks is lost with its declared counts;
-what it gets wrong about files that are whole is a notice.
+``metadata.yaml`` is a hint. What it lists and the folder lacks is dropped with its declared counts,
+and so is what it counts beyond the rows in the files; what the files hold beyond that is a notice.
 """
 
 from __future__ import annotations
@@ -155,17 +155,20 @@ class FolderLog(Closing):
         gone = [(hint.name, MISSING) for hint in absent] + [
             (split.path.name, UNREADABLE) for split in shut
         ]
-        was_whole = ledger.is_whole and not gone
         reason = gone[0][1] if gone else BY_METADATA
         detail = ", ".join(name for name, _ in gone)
         # Rows lost from a known number of nameless ones must not be counted a second time.
         is_counted = "" in ledger.accounts and ledger.accounts[""].dropped.total() > 0
+        # As many rows under another name are a renamed topic, not missing rows.
+        held = sum(account.in_file for account in ledger.accounts.values())
+        is_short = not ledger.is_whole or bool(gone) or sum(metadata.counts.values()) > held
         missing: dict[str, int] = {}
         for name, count in metadata.counts.items():
             in_file = ledger.accounts[name].in_file if name in ledger.accounts else 0
             missing[name] = count - in_file
-            if missing[name] > 0 and not was_whole and not is_counted:
-                ledger.drop(name, reason, missing[name], detail or "a storage file is damaged")
+            if missing[name] > 0 and is_short and not is_counted:
+                counted = f"metadata.yaml counts {count} messages, the files hold {in_file}"
+                ledger.drop(name, reason, missing[name], detail or counted)
             elif missing[name]:
                 ledger.notice(
                     f"{name}: metadata.yaml counts {count} messages, the files hold {in_file}"

@@ -1,0 +1,248 @@
+"""One row taken out of the middle of a log: formats with a counter report exactly one missing."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType, IndexType, Writer
+
+from crosscue.eval import cli
+from crosscue.replay.formats import FORMATS
+from support.accounted import read
+from support.can_files import blf, made, trc
+from support.every_format import EVERY_FORMAT, FRAMES
+from support.pictures import picture_folder
+from support.rosbag_files import START_NS, header_field, record
+from support.videos import video
+
+DOCS: Final = Path(__file__).parents[2] / "docs" / "reference" / "formats.md"
+
+
+def _mcap(folder: Path) -> Path:
+    path = folder / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(
+            file,
+            compression=CompressionType.NONE,
+            use_chunking=False,
+            index_types=IndexType.NONE,
+            use_summary_offsets=False,
+        )
+        writer.start()
+        channel = writer.register_channel("/a", "json", 0)
+        for k in range(40):
+            writer.add_message(channel, START_NS + k, b"message %02d" % k, START_NS + k)
+        writer.finish()  # type: ignore[no-untyped-call]
+    raw = bytearray(path.read_bytes())
+    at, size = raw.index(b"message 20") - 31, 41
+    assert raw[at] == 0x05
+    del raw[at : at + size]
+    # Checksums would show it, too: 0 says that there is none.
+    end = raw.rindex(b"\x0f" + struct.pack("<Q", 4))
+    raw[end + 9 : end + 13] = bytes(4)
+    (summary_at,) = struct.unpack_from("<Q", raw, len(raw) - 28)
+    struct.pack_into("<QQL", raw, len(raw) - 28, summary_at - size, 0, 0)
+    path.write_bytes(raw)
+    return path
+
+
+def _bag(folder: Path) -> Path:
+    """Ten messages by its index, nine in its chunk."""
+
+    def stamp(t_ns: int) -> bytes:
+        return struct.pack("<II", *divmod(t_ns, 10**9))
+
+    def number(value: int) -> bytes:
+        return struct.pack("<I", value)
+
+    said = {b"topic": b"/a", b"type": b"std_msgs/String", b"md5sum": b"x" * 32}
+    said[b"message_definition"] = b"string data\n"
+    body = b"".join(header_field(name, value) for name, value in said.items())
+    link = record(body, op=b"\x07", conn=number(0), topic=b"/a")
+    rows = [
+        record(b"message", op=b"\x02", conn=number(0), time=stamp(START_NS + k)) for k in range(10)
+    ]
+    del rows[5]
+    inside = link + b"".join(rows)
+    chunk = record(inside, op=b"\x05", compression=b"none", size=number(len(inside)))
+    head = record(
+        b" " * 64,
+        op=b"\x03",
+        index_pos=struct.pack("<Q", 0),
+        conn_count=number(1),
+        chunk_count=number(1),
+    )
+    begin = len(b"#ROSBAG V2.0\n") + len(head)
+    head = head.replace(
+        b"index_pos=" + bytes(8), b"index_pos=" + struct.pack("<Q", begin + len(chunk))
+    )
+    info = record(
+        number(0) + number(10),
+        op=b"\x06",
+        ver=number(1),
+        chunk_pos=struct.pack("<Q", begin),
+        start_time=stamp(START_NS),
+        end_time=stamp(START_NS + 9),
+        count=number(1),
+    )
+    path = folder / "log.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n" + head + chunk + link + info)
+    return path
+
+
+def _without_row(database: Path) -> None:
+    with sqlite3.connect(database) as connection:
+        done = connection.execute("DELETE FROM messages WHERE id = 200")
+        assert done.rowcount == 1
+    connection.close()
+
+
+def _db3(folder: Path) -> Path:
+    log = EVERY_FORMAT["rosbag2-sqlite3"](folder)
+    _without_row(log)
+    return log
+
+
+def _rosbag2(folder: Path) -> Path:
+    log = EVERY_FORMAT["rosbag2"](folder)
+    _without_row(next(log.glob("*.db3")))
+    return log
+
+
+def _blf(folder: Path) -> Path:
+    frames = made(FRAMES)
+    raw = bytearray(blf(frames[:150] + frames[151:]))
+    (objects,) = struct.unpack_from("<L", raw, 32)
+    assert objects == FRAMES - 1
+    struct.pack_into("<L", raw, 32, FRAMES)
+    path = folder / "can.blf"
+    path.write_bytes(raw)
+    return path
+
+
+def _trc(folder: Path) -> Path:
+    lines = trc(made(FRAMES)).splitlines(keepends=True)
+    del lines[len(lines) // 2]
+    path = folder / "can.trc"
+    path.write_bytes(b"".join(lines))
+    return path
+
+
+def _mf4(folder: Path) -> Path:
+    """A group's data holds one record less than its counter says."""
+    path = EVERY_FORMAT["mf4"](folder)
+    raw = bytearray(path.read_bytes())
+    at = -1
+    while (at := raw.find(b"##CG", at + 1)) >= 0:
+        (count,) = struct.unpack_from("<Q", raw, at + 80)
+        if count > 1:
+            struct.pack_into("<Q", raw, at + 80, count + 1)
+            break
+    assert at >= 0
+    path.write_bytes(raw)
+    return path
+
+
+def _comma2k19(folder: Path) -> Path:
+    log = EVERY_FORMAT["comma2k19"](folder)
+    path = log / "processed_log" / "IMU" / "gyro" / "value"
+    rows = np.load(path)
+    with path.open("wb") as file:
+        np.save(file, np.delete(rows, 250, axis=0))
+    return log
+
+
+def _kitti(folder: Path) -> Path:
+    log = EVERY_FORMAT["kitti-raw"](folder)
+    sorted((log / "image_02" / "data").iterdir())[15].unlink()
+    return log
+
+
+def _video(folder: Path) -> Path:
+    path = video(folder / "front.mp4", 23)
+    (folder / "front.txt").write_text("".join(f"{0.05 * i:.2f}\n" for i in range(24)))
+    return path
+
+
+def _images(folder: Path) -> Path:
+    times = "".join(f"{0.1 * i:.1f}\n" for i in range(12))
+    log = picture_folder(folder / "front", 12, times)
+    (log / "frame_6.png").unlink()
+    return log
+
+
+ONE_TAKEN_OUT: Final[dict[str, Callable[[Path], Path]]] = {
+    "mcap": _mcap,
+    "rosbag1": _bag,
+    "rosbag2-sqlite3": _db3,
+    "rosbag2": _rosbag2,
+    "blf": _blf,
+    "trc": _trc,
+    "mf4": _mf4,
+    "comma2k19": _comma2k19,
+    "kitti-raw": _kitti,
+    "video": _video,
+    "images": _images,
+}
+"""Formats that count their rows, and a log of each with a row taken out of its middle."""
+WITHOUT_COUNTER: Final = {"candump": "candump", "asc": "ASC"}
+"""Formats in which a row taken out cannot be seen, and what people call them."""
+
+
+def test_every_format_counts_its_rows_or_is_named() -> None:
+    assert ONE_TAKEN_OUT.keys() | WITHOUT_COUNTER.keys() == FORMATS.keys()
+    assert not ONE_TAKEN_OUT.keys() & WITHOUT_COUNTER.keys()
+
+
+@pytest.mark.parametrize("name", sorted(ONE_TAKEN_OUT))
+def test_exactly_one_row_is_reported_missing(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = ONE_TAKEN_OUT[name](tmp_path)
+
+    _, ledger = read(log)
+
+    accounts = ledger.accounts.values()
+    assert sum(account.dropped.total() for account in accounts) == 1, ledger.details
+    assert not any(account.dropped_unknown for account in accounts), ledger.details
+    assert cli.run(["info", str(log)]) == 3
+    assert "losses" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", sorted(WITHOUT_COUNTER))
+def test_a_format_without_a_counter_says_so(name: str, tmp_path: Path) -> None:
+    log = EVERY_FORMAT[name](tmp_path)
+    lines = log.read_bytes().splitlines(keepends=True)
+    middle = next(k for k in range(len(lines) // 2, len(lines)) if b"Statistic" not in lines[k])
+    del lines[middle]
+    log.write_bytes(b"".join(lines))
+
+    ledger = read(log)[1]
+
+    assert ledger.is_whole
+    assert "a missing line cannot be seen" in ledger.integrity
+    (row,) = (line for line in DOCS.read_text().splitlines() if "no usable count" in line)
+    assert WITHOUT_COUNTER[name] in row.partition("no usable count")[0]
+
+
+def test_a_row_that_metadata_counts_and_no_file_holds_is_dropped(tmp_path: Path) -> None:
+    log = EVERY_FORMAT["rosbag2"](tmp_path)
+    text = (log / "metadata.yaml").read_text()
+    shutil.copy(log / "metadata.yaml", tmp_path)
+    head, mark, rest = text.rpartition("message_count: ")
+    digits = rest[: len(rest) - len(rest.lstrip("0123456789"))]
+    more = f"{head}{mark}{int(digits) + 1}{rest[len(digits) :]}"
+    (log / "metadata.yaml").write_text(more)
+
+    _, ledger = read(log)
+
+    assert [account.dropped.total() for account in ledger.accounts.values() if account.dropped] == [
+        1
+    ]
