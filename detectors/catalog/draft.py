@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -14,8 +13,8 @@ from crosscue.detectors.decoders.base import Guess, Interface, static
 from crosscue.replay.errors import UsageError
 
 from .class_names import COCO_80, COCO_90, meaning_of
+from .recognise import DEFAULT_SIDE_PX, size_in
 
-DEFAULT_SIDE_PX: Final = 640
 _LINE: Final = 100
 
 
@@ -137,7 +136,7 @@ def _input(
     elif width is not None and height is not None:
         certain.append(f"its input is {width} x {height}")
     else:
-        width, height = _size_in(model.metadata) or (DEFAULT_SIDE_PX, DEFAULT_SIDE_PX)
+        width, height = size_in(model.metadata) or (DEFAULT_SIDE_PX, DEFAULT_SIDE_PX)
         assumed.append(f"its size is open; {width} x {height} (--size WxH)")
     usual.pop("layout", None)
     if "colour" in usual and not model.class_names:
@@ -151,15 +150,6 @@ def _layout(shape: Sequence[int | str | None]) -> str | None:
     if len(shape) == 4 and 3 in (shape[1], shape[3]):
         return "nchw" if shape[1] == 3 else "nhwc"
     return None
-
-
-def _size_in(metadata: Mapping[str, str]) -> tuple[int, int] | None:
-    """Width and height that an exporter left as ``imgsz``: height first."""
-    try:
-        height, width = ast.literal_eval(metadata.get("imgsz", "")[:100])
-        return int(width), int(height)
-    except (ValueError, SyntaxError, TypeError):
-        return None
 
 
 def _value(value: object) -> str:

@@ -21,6 +21,8 @@ from crosscue.replay.files.bounded import read_at_most
 from .card import MOST_BYTES, Input, Weights
 
 _MAX_NAMES_CHARACTERS: Final = 100_000
+DEFAULT_SIDE_PX: Final = 640
+"""Of a network that takes pictures of any size and names none."""
 SENSIBLE_FRACTION: Final = 0.99
 """Of boxes that a network gives for noise, where their layout is read rightly."""
 _REFUSED: Final = {
@@ -120,19 +122,71 @@ def class_names(metadata: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(found)
 
 
+def closed(path: Path, model: Interface, size_px: tuple[int, int] | None) -> Interface:
+    """The interface with sizes that the file leaves open, from running the network once.
+
+    Args:
+        path: The model file.
+        model: What it says of itself.
+        size_px: Width and height to run at, where the file leaves them open.
+
+    Raises:
+        VehicleError: The network does not run at that size.
+    """
+    if all(isinstance(side, int) for out in model.outputs for side in out.shape):
+        return model
+    given = model.inputs[0]
+    if len(given.shape) not in (3, 4):
+        return model
+    width, height = size_px or size_in(model.metadata) or (DEFAULT_SIDE_PX, DEFAULT_SIDE_PX)
+    is_last = len(given.shape) == 4 and static(given.shape, 3) == 3
+    wanted = (1, height, width, 3) if is_last else (1, 3, height, width)[-len(given.shape) :]
+    shape = tuple(
+        side if isinstance(side, int) else want
+        for side, want in zip(given.shape, wanted, strict=True)
+    )
+    network = load_network(_weights(path))
+    noise = np.random.default_rng(0).random(shape, np.float32)
+    try:
+        outputs = network(noise)
+    except Exception as error:
+        raise UsageError(
+            f"{path}: does not run on input {'x'.join(map(str, shape))}: {one_line(error, 160)}; "
+            "give another --size"
+        ) from None
+    return Interface(
+        (Tensor(given.name, shape), *model.inputs[1:]),
+        tuple(Tensor(out.name, outputs[out.name].shape) for out in model.outputs),
+        model.metadata,
+        model.class_names,
+    )
+
+
+def size_in(metadata: Mapping[str, str]) -> tuple[int, int] | None:
+    """Width and height that an exporter left as ``imgsz``: height first."""
+    try:
+        height, width = ast.literal_eval(metadata.get("imgsz", "")[:100])
+        return int(width), int(height)
+    except (ValueError, SyntaxError, TypeError):
+        return None
+
+
+def _weights(path: Path) -> Weights:
+    second = path.with_suffix(".bin")
+    return Weights(
+        name=str(path),
+        content=path.read_bytes(),
+        second=second.read_bytes() if path.suffix == ".xml" and second.exists() else b"",
+    )
+
+
 def plausible(path: Path, model: Interface, found: list[Guess]) -> list[Guess]:
     """Those layouts by which the network's answer to noise is boxes of sensible sizes.
 
     Raises:
         VehicleError: The network does not run at all.
     """
-    second = path.with_suffix(".bin")
-    weights = Weights(
-        name=str(path),
-        content=path.read_bytes(),
-        second=second.read_bytes() if path.suffix == ".xml" and second.exists() else b"",
-    )
-    network = load_network(weights)
+    network = load_network(_weights(path))
     kept = [guess for guess in found if _is_plausible(network, model, guess)]
     return kept or found
 

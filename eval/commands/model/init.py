@@ -15,7 +15,7 @@ import re
 from pathlib import Path
 
 from crosscue.detectors.catalog.draft import Draft, draft
-from crosscue.detectors.catalog.recognise import guesses, plausible, read_interface
+from crosscue.detectors.catalog.recognise import closed, guesses, plausible, read_interface
 from crosscue.detectors.decoders.base import Guess, Interface
 from crosscue.detectors.networks.model_detector import build
 from crosscue.eval.commands.model.shared import look
@@ -54,12 +54,14 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"{output}: exists; give another name or --overwrite")
     if output.resolve().parent != args.weights.resolve().parent:
         raise UsageError(f"{output}: a card lies beside its weights, in {args.weights.parent}")
+    size = _size(args.size)
     model = read_interface(args.weights)
-    found_kinds = guesses(model)
+    run_once = closed(args.weights, model, size)
+    found_kinds = guesses(run_once)
     if args.kind is None and len(found_kinds) > 1:
-        found_kinds = plausible(args.weights, model, found_kinds)
-    guess = _chosen(args.weights, found_kinds, model, args.kind)
-    written = draft(args.weights, model, guess, _names(args.classes), _size(args.size))
+        found_kinds = plausible(args.weights, run_once, found_kinds)
+    guess = _chosen(args.weights, found_kinds, run_once, args.kind)
+    written = draft(args.weights, model, guess, _names(args.classes), size)
     _try(output, written)
     found = None
     if args.picture is not None:

@@ -13,7 +13,7 @@ from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.recognise import class_names
 from crosscue.eval.cli import run
 from support.data import shared
-from support.onnx_models import Array, constant_model
+from support.onnx_models import Array, bright_box_model, constant_model
 
 ULTRALYTICS = {"names": "{0: 'person', 1: 'car', 2: 'stop-sign'}", "imgsz": "[64, 128]"}
 
@@ -96,6 +96,24 @@ def test_what_the_file_does_not_say_is_assumed_aloud(
     assert "assumed    logits become scores by the logistic function" in said
     text = (tmp_path / "my.toml").read_text(encoding="utf-8")
     assert "# Assumed, please check: logits become scores" in text
+
+
+def test_sizes_that_a_file_leaves_open_are_found_by_running_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = onnx.load_model_from_string(bright_box_model())
+    model.graph.output[0].type.tensor_type.shape.dim[2].dim_param = "columns"
+    path = tmp_path / "my.onnx"
+    path.write_bytes(model.SerializeToString())
+    names = tmp_path / "names.txt"
+    names.write_text("bright\n", encoding="utf-8")
+
+    args = ["--classes", str(names), "--size", "96x64"]
+    assert run(["model", "init", str(path), *args]) == 0
+
+    assert "my.toml: end-to-end" in capsys.readouterr().out
+    card = read_card(tmp_path / "my.toml")
+    assert (card.input.width_px, card.input.height_px) == (96, 64)
 
 
 def test_several_layouts_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
