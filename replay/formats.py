@@ -84,6 +84,12 @@ FORMATS: Final[dict[str, Format]] = {
         "crosscue.datasets.adapters.kitti:open_drive",
         "KITTI raw drive",
     ),
+    "pandaset": Format(
+        (),
+        ("camera/*/poses.json",),
+        "crosscue.datasets.adapters.pandaset:open_sequence",
+        "PandaSet sequence",
+    ),
     "video": Format(
         (".mp4", ".avi", ".mkv", ".mov", ".hevc", ".h264"),
         (),

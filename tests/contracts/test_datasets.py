@@ -12,6 +12,7 @@ import pytest
 from crosscue.datasets.truth.truth import CARRIED
 from crosscue.testing import check_dataset
 from support.kitti_drive import raw_drive
+from support.pandaset_drive import pandaset_drive
 
 
 def _comma(path: Path) -> Path:
@@ -34,7 +35,11 @@ def _comma(path: Path) -> Path:
     return path
 
 
-DRIVES: Final[dict[str, Callable[[Path], Path]]] = {"comma2k19": _comma, "kitti-raw": raw_drive}
+DRIVES: Final[dict[str, Callable[[Path], Path]]] = {
+    "comma2k19": _comma,
+    "kitti-raw": raw_drive,
+    "pandaset": pandaset_drive,
+}
 """By format: writes a small drive."""
 
 

@@ -35,6 +35,12 @@ def _garbled_picture(folder: Path) -> None:
     pictures[len(pictures) // 2].write_bytes(b"\x89PNG\r\n\x1a\n")
 
 
+def _cut_jpeg(folder: Path) -> None:
+    pictures = sorted(folder.glob("camera/*/*.jpg"))
+    whole = pictures[len(pictures) // 2]
+    whole.write_bytes(whole.read_bytes()[:-20])
+
+
 def _null_payload(path: Path) -> None:
     """One row whose payload is gone."""
     file = path if path.is_file() else next(path.glob("*.db3"))
@@ -104,5 +110,6 @@ ONE_ROW: Final[dict[str, tuple[Callable[[Path], Path], Callable[[Path], None]]]]
     "rosbag2-sqlite3": (EVERY_FORMAT["rosbag2-sqlite3"], _null_payload),
     "rosbag2": (EVERY_FORMAT["rosbag2"], _null_payload),
     "images": (EVERY_FORMAT["images"], _garbled_picture),
+    "pandaset": (EVERY_FORMAT["pandaset"], _cut_jpeg),
 }
 """By format: writes a log, and damages one row of it."""

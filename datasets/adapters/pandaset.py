@@ -1,0 +1,320 @@
+"""PandaSet: one sequence in its published folder layout as a log; its truth from the poses.
+
+``camera/NAME/`` holds ``NN.jpg``, ``timestamps.json`` (seconds since 1970), ``poses.json``
+(position and orientation of the camera in a local frame; its axes are right, down, forward) and
+``intrinsics.json``; ``meta/gps.json`` with ``meta/timestamps.json`` one GNSS/INS row for each sweep
+of the lidar. Lidar and annotations are not read: as published, annotations are pickles, and a
+pickle runs code when it is read.
+
+Topics: one per camera; ``odometry`` (forward speed and yaw rate of the car, from the front camera's
+poses, so it is no wheel speed and as good as the poses are); ``gnss``.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from crosscue.datasets.truth.truth import Truth, save
+from crosscue.datasets.truth.tum import Trajectory, write_tum
+from crosscue.replay.columns import Block, Floats, Int64s, Table, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import MIB, Limits
+from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.readers.images.files import SUFFIXES, PictureFiles
+from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files
+
+POSE_FILE: Final = "pose.tum"
+MAX_FILE_BYTES: Final = 64 * MIB
+FRONT: Final = "front_camera"
+_GNSS: Final = {
+    "lat": "latitude_deg",
+    "long": "longitude_deg",
+    "height": "altitude_m",
+    "xvel": "velocity_east_mps",
+    "yvel": "velocity_north_mps",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """The camera's track.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        xyz_m: Shape (N, 3), float64, local frame.
+        forward: Shape (N, 3): the optical axis in that frame.
+        left: Shape (N, 3): leftwards in the picture.
+    """
+
+    t_ns: Int64s
+    xyz_m: Floats
+    forward: Floats
+    left: Floats
+
+    def speed_mps(self) -> Floats:
+        """Forward speed at each pose, shape (N,): central differences, one-sided at both ends.
+
+        A rigid car has the same forward speed everywhere along its axis, so it is the rear axle's.
+        """
+        seconds = (self.t_ns - self.t_ns[0]) * 1e-9
+        velocity = np.gradient(self.xyz_m, seconds, axis=0)
+        return np.asarray((velocity * self.forward).sum(axis=1), np.float64)
+
+    def heading_rad(self) -> Floats:
+        """From x, counter-clockwise, continuous, shape (N,)."""
+        return np.unwrap(np.arctan2(self.forward[:, 1], self.forward[:, 0]))
+
+    def odometry(self) -> Table:
+        """Speed and yaw rate."""
+        seconds = (self.t_ns - self.t_ns[0]) * 1e-9
+        yaw_rate = np.gradient(self.heading_rad(), seconds)
+        return Table({"speed_x_mps": self.speed_mps(), "yaw_rate_radps": yaw_rate})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """A stream of numbers held in memory: a sequence has some hundred rows."""
+
+    topic: Topic
+    t_ns: Int64s
+    table: Table
+
+    def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
+        name, n = self.topic.name, len(self.t_ns)
+        ledger.declare(name, n)
+        ledger.find(name, n)
+        if not selection.wants(name):
+            ledger.skip(name, NOT_ASKED_TOPIC, n)
+        else:
+            wanted = is_inside(self.t_ns, selection)
+            ledger.skip(name, NOT_ASKED_TIME, n - int(wanted.sum()))
+            if wanted.any():
+                yield Block(name, self.t_ns, self.table).take(wanted)
+        if selection.start_ns is None and selection.end_ns is None:
+            ledger.settle(name)
+
+
+class Drive(Closing):
+    """One sequence as a ``Log``."""
+
+    format: Final = "pandaset"
+
+    def __init__(
+        self,
+        path: Path,
+        cameras: Sequence[PictureFiles],
+        rows: Sequence[_Rows],
+        unreadable: Sequence[tuple[str, str, int | None, str]],
+        limits: Limits,
+    ) -> None:
+        """Put a sequence together; ``unreadable`` holds arguments for ``Ledger.drop``."""
+        self.path: Final = path
+        self._cameras: Final = tuple(cameras)
+        self._rows: Final = tuple(rows)
+        self._unreadable: Final = tuple(unreadable)
+        self._limits: Final = limits
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """Cameras, then numbers."""
+        return (
+            *(camera.topic for camera in self._cameras),
+            *(rows.topic for rows in self._rows),
+        )
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """All streams side by side, in order of each block's first time; see ``Log.read``."""
+        for loss in self._unreadable:
+            ledger.drop(*loss)
+        if (self.path / "lidar").is_dir():
+            ledger.notice("lidar: sweeps are not read")
+        streams = [camera.read(ledger, selection, self._limits) for camera in self._cameras]
+        streams += [rows.read(ledger, selection) for rows in self._rows]
+        yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """Pictures without a time, times without a picture; see ``KnowsItsEnd``."""
+        for loss in self._unreadable:
+            ledger.drop(*loss)
+        for camera in self._cameras:
+            camera.report_missing(ledger)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def open_sequence(path: Path, limits: Limits) -> Drive:
+    """Open a sequence's folder; see ``crosscue.replay.formats.FORMATS``.
+
+    Raises:
+        LogFormatError: No camera with times, and no poses.
+    """
+    unreadable: list[tuple[str, str, int | None, str]] = []
+    cameras = []
+    for folder in sorted((path / "camera").iterdir()):
+        paths = list_files(folder, SUFFIXES) if folder.is_dir() else []
+        if not paths:
+            continue
+        try:
+            files = _timed(paths, _times_ns(folder / "timestamps.json"))
+        except LogFormatError as error:
+            unreadable.append((folder.name, "times cannot be read", len(paths), str(error)))
+            continue
+        topic = Topic(folder.name, "crosscue/Images", "columns", declared=files.declared)
+        cameras.append(PictureFiles(topic, files))
+    rows = []
+    for name, read in (("odometry", _odometry), ("gnss", _gnss)):
+        try:
+            found = read(path)
+        except LogFormatError as error:
+            unreadable.append((name, "file cannot be read", None, str(error)))
+            continue
+        if found is not None:
+            rows.append(found)
+    if not cameras and not rows:
+        why = unreadable[0][3] if unreadable else "no camera with pictures and timestamps.json"
+        raise LogFormatError(f"{path}: no stream of a PandaSet sequence can be read: {why}")
+    return Drive(path, cameras, rows, unreadable, limits)
+
+
+def read_poses(path: Path, camera: str = FRONT) -> Poses:
+    """A camera's poses.
+
+    Args:
+        path: The sequence's folder.
+        camera: One below ``camera``.
+
+    Raises:
+        LogFormatError: A file is missing or damaged, or there are fewer than two poses.
+    """
+    folder = path / "camera" / camera
+    t_ns = _times_ns(folder / "timestamps.json")
+    poses = _json(folder / "poses.json")
+    try:
+        xyz = np.array([[p["position"][a] for a in "xyz"] for p in poses], np.float64)
+        wxyz = np.array([[p["heading"][a] for a in "wxyz"] for p in poses], np.float64)
+        turn = Rotation.from_quat(wxyz[:, [1, 2, 3, 0]])
+    except (TypeError, KeyError, ValueError, IndexError) as error:
+        raise LogFormatError(
+            f"{folder / 'poses.json'}: expected a list of position x, y, z and heading w, x, y, z: "
+            f"{error!r}"
+        ) from None
+    n = min(len(t_ns), len(xyz))
+    if n < 2 or not np.isfinite(xyz).all() or not (np.diff(t_ns) > 0).all():
+        raise LogFormatError(f"{folder / 'poses.json'}: {n} poses in order; expected two or more")
+    forward, left = (turn.apply(axis) for axis in ((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)))
+    return Poses(t_ns[:n], xyz[:n], forward[:n], left[:n])
+
+
+def read_intrinsics(path: Path, camera: str = FRONT) -> tuple[float, tuple[float, float]]:
+    """Focal length and principal point of a camera, pixels.
+
+    Raises:
+        LogFormatError: The file is missing or damaged.
+    """
+    file = path / "camera" / camera / "intrinsics.json"
+    found = _json(file)
+    try:
+        focal = (float(found["fx"]) + float(found["fy"])) / 2.0
+        return focal, (float(found["cx"]), float(found["cy"]))
+    except (TypeError, KeyError, ValueError):
+        raise LogFormatError(f"{file}: expected the numbers fx, fy, cx, cy") from None
+
+
+def write_truth(path: Path, folder: Path) -> Path:
+    """Write the front camera's track.
+
+    Raises:
+        LogFormatError: The sequence has no poses.
+        OutputError: It cannot be written.
+    """
+    poses = read_poses(path)
+    up = np.cross(poses.forward, poses.left)
+    turn = Rotation.from_matrix(np.stack([poses.forward, poses.left, up], axis=2))
+    wxyz = turn.as_quat()[:, [3, 0, 1, 2]]
+    note = "PandaSet: the front camera in the sequence's local frame, z up"
+    folder.mkdir(parents=True, exist_ok=True)
+    write_tum(folder / POSE_FILE, Trajectory(poses.t_ns, poses.xyz_m, wxyz), note)
+    truth = Truth(
+        version=1,
+        log=path.resolve().name,
+        start_ns=int(poses.t_ns[0]),
+        end_ns=int(poses.t_ns[-1]) + 1,
+        pose=POSE_FILE,
+        pose_point="camera",
+        source="PandaSet (Scale AI, Hesai; CC BY 4.0): published poses of the front camera",
+    )
+    return save(truth, folder)
+
+
+def _odometry(path: Path) -> _Rows | None:
+    if not (path / "camera" / FRONT / "poses.json").is_file():
+        return None
+    poses = read_poses(path)
+    topic = Topic("odometry", "nav_msgs/msg/Odometry", "columns", declared=len(poses.t_ns))
+    return _Rows(topic, poses.t_ns, poses.odometry())
+
+
+def _gnss(path: Path) -> _Rows | None:
+    file = path / "meta" / "gps.json"
+    if not file.is_file():
+        return None
+    t_ns, rows = _times_ns(path / "meta" / "timestamps.json"), _json(file)
+    try:
+        columns = {
+            name: np.array([float(row[key]) for row in rows], np.float64)[: len(t_ns)]
+            for key, name in _GNSS.items()
+        }
+    except (TypeError, KeyError, ValueError) as error:
+        raise LogFormatError(
+            f"{file}: expected {', '.join(_GNSS)} in each row: {error!r}"
+        ) from None
+    n = len(columns["latitude_deg"])
+    topic = Topic("gnss", "sensor_msgs/msg/NavSatFix", "columns", declared=n)
+    return _Rows(topic, t_ns[:n], Table(columns))
+
+
+def _timed(paths: Sequence[Path], t_ns: Int64s) -> TimedFiles:
+    """Picture ``NN`` has the time at place NN."""
+    places = np.array([int(p.stem) if p.stem.isdecimal() else -1 for p in paths], np.int64)
+    is_timed = (places >= 0) & (places < len(t_ns))
+    found = np.full(len(paths), -1, np.int64)
+    found[is_timed] = t_ns[places[is_timed]]
+    is_missing = np.ones(len(t_ns), np.bool_)
+    is_missing[places[is_timed]] = False
+    return TimedFiles(tuple(paths), found, t_ns[is_missing], len(t_ns), ())
+
+
+def _times_ns(path: Path) -> Int64s:
+    found = _json(path)
+    try:
+        seconds = np.array([float(value) for value in found], np.float64)
+    except (TypeError, ValueError):
+        raise LogFormatError(f"{path}: expected a list of seconds") from None
+    if not np.isfinite(seconds).all() or (np.abs(seconds) > 9e9).any():
+        raise LogFormatError(f"{path}: a time is no number of seconds since 1970")
+    # Whole microseconds, as published: more digits are only those of a floating-point number.
+    return np.rint(seconds * 1e6).astype(np.int64) * 1000
+
+
+def _json(path: Path) -> Any:
+    try:
+        content = read_at_most(path, MAX_FILE_BYTES)
+        if content is None:
+            raise LogFormatError(f"{path}: over {MAX_FILE_BYTES // MIB} MiB; not read")
+        return json_tree(content)
+    except OSError as error:
+        raise LogFormatError(f"{path}: {error.strerror}; put it back") from None
+    except ValueError as error:
+        raise LogFormatError(f"{path}: not JSON: {error}") from None

@@ -1,0 +1,113 @@
+"""PandaSet sequences: streams, odometry and truth agree with what was driven."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.adapters.pandaset import read_intrinsics, read_poses
+from crosscue.datasets.truth.truth import load, write_carried
+from crosscue.datasets.truth.tum import heading_rad, read_tum
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.log import Selection
+from crosscue.replay.opening import open_log
+from support.data import shared
+from support.pandaset_drive import COUNT, SPEED_MPS, START_S, YAW_RATE_RADPS, pandaset_drive
+
+CAMERA = Path("camera") / "front_camera"
+
+
+def rows(path: Path, selection: Selection | None = None) -> tuple[dict[str, int], Ledger]:
+    ledger = Ledger("pandaset")
+    found: dict[str, int] = {}
+    with open_log(path) as log:
+        chosen = Selection() if selection is None else selection
+        for block in ledger.handing_on(log.read(ledger, chosen)):
+            found[block.topic] = found.get(block.topic, 0) + len(block)
+    ledger.check(found)
+    return found, ledger
+
+
+def test_every_stream_is_read(tmp_path: Path) -> None:
+    found, ledger = rows(pandaset_drive(tmp_path / "002"))
+
+    assert found == {"front_camera": COUNT, "odometry": COUNT, "gnss": COUNT}
+    assert ledger.is_whole
+
+
+def test_odometry_is_what_was_driven(tmp_path: Path) -> None:
+    table = read_poses(pandaset_drive(tmp_path / "002")).odometry()
+
+    # A chord of 0.2 s at 0.2 rad/s is 0.007 % shorter than its arc.
+    np.testing.assert_allclose(table["speed_x_mps"][1:-1], SPEED_MPS, rtol=1e-4)
+    np.testing.assert_allclose(table["yaw_rate_radps"], YAW_RATE_RADPS, rtol=1e-5)
+
+
+def test_truth_is_the_camera_s_track(tmp_path: Path) -> None:
+    truth = load(write_carried("pandaset", pandaset_drive(tmp_path / "002"), tmp_path / "truth"))
+    track = read_tum(tmp_path / "truth" / str(truth.pose))
+
+    assert truth.pose_point == "camera"
+    assert truth.start_ns == round(START_S * 1e6) * 1000
+    np.testing.assert_allclose(
+        heading_rad(track), 0.1 * YAW_RATE_RADPS * np.arange(COUNT), atol=1e-6
+    )
+
+
+def test_intrinsics_are_one_focal_length_and_the_middle(tmp_path: Path) -> None:
+    focal_px, center_px = read_intrinsics(pandaset_drive(tmp_path / "002"))
+
+    assert (focal_px, center_px) == (1971.0, (970.5, 483.0))
+
+
+@pytest.mark.parametrize("number", [0, 7, COUNT - 1])
+def test_a_picture_that_is_gone_is_dropped_at_its_time(tmp_path: Path, number: int) -> None:
+    path = pandaset_drive(tmp_path / "002")
+    (path / CAMERA / f"{number:02d}.jpg").unlink()
+
+    found, ledger = rows(path)
+
+    assert found["front_camera"] == COUNT - 1
+    assert ledger.accounts["front_camera"].dropped == {"a time without its picture": 1}
+
+
+@pytest.mark.parametrize("name", ["poses.json", "timestamps.json", "intrinsics.json"])
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '["a"]', "null", "[" * 9999])
+def test_a_damaged_file_is_a_loss(tmp_path: Path, name: str, text: str) -> None:
+    path = pandaset_drive(tmp_path / "002")
+    (path / CAMERA / name).write_text(text)
+
+    found, ledger = rows(path)
+
+    assert ledger.is_whole == (name == "intrinsics.json")
+    assert found["gnss"] == COUNT
+    if name == "intrinsics.json":
+        with pytest.raises(LogFormatError, match=r"intrinsics\.json"):
+            read_intrinsics(path)
+
+
+def test_poses_out_of_order_are_refused(tmp_path: Path) -> None:
+    path = pandaset_drive(tmp_path / "002")
+    times = json.loads((path / CAMERA / "timestamps.json").read_text())
+    times[3], times[4] = times[4], times[3]
+    (path / CAMERA / "timestamps.json").write_text(json.dumps(times))
+
+    with pytest.raises(LogFormatError, match="poses in order"):
+        read_poses(path)
+
+
+def test_the_real_sequence(tmp_path: Path) -> None:
+    """80 pictures in 8 s; the car stands first and has gone 21.5 m in the end."""
+    path = shared("sequences", "pandaset_002")
+
+    found, ledger = rows(path)
+    speed = read_poses(path).odometry()["speed_x_mps"]
+
+    assert found == {"front_camera": 80, "odometry": 80, "gnss": 80}
+    assert ledger.is_whole
+    assert speed[0] == pytest.approx(0.07, abs=0.05)
+    assert float(speed.sum()) * 0.1 == pytest.approx(21.5, abs=0.3)
