@@ -43,8 +43,10 @@ def test_odometry_is_what_was_driven(tmp_path: Path) -> None:
     table = read_poses(pandaset_drive(tmp_path / "002")).odometry()
 
     # A chord of 0.2 s at 0.2 rad/s is 0.007 % shorter than its arc.
-    np.testing.assert_allclose(table["speed_x_mps"][1:-1], SPEED_MPS, rtol=1e-4)
-    np.testing.assert_allclose(table["yaw_rate_radps"], YAW_RATE_RADPS, rtol=1e-5)
+    np.testing.assert_allclose(np.asarray(table["speed_x_mps"], float)[1:-1], SPEED_MPS, rtol=1e-4)
+    np.testing.assert_allclose(
+        np.asarray(table["yaw_rate_radps"], float), YAW_RATE_RADPS, rtol=1e-5
+    )
 
 
 def test_truth_is_the_camera_s_track(tmp_path: Path) -> None:
