@@ -25,11 +25,10 @@ from crosscue.detectors.cues.cars import (
     pair_cars,
     parked_cars,
 )
-from crosscue.eval.pipeline.estimate import detected_part
 from crosscue.eval.pipeline.stored_frames import stored_frames
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.scoring.truth import cue_at
-from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 LEAST_NEAR = 0.5
 """A true car counts where its middle is so near, in lengths of its box."""
@@ -68,11 +67,11 @@ def what_is_at(cars: list[dict[str, Any]], x: float, y: float) -> str:
 
 def claims(run: RunFolder, vehicle: Vehicle) -> Iterator[tuple[int, str, float, float]]:
     """Time, cue and place of every car that counted."""
-    found = detected_part(run.manifest())
+    found = run.drive_manifest().detected
     assert found is not None
     before: CarShapes | None = None
     rules = vehicle.cars
-    for frame in stored_frames(run, found["detectors"]):
+    for frame in stored_frames(run, found.detectors):
         now = car_shapes(frame.seen.objects, rules)
         if before is not None:
             pairs = pair_cars(before, now, rules)
@@ -104,7 +103,7 @@ def main() -> None:
     for path in runs:
         run, drive = open_run(path), study / "drives" / path.name
         truth, cars = load(drive / "truth.json"), true_cars(drive)
-        for t_ns, cue, x, y in claims(run, of_manifest(run.manifest()["settings"])):
+        for t_ns, cue, x, y in claims(run, run.drive_manifest().settings):
             kind = cue.rpartition("_")[0]
             verdict = is_true(truth, cue, t_ns)
             if verdict:

@@ -150,7 +150,7 @@ def after_kill(run: Path, right: dict[str, str]) -> str:
         manifest = open_run(run).manifest()
     except RunError:
         return "left: not a run"
-    if manifest["stage"] != "estimate":
+    if manifest.stage != "estimate":
         return "left: only detected"
     return "left: whole" if contents(run) == right else "LEFT: TAKEN FOR WHOLE"
 

@@ -15,6 +15,7 @@ import multiprocessing
 import os
 import resource
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -35,6 +36,10 @@ from crosscue.eval.batch.merge import merge_runs
 from crosscue.eval.batch.processes import Processes
 from crosscue.eval.runs.folder import RunFolder, clear, create, locked, open_run, write_manifest
 from crosscue.eval.runs.table_sink import TableSink
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from support.manifests import estimated
 
 SCHEMA = pa.schema([("t_ns", pa.int64())])
 DETECTOR = """
@@ -57,7 +62,7 @@ def tiny(job: Job) -> Written:
         clear(run)
         with TableSink(run, "pose", SCHEMA) as sink:
             sink.write({"t_ns": np.arange(1000)})
-        write_manifest(run, {"stage": "estimate"})
+        write_manifest(run, estimated())
     return Written()
 
 

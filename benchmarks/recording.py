@@ -99,7 +99,9 @@ def frame_by_frame(run: RunFolder, path: Path) -> None:
     camera = camera_of(run)
     assert camera is not None
     read_pictures(camera, picture)
-    for frame in stored_frames(run, run.manifest()["detect"]["detectors"]):
+    detected = run.drive_manifest().detected
+    assert detected is not None
+    for frame in stored_frames(run, detected.detectors):
         recording.set_time("drive", timestamp=np.datetime64(frame.seen.t_ns, "ns"))
         for found in frame.seen.objects:
             classes = np.zeros(found.size_px[::-1], np.uint8)

@@ -56,6 +56,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "truth": ("truth.write", "write the truth that a data set contains"),
     "truth import": ("truth.import_annotations", "import annotations from COCO or CVAT as truth"),
     "truth check": ("truth.check", "check a truth file against its log"),
+    "run schema": ("run.schema", "print the JSON Schema of a run's manifest.json"),
     "truth schema": ("truth.schema", "print the JSON Schema of truth.json"),
     "simulate": ("simulate", "simulate drives up to intersections, with all sensors and truth"),
     "train frames": ("train.frames", "render annotated images of intersections to train on"),

@@ -13,18 +13,24 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
-from crosscue.eval.pipeline.run_account import is_whole, summed
+from crosscue.eval.runs.account import summed
 from crosscue.eval.runs.folder import (
     MANIFEST,
-    MERGED,
     RunFolder,
     clear,
     locked,
     open_run,
     staged,
     write_manifest,
+)
+from crosscue.eval.runs.manifest import (
+    DriveManifest,
+    EstimateManifest,
+    MergedDrive,
+    MergedLog,
+    MergedManifest,
 )
 from crosscue.eval.runs.table_sink import TableSink
 from crosscue.replay.errors import RunError, UsageError, one_line
@@ -60,7 +66,7 @@ class Merged:
 class _Drive:
     name: str
     run: RunFolder
-    manifest: dict[str, Any]
+    manifest: DriveManifest
     rows: dict[str, int] = field(default_factory=dict)
     first_ns: int | None = None
     last_ns: int | None = None
@@ -87,7 +93,7 @@ def merge_runs(
         RunError: A run is damaged, or two have columns of one name and different types.
         OutputError: The disk is full.
     """
-    drives = [_Drive(name, run, run.manifest()) for name, run in sorted(runs.items())]
+    drives = [_Drive(name, run, run.drive_manifest()) for name, run in sorted(runs.items())]
     kinds = sorted({path.stem for one in drives for path in one.run.path.glob("*.parquet")})
     with locked(out), staged(out) as new:
         clear(new)
@@ -146,36 +152,38 @@ def _schema(kind: str, holding: Sequence[_Drive]) -> pa.Schema:
 
 def _manifest(
     drives: Sequence[_Drive], kinds: Sequence[str], failures: Mapping[str, str]
-) -> dict[str, object]:
-    return {
-        "stage": MERGED,
-        "tables": list(kinds),
-        "drives": [
-            {
-                "name": one.name,
-                "logs": [
-                    {"name": log["name"], "identity": log["identity"]}
-                    for log in one.manifest.get("logs", [])
-                ],
-                "settings_sha256": _settings_hash(one.manifest),
-                "is_whole": is_whole(one.manifest),
-                "rows": one.rows,
-                "seconds": one.seconds,
-                "tables_sha256": _tables_hash(one.run),
-            }
+) -> MergedManifest:
+    return MergedManifest(
+        tables=tuple(kinds),
+        drives=tuple(
+            MergedDrive(
+                name=one.name,
+                logs=tuple(
+                    MergedLog(name=log.name, identity=log.identity) for log in one.manifest.logs
+                ),
+                settings_sha256=_settings_hash(one.manifest),
+                is_whole=one.manifest.account.is_whole,
+                rows=one.rows,
+                seconds=one.seconds,
+                tables_sha256=_tables_hash(one.run),
+            )
             for one in drives
-        ],
-        "failures": dict(sorted(failures.items())),
-        "account": summed(one.manifest["account"] for one in drives),
-        "notices": dict(Counter(text for one in drives for text in _notices(one)).most_common()),
-        "versions": _versions(drives),
-    }
+        ),
+        failures=dict(sorted(failures.items())),
+        account=summed(one.manifest.account for one in drives),
+        notices=dict(Counter(text for one in drives for text in _notices(one)).most_common()),
+        versions=_versions(drives),
+    )
 
 
-def _settings_hash(manifest: Mapping[str, Any]) -> str:
+def _settings_hash(manifest: DriveManifest) -> str:
     """Of the settings and detectors that a run was made with."""
-    detected = manifest.get("detect") or {}
-    made_with = [manifest.get("settings"), detected.get("detectors"), manifest.get("selection")]
+    detected = manifest.detect if isinstance(manifest, EstimateManifest) else None
+    made_with = [
+        manifest.settings.model_dump(mode="json"),
+        None if detected is None else [one.as_json() for one in detected.detectors],
+        manifest.selection.as_json(),
+    ]
     return hashlib.sha256(strict_json(made_with).encode()).hexdigest()
 
 
@@ -215,9 +223,9 @@ def gathered(
                     f"{first.path} and {path}: two different runs of one name; merging would "
                     "drop one: rename it, or replay it as the other was"
                 )
-        merged = RunFolder(folder / FOLDER)
-        if is_merged(merged):
-            for name, why in merged.manifest()["failures"].items():
+        merged = _merged_in(RunFolder(folder / FOLDER))
+        if merged is not None:
+            for name, why in merged.failures.items():
                 failures.setdefault(name, why)
     return runs, {name: why for name, why in failures.items() if name not in runs}
 
@@ -240,22 +248,22 @@ def _finished(folder: Path) -> list[Path]:
 
 def _content(run: RunFolder) -> tuple[str, ...]:
     """What makes two runs the same: logs, settings and every table."""
-    manifest = run.manifest()
-    logs = sorted(str(log["identity"]["digest"]) for log in manifest.get("logs", []))
+    manifest = run.drive_manifest()
+    logs = sorted(log.identity.digest for log in manifest.logs)
     return (*logs, _settings_hash(manifest), _tables_hash(run))
 
 
 def _notices(one: _Drive) -> set[str]:
-    return set(one.manifest.get("notices", []))
+    return set(one.manifest.notices)
 
 
-def _versions(drives: Sequence[_Drive]) -> dict[str, list[str]]:
+def _versions(drives: Sequence[_Drive]) -> dict[str, tuple[str, ...]]:
     """All that were used: more than one of a library is worth a look."""
     found: dict[str, set[str]] = {}
     for one in drives:
-        for library, version in one.manifest.get("versions", {}).items():
+        for library, version in one.manifest.versions.items():
             found.setdefault(library, set()).add(version)
-    return {library: sorted(used) for library, used in sorted(found.items())}
+    return {library: tuple(sorted(used)) for library, used in sorted(found.items())}
 
 
 def open_one(
@@ -271,8 +279,7 @@ def open_one(
         RunError: It holds many drives; else as ``open_run``.
     """
     run = open_run(path, logs, without_images=without_images, limits=limits)
-    if is_merged(run):
-        raise RunError(f"{path}: holds the tables of many drives; give one of the runs beside it")
+    run.drive_manifest()
     return run
 
 
@@ -282,4 +289,9 @@ def is_merged(run: RunFolder) -> bool:
     Raises:
         RunError: It has no manifest that can be read.
     """
-    return run.file(MANIFEST).exists() and run.manifest().get("stage") == MERGED
+    return _merged_in(run) is not None
+
+
+def _merged_in(run: RunFolder) -> MergedManifest | None:
+    found = run.manifest() if run.file(MANIFEST).exists() else None
+    return found if isinstance(found, MergedManifest) else None

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 
-from crosscue.eval.pipeline.run_account import is_whole
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, open_run
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.eval.scoring.runs import FOLDER, METRICS
@@ -50,7 +49,10 @@ PARTS: Final = (
     "attribution",
 )
 """Metrics below these stand on few rows each; they are shown but not judged."""
-COMPARED: Final = ("versions", "settings", "detectors", "camera", "selection", "logs", "landmarks")
+COMPARED: Final = {
+    "versions", "settings", "detectors", "camera", "selection", "logs", "landmarks",
+}  # fmt: skip
+"""Parts of a manifest."""
 MOST_BYTES: Final = 256 * MIB
 
 
@@ -226,7 +228,7 @@ def open_scored(path: Path) -> RunFolder:
 def is_whole_run(run: RunFolder) -> bool:
     """Was nothing dropped in the run, or in any of those that were scored together?"""
     if not _is_pooled(run.path):
-        return is_whole(run.manifest())
+        return run.manifest().account.is_whole
     account = _tree_of(run.file(METRICS)).get("account")
     return isinstance(account, dict) and bool(account.get("is_whole"))
 
@@ -238,8 +240,7 @@ def _is_pooled(path: Path) -> bool:
 def _settings_of(run: RunFolder) -> dict[str, object]:
     if _is_pooled(run.path):
         return {}
-    manifest = run.manifest()
-    return dict(_leaves({name: manifest[name] for name in COMPARED if name in manifest}, ""))
+    return dict(_leaves(run.manifest().model_dump(mode="json", include=COMPARED), ""))
 
 
 def _leaves(value: object, path: str) -> Iterator[tuple[str, object]]:

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 from crosscue.eval.pipeline.accounts import versions, write_skipped
-from crosscue.eval.pipeline.drive_time import time_told, whole_timeline
+from crosscue.eval.pipeline.drive_time import time_segments, whole_timeline
 from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
-from crosscue.eval.pipeline.run_account import Account, account, reading_of
+from crosscue.eval.runs.account import Account, account, reading_of
 from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
+from crosscue.eval.runs.manifest import DecodeManifest
 from crosscue.eval.runs.table_sink import TableSink
 from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
@@ -96,7 +97,7 @@ class Decoded:
     @property
     def exit_status(self) -> int:
         """3 when anything was dropped or the logs have gaps, else 0."""
-        return 3 if self.timeline.has_gaps or not self.account["is_whole"] else 0
+        return 3 if self.timeline.has_gaps or not self.account.is_whole else 0
 
 
 def decode_tables(
@@ -143,15 +144,15 @@ def decode_tables(
         if not any(rows.values()):
             raise empty_result("no topic gave a row for a table", logs, selection)
         made = account(reading_of(ledgers))
-        write_skipped(new, ledgers, made["reading"], timeline=timeline)
-        content = {
-            "versions": versions(),
-            "tables": {topic: f"{table.name}.parquet" for topic, table in tables.items()},
-            "rows": rows,
-            "settings": vehicle.model_dump(mode="json"),
-            "account": made,
-            "time": time_told(timeline),
-        }
+        write_skipped(new, ledgers, made.reading, timeline=timeline)
+        content = DecodeManifest(
+            versions=versions(),
+            tables={topic: f"{table.name}.parquet" for topic, table in tables.items()},
+            rows=rows,
+            settings=vehicle,
+            account=made,
+            time=time_segments(timeline),
+        )
         write_manifest(new, content)
     return Decoded(rows, made, timeline)
 

@@ -17,8 +17,8 @@ from crosscue.eval.commands.shared.options import (
     selection_of,
 )
 from crosscue.eval.commands.shared.progress import Done, progress_line
-from crosscue.eval.pipeline.drive_time import time_told
-from crosscue.eval.pipeline.run_account import account_lines
+from crosscue.eval.pipeline.drive_time import time_segments
+from crosscue.eval.runs.account import account_lines
 from crosscue.eval.runs.folder import create
 from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import visible
@@ -51,15 +51,21 @@ def run(args: argparse.Namespace) -> int:
             )
     rows, account = done.rows, done.account
     if args.json:
-        print_json({"tables": rows, "account": account, "time": time_told(done.timeline)})
+        print_json(
+            {
+                "tables": rows,
+                "account": account.as_json(),
+                "time": time_segments(done.timeline).as_json(),
+            }
+        )
     elif not args.quiet:
         width = max(map(len, rows), default=0)
         for name, count in rows.items():
             print(f"{name:{width}}  {count:>10,} rows")
         for line in account_lines(account):
             print(visible(line))
-        for log in account["reading"]:
-            for sentence in log["notices"]:
+        for log in account.reading:
+            for sentence in log.notices:
                 print(f"note     {visible(sentence)}")
         for sentence in gaps_told(done.timeline.segments):
             print(f"note     {sentence}")

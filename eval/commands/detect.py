@@ -21,7 +21,7 @@ from crosscue.eval.commands.shared.options import (
 )
 from crosscue.eval.commands.shared.progress import DriveLine, is_shown
 from crosscue.eval.pipeline.detect import DetectOutcome, detect_drive
-from crosscue.eval.pipeline.run_account import account_lines, details_of
+from crosscue.eval.runs.account import account_lines, details_of
 from crosscue.eval.runs.folder import create
 from crosscue.replay.errors import UsageError
 from crosscue.replay.opening import open_logs
@@ -82,7 +82,7 @@ def summary(outcome: DetectOutcome) -> str:
 def _as_json(outcome: DetectOutcome) -> dict[str, object]:
     return {
         "run": str(outcome.run.path),
-        "account": outcome.account,
+        "account": outcome.account.as_json(),
         "frames": outcome.counts.frames,
         "ran": outcome.counts.ran,
         "from_cache": outcome.counts.from_cache,

@@ -46,9 +46,9 @@ from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
-from crosscue.eval.pipeline.run_account import account_lines
 from crosscue.eval.pipeline.run_input import files_named_in
 from crosscue.eval.pipeline.scene import ApproachSummary, SceneOutcome
+from crosscue.eval.runs.account import account_lines
 from crosscue.eval.runs.folder import create
 from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.opening import open_logs
@@ -313,10 +313,10 @@ def _drive_as_json(one: Done[Outcome]) -> dict[str, object]:
 def summary(outcome: Outcome) -> str:
     """What happened, for a person, in 80 columns."""
     lines = [f"run      {outcome.run.path}"]
-    for log in outcome.account["reading"]:
-        lines.append(f"log      {log['log']}")
-        lines.append(f"         integrity: {log['integrity']}")
-        lines += [f"  note   {sentence}" for sentence in log["notices"]]
+    for log in outcome.account.reading:
+        lines.append(f"log      {log.log}")
+        lines.append(f"         integrity: {log.integrity}")
+        lines += [f"  note   {sentence}" for sentence in log.notices]
     lines += account_lines(outcome.account)
     if outcome.rows:
         lines += [
@@ -382,7 +382,7 @@ def as_json(outcome: Outcome) -> dict[str, object]:
     """The result for other programs."""
     return {
         "run": str(outcome.run.path),
-        "account": outcome.account,
+        "account": outcome.account.as_json(),
         "pose": {
             "rows": outcome.rows,
             "travelled_m": outcome.travelled_m,

@@ -33,17 +33,24 @@ from crosscue.eval.commands.shared.options import (
     print_json,
 )
 from crosscue.eval.commands.shared.progress import Done, with_progress
-from crosscue.eval.pipeline.run_account import account_lines
 from crosscue.eval.report.junit import write_junit
 from crosscue.eval.report.page import REPORT, write_report
 from crosscue.eval.report.score_runs import Failed, Scored, ScoreWork, score_runs
 from crosscue.eval.report.summary import gate_lines, headline, pose_summary, summary, told_line
+from crosscue.eval.runs.account import account_lines
 from crosscue.eval.runs.folder import locked
 from crosscue.eval.scoring.drives import DEFAULTS, Scores, ScoreSettings
 from crosscue.eval.scoring.gates import Gate, GateResult, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.pose.smoother import told
-from crosscue.eval.scoring.runs import FOLDER, RunScored, metrics_of, scores_of, write_scores
+from crosscue.eval.scoring.runs import (
+    FOLDER,
+    RunScored,
+    account_of_scores,
+    metrics_of,
+    scores_of,
+    write_scores,
+)
 from crosscue.eval.studies.attribution import (
     Attribution,
     Drive,
@@ -209,7 +216,7 @@ def _tell_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) 
     if args.json or args.quiet:
         return found.metrics
     print(f"run        {visible(str(one.run.path))}")
-    print("\n".join(map(visible, account_lines(found.metrics["account"]))) + "\n")
+    print("\n".join(map(visible, account_lines(account_of_scores([one])))) + "\n")
     _print_scores(scores, one.why_no_pose, worth)
     if one.pose is not None:
         print("\n" + pose_summary(one.pose))
@@ -274,7 +281,7 @@ def _pool(
     for first, second in tree["coverage"].get("same_log", ()):
         names = f"{visible(first)} and {visible(second)}"
         print(told_line("twice", f"{names} are runs of one log, which therefore counts twice"))
-    print("\n".join(map(visible, account_lines(tree["account"]))) + "\n")
+    print("\n".join(map(visible, account_lines(account_of_scores(ones)))) + "\n")
     why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
     _print_scores(scores, why, worth)
     if args.output is not None:

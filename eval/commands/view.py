@@ -23,7 +23,6 @@ from crosscue.eval.commands.shared.options import (
     print_json,
     refuse_existing,
 )
-from crosscue.eval.pipeline.run_account import is_whole
 from crosscue.eval.recording import save
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.pose.score import truth_track
@@ -71,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
             print(path)
     else:
         _open(path, args.web)
-    return 0 if is_whole(folder.manifest()) else 3
+    return 0 if folder.manifest().account.is_whole else 3
 
 
 def _truth(

@@ -29,7 +29,7 @@ from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan
 from crosscue.replay.signals.plan import camera_of, with_pictures
-from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 LEAST_POINTS: Final = 20
 """Pictures with fewer points (a blank wall, the dark) are no landmarks."""
@@ -107,7 +107,7 @@ def read_poses(path: Path, vehicle: Vehicle) -> CameraPoses:
 
 def _run_poses(path: Path) -> CameraPoses:
     run = open_run(path)
-    vehicle = of_manifest(run.manifest()["settings"])
+    vehicle = run.drive_manifest().settings
     names = ["t_ns", "x_m", "y_m", "heading_rad", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2"]
     table = run.table("pose", names)
     x, y, heading, xx, xy, yy = (table[name].to_numpy() for name in names[1:])

@@ -26,7 +26,7 @@ from crosscue.fusion.factor_graph import FactorGraph, graph_of
 from crosscue.fusion.message_fit import MessageFit, RateFit, Side
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import RunError, UsageError
-from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 COVERED: Final = 0.9
 """Of the time between two frames, at least so much must have odometry."""
@@ -53,7 +53,7 @@ def graph_of_runs(runs: Sequence[RunFolder]) -> tuple[FactorGraph, Vehicle]:
         UsageError: They do not share one.
         RunError: A manifest cannot be read.
     """
-    vehicles = [of_manifest(run.manifest()["settings"]) for run in runs]
+    vehicles = [run.drive_manifest().settings for run in runs]
     graphs = [graph_of(vehicle.fusion) for vehicle in vehicles]
     for run, graph in zip(runs, graphs, strict=True):
         if graph != graphs[0]:

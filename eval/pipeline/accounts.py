@@ -8,10 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
+from crosscue.eval.runs.account import UNATTRIBUTED, LogAccount, TopicLine
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import ClockRow
 from crosscue.eval.runs.table_sink import TableSink
 from crosscue.replay.clocks.reports import Clock
-from crosscue.replay.ledger import Ledger, TopicAccount
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
@@ -22,8 +24,6 @@ from .labelled import labelled
 if TYPE_CHECKING:
     import pyarrow as pa
 
-UNATTRIBUTED: Final = ""
-"""The topic of what no topic can be named for."""
 PROBE_NS: Final = 10_000_000_000
 """Log time looked at before a clock is chosen for each topic."""
 
@@ -42,15 +42,15 @@ def probe_clocks(log: Log, extractor: Extractor, selection: Selection) -> dict[s
     return {name: report.used for name, report in extractor.watch.reports().items()}
 
 
-def clock_rows(extractor: Extractor) -> dict[str, object]:
-    """Clock used and the whole pass's report for each topic, as plain values."""
+def clock_rows(extractor: Extractor) -> dict[str, ClockRow]:
+    """Clock used and the whole pass's report for each topic."""
     return {
-        name: {
-            "used": extractor.clocks.get(name, Clock.LOG).value,
-            "why": report.why,
-            "rows": report.of_used.rows,
-            "rate_hz": report.rate_hz,
-        }
+        name: ClockRow(
+            used=extractor.clocks.get(name, Clock.LOG),
+            why=report.why,
+            rows=report.of_used.rows,
+            rate_hz=report.rate_hz,
+        )
         for name, report in extractor.watch.reports().items()
     }
 
@@ -87,29 +87,6 @@ def _skipped_rows(ledger: Ledger) -> list[dict[str, Any]]:
     return [asdict(detail) | {"log": ledger.log} for detail in ledger.details]
 
 
-def account_of(ledger: Ledger) -> dict[str, object]:
-    """One log's account as plain values, for manifest and JSON output."""
-    return {
-        "log": ledger.log,
-        "integrity": ledger.integrity,
-        "is_whole": ledger.is_whole,
-        "notices": list(ledger.notices),
-        "topics": {name: _account(a) for name, a in sorted(ledger.accounts.items())},
-    }
-
-
-def _account(account: TopicAccount) -> dict[str, object]:
-    return {
-        "declared": account.declared,
-        "in": account.in_file,
-        "found": account.found,
-        "used": account.used,
-        "skipped": dict(sorted(account.skipped.items())),
-        "dropped": dict(sorted(account.dropped.items())),
-        "dropped_unknown": sorted(set(account.dropped_unknown)),
-    }
-
-
 def versions() -> dict[str, str]:
     """Of crosscue, Python and the libraries that results depend on."""
     libraries = ("crosscue", "numpy", "numba", "cantools", "rosbags", "mcap", "pyarrow")
@@ -119,7 +96,7 @@ def versions() -> dict[str, str]:
 def write_skipped(
     run: RunFolder,
     ledgers: Sequence[Ledger],
-    reading: Sequence[Mapping[str, Any]],
+    reading: Sequence[LogAccount],
     kept: pa.Table | None = None,
     timeline: Timeline = ONE_SEGMENT,
 ) -> None:
@@ -136,13 +113,13 @@ def write_skipped(
     earlier = [] if kept is None else kept.to_pylist()
     with TableSink(run, "skipped", labelled(skipped_schema())) as sink:
         for log in reading:
-            for topic, account in log["topics"].items():
+            for topic, account in log.topics.items():
                 # What both stages have met stands in either's rows, a camera's in the first's.
                 for rest in (rows, earlier) if topic == UNATTRIBUTED else (earlier, rows):
-                    mine = [r for r in rest if (r["log"], r["topic"]) == (log["log"], topic)]
+                    mine = [r for r in rest if (r["log"], r["topic"]) == (log.log, topic)]
                     if mine:
                         break
-                mine += _in_bulk(mine, log["log"], topic, account)
+                mine += _in_bulk(mine, log.log, topic, account)
                 if mine:
                     names = skipped_schema().names
                     times = [row["t_ns"] for row in mine]
@@ -152,21 +129,21 @@ def write_skipped(
 
 
 def _in_bulk(
-    single: Sequence[Mapping[str, Any]], log: str, topic: str, account: Mapping[str, Any]
+    single: Sequence[Mapping[str, Any]], log: str, topic: str, account: TopicLine
 ) -> list[dict[str, Any]]:
     """A row for each reason of which the single rows tell less than the account."""
     rows = []
-    for key, is_dropped in (("skipped", False), ("dropped", True)):
+    for known_counts, is_dropped in ((account.skipped, False), (account.dropped, True)):
         listed: Counter[str] = Counter()
         for row in single:
             if row["is_dropped"] is is_dropped:
                 listed[row["reason"]] += row["count"] or 0
         counts: list[tuple[str, int | None]] = [
-            (why, n - listed[why]) for why, n in account[key].items() if n != listed[why]
+            (why, n - listed[why]) for why, n in known_counts.items() if n != listed[why]
         ]
         if is_dropped:
             known = {row["reason"] for row in single if row["count"] is None}
-            counts += [(why, None) for why in account["dropped_unknown"] if why not in known]
+            counts += [(why, None) for why in account.dropped_unknown if why not in known]
         rows += [
             {
                 "t_ns": None,
@@ -180,31 +157,3 @@ def _in_bulk(
             for why, count in counts
         ]
     return rows
-
-
-def joined_accounts(
-    ours: Sequence[Mapping[str, Any]], earlier: Sequence[Mapping[str, Any]], topic: str
-) -> list[dict[str, Any]]:
-    """Accounts of one stage with that of ``topic`` taken from an earlier one, which read it."""
-    logs = {account["log"]: account for account in earlier}
-    joined = []
-    for account in ours:
-        one = dict(account)
-        before = logs.get(account["log"])
-        if before is not None and topic in before["topics"]:
-            one["topics"] = {**account["topics"], topic: before["topics"][topic]}
-            if UNATTRIBUTED not in account["topics"] and UNATTRIBUTED in before["topics"]:
-                one["topics"][UNATTRIBUTED] = before["topics"][UNATTRIBUTED]
-            one["is_whole"] = account["is_whole"] and before["is_whole"]
-            one["notices"] = list(dict.fromkeys([*before["notices"], *account["notices"]]))
-        joined.append(one)
-    return joined
-
-
-def selection_told(selection: Selection) -> dict[str, object]:
-    """Which part of the logs was asked for, for the manifest."""
-    return {
-        "start_ns": selection.start_ns,
-        "end_ns": selection.end_ns,
-        "topics": None if selection.topics is None else sorted(selection.topics),
-    }

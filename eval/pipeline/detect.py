@@ -19,7 +19,15 @@ from crosscue.detectors.ranging.height_to_range import range_of
 from crosscue.detectors.registry import Choice, make
 from crosscue.detectors.result_cache import ResultCache
 from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
+from crosscue.eval.runs.account import Account, account, detecting_of, reading_of
 from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
+from crosscue.eval.runs.manifest import (
+    DetectCounts,
+    DetectManifest,
+    DetectorRow,
+    DetectTimings,
+    part_of,
+)
 from crosscue.replay.columns import Block
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
@@ -30,11 +38,10 @@ from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_told, shift_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .accounts import clock_rows, probe_clocks, selection_told, versions, write_skipped
-from .drive_time import camera_timeline, time_told
+from .accounts import clock_rows, probe_clocks, versions, write_skipped
+from .drive_time import camera_timeline, time_segments
 from .empty_result import empty_result, nothing_left
 from .labelled import LabelledSink
-from .run_account import Account, account, detecting_of, reading_of
 from .run_input import input_of
 from .run_logs import log_names, log_rows
 
@@ -79,7 +86,7 @@ class DetectOutcome:
     @property
     def exit_status(self) -> int:
         """3 when anything was dropped or the drive has gaps, else 0."""
-        return 0 if self.account["is_whole"] and not self.has_gaps else 3
+        return 0 if self.account.is_whole and not self.has_gaps else 3
 
 
 def choices_of(vehicle: Vehicle) -> dict[str, Choice]:
@@ -195,43 +202,42 @@ def detect_into(
             what = f"the camera, planned from {topic.name}, found no frames{dropped}"
             raise empty_result(what, logs, selection)
         made = account(reading_of([ledger]), detecting_of(topic.name, ledger, runner.counts.frames))
-        write_skipped(run, [ledger], made["reading"], timeline=timeline)
+        write_skipped(run, [ledger], made.reading, timeline=timeline)
         seconds = time.monotonic() - began
         notices = (*gaps_told(timeline.segments), *tables.notices)
         write_manifest(
             run,
-            {
-                "stage": "detect",
-                "versions": versions(),
-                "logs": log_rows(logs, run),
-                "selection": selection_told(selection),
-                "settings": vehicle.model_dump(mode="json"),
-                "camera": topic.name,
-                "camera_log": camera[0],
-                "time": time_told(timeline),
-                "detectors": [
-                    {
-                        "name": one.name,
-                        "identity": one.detector.identity,
-                        "kind": choice.kind,
-                        "role": tables.roles.get(one.name),
-                        "settings": dict(choice.settings),
-                    }
+            DetectManifest(
+                versions=versions(),
+                logs=log_rows(logs, run),
+                selection=part_of(selection),
+                settings=vehicle,
+                camera=topic.name,
+                camera_log=camera[0],
+                time=time_segments(timeline),
+                detectors=tuple(
+                    DetectorRow(
+                        name=one.name,
+                        identity=one.detector.identity,
+                        kind=choice.kind,
+                        role=tables.roles.get(one.name),
+                        settings=dict(choice.settings),
+                    )
                     for one, choice in zip(named, choices, strict=True)
-                ],
-                "clocks": [clock_rows(extractor)],
-                "account": made,
-                "counts": {
-                    "frames": runner.counts.frames,
-                    "decoded": runner.counts.decoded,
-                    "ran": runner.counts.ran,
-                    "from_cache": runner.counts.from_cache,
-                    "objects": tables.objects,
-                    "cues": tables.cue_frames,
-                },
-                "notices": list(notices),
-                "timings": {"seconds": seconds},
-            },
+                ),
+                clocks=(clock_rows(extractor),),
+                account=made,
+                counts=DetectCounts(
+                    frames=runner.counts.frames,
+                    decoded=runner.counts.decoded,
+                    ran=runner.counts.ran,
+                    from_cache=runner.counts.from_cache,
+                    objects=tables.objects,
+                    cues=tables.cue_frames,
+                ),
+                notices=notices,
+                timings=DetectTimings(seconds=seconds),
+            ),
         )
     return DetectOutcome(
         run,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
+from crosscue.eval.runs.manifest import TimeSegments
 from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import VehicleError
@@ -14,7 +14,7 @@ from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import plan, with_pictures
 from crosscue.replay.time.scan import scan
-from crosscue.replay.time.segments import Timeline, gaps_told, timeline_of
+from crosscue.replay.time.segments import Timeline, gaps_told
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .accounts import probe_clocks
@@ -123,12 +123,10 @@ def _narrowed(selection: Selection, planned: frozenset[str]) -> Selection:
     return Selection(topics, selection.start_ns, selection.end_ns)
 
 
-def time_told(timeline: Timeline) -> dict[str, Any]:
+def time_segments(timeline: Timeline) -> TimeSegments:
     """The manifest's part on time."""
-    return timeline.as_dict() | {"notices": gaps_told(timeline.segments)}
-
-
-def timeline_in(manifest: Mapping[str, Any]) -> Timeline:
-    """The timeline of a finished run, or of its detect stage."""
-    told = manifest.get("time")
-    return timeline_of(None if told is None else told)
+    return TimeSegments(
+        segments=timeline.segments,
+        clocks=timeline.clocks,
+        notices=tuple(gaps_told(timeline.segments)),
+    )

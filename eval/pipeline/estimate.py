@@ -10,9 +10,28 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
 
+from crosscue.eval.runs.account import (
+    UNATTRIBUTED,
+    Account,
+    account,
+    joined_accounts,
+    reading_of,
+)
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, write_manifest
+from crosscue.eval.runs.manifest import (
+    ApproachRow,
+    DetectManifest,
+    EstimateCounts,
+    EstimateManifest,
+    EstimateTimings,
+    LandmarksUsed,
+    LogRow,
+    PoseSummary,
+    SceneSummary,
+    part_of,
+)
 from crosscue.eval.runs.table_sink import TableSink
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.columns import Topic
@@ -36,41 +55,27 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.windows import windows
 
 from . import measurements
-from .accounts import (
-    UNATTRIBUTED,
-    clock_changes,
-    clock_rows,
-    joined_accounts,
-    probe_clocks,
-    selection_told,
-    versions,
-    write_skipped,
-)
+from .accounts import clock_changes, clock_rows, probe_clocks, versions, write_skipped
 from .detect import DetectOutcome
 from .drive_time import (
     OnTime,
     drive_timeline,
     report_time,
     selections_of,
-    time_told,
-    timeline_in,
+    time_segments,
     unwatched_time,
 )
 from .empty_result import empty_result, silent_roles
 from .labelled import LabelledSink
 from .landmarks import looking
 from .mobileye_tables import MobileyeSink, StoredMobileye
-from .pose import PoseStage, turn_signal_of
+from .pose import PoseStage, estimating_of, turn_signal_of
 from .pose_tables import PoseTally, pose_rows, pose_schema
-from .run_account import Account, account, estimating_of, reading_of
 from .run_logs import log_names, log_rows, relative
 from .scene import SceneOutcome, estimate_scene, features_of, schemas
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-DETECT: Final = "detect"
-"""Stage name and key of the manifest's part on detection."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,15 +115,7 @@ class Outcome:
     @property
     def exit_status(self) -> int:
         """3 when anything was dropped or the drive has gaps, else 0."""
-        return 0 if self.account["is_whole"] and len(self.segments) == 1 else 3
-
-
-def detected_part(manifest: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """What a manifest says of the detect stage; None where none ran."""
-    if manifest.get("stage") == DETECT:
-        return manifest
-    found: Mapping[str, Any] | None = manifest.get(DETECT)
-    return found
+        return 0 if self.account.is_whole and len(self.segments) == 1 else 3
 
 
 def estimate_into(
@@ -129,8 +126,8 @@ def estimate_into(
     on_time: OnTime = unwatched_time,
     landmarks: LandmarkDatabase | None = None,
     detected: DetectOutcome | None = None,
-    earlier: Mapping[str, Any] | None = None,
-    told: Sequence[Mapping[str, object]] | None = None,
+    earlier: DetectManifest | None = None,
+    told: Sequence[LogRow] | None = None,
     timeline: Timeline | None = None,
 ) -> Outcome:
     """Write pose, cues, ranges, beliefs and the manifest into a run folder that is locked.
@@ -153,8 +150,8 @@ def estimate_into(
         OutputError: The disk is full.
     """
     began = time.monotonic()
-    found = earlier if detected is None else detected_part(run.manifest())
-    kept = None if found is None else _camera_skips(run, found["camera"])
+    found = earlier if detected is None else run.drive_manifest().detected
+    kept = None if found is None else _camera_skips(run, found.camera)
     reading = _Reading(logs, vehicle, selection, landmarks, timeline, found)
     timeline = reading.timeline
     stage = PoseStage(vehicle, turn_signal_of(reading.planned, vehicle), timeline=timeline)
@@ -175,14 +172,14 @@ def estimate_into(
     scene = None if found is None else _scene(run, vehicle, found, reading)
     accounts = reading_of(reading.ledgers)
     if found is not None:
-        accounts = joined_accounts(accounts, found["account"]["reading"], found["camera"])
-    frames = None if scene is None or found is None else (found["counts"]["frames"], scene.frames)
+        accounts = joined_accounts(accounts, found.account.reading, found.camera)
+    frames = None if scene is None or found is None else (found.counts.frames, scene.frames)
     made = account(
         accounts,
-        {} if found is None else found["account"]["detecting"],
+        {} if found is None else found.account.detecting,
         estimating_of(stage, frames),
     )
-    write_skipped(run, reading.ledgers, made["reading"], kept, timeline)
+    write_skipped(run, reading.ledgers, made.reading, kept, timeline)
     before = 0.0 if detected is None else detected.seconds
     seconds = time.monotonic() - began
     notices = (
@@ -199,36 +196,31 @@ def estimate_into(
     )
     write_manifest(
         run,
-        {
-            "stage": "estimate",
-            "versions": versions(),
-            "logs": _hashed(logs, run, found) if told is None else list(told),
-            "selection": selection_told(selection),
-            "settings": vehicle.model_dump(mode="json"),
-            "sources": _sources(reading.planned, logs),
-            "clocks": [clock_rows(extractor) for extractor in reading.extractors],
-            "account": made,
-            "counts": stage.counts(),
-            "time": time_told(timeline),
-            "landmarks": None
+        EstimateManifest(
+            versions=versions(),
+            logs=_hashed(logs, run, found) if told is None else tuple(told),
+            selection=part_of(selection),
+            settings=vehicle,
+            sources=_sources(reading.planned, logs),
+            clocks=tuple(clock_rows(extractor) for extractor in reading.extractors),
+            account=made,
+            counts=EstimateCounts(**stage.counts()),
+            time=time_segments(timeline),
+            landmarks=None
             if landmarks is None
-            else {
-                "database": relative(landmarks.path, run),
-                "landmarks": len(landmarks),
-                "sha256": sha256_of(landmarks.path),
-            },
-            "notices": list(notices),
-            "pose": {
-                "rows": tally.rows,
-                "travelled_m": tally.travelled_m,
-                "major_axis_m": tally.major_axis_m,
-            },
-            "scene": None if scene is None else _scene_told(scene),
-            DETECT: None
-            if found is None
-            else {key: value for key, value in found.items() if key != "format_version"},
-            "timings": {"seconds": seconds + before, "detect_seconds": before},
-        },
+            else LandmarksUsed(
+                database=relative(landmarks.path, run),
+                landmarks=len(landmarks),
+                sha256=sha256_of(landmarks.path),
+            ),
+            notices=notices,
+            pose=PoseSummary(
+                rows=tally.rows, travelled_m=tally.travelled_m, major_axis_m=tally.major_axis_m
+            ),
+            scene=None if scene is None else _scene_summary(scene),
+            detect=found,
+            timings=EstimateTimings(seconds=seconds + before, detect_seconds=before),
+        ),
     )
     return Outcome(
         run,
@@ -247,11 +239,11 @@ def estimate_into(
     )
 
 
-def _of_detecting(found: Mapping[str, Any] | None) -> list[str]:
+def _of_detecting(found: DetectManifest | None) -> list[str]:
     """What the detect stage had to say, but for the gaps: those are said of the whole run."""
     if found is None:
         return []
-    return [one for one in found["notices"] if one not in found["time"]["notices"]]
+    return [one for one in found.notices if one not in found.time.notices]
 
 
 def _driven_s(timeline: Timeline, tally: PoseTally) -> float:
@@ -263,19 +255,18 @@ def _driven_s(timeline: Timeline, tally: PoseTally) -> float:
 
 
 def _hashed(
-    logs: Sequence[Log], run: RunFolder, found: Mapping[str, Any] | None
-) -> Sequence[Mapping[str, object]]:
+    logs: Sequence[Log], run: RunFolder, found: DetectManifest | None
+) -> tuple[LogRow, ...]:
     """Paths and hashes of the logs; the detect stage of this very run has taken them already."""
-    told: Sequence[Mapping[str, object]] = log_rows(logs, run) if found is None else found["logs"]
-    return told
+    return log_rows(logs, run) if found is None else found.logs
 
 
-def begin_again(run: RunFolder, found: Mapping[str, Any] | None) -> None:
+def begin_again(run: RunFolder, found: DetectManifest | None) -> None:
     """Make the run what the detect stage left: cut short, it must not pass for a whole one."""
     if found is None:
         run.file(MANIFEST).unlink(missing_ok=True)
     else:
-        write_manifest(run, {key: value for key, value in found.items() if key != "format_version"})
+        write_manifest(run, found)
 
 
 class _Reading:
@@ -288,7 +279,7 @@ class _Reading:
         selection: Selection,
         landmarks: LandmarkDatabase | None,
         timeline: Timeline | None,
-        found: Mapping[str, Any] | None,
+        found: DetectManifest | None,
     ) -> None:
         topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
         self.logs = logs
@@ -300,7 +291,7 @@ class _Reading:
         self.ledgers = tuple(Ledger(name) for name in log_names(logs))
         self.selections = selections_of(logs, self.planned, selection)
         if timeline is None:
-            known = None if found is None else timeline_in(found)
+            known = None if found is None else found.timeline
             timeline = drive_timeline(logs, vehicle, selection, self.camera, known)
         self.timeline = timeline
         clocks = [
@@ -354,9 +345,9 @@ def _write_all(sink: TableSink, parts: Sequence[Mapping[str, object]]) -> None:
 
 
 def _scene(
-    run: RunFolder, vehicle: Vehicle, found: Mapping[str, Any], reading: _Reading
+    run: RunFolder, vehicle: Vehicle, found: DetectManifest, reading: _Reading
 ) -> SceneOutcome:
-    timeline, clock = reading.timeline, reading.timeline.clock(found["camera_log"])
+    timeline, clock = reading.timeline, reading.timeline.clock(found.camera_log)
     with ExitStack() as stack:
         sinks = {
             name: stack.enter_context(LabelledSink(run, name, schema, timeline, clock))
@@ -374,14 +365,14 @@ def _scene(
         )
 
 
-def _scene_told(scene: SceneOutcome) -> dict[str, object]:
-    return {
-        "frames": scene.frames,
-        "positive": dict(scene.positive),
-        "counts": dict(scene.counts),
-        "without_odometry": scene.without_odometry,
-        "approaches": [asdict(one) for one in scene.approaches],
-    }
+def _scene_summary(scene: SceneOutcome) -> SceneSummary:
+    return SceneSummary(
+        frames=scene.frames,
+        positive=dict(scene.positive),
+        counts=dict(scene.counts),
+        without_odometry=scene.without_odometry,
+        approaches=tuple(ApproachRow(**asdict(one)) for one in scene.approaches),
+    )
 
 
 def _camera_skips(run: RunFolder, camera: str) -> pa.Table:
@@ -423,14 +414,14 @@ def _no_camera(landmarks: LandmarkDatabase | None, camera: tuple[int, Topic] | N
     return ["landmarks were given, but the logs have no camera: none is looked for"]
 
 
-def _no_mobileye(found: Mapping[str, Any] | None, planned: Plan) -> list[str]:
+def _no_mobileye(found: DetectManifest | None, planned: Plan) -> list[str]:
     reason = planned.missing.get(Signal.MOBILEYE_OBSTACLES)
     if found is None or reason is None:
         return []
     return [f"no Mobileye, so no lane lines or vehicles past the intersection: {reason}"]
 
 
-def _no_scene(found: Mapping[str, Any] | None, reading: _Reading) -> list[str]:
+def _no_scene(found: DetectManifest | None, reading: _Reading) -> list[str]:
     if found is not None:
         return []
     if not reading.has_camera:

@@ -20,8 +20,6 @@ from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import RunError
 from crosscue.replay.time.segments import Cause, Timeline
 
-from .drive_time import timeline_in
-
 if TYPE_CHECKING:
     import pyarrow as pa
 
@@ -101,7 +99,7 @@ def pose_in_log_time(run: RunFolder) -> pa.Table:
     Raises:
         RunError: It is missing or damaged.
     """
-    return table_in_log_time(run.table("pose"), timeline_in(run.manifest()))
+    return table_in_log_time(run.table("pose"), run.drive_manifest().timeline)
 
 
 def comes_twice(timeline: Timeline, log_ns: Int64s) -> NDArray[np.bool_]:
@@ -118,7 +116,7 @@ def refuse_set_back(run: RunFolder, what: str) -> None:
     Raises:
         RunError: A clock was set back during it.
     """
-    if was_set_back(timeline_in(run.manifest())):
+    if was_set_back(run.drive_manifest().timeline):
         raise RunError(
             f"{run.path}: a clock was set back during the drive, so its times are not the truth's; "
             f"{what} takes drives without: replay each side alone with --from and --to"

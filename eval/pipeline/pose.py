@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from crosscue.eval.runs.account import Line, line
 from crosscue.localization import compass, odometry, pose_track
 from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.odometry import OdometrySettings, Pending, TurnSignal, WheelSpeeds
@@ -318,3 +319,46 @@ def _wheels(found: Samples | None) -> WheelSpeeds:
     if np.isnan(speeds[:, :2]).all():
         speeds = speeds[:, 2:]
     return WheelSpeeds(found.t_ns, speeds)
+
+
+def estimating_of(stage: PoseStage, frames: tuple[int, int] | None) -> dict[str, Line]:
+    """What the filters took of the readings that reached them.
+
+    Args:
+        stage: After its last window.
+        frames: Frames detected and frames that cues and belief were estimated for, if any were.
+    """
+    wheels, track, got = stage.odometry_counts, stage.track_counts, stage.received
+    rejected = {
+        "not finite": wheels.not_finite,
+        "repeated time": wheels.repeated,
+        "out of order": wheels.out_of_order,
+    }
+    found = {
+        "wheel speeds": line(
+            got[Signal.WHEEL_SPEEDS], wheels.rows - sum(rejected.values()), rejected
+        ),
+        "headings": line(
+            got[Signal.HEADING] + got[Signal.MAGNETIC_FIELD],
+            track.headings_accepted + stage.started_with,
+            {
+                "too soon after the last one used": track.headings_thinned,
+                "refused by the gate": track.headings_rejected,
+                "earlier than the estimate": track.headings_late,
+                "not finite": track.headings_bad,
+                "after the last wheel speeds": stage.waiting,
+            },
+        ),
+    }
+    if stage.turn is not None:
+        found["turn rates"] = line(
+            got[stage.turn],
+            wheels.turn_rows - wheels.turn_dropped,
+            {
+                "not finite, repeated or out of order": wheels.turn_dropped,
+                "before the first wheel speeds": stage.turn_early,
+            },
+        )
+    if frames is not None:
+        found["frames"] = line(*frames, {})
+    return {name: one for name, one in found.items() if one.entered}

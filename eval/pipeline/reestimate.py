@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, locked, staged, write_input
+from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest, LogRow
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.files.whole_file import sha256_of
-from crosscue.replay.log import Log, Selection
-from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
+from crosscue.replay.log import Log
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .drive_time import OnTime, unwatched_time
-from .estimate import Outcome, begin_again, detected_part, estimate_into
+from .estimate import Outcome, begin_again, estimate_into
 from .run_input import settings_changed
 from .run_logs import reopened
-
-
-def selection_used(manifest: Mapping[str, Any]) -> Selection:
-    """The part of the logs that a run was made of."""
-    said = manifest["selection"]
-    topics = said.get("topics")
-    return Selection(
-        None if topics is None else frozenset(topics), said["start_ns"], said["end_ns"]
-    )
 
 
 def estimate_run(
@@ -48,8 +38,8 @@ def estimate_run(
         VehicleError: The settings do not fit the logs.
         UsageError: They split the drive otherwise than detections are labelled.
     """
-    manifest = run.manifest()
-    if manifest.get("landmarks"):
+    manifest = run.drive_manifest()
+    if isinstance(manifest, EstimateManifest) and manifest.landmarks is not None:
         raise RunError(
             f"{run.path}: landmarks are looked for in pictures, which estimate does not open; run "
             "crosscue replay --landmarks again"
@@ -57,32 +47,31 @@ def estimate_run(
     if vehicle is not None:
         _refuse_other_time(run, manifest, vehicle)
     with ExitStack() as stack:
-        logs = [stack.enter_context(_reopened(run, said)) for said in manifest["logs"]]
+        logs = [stack.enter_context(_reopened(run, said)) for said in manifest.logs]
         stack.enter_context(locked(run))
-        settings = vehicle or of_manifest(manifest["settings"])
+        settings = vehicle or manifest.settings
         changed = None if vehicle is None else settings_changed(run, vehicle)
-        new = stack.enter_context(staged(run, keep=True, until=detected_part(manifest)))
+        new = stack.enter_context(staged(run, keep=True, until=manifest.detected))
         if changed is not None:
             # In this order a run cut short between them does not pass for a whole one.
-            begin_again(new, detected_part(manifest))
+            begin_again(new, manifest.detected)
             write_input(new, changed)
         outcome = estimate_into(
             logs,
             settings,
             new,
-            selection_used(manifest),
+            manifest.selection.selection,
             on_time,
-            earlier=detected_part(manifest),
-            told=manifest["logs"],
+            earlier=manifest.detected,
+            told=manifest.logs,
         )
     return replace(outcome, run=run)
 
 
-def _refuse_other_time(run: RunFolder, manifest: Mapping[str, Any], vehicle: Vehicle) -> None:
+def _refuse_other_time(run: RunFolder, manifest: DriveManifest, vehicle: Vehicle) -> None:
     """Frames and detections carry segments by the ``[time]`` they were detected with."""
-    found = detected_part(manifest)
-    wanted = vehicle.time.model_dump(mode="json")
-    there = wanted if found is None else found["settings"]["time"]
+    wanted = vehicle.time.model_dump()
+    there = wanted if manifest.detected is None else manifest.detected.settings.time.model_dump()
     for name, value in wanted.items():
         if there[name] != value:
             raise UsageError(
@@ -91,9 +80,9 @@ def _refuse_other_time(run: RunFolder, manifest: Mapping[str, Any], vehicle: Veh
             )
 
 
-def _reopened(run: RunFolder, said: Mapping[str, Any]) -> Log:
+def _reopened(run: RunFolder, said: LogRow) -> Log:
     log = reopened(run, said)
-    if said["sha256"] and not _is_older(log.path, run) and sha256_of(log.path) != said["sha256"]:
+    if said.sha256 and not _is_older(log.path, run) and sha256_of(log.path) != said.sha256:
         log.close()
         raise RunError(f"{run.path}: its log {log.path} has changed since; replay again")
     return log

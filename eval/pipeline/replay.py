@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from crosscue.detectors.registry import Choice, make
 from crosscue.eval.runs.folder import RunFolder, clear, locked, staged
+from crosscue.eval.runs.manifest import DetectManifest, part_of
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import RunError
@@ -17,11 +18,10 @@ from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .accounts import selection_told
 from .detect import DetectOutcome, OnFrames, detect_into, unwatched
 from .drive_time import OnTime, drive_timeline, unwatched_time
 from .empty_result import nothing_left
-from .estimate import Outcome, detected_part, estimate_into
+from .estimate import Outcome, estimate_into
 from .run_input import input_of, refuse_another
 from .run_logs import log_rows
 
@@ -150,30 +150,30 @@ def _kept(
     run: RunFolder,
     selection: Selection,
     detecting: Detecting,
-) -> Mapping[str, Any] | None:
+) -> DetectManifest | None:
     """The detect stage of an earlier start, where its tables are what it would give again."""
     try:
-        earlier = detected_part(run.manifest())
+        earlier = run.drive_manifest().detected
     except RunError:
         return None
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
     camera = camera_of(topics, vehicle)
     if earlier is None or camera is None or not all(run.file(name).exists() for name in TABLES):
         return None
-    wanted = {
-        "logs": log_rows(logs, run),
-        "selection": selection_told(selection),
-        "camera": camera[1].name,
-        "identities": [make(choice).identity for choice in detecting.choices],
-        "depth_bits": vehicle.camera.depth_bits,
-        "time": vehicle.time.model_dump(mode="json"),
-    }
-    there = {
-        "logs": earlier["logs"],
-        "selection": earlier["selection"],
-        "camera": earlier["camera"],
-        "identities": [detector["identity"] for detector in earlier["detectors"]],
-        "depth_bits": earlier["settings"]["camera"]["depth_bits"],
-        "time": earlier["settings"]["time"],
-    }
+    wanted = (
+        log_rows(logs, run),
+        part_of(selection),
+        camera[1].name,
+        [make(choice).identity for choice in detecting.choices],
+        vehicle.camera.depth_bits,
+        vehicle.time,
+    )
+    there = (
+        earlier.logs,
+        earlier.selection,
+        earlier.camera,
+        [detector.identity for detector in earlier.detectors],
+        earlier.settings.camera.depth_bits,
+        earlier.settings.time,
+    )
     return earlier if wanted == there else None

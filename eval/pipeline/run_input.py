@@ -13,6 +13,7 @@ from typing import Any
 
 from crosscue.detectors.registry import Choice
 from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, RunFolder
+from crosscue.eval.runs.manifest import part_of
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.identity import (
     Identity,
@@ -26,7 +27,7 @@ from crosscue.replay.log import Log, Selection
 from crosscue.replay.remote.logs import version_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .accounts import selection_told, versions
+from .accounts import versions
 
 
 def input_of(
@@ -49,7 +50,7 @@ def input_of(
     """
     settings = {
         "vehicle": vehicle.model_dump(mode="json"),
-        "selection": selection_told(selection),
+        "selection": part_of(selection).as_json(),
         "detectors": [asdict(choice) for choice in choices],
         "draw": draw,
         "landmarks": None if landmarks is None else str(landmarks.resolve()),

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import LogRow
 from crosscue.replay.errors import CrosscueError, RunError
-from crosscue.replay.files.identity import as_row, identity_of, identity_of_log, of_row
+from crosscue.replay.files.identity import identity_of, identity_of_log
 from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.log import Log
 from crosscue.replay.opening import open_log
@@ -43,22 +44,22 @@ def place_name(place: Path | str) -> str:
     return Path(place).name or Path(place).resolve().name
 
 
-def log_rows(logs: Sequence[Log], run: RunFolder) -> list[dict[str, object]]:
+def log_rows(logs: Sequence[Log], run: RunFolder) -> tuple[LogRow, ...]:
     """Name, place, format, identity, cameras and hashes of every log, for the manifest.
 
     A log that is read by ranges is known by its identity alone: a hash would fetch all of it.
     """
-    return [
-        {
-            "name": name,
-            "path": place if isinstance(place := origin(log), str) else relative(place, run),
-            "format": log.format,
-            "identity": as_row(identity_of_log(log)),
-            "cameras": sorted(one.name for one in log.topics if role_of(one) is Role.CAMERA),
-            "sha256": {} if isinstance(log, RangedLog) else sha256_of(log.path),
-        }
+    return tuple(
+        LogRow(
+            name=name,
+            path=place if isinstance(place := origin(log), str) else relative(place, run),
+            format=log.format,
+            identity=identity_of_log(log),
+            cameras=tuple(sorted(o.name for o in log.topics if role_of(o) is Role.CAMERA)),
+            sha256={} if isinstance(log, RangedLog) else sha256_of(log.path),
+        )
         for name, log in zip(log_names(logs), logs, strict=True)
-    ]
+    )
 
 
 def relative(place: Path, run: RunFolder) -> str:
@@ -67,7 +68,7 @@ def relative(place: Path, run: RunFolder) -> str:
     return os.path.relpath(whole.parent.resolve() / whole.name, (run.home or run.path).resolve())
 
 
-def place_of(run: RunFolder, said: Mapping[str, Any]) -> Path | str:
+def place_of(run: RunFolder, said: LogRow) -> Path | str:
     """Where a log of a run lies now: a URL, or a path whose content is what the run was made of.
 
     Args:
@@ -77,8 +78,7 @@ def place_of(run: RunFolder, said: Mapping[str, Any]) -> Path | str:
     Raises:
         RunError: It is gone, or another log lies there.
     """
-    where = str(said["path"])
-    wanted = of_row(said["identity"])
+    where, wanted = said.path, said.identity
     if is_remote(where):
         places: list[Path | str] = [where]
     elif run.logs is None:
@@ -118,7 +118,7 @@ def _moved(folder: Path, where: Path) -> Iterator[Path]:
             yield Path(place, where.name)
 
 
-def reopened(run: RunFolder, said: Mapping[str, Any]) -> Log:
+def reopened(run: RunFolder, said: LogRow) -> Log:
     """A log of a run, open.
 
     Raises:

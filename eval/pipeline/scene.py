@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.fusion.approaches import Approaches, FrameEvidence, PastCues, SignRange, Step
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
@@ -87,7 +88,7 @@ def nothing_past(_t_ns: int) -> PastCues | None:
 def estimate_scene(
     run: RunFolder,
     vehicle: Vehicle,
-    detected: Mapping[str, Any],
+    detected: DetectManifest,
     sink: Sink,
     past: Callable[[int], PastCues | None] = nothing_past,
     without: frozenset[str] = frozenset(),
@@ -120,8 +121,8 @@ def estimate_scene(
         _Rows(sink, features_of(vehicle)),
     )
     restarts = _Restarts(vehicle, timeline)
-    fresh_regions = detected["settings"]["regions"] != vehicle.model_dump(mode="json")["regions"]
-    for frame in stored_frames(run, detected["detectors"], with_road_masks=fresh_regions):
+    fresh_regions = detected.settings.regions != vehicle.regions
+    for frame in stored_frames(run, detected.detectors, with_road_masks=fresh_regions):
         fresh_ns = restarts.before(frame.seen.t_ns)
         if fresh_ns is not None:
             scene.restart(fresh_ns)

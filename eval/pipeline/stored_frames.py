@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -13,6 +13,7 @@ from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.cues.frame import Role, Seen
 from crosscue.detectors.cues.road import RoadShares
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.replay.columns import Floats
 
 NO_BOXES: Final = np.empty((0, 4))
@@ -71,7 +72,7 @@ MASK: Final = ("mask", "mask_width_px", "mask_height_px")
 
 
 def stored_frames(
-    run: RunFolder, detectors: Sequence[Mapping[str, Any]], *, with_road_masks: bool = False
+    run: RunFolder, detectors: Sequence[DetectorRow], *, with_road_masks: bool = False
 ) -> Iterator[StoredFrame]:
     """All frames of a run in the order they were looked at; memory holds one batch of rows.
 
@@ -83,9 +84,9 @@ def stored_frames(
     Raises:
         RunError: A table is missing or damaged.
     """
-    objects = [d["name"] for d in detectors if d["role"] == Role.OBJECTS]
-    signs = [d["name"] for d in detectors if d["role"] == Role.SIGNS]
-    has_road = any(d["role"] == Role.ROAD for d in detectors)
+    objects = [d.name for d in detectors if d.role == Role.OBJECTS]
+    signs = [d.name for d in detectors if d.role == Role.SIGNS]
+    has_road = any(d.role == Role.ROAD for d in detectors)
     found = _Rows(run.batches("detections", ["frame", *FOUND]), FOUND)
     columns = MASK if with_road_masks else SHARES
     road = _Rows(run.batches("road", ["frame", *columns]), columns)

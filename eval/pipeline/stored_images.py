@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from crosscue.detectors.images import Encoded, encoded
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.columns import Block, Images, Topic
 from crosscue.replay.ledger import Ledger
@@ -23,7 +24,6 @@ from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.time.segments import UNSHIFTED, LogClock, TimedLog
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .drive_time import timeline_in
 from .run_logs import place_of
 
 AROUND_NS: Final = 2_000_000_000
@@ -60,15 +60,13 @@ def camera_of(run: RunFolder) -> StoredCamera | None:
     """
     if run.without_images:
         return None
-    manifest = run.manifest()
-    detected = manifest if manifest.get("stage") == "detect" else manifest.get("detect")
-    named = None if detected is None else detected["camera"]
-    if detected is None:
-        named = manifest["settings"].get("topics", {}).get("camera")
+    manifest = run.drive_manifest()
+    detected = manifest.detected
+    named = manifest.settings.topics.camera if detected is None else detected.camera
     cameras = [
         (number, entry, name)
-        for number, entry in enumerate(manifest["logs"])
-        for name in entry["cameras"]
+        for number, entry in enumerate(manifest.logs)
+        for name in entry.cameras
         if named in (None, name)
     ]
     if len(cameras) != 1:
@@ -77,16 +75,16 @@ def camera_of(run: RunFolder) -> StoredCamera | None:
     place = place_of(run, entry)
     with open_log(place, run.limits) as log:
         topic = next(one for one in log.topics if one.name == name)
-    part = manifest.get("selection", {})
-    selection = Selection(frozenset({topic.name}), part.get("start_ns"), part.get("end_ns"))
-    clock = timeline_in(manifest).clock(number)
+    part = manifest.selection
+    selection = Selection(frozenset({topic.name}), part.start_ns, part.end_ns)
+    clock = manifest.timeline.clock(number)
     return StoredCamera(place, topic, _clock(detected, topic.name), selection, clock, run.limits)
 
 
-def _clock(detected: Mapping[str, Any] | None, topic: str) -> Clock:
-    for told in [] if detected is None else detected["clocks"]:
-        if topic in told:
-            return Clock(told[topic]["used"])
+def _clock(detected: DetectManifest | None, topic: str) -> Clock:
+    for rows in () if detected is None else detected.clocks:
+        if topic in rows:
+            return rows[topic].used
     return Clock.LOG
 
 

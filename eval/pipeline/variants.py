@@ -6,10 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.errors import RunError
-from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
+from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .drive_time import timeline_in
-from .estimate import detected_part
 from .labelled import with_labels
 from .mobileye_tables import StoredMobileye
 from .scene import estimate_scene, features_of, schemas
@@ -33,11 +31,11 @@ def scene_tables(
     """
     import pyarrow as pa
 
-    manifest = run.manifest()
-    detected = detected_part(manifest)
+    manifest = run.drive_manifest()
+    detected = manifest.detected
     if detected is None:
         raise RunError(f"{run.path}: no detector has looked at its camera; replay with detectors")
-    settings = of_manifest(manifest["settings"]) if vehicle is None else vehicle
+    settings = manifest.settings if vehicle is None else vehicle
     wanted = schemas(features_of(settings))
     parts: dict[str, list[pa.Table]] = {
         name: [schema.empty_table()] for name, schema in wanted.items()
@@ -46,7 +44,7 @@ def scene_tables(
     def keep(name: str, rows: dict[str, list[Any]]) -> None:
         parts[name].append(pa.table(rows, schema=wanted[name]))
 
-    timeline = timeline_in(manifest)
+    timeline = manifest.timeline
     past = StoredMobileye(run, settings.past)
     estimate_scene(
         run,
@@ -58,7 +56,7 @@ def scene_tables(
         timeline=timeline,
         on_restart=past.forget_before,
     )
-    clock = timeline.clock(detected["camera_log"])
+    clock = timeline.clock(detected.camera_log)
     return {
         name: with_labels(pa.concat_tables(some), timeline, clock) for name, some in parts.items()
     }

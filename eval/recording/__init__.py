@@ -8,17 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from crosscue.eval.pipeline.stored_images import StoredCamera, camera_of
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import DriveManifest
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.columns import Floats
 from crosscue.replay.files.whole_file import write_whole
-from crosscue.replay.vehicle.vehicle import of_manifest
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -83,8 +83,8 @@ def _log_all(
     from .notes import notes
     from .scene_rows import scene_rows
 
-    manifest = run.manifest()
-    vehicle = of_manifest(manifest["settings"])
+    manifest = run.drive_manifest()
+    vehicle = manifest.settings
     scene = scene_rows(run)
     more: list[str] = []
     if pose is not None:
@@ -108,19 +108,18 @@ def _log_all(
 
 
 def _log_marks(
-    recording: rr.RecordingStream, time: DriveTime, run: RunFolder, manifest: Mapping[str, Any]
+    recording: rr.RecordingStream, time: DriveTime, run: RunFolder, manifest: DriveManifest
 ) -> None:
-    from crosscue.eval.pipeline.estimate import detected_part
     from crosscue.eval.pipeline.stored_frames import stored_frames
 
     from .marks import FRAMES_HELD, Marks, log_styles
 
-    detected = detected_part(manifest)
+    detected = manifest.detected
     if detected is None:
         return
     log_styles(recording)
-    marks = Marks(of_manifest(manifest["settings"]))
-    frames = stored_frames(run, detected["detectors"], with_road_masks=True)
+    marks = Marks(manifest.settings)
+    frames = stored_frames(run, detected.detectors, with_road_masks=True)
     for number, frame in enumerate(frames):
         marks.add(frame)
         if number % FRAMES_HELD == FRAMES_HELD - 1:

@@ -23,10 +23,10 @@ COLOURS: Final = (
 
 def notes(run: RunFolder, more: Sequence[str]) -> rr.TextDocument:
     """What a person should know before looking."""
-    manifest = run.manifest()
-    logs = [f"- {inert(log['name'])}" for log in manifest["logs"]]
-    notices = [f"- {inert(sentence)}" for sentence in (*manifest["notices"], *more)]
-    dropped = sum(not account["is_whole"] for account in manifest["account"]["reading"])
+    manifest = run.drive_manifest()
+    logs = [f"- {inert(log.name)}" for log in manifest.logs]
+    notices = [f"- {inert(sentence)}" for sentence in (*manifest.notices, *more)]
+    dropped = sum(not log.is_whole for log in manifest.account.reading)
     whole = (
         "nothing is known to be dropped"
         if not dropped

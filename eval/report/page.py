@@ -14,8 +14,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.eval.pipeline.drive_time import timeline_in
 from crosscue.eval.pipeline.log_time import gaps_of
+from crosscue.eval.runs.manifest import DriveManifest
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.files.tree_text import strict_json
@@ -48,7 +48,7 @@ YEAR_2000_NS: Final = 946_684_800_000_000_000
 @dataclass(frozen=True, slots=True)
 class _Run:
     name: str
-    manifest: Mapping[str, Any]
+    manifest: DriveManifest
     clocks: str
     settings: str
     versions: str
@@ -120,7 +120,7 @@ def _content(scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> dict[st
     cues = [_cue(name, one) for name, one in metrics["cues"].items()]
     pose = metrics["pose"]
     is_alone = len(scored) == 1
-    accounts = [account for run in runs for account in run.manifest["account"]["reading"]]
+    accounts = [account for run in runs for account in run.manifest.account.reading]
     return {
         "title": runs[0].name if is_alone else f"{len(runs)} drives",
         "runs": runs,
@@ -128,7 +128,7 @@ def _content(scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> dict[st
         "simulated": sum("simulated" in source.lower() for source in sources),
         "failed": metrics["coverage"].get("failed", {}),
         "same_log": metrics["coverage"].get("same_log", ()),
-        "dropped": sum(not account["is_whole"] for account in accounts),
+        "dropped": sum(not account.is_whole for account in accounts),
         "coverage": metrics["coverage"],
         "scoring": metrics["account"]["scoring"],
         "settings": metrics["settings"],
@@ -146,13 +146,14 @@ def _content(scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> dict[st
 
 
 def _run(one: RunScored) -> _Run:
-    manifest = one.run.manifest()
+    manifest = one.run.drive_manifest()
+    told = manifest.as_json()
     return _Run(
         name=_name(one),
         manifest=manifest,
-        clocks=strict_json(manifest["clocks"]),
-        settings=strict_json(manifest["settings"]),
-        versions=strict_json({"versions": manifest["versions"], "logs": manifest["logs"]}),
+        clocks=strict_json(told["clocks"]),
+        settings=strict_json(told["settings"]),
+        versions=strict_json({"versions": told["versions"], "logs": told["logs"]}),
     )
 
 
@@ -203,7 +204,7 @@ def _figures(scored: Sequence[RunScored], scores: Scores) -> _Figures:
         if one.judged.approaches is not None
         for curve in one.judged.approaches.curves
     ]
-    gaps = {one.judged.coverage.drive: gaps_of(timeline_in(one.run.manifest())) for one in scored}
+    gaps = {one.judged.coverage.drive: gaps_of(one.run.drive_manifest().timeline) for one in scored}
     ranges = [part for one in scored for part in one.judged.ranges]
     tracks = sum(len(set(part.approach.tolist())) for part in ranges)
     results = [] if scores.approaches is None else scores.approaches.results

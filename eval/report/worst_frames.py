@@ -21,7 +21,7 @@ from crosscue.eval.scoring.cues import CueJudged
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.cue_table import CUES
-from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .scene_figures import is_wrong
 
@@ -88,7 +88,7 @@ def _wrong(scored: RunScored) -> list[WorstFrame]:
     mistakes = [(cue, row) for cue in scored.judged.cues for row in _mistakes(cue)]
     if not mistakes:
         return []
-    vehicle = of_manifest(scored.run.manifest()["settings"])
+    vehicle = scored.run.drive_manifest().settings
     times = {int(cue.t_ns[i]) for cue, rows in mistakes for i in rows}
     scores = _scores(scored.run, times)
     found = []
@@ -143,7 +143,7 @@ def _scores(run: RunFolder, times: set[int]) -> dict[int, list[dict[str, Any]]]:
 
 
 def _with_picture(one: WorstFrame, run: RunFolder) -> WorstFrame:
-    labels = _labels(one.cue, of_manifest(run.manifest()["settings"]))
+    labels = _labels(one.cue, run.drive_manifest().settings)
     rows = [row for row in _scores(run, {one.t_ns}).get(one.t_ns, []) if row["label"] in labels]
     try:
         camera = camera_of(run)

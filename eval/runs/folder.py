@@ -13,15 +13,25 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from crosscue.replay.errors import RunError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.parquet import opened
 from crosscue.replay.files.partial_file import is_partial, is_still, lock, sweep
-from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import cannot_write, write_text
 from crosscue.replay.limits import DEFAULT, Limits
+
+from .manifest import (
+    FORMAT_VERSION,
+    DecodeManifest,
+    DriveManifest,
+    Manifest,
+    MergedManifest,
+    OtherVersionError,
+    parse_manifest,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -30,9 +40,6 @@ MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
 INPUT: Final = "input.json"
 """What a run is made of, written before anything else: a run cut short has no manifest."""
-MERGED: Final = "merged"
-"""The ``stage`` of a run that many drives were merged into."""
-FORMAT_VERSION: Final = 2
 MAX_MANIFEST_BYTES: Final = 256 << 20
 STAGED: Final = ".new"
 """Folder inside a run that holds what is to replace it, until that is whole."""
@@ -60,7 +67,7 @@ class RunFolder:
         """Path of one of its files."""
         return self.path / name
 
-    def manifest(self) -> dict[str, Any]:
+    def manifest(self) -> Manifest:
         """The manifest as read.
 
         Raises:
@@ -71,20 +78,31 @@ class RunFolder:
             content = read_at_most(path, MAX_MANIFEST_BYTES)
             if content is None:
                 raise ValueError(f"over {MAX_MANIFEST_BYTES >> 20} MiB")
-            found = json_tree(content)
+            return parse_manifest(content)
         except FileNotFoundError:
             raise RunError(
                 f"{self.path}: no {MANIFEST}: not a run folder, or its run was cut short; "
                 "run crosscue replay again"
             ) from None
+        except OtherVersionError as error:
+            raise RunError(f"{path}: {error}: replay again") from None
         except (OSError, ValueError) as error:
             raise RunError(f"{path}: unreadable ({error}); run crosscue replay again") from None
-        version = found.get("format_version") if isinstance(found, dict) else None
-        if version != FORMAT_VERSION:
+
+    def drive_manifest(self) -> DriveManifest:
+        """The manifest of a run of one drive.
+
+        Raises:
+            RunError: It holds many drives, or tables of ``crosscue decode``; else as ``manifest``.
+        """
+        found = self.manifest()
+        if isinstance(found, MergedManifest):
             raise RunError(
-                f"{path}: format {version!r}, this crosscue reads {FORMAT_VERSION}: replay again"
+                f"{self.path}: holds the tables of many drives; give one of the runs beside it"
             )
-        return dict(found)
+        if isinstance(found, DecodeManifest):
+            raise RunError(f"{self.path}: holds tables of crosscue decode; give a run of replay")
+        return found
 
     def table(self, name: str, columns: list[str] | None = None) -> pa.Table:
         """Rows of ``NAME.parquet``, its page checksums verified.
@@ -198,7 +216,7 @@ def clear(run: RunFolder, content: Mapping[str, object] | None = None) -> None:
 
 @contextmanager
 def staged(
-    run: RunFolder, *, keep: bool = False, until: Mapping[str, object] | None = None
+    run: RunFolder, *, keep: bool = False, until: Manifest | None = None
 ) -> Iterator[RunFolder]:
     """A place to write what replaces a finished run; that is touched only once this is whole.
 
@@ -245,7 +263,7 @@ def _link_files(run: RunFolder, new: RunFolder) -> None:
             shutil.copy2(entry, new.file(entry.name))
 
 
-def _swap(run: RunFolder, new: RunFolder, keep: bool, until: Mapping[str, object] | None) -> None:
+def _swap(run: RunFolder, new: RunFolder, keep: bool, until: Manifest | None) -> None:
     """Put the new files in place of the old ones; the manifest goes first and comes last."""
     if until is None:
         run.file(MANIFEST).unlink()
@@ -380,10 +398,9 @@ def _started(pid: int) -> str:
     return f"{boot} {ticks}"
 
 
-def write_manifest(run: RunFolder, content: Mapping[str, object]) -> None:
+def write_manifest(run: RunFolder, content: Manifest) -> None:
     """Write the manifest, last of all: a folder that has one is a finished run."""
-    whole = {"format_version": FORMAT_VERSION, **content}
-    write_text(run.file(MANIFEST), strict_json(whole) + "\n")
+    write_text(run.file(MANIFEST), strict_json(content.as_json()) + "\n")
 
 
 def write_input(run: RunFolder, content: Mapping[str, object]) -> None:

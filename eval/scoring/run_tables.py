@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.pipeline.drive_time import timeline_in
 from crosscue.eval.pipeline.log_time import LABELS, table_in_log_time
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Floats, Int64s
@@ -107,7 +106,7 @@ def tables_of(run: RunFolder) -> RunTables:
     Raises:
         RunError: A table is damaged or has other columns.
     """
-    timeline = timeline_in(run.manifest())
+    timeline = run.drive_manifest().timeline
     found = {name: run.table(name) for name in NAMES if run.file(f"{name}.parquet").exists()}
     return in_log_time(str(run.path), found, timeline)
 

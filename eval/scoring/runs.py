@@ -13,9 +13,17 @@ import numpy as np
 
 from crosscue.datasets.truth.truth import FILE, Truth
 from crosscue.eval.pipeline.log_time import AMBIGUOUS
-from crosscue.eval.pipeline.run_account import Account, Line, check, line, summed
 from crosscue.eval.pipeline.run_logs import place_of
-from crosscue.eval.runs.folder import MERGED, RunFolder
+from crosscue.eval.runs.account import (
+    Line,
+    ScoredAccount,
+    SummedAccount,
+    check,
+    line,
+    summed,
+)
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import LogRow
 from crosscue.replay.errors import RunError, SchemaError, UsageError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text, write_whole
@@ -74,8 +82,8 @@ def find_truth(run: RunFolder, given: Path | None) -> Path:
     if given is not None:
         return given
     looked: list[str] = []
-    for log in run.manifest().get("logs", []):
-        if is_remote(log["path"]):
+    for log in run.drive_manifest().logs:
+        if is_remote(log.path):
             continue
         path = _place(run, log)
         for folder in (path, path.parent):
@@ -85,12 +93,12 @@ def find_truth(run: RunFolder, given: Path | None) -> Path:
     raise UsageError(f"{run.path}: no {FILE} beside its logs ({', '.join(looked)}); give --truth")
 
 
-def _place(run: RunFolder, log: Mapping[str, Any]) -> Path:
+def _place(run: RunFolder, log: LogRow) -> Path:
     """Where a log lies or lay; its truth may still be there."""
     try:
         return Path(place_of(run, log))
     except RunError:
-        return Path(os.path.normpath(run.path.resolve() / log["path"]))
+        return Path(os.path.normpath(run.path.resolve() / log.path))
 
 
 def judge_run(
@@ -114,10 +122,7 @@ def judge_run(
         RunError: A table is damaged, or it holds many drives merged.
         SchemaError: The truth does not fit the run, or there is nothing to score.
     """
-    if run.manifest().get("stage") == MERGED:
-        raise RunError(
-            f"{run.path}: many drives merged, whose times are mixed; score their run folders"
-        )
+    run.drive_manifest()
     truth = score_truth.load(truth_path, str(run.path))
     if not any_log:
         _check_log(run, truth.truth, truth_path)
@@ -135,15 +140,15 @@ def judge_run(
 
 def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
     told = set(truth.log_sha256.values())
-    logs = run.manifest().get("logs", [])
-    found = {digest for log in logs for digest in log.get("sha256", {}).values()}
+    logs = run.drive_manifest().logs
+    found = {digest for log in logs for digest in log.sha256.values()}
     if told and logs and not found:
         raise SchemaError(
             f"{path}: names its log by hash, and the run read its log by ranges: no hash; "
             "replay the whole log, or give --any-log if both are the same drive"
         )
     if told and not told & found:
-        names = ", ".join(log["name"] for log in logs)
+        names = ", ".join(log.name for log in logs)
         raise SchemaError(
             f"{path}: by its hash it belongs to another {truth.log or 'log'}, not to {names}; "
             "give the truth of that log, or --any-log for the same drive in another file"
@@ -155,9 +160,9 @@ def _check_times(run: RunFolder, truth: Truth, tables: RunTables, path: Path) ->
 
     A truth that shares no moment with the run at all is refused by ``judge``.
     """
-    selection = run.manifest().get("selection") or {}
+    selection = run.drive_manifest().selection
     span = tables.span_ns()
-    is_whole = selection.get("start_ns") is None and selection.get("end_ns") is None
+    is_whole = selection.start_ns is None and selection.end_ns is None
     if span is None or not is_whole or truth.start_ns > span[1] or truth.end_ns <= span[0]:
         return
     for one in truth.approaches:
@@ -187,7 +192,7 @@ def metrics_of(scored: Sequence[RunScored], scores: Scores) -> dict[str, Any]:
     A single run's pose is given whole; of several, means over drives and each one by itself.
     """
     tree = as_metrics(scores)
-    tree["account"] = _account_of(scored)
+    tree["account"] = account_of_scores(scored).as_json()
     poses = {str(one.run.path): one.pose for one in scored if one.pose is not None}
     if not poses:
         tree["coverage"]["not_scored"]["pose"] = scored[0].why_no_pose
@@ -201,14 +206,21 @@ def metrics_of(scored: Sequence[RunScored], scores: Scores) -> dict[str, Any]:
     return tree
 
 
-def _account_of(scored: Sequence[RunScored]) -> Account:
+def account_of_scores(scored: Sequence[RunScored]) -> ScoredAccount | SummedAccount:
     """The account of one run, or of all added up, with the scoring as its last stage."""
     if len(scored) == 1:
         (only,) = scored
-        found: Account = only.run.manifest()["account"] | {"scoring": scoring_of(only)}
+        of = only.run.drive_manifest().account
+        found = ScoredAccount(
+            reading=of.reading,
+            detecting=of.detecting,
+            estimating=of.estimating,
+            is_whole=of.is_whole,
+            scoring=scoring_of(only),
+        )
         check(found)
         return found
-    return summed(_account_of([one]) for one in scored)
+    return summed(account_of_scores([one]) for one in scored)
 
 
 def scoring_of(one: RunScored) -> dict[str, Line]:
@@ -242,18 +254,17 @@ def same_logs(scored: Sequence[RunScored]) -> list[tuple[str, str]]:
     pairs: list[tuple[str, str]] = []
     for one in scored:
         name = str(one.run.path)
-        logs = one.run.manifest().get("logs", [])
+        logs = one.run.drive_manifest().logs
         for digest in {digest for log in logs for digest in _digests(log)}:
             if first.setdefault(digest, name) != name:
                 pairs.append((first[digest], name))
     return sorted(set(pairs))
 
 
-def _digests(log: Mapping[str, Any]) -> Iterator[str]:
+def _digests(log: LogRow) -> Iterator[str]:
     """What a log is known by: hashes of its files, and its identity."""
-    yield from log.get("sha256", {}).values()
-    if "identity" in log:
-        yield log["identity"]["digest"]
+    yield from log.sha256.values()
+    yield log.identity.digest
 
 
 def _poses(poses: Mapping[str, PoseScore]) -> dict[str, Any]:

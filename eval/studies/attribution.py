@@ -13,7 +13,6 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
-from crosscue.eval.pipeline.drive_time import timeline_in
 from crosscue.eval.pipeline.variants import scene_tables
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.approaches import ApproachResult
@@ -106,7 +105,7 @@ def estimate_of(run: RunFolder, vehicle: Vehicle | None = None) -> EstimateWitho
     """
 
     def estimate(cues: frozenset[str], /) -> RunTables:
-        timeline = timeline_in(run.manifest())
+        timeline = run.drive_manifest().timeline
         tables = scene_tables(run, vehicle, cues)
         frames = run.table("frames", ["t_ns", "segment", "log_t_ns"])
         return in_log_time(str(run.path), {"frames": frames, **tables}, timeline)

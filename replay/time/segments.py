@@ -14,9 +14,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,13 +157,6 @@ class Timeline:
         """Is there more than one segment?"""
         return len(self.segments) > 1
 
-    def as_dict(self) -> dict[str, Any]:
-        """As plain values, for a manifest."""
-        return {
-            "segments": [asdict(one) | {"cause": one.cause.value} for one in self.segments],
-            "clocks": [asdict(clock) for clock in self.clocks],
-        }
-
 
 ONE_SEGMENT: Final = Timeline()
 
@@ -172,30 +165,6 @@ def shift_of(timeline: Timeline, log: int) -> Callable[[Int64s], Int64s] | None:
     """``shift_at`` of a log's clock, or None where that was never set back."""
     clock = timeline.clock(log)
     return clock.shift_at if len(clock.epochs) > 1 else None
-
-
-def timeline_of(told: Mapping[str, Any] | None) -> Timeline:
-    """The timeline that a manifest keeps."""
-    if told is None:
-        return ONE_SEGMENT
-    return Timeline(
-        tuple(Segment(**(one | {"cause": Cause(one["cause"])})) for one in told["segments"]),
-        tuple(_clock_of(clock) for clock in told["clocks"]),
-    )
-
-
-def _clock_of(told: Mapping[str, Any]) -> LogClock:
-    return LogClock(
-        tuple(Epoch(**epoch) for epoch in told["epochs"]),
-        {
-            name: Marks(
-                tuple(marks["entries"]),
-                tuple(marks["ends_ns"]),
-                tuple((start, stop) for start, stop in marks["strays"]),
-            )
-            for name, marks in told["topics"].items()
-        },
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,6 @@ REP-103: x forward, y left, heading counter-clockwise. Every default is written 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -337,23 +336,6 @@ def parse(text: str, where: str) -> Vehicle:
         return Vehicle.model_validate(tuples(tree))
     except ValidationError as error:
         raise VehicleError(explain(error, text, where, Vehicle)) from None
-
-
-def of_manifest(settings: Mapping[str, Any]) -> Vehicle:
-    """The vehicle settings as a run's manifest keeps them.
-
-    Raises:
-        VehicleError: They are of another version of crosscue.
-    """
-    try:
-        return Vehicle.model_validate(tuples(dict(settings)))
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise VehicleError(
-            f"manifest.json: settings.{place}: {first['msg'].lower()}; the run was made by another "
-            "version of crosscue: replay again"
-        ) from None
 
 
 def tuples(value: Any) -> Any:

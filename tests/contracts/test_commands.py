@@ -55,6 +55,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "study field": ("-o out --settings gone.toml", SETTINGS),
 }
 READS_NOTHING: Final = {
+    "run schema",
     "truth schema",
     "model list",
     "simulate",
@@ -64,7 +65,7 @@ READS_NOTHING: Final = {
     "plugins",
     "completion",
 }
-ALWAYS_JSON: Final = {"truth schema"}
+ALWAYS_JSON: Final = {"run schema", "truth schema"}
 PRINTS_NO_RESULT: Final = {"completion"}
 
 NAMED_BY_COMMAND: Final = {

@@ -127,8 +127,7 @@ def test_a_dummy_cue_is_one_row_and_one_function(
 
     # Scored as its row says, reported with its published precision, drawn in its colour.
     found = {"frames": frame_table(40), "cues": cue_table({"zebra": {5: 1, 6: 0}})}
-    settings = Vehicle(version=1).model_dump(mode="json")
-    run = run_folder(tmp_path / "run", found, settings=settings)
+    run = run_folder(tmp_path / "run", found)
     told = truth([*good_truth().truth.cues, span("zebra", 0, 40, count=1)])
     one = judge_run(run, truth_folder(tmp_path / "drive", told))
     scores = scores_of([one])

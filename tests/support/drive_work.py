@@ -12,10 +12,13 @@ from pathlib import Path
 import pyarrow as pa
 
 from crosscue.eval.batch.jobs import Job
-from crosscue.eval.pipeline.run_account import account, line
+from crosscue.eval.runs.account import LogAccount, account
 from crosscue.eval.runs.folder import clear, create, locked, write_manifest
+from crosscue.eval.runs.manifest import EstimateTimings
 from crosscue.eval.runs.table_sink import TableSink
 from crosscue.replay.errors import LogFormatError
+
+from .manifests import estimated, log_account
 
 SCHEMA = pa.schema([("t_ns", pa.int64()), ("letter", pa.string())])
 
@@ -54,23 +57,18 @@ def letters(job: Job) -> Letters:
             _obey(word, log)
         write_manifest(
             run,
-            {
-                "account": account(
-                    [
-                        {
-                            "log": str(log),
-                            "is_whole": word != "loss",
-                            "topics": {
-                                "letters": line(len(word), len(word) - 1, {"dull": 1}),
-                            },
-                        }
-                    ]
-                ),
-                "timings": {"seconds": time.monotonic()},
-            },
+            estimated(
+                account=account([_account(log, word)]),
+                timings=EstimateTimings(seconds=time.monotonic(), detect_seconds=0.0),
+            ),
         )
     status = 3 if word == "loss" else 0
     return Letters(len(word), status, os.getpid(), os.environ.get("OMP_NUM_THREADS", ""))
+
+
+def _account(log: Path, word: str) -> LogAccount:
+    found = log_account(str(log), "letters", used=len(word) - 1, skipped={"dull": 1})
+    return found.model_copy(update={"is_whole": word != "loss"})
 
 
 def _obey(word: str, log: Path) -> None:

@@ -17,6 +17,7 @@ from crosscue.fusion.factor_graph import graph_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .fusion import NONE_SEEN, SECOND_NS, sign
+from .manifests import estimated
 
 FRAME_NS = SECOND_NS // 10
 
@@ -65,7 +66,7 @@ def write_run(
                 "distance_var_m2": [one.travelled_var_m2 for one in taken],
             }
         )
-    write_manifest(run, {"settings": vehicle.model_dump(mode="json")})
+    write_manifest(run, estimated(settings=vehicle))
     return run
 
 

@@ -13,14 +13,16 @@ from crosscue.detectors import rle
 from crosscue.eval.pipeline.detect import schemas
 from crosscue.eval.pipeline.labelled import with_labels
 from crosscue.eval.pipeline.pose_tables import pose_schema
-from crosscue.eval.pipeline.run_account import line
+from crosscue.eval.runs.account import account, line
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import ClockRow
+from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.time.segments import ONE_SEGMENT, UNSHIFTED
-from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.write.convert import LogWriter
 
+from .manifests import detected, log_account
 from .scoring import (
     BELIEF,
     CUES,
@@ -37,21 +39,6 @@ FRAMES: Final = 50
 SIZE: Final = (160, 90)
 LABEL: Final = "<img src=x onerror=alert(1)>"
 TOPIC: Final = "/camera/[red]<script>alert(1)</script>"
-ACCOUNT: Final[dict[str, Any]] = {
-    "log": "drive.mcap",
-    "integrity": "not checkable",
-    "is_whole": False,
-    "notices": [],
-    "topics": {
-        TOPIC: {
-            "in": FRAMES,
-            "used": FRAMES - 1,
-            "skipped": {},
-            "dropped": {"<b>cut</b>": 1},
-            "dropped_unknown": [],
-        }
-    },
-}
 
 
 def write_pictures(path: Path, frames: int = FRAMES) -> int:
@@ -157,12 +144,8 @@ def scene_run(folder: Path, *, without: frozenset[str] = frozenset()) -> RunFold
         "belief": belief_table(BELIEF),
         "range": range_table(8, 45, 0.5),
     }
-    detect = {
-        "camera": TOPIC,
-        "clocks": [{TOPIC: {"used": "log time"}}],
-        "notices": [],
-        "detectors": [{"name": "finder", "role": "objects"}, {"name": "network", "role": "road"}],
-    }
+    clock = ClockRow(used=Clock.LOG, why="", rows=FRAMES, rate_hz=None)
+    detect = detected(TOPIC, {"finder": "objects", "network": "road"}, clocks=({TOPIC: clock},))
     return run_folder(
         folder / "run",
         {
@@ -170,16 +153,11 @@ def scene_run(folder: Path, *, without: frozenset[str] = frozenset()) -> RunFold
             for name, table in tables.items()
             if name not in without
         },
-        stage="estimate",
         detect=detect,
-        account={
-            "reading": [ACCOUNT],
-            "is_whole": False,
-            "estimating": {},
-            "detecting": {TOPIC: line(FRAMES, FRAMES - 1, {}, {"<b>not decoded</b>": 1})},
-        },
-        settings=Vehicle(version=1).model_dump(mode="json"),
-        logs=[log_row(folder / "drive.mcap", RunFolder(folder / "run"), "00", TOPIC)],
-        selection={"start_ns": None, "end_ns": None, "topics": None},
-        notices=["[here](http://example.org) ![x](http://example.org/x.png) </td><script>"],
+        account=account(
+            [log_account("drive.mcap", TOPIC, used=FRAMES - 1, dropped={"<b>cut</b>": 1})],
+            {TOPIC: line(FRAMES, FRAMES - 1, {}, {"<b>not decoded</b>": 1})},
+        ),
+        logs=(log_row(folder / "drive.mcap", RunFolder(folder / "run"), "00", TOPIC),),
+        notices=("[here](http://example.org) ![x](http://example.org/x.png) </td><script>",),
     )

@@ -11,13 +11,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
-from crosscue.eval.pipeline.run_account import account
 from crosscue.eval.pipeline.run_logs import relative
 from crosscue.eval.runs.folder import RunFolder, create, write_manifest
+from crosscue.eval.runs.manifest import LogRow
 from crosscue.eval.scoring.run_tables import RunTables, run_tables
 from crosscue.eval.scoring.truth import DriveTruth, TrueRanges
-from crosscue.replay.files.identity import Identity, as_row, identity_of
+from crosscue.replay.files.identity import Identity, identity_of
 from crosscue.replay.files.whole_file import write_text
+
+from .manifests import estimated
 
 STEP_NS: Final = 100_000_000
 ENTER: Final = 40
@@ -195,17 +197,17 @@ def good_truth(drive: str = "made up") -> DriveTruth:
     )
 
 
-def log_row(log: Path, run: RunFolder, sha256: str = "00", *cameras: str) -> dict[str, Any]:
+def log_row(log: Path, run: RunFolder, sha256: str = "00", *cameras: str) -> LogRow:
     """A log as a manifest tells of it; of one that is not there, with a made-up identity."""
     found = identity_of(log) if log.exists() else Identity(log.name, 0, "0" * 64)
-    return {
-        "name": log.name,
-        "path": relative(log, run),
-        "format": "mcap",
-        "cameras": list(cameras),
-        "identity": as_row(found),
-        "sha256": {log.name: sha256},
-    }
+    return LogRow(
+        name=log.name,
+        path=relative(log, run),
+        format="mcap",
+        cameras=cameras,
+        identity=found,
+        sha256={log.name: sha256},
+    )
 
 
 def run_folder(
@@ -222,18 +224,8 @@ def run_folder(
         }
     for name, table in found.items():
         pq.write_table(table, run.file(f"{name}.parquet"), write_page_checksum=True)
-    content: dict[str, Any] = {
-        "stage": "replay",
-        "versions": {"crosscue": "0"},
-        "settings": {},
-        "notices": [],
-        "logs": [log_row(path.parent / "drive.mcap", run)],
-        "account": account([]),
-        "clocks": [],
-        "counts": {},
-        "timings": {"seconds": 1.0},
-    }
-    write_manifest(run, content | manifest)
+    logs = (log_row(path.parent / "drive.mcap", run),)
+    write_manifest(run, estimated(**{"logs": logs, **manifest}))
     return run
 
 

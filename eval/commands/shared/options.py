@@ -11,6 +11,7 @@ from pathlib import Path
 
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.log_part import first_ns, named_topics
@@ -175,3 +176,22 @@ def _time_ns(flag: str, text: str | None, logs: Sequence[Log]) -> int | None:
 def print_json(value: object) -> None:
     """Strict JSON on stdout: sorted keys, NaN and infinities as null."""
     print(strict_json(value))
+
+
+def add_schema_output(parser: argparse.ArgumentParser) -> None:
+    """``-o`` and ``--overwrite`` of commands that print a JSON Schema."""
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: print it")
+    parser.add_argument("--overwrite", action="store_true", help="replace the output")
+
+
+def print_schema(schema: object, args: argparse.Namespace) -> None:
+    """A JSON Schema to stdout, or whole into the file of ``--output``.
+
+    Raises:
+        OutputError: The file exists, or cannot be written.
+    """
+    refuse_existing(args)
+    if args.output is None:
+        print_json(schema)
+    else:
+        write_text(args.output, strict_json(schema) + "\n")

@@ -1,7 +1,7 @@
 """Print the JSON Schema of truth.json, for editors and other tools.
 
 example:
-  crosscue truth schema > truth.schema.json
+  crosscue truth schema -o truth.schema.json
 """
 
 from __future__ import annotations
@@ -9,14 +9,15 @@ from __future__ import annotations
 import argparse
 
 from crosscue.datasets.truth.truth import json_schema
-from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.options import add_schema_output, print_schema
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare no flags: there is but one schema."""
+    """Declare flags."""
+    add_schema_output(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print it."""
-    print_json(json_schema())
+    """Print or write it."""
+    print_schema(json_schema(), args)
     return 0

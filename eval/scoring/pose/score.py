@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
-from crosscue.eval.pipeline.drive_time import timeline_in
 from crosscue.eval.pipeline.log_time import Gap, comes_twice, gaps_of, pose_in_log_time
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.localization.angles import wrap_all
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
-from crosscue.replay.vehicle.vehicle import Vehicle, of_manifest
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .errors import (
     Alignment,
@@ -180,11 +179,11 @@ def measure(
     """
     truth, track = load_truth(truth_path)
     table = pose_in_log_time(run)
-    vehicle = of_manifest(run.manifest()["settings"])
+    vehicle = run.drive_manifest().settings
     _inside(track, table, truth_path)
     estimate, cov = _estimate(table, vehicle, truth)
     flat = planar(track.t_ns, track.xyz_m[:, 0], track.xyz_m[:, 1], heading_rad(track))
-    paired = _paired(flat, estimate, cov, comes_twice(timeline_in(run.manifest()), flat.t_ns))
+    paired = _paired(flat, estimate, cov, comes_twice(run.drive_manifest().timeline, flat.t_ns))
     values = nees(paired, 3)
     result = PoseScore(
         coverage=paired.coverage,
@@ -200,7 +199,7 @@ def measure(
     write_tum(folder / "estimate.tum", paired.estimate, "crosscue estimate, planar")
     write_tum(folder / "truth.tum", paired.truth, "truth, planar")
     title = f"{run.path.name} against {truth.source or truth_path.name}"
-    gaps = gaps_of(timeline_in(run.manifest()))
+    gaps = gaps_of(run.drive_manifest().timeline)
     return result, _scored(paired, values, table, vehicle.lost_above_m, title, gaps)
 
 

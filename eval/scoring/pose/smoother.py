@@ -19,7 +19,6 @@ from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.vehicle.vehicle import of_manifest
 
 from .errors import NeesSummary, nees, pair, summarise_nees
 from .score import COVARIANCES, MAX_DIFFERENCE_NS, at_truths_point, load_truth
@@ -66,7 +65,7 @@ def score_smoother(run: RunFolder, truth_path: Path) -> SmootherScore:
     truth, track = load_truth(truth_path)
     refuse_set_back(run, "the smoother")
     measured = read_measured(run)
-    vehicle = of_manifest(run.manifest()["settings"])
+    vehicle = run.drive_manifest().settings
     first_ns, last_ns = measured.start.t_ns, int(measured.increments.stop_ns[-1])
     wanted = _thinned(track.t_ns[(track.t_ns > first_ns) & (track.t_ns <= last_ns)])
     if not len(wanted):

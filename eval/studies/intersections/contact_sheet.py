@@ -79,8 +79,10 @@ def _frame_near(one: RunScored) -> StoredFrame | None:
     if not np.isfinite(away).any():
         return None
     wanted = int(inside[int(np.nanargmin(away))])
-    detectors = one.run.manifest()["detect"]["detectors"]
-    for frame in stored_frames(one.run, detectors, with_road_masks=True):
+    detected = one.run.drive_manifest().detected
+    if detected is None:
+        return None
+    for frame in stored_frames(one.run, detected.detectors, with_road_masks=True):
         if frame.seen.t_ns == wanted:
             return frame
     return None

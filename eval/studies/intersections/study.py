@@ -34,7 +34,7 @@ from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.fusion import Calibrated
-from crosscue.replay.vehicle.vehicle import Vehicle, load, of_manifest
+from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 LEAST_PLACES: Final = 3
 """Intersections, so that messages for one can be learned at two others or more."""
@@ -231,6 +231,6 @@ def _learned(scored: Sequence[RunScored]) -> Calibrated:
 
 
 def _with_messages(one: RunScored, learned: Calibrated) -> Vehicle:
-    vehicle = of_manifest(one.run.manifest()["settings"])
+    vehicle = one.run.drive_manifest().settings
     fusion = vehicle.fusion.model_copy(update={"kind": "calibrated", "calibrated": learned})
     return vehicle.model_copy(update={"fusion": fusion})

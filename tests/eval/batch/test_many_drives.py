@@ -105,7 +105,7 @@ def test_a_run_that_was_replaced_by_hand_is_noticed(tmp_path: Path) -> None:
     jobs = made_jobs(tmp_path, ["plain"])
     run_many(jobs, letters, in_turn)
     manifest = jobs[0].run / "manifest.json"
-    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "settings": "by hand"}))
+    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "notices": ["by hand"]}))
 
     assert state_of(jobs[0]) is State.OTHER
 

@@ -8,11 +8,12 @@ import pytest
 from crosscue.eval import cli
 from crosscue.eval.batch.jobs import in_turn, run_many
 from crosscue.eval.batch.merge import is_merged, merge_runs
-from crosscue.eval.pipeline.run_account import account
 from crosscue.eval.runs.folder import RunFolder, create, open_run, write_manifest
+from crosscue.eval.runs.manifest import MergedManifest
 from crosscue.eval.runs.table_sink import TableSink
 from crosscue.replay.errors import RunError
 from support.drive_work import letters, made_jobs
+from support.manifests import estimated
 from support.trees import tree
 
 
@@ -29,7 +30,7 @@ def _run(path: Path, **columns: "pa.Array") -> RunFolder:
     table = pa.table(columns)
     with TableSink(run, "belief", table.schema) as sink:
         sink.write({name: table[name] for name in table.column_names})
-    write_manifest(run, {"stage": "estimate", "account": account([])})
+    write_manifest(run, estimated())
     return run
 
 
@@ -44,14 +45,15 @@ def test_rows_keep_their_order_and_gain_their_drive(tmp_path: Path) -> None:
 
 def test_the_manifest_names_failures_and_adds_up_accounts(tmp_path: Path) -> None:
     manifest = _merged(tmp_path, ["abc", "damaged", "de"]).manifest()
+    assert isinstance(manifest, MergedManifest)
 
-    assert manifest["failures"].keys() == {"drive1"}
-    assert "cut; copy it again" in manifest["failures"]["drive1"]
-    letters = manifest["account"]["reading"]["letters"]
-    assert (letters["runs"], letters["in"], letters["used"]) == (2, 5, 3)
-    assert letters["skipped"] == {"dull": 2}
-    assert letters["in"] == letters["used"] + sum(letters["skipped"].values())
-    assert [one["rows"] for one in manifest["drives"]] == [{"letters": 3}, {"letters": 2}]
+    assert manifest.failures.keys() == {"drive1"}
+    assert "cut; copy it again" in manifest.failures["drive1"]
+    letters = manifest.account.reading["letters"]
+    assert (letters.runs, letters.entered, letters.used) == (2, 5, 3)
+    assert letters.skipped == {"dull": 2}
+    assert letters.entered == letters.used + sum(letters.skipped.values())
+    assert [one.rows for one in manifest.drives] == [{"letters": 3}, {"letters": 2}]
 
 
 def test_merging_again_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -99,4 +101,6 @@ def test_no_drive_at_all_is_an_empty_run(tmp_path: Path) -> None:
     merged = merge_runs({}, create(tmp_path / "out", overwrite=False), {"a": "cut"})
 
     assert (merged.drives, merged.rows, merged.drive_seconds) == (0, {}, 0.0)
-    assert merged.run.manifest()["failures"] == {"a": "cut"}
+    manifest = merged.run.manifest()
+    assert isinstance(manifest, MergedManifest)
+    assert manifest.failures == {"a": "cut"}

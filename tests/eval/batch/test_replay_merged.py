@@ -16,6 +16,7 @@ from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import open_run
+from crosscue.eval.runs.manifest import MergedManifest
 
 
 @pytest.fixture
@@ -39,11 +40,13 @@ def test_a_broken_vehicle_file_costs_its_own_drive_and_an_edited_dbc_is_seen(
     assert runs_of([str(tmp_path / "runs")]) == (tmp_path / "runs" / told["monday"]["name"],)
     merged = open_run(tmp_path / "runs" / "merged")
     assert set(merged.table("pose")["drive"].to_pylist()) == {told["monday"]["name"]}
-    assert list(merged.manifest()["failures"]) == [told["tuesday"]["name"]]
-    accounts = merged.manifest()["account"]["reading"].values()
-    assert sum(one["used"] for one in accounts) > 1000
+    manifest = merged.manifest()
+    assert isinstance(manifest, MergedManifest)
+    assert list(manifest.failures) == [told["tuesday"]["name"]]
+    accounts = manifest.account.reading.values()
+    assert sum(one.used for one in accounts) > 1000
     for one in accounts:
-        assert one["in"] == one["used"] + sum(one["skipped"].values())
+        assert one.entered == one.used + sum(one.skipped.values())
 
     (dbc,) = drives.joinpath("monday").glob("*.dbc")
     dbc.write_text(dbc.read_text() + "\n")
@@ -65,8 +68,8 @@ def test_a_log_on_an_object_store_is_replayed_and_fetched_again_for_an_estimate(
 
     assert run(["replay", url, "--vehicle", str(vehicle), "-o", str(run_path), "-q"]) == 0
     before = (run_path / "pose.parquet").read_bytes()
-    (said,) = open_run(run_path).manifest()["logs"]
-    assert said["path"] == url
+    (said,) = open_run(run_path).drive_manifest().logs
+    assert said.path == url
     # Read by ranges, the log leaves nothing in the store that an estimate could lean on.
     assert not store.exists()
     assert run(["estimate", str(run_path), "-q"]) == 0

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -31,10 +30,9 @@ from support.scoring import (
 WORSE_CUES = {**CUES, "stop_sign": {frame: int(frame >= 3) for frame in range(40)}}
 
 
-def _settings(established: float) -> dict[str, Any]:
+def _settings(established: float) -> Vehicle:
     """As a manifest has them."""
-    vehicle = Vehicle(version=1, fusion=Fusion(established=established))
-    return vehicle.model_dump(mode="json")
+    return Vehicle(version=1, fusion=Fusion(established=established))
 
 
 def _pair(tmp_path: Path, *, scored: bool = True, threshold: float = 0.3) -> tuple[Path, Path]:
@@ -181,7 +179,7 @@ def test_hostile_names_cannot_drive_the_terminal(
         run_folder(
             tmp_path / name,
             {"t": pa.table({"\x1b[2J": [value]})},
-            settings={"\x1b]0;x\x07": f"\x1b[31m{value}"},
+            versions={"\x1b]0;x\x07": f"\x1b[31m{value}"},
         )
         for name, value in (("a", 1), ("b", 2))
     ]

@@ -69,9 +69,9 @@ def test_what_is_not_understood_is_counted_not_dropped(tmp_path: Path) -> None:
     )
 
     assert done.rows == {"wheels.parquet": 1}
-    topics = done.account["reading"][0]["topics"]
-    assert topics["odd"]["skipped"] == {"type not understood": 2}
-    assert topics["eye"]["used"] == 0
+    topics = done.account.reading[0].topics
+    assert topics["odd"].skipped == {"type not understood": 2}
+    assert topics["eye"].used == 0
 
 
 @pytest.mark.parametrize("by_s", [-7.0, 0.0, 30.0])

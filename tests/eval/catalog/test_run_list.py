@@ -1,13 +1,14 @@
 """Which runs a command line means."""
 
-import json
 from pathlib import Path
 
 import pytest
 
+from crosscue.eval.batch.merge import merge_runs
 from crosscue.eval.catalog.find_runs import runs_of
-from crosscue.eval.runs.folder import FORMAT_VERSION
+from crosscue.eval.runs.folder import create, write_manifest
 from crosscue.replay.errors import CrosscueError
+from support.manifests import estimated
 
 
 @pytest.fixture
@@ -18,10 +19,11 @@ def runs(tmp_path: Path) -> Path:
         ("deep/c", "estimate"),
         ("merged", "merged"),
     ):
-        folder = tmp_path / "runs" / name
-        folder.mkdir(parents=True)
-        text = json.dumps({"format_version": FORMAT_VERSION, "stage": stage})
-        folder.joinpath("manifest.json").write_text(text)
+        run = create(tmp_path / "runs" / name, overwrite=False)
+        if stage == "merged":
+            merge_runs({}, run, {})
+        else:
+            write_manifest(run, estimated())
     (tmp_path / "runs" / "empty").mkdir()
     (tmp_path / "runs" / ".drives").mkdir()
     return tmp_path / "runs"

@@ -98,7 +98,7 @@ def _is_whole_or_says_so(run: Path, *wholes: dict[str, str]) -> None:
         manifest = open_run(run).manifest()
     except RunError:
         return
-    if manifest["stage"] == "estimate":
+    if manifest.stage == "estimate":
         there = {name: of for name, of in tree(run).items() if not name.startswith(".")}
         assert there in wholes
 

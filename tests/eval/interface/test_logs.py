@@ -15,6 +15,7 @@ from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import DecodeManifest
 from support.every_format import EVERY_FORMAT
 
 
@@ -62,7 +63,9 @@ def test_a_table_equals_what_decode_writes(drive: DriveFiles, tmp_path: Path) ->
         name = next(n for n in log.topics if n != "/can" and "mage" not in log[n].type_name)
         table = log[name].table()
 
-    written = decoded.table(decoded.manifest()["tables"][name].removesuffix(".parquet"))
+    manifest = decoded.manifest()
+    assert isinstance(manifest, DecodeManifest)
+    written = decoded.table(manifest.tables[name].removesuffix(".parquet"))
     assert table.replace_schema_metadata() == written.replace_schema_metadata()
 
 

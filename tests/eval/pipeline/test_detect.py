@@ -145,10 +145,10 @@ def test_broken_empty_and_huge_pictures_are_skipped_and_told(tmp_path: Path) -> 
     assert len(open_run(out).table("detections")) == 3
     reasons = open_run(out).table("skipped")["reason"].to_pylist()
     assert sorted(reasons) == ["empty file", "picture not decoded"]
-    account = open_run(out).manifest()["account"]["reading"][0]["topics"]["cam"]
-    assert account["used"] == 3
-    assert account["in"] == 5
-    assert account["dropped"]["picture not decoded"] == 1
+    account = open_run(out).drive_manifest().account.reading[0].topics["cam"]
+    assert account.used == 3
+    assert account.entered == 5
+    assert account.dropped["picture not decoded"] == 1
 
 
 def test_a_camera_that_changes_size_is_followed_and_told(tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ def test_a_camera_that_changes_size_is_followed_and_told(tmp_path: Path) -> None
 
     found = open_run(out).table("detections")
     assert found["picture_width_px"].to_pylist() == [64, 64, 64, 64, 128]
-    assert "(64, 48) became (128, 96)" in open_run(out).manifest()["notices"][0]
+    assert "(64, 48) became (128, 96)" in open_run(out).drive_manifest().notices[0]
 
 
 @pytest.mark.parametrize(

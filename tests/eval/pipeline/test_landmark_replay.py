@@ -31,6 +31,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 from support.data import shared
 from support.landmark_files import database_of, encoded, seen_from, wall
+from support.manifests import estimate_manifest
 
 WALL_M = 40.0
 
@@ -125,7 +126,7 @@ def errors_m(town: Town, run: RunFolder) -> Floats:
 def test_landmarks_correct_a_drifting_pose(
     town: Town, found: RunFolder, without: RunFolder
 ) -> None:
-    counts = found.manifest()["counts"]["landmarks"]
+    counts = estimate_manifest(found).counts.landmarks
     assert counts["accepted"] >= 10
     assert counts["gated"] <= 2
     late = slice(-500, None)
@@ -138,20 +139,17 @@ def test_landmarks_correct_a_drifting_pose(
 def test_rows_name_the_landmark_and_the_manifest_accounts_for_every_frame(
     town: Town, found: RunFolder
 ) -> None:
-    manifest = found.manifest()
-    counts = manifest["counts"]["landmarks"]
+    manifest = estimate_manifest(found)
+    counts = manifest.counts.landmarks
     named = [name for name in found.table("pose")["landmark"].to_pylist() if name is not None]
 
     assert len(named) == counts["accepted"]
     assert all(name.startswith("survey/") for name in named)
-    [camera] = [
-        log["topics"]["camera"]
-        for log in manifest["account"]["reading"]
-        if "camera" in log["topics"]
-    ]
-    assert counts["frames"] == camera["used"] == len(list(town.camera.glob("*.png")))
+    [camera] = [log.topics["camera"] for log in manifest.account.reading if "camera" in log.topics]
+    assert counts["frames"] == camera.used == len(list(town.camera.glob("*.png")))
     with LandmarkDatabase(town.database) as database:
-        assert manifest["landmarks"]["landmarks"] == len(database)
+        assert manifest.landmarks is not None
+        assert manifest.landmarks.landmarks == len(database)
     times = found.table("pose")["t_ns"].to_numpy()
     assert (np.diff(times) > 0).all()
 
@@ -179,7 +177,7 @@ def test_a_log_without_a_camera_says_so(town: Town, tmp_path: Path) -> None:
     command = ["replay", str(town.drive.log), "--vehicle", str(town.vehicle), "-o", str(run)]
     assert cli.run([*command, "--landmarks", str(town.database)]) == 0
 
-    notices = RunFolder(run).manifest()["notices"]
+    notices = RunFolder(run).drive_manifest().notices
     assert "landmarks were given, but the logs have no camera: none is looked for" in notices
 
 
@@ -405,13 +403,13 @@ def test_the_score_shows_filter_and_batch_smoother_side_by_side(
 
 
 def test_the_measurements_are_those_that_the_filter_used(found: RunFolder) -> None:
-    counts = found.manifest()["counts"]
+    counts = estimate_manifest(found).counts
     kinds = found.table("measurements")["kind"].to_pylist()
 
     assert kinds.count("start") == 1
-    assert kinds.count("odometry") == counts["odometry"]["intervals"]
-    assert kinds.count("heading") == counts["track"]["headings_accepted"] > 0
-    assert kinds.count("landmark") == counts["landmarks"]["accepted"] > 0
+    assert kinds.count("odometry") == counts.odometry["intervals"]
+    assert kinds.count("heading") == counts.track["headings_accepted"] > 0
+    assert kinds.count("landmark") == counts.landmarks["accepted"] > 0
     read = read_measured(found)
     table = found.table("pose")
     ends = np.isin(read.increments.stop_ns, table["t_ns"].to_numpy())

@@ -16,6 +16,7 @@ from crosscue.replay.log import EVERYTHING
 from crosscue.replay.vehicle.time import Time
 from crosscue.replay.vehicle.vehicle import Start, Vehicle, parse
 from support.data import shared
+from support.manifests import estimate_manifest
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
 
 SECOND = 1_000_000_000
@@ -87,20 +88,20 @@ def test_rows_that_are_not_numbers_are_counted_and_left_out(tmp_path: Path) -> N
 
     outcome = _replay(tmp_path / "run", blocks, vehicle)
 
-    counts = outcome.run.manifest()["counts"]["odometry"]
+    counts = estimate_manifest(outcome.run).counts.odometry
     assert counts["not_finite"] == 1
     assert counts["gaps"] == 1
     assert np.isfinite(outcome.run.table("pose")["x_m"].to_numpy()).all()
 
 
 def test_the_manifest_accounts_for_every_row_and_setting(tmp_path: Path) -> None:
-    manifest = _replay(tmp_path / "run", _drive(0.0)).run.manifest()
+    manifest = estimate_manifest(_replay(tmp_path / "run", _drive(0.0)).run)
 
-    topics = manifest["account"]["reading"][0]["topics"]
-    assert topics["wheels"]["used"] == topics["wheels"]["in"] == 200
-    assert manifest["settings"]["odometry"]["track_width_m"] == 1.55
-    assert manifest["sources"]["yaw_rate"].endswith("gyro")
-    assert manifest["versions"]["crosscue"]
+    wheels = manifest.account.reading[0].topics["wheels"]
+    assert wheels.used == wheels.entered == 200
+    assert manifest.settings.odometry.track_width_m == 1.55
+    assert str(manifest.sources["yaw_rate"]).endswith("gyro")
+    assert manifest.versions["crosscue"]
 
 
 def test_without_wheels_and_camera_there_is_no_run(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import pytest
 from matplotlib.figure import Figure
 from rerun.chunk import RrdReader
 
-from crosscue.eval.pipeline.drive_time import timeline_in
 from crosscue.eval.pipeline.log_time import Gap, broken_at, gaps_of
 from crosscue.eval.recording import save
 from crosscue.eval.report.score_runs import ScoreWork
@@ -48,7 +47,7 @@ def _crosses(rows: Sequence[tuple[int, Any]], gap: Gap) -> bool:
 
 
 def test_the_gap_is_where_the_wheels_were_silent(paused: RunFolder) -> None:
-    (gap,) = gaps_of(timeline_in(paused.manifest()))
+    (gap,) = gaps_of(paused.drive_manifest().timeline)
 
     assert (gap.start_ns, gap.end_ns) == (BEGIN + 5 * SECOND - ROW, BEGIN + 71 * ROW)
     assert gap.text == "gap of 2.2 s"
@@ -59,7 +58,7 @@ def test_no_line_of_a_recording_runs_across_a_gap(paused: RunFolder, tmp_path: P
     path = tmp_path / "run.rrd"
     save(paused, path)
 
-    (gap,) = gaps_of(timeline_in(paused.manifest()))
+    (gap,) = gaps_of(paused.drive_manifest().timeline)
     lines = [
         "/plots/belief/intersection",
         "/plots/range/start",
@@ -125,7 +124,7 @@ def test_a_long_gap_does_not_squeeze_the_rest() -> None:
 def test_what_comes_twice_is_shaded_as_set_back(tmp_path: Path) -> None:
     run = replayed(tmp_path, write_drive(tmp_path, Clock(set_at_s=6.0, by_s=-3.0)))
 
-    (gap,) = gaps_of(timeline_in(run.manifest()))
+    (gap,) = gaps_of(run.drive_manifest().timeline)
 
     assert gap.text == "clock set back"
     assert (gap.start_ns, gap.end_ns) == (BEGIN + 3 * SECOND, BEGIN + 6 * SECOND - ROW)

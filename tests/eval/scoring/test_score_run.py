@@ -15,11 +15,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
+from crosscue.eval.batch.merge import merge_runs
 from crosscue.eval.report.junit import junit_text
-from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.folder import RunFolder, create
+from crosscue.eval.runs.manifest import FORMAT_VERSION, LogRow, Part
 from crosscue.eval.scoring.gates import Gate, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
-from crosscue.replay.errors import UsageError
+from crosscue.eval.scoring.runs import judge_run
+from crosscue.replay.errors import RunError, UsageError
+from support.manifests import WHOLE_LOG
 from support.scoring import (
     BELIEF,
     CUES,
@@ -255,8 +259,8 @@ def test_an_approach_outside_the_log_is_refused_unless_only_a_part_was_replayed(
 ) -> None:
     late = approach(id=1, start_ns=at(1000), enter_ns=at(1040))
     truth_folder(tmp_path, truth([], [approach(), late], end=2000))
-    whole = run_folder(tmp_path / "whole", selection={"start_ns": None, "end_ns": None})
-    part = run_folder(tmp_path / "part", selection={"start_ns": None, "end_ns": at(50)})
+    whole = run_folder(tmp_path / "whole", selection=WHOLE_LOG)
+    part = run_folder(tmp_path / "part", selection=Part(start_ns=None, end_ns=at(50), topics=None))
 
     assert "approach 1 from" in _fails(capsys, "score", whole.path)
     assert cli.run(["score", str(part.path), "-q"]) == 0
@@ -304,7 +308,8 @@ def test_runs_that_cannot_be_scored_are_named(
     manifest = run / "manifest.json"
     whole = manifest.read_text()
 
-    manifest.write_text(whole.replace('"format_version": 2', '"format_version": 99'))
+    this = f'"format_version": {FORMAT_VERSION}'
+    manifest.write_text(whole.replace(this, '"format_version": 99'))
     assert "format 99" in _fails(capsys, "score", run)
     manifest.write_text(whole[:50])
     assert "manifest.json: unreadable" in _fails(capsys, "score", run)
@@ -366,13 +371,15 @@ def test_merged_drives_are_not_scored_as_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truth_folder(tmp_path)
-    run = run_folder(tmp_path / "merged", stage="merged")
+    run = merge_runs({}, create(tmp_path / "merged", overwrite=False), {}).run
 
-    assert "many drives merged" in _fails(capsys, "score", run.path)
+    assert "tables of many drives" in _fails(capsys, "score", run.path)
+    with pytest.raises(RunError, match="tables of many drives"):
+        judge_run(run, tmp_path / "truth.json")
 
 
-def _log_of(folder: Path, run: Path) -> list[dict[str, Any]]:
-    return [log_row(folder / "drive.mcap", RunFolder(run), folder.name)]
+def _log_of(folder: Path, run: Path) -> tuple[LogRow, ...]:
+    return (log_row(folder / "drive.mcap", RunFolder(run), folder.name),)
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.eval.pipeline.drive_time import timeline_in
 from crosscue.eval.pipeline.log_time import AMBIGUOUS, ambiguous
 from crosscue.eval.report.score_runs import ScoreWork
 from crosscue.eval.report.summary import pose_summary, summary
@@ -24,7 +23,7 @@ def _replayed(folder: Path, clock: Clock) -> RunFolder:
 
 def _ambiguous_rows(run: RunFolder, name: str) -> int:
     """By hand: rows whose stamp lies in the other segment's time."""
-    timeline = timeline_in(run.manifest())
+    timeline = run.drive_manifest().timeline
     table = run.table(name)
     log_ns, numbers = table["log_t_ns"].to_numpy(), table["segment"].to_numpy().astype(np.int64)
     return int(ambiguous(timeline, log_ns, numbers).sum())

@@ -2,7 +2,6 @@
 
 import json
 from collections import Counter
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,20 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval import cli
-from crosscue.eval.pipeline.accounts import account_of, write_skipped
-from crosscue.eval.pipeline.run_account import account, account_lines, check, line, lines, summed
+from crosscue.eval.pipeline.accounts import write_skipped
+from crosscue.eval.runs.account import (
+    Account,
+    account,
+    account_lines,
+    account_of,
+    check,
+    line,
+    summed,
+)
 from crosscue.eval.runs.folder import create, open_run
 from crosscue.replay.errors import AccountError
 from crosscue.replay.ledger import DETAILS_KEPT, Ledger
+from support.manifests import log_account
 from support.pictures import picture_folder
 
 BRIGHT = "support.detecting:build"
@@ -32,12 +40,12 @@ def damaged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]
     return folder, files.log, files.vehicle
 
 
-def _agrees(run: Path, printed: dict[str, Any]) -> dict[str, Any]:
+def _agrees(run: Path, printed: dict[str, Any]) -> Account:
     """The run's account, after every place that shows it was held against it."""
     folder = open_run(run)
-    found: dict[str, Any] = folder.manifest()["account"]
+    found = folder.drive_manifest().account
     check(found)
-    assert printed["account"] == found
+    assert printed["account"] == found.as_json()
     told: Counter[tuple[str, str, bool]] = Counter()
     unknown = set()
     for row in folder.table("skipped").to_pylist():
@@ -45,11 +53,11 @@ def _agrees(run: Path, printed: dict[str, Any]) -> dict[str, Any]:
         if row["count"] is None:
             unknown.add((row["topic"], row["reason"]))
     wanted: Counter[tuple[str, str, bool]] = Counter()
-    for log in found["reading"]:
-        for topic, one in log["topics"].items():
-            wanted.update({(topic, why, False): n for why, n in one["skipped"].items()})
-            wanted.update({(topic, why, True): n for why, n in one["dropped"].items()})
-            assert {(topic, why) for why in one["dropped_unknown"]} <= unknown
+    for log in found.reading:
+        for topic, one in log.topics.items():
+            wanted.update({(topic, why, False): n for why, n in one.skipped.items()})
+            wanted.update({(topic, why, True): n for why, n in one.dropped.items()})
+            assert {(topic, why) for why in one.dropped_unknown} <= unknown
     assert +told == +wanted
     return found
 
@@ -79,16 +87,16 @@ def test_replay_and_estimate_of_a_damaged_log(
     ):
         assert cli.run(argv) == 3
         found = _agrees(run, json.loads(capsys.readouterr().out))
-        assert {stage for stage, _, _ in lines(found)} == {"reading", "estimating"}
-        assert not found["is_whole"]
-        assert found["estimating"]["wheel speeds"]["used"] > 0
+        assert {stage for stage, _, _ in found.lines()} == {"reading", "estimating"}
+        assert not found.is_whole
+        assert found.estimating["wheel speeds"].used > 0
 
     assert cli.run(["view", str(run), "-o", str(tmp_path / "x.rrd"), "-q"]) == 3
     assert cli.run(["compare", str(run), str(run), "-q"]) == 3
     assert cli.run(["estimate", str(run)]) == 3
     text = capsys.readouterr().out
     assert text.count("account  ") == 1
-    assert sum(one["used"] for at, _, one in lines(found) if at == "reading") > 0
+    assert sum(one.used for at, _, one in found.lines() if at == "reading") > 0
 
 
 def test_detect_over_pictures_that_do_not_decode(
@@ -106,12 +114,12 @@ def test_detect_over_pictures_that_do_not_decode(
     assert cli.run(argv) == 3
 
     found = _agrees(run, json.loads(capsys.readouterr().out))
-    ((name, frames),) = found["detecting"].items()
-    topics = found["reading"][0]["topics"]
-    assert (frames["in"], frames["used"]) == (6, 4)
-    assert frames["used"] == topics[name]["used"]
-    assert frames["dropped"] == topics[name]["dropped"]
-    assert sum(frames["dropped"].values()) + sum(frames["skipped"].values()) == 2
+    ((name, frames),) = found.detecting.items()
+    topics = found.reading[0].topics
+    assert (frames.entered, frames.used) == (6, 4)
+    assert frames.used == topics[name].used
+    assert frames.dropped == topics[name].dropped
+    assert sum(frames.dropped.values()) + sum(frames.skipped.values()) == 2
 
 
 def test_single_rows_beyond_those_kept_are_added_up(tmp_path: Path) -> None:
@@ -130,10 +138,9 @@ def test_single_rows_beyond_those_kept_are_added_up(tmp_path: Path) -> None:
     assert [row["count"] for row in rows if row["reason"] == "who knows"] == [None]
 
 
-def _made() -> dict[str, Any]:
-    topic = {**line(10, 7, {"dull": 2}, {"cut": 1})}
+def _made() -> Account:
     return account(
-        [{"log": "a", "is_whole": False, "topics": {"/t": topic}}],
+        [log_account("a", "/t", used=7, skipped={"dull": 2}, dropped={"cut": 1})],
         {"/cam": line(5, 4, {}, {"not decoded": 1})},
         {"headings": line(9, 6, {"refused by the gate": 3})},
     )
@@ -141,14 +148,14 @@ def _made() -> dict[str, Any]:
 
 @pytest.mark.parametrize("stage", ["reading", "detecting", "estimating"])
 @pytest.mark.parametrize("by", [-1, 1])
-@pytest.mark.parametrize("what", ["in", "used", "skipped", "dropped"])
+@pytest.mark.parametrize("what", ["entered", "used", "skipped", "dropped"])
 def test_one_row_more_or_less_anywhere_is_a_bug_and_loud(stage: str, by: int, what: str) -> None:
-    wrong = deepcopy(_made())
-    ((_, one),) = [(name, one) for at, name, one in lines(wrong) if at == stage]
-    if what in ("in", "used"):
-        one[what] += by
+    wrong = _made()
+    (one,) = [one for at, _, one in wrong.lines() if at == stage]
+    if what in ("entered", "used"):
+        object.__setattr__(one, what, getattr(one, what) + by)
     else:
-        one[what]["another"] = by
+        getattr(one, what)["another"] = by
 
     with pytest.raises(AccountError, match=f"{stage} .*please report"):
         check(wrong)
@@ -157,11 +164,11 @@ def test_one_row_more_or_less_anywhere_is_a_bug_and_loud(stage: str, by: int, wh
 def test_runs_add_up_and_stay_damaged() -> None:
     both = summed([_made(), _made()])
 
-    assert both["reading"]["/t"]["in"] == 20
-    assert both["reading"]["/t"]["dropped"] == {"cut": 2}
-    assert both["detecting"]["/cam"]["runs"] == 2
-    assert both["estimating"]["headings"]["skipped"] == {"refused by the gate": 6}
-    assert not both["is_whole"]
+    assert both.reading["/t"].entered == 20
+    assert both.reading["/t"].dropped == {"cut": 2}
+    assert both.detecting["/cam"].runs == 2
+    assert both.estimating["headings"].skipped == {"refused by the gate": 6}
+    assert not both.is_whole
 
 
 def test_a_person_reads_every_stage_and_every_reason_once() -> None:
@@ -213,5 +220,5 @@ def test_headings_that_the_first_belief_is_made_of_are_used(
 
     printed = json.loads(capsys.readouterr().out)
     assert any("start heading" in sentence for sentence in printed["notices"])
-    headings = _agrees(run, printed)["estimating"]["headings"]
-    assert headings["in"] == headings["used"] + sum(headings["skipped"].values())
+    headings = _agrees(run, printed).estimating["headings"]
+    assert headings.entered == headings.used + sum(headings.skipped.values())

@@ -1,0 +1,23 @@
+"""Print the JSON Schema of a run's manifest.json, for editors and other tools.
+
+example:
+  crosscue run schema -o manifest.schema.json
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from crosscue.eval.commands.shared.options import add_schema_output, print_schema
+from crosscue.eval.runs.manifest import json_schema
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    add_schema_output(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print or write it."""
+    print_schema(json_schema(), args)
+    return 0

@@ -1,0 +1,137 @@
+"""The manifest is a typed record: what is written is what is read, and nothing else is taken."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from crosscue.eval import cli
+from crosscue.eval.batch.merge import merge_runs
+from crosscue.eval.catalog.decoded_logs import decode_tables
+from crosscue.eval.runs.account import Account, account
+from crosscue.eval.runs.folder import RunFolder, create, open_run, write_manifest
+from crosscue.eval.runs.manifest import (
+    FORMAT_VERSION,
+    DecodeManifest,
+    EstimateManifest,
+    Manifest,
+    TimeSegments,
+)
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import RunError
+from crosscue.replay.log import EVERYTHING
+from crosscue.replay.time.segments import Cause, Epoch, LogClock, Marks, Segment
+from crosscue.replay.vehicle.vehicle import Vehicle
+from support.manifests import detected, estimated, log_account
+from support.memory_log import MemoryLog, wheel_block
+
+SET_BACK = TimeSegments(
+    segments=(
+        Segment(0, 0, 1, 2, 1, 2, Cause.START),
+        Segment(1, 5, 5, 9, 3, 7, Cause.SET_BACK, None, -2, breaks_odometry=True),
+    ),
+    clocks=(LogClock((Epoch(0, 0), Epoch(5, 2)), {"/a": Marks((3, None), (7,), ((1, 2),))}),),
+    notices=("set back",),
+)
+RICH = detected("/cam", {"finder": "objects"}, time=SET_BACK)
+LOST = account([log_account("a", "/t", used=7, skipped={"dull": 2}, dropped={"cut": 1})])
+
+
+@pytest.mark.parametrize(
+    "made",
+    [estimated(), estimated(detect=RICH, account=LOST), RICH],
+    ids=["bare", "rich", "detect"],
+)
+def test_what_is_written_is_read_again(made: Manifest, tmp_path: Path) -> None:
+    run = create(tmp_path / "run", overwrite=False)
+    write_manifest(run, made)
+    first = run.file("manifest.json").read_bytes()
+
+    assert run.manifest() == made
+    write_manifest(run, run.manifest())
+    assert run.file("manifest.json").read_bytes() == first
+
+
+def test_decode_writes_its_stage_and_is_no_run(tmp_path: Path) -> None:
+    wheels = Topic("wheels", "crosscue/WheelSpeeds", "columns")
+    log = MemoryLog((wheels,), [wheel_block([3], [1.0])], path=Path(__file__))
+    run = create(tmp_path / "out", overwrite=False)
+    decode_tables([log], Vehicle(version=1), run, EVERYTHING)
+
+    found = run.manifest()
+    assert isinstance(found, DecodeManifest)
+    assert found.stage == "decode"
+    assert found.tables == {"wheels": "wheels.parquet"}
+    with pytest.raises(RunError, match="tables of crosscue decode; give a run"):
+        run.drive_manifest()
+
+
+@pytest.mark.parametrize("command", ["score", "estimate", "view"])
+def test_commands_on_one_drive_refuse_other_folders_in_one_line(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    merged = merge_runs({}, create(tmp_path / "merged", overwrite=False), {}).run.path
+
+    assert cli.run([command, str(merged)]) in (1, 4)
+
+    assert re.fullmatch(r"crosscue: .*many drives.*\n", capsys.readouterr().err)
+
+
+def _changed(run: RunFolder, **changes: Any) -> RunFolder:
+    write_manifest(run, estimated())
+    path = run.file("manifest.json")
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    return run
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"format_version": 2}, r"format 2, this crosscue reads 3: replay again"),
+        ({"format_version": None}, r"format None"),
+        ({"stage": "dream"}, r"stage: .*'dream'.*replay again"),
+        ({"settings": {"version": 1, "wings": 2}}, r"settings: wings: extra inputs.*replay again"),
+        ({"notices": "none"}, r"notices: .*replay again"),
+        ({"pose": {"rows": "7", "travelled_m": 0.0, "major_axis_m": None}}, r"pose\.rows: "),
+        ({"colour": "red"}, r"colour: extra inputs are not permitted"),
+    ],
+)
+def test_another_version_or_value_is_refused_in_one_line(
+    changes: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    run = _changed(create(tmp_path / "run", overwrite=False), **changes)
+
+    with pytest.raises(RunError, match=said) as error:
+        open_run(run.path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_record_takes_no_unknown_name_and_never_changes() -> None:
+    with pytest.raises(ValidationError, match="Extra inputs"):
+        Account(**{**LOST.as_json(), "lost": 1})
+    with pytest.raises(ValidationError, match="frozen"):
+        estimated().notices = ("other",)
+
+
+def test_the_schema_is_that_of_every_stage(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["run", "schema"]) == 0
+    printed = capsys.readouterr().out
+    assert cli.run(["run", "schema", "-o", str(tmp_path / "s.json")]) == 0
+    assert (tmp_path / "s.json").read_text() == printed
+    assert cli.run(["run", "schema", "-o", str(tmp_path / "s.json")]) == 1
+    schema = json.loads(printed)
+    stages = set(schema["discriminator"]["mapping"])
+    assert stages == {"detect", "estimate", "merged", "decode"}
+    names = schema["$defs"][EstimateManifest.__name__]
+    assert names["properties"].keys() == estimated().as_json().keys()
+    assert names["properties"]["format_version"]["const"] == FORMAT_VERSION
+    assert schema["$defs"]["Line"]["properties"].keys() >= {"in", "used", "skipped", "dropped"}
+    assert names["additionalProperties"] is False
+
+    assert cli.run(["truth", "schema", "-o", str(tmp_path / "t.json")]) == 0
+    assert json.loads((tmp_path / "t.json").read_text())["title"] == "Truth"

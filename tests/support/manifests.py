@@ -1,0 +1,103 @@
+"""Manifests of made-up runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from crosscue.eval.runs.account import LogAccount, TopicLine, account
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import (
+    DetectCounts,
+    DetectManifest,
+    DetectorRow,
+    DetectTimings,
+    EstimateCounts,
+    EstimateManifest,
+    EstimateTimings,
+    Part,
+    PoseSummary,
+    TimeSegments,
+)
+from crosscue.replay.time.segments import ONE_SEGMENT
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+WHOLE_LOG = Part(start_ns=None, end_ns=None, topics=None)
+NOTHING = account([])
+
+
+def _drive() -> dict[str, Any]:
+    return {
+        "versions": {"crosscue": "0"},
+        "logs": (),
+        "selection": WHOLE_LOG,
+        "settings": Vehicle(version=1),
+        "clocks": (),
+        "time": TimeSegments(segments=ONE_SEGMENT.segments, clocks=(), notices=()),
+        "account": NOTHING,
+        "notices": (),
+    }
+
+
+def estimated(**changes: Any) -> EstimateManifest:
+    """A whole run of nothing, but for the changes."""
+    content = {
+        **_drive(),
+        "sources": {},
+        "counts": EstimateCounts(odometry={}, track={}, landmarks={}),
+        "landmarks": None,
+        "pose": PoseSummary(rows=0, travelled_m=0.0, major_axis_m=None),
+        "scene": None,
+        "detect": None,
+        "timings": EstimateTimings(seconds=1.0, detect_seconds=0.0),
+    }
+    return EstimateManifest(**{**content, **changes})
+
+
+def detected(camera: str, detectors: dict[str, str], **changes: Any) -> DetectManifest:
+    """A finished detect stage.
+
+    Args:
+        camera: Its topic.
+        detectors: Roles by name.
+        changes: Of anything else.
+    """
+    content = {
+        **_drive(),
+        "camera": camera,
+        "camera_log": 0,
+        "detectors": tuple(
+            DetectorRow(name=name, identity="0", kind="made up", role=role, settings={})
+            for name, role in detectors.items()
+        ),
+        "counts": DetectCounts(frames=0, decoded=0, ran={}, from_cache={}, objects={}, cues={}),
+        "timings": DetectTimings(seconds=1.0),
+    }
+    return DetectManifest(**{**content, **changes})
+
+
+def estimate_manifest(run: RunFolder) -> EstimateManifest:
+    """The manifest of a run that is whole."""
+    found = run.manifest()
+    assert isinstance(found, EstimateManifest)
+    return found
+
+
+def log_account(log: str, topic: str, **counts: Any) -> LogAccount:
+    """The account of a log with one topic, not whole where something was dropped."""
+    used, skipped, dropped = counts["used"], counts.get("skipped", {}), counts.get("dropped", {})
+    found = used + sum(skipped.values())
+    one = TopicLine(
+        declared=None,
+        found=found,
+        entered=found + sum(dropped.values()),
+        used=used,
+        skipped=skipped,
+        dropped=dropped,
+    )
+    return LogAccount(
+        log=log,
+        integrity="not checkable",
+        is_whole=not dropped,
+        notices=(),
+        topics={topic: one},
+    )
