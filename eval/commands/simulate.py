@@ -13,9 +13,7 @@ examples:
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +25,7 @@ from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.whole_file import write_bytes
+from crosscue.replay.processes import in_processes
 
 PUBLISHED_RUNS = 10
 
@@ -99,14 +98,12 @@ def _made(
     wanted: list[SceneSettings], args: argparse.Namespace
 ) -> Iterator[tuple[SceneSettings, SceneFiles]]:
     """Drives in the order asked for, several made at a time."""
-    folders = [args.output / settings.name for settings in wanted]
-    make = partial(write_scene, overwrite=args.overwrite)
-    if args.workers == 1:
-        yield from zip(wanted, map(make, folders, wanted), strict=True)
-        return
-    fresh = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(args.workers, len(wanted)), mp_context=fresh) as pool:
-        yield from zip(wanted, pool.map(make, folders, wanted), strict=True)
+    make = partial(_make, output=args.output, overwrite=args.overwrite)
+    return zip(wanted, in_processes(make, wanted, args.workers), strict=True)
+
+
+def _make(settings: SceneSettings, output: Path, overwrite: bool) -> SceneFiles:
+    return write_scene(output / settings.name, settings, overwrite=overwrite)
 
 
 def _sheet(wanted: list[SceneSettings], args: argparse.Namespace) -> int:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +25,7 @@ from crosscue.replay.errors import CrosscueError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.processes import in_processes
 
 from .page import write_report
 from .pose_figures import draw_all
@@ -134,9 +133,4 @@ def score_runs(
     paths: Sequence[Path], work: ScoreWork, workers: int = 1
 ) -> Iterator[Scored | Failed]:
     """Score runs, in order; with several workers in as many processes."""
-    if workers == 1 or len(paths) == 1:
-        yield from map(work.attempt, paths)
-        return
-    fresh = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(paths)), mp_context=fresh) as pool:
-        yield from pool.map(work.attempt, paths)
+    return in_processes(work.attempt, paths, workers)

@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from crosscue.eval.scoring.intervals import wilson
 from crosscue.replay.columns import Floats
 
 Z_95: Final = 1.959964
@@ -41,10 +42,7 @@ def share_of(right: int, of: int) -> Measured:
     """A share with Wilson's interval (1927)."""
     if not of:
         return Measured(math.nan, 0.0, 1.0)
-    share, spread = right / of, Z_95**2 / of
-    middle = (share + spread / 2.0) / (1.0 + spread)
-    half = Z_95 * math.sqrt(share * (1.0 - share) / of + spread / (4.0 * of)) / (1.0 + spread)
-    return Measured(share, max(middle - half, 0.0), min(middle + half, 1.0))
+    return Measured(right / of, *wilson(right, of))
 
 
 def weights_of(n: int, replicates: int = REPLICATES, seed: int = 0) -> Floats:

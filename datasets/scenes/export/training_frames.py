@@ -6,9 +6,7 @@ hundred intersections than from a thousand pictures of one.
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -21,6 +19,7 @@ from crosscue.datasets.scenes.world import World
 from crosscue.datasets.simulated.drive import START_NS
 from crosscue.replay.columns import Floats
 from crosscue.replay.files.whole_file import write_bytes
+from crosscue.replay.processes import in_processes
 
 from .coco import Objects
 
@@ -69,13 +68,7 @@ def frames(
     runs: Sequence[SceneSettings], count: int, folder: Path, workers: int = 1
 ) -> Iterator[Objects]:
     """``frames_of`` for each run, in order, several made at a time."""
-    make = partial(frames_of, count=count, folder=folder)
-    if workers == 1:
-        yield from map(make, runs)
-        return
-    fresh = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(runs)), mp_context=fresh) as pool:
-        yield from pool.map(make, runs)
+    return in_processes(partial(frames_of, count=count, folder=folder), runs, workers)
 
 
 def joined(parts: Sequence[Objects]) -> Objects:

@@ -1,45 +1,53 @@
-"""Unit quaternions in columns, w first (Hamilton): R(a b) = R(a) R(b)."""
+"""Unit quaternions in columns, w first (Hamilton): R(a b) = R(a) R(b).
+
+scipy's ``Rotation`` computes; it is imported at the first use, which takes a quarter of a second.
+"""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from crosscue.replay.columns import Floats
 
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+
+def rotation_of(quat: Floats) -> Rotation:
+    """Of unit quaternions, shape (4,) or (N, 4)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(np.roll(quat, -1, axis=-1))
+
+
+def quat_of(rotation: Rotation) -> Floats:
+    """The quaternion with w not negative."""
+    quat: Floats = np.roll(rotation.as_quat(canonical=True), 1, axis=-1)
+    return quat
+
 
 def product(a: Floats, b: Floats) -> Floats:
-    """Rotate by ``b``, then by ``a``; shapes (..., 4)."""
-    aw, ax, ay, az = np.moveaxis(a, -1, 0)
-    bw, bx, by, bz = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
-    )
+    """Rotate by ``b``, then by ``a``; shapes (4,) or (N, 4)."""
+    return quat_of(rotation_of(a) * rotation_of(b))
 
 
 def inverse(quat: Floats) -> Floats:
-    """The rotation back; shape (..., 4)."""
-    back: Floats = quat * np.array([1.0, -1.0, -1.0, -1.0])
-    return back
+    """The rotation back; shape (4,) or (N, 4)."""
+    return quat_of(rotation_of(quat).inv())
 
 
 def rotate(quat: Floats, xyz: Floats) -> Floats:
-    """Vectors turned; shapes (..., 4) and (..., 3)."""
-    w, axis = quat[..., :1], quat[..., 1:]
-    across = 2.0 * np.cross(axis, xyz)
-    return xyz + w * across + np.cross(axis, across)
+    """Vectors turned; shapes (4,) or (N, 4), and (N, 3)."""
+    turned: Floats = rotation_of(quat).apply(xyz)
+    return turned
 
 
 def angle_rad(quat: Floats) -> Floats:
-    """Angle of each rotation, in [0, pi]; shape (...)."""
-    sine = np.linalg.norm(quat[..., 1:], axis=-1)
-    half: Floats = np.arctan2(sine, np.abs(quat[..., 0]))
-    return 2.0 * half
+    """Angle of each rotation, in [0, pi]; shape () or (N,)."""
+    angle: Floats = rotation_of(quat).magnitude()
+    return angle
 
 
 def between(a: Floats, b: Floats, share: Floats) -> Floats:
@@ -50,13 +58,11 @@ def between(a: Floats, b: Floats, share: Floats) -> Floats:
         b: Shape (N, 4).
         share: Shape (N,), from 0 at ``a`` to 1 at ``b``.
     """
-    turn = product(inverse(a), b)
-    turn = np.where(turn[..., :1] < 0.0, -turn, turn)
-    half = np.arctan2(np.linalg.norm(turn[..., 1:], axis=-1), turn[..., 0])
-    # sin(share half) / sin(half), which is share for no turn at all.
-    ratio = share * np.sinc(share * half / np.pi) / np.sinc(half / np.pi)
-    part = np.concatenate([np.cos(share * half)[:, None], ratio[:, None] * turn[..., 1:]], axis=-1)
-    return product(a, part)
+    from scipy.spatial.transform import Rotation
+
+    start = rotation_of(a)
+    turn = (start.inv() * rotation_of(b)).as_rotvec()
+    return quat_of(start * Rotation.from_rotvec(share[:, None] * turn))
 
 
 def about_z(angle: float) -> Floats:

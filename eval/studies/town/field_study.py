@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Final
 
@@ -27,6 +25,7 @@ from crosscue.localization.town.random_stream import key_of
 from crosscue.replay.errors import RunError
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.processes import in_processes
 
 from .replayed import through_log
 from .settings import FieldStudy
@@ -113,13 +112,8 @@ def drive_field(
         for i in range(runs)
     ]
     with locked(RunFolder(folder)):
-        if workers == 1:
-            for done, job in enumerate(jobs, 1):
-                yield done / len(jobs), _run(job)
-            return
-        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-            for done, run in enumerate(pool.map(_run, jobs), 1):
-                yield done / len(jobs), run
+        for done, run in enumerate(in_processes(_run, jobs, workers), 1):
+            yield done / len(jobs), run
 
 
 def _claim(study: FieldStudy, folder: Path, *, overwrite: bool) -> None:

@@ -1,0 +1,46 @@
+"""Work side by side: the same results in the same order, whatever the number of processes."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import pytest
+
+from crosscue.replay.processes import in_processes
+
+
+def slow_square(number: int) -> tuple[int, int]:
+    """The first ones take longest."""
+    time.sleep(0.05 * max(0, 3 - number))
+    return number * number, os.getpid()
+
+
+def fail_at_two(number: int) -> int:
+    if number == 2:
+        raise ValueError("two")
+    return number
+
+
+def test_results_come_in_order_from_other_processes() -> None:
+    found = list(in_processes(slow_square, range(6), 2))
+
+    assert [square for square, _ in found] == [0, 1, 4, 9, 16, 25]
+    assert os.getpid() not in {process for _, process in found}
+
+
+@pytest.mark.parametrize(("things", "workers"), [([1, 2, 3], 1), ([4], 8), ([], 8)])
+def test_one_worker_or_one_thing_needs_no_process(things: list[int], workers: int) -> None:
+    found = list(in_processes(slow_square, things, workers))
+
+    assert [square for square, _ in found] == [number * number for number in things]
+    assert {process for _, process in found} <= {os.getpid()}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_failure_comes_after_what_was_done_before_it(workers: int) -> None:
+    found = in_processes(fail_at_two, range(4), workers)
+
+    assert [next(found), next(found)] == [0, 1]
+    with pytest.raises(ValueError, match="two"):
+        next(found)
