@@ -12,11 +12,11 @@ example:
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from crosscue.detectors.catalog.fetch import Fetched, fetch
+from crosscue.detectors.catalog.fetch import Fetched, Progress, fetch
 from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.progress import Done, ProgressLine, progress_line
 from crosscue.replay.errors import UsageError
 
 
@@ -34,10 +34,10 @@ def run(args: argparse.Namespace) -> int:
     """Fetch."""
     if args.given is not None and len(args.models) > 1:
         raise UsageError("--from: one model at a time")
-    shown = _Shown(sys.stderr.isatty() and not args.quiet)
     found: dict[str, list[Fetched]] = {}
     for name in args.models:
-        found[name] = fetch(name, args.given, shown)
+        with progress_line(args, "fetching") as line:
+            found[name] = fetch(name, args.given, _megabytes(line))
         if not args.quiet and not args.json:
             for file in found[name]:
                 print(f"{name}: {file.path} (from {file.came_from})")
@@ -46,13 +46,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-class _Shown:
-    """One line with the fraction done, on a terminal."""
+def _megabytes(line: ProgressLine) -> Progress:
+    def show(file: str, done: int, of: int) -> None:
+        line.at(Done(done / 1e6, of / 1e6, "MB"), file)
 
-    def __init__(self, is_on: bool) -> None:
-        self._is_on = is_on
-
-    def __call__(self, name: str, done: int, total: int) -> None:
-        if self._is_on:
-            end = "\n" if done >= total else ""
-            print(f"\r{name} {done / 1e6:.1f} of {total / 1e6:.1f} MB", end=end, file=sys.stderr)
+    return show
