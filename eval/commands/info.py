@@ -15,6 +15,7 @@ import argparse
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
 from enum import Enum
+from pathlib import Path
 
 from crosscue.eval.commands.shared.options import (
     add_part_arguments,
@@ -23,6 +24,9 @@ from crosscue.eval.commands.shared.options import (
     selection_of,
 )
 from crosscue.eval.commands.shared.progress import Done, with_progress
+from crosscue.eval.pipeline.drive_time import plan_for_time, time_segments
+from crosscue.replay.clocks.findings import instant_text
+from crosscue.replay.columns import Block
 from crosscue.replay.log_summary import (
     LogSummary,
     Progress,
@@ -36,6 +40,9 @@ from crosscue.replay.log_summary import (
 )
 from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import table, terminal_width, visible, wrapped
+from crosscue.replay.time.scan import LogWatch, timeline_from
+from crosscue.replay.time.segments import Timeline, gaps_told
+from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 LOSSES_SHOWN = 10
 
@@ -44,6 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("logs", nargs="+", metavar="LOG", help="recordings; paths or URLs")
     add_part_arguments(parser)
+    parser.add_argument(
+        "--vehicle", type=Path, metavar="V.toml", help="where the wheel speeds are, to find gaps"
+    )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     parser.add_argument(
         "--quick",
@@ -56,24 +66,38 @@ def run(args: argparse.Namespace) -> int:
     """Look at each log and print what it holds.
 
     Returns:
-        0 when all logs are whole, 3 when something is dropped.
+        0 when all logs are whole, 3 when something is dropped or there is more than one segment.
     """
+    vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
+    timeline = None
     with open_logs(args.logs, limits_of(args)) as logs:
         if args.quick:
             summaries = [quick_summary(log) for log in logs]
         else:
             part = selection_of(args, logs)
-            summaries = [summarise(log, _progress(args), part) for log in logs]
+            planned, clocks = plan_for_time(logs, vehicle, part)
+            watches = [LogWatch(i, planned, vehicle, clocks[i]) for i in range(len(logs))]
+            summaries = [
+                summarise(log, _progress(args, watch), part)
+                for log, watch in zip(logs, watches, strict=True)
+            ]
+            timeline = timeline_from(watches, planned, vehicle)
     common = together(summaries) if len(summaries) > 1 and not args.quick else None
     if args.json:
-        print_json({"logs": [plain(s) for s in summaries], "together": plain(common)})
+        told = None if timeline is None else time_segments(timeline).as_json()
+        print_json(
+            {"logs": [plain(s) for s in summaries], "together": plain(common), "time": plain(told)}
+        )
     else:
         width = terminal_width()
         for summary in summaries:
             print("\n".join(lines_of(summary, width)))
         if common is not None:
             print("\n".join(_lines_together(common, width)))
-    return 0 if all(summary.is_whole for summary in summaries) else 3
+        if timeline is not None and timeline.has_gaps:
+            print("\n".join(_segments(timeline, width)))
+    has_gaps = timeline is not None and timeline.has_gaps
+    return 3 if has_gaps or not all(summary.is_whole for summary in summaries) else 0
 
 
 def plain(value: object) -> object:
@@ -209,7 +233,29 @@ def _or_dash(count: int | None) -> str:
     return "-" if count is None else str(count)
 
 
-def _progress(args: argparse.Namespace) -> Progress:
+def _segments(timeline: Timeline, width: int) -> Iterator[str]:
+    rows = [
+        (
+            str(one.number),
+            one.cause.value,
+            "-" if one.gap_ns is None else f"{one.gap_ns * 1e-9:.2f}",
+            f"{one.by_ns * 1e-9:.2f}" if one.by_ns else "-",
+            instant_text(one.log_start_ns),
+            f"{(one.log_end_ns - one.log_start_ns) * 1e-9:.2f}",
+        )
+        for one in timeline.segments
+    ]
+    head = ("segment", "begins with", "gap s", "clock set s", "from", "length s")
+    yield from table(head, rows, width, (1, 4))
+    yield from (wrapped(sentence, width) for sentence in gaps_told(timeline.segments))
+
+
+def _progress(args: argparse.Namespace, watch: LogWatch) -> Progress:
+    def watched(blocks: Iterable[Block]) -> Iterator[Block]:
+        for block in blocks:
+            watch.add(block)
+            yield block
+
     return lambda blocks, rows: with_progress(
-        blocks, lambda: Done(*rows(), "rows"), args, "reading"
+        watched(blocks), lambda: Done(*rows(), "rows"), args, "reading"
     )

@@ -25,6 +25,7 @@ from crosscue.replay.log_summary import quick_summary, summarise, together
 from crosscue.replay.safe_text import cells, table, visible, wrapped
 from support.clock_streams import SECOND_NS, START_NS, Stream, table_of
 from support.data import shared
+from support.gap_drive import Clock, write_drive
 
 MS = 1_000_000
 NASTY = "/cam\x1b[31m\n\u202e\udcff\x00<b>"
@@ -336,3 +337,35 @@ def test_the_command_on_nothing_readable_ends_with_four(
 ) -> None:
     assert run(["info", str(tmp_path)]) == 4
     assert "a folder without any known recording in it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("clock", "car", "causes"),
+    [
+        (Clock(), True, ["start"]),
+        (Clock(pause_s=(5.0, 9.0)), True, ["start", "odometry silent"]),
+        (Clock(set_at_s=6.0, by_s=1200.0), True, ["start", "odometry silent"]),
+        (Clock(set_at_s=6.0, by_s=-10.0), True, ["start", "clock set back"]),
+        (Clock(set_at_s=6.0, by_s=-10.0), False, ["start", "clock set back"]),
+    ],
+)
+def test_segments_are_listed_and_more_than_one_exits_3(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    clock: Clock,
+    car: bool,
+    causes: list[str],
+) -> None:
+    words = ["info", str(write_drive(tmp_path, clock))]
+    words += ["--vehicle", str(tmp_path / "car.toml")] if car else []
+    status = 0 if len(causes) == 1 else 3
+
+    assert run([*words, "--json"]) == status
+    found = json.loads(capsys.readouterr().out)["time"]["segments"]
+    assert [one["cause"] for one in found] == causes
+    assert run(words) == status
+    text = capsys.readouterr().out
+    assert all(cause in text for cause in causes[1:])
+    assert ("2 time segments" in text) is (len(causes) == 2)
+    assert run([*words, "--quick", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["time"] is None
