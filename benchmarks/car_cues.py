@@ -25,8 +25,8 @@ from crosscue.detectors.cues.cars import (
     pair_cars,
     parked_cars,
 )
-from crosscue.eval.pipeline.stored_frames import stored_frames
 from crosscue.eval.runs.folder import RunFolder, open_run
+from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.eval.scoring.truth import cue_at
 from crosscue.replay.vehicle.vehicle import Vehicle
 

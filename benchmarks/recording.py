@@ -33,10 +33,10 @@ from crosscue.detectors import rle
 from crosscue.detectors.registry import Choice
 from crosscue.eval.pipeline.detect import detect_drive
 from crosscue.eval.pipeline.reestimate import estimate_run
-from crosscue.eval.pipeline.stored_frames import stored_frames
-from crosscue.eval.pipeline.stored_images import camera_of, read_pictures
 from crosscue.eval.recording import save
 from crosscue.eval.runs.folder import RunFolder, create, open_run
+from crosscue.eval.runs.stored_images import camera_of, read_pictures
+from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.replay.columns import Block, Images
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.opening import open_log

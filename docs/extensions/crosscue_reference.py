@@ -139,14 +139,15 @@ class Tables(SphinxDirective):
 
 
 def _schemas() -> dict[str, pa.Schema]:
-    from crosscue.eval.pipeline import accounts, detect, measurements, pose_tables, scene
+    from crosscue.eval.pipeline import detect, scene
+    from crosscue.eval.runs.tables import measurements, pose_tables, skipped
 
     return {
         **detect.schemas(),
         **scene.schemas(),
         "pose": pose_tables.pose_schema(),
         measurements.TABLE: measurements.schema(),
-        "skipped": accounts.skipped_schema(),
+        "skipped": skipped.skipped_schema(),
     }
 
 

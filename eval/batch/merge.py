@@ -32,7 +32,7 @@ from crosscue.eval.runs.manifest import (
     MergedLog,
     MergedManifest,
 )
-from crosscue.eval.runs.table_sink import TableSink
+from crosscue.eval.runs.tables.table_sink import TableSink
 from crosscue.replay.errors import RunError, UsageError, one_line
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.limits import DEFAULT, Limits

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
-from crosscue.eval.pipeline.accounts import versions, write_skipped
 from crosscue.eval.pipeline.drive_time import time_segments, whole_timeline
 from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
 from crosscue.eval.runs.account import Account, account, reading_of
 from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
 from crosscue.eval.runs.manifest import DecodeManifest
-from crosscue.eval.runs.table_sink import TableSink
+from crosscue.eval.runs.tables.skipped import write_skipped
+from crosscue.eval.runs.tables.table_sink import TableSink
 from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
@@ -31,6 +31,7 @@ from crosscue.replay.time.segments import LogClock, TimedLog, Timeline
 from crosscue.replay.topic_part import columns_of
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.versions import versions
 
 if TYPE_CHECKING:
     import numpy as np

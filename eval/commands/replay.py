@@ -41,19 +41,19 @@ from crosscue.eval.commands.shared.options import (
     selection_of,
 )
 from crosscue.eval.commands.shared.progress import DriveLine, DrivesLine, is_shown
-from crosscue.eval.pipeline.accounts import versions
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
-from crosscue.eval.pipeline.run_input import files_named_in
 from crosscue.eval.pipeline.scene import ApproachSummary, SceneOutcome
 from crosscue.eval.runs.account import account_lines
 from crosscue.eval.runs.folder import create
+from crosscue.eval.runs.input import files_named_in
 from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import terminal_width, visible, wrapped
 from crosscue.replay.vehicle.vehicle import Vehicle, load
+from crosscue.replay.versions import versions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

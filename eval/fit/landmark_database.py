@@ -14,7 +14,7 @@ import numpy as np
 
 from crosscue.datasets.truth.tum import heading_rad
 from crosscue.detectors.images import Encoded
-from crosscue.eval.pipeline.accounts import probe_clocks
+from crosscue.eval.pipeline.clocks import probe_clocks
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.pose.score import load_truth
 from crosscue.localization.angles import interpolate_angle

@@ -9,7 +9,7 @@ import numpy as np
 
 from crosscue.datasets.truth.annotations import LogPictures
 from crosscue.detectors.images import encoded, size_of
-from crosscue.eval.pipeline.accounts import probe_clocks
+from crosscue.eval.pipeline.clocks import probe_clocks
 from crosscue.replay.columns import Block, Images
 from crosscue.replay.errors import LogError, VehicleError
 from crosscue.replay.ledger import Ledger

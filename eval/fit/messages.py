@@ -16,9 +16,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.datasets.truth.truth import Truth
-from crosscue.eval.pipeline.log_time import refuse_set_back
-from crosscue.eval.pipeline.travelled import odometer_of
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.tables.log_time import refuse_set_back
+from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.eval.scoring.intervals import Interval, resampled, wilson
 from crosscue.eval.scoring.truth import CROSSING_NS
 from crosscue.fusion.annotated_approach import NOT_LOOKED, AnnotatedApproach

@@ -8,7 +8,7 @@ from typing import Final
 
 from crosscue.detectors.images import Encoded, encoded
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
-from crosscue.eval.pipeline.accounts import probe_clocks
+from crosscue.eval.pipeline.clocks import probe_clocks
 from crosscue.replay.columns import Block, Images
 from crosscue.replay.errors import LogError, SchemaError
 from crosscue.replay.files.bounded import read_at_most

@@ -21,6 +21,8 @@ from crosscue.detectors.result_cache import ResultCache
 from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
 from crosscue.eval.runs.account import Account, account, detecting_of, reading_of
 from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
+from crosscue.eval.runs.input import input_of
+from crosscue.eval.runs.logs import log_names, log_rows
 from crosscue.eval.runs.manifest import (
     DetectCounts,
     DetectManifest,
@@ -28,6 +30,8 @@ from crosscue.eval.runs.manifest import (
     DetectTimings,
     part_of,
 )
+from crosscue.eval.runs.tables.labelled import LabelledSink
+from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.replay.columns import Block
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
@@ -37,13 +41,11 @@ from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_told, shift_of
 from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.versions import versions
 
-from .accounts import clock_rows, probe_clocks, versions, write_skipped
+from .clocks import clock_rows, probe_clocks
 from .drive_time import camera_timeline, time_segments
 from .empty_result import empty_result, nothing_left
-from .labelled import LabelledSink
-from .run_input import input_of
-from .run_logs import log_names, log_rows
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -17,7 +17,7 @@ from crosscue.replay.time.scan import scan
 from crosscue.replay.time.segments import Timeline, gaps_told
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .accounts import probe_clocks
+from .clocks import probe_clocks
 
 OnTime = Callable[[float, float], None]
 """Called with the seconds of a drive that are done, and those there are."""

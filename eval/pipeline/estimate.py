@@ -20,6 +20,7 @@ from crosscue.eval.runs.account import (
     reading_of,
 )
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, write_manifest
+from crosscue.eval.runs.logs import log_names, log_rows, relative
 from crosscue.eval.runs.manifest import (
     ApproachRow,
     DetectManifest,
@@ -32,7 +33,12 @@ from crosscue.eval.runs.manifest import (
     SceneSummary,
     part_of,
 )
-from crosscue.eval.runs.table_sink import TableSink
+from crosscue.eval.runs.tables import measurements
+from crosscue.eval.runs.tables.labelled import LabelledSink
+from crosscue.eval.runs.tables.mobileye_tables import MobileyeSink, StoredMobileye
+from crosscue.eval.runs.tables.pose_tables import PoseTally, pose_rows, pose_schema
+from crosscue.eval.runs.tables.skipped import write_skipped
+from crosscue.eval.runs.tables.table_sink import TableSink
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.columns import Topic
 from crosscue.replay.files.whole_file import sha256_of
@@ -52,10 +58,10 @@ from crosscue.replay.time.segments import (
 )
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.versions import versions
 from crosscue.replay.windows import windows
 
-from . import measurements
-from .accounts import clock_changes, clock_rows, probe_clocks, versions, write_skipped
+from .clocks import clock_changes, clock_rows, probe_clocks
 from .detect import DetectOutcome
 from .drive_time import (
     OnTime,
@@ -66,12 +72,8 @@ from .drive_time import (
     unwatched_time,
 )
 from .empty_result import empty_result, silent_roles
-from .labelled import LabelledSink
 from .landmarks import looking
-from .mobileye_tables import MobileyeSink, StoredMobileye
 from .pose import PoseStage, estimating_of, turn_signal_of
-from .pose_tables import PoseTally, pose_rows, pose_schema
-from .run_logs import log_names, log_rows, relative
 from .scene import SceneOutcome, estimate_scene, features_of, schemas
 
 if TYPE_CHECKING:

@@ -10,6 +10,13 @@ from typing import Final
 import numpy as np
 
 from crosscue.eval.runs.account import Line, line
+from crosscue.eval.runs.tables.measurements import (
+    gap_rows,
+    heading_rows,
+    landmark_rows,
+    odometry_rows,
+    start_rows,
+)
 from crosscue.localization import compass, odometry, pose_track
 from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.odometry import OdometrySettings, Pending, TurnSignal, WheelSpeeds
@@ -28,7 +35,6 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.windows import Window
 
 from .landmarks import LandmarkStage, NoLandmarks
-from .measurements import gap_rows, heading_rows, landmark_rows, odometry_rows, start_rows
 
 REJECTED_SHARE: Final = 0.1
 """An honest filter refuses one reading in a thousand; above this something is wrong."""

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, locked, staged, write_input
+from crosscue.eval.runs.input import settings_changed
+from crosscue.eval.runs.logs import reopened
 from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest, LogRow
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.files.whole_file import sha256_of
@@ -15,8 +17,6 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .drive_time import OnTime, unwatched_time
 from .estimate import Outcome, begin_again, estimate_into
-from .run_input import settings_changed
-from .run_logs import reopened
 
 
 def estimate_run(

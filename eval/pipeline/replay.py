@@ -9,6 +9,8 @@ from typing import Final
 
 from crosscue.detectors.registry import Choice, make
 from crosscue.eval.runs.folder import RunFolder, clear, locked, staged
+from crosscue.eval.runs.input import input_of, refuse_another
+from crosscue.eval.runs.logs import log_rows
 from crosscue.eval.runs.manifest import DetectManifest, part_of
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.columns import Topic
@@ -22,8 +24,6 @@ from .detect import DetectOutcome, OnFrames, detect_into, unwatched
 from .drive_time import OnTime, drive_timeline, unwatched_time
 from .empty_result import nothing_left
 from .estimate import Outcome, estimate_into
-from .run_input import input_of, refuse_another
-from .run_logs import log_rows
 
 TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
 """What the second stage reads of the first."""

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
+from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
+from crosscue.eval.runs.tables.travelled import Odometer, odometer_of
 from crosscue.fusion.approaches import Approaches, FrameEvidence, PastCues, SignRange, Step
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
@@ -24,8 +26,6 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .drive_time import OnTime, report_time, unwatched_time
 from .sign_ranges import sign_ranges
-from .stored_frames import StoredFrame, stored_frames
-from .travelled import Odometer, odometer_of
 
 if TYPE_CHECKING:
     import pyarrow as pa

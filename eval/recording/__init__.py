@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crosscue.eval.pipeline.stored_images import StoredCamera, camera_of
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DriveManifest
+from crosscue.eval.runs.stored_images import StoredCamera, camera_of
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.columns import Floats
@@ -110,7 +110,7 @@ def _log_all(
 def _log_marks(
     recording: rr.RecordingStream, time: DriveTime, run: RunFolder, manifest: DriveManifest
 ) -> None:
-    from crosscue.eval.pipeline.stored_frames import stored_frames
+    from crosscue.eval.runs.tables.stored_frames import stored_frames
 
     from .marks import FRAMES_HELD, Marks, log_styles
 

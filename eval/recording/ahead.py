@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 import rerun as rr
 
-from crosscue.eval.pipeline.mobileye_tables import StoredMobileye
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
 from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.columns import Floats
 from crosscue.replay.mobileye.geometry import evaluate

@@ -9,7 +9,7 @@ import rerun as rr
 
 from crosscue.detectors.base import View
 from crosscue.detectors.images import Encoded, decode, encoded
-from crosscue.eval.pipeline.stored_images import StoredCamera, read_pictures
+from crosscue.eval.runs.stored_images import StoredCamera, read_pictures
 from crosscue.replay.columns import Block, Images
 from crosscue.replay.errors import LogError
 

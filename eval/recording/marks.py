@@ -25,7 +25,7 @@ from crosscue.detectors.cues.cars import (
     parked_cars,
 )
 from crosscue.detectors.cues.road import RoadShares, road_shares
-from crosscue.eval.pipeline.stored_frames import StoredFrame
+from crosscue.eval.runs.tables.stored_frames import StoredFrame
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Vehicle
 

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 import rerun as rr
 from numpy.typing import NDArray
 
-from crosscue.eval.pipeline.log_time import LABELS
+from crosscue.eval.runs.tables.log_time import LABELS
 from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle import cue_table

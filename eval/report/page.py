@@ -14,8 +14,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.eval.pipeline.log_time import gaps_of
 from crosscue.eval.runs.manifest import DriveManifest
+from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.files.tree_text import strict_json

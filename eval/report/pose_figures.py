@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.eval.pipeline.log_time import broken_at
+from crosscue.eval.runs.tables.log_time import broken_at
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.scoring.pose.score import ScoredPoses
 from crosscue.replay.columns import Floats

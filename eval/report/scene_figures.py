@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from crosscue.eval.pipeline.log_time import Gap, broken_at
+from crosscue.eval.runs.tables.log_time import Gap, broken_at
 from crosscue.eval.scoring.approaches import THRESHOLD, ApproachResult, Curve
 from crosscue.eval.scoring.belief import BeliefScore
 from crosscue.eval.scoring.cues import CueJudged

@@ -15,8 +15,8 @@ from crosscue.detectors.cues.labelled import labels_of
 from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.overlay import draw
 from crosscue.detectors.runner import FrameResult
-from crosscue.eval.pipeline.stored_images import camera_of, picture_at
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.stored_images import camera_of, picture_at
 from crosscue.eval.scoring.cues import CueJudged
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.errors import CrosscueError

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.pipeline.log_time import AMBIGUOUS
+from crosscue.eval.runs.tables.log_time import AMBIGUOUS
 from crosscue.replay.columns import Floats, Int64s
 
 from .approaches import FEATURES

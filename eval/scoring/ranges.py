@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.pipeline.log_time import AMBIGUOUS
+from crosscue.eval.runs.tables.log_time import AMBIGUOUS
 from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
 from crosscue.replay.columns import Floats, Int64s
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.pipeline.log_time import LABELS, table_in_log_time
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.tables.log_time import LABELS, table_in_log_time
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import RunError
 from crosscue.replay.time.segments import Timeline

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crosscue.datasets.truth.truth import FILE, Truth
-from crosscue.eval.pipeline.log_time import AMBIGUOUS
-from crosscue.eval.pipeline.run_logs import place_of
 from crosscue.eval.runs.account import (
     Line,
     ScoredAccount,
@@ -23,7 +21,9 @@ from crosscue.eval.runs.account import (
     summed,
 )
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.logs import place_of
 from crosscue.eval.runs.manifest import LogRow
+from crosscue.eval.runs.tables.log_time import AMBIGUOUS
 from crosscue.replay.errors import RunError, SchemaError, UsageError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text, write_whole

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from crosscue.datasets.truth.truth import Approach, Features, Truth, save
-from crosscue.eval.pipeline import measurements
 from crosscue.eval.pipeline.scene import schemas
 from crosscue.eval.runs.folder import RunFolder, create, write_manifest
-from crosscue.eval.runs.table_sink import TableSink
+from crosscue.eval.runs.tables import measurements
+from crosscue.eval.runs.tables.table_sink import TableSink
 from crosscue.fusion.approaches import Approaches, FrameEvidence, Step
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.replay.vehicle.vehicle import Vehicle

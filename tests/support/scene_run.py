@@ -11,11 +11,11 @@ import pyarrow as pa
 
 from crosscue.detectors import rle
 from crosscue.eval.pipeline.detect import schemas
-from crosscue.eval.pipeline.labelled import with_labels
-from crosscue.eval.pipeline.pose_tables import pose_schema
 from crosscue.eval.runs.account import account, line
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import ClockRow
+from crosscue.eval.runs.tables.labelled import with_labels
+from crosscue.eval.runs.tables.pose_tables import pose_schema
 from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.ledger import Ledger

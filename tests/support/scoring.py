@@ -11,8 +11,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
-from crosscue.eval.pipeline.run_logs import relative
 from crosscue.eval.runs.folder import RunFolder, create, write_manifest
+from crosscue.eval.runs.logs import relative
 from crosscue.eval.runs.manifest import LogRow
 from crosscue.eval.scoring.run_tables import RunTables, run_tables
 from crosscue.eval.scoring.truth import DriveTruth, TrueRanges

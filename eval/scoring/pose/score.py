@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
-from crosscue.eval.pipeline.log_time import Gap, comes_twice, gaps_of, pose_in_log_time
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.tables.log_time import Gap, comes_twice, gaps_of, pose_in_log_time
 from crosscue.localization.angles import wrap_all
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError

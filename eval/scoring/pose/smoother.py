@@ -10,9 +10,9 @@ from typing import Final
 import numpy as np
 
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar
-from crosscue.eval.pipeline.log_time import refuse_set_back
-from crosscue.eval.pipeline.measurements import read_measured
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.tables.log_time import refuse_set_back
+from crosscue.eval.runs.tables.measurements import read_measured
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.smoother import smooth
 from crosscue.replay.columns import Floats, Int64s

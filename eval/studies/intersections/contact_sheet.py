@@ -13,9 +13,9 @@ from crosscue.detectors.cues.frame import FrameCues
 from crosscue.detectors.images import decode
 from crosscue.detectors.overlay import draw, write_label
 from crosscue.detectors.runner import FrameResult
-from crosscue.eval.pipeline.stored_frames import StoredFrame, stored_frames
-from crosscue.eval.pipeline.stored_images import StoredCamera, camera_of, picture_at
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.stored_images import StoredCamera, camera_of, picture_at
+from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.files.whole_file import write_bytes

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.eval.batch.jobs import Done
-from crosscue.eval.pipeline.accounts import versions
 from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.report.html import render_page
 from crosscue.eval.scoring.approaches import ApproachScore
 from crosscue.eval.scoring.runs import metrics_of, write_scores
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.versions import versions
 
 from .causes import Finding, by_cause, condition_costs, findings
 from .contact_sheet import write_sheet

@@ -20,7 +20,6 @@ from crosscue.datasets.truth.truth import FILE
 from crosscue.detectors.registry import EMBEDDED, chosen
 from crosscue.eval.batch.jobs import Done, Engine, Job, Progress, fingerprint_of, run_many
 from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs
-from crosscue.eval.pipeline.accounts import versions
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
@@ -35,6 +34,7 @@ from crosscue.replay.log import EVERYTHING
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.fusion import Calibrated
 from crosscue.replay.vehicle.vehicle import Vehicle, load
+from crosscue.replay.versions import versions
 
 LEAST_PLACES: Final = 3
 """Intersections, so that messages for one can be learned at two others or more."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from crosscue.eval.pipeline.travelled import Odometer, Way
+from crosscue.eval.runs.tables.travelled import Odometer, Way
 
 SECOND = 1_000_000_000
 

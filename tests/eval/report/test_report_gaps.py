@@ -11,10 +11,10 @@ import pytest
 from matplotlib.figure import Figure
 from rerun.chunk import RrdReader
 
-from crosscue.eval.pipeline.log_time import Gap, broken_at, gaps_of
 from crosscue.eval.recording import save
 from crosscue.eval.report.score_runs import ScoreWork
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.tables.log_time import Gap, broken_at, gaps_of
 from crosscue.eval.scoring.drives import ScoreSettings
 from crosscue.eval.scoring.pose.score import ScoredPoses
 from support.gap_drive import BEGIN, ROW, SECOND, Clock, replayed, write_drive

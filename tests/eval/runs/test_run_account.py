@@ -11,7 +11,6 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval import cli
-from crosscue.eval.pipeline.accounts import write_skipped
 from crosscue.eval.runs.account import (
     Account,
     account,
@@ -22,6 +21,7 @@ from crosscue.eval.runs.account import (
     summed,
 )
 from crosscue.eval.runs.folder import create, open_run
+from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.replay.errors import AccountError
 from crosscue.replay.ledger import DETAILS_KEPT, Ledger
 from support.manifests import log_account

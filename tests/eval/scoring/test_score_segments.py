@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.eval.pipeline.log_time import AMBIGUOUS, ambiguous
 from crosscue.eval.report.score_runs import ScoreWork
 from crosscue.eval.report.summary import pose_summary, summary
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.tables.log_time import AMBIGUOUS, ambiguous
 from crosscue.eval.scoring.drives import ScoreSettings
 from crosscue.eval.scoring.runs import scores_of
 from support.gap_drive import Clock, replayed, write_drive

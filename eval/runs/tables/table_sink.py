@@ -7,10 +7,9 @@ from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.files.partial_file import PartialFile
 from crosscue.replay.files.whole_file import cannot_write
-
-from .folder import RunFolder
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -26,8 +26,7 @@ from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.remote.logs import version_of
 from crosscue.replay.vehicle.vehicle import Vehicle
-
-from .accounts import versions
+from crosscue.replay.versions import versions
 
 
 def input_of(

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.table_sink import TableSink
 from crosscue.replay.time.segments import LogClock, Timeline
+
+from .table_sink import TableSink
 
 if TYPE_CHECKING:
     import pyarrow as pa

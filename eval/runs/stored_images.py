@@ -24,7 +24,7 @@ from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.time.segments import UNSHIFTED, LogClock, TimedLog
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .run_logs import place_of
+from .logs import place_of
 
 AROUND_NS: Final = 2_000_000_000
 """A picture's own clock and the log's may differ by this much."""

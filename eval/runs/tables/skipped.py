@@ -1,68 +1,22 @@
-"""What a run's manifest and ``skipped.parquet`` tell of logs, clocks and versions."""
+"""``skipped.parquet``: what was left out of the logs, and why."""
 
 from __future__ import annotations
 
-import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from crosscue.eval.runs.account import UNATTRIBUTED, LogAccount, TopicLine
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.manifest import ClockRow
-from crosscue.eval.runs.table_sink import TableSink
-from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Log, Selection
-from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
-from crosscue.replay.versions import installed
 
 from .labelled import labelled
+from .table_sink import TableSink
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-PROBE_NS: Final = 10_000_000_000
-"""Log time looked at before a clock is chosen for each topic."""
-
-
-def probe_clocks(log: Log, extractor: Extractor, selection: Selection) -> dict[str, Clock]:
-    """Which clock to use for each planned topic, judged by the log's first seconds."""
-    first_ns: int | None = None
-    for block in log.read(extractor.ledger, selection):
-        if not len(block):
-            continue
-        first_ns = int(block.log_ns[0]) if first_ns is None else first_ns
-        for _ in extractor(block):
-            pass
-        if int(block.log_ns[0]) - first_ns > PROBE_NS:
-            break
-    return {name: report.used for name, report in extractor.watch.reports().items()}
-
-
-def clock_rows(extractor: Extractor) -> dict[str, ClockRow]:
-    """Clock used and the whole pass's report for each topic."""
-    return {
-        name: ClockRow(
-            used=extractor.clocks.get(name, Clock.LOG),
-            why=report.why,
-            rows=report.of_used.rows,
-            rate_hz=report.rate_hz,
-        )
-        for name, report in extractor.watch.reports().items()
-    }
-
-
-def clock_changes(extractors: Sequence[Extractor]) -> list[str]:
-    """Topics whose clock would have been chosen otherwise in hindsight."""
-    return [
-        f"{name}: used the {extractor.clocks[name].value}, but over the whole log: {report.why}"
-        for extractor in extractors
-        for name, report in extractor.watch.reports().items()
-        if name in extractor.clocks and extractor.clocks[name] is not report.used
-    ]
 
 
 def skipped_schema() -> pa.Schema:
@@ -85,12 +39,6 @@ def skipped_schema() -> pa.Schema:
 def _skipped_rows(ledger: Ledger) -> list[dict[str, Any]]:
     """Single skips and drops of one log."""
     return [asdict(detail) | {"log": ledger.log} for detail in ledger.details]
-
-
-def versions() -> dict[str, str]:
-    """Of crosscue, Python and the libraries that results depend on."""
-    libraries = ("crosscue", "numpy", "numba", "cantools", "rosbags", "mcap", "pyarrow")
-    return {"python": platform.python_version(), **{name: installed(name) for name in libraries}}
 
 
 def write_skipped(

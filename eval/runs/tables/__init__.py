@@ -1,0 +1,1 @@
+"""Tables of a run: how they are written, and read back."""
