@@ -7,12 +7,16 @@ ends with exit status 3.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from .ledger import Ledger
+
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 class LossWarning(UserWarning):
@@ -25,6 +29,22 @@ def warn_of(ledger: Ledger) -> None:
         detail = f" ({drop.detail})" if drop.detail else ""
         text = f"{ledger.log}: {drop.topic or 'unknown topics'}: {drop.reason}{detail}"
         warnings.warn(text, LossWarning, stacklevel=3)
+
+
+def with_losses(work: Callable[[T], R], one: T) -> tuple[R, tuple[str, ...]]:
+    """What ``work`` makes of ``one``, and its losses: for another process, whose warnings are lost.
+
+    The process that asked passes them on with ``warn_again``.
+    """
+    with losses_heard() as heard:
+        result = work(one)
+    return result, tuple(heard)
+
+
+def warn_again(losses: Iterable[str]) -> None:
+    """Warn here of losses met in another process."""
+    for loss in losses:
+        warnings.warn(loss, LossWarning, stacklevel=3)
 
 
 @contextmanager
