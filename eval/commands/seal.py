@@ -22,7 +22,7 @@ from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.replay.errors import CrosscueError, LogError, UsageError
 from crosscue.replay.formats import format_of
 from crosscue.replay.safe_text import visible
-from crosscue.replay.seal.seal import HASH, SUFFIX, Check, Sealing, read_seal, seal_path, write_seal
+from crosscue.replay.seal.seal import HASH, SUFFIX, Check, Sealing, seal_over, seal_path, write_seal
 
 SHOWN = 20
 MEGABYTE = 1_000_000
@@ -90,10 +90,11 @@ def _seal(log: Path, args: argparse.Namespace) -> dict[str, object]:
 
 
 def _check(log: Path, args: argparse.Namespace) -> dict[str, object]:
-    path = seal_path(log)
-    if not path.exists():
-        raise CrosscueError(f"{log}: not sealed, there is no {path.name}; run 'crosscue seal'")
-    seal = read_seal(path)
+    found = seal_over(log)
+    if found is None:
+        name = seal_path(log).name
+        raise CrosscueError(f"{log}: not sealed, there is no {name}; run 'crosscue seal'")
+    path, seal = found
     try:
         check = Check(log, seal)
     except OSError as error:

@@ -18,7 +18,7 @@ from crosscue.replay.files.closing import Closing
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import EVERYTHING, Log, Selection, report_missing
 
-from .seal import HASH, Check, Seal, read_seal, seal_path
+from .seal import HASH, Check, Seal, seal_over, seal_path
 from .touched import Blocks, Touched
 
 DIFFERS: Final = "bytes differ from the seal"
@@ -36,44 +36,42 @@ class Touching(Protocol):
         ...
 
 
-def with_seal(path: Path, opened: Callable[[], Log]) -> Log:
-    """Open a log, and hold it against its seal if there is one.
+def with_seal(path: Path, opened: Callable[[], Log], *, is_part: bool = False) -> Log:
+    """Open a log, and hold it against its seal, or that of a folder it is in, if there is one.
+
+    Args:
+        path: The log.
+        opened: Opens it without looking at a seal.
+        is_part: It is read as a part of a folder, whose seal is looked at for all of it.
 
     Raises:
         LogError: The seal is damaged, or the log cannot be opened: then its seal says where it is
             damaged.
         OSError: As ``opened``.
     """
-    at = seal_path(path)
-    if not _is_there(at):
+    found = seal_over(path)
+    if found is None or (is_part and found[0] != seal_path(path)):
         return opened()
-    seal = read_seal(at)
+    at, seal = found
     try:
-        return SealedLog(opened(), seal)
+        return SealedLog(opened(), seal, None if at == seal_path(path) else at)
     except LogError as error:
         check = Check(path, seal)
         _exhaust(check.everything())
         spans = [f"{s.name}: bytes {s.start} to {s.stop}" for s in check.damaged()]
-        found = [*check.oddities, *spans[:_SPANS_SHOWN]]
-        if not found:
+        found_odd = [*check.oddities, *spans[:_SPANS_SHOWN]]
+        if not found_odd:
             raise
-        raise type(error)(f"{error}; its seal differs: {'; '.join(found)}") from None
-
-
-def _is_there(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError:
-        # A log's name may be too long to have a seal.
-        return False
+        raise type(error)(f"{error}; its seal differs: {'; '.join(found_odd)}") from None
 
 
 class SealedLog(Closing):
     """Stands for a log; see ``crosscue.replay.log.Log`` and the module's text."""
 
-    def __init__(self, log: Log, seal: Seal) -> None:
-        """Stand for ``log``."""
+    def __init__(self, log: Log, seal: Seal, folders: Path | None = None) -> None:
+        """Stand for ``log``; ``folders`` is the seal file if it is that of a folder around it."""
         self.seal: Final = seal
+        self.folders: Final = folders
         self._log: Final = log
         self._touched: Final = log.touched if isinstance(log, Touching) else None
         self._opening: Final = {} if self._touched is None else self._touched.of_opening()
@@ -162,4 +160,5 @@ def sealed_sentence(log: Log) -> str:
     if not isinstance(log, SealedLog):
         return "not sealed"
     seal = log.seal
-    return f"sealed at {seal.sealed_at} ({HASH}, {seal.blocks} blocks of 1 MiB)"
+    by = "" if log.folders is None else f", by {log.folders.name} of the folder it is in"
+    return f"sealed at {seal.sealed_at} ({HASH}, {seal.blocks} blocks of 1 MiB{by})"

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
@@ -330,6 +330,56 @@ def _file_of(entry: Mapping[str, Any]) -> SealedFile:
     if size < 0 or len(digests) != _blocks_in(size) * DIGEST_BYTES:
         raise ValueError(f"{name!r:.40}: {len(digests)} bytes of hashes for {size} bytes")
     return SealedFile(name, size, digests)
+
+
+def seal_over(log: Path) -> tuple[Path, Seal] | None:
+    """Where the seal of a log lies and what it says: its own, or of a folder that it is in.
+
+    Raises:
+        LogError: The seal is damaged.
+    """
+    own = seal_path(log)
+    if _is_there(own):
+        return own, read_seal(own)
+    place = Path(os.path.abspath(log))  # noqa: PTH100  # as in seal_path
+    for folder in place.parents[:-1]:
+        path = seal_path(folder)
+        if _is_there(path):
+            seal = read_seal(path)
+            part = _part_of(seal, log, place.relative_to(folder).as_posix())
+            return None if part is None else (path, part)
+    return None
+
+
+def _part_of(seal: Seal, log: Path, name: str) -> Seal | None:
+    """What a folder's seal says of one log in it; None if nothing."""
+    if log.is_dir():
+        inside = name + "/"
+        files = [
+            replace(file, name=key.removeprefix(inside))
+            for key, file in seal.files.items()
+            if key.startswith(inside)
+        ]
+    elif name in seal.files:
+        place = name[: -len(log.name)]
+        beside = [place + other for other in files_of(log) if other != THE_LOG]
+        files = [replace(seal.files[name], name=THE_LOG)]
+        files += [
+            replace(seal.files[key], name=key.removeprefix(place))
+            for key in beside
+            if key in seal.files
+        ]
+    else:
+        files = []
+    return Seal(seal.sealed_at, {file.name: file for file in files}) if files else None
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:
+        # A log's name may be too long to have a seal.
+        return False
 
 
 class Check:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader, FileIO
 from pathlib import Path
 from threading import Lock
-from typing import Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+if TYPE_CHECKING:
+    from _typeshed import WriteableBuffer
 
 BLOCK_BITS: Final = 20
 """Blocks of 1 MiB, as in seals."""
@@ -57,3 +61,36 @@ class Touched:
             heard = dict(listener)
             listener.clear()
         return heard
+
+
+class _Noted(FileIO):
+    """A file that notes which of its bytes are read."""
+
+    def __init__(self, path: Path, touched: Touched) -> None:
+        super().__init__(path, "rb")
+        self._path: Final = path
+        self._touched: Final = touched
+
+    def readinto(self, buffer: WriteableBuffer, /) -> int | None:
+        at = self.tell()
+        size = super().readinto(buffer)
+        self._touched.add(self._path, at, size or 0)
+        return size
+
+    def read(self, size: int | None = -1, /) -> bytes | Any:
+        at = self.tell()
+        found = super().read(size)
+        self._touched.add(self._path, at, len(found))
+        return found
+
+    def readall(self) -> bytes | Any:
+        return self.read()
+
+
+def open_noted(path: Path, touched: Touched, buffering: int = 1 << 13) -> BufferedReader:
+    """A file opened for reading, whatever is read of it noted.
+
+    Raises:
+        OSError: It cannot be opened.
+    """
+    return BufferedReader(_Noted(path, touched), buffering)

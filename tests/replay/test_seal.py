@@ -6,7 +6,9 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import asammdf
 import numpy as np
 import pytest
 
@@ -21,10 +23,11 @@ from crosscue.replay.limits import MIB
 from crosscue.replay.log import Selection
 from crosscue.replay.losses import losses_heard
 from crosscue.replay.opening import open_log
+from crosscue.replay.seal import seal as sealing
 from crosscue.replay.seal.log import CHANGED, DIFFERS
-from crosscue.replay.seal.seal import read_seal, seal_path
+from crosscue.replay.seal.seal import digests_of, read_seal, seal_path
 from support.accounted import read
-from support.can_files import candump, made
+from support.can_files import blf, candump, made
 from support.every_format import EVERY_FORMAT
 from support.pictures import picture_folder
 from support.rosbag_files import rows_of, write_bag, write_folder
@@ -417,3 +420,130 @@ def test_a_window_of_an_indexed_log_checks_its_own_blocks_alone(tmp_path: Path, 
     at = rows[10].payload[4:20]
     _flip(log, log.read_bytes().index(at)) if at in log.read_bytes() else _flip(log, 5000)
     assert losses(early) == [f"{log.name}: bytes 0 to {MIB}"]
+
+
+def _in_window(kind: str, folder: Path) -> tuple[Path, Selection, dict[str, bool]]:
+    """A log, a window at its beginning, and files or parts of it: are they read for the window?"""
+    if kind == "images":
+        times = "".join(f"{0.5 * i:.1f}\n" for i in range(12))
+        log = picture_folder(folder / "front", 12, times)
+        return log, Selection(end_ns=1_000_000_000), {"frame_0.png": True, "frame_9.png": False}
+    if kind == "blf":
+        log = folder / "can.blf"
+        frames = made(60_000, step_ns=1_000_000)
+        log.write_bytes(blf(frames, stored=True, container=60_000))
+    else:
+        log = folder / "x.mf4"
+        at_s = np.arange(400_000) * 1e-3
+        with asammdf.MDF(version="4.10") as mdf:
+            mdf.configure(write_fragment_size=1 << 18)
+            mdf.append([asammdf.Signal(at_s * 3.0, at_s, name="speed")], acq_name="drive")
+            mdf.save(log, compression=0)
+    assert log.stat().st_size > 3 * MIB
+    begin = int(read(log)[0][0].log_ns[0])
+    return log, Selection(end_ns=begin + 500_000_000), {}
+
+
+@pytest.mark.parametrize("kind", ["blf", "mf4", "images"])
+def test_a_window_checks_only_what_it_reads(tmp_path: Path, kind: str) -> None:
+    log, window, files = _in_window(kind, tmp_path)
+    assert run(["seal", str(log)]) == 0
+    total = read_seal(seal_path(log)).blocks
+
+    def losses(selection: Selection) -> tuple[int, list[str]]:
+        ledger = Ledger(str(log))
+        with open_log(log) as opened:
+            for _ in opened.read(ledger, selection):
+                pass
+        found = re.search(r"(\d+) of \d+ blocks", ledger.integrity)
+        details = [drop.detail for drop in ledger.drops() if drop.reason == DIFFERS]
+        return int(found[1]) if found else total, details
+
+    checked, none = losses(window)
+    assert 0 < checked < total
+    assert not none
+    # A byte of a payload, or one that no decoder looks at: only the seal can see it.
+    if not files:
+        at = int(log.stat().st_size * 0.6)
+        _flip(log, at)
+        assert losses(window) == (checked, [])
+        begin = at // MIB * MIB
+        assert f"{log.name}: bytes {begin} to {begin + MIB}" in losses(Selection())[1]
+        return
+    for name, is_read in files.items():
+        size = (log / name).stat().st_size
+        _flip(log / name, size - 1)
+        assert losses(window) == (checked, [f"{name}: bytes 0 to {size}"] if is_read else [])
+        _flip(log / name, size - 1)
+
+
+def test_one_file_of_a_sealed_folder_is_held_against_the_folders_seal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = write_folder(tmp_path / "bag", rows_of(50))
+    assert run(["seal", str(place)]) == 0
+    database = next(place.glob("*.db3"))
+    assert "all 1 blocks of 1 MiB were checked, none differs" in read(database)[1].integrity
+    run(["info", "--quick", str(database)])
+    assert f"by {place.name}.seal of the folder" in " ".join(capsys.readouterr().out.split())
+
+    _flip(database, database.stat().st_size - 5)
+    assert f"{database.name}: bytes 0 to {database.stat().st_size}" in _said(database)
+    assert run(["seal", "--check", str(database)]) == 3
+    # Read as a part of its folder, it is reported once.
+    details = [drop.detail for drop in read(place)[1].drops() if drop.reason == DIFFERS]
+    assert details == [f"{database.name}: bytes 0 to {database.stat().st_size}"]
+
+
+def test_a_folder_in_a_sealed_folder_is_held_against_its_seal(tmp_path: Path) -> None:
+    drive = _sealed(tmp_path, "kitti-raw")
+    camera = drive / "image_02" / "data"
+    one = sorted(camera.iterdir())[3]
+    assert "none differs" in read(camera)[1].integrity
+
+    _flip(one, one.stat().st_size - 1)
+    assert f"{one.name}: bytes 0 to {one.stat().st_size}" in _said(camera)
+
+
+def test_a_log_that_joined_a_sealed_folder_later_is_not_sealed(tmp_path: Path) -> None:
+    place = write_folder(tmp_path / "bag", rows_of(50))
+    assert run(["seal", str(place)]) == 0
+    late = place / "can.log"
+    late.write_bytes(candump(made(30)))
+
+    assert read(late)[1].is_whole
+    assert "sealed" not in read(late)[1].integrity
+    assert not read(place)[1].is_whole
+
+
+def test_an_interrupted_seal_leaves_nothing_half_written(
+    long_log: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = seal_path(long_log).read_bytes()
+    names = sorted(path.name for path in long_log.parent.iterdir())
+    hashed = 0
+
+    def interrupted(*given: Any) -> Iterator[bytes]:
+        nonlocal hashed
+        for digest in digests_of(*given):
+            hashed += 1
+            if hashed == 2:
+                raise KeyboardInterrupt
+            yield digest
+
+    monkeypatch.setattr(sealing, "digests_of", interrupted)
+    for argv in (["seal", "--overwrite", str(long_log)], ["seal", "--check", str(long_log)]):
+        hashed = 0
+        assert run(argv) == 130
+        assert "Traceback" not in capsys.readouterr().err
+    assert seal_path(long_log).read_bytes() == before
+    assert sorted(path.name for path in long_log.parent.iterdir()) == names
+
+
+def test_sealing_reports_its_progress_in_bytes(long_log: Path) -> None:
+    work = sealing.Sealing(long_log)
+    done = list(work)
+
+    assert work.total == long_log.stat().st_size == done[-1]
+    assert done == sorted(done)
+    assert len(done) == read_seal(seal_path(long_log)).blocks

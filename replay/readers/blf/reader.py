@@ -32,6 +32,7 @@ from crosscue.replay.readers.can_rows import (
     keep_memory,
 )
 from crosscue.replay.readers.can_text.digits import NANOS, within_range
+from crosscue.replay.seal.touched import Touched, open_noted
 
 from .objects import BASE_BYTES, CONTAINER, MAGIC, PADDING_MAX, TYPE_MAX, Tally, chain_of, rows_of
 from .windows import unwanted
@@ -92,10 +93,12 @@ class BlfLog(Closing):
             LogFormatError: It does not begin with a BLF header.
         """
         self._path, self._limits = path, limits
-        with path.open("rb") as file:
+        self.touched: Final = Touched()
+        with open_noted(path, self.touched) as file:
             self._header = _header_of(file, path)
         self._names: dict[str, int] = {}
-        for n, rows in enumerate(_Pass(self._path, self._header, limits, self._names).rows()):
+        first = _Pass(self._path, self._header, limits, self._names, self.touched)
+        for n, rows in enumerate(first.rows()):
             if len(rows) or n >= _PEEKED:
                 break
 
@@ -130,7 +133,9 @@ class BlfLog(Closing):
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """All frames, a stretch of containers at a time; see ``Log.read``."""
         keep_memory()
-        reading = _Pass(self._path, self._header, self._limits, self._names, selection)
+        reading = _Pass(
+            self._path, self._header, self._limits, self._names, self.touched, selection
+        )
         try:
             for rows in reading.rows():
                 yield from blocks_by_bus(rows, tuple(self._names), ledger, selection)
@@ -150,6 +155,7 @@ class _Pass:
         header: FileHeader,
         limits: Limits,
         names: dict[str, int],
+        touched: Touched,
         selection: Selection = EVERYTHING,
     ) -> None:
         self.tally = Tally()
@@ -157,7 +163,7 @@ class _Pass:
         self._tail = b""
         self._is_resumed = self._has_loose = False
         self._deflated = self._stored = self._wasted = 0
-        self._selection = selection
+        self._selection, self._touched = selection, touched
         self._skips: Mapping[int, int] = {}
         self._skipped_bytes = 0
 
@@ -165,7 +171,7 @@ class _Pass:
         """The file's frames, a stretch at a time."""
         parts: list[bytes] = []
         place, held = "", 0
-        with self._path.open("rb") as file:
+        with open_noted(self._path, self._touched) as file:
             for content, where in self._contents(file):
                 if content is None:
                     # Where nothing is missing, only not read, an object may end in what follows.
@@ -279,7 +285,9 @@ class _Pass:
             self.tally.damage("file is cut", "inside its header")
         if self._header.objects:  # otherwise nothing says how many objects are not read
             start_ns = self._header.start_ns or 0
-            self._skips = unwanted(file, position, size, start_ns, self._selection)
+            # Heads of containers that are left out do not count as read.
+            with self._path.open("rb") as heads:
+                self._skips = unwanted(heads, position, size, start_ns, self._selection)
         while position < size:
             if position in self._skips:
                 self._skipped_bytes += self._skips[position] - position

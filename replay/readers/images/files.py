@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import stat
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +16,7 @@ from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, Selection
 from crosscue.replay.readers.timed_files import TimedFiles, is_inside
+from crosscue.replay.seal.touched import Touched, open_noted
 
 from .damage import CHECKED, damage_of
 
@@ -30,10 +31,12 @@ class PictureFiles:
     Attributes:
         topic: The camera.
         files: Its pictures.
+        touched: Takes note of what is read, for a seal.
     """
 
     topic: Topic
     files: TimedFiles
+    touched: Touched = field(default_factory=Touched)
 
     def read(self, ledger: Ledger, selection: Selection, limits: Limits) -> Iterator[Block]:
         """The pictures in blocks, accounted for; codings met are added to ``ledger.integrity``."""
@@ -79,7 +82,7 @@ class PictureFiles:
         batch = _Batch(name)
         for i in np.flatnonzero(wanted):
             t_ns = int(self.files.t_ns[i])
-            picture = _read_picture(self.files.paths[i], name, t_ns, ledger, limits)
+            picture = _read_picture(self.files.paths[i], name, t_ns, ledger, limits, self.touched)
             if picture is None:
                 continue
             if batch.size and batch.size + len(picture[0]) > BLOCK_BYTES:
@@ -122,13 +125,13 @@ def image_block(
 
 
 def _read_picture(
-    path: Path, topic: str, t_ns: int, ledger: Ledger, limits: Limits
+    path: Path, topic: str, t_ns: int, ledger: Ledger, limits: Limits, touched: Touched
 ) -> tuple[bytes, str] | None:
     """A whole picture and its coding; else None, and the ledger knows why."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             raise OSError("not a regular file")
-        with path.open("rb") as file:
+        with open_noted(path, touched) as file:
             picture = file.read(limits.message_bytes + 1)
     except OSError as error:
         why = error.strerror or str(error)

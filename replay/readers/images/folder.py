@@ -18,6 +18,7 @@ from crosscue.replay.limits import Limits
 from crosscue.replay.log import EVERYTHING, Selection
 from crosscue.replay.readers.time_file import find_time_file, read_time_file
 from crosscue.replay.readers.timed_files import list_files, pair
+from crosscue.replay.seal.touched import Touched
 
 from .files import SUFFIXES, PictureFiles
 
@@ -46,6 +47,11 @@ class ImageFolder(Closing):
         """Pictures without a time, times without a picture; see ``KnowsItsEnd``."""
         self._pictures.report_missing(ledger)
 
+    @property
+    def touched(self) -> Touched:
+        """Which files were read, for a seal."""
+        return self._pictures.touched
+
     def close(self) -> None:
         """Nothing is held open."""
 
@@ -71,4 +77,7 @@ def open_images(path: Path, limits: Limits) -> ImageFolder:
     camera = name.parent.name if name.name == "data" else name.name
     files = pair(paths, times)
     topic = Topic(camera or "images", "crosscue/Images", "columns", declared=files.declared)
-    return ImageFolder(path, PictureFiles(topic, files), limits)
+    pictures = PictureFiles(topic, files)
+    if time_file.parent == path:
+        pictures.touched.add(time_file, 0, time_file.stat().st_size)
+    return ImageFolder(path, pictures, limits)

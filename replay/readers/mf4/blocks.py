@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, Final
 
@@ -172,8 +172,14 @@ class Header:
 class Blocks:
     """Blocks of an open file."""
 
-    def __init__(self, file: BinaryIO, size: int, limits: Limits) -> None:
-        self._file, self.size, self._limits = file, size, limits
+    def __init__(
+        self, file: BinaryIO, size: int, limits: Limits, note: Callable[[int, int], None]
+    ) -> None:
+        """Blocks of ``file``; ``note`` is called with start and size of what is read of it.
+
+        The heads of data blocks are not noted: all are read, whatever part is asked for.
+        """
+        self._file, self.size, self._limits, self._note = file, size, limits, note
         self._linked: set[int] = set()
 
     def header(self, path: str) -> Header:
@@ -183,6 +189,7 @@ class Blocks:
             LogFormatError: It is no MDF 4 file, or its header is damaged.
         """
         self._file.seek(0)
+        self._note(0, 64)
         head = self._file.read(64)
         name, version = head[:8], head[8:16].rstrip(b"\0 ").decode("ascii", "replace")
         if not head:
@@ -224,6 +231,7 @@ class Blocks:
         is_sound = links <= count <= _LINKS_MAX and HEAD_BYTES + 8 * count + body <= length
         if not is_sound or length > _BLOCK_MAX or at + length > self.size:
             raise BrokenBlockError(f"{kind.decode()} at byte {at} has impossible sizes")
+        self._note(at, length)
         raw = self._file.read(length - HEAD_BYTES)
         found_links: tuple[int, ...] = struct.unpack_from(f"<{count}Q", raw)
         self._linked.update(found_links)
@@ -270,6 +278,7 @@ class Blocks:
 
     def read(self, at: int, count: int) -> bytes:
         """Bytes of the file."""
+        self._note(at, count)
         self._file.seek(at)
         return self._file.read(count)
 
@@ -418,6 +427,7 @@ class Blocks:
         kind, length, count = self._head(at)
         if kind not in (b"##TX", b"##MD") or length < HEAD_BYTES or count:
             raise BrokenBlockError(f"no text block at byte {at}: {kind!r}")
+        self._note(at, min(length, _TEXT_MAX))
         raw = self._file.read(min(length - HEAD_BYTES, _TEXT_MAX)).split(b"\0", 1)[0]
         if kind == b"##MD":
             found = _TX.search(raw)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Final
 
@@ -34,6 +34,7 @@ from crosscue.replay.readers.can_rows import (
     merged,
     merged_by_time,
 )
+from crosscue.replay.seal.touched import Touched
 
 from .blocks import (
     CYCLE_COUNTERS,
@@ -130,8 +131,10 @@ class Mf4Log(Closing):
         """
         self._path, self._limits = path, limits
         keep_memory()
+        self.touched: Final = Touched()
         self._file = path.open("rb", buffering=_BUFFER_BYTES)
-        self._blocks = Blocks(self._file, path.stat().st_size, limits)
+        note = partial(self.touched.add, path)
+        self._blocks = Blocks(self._file, path.stat().st_size, limits, note)
         self._buses: dict[str, int] = {}
         self._broken = ""
         try:

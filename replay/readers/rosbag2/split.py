@@ -16,6 +16,7 @@ from crosscue.replay.ledger import Detail, Ledger
 from crosscue.replay.limits import MIB, Limits
 from crosscue.replay.log import Log, report_missing
 from crosscue.replay.opening import open_log, open_unsealed
+from crosscue.replay.seal.log import with_seal
 
 from .db3 import Db3Log
 from .metadata import Metadata
@@ -95,9 +96,13 @@ def look_into(path: Path, metadata: Metadata, limits: Limits) -> Split:
         return Split(path, fault=str(error))
 
 
+def _open_part(path: Path, limits: Limits) -> Log:
+    return with_seal(path, lambda: open_unsealed(path, limits), is_part=True)
+
+
 @contextmanager
 def opened(
-    path: Path, limits: Limits, open_one: Callable[[Path, Limits], Log] = open_log
+    path: Path, limits: Limits, open_one: Callable[[Path, Limits], Log] = _open_part
 ) -> Iterator[tuple[Log, str]]:
     """The log in a storage file, and what went wrong when it was unpacked (or nothing)."""
     if not path.name.endswith(PACKED):
