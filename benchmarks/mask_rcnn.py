@@ -18,10 +18,14 @@ from __future__ import annotations
 import argparse
 import copy
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -146,6 +150,69 @@ def one_result(detector: MaskRcnnDetector, frame: Frame) -> Detections:
     (found,) = detector([frame])
     assert isinstance(found, Detections)
     return found
+
+
+class WholeOnnx:
+    """The plain loop's network, exported whole, in onnxruntime on one thread."""
+
+    def __init__(self, checkpoint: Checkpoint, proposals: int, example: Frame) -> None:
+        """Export for the example's size, with the score that ours has here."""
+        onnxruntime: Any = import_module("onnxruntime")
+        self.plan = checkpoint.facts.plan
+        network = copy.deepcopy(checkpoint.network)
+        set_limits(network, proposals, 0.5)
+        network.rpn._pre_nms_top_n["testing"] = 1000
+        pixels = self._input(example)
+        network.transform = GeneralizedRCNNTransform(*pixels.shape[1:], list(MEAN), list(SPREAD))
+        with TemporaryDirectory() as folder, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            path = Path(folder) / "whole.onnx"
+            torch.onnx.export(network.eval(), ([pixels],), path, opset_version=17, dynamo=False)
+            content = path.read_bytes()
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        self.session = onnxruntime.InferenceSession(
+            content, options, providers=["CPUExecutionProvider"]
+        )
+
+    def _input(self, frame: Frame) -> Tensor:
+        rgb = place(frame.pixels, self.plan).pixels[:, :, ::-1].transpose(2, 0, 1)
+        return torch.from_numpy(np.ascontiguousarray(rgb)).float() / 255.0
+
+    def __call__(self, frame: Frame) -> Detections:
+        """The same as ours, without masks, though it pastes them."""
+        name = self.session.get_inputs()[0].name
+        found, labels, scores, _ = self.session.run(None, {name: self._input(frame).numpy()})
+        placed = place(frame.pixels, self.plan)
+        boxes = (found.astype(np.float64) + np.tile(placed.corner_px, 2)) / np.tile(placed.scale, 2)
+        names = tuple(str(self.plan.classes[i - 1]) for i in labels.tolist())
+        return Detections(
+            frame.t_ns, frame.size_px, boxes, scores.astype(np.float64), names, (b"",) * len(names)
+        )
+
+
+def whole_onnx(checkpoint: Checkpoint, counts: Sequence[int], seen: Sequence[Scene]) -> None:
+    """Print ours beside the exported network: CPU time, and whether detections are equal."""
+    for count in (min(counts), max(counts)):
+        ours = raw_detector(checkpoint, proposals=count)
+        theirs = WholeOnnx(checkpoint, count, seen[0].frame)
+        print(f"  {count} proposals, score 0.5")
+        in_rotation(
+            {
+                "whole network in onnxruntime": theirs,
+                "ours, torch": lambda frame, d=ours: d([frame]),  # type: ignore[misc]
+            },
+            [scene.frame for scene in seen],
+        )
+        same = sum(
+            (
+                matches(theirs(scene.frame), one_result(ours, scene.frame), lambda name: 0.5)
+                for scene in seen
+            ),
+            Counter[str](),
+        )
+        print(f"    {dict(same)}")
 
 
 def our_ways(checkpoint: Checkpoint, counts: Sequence[int]) -> dict[str, MaskRcnnDetector]:
@@ -322,12 +389,18 @@ def main() -> None:
     """Print all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--network", default="embedded", help="a checkpoint instead")
+    parser.add_argument(
+        "--onnx", action="store_true", help="only: the whole network as ONNX beside ours"
+    )
     parser.add_argument("--resnet-pictures", type=int, default=4, help="how many; it is slow")
     args = parser.parse_args()
     torch.set_num_threads(1)
     seen = scenes()
     own = checkpoint_named(args.network)
     print(f"{args.network}, {own.facts.plan.width_px} pixels wide, {len(seen)} pictures")
+    if args.onnx:
+        whole_onnx(own, (100, 1000), seen)
+        return
     compare(own, (100, 200, 300, 1000), seen, score_levels(own), is_true=True)
     few = seen[: args.resnet_pictures]
     if few:

@@ -2,6 +2,10 @@
 
 Everything written by others is escaped here. Each chart carries a title and a description for those
 who do not see it. The same input gives the same bytes.
+
+matplotlib draws the studies' figures and not these: its SVG follows no style of the page and has no
+hints, is twice as large (21 against 11 kB for four curves of 200 points), and twelve of them take
+0.5 s of CPU, and 0.35 s to import it, against 0.01 s.
 """
 
 from __future__ import annotations
