@@ -26,6 +26,8 @@ DETAILS_KEPT: Final = 1000
 
 NOT_ASKED_TIME: Final = "outside --from/--to"
 NOT_ASKED_TOPIC: Final = "topic not asked for"
+DIFFERS: Final = "bytes differ from the seal"
+CHANGED: Final = "files differ from the seal"
 
 
 class RowsOfTopic(Protocol):

@@ -18,9 +18,8 @@ from typing import Final, Protocol
 from pydantic import Field
 
 from crosscue.replay.errors import AccountError
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.ledger import CHANGED, DIFFERS, NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.ledger import TopicAccount as Counted
-from crosscue.replay.seal.log import CHANGED, DIFFERS
 
 from .record import Record
 

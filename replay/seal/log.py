@@ -15,14 +15,12 @@ from typing import Final, Protocol, runtime_checkable
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import LogError
 from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.ledger import CHANGED, DIFFERS, Ledger
 from crosscue.replay.log import EVERYTHING, Log, Selection, report_missing
 
 from .seal import HASH, Check, Seal, seal_over, seal_path
 from .touched import Blocks, Touched
 
-DIFFERS: Final = "bytes differ from the seal"
-CHANGED: Final = "files differ from the seal"
 _SPANS_SHOWN: Final = 3
 
 

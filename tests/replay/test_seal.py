@@ -18,13 +18,12 @@ from crosscue.eval.runs.stored_images import StoredCamera, read_pictures
 from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.errors import LogError
 from crosscue.replay.formats import FORMATS
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.ledger import CHANGED, DIFFERS, Ledger
 from crosscue.replay.limits import MIB
 from crosscue.replay.log import Selection
 from crosscue.replay.losses import losses_heard
 from crosscue.replay.opening import open_log
 from crosscue.replay.seal import seal as sealing
-from crosscue.replay.seal.log import CHANGED, DIFFERS
 from crosscue.replay.seal.seal import digests_of, read_seal, seal_path
 from support.accounted import read
 from support.can_files import blf, candump, made
