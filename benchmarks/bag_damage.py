@@ -26,7 +26,15 @@ from support.rosbag_files import (
     write_folder,
 )
 
-COLUMNS = ("refused", "same", "told", "wrong, told", "undetectable", "SILENT LOSS", "SILENT WRONG")
+COLUMNS = (
+    "refused",
+    "same",
+    "reported",
+    "wrong, reported",
+    "undetectable",
+    "SILENT LOSS",
+    "SILENT WRONG",
+)
 
 
 def originals(folder: Path) -> dict[str, Path]:
@@ -78,7 +86,7 @@ def run_one(
         verdict = judge(copy, truth, calm)
         slowest = max(slowest, time.perf_counter() - began)
         verdicts[verdict] += 1
-        if is_shown and verdict in ("SILENT LOSS", "SILENT WRONG", "wrong, told"):
+        if is_shown and verdict in ("SILENT LOSS", "SILENT WRONG", "wrong, reported"):
             print(f"  {verdict}: {how}")
     counts = "".join(f"{verdicts[c]:>14}" for c in COLUMNS)
     print(f"{name:20}{what:8}{counts}{slowest:>12.2f}", flush=True)

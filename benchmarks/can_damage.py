@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from support.can_files import damaged
 from support.can_kinds import KINDS, Kind, judge
 
-COLUMNS = ("refused", "same", "told", "undetectable", "SILENT", "INVENTED", "UNCLEAR", "CRASH")
+COLUMNS = ("refused", "same", "reported", "undetectable", "SILENT", "INVENTED", "UNCLEAR", "CRASH")
 
 
 def count(

@@ -30,7 +30,7 @@ from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.eval.scoring.truth import cue_at
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-LEAST_NEAR = 0.5
+MIN_NEAR = 0.5
 """A true car counts where its middle is so near, in lengths of its box."""
 KINDS = {
     "cross": "car on the crossroad that moves",
@@ -55,8 +55,8 @@ def true_cars(drive: Path) -> dict[int, list[dict[str, Any]]]:
 
 
 def what_is_at(cars: list[dict[str, Any]], x: float, y: float) -> str:
-    """What the nearest true car does, or that there is none."""
-    best, nearest = "no car", LEAST_NEAR
+    """What the nearest true car does, or that none exists."""
+    best, nearest = "no car", MIN_NEAR
     for one in cars:
         x0, y0, width, height = one["bbox"]
         away = float(np.hypot(x - x0 - width / 2, y - y0 - height / 2)) / max(width, height)
@@ -78,11 +78,11 @@ def claims(run: RunFolder, vehicle: Vehicle) -> Iterator[tuple[int, str, float, 
             for i, (x, y) in enumerate(pairs.center_px.tolist()):
                 part = slice(i, i + 1)
                 one = replace(pairs, step_px=pairs.step_px[part], nose=pairs.nose[part])
-                told = {
+                reported = {
                     "cross_traffic": cross_traffic(one, rules),
                     "parked": parked_cars(one, rules),
                 }
-                for cue, (left, right) in told.items():
+                for cue, (left, right) in reported.items():
                     if left or right:
                         yield now.t_ns, f"{cue}_{'left' if left else 'right'}", x, y
         before = now

@@ -31,7 +31,7 @@ from crosscue.eval import cli
 from crosscue.eval.runs.folder import open_run
 from crosscue.replay.errors import RunError
 
-LEAST_S = 0.001
+MIN_S = 0.001
 
 
 class Bright:
@@ -131,7 +131,7 @@ def main() -> None:
             if number % 2:
                 for path in folder.glob("cache.sqlite*"):
                     path.unlink()
-            after_s = rng.uniform(LEAST_S, 1.1 * usual_s)
+            after_s = rng.uniform(MIN_S, 1.1 * usual_s)
             found, took_s = kill_and_resume(argv, run, after_s, right)
             outcomes.update(found)
             resumed_s.append(took_s)

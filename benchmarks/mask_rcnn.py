@@ -7,8 +7,8 @@ score ours has too (the same class, every side within half a pixel), and, since 
 simulated, what is true: right, a second time the same object, or false.
 
 The ResNet-50 has random weights, since COCO's are not at hand. Its scores are set by a proposal's
-rank (the 5 likeliest are sure, 60 compete, 20 detections remain), so its equal detections tell that
-levels, proposals and boxes agree, and nothing of what fewer proposals cost.
+rank (the 5 likeliest are sure, 60 compete, 20 detections remain), so its equal detections report
+that levels, proposals and boxes agree, and nothing of what fewer proposals cost.
 
 That cost as average precision: crosscue train mask-rcnn --measure embedded --proposals 100 1000.
 """
@@ -98,7 +98,7 @@ def scenes() -> list[Scene]:
 
 @dataclass(frozen=True, slots=True)
 class PlainLoop:
-    """Torchvision's own way, on the part of the picture that ours looks at."""
+    """Torchvision's own way, on the part of the picture that ours examines."""
 
     network: Any
     plan: Plan
@@ -296,7 +296,7 @@ def judged(found: Detections, scene: Scene, least: Least) -> Counter[str]:
     return counts
 
 
-def told_equality(
+def reported_equality(
     plain: PlainLoop,
     ours: Mapping[str, MaskRcnnDetector],
     seen: Sequence[Scene],
@@ -315,11 +315,15 @@ def told_equality(
             true = sum(
                 (judged(a, s, least) for a, s in zip(results, seen, strict=True)), Counter[str]()
             )
-            told = f"    {name:36} {same['the same']:4} the same, {same['only plain']} only plain, "
-            told += f"{same['only ours']} only ours"
+            reported = (
+                f"    {name:36} {same['the same']:4} the same, {same['only plain']} only plain, "
+            )
+            reported += f"{same['only ours']} only ours"
             if is_true:
-                told += f"; {true['right']} right, {true['doubles']} doubles, {true['false']} false"
-            print(told)
+                reported += (
+                    f"; {true['right']} right, {true['doubles']} doubles, {true['false']} false"
+                )
+            print(reported)
 
 
 def score_levels(checkpoint: Checkpoint) -> dict[str, Least]:
@@ -382,7 +386,7 @@ def compare(
     for name, detector in ours.items():
         ways[name] = lambda frame, d=detector: d([frame])  # type: ignore[misc]
     in_rotation(ways, [scene.frame for scene in seen])
-    told_equality(plain, ours, seen, levels, is_true)
+    reported_equality(plain, ours, seen, levels, is_true)
 
 
 def main() -> None:

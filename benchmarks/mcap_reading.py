@@ -306,8 +306,8 @@ def memory(megabytes: int) -> None:
                 path = Path(folder) / "log.mcap"
                 write_log(path, compression, max(1, round(size / 148)))
                 call = [sys.executable, "-c", PEAK, str(path)]
-                told = subprocess.run(call, check=True, capture_output=True, text=True).stdout
-                before, after = (int(kib) / 1024 for kib in told.split())
+                reported = subprocess.run(call, check=True, capture_output=True, text=True).stdout
+                before, after = (int(kib) / 1024 for kib in reported.split())
                 added.append(after - before)
                 print(
                     f"{compression.name.lower():5} log of {path.stat().st_size / 1e6:5.0f} MB: "

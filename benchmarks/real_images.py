@@ -1,4 +1,4 @@
-"""Count what runs of crosscue detect found, as docs/real_images.md tells it.
+"""Count what runs of crosscue detect found, as docs/real_images.md reports it.
 
 For each run: in how many frames a label was found at a score, with how many boxes; frames in which
 each cue is positive. With --road, how far the other runs' road agrees with that run's.
@@ -33,13 +33,13 @@ def print_found(run: RunFolder, scores: list[float]) -> None:
     table = run.table("detections", ["frame", "label", "score"]).to_pylist()
     print(f"{run.path}: {frames} frames")
     for label in LABELS:
-        told = []
+        reported = []
         for score in scores:
             rows = [row for row in table if row["label"] == label and row["score"] >= score]
             seen = {row["frame"] for row in rows}
-            told.append(f"from {score:g}: {len(seen)} frames, {len(rows)} boxes")
+            reported.append(f"from {score:g}: {len(seen)} frames, {len(rows)} boxes")
         if any(row["label"] == label for row in table):
-            print(f"  {label:14} {'; '.join(told)}")
+            print(f"  {label:14} {'; '.join(reported)}")
 
 
 def print_cues(run: RunFolder) -> None:
@@ -47,8 +47,8 @@ def print_cues(run: RunFolder) -> None:
     positive: dict[str, int] = defaultdict(int)
     for row in run.table("cues", ["cue", "count"]).to_pylist():
         positive[row["cue"]] += row["count"] > 0
-    told = ", ".join(f"{cue} {count}" for cue, count in sorted(positive.items()))
-    print(f"  cues positive in frames: {told or 'none looked for'}")
+    reported = ", ".join(f"{cue} {count}" for cue, count in sorted(positive.items()))
+    print(f"  cues positive in frames: {reported or 'none looked for'}")
 
 
 def road_masks(run: RunFolder, size_px: tuple[int, int]) -> Iterator[NDArray[np.bool_]]:

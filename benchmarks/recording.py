@@ -6,7 +6,7 @@ A simulated town drive (no scene in its pictures) with 10 pictures a second of 1
 objects in each, as in ``estimate.py``. The peer does what tutorials do: set the time, log the
 picture, boxes with labels, masks as a segmentation image, beliefs and ranges, frame by frame; it
 draws neither map nor way ahead, cars, regions or cues, which ours does. Cases run in rotation;
-ratios are taken round by round. Peak memory of ours is told for the drive and for one twice as
+ratios are taken round by round. Peak memory of ours is reported for the drive and for one twice as
 long, each in a process of its own: it should hardly grow.
 """
 
@@ -156,13 +156,13 @@ def main() -> None:
             )
         twice, longer = make_run(Path(name) / "two", 2.0 * minutes)
         for one, length in ((run, seconds), (twice, longer)):
-            told = subprocess.run(
+            reported = subprocess.run(
                 [sys.executable, "-c", MEMORY, str(one.path), str(Path(name) / "m.rrd")],
                 capture_output=True,
                 text=True,
                 check=True,
             )
-            print(f"peak memory over {length:.0f} s of drive: {told.stdout.strip()} MiB")
+            print(f"peak memory over {length:.0f} s of drive: {reported.stdout.strip()} MiB")
 
 
 if __name__ == "__main__":

@@ -2,12 +2,12 @@
 
 Both look for the same drawings on the same levels of the pyramid, with points of the same kind and
 the same ratio test. The peer slides one window of each of the drawings' sizes, 16 pixels a step,
-and runs ORB once in each window, for all drawings of that size; a window's score is the share of a
-drawing's points that it has. "one size" does it with a single window that is as large as the
+and runs ORB once in each window, for all drawings of that size; a window's score is the fraction of
+a drawing's points that it has. "one size" does it with a single window that is as large as the
 largest drawing, which is as few runs of ORB as can be.
 
 On small pictures (our drawings over clutter) both look everywhere and the signs found are counted.
-In simulated streets of a usual camera's size the peer looks at every 40th window, on all levels
+In simulated streets of a usual camera's size the peer examines every 40th window, on all levels
 alike, and its time is scaled up; what shrinking the picture takes it is not charged for.
 """
 
@@ -39,7 +39,7 @@ ROUNDS = 5
 SCENES = 6
 ONE_IN = 40
 RULES = SignSettings(crop_bottom=0.0)
-LEAST_SHARE = 0.1
+MIN_SHARE = 0.1
 Size = tuple[int, int]
 Found = list[tuple[str, Floats]]
 
@@ -83,7 +83,7 @@ class WindowSearch:
 
     def __call__(self, grey: Bytes) -> Found:
         """The best window, if a tenth of a drawing's points are in it."""
-        best: tuple[float, str, Floats] = (LEAST_SHARE, "", np.zeros(4))
+        best: tuple[float, str, Floats] = (MIN_SHARE, "", np.zeros(4))
         for size, of_size in self._by_size.items():
             for window in self._windows(grey, size):
                 best = max(best, *self._shares(window, of_size), key=lambda one: one[0])

@@ -1,7 +1,7 @@
 """How fast simulated drives are made: pictures a second, stage by stage, on one core.
 
-There is no peer that draws these scenes without a GPU; each stage stands as a share of the whole,
-and OpenCV's encoding of the same picture as JPEG serves as the unit to compare machines by.
+There is no peer that draws these scenes without a GPU; each stage stands as a fraction of the
+whole, and OpenCV's encoding of the same picture as JPEG serves as the unit to compare machines by.
 
     python benchmarks/simulation.py
 """

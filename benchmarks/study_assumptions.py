@@ -1,4 +1,4 @@
-"""How far the studies' results hang on what the source does not tell: one assumption at a time.
+"""How far the studies' results hang on what the source does not report: one assumption at a time.
 
     python benchmarks/study_assumptions.py [--only field|nees|landmarks] [--drives 200]
         [--field-drives 400] [--nees-drives 20000] [--seed 77]
@@ -115,8 +115,8 @@ def nees(drives: int, seed: int) -> None:
         both = [
             drive_many(one, seeds_of(seed, count)) for one in coarse_and_fine(compass_deg, goals)
         ]
-        told(name, count, [float(rows[:, NEES].mean()) for rows in both])
-    told(
+        reported(name, count, [float(rows[:, NEES].mean()) for rows in both])
+    reported(
         "no compass, errors along an arc",
         fewer,
         [
@@ -140,7 +140,7 @@ def coarse_and_fine(compass_deg: float | None, goals: int) -> list[Drive]:
     ]
 
 
-def told(name: str, count: int, means: list[float]) -> None:
+def reported(name: str, count: int, means: list[float]) -> None:
     low, high = mean_band(3, count)
     print(
         f"{f'{name}, {count}':42} {means[0]:24.2f} {means[1]:24.2f} {f'{low:.2f}..{high:.2f}':>18}"

@@ -22,7 +22,7 @@ from crosscue.replay.readers.images.damage import damage_of
 
 from .base import View
 
-MOST_PIXELS: Final = 64_000_000
+MAX_PIXELS: Final = 64_000_000
 """Largest picture decoded: 192 MB of colour."""
 _REDUCTIONS: Final = (8, 4, 2)
 """What a JPEG decoder can leave out by itself."""
@@ -54,7 +54,7 @@ def encoded(images: Images, row: int) -> Encoded:
 
 
 def read_file(path: Path, most_bytes: int = DEFAULT.message_bytes) -> Encoded:
-    """A picture file's bytes; what they code is told by the first of them, not by the name.
+    """A picture file's bytes; their format is known from the first of them, not from the name.
 
     Raises:
         OSError: It cannot be read.
@@ -75,7 +75,7 @@ def size_of(picture: Encoded) -> tuple[int, int]:
 
     Raises:
         LogFormatError: It says nothing, or the coding is not decoded here.
-        LogTooLargeError: More than ``MOST_PIXELS``.
+        LogTooLargeError: More than ``MAX_PIXELS``.
     """
     if picture.layout is not None:
         size: tuple[int, int] | None = picture.layout[:2]
@@ -85,9 +85,9 @@ def size_of(picture: Encoded) -> tuple[int, int]:
         raise LogFormatError(f"{picture.coding} picture without a size, or not decoded here")
     if min(size) < 1:
         raise LogFormatError(f"picture of {size[0]} x {size[1]} pixels: want at least one")
-    if size[0] * size[1] > MOST_PIXELS:
+    if size[0] * size[1] > MAX_PIXELS:
         raise LogTooLargeError(
-            f"picture of {size[0]} x {size[1]} pixels: more than {MOST_PIXELS:,} are not decoded"
+            f"picture of {size[0]} x {size[1]} pixels: more than {MAX_PIXELS:,} are not decoded"
         )
     return size
 

@@ -74,7 +74,7 @@ class Runner:
         cache: Asked first.
         camera: Topic.
         depth_bits: Of 16-bit pictures.
-        on_skip: Told the time and reason of each picture that cannot be decoded.
+        on_skip: Reported the time and reason of each picture that cannot be decoded.
         counts: Grow as it works.
     """
 

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from crosscue.replay.errors import VehicleError
 
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Proportion = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 

@@ -5,7 +5,7 @@ The source scores one approach for each run; a drive has many. An approach
 * opens at the first evidence: a sign with a range, or a cue that speaks first (so a neutral belief
   is never old when an intersection comes);
 * closes once its end is behind the rear axle (the end as ranged, or the start and a usual length),
-  once the car has turned at it, or when evidence has gone stale. Where no sign tells a range it
+  once the car has turned at it, or when evidence has gone stale. Where no sign reports a range it
   goes stale sooner, and ends after ``longest_m`` in any case, since nothing else could end it;
 * begins anew when its first range shows that it began too far away to be about that intersection;
 * that closes before presence was established was noise: counted as neutral, no detection.
@@ -29,7 +29,7 @@ from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
 from .belief import Belief, Situation, Speaker, begin, establish, multiply, probabilities
 from .factor_graph import FactorGraph
 from .intersection_range import RangeBelief, Reference
-from .range_track import NOTHING, RangeTrack, Verdict, advance, go_blind, measure
+from .range_track import NOTHING, RangeTrack, Verdict, advance, measure, predict_without_odometry
 from .speakers import speakers_of
 
 TURN_FADES_M: Final = 25.0
@@ -38,7 +38,7 @@ TURN_FADES_M: Final = 25.0
 
 @dataclass(frozen=True, slots=True)
 class SignRange:
-    """The range that one detected sign or light tells.
+    """The range that one detected sign or light reports.
 
     Attributes:
         reference: What it stands at.
@@ -60,7 +60,7 @@ class FrameEvidence:
         travelled_m: Way since the evidence before, negative in reverse; None where odometry is
             missing.
         travelled_var_m2: Its variance.
-        signs: Each detection that tells a range.
+        signs: Each detection that reports a range.
         counts: From cue to how many; 0 is looked for and not found, absent is not looked for.
         objects: From cue to identities of the counted things, where a tracker gives them.
         is_new_picture: Not the same picture as the frame before.
@@ -227,7 +227,7 @@ class Approaches:
 
     def _carried(self, track: RangeTrack, evidence: FrameEvidence, moved_m: float) -> RangeTrack:
         if evidence.travelled_m is None or not _has_way(evidence):
-            return go_blind(track, moved_m, self._filter)
+            return predict_without_odometry(track, moved_m, self._filter)
         return advance(track, evidence.travelled_m, evidence.travelled_var_m2, self._filter)
 
     def _over(self, at_hand: _Open) -> str | None:

@@ -1,10 +1,10 @@
 """Cues that speak as often as they have been seen to be right, and do not repeat themselves.
 
-The source multiplies in the same parked car again in every frame, as if each look were a new one,
-and takes precision for a likelihood ratio. Here a cue is a Markov chain with two states, positive
-or not: where a feature is there it is positive at a rate ``p``, where not at a rate ``q``, and a
-look resembles the one before by ``rho = exp(-way / fade)`` (or time, for what moves by itself).
-Each look says to the feature
+The source multiplies in the same parked car again in every frame, as if each observation were a new
+one, and takes precision for a likelihood ratio. Here a cue is a Markov chain with two states,
+positive or not: where a feature is there it is positive at a rate ``p``, where not at a rate ``q``,
+and an observation resembles the one before by ``rho = exp(-way / fade)`` (or time, for what moves
+by itself). Each look says to the feature
 
     log P(now | before, there) - log P(now | before, not there),
     P(positive | positive) = p + (1 - p) rho,      P(positive | not) = p (1 - rho),
@@ -32,7 +32,7 @@ from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
 
 from .belief import Situation
 from .factor_graph import CueNode, FactorGraph, log_odds
-from .independence import independent_share
+from .independence import effective_sample_fraction
 
 USUAL_FADE: Final = Fade(way_m=10.0)
 """For a cue of which no fade was learned."""
@@ -47,7 +47,7 @@ class Learned(NamedTuple):
     scale: float
 
     def says(self, is_positive: bool, was_positive: bool | None, rho: float, share: float) -> float:
-        """Log odds of one look.
+        """Log odds of one observation.
 
         Args:
             is_positive: Now.
@@ -106,7 +106,7 @@ class _Heard:
     known: set[int] = field(default_factory=set)
 
 
-class CalibratedSpeaker:
+class CalibratedMessageModel:
     """The cues of one approach."""
 
     def __init__(self, size: int, voices: Iterable[Voice]) -> None:
@@ -141,12 +141,12 @@ class CalibratedSpeaker:
         share = 1.0
         if before is not is_positive:
             last_at = heard.changed_at.get(is_positive, -math.inf)
-            share = 1.0 if is_fresh else independent_share(at - last_at)
+            share = 1.0 if is_fresh else effective_sample_fraction(at - last_at)
             heard.changed_at[is_positive] = at
         for edge in voice.near if situation.is_near else voice.far:
             out[edge.feature] += edge.says(is_positive, before, rho, share)
         if is_positive:
-            again = 1.0 if is_fresh else independent_share(at - heard.sent_at)
+            again = 1.0 if is_fresh else effective_sample_fraction(at - heard.sent_at)
             for other in voice.published_near if situation.is_near else voice.published_far:
                 out[other.feature] += again * other.says
             heard.sent_at = at

@@ -1,10 +1,10 @@
-"""How many independent looks an approach holds: a cue's fade.
+"""How many independent observations an approach holds: a cue's fade.
 
 A cue's residual (positive or not, less the rate to be expected) resembles itself at a distance by
 ``always + fading * exp(-distance / scale)``, the rest being noise of single looks; ``always`` is
 what a place keeps saying wrongly all the way. Least squares on products of residuals at many lags;
 distance is way or time, whichever leaves less. The fade is the integral of that over an approach's
-length: the scale of the one exponential that is worth as many looks.
+length: the scale of the one exponential that is worth as many observations.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from .annotated_approach import AnnotatedApproach, Bools
 from .calibrated import USUAL_FADE
 from .factor_graph import CueNode, FactorGraph
 
-LEAST_POSITIVES: Final = 20
-"""Fewer positive looks do not tell a fade."""
+MIN_POSITIVES: Final = 20
+"""Fewer positive observations do not determine a fade."""
 LAGS: Final = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
 WAYS_M: Final = np.geomspace(0.3, 100.0, 36)
 TIMES_S: Final = np.geomspace(0.05, 20.0, 36)
@@ -54,7 +54,7 @@ class Binned(NamedTuple):
 
 
 def fit_fade(approaches: Sequence[AnnotatedApproach], graph: FactorGraph, cue: CueNode) -> FadeFit:
-    """A cue's fade, or the usual one where too few positive looks tell it."""
+    """A cue's fade, or the usual one where too few positive observations report it."""
     residuals = _residuals(approaches, graph, cue)
     looks, positives, squares = 0, 0, 0.0
     ways, times, products = [np.empty(0)], [np.empty(0)], [np.empty(0)]
@@ -72,7 +72,7 @@ def fit_fade(approaches: Sequence[AnnotatedApproach], graph: FactorGraph, cue: C
             times.append(time_s[lag:] - time_s[:-lag])
             products.append(residual[lag:] * residual[:-lag])
     correlation = np.concatenate(products)
-    if positives < LEAST_POSITIVES or squares == 0.0 or not len(correlation):
+    if positives < MIN_POSITIVES or squares == 0.0 or not len(correlation):
         return FadeFit(cue.name, USUAL_FADE, positives, looks, False)
     correlation *= looks / squares
     length_m, length_s = np.mean(spans, axis=0).tolist()
@@ -121,7 +121,7 @@ def _binned(distance: Floats, correlation: Floats) -> Binned:
 
 
 def _integral(binned: Binned, scales: Floats, length: float) -> tuple[float, float]:
-    """Integral of the best curve over ``length``, and its misfit less what no curve can mend."""
+    """Integral of the best curve over ``length``, and its misfit less what no curve can repair."""
     best, least = float(scales[0]), float("inf")
     for scale in scales.tolist():
         shape = np.exp(-binned.distance / scale)

@@ -1,7 +1,7 @@
 """Distance to an intersection as a scalar Kalman filter, as pure functions.
 
 The state is one number: metres along the path from the rear axle to the start of the intersection
-(a stop sign tells it) or to its end (a traffic light does). The two are never mixed. Equation
+(a stop sign reports it) or to its end (a traffic light does). The two are never mixed. Equation
 numbers are those of Chipka (2018), chapter 3; filterpy computes them, with the variance in Joseph's
 form, which stays positive. It is imported at the first range: importing it takes longer than
 estimating a short drive without any.

@@ -1,11 +1,11 @@
 """From annotated approaches to what ``fusion = "calibrated"`` needs: fades, rates and exponents.
 
-* A cue's *fade* tells how many independent looks an approach holds; see ``fade_fit``.
-* A *rate* is the share of positive looks where a feature is there, and where it is not, near and
-  far. Each look weighs what it is worth as an independent one, and each place the same: a thousand
-  looks at three crossroads say little of a fourth. Both shares are pulled towards their common one
-  as if by one more place there (Laplace's rule with the pooled rate for a prior), so that few
-  places say that there is no difference.
+* A cue's *fade* reports how many independent observations an approach holds; see ``fade_fit``.
+* A *rate* is the fraction of positive observations where a feature is there, and where it is not,
+  near and far. Each look weighs what it is worth as an independent one, and each place the same: a
+  thousand examines three crossroads say little of a fourth. Both shares are pulled towards their
+  common one as if by one more place there (Laplace's rule with the pooled rate for a prior), so
+  that few places say that there is no difference.
 * A feature's *exponent* is the factor on all its log odds, at most 1, that makes its log score over
   the annotated places best, each place weighing the same, against a mild pull towards 1 (a
   log-normal prior of unit width), so that few places do not silence a feature.
@@ -24,12 +24,13 @@ from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
 
 from .annotated_approach import NOT_LOOKED, AnnotatedApproach
 from .belief import Situation
-from .calibrated import CalibratedSpeaker, voices_of
+from .calibrated import CalibratedMessageModel, voices_of
 from .factor_graph import CueNode, FactorGraph, log_odds
 from .fade_fit import FadeFit, fit_fade
 
-LEAST_PLACES: Final = 3
-"""With the feature and without, each; fewer do not tell a rate or an exponent. A rate also needs as
+MIN_PLACES: Final = 3
+"""With the feature and without, each; fewer fix no rate or exponent. A rate also needs
+as
 many that were positive at all: of a cue never seen nothing is known but what was published."""
 PULL_PLACES: Final = 1.0
 """So many places at the pooled rate are added to either side."""
@@ -40,7 +41,7 @@ class Side(NamedTuple):
     """One side of a rate.
 
     Attributes:
-        rates: Share of positive looks at each place that has any.
+        rates: Fraction of positive examines each place that has any.
         frames: Looks as they are.
         looks: What they are worth as independent ones.
         hits: Likewise of the positive ones.
@@ -53,12 +54,12 @@ class Side(NamedTuple):
 
     @property
     def places(self) -> int:
-        """With at least one look."""
+        """With at least one observation."""
         return len(self.rates)
 
 
 class RateFit(NamedTuple):
-    """An edge's rates near or far; None where too little was seen to tell."""
+    """An edge's rates near or far; None where too little was seen."""
 
     cue: str
     feature: str
@@ -114,7 +115,7 @@ def _rate(
     rates = None
     seen = (*there.rates, *missing.rates)
     positive = sum(rate > 0.0 for rate in seen)
-    if min(there.places, missing.places, positive) >= LEAST_PLACES:
+    if min(there.places, missing.places, positive) >= MIN_PLACES:
         pooled = (sum(seen) + 0.5) / (len(seen) + 1.0)
         if_there, if_not = (
             (sum(side.rates) + PULL_PLACES * pooled) / (side.places + PULL_PLACES)
@@ -166,7 +167,7 @@ def _exponents(
                 away = log_odds(feature.prior) + EXPONENTS[:, None] * odds[None, :, column]
                 loss = np.logaddexp(0.0, -away if is_there else away).mean(axis=1)
                 losses.setdefault(approach.place, []).append(loss)
-        if min(map(len, sides.values())) >= LEAST_PLACES:
+        if min(map(len, sides.values())) >= MIN_PLACES:
             total = sum(np.mean(some, axis=0) for some in losses.values())
             best = int(np.argmin(total + 0.5 * np.log(EXPONENTS) ** 2))
             out[feature.name] = round(float(EXPONENTS[best]), 3)
@@ -175,7 +176,7 @@ def _exponents(
 
 def log_odds_of(approach: AnnotatedApproach, graph: FactorGraph, learned: Calibrated) -> Floats:
     """Sums of messages after each frame, without the prior, shape (N, features)."""
-    speaker = CalibratedSpeaker(len(graph.features), voices_of(graph, learned))
+    speaker = CalibratedMessageModel(len(graph.features), voices_of(graph, learned))
     messages = [speaker(situation) for situation in _situations(approach)]
     return np.cumsum(np.array(messages).reshape(-1, len(graph.features)), axis=0)
 

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 from crosscue.replay.vehicle.fusion import RangeFilter
 
-from .independence import independent_share
+from .independence import effective_sample_fraction
 from .intersection_range import RangeBelief, initialise, nis, predict, update
 
 
@@ -46,8 +46,8 @@ class RangeTrack(NamedTuple):
 
 
 NOTHING: Final = RangeTrack()
-LEAST_WORTH: Final = 1e-9
-"""Of a look from where the car stood at the last one: next to nothing, yet no division by zero."""
+MIN_EFFECTIVE_SAMPLES: Final = 1e-9
+"""Of an observation from the place of the last one: next to nothing, yet no division by zero."""
 
 
 def advance(
@@ -55,8 +55,8 @@ def advance(
 ) -> RangeTrack:
     """The track after the car went on.
 
-    A belief that has become less sure than ``most_sd_m`` is dropped, and first looks that nothing
-    has confirmed within ``begin_within_m`` are forgotten.
+    A belief that has become less sure than ``most_sd_m`` is dropped, and first observations that
+    nothing has confirmed within ``begin_within_m`` are forgotten.
     """
     if track.belief is None and track.rival is None:
         return track
@@ -71,7 +71,9 @@ def advance(
     return RangeTrack(belief, rival, track.rival_seen, unseen_m)
 
 
-def go_blind(track: RangeTrack, widens_m: float, settings: RangeFilter) -> RangeTrack:
+def predict_without_odometry(
+    track: RangeTrack, widens_m: float, settings: RangeFilter
+) -> RangeTrack:
     """The track after a way that nobody measured: the mean stays, the s.d. grows by ``widens_m``.
 
     Standard deviations add, not variances: the unknown speed of one moment is that of the next.
@@ -97,7 +99,7 @@ def measure(
         track: Before the measurement, advanced to its time.
         measured_m: Distance to the track's reference.
         sensor_var_m2: Of the measurement.
-        settings: Gate, fade, how many looks begin a range, and when a rival takes over.
+        settings: Gate, fade, how many observations begin a range, and when a rival takes over.
         restarts_beyond_m: No rival takes over from a belief nearer than this: signs further away
             are then the next intersection's.
     """
@@ -127,7 +129,7 @@ def _inside(
 
 
 def _worth(since_m: float, fade_m: float) -> float:
-    """How many independent looks one is, so soon after another; as in ``calibrated``."""
+    """How many independent observations one is, so soon after another; as in ``calibrated``."""
     if fade_m == 0.0:
         return 1.0
-    return max(independent_share(since_m / fade_m), LEAST_WORTH)
+    return max(effective_sample_fraction(since_m / fade_m), MIN_EFFECTIVE_SAMPLES)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from crosscue.replay.vehicle.fusion import Fusion
 
 from .belief import Speaker, source_speaker
-from .calibrated import CalibratedSpeaker, voices_of
+from .calibrated import CalibratedMessageModel, voices_of
 from .factor_graph import FactorGraph
 
 
@@ -23,4 +23,4 @@ def speakers_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], Speaker]:
     if fusion.calibrated is None:
         raise ValueError("fusion.calibrated: want what crosscue fit messages wrote, got None")
     voices, size = voices_of(graph, fusion.calibrated), len(graph.features)
-    return lambda: CalibratedSpeaker(size, voices)
+    return lambda: CalibratedMessageModel(size, voices)

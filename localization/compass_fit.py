@@ -36,7 +36,7 @@ SOFT_IRON: Final = "soft iron"
 _BIN_DEG: Final = 10
 _BIN_READINGS: Final = 3
 _RING: Final = 0.2
-"""Scatter of a ring about its radius, as a share of it; a shapeless cloud has about half."""
+"""Scatter of a ring about its radius, as a fraction of it; a shapeless cloud has about half."""
 
 
 class NotObservable(NamedTuple):
@@ -74,7 +74,7 @@ class CompassFit:
         coverage_deg: Headings that the drive covered, in steps of 10 degrees.
         residual_sd_rad: S.d. of heading less reference: the filter's compass noise. NaN without
             a reference.
-        residual_autocorrelation: Of one residual with the next; NaN where it cannot be told.
+        residual_autocorrelation: Of one residual with the next; NaN where it cannot be determined.
         persists_s: Time over which the residuals' autocorrelation falls to 1/e; give the filter
             twice this as its ``heading_interval_s``. At least this, if they never fell so far.
         persists_is_bound: They never fell so far.

@@ -61,7 +61,7 @@ class OdometrySettings:
         steering_noise_rad_sqrt_m: Noise density of the road-wheel angle along the way; its s.d.
             times the root of the distance over which its error persists.
         wheel_turn_rad_per_sqrt_m: S.d. of the heading by wheel difference after one metre.
-        turn_per_turn: S.d. of the change of heading as a share of that change.
+        turn_per_turn: S.d. of the change of heading as a fraction of that change.
         max_gap_s: Samples further apart are a gap: counted, and the variances grow.
         gap_accel_mps2: How fast the speed may have changed, unseen, inside a gap.
         gap_yaw_accel_radps2: How fast the yaw rate may have changed inside a gap.
@@ -144,7 +144,7 @@ class WheelSpeeds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnSignal:
-    """N samples of what tells how the car turns.
+    """N samples of what reports how the car turns.
 
     Attributes:
         t_ns: Shape (N,), int64.

@@ -2,15 +2,15 @@
 
 Events are taken in order of time: the end of an odometry interval, then a heading, then a wanted
 row. An interval that a heading or a wanted row falls into is driven in parts, distance, turn and
-variances by share of its time. The numbers are those of ``predict_odometry``, ``update_speed``
+variances by fraction of its time. The numbers are those of ``predict_odometry``, ``update_speed``
 and ``update_heading``, written out in plain floats because a drive has millions of steps; tests
 hold the two equal.
 
 Compass errors last (a bridge, a lorry, the car's own current), so ten readings a second do not
-tell ten times as much as one. A filter told otherwise is soon far too sure of itself. Here a
+report ten times as much as one. A filter configured otherwise is soon overconfident. Here a
 reading counts only once the car has gone ``heading_interval_m`` and ``heading_interval_s`` have
 passed since the last one that counted: the source's compass of variance r every ds metres.
-``fit_compass`` tells the time over which a compass's error persists; twice that is a good
+``fit_compass`` estimates the time over which a compass's error persists; twice that is a good
 ``heading_interval_s``.
 
 Long drives go in windows: hand each call's ``TrackState`` to the next. Headings and wanted rows
@@ -280,7 +280,7 @@ def advance(
         rows_ns: Shape (M,): times at which rows are wanted. None: after every interval. Make the
             same choice in every window.
         looks: Asked at their times, after headings; rows made after every interval are made after
-            a look that found something, too.
+            an observation that found something, too.
 
     Returns:
         The state for the next window, the rows, what became of each heading that reached the

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 STEP_NS: Final = 1_000_000_000
 """Longest time between two poses of the graph."""
-_LEAST_VARIANCE: Final = np.diag([1e-5, 1e-5, 1e-8])
+_MIN_VARIANCE: Final = np.diag([1e-5, 1e-5, 1e-8])
 """Added so that exact odometry (an arc has no sideways error) can be inverted: 3 mm, 0.1 mrad."""
 RELATIVE_TOLERANCE: Final = 1e-10
 ABSOLUTE_TOLERANCE: Final = 1e-6
@@ -240,7 +240,7 @@ def _rotation(angle_rad: float) -> Floats:
 def _in_end_frame(cov: Floats, turn_rad: float) -> Floats:
     """GTSAM states a pose's error in that pose's own axes."""
     back = _rotation(-turn_rad)
-    turned: Floats = back @ cov @ back.T + _LEAST_VARIANCE
+    turned: Floats = back @ cov @ back.T + _MIN_VARIANCE
     return turned
 
 
@@ -279,7 +279,7 @@ def _add_fixes(
     import gtsam
 
     lever = gtsam.Pose2(lever_m[0], lever_m[1], 0.0)
-    rigid = gtsam.noiseModel.Gaussian.Covariance(_LEAST_VARIANCE)
+    rigid = gtsam.noiseModel.Gaussian.Covariance(_MIN_VARIANCE)
     for i, t_ns in enumerate(fixes.t_ns.tolist()):
         key = int(np.searchsorted(times, t_ns))
         if key == len(times) or times[key] != t_ns:

@@ -147,7 +147,7 @@ class Ledger:
                 self._keep(Detail(topic, reason, detail, t_ns, count, is_dropped=False))
 
     def skip_more(self, topic: str, reason: str, count: int) -> None:
-        """Count more rows skipped for a reason that has been told with its detail already."""
+        """Count more rows skipped for a reason that has been reported with its detail already."""
         self.topic(topic).skipped[reason] += count
         self._refuse(topic, count)
 

@@ -99,7 +99,7 @@ class LogSummary:
     Attributes:
         path: As the user gave it.
         format: Short name of its format.
-        is_quick: Only what the log declares was looked at; its body was not read.
+        is_quick: Only what the log declares was examined; its body was not read.
         is_whole: Nothing is known to be dropped; says nothing when quick.
         integrity: Which checksums were verified, in words.
         seal: Whether it is sealed, when and with which hash.
@@ -134,7 +134,7 @@ class Together:
     """Several logs taken as one drive.
 
     Attributes:
-        start_ns: Where the time begins that all logs share, or None where there is none.
+        start_ns: Where the time begins that all logs share, or None where none exists.
         end_ns: Where it ends.
         findings: What is wrong with the choice, a sentence each.
     """
@@ -206,8 +206,8 @@ def together(summaries: Iterable[LogSummary]) -> Together:
     starts, ends = zip(*spans.values(), strict=True) if spans else ((0,), (0,))
     start_ns, end_ns = max(starts), min(ends)
     if not spans or end_ns < start_ns:
-        told = apart(spans) or ("there is no time at which all of these logs have rows",)
-        return Together(None, None, told)
+        reported = apart(spans) or ("there is no time at which all of these logs have rows",)
+        return Together(None, None, reported)
     return Together(start_ns, end_ns, apart(spans))
 
 

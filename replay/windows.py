@@ -2,7 +2,7 @@
 
 Memory is bounded by the horizon, not by the logs' length: a window closes once every source has
 passed its end, or its log has run ahead by the horizon without it. Rows that come later than that
-are skipped and told.
+are skipped and reported.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class _Pending:
         self._closed_ns: int | None = None
 
     def add(self, log: int, topic: str, samples: Samples) -> None:
-        """Take samples in; those before the last closed window's end are told as late."""
+        """Take samples in; those before the last closed window's end are reported as late."""
         if not len(samples.t_ns):
             return
         if self._closed_ns is not None:

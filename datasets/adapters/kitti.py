@@ -3,7 +3,7 @@
 A raw drive has folders ``image_00`` to ``image_03`` and ``oxts``, each with ``data/`` (one file a
 row) and ``timestamps.txt`` (UTC date-times to the nanosecond). The tracking set keeps one line of
 ``oxts/SEQ.txt`` and one picture ``image_0x/SEQ/NNNNNN.png`` for every frame, and no times: they are
-made from the frame number at 10 Hz, which is told.
+made from the frame number at 10 Hz, which is reported.
 
 Topics: one per camera folder; from the OXTS box ``oxts/imu``, ``oxts/gnss`` and ``oxts/ins_speed``.
 All of the box's numbers come from one filter: ``ins_speed`` is no wheel speed, and ``gnss`` is no
@@ -45,7 +45,7 @@ Unreadable: TypeAlias = tuple[str, str, int | None, str]
 """Topic, reason, count and detail of a stream that cannot be read."""
 
 Line: TypeAlias = tuple[str, int, bytes | str]
-"""Place, time and bytes of a packet; a text in place of bytes says why there are none."""
+"""Place, time and bytes of a packet; a text in place of bytes says why it has no bytes."""
 
 TOPICS: Final[dict[str, tuple[str, Callable[[Packets], Table]]]] = {
     "oxts/imu": ("sensor_msgs/msg/Imu", lambda packets: packets.table(IMU)),
@@ -114,7 +114,7 @@ class Drive(Closing):
 
     @property
     def oxts(self) -> Oxts | None:
-        """The box's packets, or None where there are none with times."""
+        """The box's packets, or None where none exists with times."""
         return self._oxts
 
     @property

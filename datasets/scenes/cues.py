@@ -13,7 +13,7 @@ from crosscue.replay.vehicle.cue_table import CUES
 from .layout import Layout
 from .world import Thing
 
-LEAST_PIXELS: Final = 12
+MIN_PIXELS: Final = 12
 """Of a smaller thing nobody can tell what it is."""
 PAST_REACH_M: Final = 110.0
 LANES_REACH_M: Final = 45.0
@@ -39,14 +39,14 @@ def present(layout: Layout, picture: Picture) -> dict[str, Presence]:
 
 
 def _things(shows: Shows, most_m: float = math.inf) -> Simulated:
-    """The things in a picture, large enough to be told, that show a cue."""
+    """The things in a picture, large enough to be labelled, that show a cue."""
 
     def simulated(layout: Layout, picture: Picture) -> Presence:
         found = ABSENT
         for seen in picture.seen:
             if seen.distance_m > most_m or not shows(layout, seen.thing, picture.t_s):
                 continue
-            if seen.mask.sum() >= LEAST_PIXELS:
+            if seen.mask.sum() >= MIN_PIXELS:
                 found = Presence(found.things + 1, max(found.visible, seen.visible))
         return found
 

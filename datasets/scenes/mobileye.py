@@ -36,11 +36,11 @@ class Faults:
     Attributes:
         half_view_rad: Half its field of view.
         reach_m: Farthest vehicle.
-        least_visible: Share of a vehicle that must show.
+        least_visible: Fraction of a vehicle that must show.
         hit: Chance that a vehicle on our road is reported; states last about a second.
         hit_crossing: The same for one that shows its side.
         hit_off_road: The same for one in a lot or driveway.
-        place_share: Error of distance, as a share of it.
+        place_share: Relative error of distance.
         side_m: Error aside.
     """
 

@@ -31,7 +31,7 @@ OTHER_THINGS: Final = frozenset(
 SLACK_PX: Final = 1.0
 """Boxes may lie so far outside: tools round differently."""
 FAR: Final = 0.4
-"""Share of the time between frames that a picture may be off the frame it belongs to."""
+"""Fraction of the time between frames that a picture may be off the frame it belongs to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +64,8 @@ class Picture:
     Attributes:
         name: File name.
         size_px: Width and height as the tool saw it.
-        t_ns: Log time where the file tells it.
-        frame: Number of the frame in its video where the file tells it.
+        t_ns: Log time where the file reports it.
+        frame: Number of the frame in its video where the file reports it.
         things: What was annotated; none is an answer, too.
     """
 
@@ -228,7 +228,7 @@ def meanings(
 
     Args:
         annotations: With labels.
-        own: From label to cue as the user says; an empty cue for a thing that is none.
+        own: From label to cue as the user says; an empty cue for a thing that is not one.
         own_cues: Cues beside the usual ones.
         any_thing: A label that is not nearly a cue's name may be a thing nobody has heard of.
 
@@ -305,7 +305,7 @@ def cue_truths(
     meant = {cue for cue in cues.values() if cue is not None}
     known: list[str] = [cue for cue in CUES if cue in meant]
     known += sorted(meant.difference(known))
-    told: list[CueTruth] = []
+    reported: list[CueTruth] = []
     for t_ns, picture in sorted(
         zip(placed.t_ns, annotations.pictures, strict=True), key=lambda pair: pair[0]
     ):
@@ -313,7 +313,7 @@ def cue_truths(
             mine = [thing for thing in picture.things if cues[thing.label] == cue]
             seen = [thing.visible for thing in mine if thing.visible is not None]
             counted = not any(thing.is_crowd for thing in mine)
-            told.append(
+            reported.append(
                 CueTruth(
                     cue=cue,
                     present=bool(mine),
@@ -322,7 +322,7 @@ def cue_truths(
                     visible=max(seen) if mine and len(seen) == len(mine) else None,
                 )
             )
-    return tuple(told)
+    return tuple(reported)
 
 
 def coco_tree(

@@ -14,8 +14,8 @@ from crosscue.replay.limits import MIB
 
 from .annotations import Annotations, Picture, Thing
 
-MOST_BYTES: Final = 512 * MIB
-MOST_SIDE: Final = 100_000
+MAX_BYTES: Final = 512 * MIB
+MAX_SIDE: Final = 100_000
 
 
 def read_coco(path: Path) -> Annotations:
@@ -25,9 +25,9 @@ def read_coco(path: Path) -> Annotations:
         SchemaError: Not there, not COCO, or references that lead nowhere.
     """
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split it")
+            raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
         tree = json_tree(content)
     except (OSError, ValueError) as error:
         raise SchemaError(f"{path}: not readable as JSON ({error}); give a COCO file") from None
@@ -91,8 +91,8 @@ def _pictures(tree: Mapping[str, Any], path: Path) -> dict[int, Picture]:
         if number < 0 or number in pictures or not isinstance(name, str):
             raise SchemaError(f"{where}: want an id that no other has, and a file_name; mend it")
         size = (_key(row.get("width")), _key(row.get("height")))
-        if not (0 < size[0] <= MOST_SIDE and 0 < size[1] <= MOST_SIDE):
-            raise SchemaError(f"{where}: width and height: want whole pixels, 1 to {MOST_SIDE}")
+        if not (0 < size[0] <= MAX_SIDE and 0 < size[1] <= MAX_SIDE):
+            raise SchemaError(f"{where}: width and height: want whole pixels, 1 to {MAX_SIDE}")
         if t_ns is not None and not (_key(t_ns) == t_ns and 0 <= t_ns < 2**62):
             raise SchemaError(f"{where}: t_ns {t_ns!r}: want whole nanoseconds; mend it")
         pictures[number] = Picture(name, size, t_ns)

@@ -21,10 +21,10 @@ from crosscue.replay.limits import MIB
 
 from .annotations import Annotations, Picture, Thing
 
-MOST_BYTES: Final = 512 * MIB
-MOST_DEPTH: Final = 64
-MOST_FRAMES: Final = 10_000_000
-MOST_SIDE: Final = 100_000
+MAX_BYTES: Final = 512 * MIB
+MAX_DEPTH: Final = 64
+MAX_FRAMES: Final = 10_000_000
+MAX_SIDE: Final = 100_000
 SHAPES: Final = ("box", "polygon", "mask", "tag")
 IGNORED: Final = ("polyline", "points", "cuboid", "ellipse", "skeleton")
 
@@ -45,8 +45,8 @@ def read_cvat(path: Path) -> Annotations:
     parser.CharacterDataHandler = reader.text
     parser.buffer_text = True
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split it")
+        if path.stat().st_size > MAX_BYTES:
+            raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
         with path.open("rb") as file:
             parser.ParseFile(file)
     except (OSError, expat.ExpatError) as error:
@@ -78,8 +78,8 @@ class _Reader:
     def start(self, tag: str, found: Mapping[str, str]) -> None:
         if not self._path and tag != "annotations":
             raise SchemaError(f"{self.where}: <{tag}>: want <annotations>; give CVAT's XML 1.1")
-        if len(self._path) >= MOST_DEPTH:
-            raise SchemaError(f"{self.where}: elements over {MOST_DEPTH} deep; this is not CVAT's")
+        if len(self._path) >= MAX_DEPTH:
+            raise SchemaError(f"{self.where}: elements over {MAX_DEPTH} deep; this is not CVAT's")
         self._path.append(tag)
         self._words = []
         if tag == "image":
@@ -116,12 +116,12 @@ class _Reader:
         name = self._text(found, "name")
         size = (self._whole(found, "width"), self._whole(found, "height"))
         self._check_size(size)
-        # A name that ends in a number tells the frame; else the number of the picture does.
+        # A name that ends in a number reports the frame; else the number of the picture does.
         has_number = re.search(r"[0-9]\.[A-Za-z]+$", name) is not None
         return Picture(name, size, None, None if has_number else self._whole(found, "id"))
 
     def _check_size(self, size: tuple[int, int]) -> None:
-        if not (0 < size[0] <= MOST_SIDE and 0 < size[1] <= MOST_SIDE):
+        if not (0 < size[0] <= MAX_SIDE and 0 < size[1] <= MAX_SIDE):
             raise SchemaError(f"{self.where}: pictures of {size[0]} x {size[1]}: want pixels")
 
     def _shape(self, tag: str, found: Mapping[str, str]) -> None:
@@ -209,8 +209,8 @@ class _Reader:
         last = self._known("stop_frame", first + self._known("size", 0) - 1)
         filtered = re.search(r"step=([0-9]{1,6})", self._found("frame_filter") or "")
         step = max(int(filtered[1]), 1) if filtered else 1
-        if last - first > MOST_FRAMES:
-            raise SchemaError(f"{self.where}: frames {first} to {last}: over {MOST_FRAMES}")
+        if last - first > MAX_FRAMES:
+            raise SchemaError(f"{self.where}: frames {first} to {last}: over {MAX_FRAMES}")
         frames = range(first, last + 1, step)
         # A thing drawn in a single frame is closed one frame later, maybe behind the last one.
         strange = [n for n, things in self._by_frame.items() if things and n not in frames]

@@ -24,7 +24,7 @@ from crosscue.replay.vehicle.validation_errors import explain
 
 VERSION: Final = 1
 FILE: Final = "truth.json"
-MOST_BYTES: Final = 256 * MIB
+MAX_BYTES: Final = 256 * MIB
 
 CARRIED: Final[dict[str, str]] = {
     "comma2k19": "crosscue.datasets.adapters.comma2k19_truth:write",
@@ -95,7 +95,7 @@ class CueTruth(Section):
     count: int | None = None
     """How many things show it."""
     visible: float | None = None
-    """Share of the most visible one that nothing hides."""
+    """Fraction of the most visible one that nothing hides."""
 
 
 class Truth(Section):
@@ -119,7 +119,7 @@ class Truth(Section):
     approaches: tuple[Approach, ...] = ()
     cues: tuple[CueTruth, ...] = ()
     own_cues: tuple[Name, ...] = ()
-    """Cues beside the usual ones that this file tells of, as the vehicle file's ``[cues.own]``
+    """Cues beside the usual ones that this file reports, as the vehicle file's ``[cues.own]``
     names them."""
     objects: str | None = None
     """COCO file of labelled objects beside this one, images by ``t_ns``."""
@@ -165,9 +165,9 @@ def load(path: Path) -> Truth:
     """
     path = path / FILE if path.is_dir() else path
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
+            raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
         tree = json_tree(content, object_pairs_hook=_no_twins)
         truth = Truth.model_validate(tree)
     except ValidationError as error:

@@ -90,7 +90,7 @@ def read_tum(path: Path, limits: Limits = DEFAULT) -> Trajectory:
     Raises:
         LogError: Not there or not readable.
         LogTooLargeError: Larger than one chunk may be.
-        LogFormatError: A line is no pose or goes back in time; its number is told.
+        LogFormatError: A line is no pose or goes back in time; its number is reported.
     """
     try:
         size = path.stat().st_size

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from crosscue.detectors.decoders.table import AnyBoxOutput
-from crosscue.detectors.settings import Settings, Share
+from crosscue.detectors.settings import Proportion, Settings
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import toml_tree
@@ -31,9 +31,9 @@ from crosscue.replay.limits import MIB
 from crosscue.replay.vehicle.validation_errors import explain
 from crosscue.replay.vehicle.vehicle import tuples
 
-MOST_BYTES: Final = 2048 * MIB
+MAX_BYTES: Final = 2048 * MIB
 """Largest weights read."""
-MOST_CARD_BYTES: Final = 1 * MIB
+MAX_CARD_BYTES: Final = 1 * MIB
 Side = Annotated[int, Field(gt=0, le=8192)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Colour = tuple[Finite, Finite, Finite]
@@ -65,9 +65,9 @@ class Input(Settings):
 class Tiles(Settings):
     """Besides the whole picture, tiles of the input's size at the picture's own resolution."""
 
-    top: Share = 0.3
+    top: Proportion = 0.3
     """Upper edge of the band covered, as a fraction of the picture's height."""
-    bottom: Share = 0.7
+    bottom: Proportion = 0.7
     """Its lower edge."""
     overlap: Annotated[float, Field(ge=0.0, lt=0.9)] = 0.2
     """Of neighbouring tiles, as a fraction of their size."""
@@ -88,7 +88,7 @@ class WeightFile(Settings):
 
     name: Annotated[str, Field(pattern=r"^[\w.-]+$")]
     url: Annotated[str, Field(pattern="^https?://")]
-    size_bytes: Annotated[int, Field(gt=0, le=MOST_BYTES)]
+    size_bytes: Annotated[int, Field(gt=0, le=MAX_BYTES)]
     sha256: Hash
 
 
@@ -167,9 +167,9 @@ def read_card(path: Path) -> ModelCard:
         VehicleError: Not there, not TOML, or a key or value that does not fit; with the line.
     """
     try:
-        content = read_at_most(path, MOST_CARD_BYTES)
+        content = read_at_most(path, MAX_CARD_BYTES)
         if content is None:
-            raise VehicleError(f"{path}: over {MOST_CARD_BYTES // MIB} MiB; this is no model card")
+            raise VehicleError(f"{path}: over {MAX_CARD_BYTES // MIB} MiB; this is no model card")
         text = content.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
@@ -201,9 +201,9 @@ def read_weights(card: ModelCard, folder: Path) -> Weights:
 
 def _verified(path: Path, want: str, key: str) -> bytes:
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise VehicleError(f"{path}: over {MOST_BYTES // MIB} MiB; not read")
+            raise VehicleError(f"{path}: over {MAX_BYTES // MIB} MiB; not read")
     except OSError as error:
         raise VehicleError(f"{path}: {error.strerror}; put the weights next to the card") from None
     found = hashlib.sha256(content).hexdigest()

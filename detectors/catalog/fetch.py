@@ -32,7 +32,7 @@ _PARTIAL: Final = 206
 _RANGE_REFUSED: Final = 416
 
 Progress = Callable[[str, int, int], None]
-"""Told a file's name, the bytes that have come, and how many there are."""
+"""Reported a file's name, the bytes that have come, and how many there are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ def fetch(
     Args:
         name: As ``crosscue model list`` prints it.
         given: A file, or a folder with the files, to take them from; no network is used.
-        on_progress: Told of each piece.
+        on_progress: Reported of each piece.
         environment: For the variables named above.
 
     Raises:

@@ -18,7 +18,7 @@ from crosscue.detectors.networks.picture_input import prepared
 from crosscue.replay.errors import UsageError, one_line
 from crosscue.replay.files.bounded import read_at_most
 
-from .card import MOST_BYTES, Input, Weights
+from .card import MAX_BYTES, Input, Weights
 
 _MAX_NAMES_CHARACTERS: Final = 100_000
 DEFAULT_SIDE_PX: Final = 640
@@ -46,9 +46,9 @@ def read_interface(path: Path) -> Interface:
     if suffix not in _READERS:
         raise UsageError(f"{path}: expected {' or '.join(_READERS)}")
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise UsageError(f"{path}: over {MOST_BYTES >> 20} MiB; not read")
+            raise UsageError(f"{path}: over {MAX_BYTES >> 20} MiB; not read")
         return _READERS[suffix](content, path)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}; give a model file") from None
@@ -82,7 +82,7 @@ def _of_openvino(content: bytes, path: Path) -> Interface:
     _need("openvino", path)
     ov = import_openvino()
     second = path.with_suffix(".bin")
-    weights = read_at_most(second, MOST_BYTES) if second.exists() else b""
+    weights = read_at_most(second, MAX_BYTES) if second.exists() else b""
     model = ov.Core().read_model(content, weights or b"")
 
     def tensor(port: Any) -> Tensor:

@@ -86,7 +86,7 @@ def car_shapes(found: Sequence[Detections], settings: Cars) -> CarShapes:
         settings: Labels, score and shape.
 
     Raises:
-        ValueError: No result at all, or a mask that is none.
+        ValueError: No result at all, or a mask that is not one.
     """
     if not found:
         raise ValueError("found: want at least one detector's result")

@@ -1,4 +1,4 @@
-"""Lane lines and vehicles past the intersection, as a Mobileye tells them: straight on is a road.
+"""Lane lines and vehicles past the intersection, as a Mobileye reports them: straight is a road.
 
 Both need to know where the intersection ends; without a range there is no count, which is neutral.
 The source takes its device's parked cars for outgoing ones (Fig. 26), so a vehicle counts whether
@@ -51,7 +51,7 @@ def past_counts(state: MobileyeState, end_m: float | None, past: Past) -> dict[s
         past: When something is past it.
 
     Returns:
-        No entry for what cannot be told: no range, the end already passed, or a device that has
+        No entry for what is unknown: no range, the end already passed, or a device that has
         not spoken lately.
     """
     if end_m is None or end_m <= 0.0:
@@ -91,7 +91,7 @@ def lanes_past(
 def vehicles_past(
     obstacles: Floats, end_m: float, past: Past
 ) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which of N obstacles are vehicles past the end and on the road straight on, shape (N,)."""
+    """Which of N obstacles are vehicles past the end and on the road straight ahead, shape (N,)."""
     is_past: np.ndarray[tuple[int], np.dtype[np.bool_]] = (
         (obstacles[:, _OBSTACLE["x_m"]] >= end_m + past.vehicle_beyond_m)
         & (np.abs(obstacles[:, _OBSTACLE["y_m"]]) <= past.vehicle_within_y_m)

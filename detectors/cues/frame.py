@@ -72,7 +72,7 @@ class FrameCues:
     Attributes:
         counts: From each cue that was looked for, a user's own among them, to how many there were;
             0 is looked and not found.
-        road: Shares of road, where a detector segments.
+        road: Fractions of road, where a detector segments.
     """
 
     counts: Mapping[str, int]

@@ -19,7 +19,7 @@ class RoadShares:
     """How much of each region of interest is road (eq. 13).
 
     Attributes:
-        left: Share of the left region's pixels, 0 to 1.
+        left: Fraction of the left region's pixels, 0 to 1.
         straight: Of the straight one.
         right: Of the right one.
     """
@@ -34,7 +34,7 @@ class RoadShares:
 
 
 def is_road(shares: RoadShares, vehicle: Vehicle, cue: CueSpec) -> int:
-    """1 where more than the vehicle file's share of the cue's region is road (eq. 14)."""
+    """1 where more than the vehicle file's fraction of the cue's region is road (eq. 14)."""
     positive = shares.positive(vehicle.cues.road_share)
     return int(positive[("left", "straight", "right").index(cue.supports[0])])
 
@@ -58,7 +58,7 @@ def road_shares(road: RoadMask, regions: Regions) -> RoadShares:
     """Road pixels over all pixels of each region (eq. 13); regions are scaled with the mask.
 
     Raises:
-        ValueError: The mask is none.
+        ValueError: The mask is not one.
     """
     width, height = road.mask_size_px
     is_road = rle.decode(road.mask, road.mask_size_px)

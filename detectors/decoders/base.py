@@ -9,7 +9,7 @@ from typing import Protocol, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.settings import Settings, Share
+from crosscue.detectors.settings import Proportion, Settings
 from crosscue.replay.columns import Floats, Int64s
 
 Array: TypeAlias = NDArray[np.generic]
@@ -79,7 +79,7 @@ class Guess:
 
     Attributes:
         settings: Keys of the card's ``[output]`` and their values.
-        class_count: How many classes it then has; None where the shapes do not tell.
+        class_count: How many classes it then has; None where the shapes leave it open.
         reasons: What in the file says so.
         assumptions: What nothing in the file says.
         input: Keys of the card's ``[input]`` that networks of this layout usually have.
@@ -98,9 +98,9 @@ class BoxOutput(Settings):
     kind: str
     classes: tuple[str, ...]
     """Names in the order of the network's class numbers."""
-    score: Share = 0.3
+    score: Proportion = 0.3
     """Candidates with a lower score are not reported."""
-    overlap: Share = 0.45
+    overlap: Proportion = 0.45
     """Of two boxes of one class that overlap more (intersection over union), the better stays."""
 
     def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:

@@ -1,4 +1,4 @@
-"""Grids of cells that networks tell boxes relative to."""
+"""Grids of cells that networks report boxes relative to."""
 
 from __future__ import annotations
 

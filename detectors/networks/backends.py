@@ -65,7 +65,7 @@ def load_network(
     Args:
         weights: Verified.
         backend: ``onnxruntime``, ``opencv``, ``openvino``, ``litert``; None for the best.
-        threads: How many the back end may use, where it can be told.
+        threads: How many the back end may use, where that can be set.
         size_px: Width and height to run at instead of those that the file declares, for networks
             that allow it.
 

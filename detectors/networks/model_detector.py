@@ -23,7 +23,7 @@ from crosscue.detectors.catalog.card import (
 )
 from crosscue.detectors.catalog.entries import weights_folder
 from crosscue.detectors.decoders.base import Array, named
-from crosscue.detectors.settings import Settings, Share, identity_of, settings_of
+from crosscue.detectors.settings import Proportion, Settings, identity_of, settings_of
 from crosscue.replay.errors import VehicleError, one_line
 
 from .backends import Network, load_network
@@ -41,7 +41,7 @@ class ModelSettings(Settings):
     """File name of the card."""
     backend: Literal["onnxruntime", "opencv", "openvino", "litert"] | None = None
     threads: int = 1
-    score: Share | None = None
+    score: Proportion | None = None
     """Instead of the card's."""
 
 

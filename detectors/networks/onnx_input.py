@@ -17,7 +17,7 @@ _FIXED: Final = {1: 8, 5: 4}
 
 
 def input_shape(content: bytes) -> tuple[int | None, ...] | None:
-    """Sizes of the first input that is no weight, None for one left open; None where not told.
+    """Sizes of the first input that is no weight, None for one left open; None where not reported.
 
     Raises:
         ValueError: The bytes are no protobuf.

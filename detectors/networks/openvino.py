@@ -23,6 +23,6 @@ def import_openvino() -> Any:
     Raises:
         ModuleNotFoundError: It is not installed.
     """
-    # None in this table is how Python is told that a module cannot be imported.
+    # None in this table is how Python learns that a module cannot be imported.
     sys.modules.setdefault(TELEMETRY, None)  # type: ignore[arg-type]
     return import_module("openvino")

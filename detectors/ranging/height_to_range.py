@@ -69,7 +69,7 @@ def fit_range(height_px: Floats, range_m: Floats, family: Family, bin_m: float =
         bin_m: Width of the bins of distance.
 
     Raises:
-        UsageError: Too few pairs, or a number that is none or not positive.
+        UsageError: Too few pairs, or a number that is not one or not positive.
     """
     model, start = _CURVES[family]
     bad = ~(np.isfinite(height_px) & np.isfinite(range_m) & (height_px > 0.0) & (range_m > 0.0))

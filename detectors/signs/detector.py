@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from crosscue.detectors.base import Detections, Detector, Found, Frame, View
-from crosscue.detectors.settings import Settings, Share, identity_of, settings_of
+from crosscue.detectors.settings import Proportion, Settings, identity_of, settings_of
 from crosscue.replay.columns import Bytes, Floats, Int64s
 
 from .matching import Counts, Words, nearest, window_counts
@@ -25,7 +25,7 @@ from .templates import AMERICAN, LABELS, Drawing, Kind, drawings
 VERSION: Final = 1
 POINTS_DRAWN: Final = 500
 """More than any drawing has."""
-LEAST_SIDE_PX: Final = 32
+MIN_SIDE_PX: Final = 32
 """Of a level; ORB's border of 8 pixels and patch of 16 leave next to nothing of less."""
 _CELL_PX: Final = 4
 """Side of the squares that votes are counted in."""
@@ -49,24 +49,24 @@ class SignSettings(Settings):
     """Kept at a level."""
     drawing_fast: Annotated[int, Field(ge=1, le=100)] = 6
     """Least contrast of a drawing's point (FAST)."""
-    ratio: Share = 0.9
+    ratio: Proportion = 0.9
     fast: Annotated[int, Field(ge=1, le=100)] = 6
     """The same of a picture's."""
-    reach: Share = 0.1
-    """A vote may miss the middle by this share of the sign's height."""
-    crop_top: Share = 0.0
-    """Share of the picture without signs above."""
-    crop_bottom: Share = 0.25
+    reach: Proportion = 0.1
+    """A vote may miss the middle by this fraction of the sign's height."""
+    crop_top: Proportion = 0.0
+    """Fraction of the picture without signs above."""
+    crop_bottom: Proportion = 0.25
     """And below."""
     most_bits: Annotated[int, Field(ge=1, le=256)] = 64
     """Two points are alike only if their descriptors differ in fewer bits of 256."""
     least_votes: Annotated[int, Field(ge=2)] = 4
     """Different points that must agree."""
-    least_share: Share = 0.25
-    """And the share of the drawing's points that they must be."""
-    least_score: Share = 0.065
+    least_share: Proportion = 0.25
+    """And the fraction of the drawing's points that they must be."""
+    least_score: Proportion = 0.065
     """For precision 0.95 on simulated layouts L800 to L838; one's own camera wants its own."""
-    overlap: Share = 0.2
+    overlap: Proportion = 0.2
     """Of two signs that overlap more, the better stays."""
 
 
@@ -188,7 +188,7 @@ class SignDetector:
         import cv2
 
         size = (round(grey.shape[1] * scale), round(grey.shape[0] * scale))
-        if min(size) < LEAST_SIDE_PX:
+        if min(size) < MIN_SIDE_PX:
             return []
         mode = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
         level = np.asarray(cv2.resize(grey, size, interpolation=mode), np.uint8)
@@ -252,8 +252,8 @@ def _apart(
     """The best windows, without those that lie over a better one, of whatever kind.
 
     A sign is found on neighbouring levels and by drawings of several sizes, a chance likeness
-    hardly ever. So a window's score is its share of the drawing's points, times
-    S / (S + 1), where S sums the shares of all windows of its kind over the same place.
+    hardly ever. So a window's score is its fraction of the drawing's points, times
+    S / (S + 1), where S sums the fractions of all windows of its kind over the same place.
     """
     from crosscue.detectors.boxes import overlaps
 

@@ -23,9 +23,9 @@ from crosscue.replay.errors import SchemaError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import json_tree
 
-MOST_BYTES: Final = 2 << 30
+MAX_BYTES: Final = 2 << 30
 """Largest file read."""
-MOST_SIDE_PX: Final = 32768
+MAX_SIDE_PX: Final = 32768
 
 Box: TypeAlias = tuple[float, float, float, float]
 """x0, y0, x1, y1."""
@@ -73,7 +73,7 @@ class LabelledSet:
         source: The file.
         classes: In the order of ``Labelled.label``.
         pictures: In the order of the file.
-        left_out: What was left out or mended, by reason.
+        left_out: What was left out or repaired, by reason.
     """
 
     source: Path
@@ -121,15 +121,15 @@ def read_coco(path: Path, folder: Path, classes: Sequence[str]) -> LabelledSet:
 
 
 def _why(left_out: Counter[str]) -> str:
-    told = ", ".join(f"{count} {reason}" for reason, count in left_out.most_common(3))
-    return f"; left out: {told}" if told else ""
+    reported = ", ".join(f"{count} {reason}" for reason, count in left_out.most_common(3))
+    return f"; left out: {reported}" if reported else ""
 
 
 def _tree(path: Path) -> Mapping[str, Any]:
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: more than {MOST_BYTES:,} bytes of annotations; split it")
+            raise SchemaError(f"{path}: more than {MAX_BYTES:,} bytes of annotations; split it")
         tree = json_tree(content)
     except OSError as error:
         raise SchemaError(f"{path}: {error.strerror}; want a COCO file") from None
@@ -153,7 +153,7 @@ def _pictures(
     found: dict[Any, tuple[Path, tuple[int, int]]] = {}
     for row in rows:
         name, width, height = row.get("file_name"), row.get("width"), row.get("height")
-        sides = [side for side in (width, height) if type(side) is int and 0 < side <= MOST_SIDE_PX]
+        sides = [side for side in (width, height) if type(side) is int and 0 < side <= MAX_SIDE_PX]
         if not isinstance(name, str) or len(sides) != 2 or not isinstance(row.get("id"), int | str):
             left_out["pictures without a name or size"] += 1
         elif Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:

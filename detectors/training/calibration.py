@@ -1,4 +1,4 @@
-"""Scores that mean something: the share of detections with such a score that are right.
+"""Scores that mean something: the fraction of detections with such a score that are right.
 
 Fitted for each class on held-out pictures by logistic regression on the score's logit (Platt 1999).
 A detection is right when it overlaps an object of its class, still free, by three tenths: a cue
@@ -21,10 +21,10 @@ from crosscue.replay.columns import Floats
 
 from .annotations import Labelled, LabelledPicture, LabelledSet
 from .operating_point import Judged
-from .scores import LEAST_AREA_PX
+from .scores import MIN_AREA_PX
 
 OVERLAP: Final = 0.3
-LEAST_ROWS: Final = 20
+MIN_ROWS: Final = 20
 """Fewer right or wrong detections of a class than this, and its scores stay as they are."""
 
 
@@ -48,7 +48,7 @@ def judged(labelled: LabelledSet, found: Sequence[Detections]) -> Mapping[str, J
 
 def _counts(one: Labelled, picture: LabelledPicture) -> bool:
     return not one.is_crowd and (
-        not isinstance(one.mask, bytes) or area_px(one.mask) >= LEAST_AREA_PX
+        not isinstance(one.mask, bytes) or area_px(one.mask) >= MIN_AREA_PX
     )
 
 
@@ -77,7 +77,7 @@ def fitted(rows: Judged) -> Calibration:
     from scipy.optimize import minimize
 
     right = int(rows.is_right.sum())
-    if min(right, len(rows.is_right) - right) < LEAST_ROWS:
+    if min(right, len(rows.is_right) - right) < MIN_ROWS:
         return Calibration()
     kept = np.clip(rows.scores, 1e-6, 1.0 - 1e-6)
     logit = np.log(kept / (1.0 - kept))

@@ -216,7 +216,7 @@ def _spread(pictures: tuple[Any, ...], most: int) -> tuple[Any, ...]:
 def finished_facts(job: Job, network: Any, held_out: LabelledSet, device: torch.device) -> Facts:
     """What the checkpoint says: its measured average precision, and calibrated scores.
 
-    The first half of the held-out pictures calibrates, the second half tells how well.
+    The first half of the held-out pictures calibrates, the second half measures how well.
     """
     settings = MaskRcnnSettings(threads=job.threads)
     found = raw_detections(job.plan, network, held_out, settings, device)
@@ -226,7 +226,7 @@ def finished_facts(job: Job, network: Any, held_out: LabelledSet, device: torch.
     by = {name: fitted(rows) for name, rows in judged(first, found[:half]).items()}
     measured = average_precisions(held_out, found)
     for name, rows in judged(second, found[half:]).items():
-        measured |= told_rates(name, rows, by[name])
+        measured |= reported_rates(name, rows, by[name])
     recipe = {
         **job.recipe,
         "start": Path(job.start).name,
@@ -237,15 +237,15 @@ def finished_facts(job: Job, network: Any, held_out: LabelledSet, device: torch.
     return Facts(plan=job.plan, calibration=by, recipe=recipe, measured=measured)
 
 
-def told_rates(name: str, rows: Judged, by: Calibration) -> dict[str, float | None]:
+def reported_rates(name: str, rows: Judged, by: Calibration) -> dict[str, float | None]:
     """Precision and recall of a class at calibrated scores, in percent; None where undefined."""
-    told: dict[str, float | None] = {}
+    reported: dict[str, float | None] = {}
     for aim, at in rates_by_score(rows, by).items():
         for what, share in (("precision", at.precision), ("recall", at.recall)):
-            told[f"{what} {name} at {aim}"] = (
+            reported[f"{what} {name} at {aim}"] = (
                 round(100.0 * share, 2) if math.isfinite(share) else None
             )
-    return told
+    return reported
 
 
 def read_curve(path: Path) -> list[Point]:

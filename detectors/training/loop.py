@@ -42,7 +42,7 @@ class Schedule:
         rate: Highest learning rate.
         warm_up: Steps until that is reached.
         decay: Of weights, as AdamW means it.
-        average: Share of the running average that a step leaves as it was, once it has settled.
+        average: Fraction of the running average that a step leaves as it was, once it has settled.
         seed: Everything random comes from it.
     """
 

@@ -23,10 +23,10 @@ from .calibration import judged
 from .operating_point import Judged, Rates, rates_at
 from .scores import average_precisions, detections_on
 
-LEAST_SCORE: Final = 0.02
+MIN_SCORE: Final = 0.02
 """Detections below it are left out of the average precision."""
 AIMS: Final = (0.5, 0.9, 0.95)
-"""Scores at which precision and recall are told; the last two are the cues' own."""
+"""Scores at which precision and recall are reported; the last two are the cues' own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,20 +71,20 @@ def raw_detections(
     settings: MaskRcnnSettings,
     device: torch.device,
 ) -> list[Detections]:
-    """What a network finds, with its own scores from ``LEAST_SCORE``.
+    """What a network finds, with its own scores from ``MIN_SCORE``.
 
     Args:
         plan: Of the network.
         network: A torchvision ``MaskRCNN``.
         labelled: The pictures.
-        settings: The score in them is not looked at.
+        settings: The score in them is not examined.
         device: Where.
 
     Raises:
         SchemaError: A picture cannot be read.
     """
     bare = Checkpoint(Facts(plan=plan), network, "")
-    low = settings.model_copy(update={"score": LEAST_SCORE})
+    low = settings.model_copy(update={"score": MIN_SCORE})
     return list(detections_on(labelled, detector_of(bare, low, device)))
 
 

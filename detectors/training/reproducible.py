@@ -1,9 +1,9 @@
 """Training twice with one seed gives one result, bit for bit, on one machine.
 
-On a CPU every operation used has a deterministic form, which torch is told to take; sums depend on
-the number of threads. On a GPU some have none (the gradient of RoI Align adds in any order): there
-torch takes what there is. What decides the bits is written into the checkpoint, so that two that
-differ say why.
+On a CPU every operation used has a deterministic form, which torch is asked to take; sums depend
+on the number of threads. On a GPU some have none (the gradient of RoI Align adds in any order):
+there torch takes what there is. What decides the bits is written into the checkpoint, so that two
+that differ say why.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def reproducible(device: torch.device) -> Iterator[None]:
 
     Args:
         device: Where the training runs. Operations without a deterministic form raise
-            ``RuntimeError`` on a CPU (there are none in our networks) and are taken on others.
+            ``RuntimeError`` on a CPU (none exist in our networks) and are taken on others.
     """
     # cuBLAS reads it when it is first used, and is not deterministic without.
     os.environ.setdefault(CUBLAS_VARIABLE, ":4096:8")
@@ -61,7 +61,7 @@ def decides_bits(device: torch.device) -> dict[str, str | int | float]:
 
 
 def _cpu_name() -> str:
-    """The processor's own name where Linux tells it."""
+    """The processor's own name where Linux reports it."""
     try:
         with Path("/proc/cpuinfo").open(encoding="utf-8", errors="replace") as file:
             lines = (line.partition(":") for line in file)

@@ -1,4 +1,4 @@
-"""Training of road networks: pictures with their share of road a pixel in, weights out.
+"""Training of road networks: pictures with their fraction of road a pixel in, weights out.
 
 AdamW with a warm-up and a cosine; pixels near the road's edge weigh more, since the near road,
 which is most of it, is soon learnt. State is kept as safetensors, so training goes on after a kill
@@ -83,7 +83,7 @@ class RoadTraining:
 
         Args:
             pixels: Shape (N, H, W, 3), uint8, blue, green, red.
-            road: Shape (N, H, W), uint8: share of road, 255 for all.
+            road: Shape (N, H, W), uint8: fraction of road, 255 for all.
         """
         self.network.train()
         while self.done < self.schedule.steps:

@@ -22,12 +22,12 @@ from crosscue.replay.errors import LogError, SchemaError
 from .annotations import Box, Labelled, LabelledPicture, LabelledSet, mask_of
 
 NEAR_OBJECT: Final = 0.85
-"""Share of windows that are laid about an object."""
-LEAST_SIDE_PX: Final = 3.0
+"""Fraction of windows that are laid about an object."""
+MIN_SIDE_PX: Final = 3.0
 """Of an object in the window: nobody could tell a smaller one."""
-LEAST_SHARE: Final = 0.3
+MIN_SHARE: Final = 0.3
 """Of an object's pixels within the window; a thinner slice is not asked for."""
-MOST_OBJECTS: Final = 24
+MAX_OBJECTS: Final = 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +144,7 @@ class Sampler:
 def _is_big_enough(box: Box, picture: LabelledPicture, plan: Plan) -> bool:
     scale = plan.width_px / picture.size_px[0]
     x0, y0, x1, y1 = box
-    return min(x1 - x0, y1 - y0) * scale >= LEAST_SIDE_PX
+    return min(x1 - x0, y1 - y0) * scale >= MIN_SIDE_PX
 
 
 def _corner(
@@ -226,12 +226,12 @@ def _sample(pixels: Bytes, picture: LabelledPicture, warp: Floats, window: Windo
         box = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
         scale = np.hypot(*warp[0, :2])
         share = mask.sum() / max(float(whole.sum()) * scale * scale, 1.0)
-        if min(box[2] - box[0], box[3] - box[1]) >= LEAST_SIDE_PX and share >= LEAST_SHARE:
+        if min(box[2] - box[0], box[3] - box[1]) >= MIN_SIDE_PX and share >= MIN_SHARE:
             boxes.append(box)
             labels.append(one.label + 1)
             masks.append(mask)
-    if len(boxes) > MOST_OBJECTS:
-        order = np.argsort([-int(mask.sum()) for mask in masks], kind="stable")[:MOST_OBJECTS]
+    if len(boxes) > MAX_OBJECTS:
+        order = np.argsort([-int(mask.sum()) for mask in masks], kind="stable")[:MAX_OBJECTS]
         boxes, labels, masks = ([part[i] for i in order] for part in (boxes, labels, masks))
     size = (window.height_px, window.width_px)
     return Sample(

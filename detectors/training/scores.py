@@ -16,7 +16,7 @@ from crosscue.replay.errors import UsageError
 from .annotations import LabelledPicture, LabelledSet, mask_of
 from .samples import read_picture
 
-LEAST_AREA_PX: Final = 24
+MIN_AREA_PX: Final = 24
 """Smaller truth is neither asked for nor wrong when found."""
 SIZES: Final = ("all", "small", "medium", "large")
 """COCO's: small below 32 x 32 pixels, large above 96 x 96."""
@@ -104,7 +104,7 @@ def _truth(labelled: LabelledSet) -> dict[str, Any]:
                     "category_id": one.label,
                     "bbox": [x0, y0, x1 - x0, y1 - y0],
                     "area": area,
-                    "iscrowd": int(one.is_crowd or area < LEAST_AREA_PX),
+                    "iscrowd": int(one.is_crowd or area < MIN_AREA_PX),
                     "segmentation": {"size": list(picture.size_px[::-1]), "counts": text},
                 }
             )

@@ -56,7 +56,7 @@ SAYS_NOTHING: Final = frozenset(
         "video",
     }
 )
-"""Names of logs that tell no drive from another."""
+"""Names of logs that distinguish no drive from another."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -151,7 +151,7 @@ def run_many(
             run folder itself and writes its manifest last.
         engine: Where to work.
         overwrite: Replace run folders that hold a run of other logs or settings.
-        on_progress: Told about once a second.
+        on_progress: Reported about once a second.
 
     Returns:
         One for each job, in the order of ``jobs``.
@@ -228,12 +228,12 @@ def attempt(work: Callable[[Job], R], job: Job) -> Done[R]:
             job, {"inputs": inputs, "manifest": manifest, "exit_status": result.exit_status}
         )
     except Exception as error:
-        status, line = told(error)
+        status, line = reported_error(error)
         return Done(job, status, line, seconds=time.monotonic() - began)
     return Done(job, result.exit_status, None, result, time.monotonic() - began)
 
 
-def told(error: Exception) -> tuple[int, str]:
+def reported_error(error: Exception) -> tuple[int, str]:
     """For any error the exit status that a command of its own would give, and one line."""
     if isinstance(error, CrosscueError):
         return error.exit_status, one_line(error)
@@ -250,7 +250,7 @@ def state_of(job: Job) -> State:
     """What a start finds in the job's run folder.
 
     Raises:
-        CrosscueError: A log cannot be looked at.
+        CrosscueError: A log cannot be examined.
     """
     entry = _entry(job)
     if not _holds_anything(job.run):
@@ -296,7 +296,7 @@ def _earlier(job: Job, overwrite: bool) -> Done[R] | None:
                 "give another folder or --overwrite"
             )
     except (CrosscueError, OSError) as error:
-        status, line = told(error)
+        status, line = reported_error(error)
         return Done(job, status, line, attempts=0)
     return None
 
@@ -325,7 +325,7 @@ def _write_entry(job: Job, entry: dict[str, object]) -> None:
 
 
 def _entry(job: Job) -> dict[str, Any] | None:
-    """The journal's entry; None where there is none, or none that can be believed."""
+    """The journal's entry; None where none exists, or none that can be believed."""
     try:
         entry = json_tree(_entry_path(job).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -334,7 +334,7 @@ def _entry(job: Job) -> dict[str, Any] | None:
     return entry if is_ours and "inputs" in entry else None
 
 
-def after_death(done: Done[R], attempts: int, how: str) -> Done[R]:
+def worker_crashed(done: Done[R], attempts: int, how: str) -> Done[R]:
     """A job whose worker died as often as it may: a failure with a line of its own."""
     line = f"{done.job.name}: its worker {how}, {attempts} times; replay this drive alone"
     return replace(done, error=line, attempts=attempts)

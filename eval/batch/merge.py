@@ -1,6 +1,6 @@
 """The runs of many drives as one folder of tables, each row with its drive's name.
 
-Tables are streamed, so memory does not grow with the number of drives. The merged manifest tells
+Tables are streamed, so memory does not grow with the number of drives. The merged manifest reports
 which drives are in it, which failed and why, and adds up every topic's account. Merging is a set
 union: the order does not matter, a run that is met twice counts once, and what comes out is the
 same bytes however the drives were spread over batches.
@@ -258,7 +258,7 @@ def _notices(one: _Drive) -> set[str]:
 
 
 def _versions(drives: Sequence[_Drive]) -> dict[str, tuple[str, ...]]:
-    """All that were used: more than one of a library is worth a look."""
+    """All that were used: more than one of a library is worth checking."""
     found: dict[str, set[str]] = {}
     for one in drives:
         for library, version in one.manifest.versions.items():

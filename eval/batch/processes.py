@@ -22,7 +22,7 @@ from pickle import PicklingError
 from types import FrameType
 from typing import Any, Final, NoReturn
 
-from .jobs import Done, Events, Job, R, after_death, attempt, told
+from .jobs import Done, Events, Job, R, attempt, reported_error, worker_crashed
 
 TICK_S: Final = 1.0
 GRACE_S: Final = 5.0
@@ -84,7 +84,7 @@ class Processes:
                     elif worker.number < self.attempts:
                         waiting.appendleft((worker.job, worker.number + 1))
                     else:
-                        yield after_death(Done(worker.job, 1), worker.number, done)
+                        yield worker_crashed(Done(worker.job, 1), worker.number, done)
                 if not ready:
                     yield None
         finally:
@@ -176,7 +176,7 @@ def _serve(pipe: Connection, threads: int) -> None:
             try:
                 pipe.send(done)
             except (PicklingError, AttributeError, TypeError) as error:
-                pipe.send(Done(job, *told(error)))
+                pipe.send(Done(job, *reported_error(error)))
     except (EOFError, BrokenPipeError):
         return
     except _StoppedError:

@@ -1,6 +1,6 @@
 """Joining a Ray cluster, or starting one on this machine, without Ray's own habits.
 
-Ray reports its use to its makers, takes SIGTERM for itself and tells of dead workers on stdout;
+Ray reports its use to its makers, takes SIGTERM for itself and reports dead workers on stdout;
 none of that is wanted here. ``local`` starts a cluster on this machine and ends it; Ray opens ports
 on all of the machine's addresses, guarded by a token.
 """
@@ -50,7 +50,7 @@ def joined(address: str, workers: int | None = None) -> Iterator[Any]:
             ray.shutdown()
 
 
-def _knock(address: str) -> None:
+def _check_reachable(address: str) -> None:
     """Refuse an address where nobody listens: Ray itself tries for many minutes.
 
     Raises:
@@ -79,7 +79,7 @@ def _connect(ray: Any, address: str, workers: int | None) -> None:
             "object_store_memory": STORE_BYTES,
             "_node_ip_address": "127.0.0.1",
         }
-    _knock(address)
+    _check_reachable(address)
     try:
         ray.init(address=address, **options)
     except (ConnectionError, RuntimeError, ValueError, OSError) as error:
@@ -91,5 +91,5 @@ def _connect(ray: Any, address: str, workers: int | None) -> None:
         if is_main:
             # Ray installs a handler of its own, which would hide a SIGTERM from the command.
             signal.signal(signal.SIGTERM, before)
-    # Of workers that die Ray tells on stdout, which belongs to results; we tell it ourselves.
+    # Of workers that die Ray reports on stdout, which belongs to results; we report it ourselves.
     ray._private.worker._worker_logs_enabled = False

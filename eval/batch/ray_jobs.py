@@ -18,7 +18,7 @@ from typing import Any
 
 from crosscue.eval.runs.folder import LOCK
 
-from .jobs import Done, Events, Job, R, after_death, attempt, told
+from .jobs import Done, Events, Job, R, attempt, reported_error, worker_crashed
 from .processes import GRACE_S, THREAD_VARIABLES, TICK_S
 from .ray_cluster import LOCAL, joined
 
@@ -72,7 +72,7 @@ class OnRay:
                         job.run.joinpath(LOCK).unlink(missing_ok=True)
                         waiting.appendleft((job, number + 1))
                     else:
-                        yield after_death(Done(job, 1), number, done)
+                        yield worker_crashed(Done(job, 1), number, done)
                 if not ready:
                     yield None
         finally:
@@ -90,7 +90,7 @@ def _taken(ray: Any, reference: Any, job: Job) -> Done[Any] | str:
         done: Done[Any] = ray.get(reference)
     except ray.exceptions.RayTaskError as error:
         # ``attempt`` answers for the drive's own errors; this is one of Ray's way to and from it.
-        return Done(job, *told(RuntimeError(str(error.cause).strip().splitlines()[-1])))
+        return Done(job, *reported_error(RuntimeError(str(error.cause).strip().splitlines()[-1])))
     except ray.exceptions.OutOfMemoryError:
         return "was killed by Ray, since its machine ran out of memory"
     except ray.exceptions.RayError as error:

@@ -53,11 +53,11 @@ COMPARED: Final = {
     "versions", "settings", "detectors", "camera", "selection", "logs", "landmarks",
 }  # fmt: skip
 """Parts of a manifest."""
-MOST_BYTES: Final = 256 * MIB
+MAX_BYTES: Final = 256 * MIB
 
 
 class Tolerance(NamedTuple):
-    """How much worse the metrics of a pattern may be; a share of the first run's value if so."""
+    """How much worse the metrics of a pattern may be; a fraction of the first run's value if so."""
 
     pattern: str
     by: float
@@ -265,9 +265,9 @@ def _metrics_of(run: RunFolder) -> dict[str, MetricValue] | None:
 
 def _tree_of(path: Path) -> dict[str, Any]:
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise RunError(f"{path}: over {MOST_BYTES // MIB} MiB; run crosscue score again")
+            raise RunError(f"{path}: over {MAX_BYTES // MIB} MiB; run crosscue score again")
         tree = json_tree(content)
     except (OSError, ValueError) as error:
         raise RunError(f"{path}: unreadable ({error}); run crosscue score again") from None

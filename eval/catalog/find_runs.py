@@ -53,7 +53,7 @@ def _expanded(text: str) -> Iterator[Path]:
 
 def _in_folder(folder: Path) -> Iterator[Path]:
     if _is_run(folder) or not folder.is_dir():
-        # What is wrong with it, if anything, is told when it is opened.
+        # What is wrong with it, if anything, is reported when it is opened.
         yield folder
         return
     found = list(_below(folder, DEPTH))
@@ -76,7 +76,7 @@ def _below(folder: Path, depth: int) -> Iterator[Path]:
 
 
 def _is_run(folder: Path) -> bool:
-    """Does it hold what a run writes? Cut short it must be told of, not passed over."""
+    """Does it hold what a run writes? Cut short it must be reported, not passed over."""
     if folder.joinpath(MANIFEST).exists():
         return True
     is_scored = folder.joinpath(METRICS).exists()

@@ -2,7 +2,7 @@
 
 Exit status 1 when the second run is worse: a metric moved in its bad direction by more than its
 tolerance, or is no longer scored. Without --tolerance none is allowed. A tolerance is a number in
-the metric's unit, a share of the first run's value (2%), or either for the metrics of a pattern;
+the metric's unit, a fraction of the first run's value (2%), or either for the metrics of a pattern;
 the last that fits counts. If a run was not scored, every difference of a table counts as worse.
 Folders that crosscue score -o wrote for several runs can be compared as well.
 
@@ -33,7 +33,7 @@ from crosscue.eval.commands.shared.options import print_json
 from crosscue.replay.safe_text import visible
 
 T = TypeVar("T")
-MOST_LINES = 20
+MAX_LINES = 20
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,18 +51,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare, tell, and give 1 when the second run is worse, 3 when either has drops."""
+    """Compare, report, and return 1 when the second run is worse, 3 when either has drops."""
     tolerances = [read_tolerance(text) for text in args.tolerance]
     runs = [open_scored(args.first), open_scored(args.second)]
     found = compare_runs(runs[0], runs[1], tolerances)
     if args.json:
         print_json(asdict(found) | {"worse": found.worse})
     elif not args.quiet:
-        print("\n".join(_told(found)))
+        print("\n".join(_report_text(found)))
     return 1 if found.worse else 0 if all(map(is_whole_run, runs)) else 3
 
 
-def _told(found: Comparison) -> Iterator[str]:
+def _report_text(found: Comparison) -> Iterator[str]:
     for one in _first_of(found.changes, "settings"):
         if isinstance(one, str):
             yield one
@@ -82,9 +82,9 @@ def _told(found: Comparison) -> Iterator[str]:
 
 
 def _first_of(things: tuple[T, ...], what: str) -> Iterator[T | str]:
-    yield from things[:MOST_LINES]
-    if len(things) > MOST_LINES:
-        yield f"           and {len(things) - MOST_LINES} more {what}; --json shows all"
+    yield from things[:MAX_LINES]
+    if len(things) > MAX_LINES:
+        yield f"           and {len(things) - MAX_LINES} more {what}; --json shows all"
 
 
 def _short(value: object) -> str:

@@ -22,7 +22,7 @@ from crosscue.eval.runs.account import account_lines
 from crosscue.eval.runs.folder import create
 from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import visible
-from crosscue.replay.time.segments import gaps_told
+from crosscue.replay.time.segments import gaps_text
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 
@@ -67,6 +67,6 @@ def run(args: argparse.Namespace) -> int:
         for log in account.reading:
             for sentence in log.notices:
                 print(f"note     {visible(sentence)}")
-        for sentence in gaps_told(done.timeline.segments):
+        for sentence in gaps_text(done.timeline.segments):
             print(f"note     {sentence}")
     return done.exit_status

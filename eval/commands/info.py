@@ -41,7 +41,7 @@ from crosscue.replay.log_summary import (
 from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import table, terminal_width, visible, wrapped
 from crosscue.replay.time.scan import LogWatch, timeline_from
-from crosscue.replay.time.segments import Timeline, gaps_told
+from crosscue.replay.time.segments import Timeline, gaps_text
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 LOSSES_SHOWN = 10
@@ -84,9 +84,13 @@ def run(args: argparse.Namespace) -> int:
             timeline = timeline_from(watches, planned, vehicle)
     common = together(summaries) if len(summaries) > 1 and not args.quick else None
     if args.json:
-        told = None if timeline is None else time_segments(timeline).as_json()
+        reported = None if timeline is None else time_segments(timeline).as_json()
         print_json(
-            {"logs": [plain(s) for s in summaries], "together": plain(common), "time": plain(told)}
+            {
+                "logs": [plain(s) for s in summaries],
+                "together": plain(common),
+                "time": plain(reported),
+            }
         )
     else:
         width = terminal_width()
@@ -247,7 +251,7 @@ def _segments(timeline: Timeline, width: int) -> Iterator[str]:
     ]
     head = ("segment", "begins with", "gap s", "clock set s", "from", "length s")
     yield from table(head, rows, width, (1, 4))
-    yield from (wrapped(sentence, width) for sentence in gaps_told(timeline.segments))
+    yield from (wrapped(sentence, width) for sentence in gaps_text(timeline.segments))
 
 
 def _progress(args: argparse.Namespace, watch: LogWatch) -> Progress:

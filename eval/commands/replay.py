@@ -231,11 +231,11 @@ def _run_many(args: argparse.Namespace, drives: DriveList) -> int:
     try:
         _merge(done, args.output)
     except CrosscueError as error:
-        # The drives are done, and that must be told, whatever became of their common table.
+        # The drives are done, and that must be reported, whatever became of their common table.
         status, why = status or 3, str(error)
     if args.json:
-        told = [_drive_as_json(one) for one in done]
-        print_json({"drives": told, "merged": where, "not_merged": why})
+        reported = [_drive_as_json(one) for one in done]
+        print_json({"drives": reported, "merged": where, "not_merged": why})
     elif not args.quiet:
         tables = where if why is None else f"not merged: {why}"
         print("\n".join([*_drive_lines(done), f"tables   {visible(tables)}"]))
@@ -262,7 +262,7 @@ def _fingerprint(args: argparse.Namespace, drive: DriveInput) -> str:
     try:
         settings: object = _vehicle(args.vehicle, drive.vehicle).model_dump(mode="json")
     except CrosscueError as error:
-        # This drive's own attempt tells it; the others must not suffer.
+        # This drive's own attempt reports it; the others must not suffer.
         settings = str(error)
     return fingerprint_of(settings, flags, versions(), files_named_in([settings, flags]))
 

@@ -36,13 +36,13 @@ from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.report.junit import write_junit
 from crosscue.eval.report.page import REPORT, write_report
 from crosscue.eval.report.score_runs import Failed, Scored, ScoreWork, score_runs
-from crosscue.eval.report.summary import gate_lines, headline, pose_summary, summary, told_line
+from crosscue.eval.report.summary import gate_lines, headline, pose_summary, reported_line, summary
 from crosscue.eval.runs.account import account_lines
 from crosscue.eval.runs.folder import locked
 from crosscue.eval.scoring.drives import DEFAULTS, Scores, ScoreSettings
 from crosscue.eval.scoring.gates import Gate, GateResult, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import metric_values
-from crosscue.eval.scoring.pose.smoother import told
+from crosscue.eval.scoring.pose.smoother import smoother_text
 from crosscue.eval.scoring.runs import (
     FOLDER,
     RunScored,
@@ -156,7 +156,7 @@ def run(args: argparse.Namespace) -> int:
     )
     scored, failed = _score_all(paths, work, args)
     if len(paths) == 1:
-        tree = _tell_one(scored[0], settings, args)
+        tree = _report_one(scored[0], settings, args)
     else:
         tree = _pool(scored, failed, settings, args)
     results = _gate(gates, tree, args.output or scored[0].one.run.file(FOLDER), paths)
@@ -200,7 +200,7 @@ def _score_all(
     return scored, failed
 
 
-def _tell_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) -> dict[str, Any]:
+def _report_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) -> dict[str, Any]:
     """Print one run's scores; its metrics come back."""
     one = found.one
     scores = scores_of([one], settings)
@@ -221,7 +221,7 @@ def _tell_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) 
     if one.pose is not None:
         print("\n" + pose_summary(one.pose))
     if found.smoothed is not None:
-        print(told(found.smoothed))
+        print(smoother_text(found.smoothed))
     print(f"written to {visible(str(report))}")
     return found.metrics
 
@@ -280,7 +280,7 @@ def _pool(
         print(f"failed     {len(failed)} of {len(failed) + len(scored)} runs, left out")
     for first, second in tree["coverage"].get("same_log", ()):
         names = f"{visible(first)} and {visible(second)}"
-        print(told_line("twice", f"{names} are runs of one log, which therefore counts twice"))
+        print(reported_line("twice", f"{names} are runs of one log, which therefore counts twice"))
     print("\n".join(map(visible, account_lines(account_of_scores(ones)))) + "\n")
     why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
     _print_scores(scores, why, worth)

@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
         return Done(len(written), len(wanted), "drives")
 
     for settings, files in with_progress(_made(wanted, args), at, args, "simulating"):
-        written.append(_told(settings, files))
+        written.append(_report_text(settings, files))
         if not args.quiet and not args.json:
             print(f"{files.log.parent}: {files.seconds:.1f} s, {files.pictures} pictures")
     if args.json:
@@ -148,7 +148,7 @@ def _wanted(args: argparse.Namespace) -> list[SceneSettings]:
         raise UsageError(f"simulate: {error}") from None
 
 
-def _told(settings: SceneSettings, files: SceneFiles) -> dict[str, object]:
+def _report_text(settings: SceneSettings, files: SceneFiles) -> dict[str, object]:
     return {
         "name": settings.name,
         "log": str(files.log),

@@ -76,12 +76,12 @@ def run(args: argparse.Namespace) -> int:
 def _truth(
     args: argparse.Namespace, folder: RunFolder
 ) -> tuple[TruthTrack | None, TrueRanges | None]:
-    """What the truth tells: the track, where run and truth have one, and the ranges."""
+    """What the truth reports: the track, where run and truth have one, and the ranges."""
     if args.truth is None:
         return None, None
-    told = load(args.truth, str(folder.path))
-    has_track = told.truth.pose is not None and folder.file("pose.parquet").exists()
-    return truth_track(args.truth, folder) if has_track else None, told.ranges
+    reported = load(args.truth, str(folder.path))
+    has_track = reported.truth.pose is not None and folder.file("pose.parquet").exists()
+    return truth_track(args.truth, folder) if has_track else None, reported.ranges
 
 
 def _open(path: Path, web: bool) -> None:

@@ -31,10 +31,10 @@ from crosscue.replay.signals.kinds import Plan
 from crosscue.replay.signals.plan import camera_of, with_pictures
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-LEAST_POINTS: Final = 20
+MIN_POINTS: Final = 20
 """Pictures with fewer points (a blank wall, the dark) are no landmarks."""
 MAX_GAP_NS: Final = 500_000_000
-MOST_COORDINATE_BYTES: Final = 256 << 20
+MAX_COORDINATE_BYTES: Final = 256 << 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,7 +195,7 @@ def add_from_log(
             counts.undecodable += 1
             ledger.skip(frame.topic, "picture does not decode", 1, str(error), frame.t_ns)
             continue
-        if len(features) < LEAST_POINTS:
+        if len(features) < MIN_POINTS:
             counts.blank += 1
             continue
         writer.add(place, features)
@@ -243,7 +243,7 @@ def add_from_images(
         except LogError as error:
             text = str(error)
             raise type(error)(text if text.startswith(str(path)) else f"{path}: {text}") from None
-        if len(features) < LEAST_POINTS:
+        if len(features) < MIN_POINTS:
             counts.blank += 1
             continue
         writer.add(place, features)
@@ -262,9 +262,9 @@ def read_coordinates(path: Path, source: str) -> Iterator[tuple[str, Place]]:
         SchemaError: As there.
     """
     try:
-        content = read_at_most(path, MOST_COORDINATE_BYTES)
+        content = read_at_most(path, MAX_COORDINATE_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: more than {MOST_COORDINATE_BYTES >> 20} MiB; split it")
+            raise SchemaError(f"{path}: more than {MAX_COORDINATE_BYTES >> 20} MiB; split it")
         with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file)
             known = set(rows.fieldnames or ())

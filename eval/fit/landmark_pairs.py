@@ -24,8 +24,8 @@ from crosscue.replay.limits import MIB
 
 from .landmark_database import CameraPoses, Frame, place_at
 
-MOST_PAIRS: Final = 1_000_000
-MOST_PAIR_BYTES: Final = 256 * MIB
+MAX_PAIRS: Final = 1_000_000
+MAX_PAIR_BYTES: Final = 256 * MIB
 SAME_TURN_RAD: Final = math.pi / 4
 """Pictures taken in directions further apart are no pair of either kind when they are near."""
 _LABELS: Final = {"1": True, "0": False, "true": True, "false": False}
@@ -56,18 +56,18 @@ def pairs_of_table(path: Path, matcher: Matcher) -> ScoredPairs:
 
 def _labelled(path: Path) -> Iterator[tuple[str, str, bool]]:
     try:
-        content = read_at_most(path, MOST_PAIR_BYTES)
+        content = read_at_most(path, MAX_PAIR_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: more than {MOST_PAIR_BYTES // MIB} MiB; split it")
+            raise SchemaError(f"{path}: more than {MAX_PAIR_BYTES // MIB} MiB; split it")
         with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
             table = csv.DictReader(file)
             if not {"query", "known", "same"} <= set(table.fieldnames or ()):
                 raise SchemaError(f"{path}:1: want columns query,known,same; mend the header")
             for row in table:
                 label = _LABELS.get(str(row["same"]).strip().lower())
-                if label is None or table.line_num > MOST_PAIRS:
+                if label is None or table.line_num > MAX_PAIRS:
                     raise SchemaError(
-                        f"{path}:{table.line_num}: same: want 1 or 0 (and at most {MOST_PAIRS:,} "
+                        f"{path}:{table.line_num}: same: want 1 or 0 (and at most {MAX_PAIRS:,} "
                         f"lines), got {row['same']!r}; mend it"
                     )
                 yield str(row["query"]), str(row["known"]), label

@@ -182,7 +182,7 @@ class SideTold(NamedTuple):
 
     Attributes:
         rate: Mean over places; NaN without any.
-        wilson: Interval by independent looks; rounding them to whole ones costs less than
+        wilson: Interval by independent observations; rounding them to whole ones costs less than
             pretending that every frame is one.
         places: Interval by resampling places; NaN for fewer than two.
     """
@@ -192,7 +192,7 @@ class SideTold(NamedTuple):
     places: Interval
 
 
-def told_of(side: Side) -> SideTold:
+def rates_of(side: Side) -> SideTold:
     """A side's rate with both intervals."""
     looks = round(side.looks)
     rates = np.array(side.rates)

@@ -17,11 +17,11 @@ from crosscue.replay.files.parquet import opened
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
 
-MOST_BYTES: Final = 256 * MIB
+MAX_BYTES: Final = 256 * MIB
 LABELS: Final[Mapping[str, str]] = {"stop_sign": "stop sign", "traffic_light": "traffic light"}
 REFERENCES: Final[Mapping[str, str]] = {"stop_sign": "start_m", "traffic_light": "end_m"}
 """A stop sign measures the start of the intersection, a light its end."""
-LEAST_VISIBLE: Final = 0.9
+MIN_VISIBLE: Final = 0.9
 """The height of an object that something hides says nothing of its range."""
 NEAREST_NS: Final = 20_000_000
 """A detection belongs to the true range of a picture this near in time."""
@@ -81,7 +81,7 @@ def pairs_of_truth(truth: Path, cue: str) -> RangePairs:
             (times[one["image_id"]], float(one["bbox"][3]))
             for one in tree["annotations"]
             if one["category_id"] in numbers
-            and one.get("visible", 1.0) >= LEAST_VISIBLE
+            and one.get("visible", 1.0) >= MIN_VISIBLE
             and one.get("in_picture", 1.0) >= 1.0
         ]
     except (KeyError, TypeError, ValueError, IndexError) as error:
@@ -152,9 +152,9 @@ def _objects(truth: Path) -> Any:
         raise SchemaError(f"{truth}: has no objects; name a COCO file with them as objects")
     path = _folder(truth) / name
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
+            raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
         return json_tree(content)
     except (OSError, ValueError) as error:
         raise SchemaError(f"{path}: not readable as JSON ({error}); mend it") from None
@@ -165,9 +165,9 @@ def _folder(truth: Path) -> Path:
 
 
 def _csv(path: Path, names: tuple[str, ...]) -> tuple[Floats, ...]:
-    content = read_at_most(path, MOST_BYTES)
+    content = read_at_most(path, MAX_BYTES)
     if content is None:
-        raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; give fewer rows")
+        raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; give fewer rows")
     rows = list(csv.DictReader(content.decode("utf-8").splitlines()))
     # Nanoseconds since 1970 are kept to 256 ns, which is near enough to find a picture by.
     return tuple(np.array([float(row[name] or "nan") for row in rows]) for name in names)

@@ -25,7 +25,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle, load
 from .sign_labels import Boxes, Labelled, coco_boxes
 from .truth_check import OBJECTS
 
-MOST_BYTES: Final = 512 * MIB
+MAX_BYTES: Final = 512 * MIB
 
 
 def drive_pictures(folder: Path) -> Iterator[Labelled]:
@@ -43,9 +43,9 @@ def drive_pictures(folder: Path) -> Iterator[Labelled]:
 
 def _boxes(path: Path) -> dict[int, Boxes]:
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
+            raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
         text = content.decode("utf-8")
     except OSError as error:
         raise SchemaError(

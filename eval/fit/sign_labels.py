@@ -15,7 +15,7 @@ from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
 
 COLUMNS: Final = ("picture", "label", "x0", "y0", "x1", "y1")
-MOST_BYTES: Final = 64 * MIB
+MAX_BYTES: Final = 64 * MIB
 _WANTED: Final = "give a CSV or COCO file of boxes, or a drive's folder"
 
 Boxes = dict[str, list[tuple[float, float, float, float]]]
@@ -41,7 +41,7 @@ def read_labels(path: Path) -> list[Labelled]:
     """Read a CSV file, where an empty label says that the picture has no sign, or COCO (.json).
 
     Raises:
-        UsageError: Not there, not such a file, or a box that is none; with the line.
+        UsageError: Not there, not such a file, or a box that is not one; with the line.
     """
     text = _text(path)
     return _of_coco(text, path) if path.suffix == ".json" else _of_csv(text, path)
@@ -49,9 +49,9 @@ def read_labels(path: Path) -> list[Labelled]:
 
 def _text(path: Path) -> str:
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise UsageError(f"{path}: over {MOST_BYTES // MIB} MiB; split it")
+            raise UsageError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
         return content.decode("utf-8")
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}; {_WANTED}") from None
@@ -76,7 +76,7 @@ def coco_boxes(text: str, path: Path) -> list[tuple[dict[str, Any], Boxes]]:
     """The images of a COCO file with their boxes, by id.
 
     Raises:
-        UsageError: It is none, holds no image, or a box is none.
+        UsageError: It is not one, holds no image, or a box is not one.
     """
     try:
         tree = json_tree(text)

@@ -41,7 +41,7 @@ SLACK_NS: Final = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class TruthFit:
-    """What a truth file that fits its log tells.
+    """What a truth file that fits its log contains.
 
     Attributes:
         seconds: Its length.
@@ -93,7 +93,7 @@ def check_truth(path: Path, log_path: Path, vehicle: Vehicle, limits: Limits = D
     """Check a truth file and all files that it names against a log.
 
     Raises:
-        SchemaError: Something does not fit; the first thing found is told.
+        SchemaError: Something does not fit; the first thing found is reported.
         LogError: The log or the track cannot be read.
     """
     drive = score_truth.load(path, str(log_path))

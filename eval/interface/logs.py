@@ -241,7 +241,7 @@ class LogTopic:
         """
         ledgers: list[Ledger] = []
         blocks = [*self._rows(self._selected(start_s, end_s), ledgers)]
-        return _table_of(blocks, _told(self.name, ledgers))
+        return _table_of(blocks, _report_text(self.name, ledgers))
 
     def batches(
         self, start_s: float | None = None, end_s: float | None = None
@@ -401,7 +401,7 @@ def _signals(
         for found in decoders[-1](block):
             if len(found):
                 parts.setdefault(found.topic.removeprefix(f"{topic.name}/"), []).append(found)
-    account = _told(topic.name, ledgers)
+    account = _report_text(topic.name, ledgers)
     return Signals({name: _table_of(parts[name], account) for name in sorted(parts)}, account)
 
 
@@ -427,11 +427,11 @@ def _decoder(log: OneLog, topic: Topic) -> Decoder:
     return decode
 
 
-def _table_of(blocks: Sequence[Block], told: Mapping[str, object]) -> pa.Table:
+def _table_of(blocks: Sequence[Block], reported: Mapping[str, object]) -> pa.Table:
     import pyarrow as pa
 
     if not blocks:
-        return pa.table({"log_ns": pa.array([], pa.int64())}, metadata=_metadata(told))
+        return pa.table({"log_ns": pa.array([], pa.int64())}, metadata=_metadata(reported))
     units = blocks[0].rows.units if isinstance(blocks[0].rows, Table) else {}
     arrays = {name: pa.array(values) for name, values in columns_of(blocks).items()}
     if isinstance(blocks[0].rows, CanFrames):
@@ -440,7 +440,7 @@ def _table_of(blocks: Sequence[Block], told: Mapping[str, object]) -> pa.Table:
         pa.field(name, array.type, metadata={"unit": units[name]} if units.get(name) else None)
         for name, array in arrays.items()
     ]
-    return pa.table(list(arrays.values()), pa.schema(fields, metadata=_metadata(told)))
+    return pa.table(list(arrays.values()), pa.schema(fields, metadata=_metadata(reported)))
 
 
 def _payloads(rows: object) -> pa.Array:
@@ -457,11 +457,11 @@ def _payloads(rows: object) -> pa.Array:
     )
 
 
-def _metadata(told: Mapping[str, object]) -> dict[str, str] | None:
-    return {"crosscue": json.dumps(told, sort_keys=True)} if told else None
+def _metadata(reported: Mapping[str, object]) -> dict[str, str] | None:
+    return {"crosscue": json.dumps(reported, sort_keys=True)} if reported else None
 
 
-def _told(topic: str, ledgers: Sequence[Ledger]) -> dict[str, object]:
+def _report_text(topic: str, ledgers: Sequence[Ledger]) -> dict[str, object]:
     """What became of every row of a topic, by log."""
     return {
         ledger.log: _account(ledger.topic(topic))

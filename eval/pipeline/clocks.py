@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     pass
 
 PROBE_NS: Final = 10_000_000_000
-"""Log time looked at before a clock is chosen for each topic."""
+"""Log time examined before a clock is chosen for each topic."""
 
 
 def probe_clocks(log: Log, extractor: Extractor, selection: Selection) -> dict[str, Clock]:

@@ -39,7 +39,7 @@ from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.signals.plan import camera_of
-from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_told, shift_of
+from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.versions import versions
 
@@ -52,10 +52,10 @@ if TYPE_CHECKING:
 
 
 OnFrames = Callable[[int, int | None], None]
-"""Told how many frames are done, and of how many where that is known."""
+"""Reported how many frames are done, and of how many where that is known."""
 
 
-def unwatched(_done: int, _of: int | None) -> None:
+def no_progress(_done: int, _of: int | None) -> None:
     """Nobody looks."""
 
 
@@ -111,7 +111,7 @@ def detect_drive(
     choices: Sequence[Choice],
     cache: Path | None = None,
     draw: int = 0,
-    on_frames: OnFrames = unwatched,
+    on_frames: OnFrames = no_progress,
 ) -> DetectOutcome:
     """Run detectors over the one camera of a drive, into an empty run folder.
 
@@ -131,7 +131,7 @@ def detect_into(
     choices: Sequence[Choice],
     cache: Path | None = None,
     draw: int = 0,
-    on_frames: OnFrames = unwatched,
+    on_frames: OnFrames = no_progress,
     timeline: Timeline | None = None,
 ) -> DetectOutcome:
     """Run detectors over the one camera of a drive, into a run folder that is locked.
@@ -144,7 +144,7 @@ def detect_into(
         choices: Detectors, in order.
         cache: File with results of earlier runs, or None for none.
         draw: How many pictures to write at most, with detections drawn, spread over the drive.
-        on_frames: Told how many frames are done, and of how many where the log declares it.
+        on_frames: Reported how many frames are done, and of how many where the log declares it.
         timeline: The drive's time segments, if they have been found already.
 
     Raises:
@@ -206,7 +206,7 @@ def detect_into(
         made = account(reading_of([ledger]), detecting_of(topic.name, ledger, runner.counts.frames))
         write_skipped(run, [ledger], made.reading, timeline=timeline)
         seconds = time.monotonic() - began
-        notices = (*gaps_told(timeline.segments), *tables.notices)
+        notices = (*gaps_text(timeline.segments), *tables.notices)
         write_manifest(
             run,
             DetectManifest(

@@ -14,7 +14,7 @@ from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import plan, with_pictures
 from crosscue.replay.time.scan import scan
-from crosscue.replay.time.segments import Timeline, gaps_told
+from crosscue.replay.time.segments import Timeline, gaps_text
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .clocks import probe_clocks
@@ -50,7 +50,7 @@ def drive_timeline(
         logs: All logs of the drive, open.
         vehicle: What the vehicle file says.
         selection: Which part of the logs will be read.
-        camera: Its stamps are looked at, too.
+        camera: Its stamps are examined, too.
         known: What an earlier stage found; its shifts are kept.
 
     Raises:
@@ -73,7 +73,7 @@ def camera_timeline(
 ) -> Timeline:
     """As ``drive_timeline``, for a stage that needs the camera alone.
 
-    Where the vehicle file does not fit the odometry, only the camera's own clock is looked at: the
+    Where the vehicle file does not fit the odometry, only the camera's own clock is examined: the
     stage that needs the odometry says what is wrong.
     """
     try:
@@ -128,5 +128,5 @@ def time_segments(timeline: Timeline) -> TimeSegments:
     return TimeSegments(
         segments=timeline.segments,
         clocks=timeline.clocks,
-        notices=tuple(gaps_told(timeline.segments)),
+        notices=tuple(gaps_text(timeline.segments)),
     )

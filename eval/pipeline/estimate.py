@@ -53,7 +53,7 @@ from crosscue.replay.time.segments import (
     Segment,
     TimedLog,
     Timeline,
-    gaps_told,
+    gaps_text,
     shift_of,
 )
 from crosscue.replay.vehicle.roles import Role, role_of
@@ -129,7 +129,7 @@ def estimate_into(
     landmarks: LandmarkDatabase | None = None,
     detected: DetectOutcome | None = None,
     earlier: DetectManifest | None = None,
-    told: Sequence[LogRow] | None = None,
+    reported: Sequence[LogRow] | None = None,
     timeline: Timeline | None = None,
 ) -> Outcome:
     """Write pose, cues, ranges, beliefs and the manifest into a run folder that is locked.
@@ -143,7 +143,7 @@ def estimate_into(
         landmarks: Camera frames are compared with these, where given.
         detected: The detect stage, if it ran just now.
         earlier: The manifest's part on the detect stage, if it ran earlier.
-        told: ``log_rows(logs, run)``, if they have been hashed already.
+        reported: ``log_rows(logs, run)``, if they have been hashed already.
         timeline: The drive's time segments, if they have been found already.
 
     Raises:
@@ -185,7 +185,7 @@ def estimate_into(
     before = 0.0 if detected is None else detected.seconds
     seconds = time.monotonic() - began
     notices = (
-        *gaps_told(timeline.segments),
+        *gaps_text(timeline.segments),
         *_missing(reading.planned),
         *silent.values(),
         *_no_camera(landmarks, reading.camera),
@@ -200,7 +200,7 @@ def estimate_into(
         run,
         EstimateManifest(
             versions=versions(),
-            logs=_hashed(logs, run, found) if told is None else tuple(told),
+            logs=_hashed(logs, run, found) if reported is None else tuple(reported),
             selection=part_of(selection),
             settings=vehicle,
             sources=_sources(reading.planned, logs),
@@ -378,7 +378,7 @@ def _scene_summary(scene: SceneOutcome) -> SceneSummary:
 
 
 def _camera_skips(run: RunFolder, camera: str) -> pa.Table:
-    """What the detect stage told of the camera; the other topics are read again."""
+    """What the detect stage reported of the camera; the other topics are read again."""
     import pyarrow.compute as pc
 
     table = run.table("skipped")

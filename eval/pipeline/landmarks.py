@@ -1,4 +1,4 @@
-"""The camera's part of a replay: frames kept until the pose track comes by, then looked at."""
+"""The camera's part of a replay: frames kept until the pose track comes by, then examined."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def estimate_run(
             manifest.selection.selection,
             on_time,
             earlier=manifest.detected,
-            told=manifest.logs,
+            reported=manifest.logs,
         )
     return replace(outcome, run=run)
 

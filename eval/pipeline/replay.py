@@ -20,7 +20,7 @@ from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .detect import DetectOutcome, OnFrames, detect_into, unwatched
+from .detect import DetectOutcome, OnFrames, detect_into, no_progress
 from .drive_time import OnTime, drive_timeline, unwatched_time
 from .empty_result import nothing_left
 from .estimate import Outcome, estimate_into
@@ -38,14 +38,14 @@ class Detecting:
         cache: File with results of earlier runs, or None for none.
         draw: How many pictures to write with detections drawn.
         resume: Keep detections of an earlier start that would come out the same.
-        on_frames: Told how many frames are done, and of how many where that is known.
+        on_frames: Reported how many frames are done, and of how many where that is known.
     """
 
     choices: tuple[Choice, ...]
     cache: Path | None = None
     draw: int = 0
     resume: bool = False
-    on_frames: OnFrames = unwatched
+    on_frames: OnFrames = no_progress
 
 
 NO_DETECTORS: Final = Detecting(())

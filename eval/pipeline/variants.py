@@ -27,7 +27,7 @@ def scene_tables(
         without: Cues to leave out as if nothing had looked for them.
 
     Raises:
-        RunError: No detector has looked at the run's camera.
+        RunError: No detector has examined the run's camera.
     """
     import pyarrow as pa
 

@@ -128,7 +128,7 @@ def _log_marks(
 
 
 def _pose(run: RunFolder) -> dict[str, Floats] | None:
-    """Columns of the pose, or None where there is none."""
+    """Columns of the pose, or None where none exists."""
     if not run.file("pose.parquet").exists():
         return None
     table = run.table("pose")

@@ -1,7 +1,7 @@
 """What lies ahead of the car, seen from above in its own frame: up is ahead, metres.
 
 The intersection stands across the way at its estimated range, its 2-sigma band around it; lanes and
-vehicles are the Mobileye's, as it had told them by then.
+vehicles are the Mobileye's, as it had reported them by then.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ HATCH_ROWS: Final = 4
 ARROW_STEPS: Final = 4.0
 """An arrow's length in steps from one frame to the next."""
 LABELLED: Final = 0.03
-"""Narrower things, in shares of the picture's width, show their label only when pointed at."""
+"""Narrower things, in fractions of the picture's width, show their label only when pointed at."""
 SIDES: Final = ("left", "straight", "right")
 
 
@@ -78,7 +78,7 @@ class Marks:
         for found in seen.objects:
             self._objects(found)
         for found in seen.signs:
-            for box, text, _ in _told(found):
+            for box, text, _ in _report_text(found):
                 self.signs.add(box, SIGN, text)
         if isinstance(seen.road, RoadMask):
             for line in road_lines(seen.road):
@@ -98,7 +98,7 @@ class Marks:
             shapes.send(recording, time)
 
     def _objects(self, found: Detections) -> None:
-        for box, text, row in _told(found):
+        for box, text, row in _report_text(found):
             colour = self._colour(found.labels[row], float(found.scores[row]))
             is_far = box[2] - box[0] < LABELLED * found.size_px[0]
             (self.far if is_far else self.objects).add(box, colour, text)
@@ -153,7 +153,7 @@ class Marks:
         self.cars.add(np.concatenate([tail, way]), colour, label)
 
 
-def _told(found: Detections) -> Iterator[tuple[Floats, str, int]]:
+def _report_text(found: Detections) -> Iterator[tuple[Floats, str, int]]:
     """Box, text and row of each detection."""
     for row, (label, score) in enumerate(zip(found.labels, found.scores.tolist(), strict=True)):
         yield found.boxes_px[row], f"{label} {score:.2f}", row

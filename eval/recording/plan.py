@@ -21,7 +21,7 @@ ELLIPSES_PER_S: Final = 5.0
 HALF_ROAD_M: Final = 8.0
 CAR_M: Final = 8.0
 CAR_SHARE: Final = 0.02
-"""The car's arrow is at least this share of the track's extent, to be seen on a long drive."""
+"""The car's arrow is at least this fraction of the track's extent, to be seen on a long drive."""
 LANDMARK_POINTS: Final = 6.0
 TRUE_CAR_POINTS: Final = 5.0
 

@@ -34,13 +34,13 @@ def junit_text(results: Sequence[GateResult], suite: str) -> str:
         case = ET.SubElement(
             parent,
             "testcase",
-            {"classname": "crosscue.gate", "name": fit_for_xml(one.gate.told()), "time": "0"},
+            {"classname": "crosscue.gate", "name": fit_for_xml(one.gate.text()), "time": "0"},
         )
         if one.failure:
             failure = ET.SubElement(
                 case, "failure", {"type": "gate", "message": fit_for_xml(one.failure)}
             )
-            failure.text = fit_for_xml(f"{one.gate.told()}: {one.failure}")
+            failure.text = fit_for_xml(f"{one.gate.text()}: {one.failure}")
     ET.indent(root)
     return '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, "unicode") + "\n"
 

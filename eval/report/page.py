@@ -147,13 +147,13 @@ def _content(scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> dict[st
 
 def _run(one: RunScored) -> _Run:
     manifest = one.run.drive_manifest()
-    told = manifest.as_json()
+    reported = manifest.as_json()
     return _Run(
         name=_name(one),
         manifest=manifest,
-        clocks=strict_json(told["clocks"]),
-        settings=strict_json(told["settings"]),
-        versions=strict_json({"versions": told["versions"], "logs": told["logs"]}),
+        clocks=strict_json(reported["clocks"]),
+        settings=strict_json(reported["settings"]),
+        versions=strict_json({"versions": reported["versions"], "logs": reported["logs"]}),
     )
 
 
@@ -182,11 +182,11 @@ def _frame(one: WorstFrame) -> dict[str, Any]:
     return {
         **asdict(one),
         "distance": "" if math.isnan(one.distance_m) else f"{one.distance_m:.0f}",
-        "when": told_time(one.t_ns),
+        "when": reported_time(one.t_ns),
     }
 
 
-def told_time(t_ns: int) -> str:
+def reported_time(t_ns: int) -> str:
     """As the viewer shows it: a date, or seconds for a clock that begins with the machine."""
     if t_ns <= YEAR_2000_NS:
         return f"{t_ns * 1e-9:.3f} s"
@@ -215,7 +215,7 @@ def _figures(scored: Sequence[RunScored], scores: Scores) -> _Figures:
                 scene_figures.draw_belief(
                     curve, one.judged.cues, threshold, gaps[one.judged.coverage.drive]
                 ),
-                _told(one, curve.intersection),
+                _report_text(one, curve.intersection),
             )
             for one, curve in curves[:BELIEFS]
         ),
@@ -226,7 +226,7 @@ def _figures(scored: Sequence[RunScored], scores: Scores) -> _Figures:
     )
 
 
-def _told(one: RunScored, intersection: str) -> str:
+def _report_text(one: RunScored, intersection: str) -> str:
     return f"{_name(one)}: approach to {intersection}. Dashed: established above it."
 
 
@@ -257,7 +257,7 @@ def _ends(low: float | None, high: float | None) -> str:
 
 
 def _span(mean: Mapping[str, Any], digits: int = 2) -> str:
-    """An interval in brackets, or nothing where there is none."""
+    """An interval in brackets, or nothing where none exists."""
     low, high = mean["low"], mean["high"]
     if low is None or high is None or math.isnan(low) or math.isnan(high):
         return ""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crosscue.eval.runs.tables.log_time import Gap, broken_at
 from crosscue.eval.scoring.approaches import THRESHOLD, ApproachResult, Curve
 from crosscue.eval.scoring.belief import BeliefScore
-from crosscue.eval.scoring.cues import CueJudged
+from crosscue.eval.scoring.cues import CueFrames
 from crosscue.eval.scoring.ranges import RangeJudged, RangeScore
 from crosscue.eval.scoring.run_tables import NONE
 from crosscue.replay.columns import Floats, Int64s
@@ -97,7 +97,7 @@ def _known(values: Sequence[float | None]) -> list[float]:
 
 def draw_belief(
     curve: Curve,
-    cues: Sequence[CueJudged],
+    cues: Sequence[CueFrames],
     threshold: float = THRESHOLD,
     gaps: Sequence[Gap] = (),
 ) -> Markup:
@@ -125,7 +125,7 @@ def draw_belief(
         f"Probability against distance: {curve.intersection}",
         "Probability of each feature over the true distance still to go, and below it at which "
         "distances each cue was found: "
-        + "; ".join(_told(name, curve, threshold) for name in curve.features),
+        + "; ".join(_report_text(name, curve, threshold) for name in curve.features),
     )
     drawing.axes(
         panel, "true distance to the intersection (m)", "", y_ticks=[0.0, 0.25, 0.5, 0.75, 1.0]
@@ -144,7 +144,7 @@ def draw_belief(
     return drawing.svg()
 
 
-def _way(curve: Curve, cues: Sequence[CueJudged]) -> tuple[Int64s, Floats]:
+def _way(curve: Curve, cues: Sequence[CueFrames]) -> tuple[Int64s, Floats]:
     """Times of an approach, sorted, and the distance still to go, shape (N,) each.
 
     Frames before the belief's first step belong to it.
@@ -169,7 +169,7 @@ def _shade(drawing: Drawing, panel: Panel, ends: Floats, text: str) -> None:
     drawing.text((left + right) / 2.0, panel.top + 11, text, "halo")
 
 
-def _told(name: str, curve: Curve, threshold: float) -> str:
+def _report_text(name: str, curve: Curve, threshold: float) -> str:
     above = np.flatnonzero(curve.features[name] > threshold)
     if not len(above):
         return f"{name} stays below {threshold:g}"
@@ -180,11 +180,11 @@ def _lane(
     drawing: Drawing,
     panel: Panel,
     y: float,
-    cue: CueJudged,
+    cue: CueFrames,
     found: NDArray[np.bool_],
     gaps: Sequence[Gap],
 ) -> None:
-    """A bar wherever the cue was found in one look after the other."""
+    """A bar wherever the cue was found in one observation after the other."""
     side = next((s for s in ("left", "right", "straight") if cue.cue.endswith(s)), "intersection")
     side = "straight" if cue.cue.endswith("past") else side
     drawing.rule(panel.left, y + 7, panel.right, y + 7, "grid")
@@ -201,7 +201,7 @@ def _lane(
     drawing.text(panel.left - 6, y + 11, cue.cue.replace("_", " "), "tick", "end")
 
 
-def is_wrong(cue: CueJudged) -> NDArray[np.bool_]:
+def is_wrong(cue: CueFrames) -> NDArray[np.bool_]:
     """Rows in which the cue was found and, in the reading that leads its score, is not so."""
     readings = [cue.is_object, cue.is_feature]
     if cue.cue in CUES and CUES[cue.cue].scored_as == "feature":

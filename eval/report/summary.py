@@ -11,7 +11,7 @@ from crosscue.eval.scoring.belief import BeliefScore
 from crosscue.eval.scoring.cues import CueScore
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.gates import GateResult
-from crosscue.eval.scoring.intervals import Mean, Share
+from crosscue.eval.scoring.intervals import Mean, Proportion
 from crosscue.eval.scoring.metric_values import MetricValue
 from crosscue.eval.scoring.pose.score import Errors, PoseScore
 from crosscue.eval.scoring.ranges import RangeScore
@@ -36,7 +36,7 @@ def summary(scores: Scores, why_no_pose: str = "") -> str:
     return "\n".join(part for line in lines for part in _wrapped(line))
 
 
-def told_line(label: str, text: str) -> str:
+def reported_line(label: str, text: str) -> str:
     """One labelled line, going on below where it is too long."""
     return "\n".join(_wrapped(_line(label, text)))
 
@@ -45,7 +45,7 @@ def gate_lines(results: Sequence[GateResult]) -> str:
     """One line for each gate, failures last."""
     ordered = sorted(results, key=lambda one: bool(one.failure))
     lines = [
-        _line("FAILED" if one.failure else "passed", visible(one.gate.told()) + _end(one))
+        _line("FAILED" if one.failure else "passed", visible(one.gate.text()) + _end(one))
         for one in ordered
     ]
     return "\n".join(part for line in lines for part in _wrapped(line))
@@ -71,13 +71,13 @@ def _wrapped(line: str) -> Iterator[str]:
 
 def _coverage(scores: Scores) -> list[str]:
     frames = sum(one.frames for one in scores.drives)
-    told = sum(one.frames_told for one in scores.drives)
+    reported = sum(one.frames_annotated for one in scores.drives)
     truth_s = sum(one.truth_s for one in scores.drives)
     covered_s = sum(one.truth_covered_s for one in scores.drives)
     n = len(scores.drives)
     twice = sum(one.frames_ambiguous for one in scores.drives)
     lines = [
-        _line("drives", f"{n}: of {frames} frames the truth speaks of {told}"),
+        _line("drives", f"{n}: of {frames} frames the truth speaks of {reported}"),
         _line("truth", f"{truth_s:.1f} s, of which the runs cover {covered_s:.1f} s"),
     ]
     if twice:
@@ -112,20 +112,20 @@ def _left_out(cues: Mapping[str, CueScore]) -> list[str]:
             same.setdefault(tuple(reasons.items()), []).append(visible(name))
     lines = []
     for why, names in same.items():
-        told = ", ".join(f"{count} {reason}" for reason, count in why)
+        reported = ", ".join(f"{count} {reason}" for reason, count in why)
         whom = "all cues" if len(names) == len(cues) else ", ".join(names)
-        lines.append(_line("left out", f"{told}: {whom}"))
+        lines.append(_line("left out", f"{reported}: {whom}"))
     return lines
 
 
-def _share(one: Share) -> str:
+def _share(one: Proportion) -> str:
     if not one.of:
         return "-"
     low, high = _ends(one)
     return f"{one.value:.3f} ({low:.2f} to {high:.2f})"
 
 
-def _ends(one: Share) -> tuple[float, float]:
+def _ends(one: Proportion) -> tuple[float, float]:
     """The wider interval of the two."""
     if math.isnan(one.clusters_low):
         return one.low, one.high
@@ -143,12 +143,12 @@ def _approaches(one: ApproachScore) -> list[str]:
         _line("in full", _distance(one.full, one.full_m)),
     ]
     if one.false_by_feature:
-        told = ", ".join(f"{name} {n}" for name, n in one.false_by_feature.items())
+        reported = ", ".join(f"{name} {n}" for name, n in one.false_by_feature.items())
         lines.append(
             _line(
                 "false",
                 f"absent features believed in {one.false_features.right} of "
-                f"{one.false_features.of} approaches: {told}",
+                f"{one.false_features.of} approaches: {reported}",
             )
         )
     for what, reasons in one.failures.items():
@@ -159,7 +159,7 @@ def _approaches(one: ApproachScore) -> list[str]:
     return lines
 
 
-def _distance(found: Share, distance: Mean) -> str:
+def _distance(found: Proportion, distance: Mean) -> str:
     text = f"{found.right} of {found.of}"
     if not distance.of:
         return text

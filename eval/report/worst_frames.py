@@ -17,7 +17,7 @@ from crosscue.detectors.overlay import draw
 from crosscue.detectors.runner import FrameResult
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.stored_images import camera_of, picture_at
-from crosscue.eval.scoring.cues import CueJudged
+from crosscue.eval.scoring.cues import CueFrames
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.cue_table import CUES
@@ -112,7 +112,7 @@ def _wrong(scored: RunScored) -> list[WorstFrame]:
     return found
 
 
-def _mistakes(cue: CueJudged) -> list[np.typing.NDArray[np.intp]]:
+def _mistakes(cue: CueFrames) -> list[np.typing.NDArray[np.intp]]:
     """Rows in which the cue is wrong, those close in time together."""
     rows = np.flatnonzero(is_wrong(cue))
     breaks = np.flatnonzero(np.diff(cue.t_ns[rows]) > APART_NS) + 1

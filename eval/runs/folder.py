@@ -226,7 +226,7 @@ def staged(
     Args:
         run: The run.
         keep: Begin with its files, and leave those that nothing replaces.
-        until: What the manifest says while files are replaced; without it there is none so long.
+        until: What the manifest says while files are replaced; without it none exists so long.
 
     Raises:
         OutputError: The folder cannot be written.

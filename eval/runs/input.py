@@ -96,7 +96,7 @@ def refuse_another(run: RunFolder, mine: Mapping[str, Any]) -> None:
 def files_named_in(settings: object) -> dict[str, str]:
     """Files that settings name, such as DBC files and model cards, with size and time of each.
 
-    A name alone would not tell that a file was edited.
+    A name alone would not show that a file was edited.
     """
     if isinstance(settings, str):
         # Longer texts are no names, and some systems fail on them.

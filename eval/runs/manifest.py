@@ -108,7 +108,7 @@ class DetectorRow(Record):
     """Of weights, settings and code: the same identity finds the same."""
     kind: str
     role: str | None
-    """None where it found nothing to tell its role by."""
+    """None where it found nothing to report its role by."""
     settings: dict[str, Any]
 
 

@@ -38,7 +38,7 @@ class StoredCamera:
         log: Path or URL.
         topic: In it.
         clock: Whose times the run's tables have.
-        selection: What part of the log the run looked at.
+        selection: What part of the log the run examined.
         time: The log's clock against the times of the run's tables.
         limits: What the log is read with.
     """
@@ -89,7 +89,7 @@ def _clock(detected: DetectManifest | None, topic: str) -> Clock:
 
 
 def picture_at(camera: StoredCamera, t_ns: int) -> Encoded | None:
-    """The picture taken at exactly this time of the run's tables; None where there is none.
+    """The picture taken at exactly this time of the run's tables; None where none exists.
 
     Raises:
         LogError: The log cannot be opened.
@@ -111,7 +111,7 @@ def read_pictures(
 
     Args:
         camera: Where they lie.
-        on_pictures: Told of blocks of ``Images`` with times as in the run's tables.
+        on_pictures: Reported of blocks of ``Images`` with times as in the run's tables.
         around_ns: Only those about this time.
 
     Raises:

@@ -6,7 +6,7 @@ neither sign nor light stands, nothing speaks of 'intersection' itself (its Fig.
 yet the source detects such a one in full 6 times of 10: for the full intersection, presence that a
 road or a car to the side has established counts as well. Distances are true ones, of the rear axle
 to the start of the intersection. Beyond the source: absent features that exceeded 0.9, and
-approaches of the run where there is none.
+approaches of the run where none exists.
 
 A run's approach belongs to the true one that it shares most time with, from its start until the car
 enters; each belongs to one at most. A further one during the same true approach is a split, one
@@ -27,7 +27,7 @@ from crosscue.datasets.truth.truth import Approach
 from crosscue.replay.columns import Floats, Int64s
 
 from .cues import has_feature
-from .intervals import Mean, Share, mean, share
+from .intervals import Mean, Proportion, mean, share
 from .run_tables import NONE, BeliefRows, RunTables
 from .truth import DriveTruth
 
@@ -132,14 +132,14 @@ class ApproachScore:
         approaches: In the truth.
         matched: Of which the run knows.
         without_range: Of which no true distance is known; they have no part in means.
-        detected: Share of approaches.
-        full: Share of approaches.
-        full_from_8_m: Share of approaches with full detection at least 8 m away.
+        detected: Fraction of approaches.
+        full: Fraction of approaches.
+        full_from_8_m: Fraction of approaches with full detection at least 8 m away.
         detected_m: Mean over those detected, resampled by approach.
         full_m: The same for full detection.
-        false_features: Share of approaches with at least one absent feature above the threshold.
+        false_features: Fraction of approaches with at least one absent feature above the threshold.
         false_by_feature: How often each was.
-        extra: Approaches of runs where there is none.
+        extra: Approaches of runs where none exists.
         extra_detected: Those that said 'intersection' above the threshold.
         splits: True approaches that the run broke in pieces.
         not_judged: Approaches of runs outside the truth's time.
@@ -153,12 +153,12 @@ class ApproachScore:
     approaches: int
     matched: int
     without_range: int
-    detected: Share
-    full: Share
-    full_from_8_m: Share
+    detected: Proportion
+    full: Proportion
+    full_from_8_m: Proportion
     detected_m: Mean
     full_m: Mean
-    false_features: Share
+    false_features: Proportion
     false_by_feature: dict[str, int]
     extra: int
     extra_detected: int
@@ -403,7 +403,7 @@ def _is_unknown(distance_m: float | None) -> bool:
     return distance_m is not None and math.isnan(distance_m)
 
 
-def _share(values: Sequence[bool]) -> Share:
+def _share(values: Sequence[bool]) -> Proportion:
     # Approaches are the clusters, so Wilson's interval is the one that counts.
     return share(np.array(values, np.bool_), np.arange(len(values)))
 

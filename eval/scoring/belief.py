@@ -20,7 +20,7 @@ from crosscue.replay.columns import Floats, Int64s
 
 from .approaches import FEATURES
 from .cues import has_feature
-from .intervals import Mean, Share, mean, share
+from .intervals import Mean, Proportion, mean, share
 from .pooling import cluster_numbers, first_reasons, summed
 from .run_tables import NONE, RunTables
 from .truth import DriveTruth
@@ -70,7 +70,7 @@ class ReliabilityBin:
     high: float
     steps: int
     mean_probability: float
-    there: Share
+    there: Proportion
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class BeliefScore:
     """One feature over all drives.
 
     Attributes:
-        steps: All, and frames ahead of a true intersection for which there is none.
+        steps: All, and frames ahead of a true intersection for which none exists.
         scored: With truth.
         left_out: Reason to steps.
         share_there: How often the feature is there.
@@ -129,7 +129,7 @@ def judge_belief(tables: RunTables, truth: DriveTruth) -> list[BeliefJudged]:
         return []
     belief = tables.belief
     at, crossing = truth.approach_at(belief.t_ns), truth.is_crossing(belief.t_ns)
-    told = truth.is_told(belief.t_ns)
+    reported = truth.is_annotated(belief.t_ns)
     frames = np.empty(0, np.int64) if tables.frames_ns is None else tables.frames_ns
     ahead = frames[truth.approach_at(frames) != NONE]
     silent = int((~np.isin(ahead, belief.t_ns)).sum())
@@ -141,7 +141,7 @@ def judge_belief(tables: RunTables, truth: DriveTruth) -> list[BeliefJudged]:
         label = _labels(name, at, truth)
         reasons = {
             "not a number": ~np.isfinite(values),
-            "outside the truth's time": ~told,
+            "outside the truth's time": ~reported,
             "in the intersection": crossing,
             "no intersection ahead": (at == NONE) & (label == NONE),
             "the truth does not know this feature": label == NONE,

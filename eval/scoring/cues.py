@@ -29,7 +29,7 @@ from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.cue_spec import Scoring
 from crosscue.replay.vehicle.cue_table import CUES
 
-from .intervals import Share, share
+from .intervals import Proportion, share
 from .pooling import cluster_numbers, first_reasons, summed
 from .run_tables import NONE, CueRows, RunTables
 from .truth import DriveTruth, cue_at
@@ -39,11 +39,11 @@ Reading = Scoring
 
 BINS_M: Final = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
 SEEN: Final = 0.5
-"""A thing of which less than this share can be seen does not count in ``recall_seen``."""
+"""A thing of which less than this fraction can be seen does not count in ``recall_seen``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CueJudged:
+class CueFrames:
     """One cue in N frames of one drive.
 
     Attributes:
@@ -80,7 +80,7 @@ class CueJudged:
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class CueMetrics:
     """One cue in one reading, coverage first.
 
     Attributes:
@@ -101,9 +101,9 @@ class Judgement:
     scored: int
     left_out: dict[str, int]
     positives: int
-    precision: Share
-    recall: Share | None
-    recall_seen: Share | None
+    precision: Proportion
+    recall: Proportion | None
+    recall_seen: Proportion | None
     by_distance: dict[str, Part]
     by_condition: dict[str, Part]
 
@@ -113,8 +113,8 @@ class Part:
     """Of the frames in a distance bin or with a condition tag."""
 
     frames: int
-    precision: Share
-    recall: Share | None
+    precision: Proportion
+    recall: Proportion | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,16 +154,16 @@ class CueScore:
 
     reading: Reading
     is_sources_reading: bool
-    precision: Share
-    recall: Share | None
+    precision: Proportion
+    recall: Proportion | None
     positives: int
     scored: int
-    readings: dict[Reading, Judgement]
+    readings: dict[Reading, CueMetrics]
     things: Things
     moments_unmatched: int
 
 
-def judge_cues(tables: RunTables, truth: DriveTruth) -> list[CueJudged]:
+def match_cues(tables: RunTables, truth: DriveTruth) -> list[CueFrames]:
     """Lay the run's cues beside the truth; nothing for a run without cues."""
     if tables.cues is None:
         return []
@@ -171,13 +171,13 @@ def judge_cues(tables: RunTables, truth: DriveTruth) -> list[CueJudged]:
     frames = np.unique(rows.t_ns)
     if tables.frames_ns is not None:
         frames = np.union1d(frames, tables.frames_ns)
-    told = {one.cue for one in truth.truth.cues}
-    others = sorted({*np.unique(rows.cue).tolist(), *told} - {*CUES})
+    stated = {one.cue for one in truth.truth.cues}
+    others = sorted({*np.unique(rows.cue).tolist(), *stated} - {*CUES})
     ambiguous = tables.ambiguous.get("frames", 0)
     return [_judge(cue, rows, frames, truth, ambiguous) for cue in (*CUES, *others)]
 
 
-def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth, ambiguous: int) -> CueJudged:
+def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth, ambiguous: int) -> CueFrames:
     looked, count = _largest(rows, cue)
     spans = [one for one in truth.truth.cues if one.cue == cue]
     everywhere = cue_at(spans, frames)
@@ -185,10 +185,10 @@ def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth, ambiguous
     at = np.searchsorted(frames, looked)
     was_looked = np.zeros(len(frames), np.bool_)
     was_looked[at] = True
-    told, crossing = truth.is_told(frames), truth.is_crossing(frames)
+    stated, crossing = truth.is_annotated(frames), truth.is_crossing(frames)
     twice = {AMBIGUOUS: ambiguous} if ambiguous else {}
     moments = np.array([one.t_ns for one in spans if one.t_ns is not None], np.int64)
-    return CueJudged(
+    return CueFrames(
         drive=truth.drive,
         cue=cue,
         t_ns=looked,
@@ -202,8 +202,8 @@ def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth, ambiguous
         frames=len(frames) + ambiguous,
         moments_unmatched=int((~np.isin(moments, frames)).sum()),
         left_out={
-            "object": twice | _reasons(everywhere.present != NONE, was_looked, told, crossing),
-            "feature": twice | _reasons(features != NONE, was_looked, told, crossing),
+            "object": twice | _reasons(everywhere.present != NONE, was_looked, stated, crossing),
+            "feature": twice | _reasons(features != NONE, was_looked, stated, crossing),
         },
         conditions={one.id: one.conditions for one in truth.truth.approaches},
     )
@@ -224,7 +224,7 @@ def _feature_at(cue: str, t_ns: Int64s, truth: DriveTruth) -> NDArray[np.int8]:
     if cue not in CUES or not truth.truth.approaches:
         return found
     # Where the truth speaks and no intersection is ahead, a cue of one stands for nothing.
-    found[truth.is_told(t_ns)] = 0
+    found[truth.is_annotated(t_ns)] = 0
     found[truth.is_crossing(t_ns)] = NONE
     at = truth.approach_at(t_ns)
     feature, is_there = CUES[cue].claim
@@ -248,12 +248,12 @@ def has_feature(approach: Approach, feature: str) -> bool | None:
 def _reasons(
     has_truth: NDArray[np.bool_],
     was_looked: NDArray[np.bool_],
-    is_told: NDArray[np.bool_],
+    is_annotated: NDArray[np.bool_],
     is_crossing: NDArray[np.bool_],
 ) -> dict[str, int]:
     """Why frames are not scored; each has one reason, the first that holds."""
     reasons = {
-        "outside the truth's time": ~is_told & ~has_truth,
+        "outside the truth's time": ~is_annotated & ~has_truth,
         "in the intersection": is_crossing & ~has_truth,
         "no truth at this time": ~has_truth,
         "not looked for": ~was_looked,
@@ -265,7 +265,7 @@ def _reasons(
 class _Pooled:
     """One cue's rows of all drives, with a number for each approach of each drive."""
 
-    rows: Sequence[CueJudged]
+    rows: Sequence[CueFrames]
     cluster: Int64s = field(init=False)
 
     def __post_init__(self) -> None:
@@ -297,24 +297,24 @@ class _Pooled:
 
 
 def score_cues(
-    judged: Sequence[CueJudged], bins_m: Sequence[float] = BINS_M, seed: int = 0
+    judged: Sequence[CueFrames], bins_m: Sequence[float] = BINS_M, seed: int = 0
 ) -> dict[str, CueScore]:
     """Scores by cue, over all drives together.
 
     Args:
-        judged: From ``judge_cues``, of any number of drives.
+        judged: From ``match_cues``, of any number of drives.
         bins_m: Borders of distance bins.
         seed: Of the resampling for intervals.
     """
-    by_cue: dict[str, list[CueJudged]] = {}
+    by_cue: dict[str, list[CueFrames]] = {}
     for one in judged:
         by_cue.setdefault(one.cue, []).append(one)
     return {cue: _score(cue, rows, bins_m, seed) for cue, rows in by_cue.items()}
 
 
-def _score(cue: str, rows: Sequence[CueJudged], bins_m: Sequence[float], seed: int) -> CueScore:
+def _score(cue: str, rows: Sequence[CueFrames], bins_m: Sequence[float], seed: int) -> CueScore:
     pooled = _Pooled(rows)
-    readings: dict[Reading, Judgement] = {
+    readings: dict[Reading, CueMetrics] = {
         reading: _judgement(pooled, reading, bins_m, seed) for reading in ("object", "feature")
     }
     wanted: Reading = CUES[cue].scored_as if cue in CUES else "object"
@@ -333,7 +333,7 @@ def _score(cue: str, rows: Sequence[CueJudged], bins_m: Sequence[float], seed: i
     )
 
 
-def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float], seed: int) -> Judgement:
+def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float], seed: int) -> CueMetrics:
     truth = pooled.ints("is_object" if reading == "object" else "is_feature")
     left_out = summed(one.left_out[reading] for one in pooled.rows)
     frames = sum(one.frames for one in pooled.rows)
@@ -342,7 +342,7 @@ def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float], seed:
     visible = pooled.floats("visible")
     # A thing whose visibility nobody noted counts as seen.
     seen = known & ((truth == 0) | np.isnan(visible) | (visible >= SEEN))
-    return Judgement(
+    return CueMetrics(
         frames=frames,
         with_truth=frames - sum(n for why, n in left_out.items() if why != "not looked for"),
         scored=int(known.sum()),
@@ -374,11 +374,11 @@ class _Cut:
     has_recall: bool
     seed: int
 
-    def precision(self, rows: NDArray[np.bool_]) -> Share:
+    def precision(self, rows: NDArray[np.bool_]) -> Proportion:
         rows = rows & self.is_found
         return share(self.truth[rows] == 1, self.cluster[rows], self.seed)
 
-    def recall(self, rows: NDArray[np.bool_]) -> Share | None:
+    def recall(self, rows: NDArray[np.bool_]) -> Proportion | None:
         if not self.has_recall:
             return None
         rows = rows & (self.truth == 1)

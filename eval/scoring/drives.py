@@ -20,7 +20,7 @@ from . import intervals
 from . import truth as score_truth
 from .approaches import ApproachesJudged, ApproachScore, judge_approaches
 from .belief import BeliefJudged, BeliefScore, judge_belief
-from .cues import BINS_M, CueJudged, CueScore, judge_cues, score_cues
+from .cues import BINS_M, CueFrames, CueScore, match_cues, score_cues
 from .ranges import RangeJudged, RangeScore, judge_range, score_range
 from .run_tables import RunTables
 from .truth import DriveTruth
@@ -66,16 +66,16 @@ class DriveCoverage:
         drive: Name.
         frames: In the run.
         frames_ambiguous: Of which the log time comes twice, so that no truth is theirs.
-        frames_told: Of which the truth speaks.
+        frames_annotated: Of which the truth speaks.
         truth_s: Length of the truth.
-        truth_covered_s: Of which the run tells something.
+        truth_covered_s: Of which the run reports something.
         not_scored: Sections that were not scored at all, and why.
     """
 
     drive: str
     frames: int
     frames_ambiguous: int
-    frames_told: int
+    frames_annotated: int
     truth_s: float
     truth_covered_s: float
     not_scored: dict[str, str]
@@ -86,7 +86,7 @@ class DriveJudged:
     """One drive laid beside its truth."""
 
     coverage: DriveCoverage
-    cues: tuple[CueJudged, ...]
+    cues: tuple[CueFrames, ...]
     approaches: ApproachesJudged | None
     belief: tuple[BeliefJudged, ...]
     ranges: tuple[RangeJudged, ...]
@@ -128,7 +128,7 @@ def judge(tables: RunTables, truth: DriveTruth, settings: ScoreSettings = DEFAUL
         SchemaError: They share no moment: the truth belongs to another log or clock.
     """
     covered_s = _check_fits(tables, truth)
-    cues = tuple(judge_cues(tables, truth))
+    cues = tuple(match_cues(tables, truth))
     approaches = judge_approaches(tables, truth, settings.threshold)
     belief, ranges = tuple(judge_belief(tables, truth)), tuple(judge_range(tables, truth))
     frames = _frames(tables)
@@ -137,7 +137,7 @@ def judge(tables: RunTables, truth: DriveTruth, settings: ScoreSettings = DEFAUL
         drive=truth.drive,
         frames=len(frames) + ambiguous,
         frames_ambiguous=ambiguous,
-        frames_told=int(truth.is_told(frames).sum()),
+        frames_annotated=int(truth.is_annotated(frames).sum()),
         truth_s=(truth.truth.end_ns - truth.truth.start_ns) * 1e-9,
         truth_covered_s=covered_s,
         not_scored=_not_scored(tables, truth),
@@ -154,23 +154,24 @@ def _frames(tables: RunTables) -> np.typing.NDArray[np.int64]:
 
 def _check_fits(tables: RunTables, truth: DriveTruth) -> float:
     """Seconds of the truth's time that the run covers."""
-    span, told = tables.span_ns(), truth.truth
+    span, reported = tables.span_ns(), truth.truth
     if span is None:
         return 0.0
-    if span[1] < told.start_ns or span[0] >= told.end_ns:
+    if span[1] < reported.start_ns or span[0] >= reported.end_ns:
         raise SchemaError(
-            f"{truth.drive}: its truth speaks of {told.start_ns} to {told.end_ns} ns, the run of "
-            f"{span[0]} to {span[1]} ns; it belongs to another log or clock: give the right one"
+            f"{truth.drive}: its truth speaks of {reported.start_ns} to {reported.end_ns} ns, "
+            f"the run of {span[0]} to {span[1]} ns; it belongs to "
+            "another log or clock: give the right one"
         )
-    return (min(span[1], told.end_ns) - max(span[0], told.start_ns)) * 1e-9
+    return (min(span[1], reported.end_ns) - max(span[0], reported.start_ns)) * 1e-9
 
 
 def _not_scored(tables: RunTables, truth: DriveTruth) -> dict[str, str]:
-    told = truth.truth
+    reported = truth.truth
     found: dict[str, str] = {}
     if tables.cues is None:
         found["cues"] = "the run has no cues"
-    elif not told.cues and not told.approaches:
+    elif not reported.cues and not reported.approaches:
         found["cues"] = "the truth tells neither cues nor approaches"
     for section, table in (
         ("approaches", tables.belief),
@@ -180,7 +181,7 @@ def _not_scored(tables: RunTables, truth: DriveTruth) -> dict[str, str]:
         if table is None:
             what = "range" if section == "range" else "belief"
             found[section] = f"the run has no {what}"
-        elif not told.approaches:
+        elif not reported.approaches:
             found[section] = "the truth tells no approaches"
     if "range" not in found and truth.ranges is None:
         found["range"] = "the truth tells neither ranges nor a track"
@@ -218,7 +219,7 @@ def as_metrics(scores: Scores) -> dict[str, Any]:
             "drives": len(scores.drives),
             "frames": sum(one.frames for one in scores.drives),
             "frames_ambiguous": sum(one.frames_ambiguous for one in scores.drives),
-            "frames_told": sum(one.frames_told for one in scores.drives),
+            "frames_annotated": sum(one.frames_annotated for one in scores.drives),
             "truth_s": sum(one.truth_s for one in scores.drives),
             "truth_covered_s": sum(one.truth_covered_s for one in scores.drives),
             "not_scored": scores.not_scored(),

@@ -30,7 +30,7 @@ from crosscue.replay.vehicle.validation_errors import explain
 
 from .metric_values import MetricValue
 
-MOST_BYTES: Final = 1 * MIB
+MAX_BYTES: Final = 1 * MIB
 Bound = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -55,7 +55,7 @@ class Gate(BaseModel):
             raise ValueError(f"min {self.min:g} is above max {self.max:g}")
         return self
 
-    def told(self) -> str:
+    def text(self) -> str:
         """Metric and bounds for a person."""
         end = "" if self.use == "value" else f" ({self.use} end)"
         low = "" if self.min is None else f" >= {self.min:g}"
@@ -94,9 +94,9 @@ def load_gates(path: Path) -> tuple[Gate, ...]:
         UsageError: Not there, not TOML, or not what version 1 says.
     """
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise UsageError(f"{path}: over {MOST_BYTES // MIB} MiB; this is no gate file")
+            raise UsageError(f"{path}: over {MAX_BYTES // MIB} MiB; this is no gate file")
         text = content.decode("utf-8")
         tree = toml_tree(text)
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""How sure a share or a mean is.
+"""How sure a fraction or a mean is.
 
 Wilson's interval (E. B. Wilson, JASA 22, 1927) takes every count as independent. Frames of one
 drive are not: a sign missed in one frame is missed in the next. So wherever several drives or
@@ -21,9 +21,9 @@ from crosscue.replay.columns import Floats, Int64s
 CONFIDENCE: Final = 0.95
 ROUNDS: Final = 2000
 SEED: Final = 0
-MOST_KEPT: Final = 500
+MAX_KEPT: Final = 500
 """Draws for so many clusters are kept for the next interval; they take 8 MB."""
-LEAST_CLUSTERS: Final = 5
+MIN_CLUSTERS: Final = 5
 """Of fewer, resampling can only give back the smallest and the largest: no interval is given."""
 
 
@@ -38,7 +38,7 @@ UNKNOWN: Final = Interval(math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True)
-class Share:
+class Proportion:
     """``right`` out of ``of``.
 
     Attributes:
@@ -103,8 +103,8 @@ def wilson(right: int, of: int, confidence: float = CONFIDENCE) -> Interval:
     return Interval(low, high)
 
 
-def share(is_right: np.typing.NDArray[np.bool_], clusters: Int64s, seed: int = SEED) -> Share:
-    """The share of true rows with both intervals.
+def share(is_right: np.typing.NDArray[np.bool_], clusters: Int64s, seed: int = SEED) -> Proportion:
+    """The fraction of true rows with both intervals.
 
     Args:
         is_right: Shape (N,).
@@ -114,7 +114,7 @@ def share(is_right: np.typing.NDArray[np.bool_], clusters: Int64s, seed: int = S
     right, of = int(is_right.sum()), len(is_right)
     ends = wilson(right, of)
     by_cluster = resampled(is_right.astype(np.float64), clusters, seed)
-    return Share(
+    return Proportion(
         right=right,
         of=of,
         value=right / of if of else math.nan,
@@ -148,7 +148,7 @@ def resampled(
     """
     names, which = np.unique(clusters, return_inverse=True)
     n = len(names)
-    if n < LEAST_CLUSTERS:
+    if n < MIN_CLUSTERS:
         return UNKNOWN
     total = np.bincount(which, values, n)
     rows = np.bincount(which, minlength=n).astype(np.float64)
@@ -160,10 +160,10 @@ def resampled(
 
 def _draws(n: int, seed: int) -> Iterator[Floats]:
     """How often each of ``n`` clusters is drawn, in parts of a bounded size, rounds by clusters."""
-    if n <= MOST_KEPT:
+    if n <= MAX_KEPT:
         yield _drawn(n, seed, ROUNDS)
         return
-    step = max(ROUNDS * MOST_KEPT // n, 1)
+    step = max(ROUNDS * MAX_KEPT // n, 1)
     for part, first in enumerate(range(0, ROUNDS, step)):
         yield _draw(n, (seed, n, part), min(step, ROUNDS - first))
 

@@ -72,7 +72,7 @@ class RangeScore:
         nees: With its band as if each approach were one independent error.
         by_distance: By true range.
         by_control: By what controls the intersection. A range to the end where no light stands
-            was measured by something that is none.
+            was measured by something that is not one.
     """
 
     rows: int

@@ -74,7 +74,7 @@ class RunTables:
     """What a run says; None where it has no such table.
 
     Attributes:
-        frames_ns: Sorted times of all frames looked at.
+        frames_ns: Sorted times of all frames examined.
         cues: From ``cues.parquet``.
         ranges: From ``range.parquet``.
         belief: From ``belief.parquet``.
@@ -202,8 +202,8 @@ def _belief(table: pa.Table, where: str) -> BeliefRows:
         features[name] = values
     established = np.zeros(table.num_rows, np.bool_)
     if "established" in table.column_names:
-        told = table["established"].fill_null(False)
-        established = told.to_numpy(zero_copy_only=False).astype(np.bool_)
+        reported = table["established"].fill_null(False)
+        established = reported.to_numpy(zero_copy_only=False).astype(np.bool_)
     return BeliefRows(_whole(table, "t_ns", where), _approach(table, where), features, established)
 
 

@@ -139,15 +139,15 @@ def judge_run(
 
 
 def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
-    told = set(truth.log_sha256.values())
+    reported = set(truth.log_sha256.values())
     logs = run.drive_manifest().logs
     found = {digest for log in logs for digest in log.sha256.values()}
-    if told and logs and not found:
+    if reported and logs and not found:
         raise SchemaError(
             f"{path}: names its log by hash, and the run read its log by ranges: no hash; "
             "replay the whole log, or give --any-log if both are the same drive"
         )
-    if told and not told & found:
+    if reported and not reported & found:
         names = ", ".join(log.name for log in logs)
         raise SchemaError(
             f"{path}: by its hash it belongs to another {truth.log or 'log'}, not to {names}; "

@@ -20,7 +20,7 @@ from crosscue.replay.limits import MIB
 from .run_tables import NONE
 
 COLUMNS: Final = ("t_ns", "approach", "start_m", "end_m")
-MOST_BYTES: Final = 256 * MIB
+MAX_BYTES: Final = 256 * MIB
 NEAREST_NS: Final = 500_000_000
 """A true range further away in time than this says nothing about a moment."""
 CROSSING_NS: Final = 10_000_000_000
@@ -80,7 +80,7 @@ class DriveTruth:
     Attributes:
         drive: What the drive is called in results.
         truth: The file.
-        ranges: None where it tells neither ranges nor a track.
+        ranges: None where it reports neither ranges nor a track.
     """
 
     drive: str
@@ -102,7 +102,7 @@ class DriveTruth:
         found &= self.approach_at(t_ns) == NONE
         return found
 
-    def is_told(self, t_ns: Int64s) -> np.typing.NDArray[np.bool_]:
+    def is_annotated(self, t_ns: Int64s) -> np.typing.NDArray[np.bool_]:
         """Whether the truth speaks of these times at all."""
         return np.asarray((t_ns >= self.truth.start_ns) & (t_ns < self.truth.end_ns))
 
@@ -120,7 +120,7 @@ class DriveTruth:
 def load(path: Path, drive: str) -> DriveTruth:
     """Read a truth file and the ranges beside it.
 
-    Ranges come from its CSV file, or where there is none from the way along its track.
+    Ranges come from its CSV file, or where none exists from the way along its track.
 
     Raises:
         SchemaError: A file does not fit.
@@ -140,8 +140,8 @@ def _read_ranges(path: Path, truth: Truth) -> TrueRanges:
     known = {one.id for one in truth.approaches}
     rows: list[tuple[int, int, float, float]] = []
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise SchemaError(f"{path}: over {MOST_BYTES // MIB} MiB; split the drive")
+        if path.stat().st_size > MAX_BYTES:
+            raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
         with path.open(encoding="utf-8", newline="") as file:
             reader = csv.DictReader(file)
             if set(COLUMNS) - set(reader.fieldnames or ()):
@@ -207,7 +207,7 @@ class CueTruthAt:
     Attributes:
         present: Shape (M,), int8: 1 there, 0 not there, ``NONE`` unknown.
         count: Shape (M,): how many things; ``NONE`` unknown.
-        visible: Shape (M,): share of the most visible one; NaN unknown.
+        visible: Shape (M,): fraction of the most visible one; NaN unknown.
     """
 
     present: np.typing.NDArray[np.int8]
@@ -233,7 +233,7 @@ def cue_at(spans: list[CueTruth], t_ns: Int64s) -> CueTruthAt:
         low, high = np.searchsorted(in_order, [first, last])
         rows = order[low:high]
         present[rows] = int(span.present)
-        told = (0 if not span.present else NONE) if span.count is None else span.count
-        count[rows] = told
+        reported = (0 if not span.present else NONE) if span.count is None else span.count
+        count[rows] = reported
         visible[rows] = math.nan if span.visible is None else span.visible
     return CueTruthAt(present, count, visible)

@@ -101,7 +101,7 @@ def estimate_of(run: RunFolder, vehicle: Vehicle | None = None) -> EstimateWitho
         vehicle: Other settings; the run's, if left out.
 
     Raises (when called):
-        RunError: No detector has looked at the run's camera.
+        RunError: No detector has examined the run's camera.
     """
 
     def estimate(cues: frozenset[str], /) -> RunTables:

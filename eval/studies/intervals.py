@@ -38,7 +38,7 @@ def mean_of(values: Floats) -> Measured:
     return Measured(mean, mean - half, mean + half)
 
 
-def share_of(right: int, of: int) -> Measured:
+def fraction_of(right: int, of: int) -> Measured:
     """A share with Wilson's interval (1927)."""
     if not of:
         return Measured(math.nan, 0.0, 1.0)

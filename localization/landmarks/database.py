@@ -37,15 +37,15 @@ from .file import (
     connect,
     connect_reading,
     damaged,
+    errors_in_one_line,
     journal_of,
     kind_of,
-    told,
 )
 
 REACH_SIGMAS: Final = 4.0
 """Most sigmas that a search may ask for: the R*Tree's boxes hold each landmark's own so many."""
-MOST_POINTS: Final = 20_000
-MOST_TEXT: Final = 1024
+MAX_POINTS: Final = 20_000
+MAX_TEXT: Final = 1024
 
 _COLUMNS: Final = (
     "l.id, l.name, l.x_m, l.y_m, l.var_x_m2, l.cov_xy_m2, l.var_y_m2, l.heading_rad, l.source"
@@ -78,8 +78,8 @@ class Place:
             ValueError: A name that is empty or too long, wrong shapes, a number that is not finite,
                 or a covariance that is not positive definite.
         """
-        if not 0 < len(self.name) <= MOST_TEXT or len(self.source) > MOST_TEXT:
-            raise ValueError(f"name, source: want up to {MOST_TEXT} letters, got {self.name!r}")
+        if not 0 < len(self.name) <= MAX_TEXT or len(self.source) > MAX_TEXT:
+            raise ValueError(f"name, source: want up to {MAX_TEXT} letters, got {self.name!r}")
         if not _is_unicode(self.name + self.source):
             raise ValueError(f"name, source: want Unicode, got {self.name!r}, {self.source!r}")
         if self.xy_m.shape != (2,) or self.cov_m2.shape != (2, 2):
@@ -147,7 +147,7 @@ class LandmarkDatabase:
         check_length(path)
         self._sql: Final = connect_reading(path)
         try:
-            with told(path):
+            with errors_in_one_line(path):
                 check_ours(self._sql, path)
                 self.kind: Final = kind_of(self._sql, path)
         except BaseException:
@@ -155,7 +155,7 @@ class LandmarkDatabase:
             raise
 
     def __len__(self) -> int:
-        with told(self.path):
+        with errors_in_one_line(self.path):
             return int(self._sql.execute("SELECT count(*) FROM landmark").fetchone()[0])
 
     def near(
@@ -185,7 +185,7 @@ class LandmarkDatabase:
         reach = sigmas * np.sqrt(np.maximum(np.diagonal(cov_m2), 0.0))
         margin = 1e-6 * np.abs(xy_m) + 1e-6
         low, high = (xy_m - reach - margin).tolist(), (xy_m + reach + margin).tolist()
-        with told(self.path):
+        with errors_in_one_line(self.path):
             rows = self._sql.execute(
                 f"SELECT {_COLUMNS} FROM place AS p JOIN landmark AS l ON l.id = p.id "  # noqa: S608
                 "WHERE p.max_x >= ? AND p.min_x <= ? AND p.max_y >= ? AND p.min_y <= ?",
@@ -198,7 +198,7 @@ class LandmarkDatabase:
     def within(self, xy_m: Floats, radius_m: float) -> Iterator[Nearby]:
         """Landmarks no further than ``radius_m`` from a position, in the order of adding."""
         low, high = (xy_m - radius_m).tolist(), (xy_m + radius_m).tolist()
-        with told(self.path):
+        with errors_in_one_line(self.path):
             rows = self._sql.execute(
                 f"SELECT {_COLUMNS} FROM landmark AS l WHERE "  # noqa: S608
                 "x_m BETWEEN ? AND ? AND y_m BETWEEN ? AND ? ORDER BY id",
@@ -211,7 +211,7 @@ class LandmarkDatabase:
 
     def __iter__(self) -> Iterator[Nearby]:
         """All landmarks in the order of adding, one at a time; ``sigmas`` is 0."""
-        with told(self.path):
+        with errors_in_one_line(self.path):
             for row in self._sql.execute(f"SELECT {_COLUMNS} FROM landmark AS l ORDER BY id"):  # noqa: S608
                 yield Nearby(cast("int", row[0]), _place(row, self.path), 0.0)
 
@@ -221,7 +221,7 @@ class LandmarkDatabase:
         Raises:
             LogFormatError: Not there, or damaged.
         """
-        with told(self.path):
+        with errors_in_one_line(self.path):
             row = self._sql.execute(
                 f"SELECT {_COLUMNS}, width_px, height_px, points, points_px, descriptors, crc "  # noqa: S608
                 "FROM landmark AS l JOIN picture AS f ON f.id = l.id WHERE l.id = ?",
@@ -292,7 +292,7 @@ class LandmarkWriter:
         except LogError as error:
             raise OutputError(str(error)) from None
         try:
-            with told(path, writing=True):
+            with errors_in_one_line(path, writing=True):
                 self._begin(kind)
         except BaseException:
             self._abandon()
@@ -305,8 +305,8 @@ class LandmarkWriter:
             UsageError: Its name is there already.
             OutputError: The disk is full.
         """
-        if len(features) > MOST_POINTS:
-            raise ValueError(f"features: want up to {MOST_POINTS} points, got {len(features)}")
+        if len(features) > MAX_POINTS:
+            raise ValueError(f"features: want up to {MAX_POINTS} points, got {len(features)}")
         (xx, xy), (_, yy) = place.cov_m2.tolist()
         x, y = place.xy_m.tolist()
         points_px = features.points_px.astype("<f4").tobytes()
@@ -314,7 +314,7 @@ class LandmarkWriter:
         width, height = features.width_px, features.height_px
         crc = _crc(place, width, height, points_px, descriptors)
         reach_x, reach_y = REACH_SIGMAS * math.sqrt(xx), REACH_SIGMAS * math.sqrt(yy)
-        with told(self._path, writing=True):
+        with errors_in_one_line(self._path, writing=True):
             try:
                 key = self._sql.execute(
                     "INSERT INTO landmark VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -345,7 +345,7 @@ class LandmarkWriter:
             self._abandon()
             return
         try:
-            with told(self._path, writing=True):
+            with errors_in_one_line(self._path, writing=True):
                 self._sql.execute("COMMIT")
         except BaseException:
             self._abandon()

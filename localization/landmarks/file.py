@@ -22,7 +22,7 @@ from crosscue.replay.files.whole_file import cannot_write
 APPLICATION_ID: Final = 0x43434C4D
 """``CCLM`` in the file's header."""
 VERSION: Final = 1
-_MOST_BYTES: Final = 16 << 20
+_MAX_BYTES: Final = 16 << 20
 _BUSY_S: Final = 5.0
 _HEADER: Final = b"SQLite format 3\0"
 
@@ -60,7 +60,7 @@ def connect(path: Path, mode: str) -> sqlite3.Connection:
     uri = f"file:{quote(str(path.absolute()), errors='surrogateescape')}?mode={mode}"
     try:
         sql = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=_BUSY_S)
-        sql.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_BYTES)
+        sql.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_BYTES)
         sql.execute("PRAGMA trusted_schema = OFF")
     except sqlite3.Error as error:
         raise LogError(f"{path}: {error}; check the path and its mode") from None
@@ -142,7 +142,7 @@ def damaged(path: Path, why: str) -> LogFormatError:
 
 
 @contextmanager
-def told(path: Path, *, writing: bool = False) -> Iterator[None]:
+def errors_in_one_line(path: Path, *, writing: bool = False) -> Iterator[None]:
     """SQLite's errors as ours."""
     try:
         yield

@@ -1,8 +1,8 @@
 """The match threshold for a wanted false-match rate, and how sure one may be of it.
 
 Pairs of pictures, labelled as one place or two, are scored. Half of the query pictures choose the
-threshold: the lowest at which no more than the wanted share of two-place pairs match. The other
-half, never looked at until then, tell the rates. Intervals: false matches by Clopper and Pearson
+threshold: the lowest at which no more than the wanted fraction of two-place pairs match. The other
+half, never examined until then, gives the rates. Intervals: false matches by Clopper and Pearson
 (Biometrika 26, 1934), which holds even where none was seen; found places by Wilson (JASA 22, 1927).
 """
 
@@ -95,11 +95,11 @@ class LandmarkFit:
 
 
 def fit_landmarks(pairs: ScoredPairs, wanted_rate: float, seed: int = 0) -> LandmarkFit:
-    """Choose the threshold on one half of the queries, tell the rates on the other.
+    """Choose the threshold on one half of the queries, measure the rates on the other.
 
     Args:
         pairs: Labelled and scored.
-        wanted_rate: Share of two-place pairs that may match.
+        wanted_rate: Fraction of two-place pairs that may match.
         seed: Of the split.
 
     Raises:
@@ -145,7 +145,7 @@ def _rate(
 
 
 def wilson(count: int, of: int) -> Rate:
-    """The 95 % score interval of a share; 0 to 1 where nothing was tried."""
+    """The 95 % score interval of a fraction; 0 to 1 where nothing was tried."""
     if of == 0:
         return Rate(0, 0, 0.0, 1.0)
     share, z2 = count / of, Z_95**2
@@ -156,7 +156,7 @@ def wilson(count: int, of: int) -> Rate:
 
 
 def clopper_pearson(count: int, of: int) -> Rate:
-    """The exact 95 % interval of a share; 0 to 1 where nothing was tried."""
+    """The exact 95 % interval of a fraction; 0 to 1 where nothing was tried."""
     if of == 0:
         return Rate(0, 0, 0.0, 1.0)
     low = 0.0 if count == 0 else _share_at(count - 1, of, 0.975)

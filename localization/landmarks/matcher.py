@@ -21,9 +21,9 @@ from crosscue.replay.errors import UsageError
 
 from .features import CameraGeometry, Features, Match
 
-_LEAST_SIDE_PX: Final = 32
-"""ORB looks at patches of this size."""
-_LEAST_PAIRS: Final = {"homography": 6, "essential": 8}
+_MIN_SIDE_PX: Final = 32
+"""ORB examines patches of this size."""
+_MIN_PAIRS: Final = {"homography": 6, "essential": 8}
 """Below these a fit says nothing: four or five points fit one by making."""
 
 
@@ -78,7 +78,7 @@ class OrbMatcher:
         if scale < 1.0:
             size = (max(round(width * scale), 1), max(round(height * scale), 1))
             grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
-        if min(grey.shape) < _LEAST_SIDE_PX:
+        if min(grey.shape) < _MIN_SIDE_PX:
             return Features(width, height, *_nothing())
         orb_features = cv2.ORB.create(nfeatures=self.settings.features)
         points, descriptors = orb_features.detectAndCompute(grey, None)
@@ -96,7 +96,7 @@ class OrbMatcher:
         ):
             return Match(0.0, 0, 0)
         here, there = self._pairs(seen, known)
-        if len(here) < _LEAST_PAIRS[self.settings.geometry]:
+        if len(here) < _MIN_PAIRS[self.settings.geometry]:
             return Match(0.0, len(here), 0)
         agreeing = self._agreeing(seen, here, there)
         return Match(float(agreeing), len(here), agreeing)

@@ -34,7 +34,7 @@ from .database import REACH_SIGMAS, LandmarkDatabase, Nearby, Place
 from .features import Features, Match, Matcher
 
 FALLEN_SHARE: Final = 0.8
-"""A score below this share of its peak has passed it."""
+"""A score below this fraction of its peak has passed it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,9 +79,9 @@ class LandmarkCounts:
 
     Attributes:
         frames: Pictures that came up.
-        thinned: Not looked at: too soon after the last one.
-        late: Not looked at: before the belief's time.
-        undecodable: Not looked at: the picture does not decode.
+        thinned: Not examined: too soon after the last one.
+        late: Not examined: before the belief's time.
+        undecodable: Not examined: the picture does not decode.
         without_candidate: No landmark inside the ellipse, so that nothing was decoded.
         candidates: Landmarks compared, over all frames.
         matched: Frames whose best score was high enough.
@@ -290,7 +290,7 @@ class LandmarkSearch:
                 return None
             if here.score >= FALLEN_SHARE * peak.score:
                 return None
-            # What is left of this landmark is its way out of sight, no new peak.
+            # What is left of this landmark leaves the view and is no new peak.
             here = here._replace(score=math.inf)
         self._peak = here
         return None if peak is None or math.isinf(peak.score) else peak

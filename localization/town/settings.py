@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from crosscue.replay.vehicle.section import NotNegative, Positive, Section
 
-Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
+Proportion = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
 class City(Section):
@@ -80,7 +80,7 @@ class Sensors(Section):
     """S.d., in x and y, of the position that a recognised landmark gives."""
     landmark_gate_nis: Positive = 13.8
     """Refuse a landmark whose normalised innovation squared is larger (0.1 % of the right ones)."""
-    detection_rate: Share = 1.0
+    detection_rate: Proportion = 1.0
     """Of the landmarks passed."""
     start_position_sd_m: Positive = 1.0
     start_heading_sd_deg: Positive = 5.0

@@ -244,7 +244,7 @@ def _parse(source: DatabaseText, form: str) -> InternalDatabase:
 
 
 def _says_fd(parsed: InternalDatabase, form: str) -> bool:
-    """Whether the file tells CAN FD frames from classic ones at all."""
+    """Whether the file distinguishes CAN FD frames from classic ones at all."""
     if form == "dbc":
         return parsed.dbc is not None and "VFrameFormat" in parsed.dbc.attribute_definitions
     return form == "arxml"

@@ -110,7 +110,7 @@ class BusDecoder:
         Args:
             database: The messages of this bus.
             bus: Topic of the frames, and first part of the topics of the rows given.
-            ledger: Told of every frame that is not decoded; the reader has counted those found.
+            ledger: Reported of every frame that is not decoded; the reader has counted those found.
             wanted: Message names, or (message, signal) pairs; None for everything.
             settings: How strictly and by what means.
             elsewhere: 11-bit identifiers that another decoder of this bus reads and accounts for;
@@ -175,7 +175,7 @@ class BusDecoder:
             if strange is not None:
                 key, count = (*entry.message.key, NO_BRANCH), int(strange.sum())
                 if not self._add(key, count):
-                    self._tell(key, count, one.log_ns, strange)
+                    self._report(key, count, one.log_ns, strange)
                 one = one.take(~strange)
             if len(one):
                 decoded.append(one)
@@ -199,13 +199,13 @@ class BusDecoder:
                 continue
             if not self._add((identifier, False, UNKNOWN_ID), count):
                 mine = is_data & (ids == identifier) & ~frames.is_extended
-                self._tell((identifier, False, UNKNOWN_ID), count, log_ns, mine)
+                self._report((identifier, False, UNKNOWN_ID), count, log_ns, mine)
         for at in np.flatnonzero(self._refused & (grouped.seen > 0)).tolist():
             entry, count = self._entries[at - 1], int(grouped.seen[at])
             left -= count
             key = (*entry.message.key, entry.refusal)
             if not self._add(key, count):
-                self._tell(key, count, log_ns, is_data & (number == at))
+                self._report(key, count, log_ns, is_data & (number == at))
         if left:
             self._account_rare(frames, grouped, log_ns)
 
@@ -225,7 +225,7 @@ class BusDecoder:
         ):
             whose = (value & 0xFFFF_FFFF, bool(value >> 32 & 1), RARE_REASONS[value >> 33])
             if not self._add(whose, count):
-                self._tell(whose, count, log_ns, np.arange(len(log_ns)) == at)
+                self._report(whose, count, log_ns, np.arange(len(log_ns)) == at)
 
     def _which_reason(self, frames: CanFrames, number: NDArray[np.uint16]) -> Int64s:
         """Place in ``RARE_REASONS`` of the first reason that holds for each frame."""
@@ -242,14 +242,14 @@ class BusDecoder:
         return np.select(holds, [np.int64(i) for i in range(len(holds))], np.int64(len(holds)))
 
     def _add(self, key: CountKey, count: int) -> bool:
-        """Count more frames of a kind that was told already; False if it was not."""
+        """Count more frames of a kind that was reported already; False if it was not."""
         if key not in self.counts:
             return False
         self.counts[key] += count
         self._ledger.skip_more(self._bus, key[2], count)
         return True
 
-    def _tell(self, key: CountKey, count: int, log_ns: Int64s, rows: NDArray[np.bool_]) -> None:
+    def _report(self, key: CountKey, count: int, log_ns: Int64s, rows: NDArray[np.bool_]) -> None:
         """Count frames with a detail: only the first of a kind, or a busy bus would fill all."""
         detail = f"{spell_id(*key[:2])}, first of them"
         if len(self.counts) >= COUNTS_KEPT:

@@ -160,7 +160,7 @@ class CanMessage:
         """The signal called ``name``.
 
         Raises:
-            ValueError: There is none; the message lists those there are.
+            ValueError: None exists; the message lists those there are.
         """
         for signal in self.signals:
             if signal.name == name:
@@ -222,14 +222,14 @@ def _multiplexing_problem(message: CanMessage) -> str:
 def overlaps(message: CanMessage) -> Iterator[tuple[str, str]]:
     """Pairs of signals that share a bit though both can be there in one frame."""
     owner: dict[int, list[CanSignal]] = {}
-    told: set[tuple[str, str]] = set()
+    reported: set[tuple[str, str]] = set()
     for signal in message.signals:
         for bit in range(signal.first_bit, signal.end_bit):
             place = bit if not signal.is_big_endian else 8 * (bit // 8) + 7 - bit % 8
             for other in owner.setdefault(place, []):
                 pair = (other.name, signal.name)
-                if pair not in told and _can_meet(message, other, signal):
-                    told.add(pair)
+                if pair not in reported and _can_meet(message, other, signal):
+                    reported.add(pair)
                     yield pair
             owner[place].append(signal)
 

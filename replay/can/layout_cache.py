@@ -1,10 +1,10 @@
 """Layouts of CAN databases, kept in the user's cache folder so that a second start parses nothing.
 
 A file's layout is kept under a hash of its text, its name and of all code that made it, cantools
-included, so that no entry ever has to be told to be out of date. Entries are JSON behind their own
-checksum, written whole: a line for the messages, then one for the signals of each, which is parsed
-when somebody asks for them. What cannot be read or written is as good as not there: the cache never
-fails, and never answers for another file.
+included, so that no entry ever goes out of date unnoticed. Entries are JSON behind their
+own checksum, written whole: a line for the messages, then one for the signals of each, which is
+parsed when somebody asks for them. What cannot be read or written is as good as not there: the
+cache never fails, and never answers for another file.
 
 ``$CROSSCUE_DBC_CACHE`` names another folder than ``~/.cache/crosscue/can_layouts``, or is ``off``.
 """
@@ -136,7 +136,7 @@ def _made_by() -> str | None:
 
 
 def _version_of_cantools() -> str:
-    """Its version as installed, told without importing it or all that reads package metadata."""
+    """Its installed version, without importing it or all that reads package metadata."""
     spec = find_spec("cantools")
     if spec is None or spec.origin is None:
         raise ImportError("cantools is not installed as files")

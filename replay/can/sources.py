@@ -11,9 +11,9 @@ from crosscue.replay.errors import LogTooLargeError, SchemaError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.limits import Limits
 
-_MOST_BITS: Final = 8 * 2048
+_MAX_BITS: Final = 8 * 2048
 """No message is longer: 1785 bytes is the longest multi-packet message there is."""
-_MOST_BRANCHES: Final = 1_000_000
+_MAX_BRANCHES: Final = 1_000_000
 
 _MESSAGE_HEADS: Final = {
     "dbc": r"^[ \t]*BO_\s+(\d+)",
@@ -149,7 +149,7 @@ def refuse_bombs(source: DatabaseText, form: str) -> None:
 def _refuse_over(source: DatabaseText, pattern: str, what: str, bits_each: int = 1) -> None:
     for match in re.finditer(pattern, source.text, re.MULTILINE):
         digits = match[1]
-        if len(digits) > 9 or int(digits) * bits_each > _MOST_BITS:
+        if len(digits) > 9 or int(digits) * bits_each > _MAX_BITS:
             raise LogTooLargeError(
                 f"{source.path}:{source.line_at(match.start(1))}: {what} {digits[:20]} is larger "
                 "than any CAN message; correct that line"
@@ -161,10 +161,10 @@ def _refuse_ranges(source: DatabaseText) -> None:
     for match in re.finditer(r"^[ \t]*SG_MUL_VAL_[^;]*", source.text, re.MULTILINE):
         for low, high in re.findall(r"(\d+)\s*-\s*(\d+)", match[0]):
             total += int(high[:30]) - int(low[:30])
-        if total > _MOST_BRANCHES:
+        if total > _MAX_BRANCHES:
             raise LogTooLargeError(
                 f"{source.path}:{source.line_at(match.start())}: multiplexer ranges of more than "
-                f"{_MOST_BRANCHES} values; correct that line"
+                f"{_MAX_BRANCHES} values; correct that line"
             )
 
 

@@ -35,13 +35,13 @@ def findings(reports: Mapping[str, ClockReport]) -> tuple[str, ...]:
     """
     starts = [r.log.min_ns for r in reports.values() if r.log.min_ns is not None]
     start_ns = min(starts, default=0)
-    told = [s for name in sorted(reports) for s in _of_topic(reports[name], start_ns)]
+    reported = [s for name in sorted(reports) for s in _of_topic(reports[name], start_ns)]
     spans = {
         name: (r.log.min_ns, r.log.max_ns)
         for name, r in reports.items()
         if r.log.rows > 1 and r.log.min_ns is not None and r.log.max_ns is not None
     }
-    return (*told, *apart(spans))
+    return (*reported, *apart(spans))
 
 
 def apart(spans: Mapping[str, tuple[int, int]]) -> tuple[str, ...]:
@@ -146,8 +146,8 @@ def _of_other(
     if abs(line.offset_ns) > MAX_OFFSET_NS:
         yield f"{clock.value} {_offset_words(line.offset_ns, line.start_log_ns)}"
     if line.drift_ppm is not None and line.drift_error_ppm is not None:
-        told = max(DRIFT_WORTH_TELLING_PPM, DRIFT_ERRORS_WORTH_TELLING * line.drift_error_ppm)
-        if abs(line.drift_ppm) > told:
+        reported = max(DRIFT_WORTH_TELLING_PPM, DRIFT_ERRORS_WORTH_TELLING * line.drift_error_ppm)
+        if abs(line.drift_ppm) > reported:
             way = "fast" if line.drift_ppm > 0 else "slow"
             yield (
                 f"{clock.value} runs {abs(line.drift_ppm):.0f} ppm {way} against the log clock "

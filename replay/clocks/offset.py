@@ -28,7 +28,7 @@ JUMP_WINDOW_NS: Final = 2_000_000_000
 _JUMP_OVER_WAIT: Final = 6
 _SHARP_ROWS: Final = 4
 _ROWS_BESIDE: Final = 16
-"""Rows that must lie on either side of a jump; fewer could not tell it from a ramp."""
+"""Rows that must lie on either side of a jump; fewer cannot distinguish it from a ramp."""
 _SHORTEST_SIDE_NS: Final = 100_000_000
 _WINDOW_ROWS: Final = (_ROWS_BESIDE, 8192)
 _ENVELOPE_BINS: Final = 1024
@@ -211,8 +211,8 @@ class _Envelope:
         at_s = self._at[pick].astype(np.float64) * 1e-9
         delay_ns = (self._delay[pick] - self._base_ns).astype(np.float64)
         slope, error, at_start_ns = 0.0, 0.0, float(delay_ns.min())
-        told = len(pick) >= 3 and self._end_ns - self._start_ns >= _FIT_SPAN_NS
-        if told:
+        reported = len(pick) >= 3 and self._end_ns - self._start_ns >= _FIT_SPAN_NS
+        if reported:
             slope, error, at_start_ns = theil_sen(at_s, delay_ns)
             error = max(error, _bend(at_s, delay_ns))
         return ClockLine(
@@ -220,8 +220,8 @@ class _Envelope:
             start_log_ns=self._start_ns,
             end_log_ns=self._end_ns,
             offset_ns=-(self._base_ns + round(at_start_ns)),
-            drift_ppm=-slope * 1e-3 if told else None,
-            drift_error_ppm=error * 1e-3 if told else None,
+            drift_ppm=-slope * 1e-3 if reported else None,
+            drift_error_ppm=error * 1e-3 if reported else None,
         )
 
 

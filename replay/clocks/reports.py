@@ -285,7 +285,7 @@ class _StampWatch:
 
 
 class _TopicWatch:
-    """The clocks of one topic; small blocks are gathered before they are looked at."""
+    """The clocks of one topic; small blocks are gathered before they are examined."""
 
     def __init__(self) -> None:
         self._count = 0

@@ -7,7 +7,7 @@ from typing import Final
 from crosscue.replay.columns import ImageCoding
 
 MAGIC_BYTES: Final = 12
-"""As many first bytes as ``coding_of`` looks at."""
+"""As many first bytes as ``coding_of`` examines."""
 
 JPEG: Final = b"\xff\xd8"
 _LABELS: Final[tuple[tuple[str, ImageCoding], ...]] = (

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 CODECS: Final = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
 """From a coding of ``Images`` to FFmpeg's decoder."""
-MOST_PIXELS: Final = 64_000_000
+MAX_PIXELS: Final = 64_000_000
 AT_ONCE: Final = 8
 """Pictures in a block: at 1280 by 720 these are 22 MB."""
 NOT_DECODED: Final = "video packet not decoded"
@@ -41,7 +41,7 @@ class PacketDecoder:
 
         Args:
             topic: Of the packets.
-            ledger: Told of packets that become no picture.
+            ledger: Reported of packets that become no picture.
         """
         self._topic = topic
         self._ledger = ledger
@@ -73,7 +73,7 @@ class PacketDecoder:
             yield from self._full()
 
     def flush(self) -> Iterator[Block]:
-        """The last pictures; packets that never became one are told."""
+        """The last pictures; packets that never became one are reported."""
         if self._context is None:
             return
         import av
@@ -127,6 +127,6 @@ def _context(coding: str) -> Any:
     import av
 
     context: Any = av.CodecContext.create(CODECS[coding], "r")
-    context.options = {"max_pixels": str(MOST_PIXELS)}
+    context.options = {"max_pixels": str(MAX_PIXELS)}
     context.thread_count = 1
     return context

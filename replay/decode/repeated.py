@@ -20,11 +20,11 @@ from crosscue.replay.columns import Bytes, Int64s, Messages
 from .plan import Items, Plan, Run, Step, Text
 from .walk import Bools
 
-MOST_BYTES: Final = 4096
+MAX_BYTES: Final = 4096
 """Longer messages are few, and copying them whole would cost more than walking them."""
 PROBE: Final = 8
 """Bytes compared at once."""
-MOST_ITEMS: Final = 64
+MAX_ITEMS: Final = 64
 LAYOUTS_KEPT: Final = 16
 
 
@@ -66,16 +66,16 @@ def layout_of(plan: Plan, raw: bytes) -> Layout | None:
 
     Args:
         plan: Of its type.
-        raw: The message; of a type with a tail, its first ``MOST_BYTES`` bytes are enough.
+        raw: The message; of a type with a tail, its first ``MAX_BYTES`` bytes are enough.
     """
     tail = tail_of(plan)
-    if len(raw) < PROBE or len(raw) > MOST_BYTES:
+    if len(raw) < PROBE or len(raw) > MAX_BYTES:
         return None
     reading = _Reading(raw, 4 if plan.is_cdr else 0, plan.is_cdr)
     if plan.is_cdr:
         reading.fixed.append((0, 2))
     reading.steps(plan.steps[:-1] if tail else plan.steps, keep=True)
-    if reading.items > MOST_ITEMS:
+    if reading.items > MAX_ITEMS:
         return None
     if tail:
         fixed = tuple(reading.fixed)
@@ -157,7 +157,7 @@ class _Reading:
             return
         self.items += count
         for _ in range(count):
-            if self.items > MOST_ITEMS:
+            if self.items > MAX_ITEMS:
                 return
             self.steps(items.item, keep=False)
 

@@ -19,7 +19,7 @@ from .plan import Plan, plan_of
 from .refuse import MISFIT, WRONG_CODING, refuse
 from .repeated import (
     LAYOUTS_KEPT,
-    MOST_BYTES,
+    MAX_BYTES,
     Layout,
     RepeatedFields,
     layout_of,
@@ -107,7 +107,7 @@ class RosDecoder:
         return ANY_LENGTH if self.tail else int(messages.stop[i] - messages.start[i])
 
     def _learn(self, messages: Messages, i: int) -> None:
-        raw = messages.payload(i)[:MOST_BYTES].tobytes()
+        raw = messages.payload(i)[:MAX_BYTES].tobytes()
         key = self._key(messages, i)
         is_big = self.plan.is_cdr and raw[1] == 0
         has_room = key in self.layouts or len(self.layouts) < LAYOUTS_KEPT

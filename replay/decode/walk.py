@@ -103,7 +103,7 @@ def walk(plan: Plan, messages: Messages, *, little: bool = True) -> Found:
 
     Args:
         plan: For the messages' type.
-        messages: For CDR with the four bytes of encapsulation, which are not looked at here.
+        messages: For CDR with the four bytes of encapsulation, which are not examined here.
         little: Byte order of these messages.
     """
     head = 4 if plan.is_cdr else 0
@@ -277,7 +277,7 @@ def _same(column: Int64s) -> Int64s | int:
 
 
 def are_utf8(buffer: Bytes, first: Int64s, length: Int64s) -> Bools:
-    """Is each range of ``buffer`` UTF-8 text? Ranges of one length are looked at together."""
+    """Is each range of ``buffer`` UTF-8 text? Ranges of one length are examined together."""
     fine = np.ones(len(first), np.bool_)
     for rows, width in by_length(length):
         if width == 0:

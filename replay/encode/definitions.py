@@ -51,7 +51,7 @@ def completed(type_name: str, text: bytes, known: Definitions) -> bytes:
             fields = _TIMES.get(name) or (well_known(name) or {}).get(name)
             if fields is None:
                 raise SchemaError(f"{type_name}: its definition lacks the type {name}")
-            # What it is made of is looked at next, since the walk goes on over ``whole``.
+            # What it is made of is examined next, since the walk goes on over ``whole``.
             whole[name] = fields
             missing.append(f"MSG: {_short(name)}\n{_body(fields)}")
     end = b"" if text.endswith(b"\n") or not missing else b"\n"

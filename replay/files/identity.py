@@ -2,12 +2,12 @@
 
 The identity of a log is a SHA-256 over its files, sorted by name: of each its name (a folder's with
 the folder's own in front), its size, and a hash of its content. A log of up to 4 MiB is hashed
-whole. Of a larger one, each file has an equal share of 4 MiB (64 KiB at least), and what is longer
-than its share is hashed in parts: of a file with an index at its end, as MCAP files and ROS 1 bags
-have, 64 KiB from the head, 64 KiB from the tail, and the index, up to 64 MiB; of others a quarter
-of the share from the head, a quarter from the tail, the rest as 32 blocks spread evenly between
-them. So a log of 100 GB costs milliseconds, and the same log has the same identity wherever it
-lies, on a disk or at a URL, and however old it looks.
+whole. Of a larger one, each file has an equal part of 4 MiB (64 KiB at least), and what is
+longer than its part is hashed in parts: of a file with an index at its end, as MCAP files and
+ROS 1 bags have, 64 KiB from the head, 64 KiB from the tail, and the index, up to 64 MiB; of others
+a quarter of the part from the head, a quarter from the tail, the rest as 32 blocks spread
+evenly between them. So a log of 100 GB costs milliseconds, and the same log has the same identity
+wherever it lies, on a disk or at a URL, and however old it looks.
 
 Files that readers consult beside a log belong to it: time files of pictures and videos, SQLite's
 journals. Hidden files and what other commands put beside a log (``vehicle.toml``, ``truth.json``,
@@ -34,7 +34,7 @@ from crosscue.replay.remote.logs import RangedLog, RemoteFiles, by_ranges, fetch
 from crosscue.replay.remote.ranges import RangedFile
 
 SHARE_BYTES: Final = 4 * MIB
-LEAST_BYTES: Final = 64 << 10
+MIN_BYTES: Final = 64 << 10
 EDGE_BYTES: Final = 64 << 10
 BLOCKS: Final = 32
 INDEX_BYTES: Final = 64 * MIB
@@ -102,7 +102,7 @@ def identity_of(place: Path | str) -> Identity:
         for name, file in files:
             with file.open("rb", buffering=0) as stream:
                 opened = _Local(stream.fileno())
-                digest_of_all.update(_told(name, opened.size, _hash(opened, share)))
+                digest_of_all.update(_report_text(name, opened.size, _hash(opened, share)))
             total += opened.size
     except OSError as error:
         raise LogError(f"{error.filename or path}: {error.strerror or error}; check it") from None
@@ -141,7 +141,7 @@ def _identity_of_parts(url: str) -> Identity | None:
     if not names or remote.is_at_hand or total < 2 * sum(min(size, share) for size in sizes):
         return None
     digest = hashlib.sha256()
-    for told, at in names:
+    for reported, at in names:
         content = hashlib.sha256().digest()
         if remote.sizes[at]:
             ranged = remote.ranged(at)
@@ -149,7 +149,7 @@ def _identity_of_parts(url: str) -> Identity | None:
                 return None
             with closing(ranged):
                 content = _hash(_Remote(ranged), share)
-        digest.update(_told(os.fsencode(told), remote.sizes[at], content))
+        digest.update(_report_text(os.fsencode(reported), remote.sizes[at], content))
     return Identity(name, total, digest.hexdigest())
 
 
@@ -164,18 +164,18 @@ def _names_of(name: str, sizes: Mapping[str, int]) -> dict[str, str]:
 
 def _share(files: int) -> int:
     """Bytes of each file that are hashed."""
-    return max(SHARE_BYTES // max(files, 1), LEAST_BYTES)
+    return max(SHARE_BYTES // max(files, 1), MIN_BYTES)
 
 
 def _identity_of_ranged(ranged: RangedFile) -> Identity:
     name = ranged.url.rstrip("/").rpartition("/")[2]
     file = _Remote(ranged)
     digest = hashlib.sha256()
-    digest.update(_told(os.fsencode(name), file.size, _hash(file, SHARE_BYTES)))
+    digest.update(_report_text(os.fsencode(name), file.size, _hash(file, SHARE_BYTES)))
     return Identity(name, file.size, digest.hexdigest())
 
 
-def _told(name: bytes, size: int, content: bytes) -> bytes:
+def _report_text(name: bytes, size: int, content: bytes) -> bytes:
     return f"{len(name)}\0{size}\0".encode() + name + content
 
 

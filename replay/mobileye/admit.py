@@ -59,7 +59,7 @@ class Admitted(NamedTuple):
 
 
 class Admission:
-    """Takes the Mobileye's frames of a bus and tells the ledger of every other one."""
+    """Takes the Mobileye's frames of a bus and reports every other one to the ledger."""
 
     def __init__(self, bus: str, ledger: Ledger, settings: MobileyeSettings) -> None:
         self._bus = bus
@@ -82,7 +82,7 @@ class Admission:
         is_plain = (frames.kind == DATA) & ~frames.is_extended & ~frames.is_fd
         good = is_plain & (message >= 0) & self._fits[message, frames.length]
         if not good.all():
-            self._tell(frames, message, ~good, log_ns)
+            self._report(frames, message, ~good, log_ns)
         return Admitted(
             message[good],
             self._instance.take(frames.arbitration_id[good], mode="clip"),
@@ -91,11 +91,11 @@ class Admission:
             words_of(frames.data[good]),
         )
 
-    def _tell(
+    def _report(
         self, frames: CanFrames, message: Int64s, bad: NDArray[np.bool_], log_ns: Int64s
     ) -> None:
         if self._is_shared_bus:
-            # The bus's own decoder tells of the rest; these identifiers it leaves to this one.
+            # The bus's own decoder reports the rest; these identifiers it leaves to this one.
             bad = bad & (frames.kind == DATA) & ~frames.is_extended & (message >= 0)
         rows = np.flatnonzero(bad)
         which = np.select(
@@ -137,9 +137,9 @@ def lengths_of(message: Message, settings: MobileyeSettings) -> tuple[int, ...]:
 
 def _ids_text(ids: NDArray[np.uint32]) -> str:
     values, counts = np.unique(ids, return_counts=True)
-    told = ", ".join(
+    reported = ", ".join(
         f"0x{i:03X} ({n})"
         for i, n in zip(values[:_IDS_TOLD].tolist(), counts[:_IDS_TOLD].tolist(), strict=True)
     )
     more = len(values) - _IDS_TOLD
-    return f"{told} and {more} more ids" if more > 0 else told
+    return f"{reported} and {more} more ids" if more > 0 else reported

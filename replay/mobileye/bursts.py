@@ -2,7 +2,7 @@
 
 A status frame (0x738) opens the burst of one image and says how many obstacles follow; each comes
 as a triple A, B, C in its slot. Nothing is joined across two status frames, and a frame that fits
-nowhere is told of, with its reason, never joined.
+nowhere is reported with its reason, never joined.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ class Shortage(NamedTuple):
 def sift(
     parts: Parts, status: Status, within_ns: int, kept: int = 0, is_closed: bool = False
 ) -> tuple[Parts, list[Fault], bool]:
-    """Leave out obstacle frames that belong to no burst, or to one that cannot be told.
+    """Leave out obstacle frames that belong to no burst, or to one that cannot be determined.
 
     Args:
         parts: In the order of the log.

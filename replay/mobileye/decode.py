@@ -1,7 +1,7 @@
 """Frames of a Mobileye's bus to tables, in columns.
 
 Obstacles are joined by burst and slot, lanes from their two halves; see ``bursts``. What cannot be
-joined or understood is told to the ledger under the bus's name, with its log time.
+joined or understood is reported to the ledger under the bus's name, with its log time.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class MobileyeDecoder:
 
         Args:
             bus: Topic of the frames; tables are called ``BUS/mobileye/TABLE``.
-            ledger: Told of every frame not used; the reader has counted those found.
+            ledger: Reported of every frame not used; the reader has counted those found.
             settings: How to read this device.
         """
         self._bus = bus
@@ -119,7 +119,7 @@ class MobileyeDecoder:
         kept, faults, is_closed = sift(
             parts, known, self._settings.within_ns, len(self._open), self._is_closed
         )
-        self._tell(faults)
+        self._report(faults)
         if not len(known):
             return []
         last = int(known.number[-1])
@@ -132,7 +132,7 @@ class MobileyeDecoder:
         triples, faults = join(parts)
         if is_end:
             faults = [f._replace(reason=CUT_AT_END) if f.reason == CUT else f for f in faults]
-        self._tell(faults)
+        self._report(faults)
         lacking = shortage(parts, status, self._settings.slots)
         for number, log_ns, count in zip(*(c.tolist() for c in lacking), strict=True):
             if is_end:
@@ -163,7 +163,7 @@ class MobileyeDecoder:
 
     def _pair(self, table: str, parts: Parts, is_last: bool) -> list[Block]:
         a, b, self._lanes[table], faults = pair(parts, self._settings.within_ns, is_last)
-        self._tell(faults)
+        self._report(faults)
         if not len(a):
             return []
         columns: Columns = {"t_ns": a.log_ns, "burst": a.burst, **lane_places(table, a.place)}
@@ -203,7 +203,7 @@ class MobileyeDecoder:
         at = np.maximum(known.at(burst), 0)
         return np.where(is_early, UNKNOWN, known.variant[at]).astype(np.int8)
 
-    def _tell(self, faults: Sequence[Fault]) -> None:
+    def _report(self, faults: Sequence[Fault]) -> None:
         for fault in faults:
             for burst, log_ns, count in events(fault, _EVENTS_TOLD):
                 where = f"burst {burst}" if burst != NO_BURST else "no burst"

@@ -24,7 +24,7 @@ from .wire import Column, Columns, Variant, variant_number, words_from
 FRAME_NS: Final = 250_000
 """One frame of 8 bytes takes about this long at 500 kbit/s."""
 LATENCY_NS: Final = 80 * MS
-"""From image to status frame, unless told otherwise: a plausible figure, measured nowhere."""
+"""From image to status frame, unless configured: a plausible figure, measured nowhere."""
 
 _OBSTACLE_PARTS: Final = ("obstacle_a", "obstacle_b", "obstacle_c")
 _LANE_PARTS: Final = {
@@ -49,7 +49,7 @@ def encode_tables(
 
     A status frame is sent at its row's log time; the obstacles of its burst follow it, slot by
     slot, a frame every ``FRAME_NS``; the second half of a lane follows its first. Columns that are
-    derived (``x_start_m``, ``latency_ns``, ...) are not looked at; columns that are not there are
+    derived (``x_start_m``, ``latency_ns``, ...) are not examined; columns that are not there are
     sent as missing, or as the layout's default.
 
     Args:

@@ -46,7 +46,7 @@ def move_points(pose: Pose, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
 def move_cubic(pose: Pose, c: Floats) -> Floats:
     """Cubics given in the source frame, in the target frame.
 
-    A turned cubic is none; it is developed to third order about its start. For turns of a few
+    A turned cubic is not one; it is developed to third order about its start. For turns of a few
     degrees that is exact to far below a step of the wire; without a turn it is exact.
 
     Args:

@@ -56,7 +56,7 @@ class MobileyeStream:
 
         Args:
             bus: Topic of the bus; for messages any name.
-            ledger: Told of what could not be used.
+            ledger: Reported of what could not be used.
             section: The vehicle file's.
             types: Of the topics with messages, from their names.
             is_shared_bus: The car's own signals are read from the same bus.

@@ -48,7 +48,7 @@ class MobileyeSettings:
             repetition, not a new image.
         least_latency_ns: What the fastest frame took from image to log; the log alone cannot tell.
         is_shared_bus: Another decoder reads the same bus and accounts for what is not the device's.
-        ros_lane_sign: Which way lanes in ROS messages are positive; ``auto`` looks at which side
+        ros_lane_sign: Which way lanes in ROS messages are positive; ``auto`` examines which side
             the left and right lane lie.
     """
 
@@ -79,7 +79,7 @@ DEFAULTS: Final = MobileyeSettings()
 
 
 def mounting_of(settings: MobileyeSettings, bus: str, ledger: Ledger) -> Mounting:
-    """Where the reference point lies; where nobody says, at the rear axle, which is told."""
+    """Where the reference point lies; where nobody says, at the rear axle, which is reported."""
     if settings.mounting is None:
         ledger.notice(
             f"{bus}: where the Mobileye's reference point lies is not given; distances count "

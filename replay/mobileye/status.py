@@ -50,7 +50,7 @@ class Statuses:
         """The bursts opened, their rows, and the burst that each frame is in."""
         at = np.flatnonzero(frames.message == self._number)
         opens = self._opens(frames.words[at], frames.log_ns[at])
-        self._tell_repeated(frames.log_ns[at[~opens]])
+        self._report_repeated(frames.log_ns[at[~opens]])
         at = at[opens]
         burst_at = np.zeros(len(frames), dtype=np.int64)
         burst_at[at] = 1
@@ -72,7 +72,7 @@ class Statuses:
         self._word, self._log_ns = word[-1:], log[-1:]
         return opens
 
-    def _tell_repeated(self, log_ns: Int64s) -> None:
+    def _report_repeated(self, log_ns: Int64s) -> None:
         if len(log_ns):
             self._ledger.skip(self._bus, REPEATED_STATUS, len(log_ns), "0x738", int(log_ns[0]))
 

@@ -125,7 +125,7 @@ def words_from(
     """The payloads that say ``columns``, rounded to the nearest step.
 
     A column that is not given is missing where the message can say so, else its default. Columns of
-    another variant than a row's are not looked at.
+    another variant than a row's are not examined.
 
     Raises:
         ValueError: A value that the field cannot carry, with column, row, value and range.

@@ -2,7 +2,7 @@
 
 Files and times are paired by name where the time file gives names; else one by one where there are
 as many of each; else by the numbers in the file names where these span as many; else in order from
-the first, which is told. Nothing is paired in silence when the counts differ.
+the first, which is reported. Nothing is paired in silence when the counts differ.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def pair(paths: Sequence[Path], times: TimeFile) -> TimedFiles:
 
 
 def _by_name(paths: Sequence[Path], names: Sequence[str]) -> Int64s:
-    """Line of each file, by its name with or without suffix; -1 where there is none."""
+    """Line of each file, by its name with or without suffix; -1 where none exists."""
     at = {name: i for i, name in enumerate(names)}
     found = [at.get(path.name, at.get(path.stem, -1)) for path in paths]
     return np.array(found, dtype=np.int64)
@@ -115,7 +115,7 @@ def _in_order(paths: Sequence[Path], times: TimeFile, notices: list[str]) -> Int
 
 
 def _numbers(paths: Sequence[Path]) -> Int64s | None:
-    """Each file's place by the last number in its name, from 0, or None where there is none.
+    """Each file's place by the last number in its name, from 0, or None where none exists.
 
     The usual step between numbers counts as one place, if all steps are whole multiples of it.
     """

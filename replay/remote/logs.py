@@ -192,7 +192,7 @@ def version_of(path: str) -> str:
     """Size and version of a log without reading it: of a file, of all files of a folder, of a URL.
 
     Raises:
-        LogError: It is not there or cannot be looked at.
+        LogError: It is not there or cannot be examined.
     """
     if is_remote(path):
         system, address = _opened(path)
@@ -356,7 +356,7 @@ class RangedLog:
             self._log.report_missing(ledger)
 
     def first_blocks(self, ledger: Ledger) -> Iterator[Block]:
-        """What the first chunk holds, for whoever looks at the beginning only."""
+        """What the first chunk holds, for whoever examines the beginning only."""
         return self.read(ledger, self._log.beginning)
 
     def close(self) -> None:
@@ -492,16 +492,16 @@ def _ranged(url: str, system: _System, address: str, store: Store) -> RangedFile
     if info.get("type") == "directory" or not info.get("size") or info.get("partial") is False:
         return None
     name = PurePosixPath(address.rstrip("/")).name
-    told = _object(name, info)
+    reported = _object(name, info)
 
     def changed() -> bool:
         system.invalidate_cache()
-        return _object(name, system.info(address)) != told
+        return _object(name, system.info(address)) != reported
 
     def opened() -> BinaryIO:
         return system.open(address, "rb", cache_type="none")
 
-    return RangedFile(url, told.size, opened, changed, Spool(store.folder, store.max_bytes))
+    return RangedFile(url, reported.size, opened, changed, Spool(store.folder, store.max_bytes))
 
 
 def _opened(url: str) -> tuple[_System, str]:
@@ -689,7 +689,7 @@ def _download(
 
 
 def _chunks(url: str, system: _System, one: _Object) -> Iterator[bytes]:
-    """An object's bytes, exactly as many as were told."""
+    """An object's bytes, exactly as many as were announced."""
     source = _guarded(url, lambda: system.open(one.address, "rb"))
     left = one.size
     with source:

@@ -24,7 +24,7 @@ from crosscue.replay.errors import CrosscueError, LogError, one_line
 
 PIECE: Final = 4 << 20
 AHEAD: Final = 8 << 10
-AHEAD_MOST: Final = 512 << 10
+MAX_AHEAD: Final = 512 << 10
 KEPT: Final = 64
 KEPT_BYTES: Final = 32 << 20
 WAITS_S: Final = (0.1, 0.5, 2.0)
@@ -77,7 +77,7 @@ class Spool:
         return max(at, self._ends[place]) if place >= 0 else at
 
     def next_at(self, at: int) -> int:
-        """Where the next span begins that it holds after ``at``; ``at`` if there is none."""
+        """Where the next span begins that it holds after ``at``; ``at`` if none exists."""
         place = bisect_right(self._begins, at)
         return self._begins[place] if place < len(self._begins) else at
 
@@ -196,7 +196,7 @@ class RangedFile:
         for begin, kept in self._kept:
             if begin <= at < begin + len(kept):
                 return kept[at - begin : end - begin]
-        stop = min(self._spool.end_at(at), max(end, at + AHEAD_MOST))
+        stop = min(self._spool.end_at(at), max(end, at + MAX_AHEAD))
         return memoryview(self._spool.read(at, stop - at)) if stop > at else None
 
     def _new(self, begin: int, end: int) -> memoryview:
@@ -213,7 +213,7 @@ class RangedFile:
         place = bisect_right(self._expected, (begin, self.size + 1)) - 1
         if place >= 0 and begin < self._expected[place][1]:
             return min(self._expected[place][1] - begin, PIECE)
-        self._ahead = min(2 * self._ahead, AHEAD_MOST) if begin == self._next_at else AHEAD
+        self._ahead = min(2 * self._ahead, MAX_AHEAD) if begin == self._next_at else AHEAD
         return end - begin + self._ahead
 
     def _range(self, begin: int, stop: int) -> bytes:

@@ -386,7 +386,7 @@ class Check:
     """Holds the files of a log against its seal, each block at most once.
 
     Attributes:
-        checked: Blocks looked at.
+        checked: Blocks examined.
         oddities: Files that are missing, new, or of another size; a sentence each.
     """
 

@@ -44,7 +44,7 @@ class Extractor:
         planned: Which topics give which signals.
         vehicle: The vehicle file.
         log: Index of the log.
-        ledger: Where skips are told.
+        ledger: Where skips are reported.
         clocks: From a topic to the clock whose times its samples carry; the log's where none is.
         watch: Sees every block, decoded.
         on_pictures: Given every block of ``Images``, its ``log_ns`` on the clock chosen.
@@ -121,7 +121,7 @@ class Extractor:
                 yield source.topic.name, samples
 
     def _show(self, block: Block, images: Images) -> None:
-        """Pictures to whoever looks at them, packets of a video decoded first."""
+        """Pictures to whoever examines them, packets of a video decoded first."""
         from crosscue.replay.decode.packets import PacketDecoder, is_stream
 
         if self.on_pictures is _no_pictures:

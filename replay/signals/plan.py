@@ -177,7 +177,7 @@ def _plan_mobileye(planner: _Planner) -> None:
 
 
 def camera_of(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> tuple[int, Topic] | None:
-    """The camera: the topic that the vehicle file names, or the only one; None where there is none.
+    """The camera: the topic that the vehicle file names, or the only one; None where none exists.
 
     Raises:
         VehicleError: The named one is not there, or several could be meant.

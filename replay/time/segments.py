@@ -44,7 +44,7 @@ class Segment:
     Attributes:
         number: From 0.
         begins_ns: Rows from this drive time on belong to it.
-        start_ns: Drive time of its first wheel speed, or where it begins if there is none.
+        start_ns: Drive time of its first wheel speed, or where it begins if none exists.
         end_ns: Drive time of its last wheel speed.
         log_start_ns: ``start_ns`` on the log's own clock.
         log_end_ns: ``end_ns`` on the log's own clock.
@@ -239,7 +239,7 @@ def _is_stray(first: int, rows: int, marks: Marks) -> NDArray[np.bool_]:
     return found
 
 
-def gaps_told(segments: Sequence[Segment]) -> list[str]:
+def gaps_text(segments: Sequence[Segment]) -> list[str]:
     """One sentence on the gaps of a drive; none for a drive without."""
     later = segments[1:]
     if not later:

@@ -84,7 +84,7 @@ class StampWatch:
         self._decide(len(self._held))
 
     def _decide(self, n: int) -> None:
-        """Judge the first ``n`` rows held; the rest is looked at only."""
+        """Judge the first ``n`` rows held; the rest is examined only."""
         if n <= 0:
             return
         rows = self._held

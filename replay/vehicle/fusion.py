@@ -40,14 +40,15 @@ class RangeFilter(Section):
     are not scored, lights that are not there are often seen once, those that are there again and
     again."""
     begin_within_m: Positive = 5.0
-    """A first look that none has confirmed within this way is forgotten."""
+    """A first observation that none has confirmed within this way is forgotten."""
     restart_after: Annotated[int, Field(ge=1)] = 5
     """So many refused measurements in a row that agree among themselves replace the belief."""
     sd_share: NotNegative = 0.05
-    """This share of a sign's range is added to its curve's s.d. (in squares); the source has 0."""
+    """This fraction of a sign's range is added to its curve's s.d. in squares (source: 0)."""
     fade_m: NotNegative = 1.0
-    """A sign's errors resemble each other over this way, so that a look soon after another counts
-    for less. With 0 every frame is a new look, as in the source; on simulated drives the variance
+    """A sign's errors resemble each other over this way, so that an observation soon after another
+    counts for less. With 0 every frame is a new look, as in the source; on simulated drives the
+    variance
     is then five times too small, with these two about right."""
     unseen_mps: Positive = 15.0
     """Where odometry is missing, the s.d. grows by this each second; the mean stays."""
@@ -68,7 +69,7 @@ class CueEntry(Section):
     """One cue: how far it is to be believed, and about what."""
 
     precision: Probability
-    """Share of its detections that are right; what it sends along its edges (Table 5)."""
+    """Fraction of its detections that are right; what it sends along its edges (Table 5)."""
     supports: tuple[Name, ...] = ()
     """Features that it shows to be there: direct edges."""
     excludes: tuple[Name, ...] = ()
@@ -160,7 +161,7 @@ class Fusion(Section):
     stale_after_m: Positive = 60.0
     """Or once the car has gone this far without any evidence."""
     stale_unranged_m: Positive = 30.0
-    """So far where no sign has told a range."""
+    """So far where no sign has reported a range."""
     longest_m: Positive = 100.0
     """Evidence from further before an intersection is not about it; the source's runs are as long.
     Without a range an approach ends after so far."""

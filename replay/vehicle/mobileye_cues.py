@@ -13,7 +13,7 @@ class Past(Section):
     lane_reach_m: Positive = 5.0
     """A lane line must reach this far past the end of the intersection."""
     lane_within_y_m: Positive = 8.0
-    """And be no further to the side there: a line that bends into the crossroad is none."""
+    """And be no further to the side there: a line that bends into the crossroad is not one."""
     lane_quality: NotNegative = 2.0
     """And be of at least this quality; the device calls 2 and 3 usable."""
     lane_types: tuple[int, ...] = (0, 1, 4, 5)
@@ -21,7 +21,7 @@ class Past(Section):
     vehicle_beyond_m: NotNegative = 3.0
     """A vehicle must be this far past the end of the intersection."""
     vehicle_within_y_m: Positive = 6.0
-    """And no further to the side of the way straight on: cars in parking lots are."""
+    """And no further to the side straight ahead: cars in parking lots are."""
     vehicle_types: tuple[int, ...] = (0, 1, 2)
     """Cars, trucks, motorcycles, standing or moving; without 3 and 4, pedestrians and bicycles."""
     vehicle_age_frames: NotNegative = 2.0

@@ -23,7 +23,7 @@ def explain(error: ValidationError, text: str | None, where: str, root: type[Bas
 
     Args:
         error: Of its validation.
-        text: The file's, when it is TOML: its line is told.
+        text: The file's, when it is TOML: its line is reported.
         where: Name of the file.
         root: The model.
     """

@@ -26,13 +26,13 @@ from .time import Time
 from .validation_errors import explain
 
 VERSION: Final = 1
-MOST_BYTES: Final = 1 * MIB
+MAX_BYTES: Final = 1 * MIB
 DEGREE: Final = math.pi / 180.0
 
 Vector = tuple[Finite, Finite, Finite]
 Matrix = tuple[Vector, Vector, Vector]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-Polygon = Annotated[tuple[tuple[Share, Share], ...], Field(min_length=3)]
+Proportion = Annotated[float, Field(ge=0.0, le=1.0)]
+Polygon = Annotated[tuple[tuple[Proportion, Proportion], ...], Field(min_length=3)]
 Signal = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
 """``MESSAGE.SIGNAL`` as the DBC file spells them."""
 
@@ -169,7 +169,7 @@ class Camera(Section):
 
 
 class Regions(Section):
-    """Where to look for road: polygons of (x, y) in shares of the picture's width and height."""
+    """Where to look for road: polygons of (x, y) in fractions of the picture's width and height."""
 
     left: Polygon = ((0.0, 0.55), (0.2, 0.55), (0.2, 0.7), (0.0, 0.7))
     straight: Polygon = ((0.44, 0.52), (0.56, 0.52), (0.6, 0.62), (0.4, 0.62))
@@ -180,17 +180,17 @@ class OwnCue(Section):
     """A cue of one's own: so many detections with one of these labels and a higher score."""
 
     labels: Annotated[tuple[str, ...], Field(min_length=1)]
-    score: Share = 0.5
+    score: Proportion = 0.5
 
 
 class Cues(Section):
     """When a detection is a cue; the numbers are the source's for Mask R-CNN."""
 
     stop_sign_labels: tuple[str, ...] = ("stop sign",)
-    stop_sign_score: Share = 0.9
+    stop_sign_score: Proportion = 0.9
     traffic_light_labels: tuple[str, ...] = ("traffic light",)
-    traffic_light_score: Share = 0.9
-    road_share: Share = 0.2
+    traffic_light_score: Proportion = 0.9
+    road_share: Proportion = 0.2
     """More road than this in a region is a cue (eq. 14)."""
     own: dict[Name, OwnCue] = Field(default_factory=dict)
     """By name; what each says of an intersection stands under [fusion.cues]."""
@@ -208,15 +208,15 @@ class Cars(Section):
     """Crossing and parked cars: shape, association and motion between two frames (eq. 15, 16)."""
 
     labels: tuple[str, ...] = ("car",)
-    score: Share = 0.95
+    score: Proportion = 0.95
     length_per_height: Positive = 2.0
     """Only cars seen from the side: longer than so many times their height."""
-    area_change: Share = 0.03
+    area_change: Proportion = 0.03
     """The same car in two frames: mask areas differ by less."""
-    position_change: Share = 0.05
-    """And positions by less than this share of the picture's width."""
-    still_change: Share = 0.002
-    """A car that moved by less than this share of the width, both ways, stood."""
+    position_change: Proportion = 0.05
+    """And positions by less than this fraction of the picture's width."""
+    still_change: Proportion = 0.002
+    """A car that moved by less than this fraction of the width, both ways, stood."""
     slope: NotNegative = 0.25
     """Horizontal motion: less than so many pixels down or up for one to the side."""
     most_gap_s: Positive = 0.5
@@ -302,9 +302,9 @@ def load(path: Path) -> Vehicle:
         VehicleError: Not there, not TOML, or a key or value that does not fit; with the line.
     """
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise VehicleError(f"{path}: over {MOST_BYTES // MIB} MiB; this is no vehicle file")
+            raise VehicleError(f"{path}: over {MAX_BYTES // MIB} MiB; this is no vehicle file")
         text = content.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"

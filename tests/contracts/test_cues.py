@@ -82,7 +82,7 @@ def test_every_cue_keeps_the_contract(cue: CueSpec) -> None:
         ({"rule": f"{__name__}:a_share"}, "want a count"),
     ],
 )
-def test_a_cue_that_breaks_the_contract_is_told(changes: dict[str, Any], match: str) -> None:
+def test_a_cue_that_breaks_the_contract_is_reported(changes: dict[str, Any], match: str) -> None:
     with pytest.raises(AssertionError, match=match):
         check_cue(replace(DUMMY, **changes))
 
@@ -128,8 +128,8 @@ def test_a_dummy_cue_is_one_row_and_one_function(
     # Scored as its row says, reported with its published precision, drawn in its colour.
     found = {"frames": frame_table(40), "cues": cue_table({"zebra": {5: 1, 6: 0}})}
     run = run_folder(tmp_path / "run", found)
-    told = truth([*good_truth().truth.cues, span("zebra", 0, 40, count=1)])
-    one = judge_run(run, truth_folder(tmp_path / "drive", told))
+    reported = truth([*good_truth().truth.cues, span("zebra", 0, 40, count=1)])
+    one = judge_run(run, truth_folder(tmp_path / "drive", reported))
     scores = scores_of([one])
     assert scores.cues["zebra"].reading == "feature"
     assert scores.cues["zebra"].readings["object"].precision.right == 1

@@ -44,7 +44,7 @@ def _mcap(folder: Path) -> Path:
     at, size = raw.index(b"message 20") - 31, 41
     assert raw[at] == 0x05
     del raw[at : at + size]
-    # Checksums would show it, too: 0 says that there is none.
+    # Checksums would show it, too: 0 says that none exists.
     end = raw.rindex(b"\x0f" + struct.pack("<Q", 4))
     raw[end + 9 : end + 13] = bytes(4)
     (summary_at,) = struct.unpack_from("<Q", raw, len(raw) - 28)

@@ -68,12 +68,14 @@ class _Remembering(BrightBlob):
         (_Remembering, "frame 17: the result's time"),
     ],
 )
-def test_a_detector_that_breaks_the_contract_is_told(kind: type[BrightBlob], match: str) -> None:
+def test_a_detector_that_breaks_the_contract_is_reported(
+    kind: type[BrightBlob], match: str
+) -> None:
     with pytest.raises(AssertionError, match=match):
         check_detector(lambda: kind(BrightSettings()))
 
 
-def test_a_detector_that_forgets_frames_is_told() -> None:
+def test_a_detector_that_forgets_frames_is_reported() -> None:
     check_detector(build)
     with pytest.raises(AssertionError, match="3 frames, 0 results"):
         check_detector(too_few)

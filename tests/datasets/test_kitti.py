@@ -1,4 +1,4 @@
-"""KITTI drives: streams, times and truth agree with what was driven; what is missing is told."""
+"""KITTI drives: streams, times and truth agree with the drive; what is missing is reported."""
 
 from __future__ import annotations
 

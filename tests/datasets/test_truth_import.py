@@ -235,7 +235,7 @@ def test_labels_mean_what_the_user_says(
         assert said in _refused(capsys)
 
 
-def test_a_cue_of_ones_own_is_told_as_the_vehicle_file_names_it(
+def test_a_cue_of_ones_own_is_reported_as_the_vehicle_file_names_it(
     tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tree = coco(categories=[{"id": 13, "name": "zebra crossing"}, {"id": 3, "name": "car"}])

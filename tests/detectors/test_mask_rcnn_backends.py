@@ -23,7 +23,7 @@ from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Checkpoint, Facts
-from crosscue.detectors.networks.mask_rcnn.cpu import LEAST_PIXELS, Halved, Winograd, for_cpu
+from crosscue.detectors.networks.mask_rcnn.cpu import MIN_PIXELS, Halved, Winograd, for_cpu
 from crosscue.detectors.networks.mask_rcnn.detector import (
     MaskRcnnDetector,
     MaskRcnnSettings,
@@ -85,7 +85,7 @@ def _simulated() -> tuple[Frame, ...]:
 
 @cache
 def _torchvision(network: Any, objectness: float = 0.0) -> Any:
-    """A copy that looks at as many places as torchvision's own loop and keeps its scores."""
+    """A copy that examines as many places as torchvision's own loop and keeps its scores."""
     own = copy.deepcopy(network).eval()
     own.rpn._pre_nms_top_n["testing"] = own.rpn._post_nms_top_n["testing"] = 1000
     own.rpn.score_thresh = objectness
@@ -94,7 +94,7 @@ def _torchvision(network: Any, objectness: float = 0.0) -> Any:
     return own
 
 
-def _told_by_torchvision(
+def _found_by_torchvision(
     checkpoint: Checkpoint, frame: Frame, objectness: float = 0.0
 ) -> Detections:
     """Torchvision's own modules in torchvision's own order, above the score."""
@@ -147,7 +147,7 @@ def test_random_weights_find_what_torchvision_finds_with_them(backend: str, seed
     found = 0
     for picture in range(2):
         frame = noise_frame(picture)
-        theirs = _told_by_torchvision(checkpoint, frame)
+        theirs = _found_by_torchvision(checkpoint, frame)
         _assert_equal(_found(detector, frame), theirs)
         found += len(theirs)
     assert found > 10
@@ -158,7 +158,7 @@ def test_places_that_look_empty_are_left_out_as_torchvision_leaves_them_out(back
     checkpoint = random_checkpoint(0)
     counts = []
     for floor in (0.0, 0.5, 1.0):
-        theirs = _told_by_torchvision(checkpoint, noise_frame(), floor)
+        theirs = _found_by_torchvision(checkpoint, noise_frame(), floor)
         ours = _found(_detector(checkpoint, backend, objectness=floor), noise_frame())
         _assert_equal(ours, theirs)
         counts.append(len(theirs))
@@ -172,7 +172,7 @@ def test_the_embedded_network_finds_what_torchvision_finds_with_it(backend: str)
     detector = _detector(checkpoint, backend)
     found = 0
     for frame in _simulated():
-        theirs = _told_by_torchvision(checkpoint, frame)
+        theirs = _found_by_torchvision(checkpoint, frame)
         _assert_equal(_found(detector, frame), theirs)
         found += len(theirs)
     assert found > 10
@@ -199,7 +199,7 @@ def test_nothing_above_the_score_is_an_empty_result(backend: str) -> None:
     assert found.boxes_px.shape == (0, 4)
 
 
-def test_identity_tells_back_ends_apart() -> None:
+def test_identity_reports_back_ends_apart() -> None:
     one, other = (_detector(random_checkpoint(), backend).identity for backend in BACKENDS)
 
     assert one != other
@@ -286,7 +286,7 @@ def test_the_copy_for_a_cpu_has_the_levels_of_its_original_and_leaves_it_alone()
     assert any(isinstance(m, Winograd) for m in own.modules())
     assert any(isinstance(m, Halved) for m in own.modules())
     assert not any(isinstance(m, nn.BatchNorm2d) for m in own.modules())
-    assert LEAST_PIXELS <= (192 // 8) * (256 // 8)
+    assert MIN_PIXELS <= (192 // 8) * (256 // 8)
     for ours_of, theirs_of in zip(ours, theirs, strict=True):
         for mine, other in zip(ours_of, theirs_of, strict=True):
             np.testing.assert_allclose(mine.numpy(), other.numpy(), rtol=1e-3, atol=1e-4)

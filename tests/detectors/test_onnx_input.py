@@ -43,7 +43,7 @@ def model(*inputs: bytes, weights: tuple[bytes, ...] = ()) -> bytes:
     return number(1, 8) + part(2, b"maker") + part(7, graph)
 
 
-def test_the_first_input_that_is_no_weight_is_told_with_what_is_left_open() -> None:
+def test_the_first_input_that_is_no_weight_is_reported_with_what_is_left_open() -> None:
     content = model(value_info(b"w", [9]), value_info(b"x", [None, 3, 360, 640]), weights=(b"w",))
 
     assert input_shape(content) == (None, 3, 360, 640)
@@ -62,7 +62,7 @@ def test_damage_ends_in_an_error_or_a_shape_never_in_a_hang(noise: bytes, cut: i
         assert found is None or all(size is None or size > 0 for size in found)
 
 
-def test_a_real_file_tells_its_shape() -> None:
+def test_a_real_file_reports_its_shape() -> None:
     path = shared("weights", "yolox_nano", "yolox_nano.onnx")
 
     assert input_shape(path.read_bytes()) == (1, 3, 416, 416)

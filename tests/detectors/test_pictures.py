@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import View
-from crosscue.detectors.images import MOST_PIXELS, Encoded, decode, reduction, size_of
+from crosscue.detectors.images import MAX_PIXELS, Encoded, decode, reduction, size_of
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
 
@@ -106,7 +106,7 @@ def test_a_bomb_is_refused_by_its_header() -> None:
     png[16:24] = struct.pack(">II", 60_000, 60_000)
     png[29:33] = struct.pack(">I", zlib.crc32(bytes(png[12:29])))
 
-    with pytest.raises(LogTooLargeError, match=f"60000 x 60000 pixels: more than {MOST_PIXELS:,}"):
+    with pytest.raises(LogTooLargeError, match=f"60000 x 60000 pixels: more than {MAX_PIXELS:,}"):
         decode(Encoded("png", memoryview(bytes(png))), COLOUR)
     jpeg = bytearray(_encode(_ramp(), ".jpg").content)
     frame = jpeg.index(b"\xff\xc0")
@@ -123,7 +123,9 @@ def test_a_bomb_is_refused_by_its_header() -> None:
     suffix=st.sampled_from([".png", ".jpg", ".webp"]),
 )
 @settings(max_examples=60, deadline=None)
-def test_a_damaged_picture_is_told_or_still_a_picture(where: int, flip: int, suffix: str) -> None:
+def test_a_damaged_picture_is_reported_or_still_a_picture(
+    where: int, flip: int, suffix: str
+) -> None:
     whole = _encode(_ramp(), suffix)
     damaged = bytearray(whole.content)
     damaged[where % len(damaged)] ^= flip

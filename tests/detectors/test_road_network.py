@@ -203,7 +203,7 @@ def test_own_pictures_with_masks_train_too(
     assert run(argv) == 1  # it is there already
 
 
-def test_a_picture_without_its_mask_or_of_another_size_is_told(tmp_path: Path) -> None:
+def test_a_picture_without_its_mask_or_of_another_size_is_reported(tmp_path: Path) -> None:
     data = folder(tmp_path / "own", 2)
     cv2.imwrite(str(data / "masks" / "01.png"), np.zeros((4, 4), np.uint8))
     with pytest.raises(Exception, match=r"01.png: 80 x 48 pixels, but its mask has 4 x 4"):
@@ -229,7 +229,7 @@ def test_a_picture_without_its_mask_or_of_another_size_is_told(tmp_path: Path) -
         ([], "give --layouts"),
     ],
 )
-def test_wrong_usage_is_told(
+def test_wrong_usage_is_reported(
     flags: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["train", "road", *flags, "-o", str(tmp_path / "o.safetensors")]) == 2
@@ -241,20 +241,20 @@ def test_a_network_is_measured_without_training(capsys: pytest.CaptureFixture[st
     measure = ["train", "road", "--measure", "embedded"]
 
     assert run([*measure, "--test-layouts", "L640", "--per-layout", "2", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["measured_pictures"] == 2
-    assert told["measured_iou"] > 0.95
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["measured_pictures"] == 2
+    assert reported["measured_iou"] > 0.95
     assert run(measure) == 2
     assert "give --test-layouts with layouts" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
-def test_a_device_that_is_not_there_is_told() -> None:
+def test_a_device_that_is_not_there_is_reported() -> None:
     with pytest.raises(VehicleError, match="detector road: device cuda: not there"):
         build(device="cuda")
 
 
-def test_a_place_that_cannot_be_written_to_is_told_before_any_work(
+def test_a_place_that_cannot_be_written_to_is_reported_before_any_work(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert run(["train", "road", "--layouts", "L1", "-o", "/proc/nowhere/o.safetensors"]) == 1

@@ -162,14 +162,14 @@ def test_fit_signs_chooses_on_some_frames_and_measures_on_others(
 
     assert run(["fit", "signs", str(labels), "--label", "one way left"]) == 0
 
-    told = capsys.readouterr().out
-    assert "least_score = " in told
-    assert "precision 1.00 (4 of 4; 95 % interval 0.51 to 1.00)" in told
-    printed = told.split()[2]
+    reported = capsys.readouterr().out
+    assert "least_score = " in reported
+    assert "precision 1.00 (4 of 4; 95 % interval 0.51 to 1.00)" in reported
+    printed = reported.split()[2]
     assert (
         run(["fit", "signs", str(labels), "--label", "one way left", "--threshold", printed]) == 0
     )
-    assert capsys.readouterr().out == told
+    assert capsys.readouterr().out == reported
 
 
 def coco(folder: Path, seeds: range) -> Path:
@@ -205,9 +205,9 @@ def test_several_labels_share_a_threshold_and_coco_files_serve_too(
 
     assert run(["fit", "signs", str(fitted), "--test", str(other), *both, "--json"]) == 0
 
-    told = json.loads(capsys.readouterr().out)
-    assert (told["chosen_on"]["signs"], told["other_frames"]["signs"]) == (4, 4)
-    assert told["other_frames"]["precision"] == 1.0
+    reported = json.loads(capsys.readouterr().out)
+    assert (reported["chosen_on"]["signs"], reported["other_frames"]["signs"]) == (4, 4)
+    assert reported["other_frames"]["precision"] == 1.0
 
 
 def drive(folder: Path, seeds: range) -> Path:
@@ -264,7 +264,7 @@ def test_drives_measure_a_threshold_with_an_interval_by_drive(
     assert 0.0 <= low <= whole["recall"] <= high <= 1.0
 
 
-def test_a_drive_without_objects_is_told(
+def test_a_drive_without_objects_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = drive(tmp_path / "d", range(2))
@@ -281,9 +281,9 @@ def test_a_given_threshold_is_measured_not_chosen(
 
     assert run(["fit", "signs", fitted, "--label", "one way left", "--threshold", "0.99"]) == 0
 
-    told = capsys.readouterr().out
-    assert "least_score = 0.99\n" in told
-    assert "recall    0.00 (0 of 2; " in told
+    reported = capsys.readouterr().out
+    assert "least_score = 0.99\n" in reported
+    assert "recall    0.00 (0 of 2; " in reported
 
 
 def test_signs_too_low_to_matter_are_neither_found_nor_missed() -> None:
@@ -298,7 +298,7 @@ def test_signs_too_low_to_matter_are_neither_found_nor_missed() -> None:
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"images": [], "annotations": [], "categories": []}'])
-def test_a_file_that_is_no_coco_is_told(
+def test_a_file_that_is_no_coco_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
 ) -> None:
     (tmp_path / "coco.json").write_text(text)
@@ -316,7 +316,7 @@ def test_a_file_that_is_no_coco_is_told(
         ("labels.csv,stop,1,2,3,4", "not a JPEG, PNG or WebP picture"),
     ],
 )
-def test_labels_that_do_not_fit_are_told_in_one_line(
+def test_labels_that_do_not_fit_are_reported_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], row: str, said: str
 ) -> None:
     labels = tmp_path / "labels.csv"
@@ -340,15 +340,15 @@ def test_a_picture_cut_short_is_named(tmp_path: Path, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("name", "said"), [("none.csv", "none.csv: No such file"), ("wild.csv", "wild.csv: is no text")]
 )
-def test_a_file_of_labels_that_is_none_is_told(
+def test_a_file_of_labels_that_is_none_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, said: str
 ) -> None:
     (tmp_path / "wild.csv").write_bytes(b"\xff\xd8\xff")
 
     assert run(["fit", "signs", str(tmp_path / name), "--label", "stop"]) == 2
-    told = capsys.readouterr().err
-    assert said in told
-    assert told.count(str(tmp_path)) == 1
+    reported = capsys.readouterr().err
+    assert said in reported
+    assert reported.count(str(tmp_path)) == 1
 
 
 def test_a_real_no_entry_sign_is_found_in_a_photo() -> None:

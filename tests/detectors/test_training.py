@@ -357,8 +357,8 @@ def test_from_simulated_pictures_to_a_checkpoint_by_commands_alone(
 
     assert run(learn) == 0
 
-    told = capsys.readouterr().out
-    assert "step 2 of 2" in told
+    reported = capsys.readouterr().out
+    assert "step 2 of 2" in reported
     checkpoint = load_checkpoint(out)
     assert checkpoint.facts.plan.classes == ("car", "stop sign", "traffic light")
     assert checkpoint.facts.recipe["schedule.steps"] == 2
@@ -394,7 +394,7 @@ def test_nothing_is_rendered_for_training_of_what_is_scored(
         (["--crop-top", "0.6", "--crop-bottom", "0.6"], "less than a tenth"),
     ],
 )
-def test_wrong_flags_are_told_before_any_work(
+def test_wrong_flags_are_reported_before_any_work(
     tmp_path: Path, flags: list[str], why: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_bars(tmp_path / "set", 11)
@@ -413,16 +413,16 @@ def test_wrong_flags_are_told_before_any_work(
     assert why in capsys.readouterr().err
 
 
-def test_a_place_that_cannot_be_written_to_is_told_before_any_work(
+def test_a_place_that_cannot_be_written_to_is_reported_before_any_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_bars(tmp_path / "set", 11)
     base = ["train", "mask-rcnn", "--data", str(path), "--images", str(path.parent / "images")]
 
     assert run([*base, "-o", "/proc/nowhere/out.safetensors"]) == 1
-    told = capsys.readouterr()
-    assert "choose a place you may write to" in told.err
-    assert "training" not in told.out
+    reported = capsys.readouterr()
+    assert "choose a place you may write to" in reported.err
+    assert "training" not in reported.out
 
 
 def test_a_network_is_measured_without_training(
@@ -454,9 +454,9 @@ def test_a_network_is_measured_without_training(
     )
 
     assert run(base) == 0
-    told = capsys.readouterr().out
-    assert "embedded on 3 pictures, 100 proposals" in told
-    assert "score from 0.95" in told
+    reported = capsys.readouterr().out
+    assert "embedded on 3 pictures, 100 proposals" in reported
+    assert "score from 0.95" in reported
 
 
 @pytest.mark.parametrize(

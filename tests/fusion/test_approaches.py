@@ -57,7 +57,7 @@ def test_a_drive_past_one_intersection_is_one_approach() -> None:
     }
 
 
-def test_a_sign_seen_once_opens_an_approach_but_tells_no_range() -> None:
+def test_a_sign_seen_once_opens_an_approach_but_reports_no_range() -> None:
     loop = approaches(range_filter=RangeFilter())
     once = replace(frame(1, stop_sign=1), signs=(sign(60.0),))
     taken = steps([frame(0), once, *(frame(i) for i in range(2, 40))], loop)

@@ -1,4 +1,4 @@
-"""Messages that were learned: what a look says, what repeats say, and how well the fit recovers."""
+"""Messages that were learned: what observations and repeats say, and how well the fit recovers."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from crosscue.fusion.approaches import Approaches
 from crosscue.fusion.belief import Situation, source_speaker
-from crosscue.fusion.calibrated import CalibratedSpeaker, voices_of
+from crosscue.fusion.calibrated import CalibratedMessageModel, voices_of
 from crosscue.fusion.factor_graph import graph_of
-from crosscue.fusion.independence import independent_share
+from crosscue.fusion.independence import effective_sample_fraction
 from crosscue.fusion.message_fit import fit_messages, log_odds_of
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Fusion, RangeFilter, Rates
@@ -34,8 +34,8 @@ LEARNED = Calibrated(
 
 
 def said(*looks: Situation, learned: Calibrated = LEARNED) -> list[float]:
-    """What each look adds to the log odds of left."""
-    speaker = CalibratedSpeaker(len(GRAPH.features), voices_of(GRAPH, learned))
+    """What each observation adds to the log odds of left."""
+    speaker = CalibratedMessageModel(len(GRAPH.features), voices_of(GRAPH, learned))
     return [speaker(look)[LEFT] for look in looks]
 
 
@@ -113,14 +113,14 @@ def test_what_moves_by_itself_is_heard_again_after_a_time_though_the_car_stands(
 
 
 def test_an_edge_of_which_nothing_was_learned_sends_the_published_message_discounted() -> None:
-    speaker = CalibratedSpeaker(len(GRAPH.features), voices_of(GRAPH, LEARNED))
+    speaker = CalibratedMessageModel(len(GRAPH.features), voices_of(GRAPH, LEARNED))
     sign = situation({"stop_sign": 1}, moved_m=2.0)
     published = math.log(0.97 / 0.03)
 
     first, second = (speaker(sign)[0] for _ in range(2))
 
     assert first == pytest.approx(published)
-    assert second == pytest.approx(published * independent_share(2.0 / 10.0))
+    assert second == pytest.approx(published * effective_sample_fraction(2.0 / 10.0))
 
 
 def test_a_features_exponent_scales_all_it_hears() -> None:
@@ -185,7 +185,7 @@ def test_the_fit_finds_the_fade_that_the_looks_were_drawn_with() -> None:
 
     for one in fit.fades:
         if one.is_learned:
-            # ten metres a second, so way and time tell the same here
+            # ten metres a second, so way and time report the same here
             scale_m = one.fade.way_m or (one.fade.time_s or 0.0) * 10.0
             assert scale_m == pytest.approx(FADE_M, rel=0.35)
     assert sum(one.is_learned for one in fit.fades) == 3

@@ -10,7 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.fusion.intersection_range import RangeBelief, initialise, nis, predict, update
-from crosscue.fusion.range_track import NOTHING, RangeTrack, Verdict, advance, go_blind, measure
+from crosscue.fusion.range_track import (
+    NOTHING,
+    RangeTrack,
+    Verdict,
+    advance,
+    measure,
+    predict_without_odometry,
+)
 from crosscue.replay.vehicle.fusion import RangeFilter
 
 METRES = st.floats(-200.0, 200.0)
@@ -186,12 +193,12 @@ def test_looks_that_contradict_each_other_begin_nothing() -> None:
 def test_a_first_look_waits_while_the_car_stands_and_widens_where_nobody_measured() -> None:
     once, _ = measure(NOTHING, 60.0, 2.9, RangeFilter(), 20.0)
     stood = advance(once, 0.0, 0.0, RangeFilter())
-    blind = go_blind(once, 3.0, RangeFilter())
+    blind = predict_without_odometry(once, 3.0, RangeFilter())
 
     assert stood.rival == once.rival
     assert blind.rival is not None
     assert math.sqrt(blind.rival.var_m2) == pytest.approx(math.sqrt(2.9) + 3.0)
-    assert go_blind(blind, 3.0, RangeFilter()) == NOTHING
+    assert predict_without_odometry(blind, 3.0, RangeFilter()) == NOTHING
 
 
 def test_absurd_measurements_that_contradict_each_other_never_take_over() -> None:

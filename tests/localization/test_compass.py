@@ -99,7 +99,7 @@ def test_levelling_keeps_the_fields_strength_and_finds_down() -> None:
     np.testing.assert_allclose(np.hypot(level[:, 0], level[:, 1]), LEVEL_T)
 
 
-def test_tilt_not_told_is_an_error_not_a_crash() -> None:
+def test_tilt_not_reported_is_an_error_not_a_crash() -> None:
     field = readings(np.array([0.0]), IRON, roll=0.1)
 
     assert 2.0 < apart_deg(heading(field, IRON), np.zeros(1)) < 20.0

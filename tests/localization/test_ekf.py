@@ -219,7 +219,7 @@ def test_order_of_measurements_at_one_time_does_not_matter() -> None:
     np.testing.assert_allclose(one.cov, other.cov, atol=1e-12)
 
 
-def test_the_gate_refuses_and_tells() -> None:
+def test_the_gate_refuses_and_reports() -> None:
     start = belief(heading=0.0)
     refused = update_heading(start, 2.0, 1e-4, gate_nis=10.8)
     taken = update_heading(start, 2.0, 1e-4)

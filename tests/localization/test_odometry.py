@@ -168,7 +168,7 @@ def test_bad_turn_rows_are_dropped_and_counted() -> None:
     assert made.increments.turn_rad.sum() == pytest.approx(0.01)
 
 
-def test_a_gap_is_told_and_makes_unsure() -> None:
+def test_a_gap_is_reported_and_makes_unsure() -> None:
     t_ns = np.array([0, 100, 200, 3_200, 3_300], np.int64) * 1_000_000
     made = integrate(WheelSpeeds(t_ns, np.full((5, 2), 10.0)), CAR)
 

@@ -1,6 +1,6 @@
 """The track over columns: equal to the filter's functions, whole in windows, errors as claimed.
 
-All drives here are simulated, with the very noise that the filter is told of.
+All drives here are simulated, with the very noise that the filter is reported of.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def test_simulated_errors_are_as_large_as_claimed() -> None:
 
 
 def test_simulated_compass_errors_that_last_need_an_interval() -> None:
-    """An error that fades over 2 s, read at 10 Hz: over-sure unless readings are thinned."""
+    """An error that fades over 2 s, read at 10 Hz: overconfident unless readings are thinned."""
     thinned = TrackSettings(heading_interval_m=0.0, heading_interval_s=4.0, heading_gate_nis=None)
 
     def mean_nees(settings: TrackSettings) -> float:
@@ -296,7 +296,7 @@ def test_a_standing_car_does_not_count_readings_twice() -> None:
     assert done.counts.headings_accepted == 1
 
 
-def test_time_without_odometry_is_driven_blind_and_told() -> None:
+def test_time_without_odometry_is_driven_blind_and_reported() -> None:
     belief = start_belief(0, 0.0, 0.0, 0.0, speed_mps=10.0, speed_sd_mps=0.5)
     done = advance(TrackState(belief), straight(first_ns=2_000_000_000), TrackSettings())
 

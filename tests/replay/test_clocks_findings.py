@@ -40,7 +40,7 @@ def test_nothing_is_said_of_a_healthy_log() -> None:
     )
 
 
-def test_gaps_are_told_with_the_longest_and_its_place() -> None:
+def test_gaps_are_reported_with_the_longest_and_its_place() -> None:
     log_ns = START_NS + 50 * MS * np.arange(1200, dtype=np.int64)
     log_ns[400:] += 500 * MS
     log_ns[800:] += 1150 * MS
@@ -68,7 +68,7 @@ def test_another_epoch_is_named(ahead_ns: int, words: str) -> None:
     assert words in said
 
 
-def test_a_stamp_that_is_zero_constant_drifting_or_jumping_is_told() -> None:
+def test_a_stamp_that_is_zero_constant_drifting_or_jumping_is_reported() -> None:
     drifting = replace(STREAM, drift_ppm=200.0).header_ns()
     jumping = replace(STREAM, jumps={600: 4 * SECOND_NS}).header_ns()
     set_back = replace(STREAM, jumps={600: -4 * SECOND_NS}).header_ns()
@@ -90,7 +90,7 @@ def test_a_stamp_that_is_zero_constant_drifting_or_jumping_is_told() -> None:
     )
 
 
-def test_log_times_out_of_order_repeated_or_set_back_are_told() -> None:
+def test_log_times_out_of_order_repeated_or_set_back_are_reported() -> None:
     log_ns = START_NS + 50 * MS * np.arange(1200, dtype=np.int64)
     late = log_ns.copy()
     late[[500, 501]] = late[[501, 500]]
@@ -110,7 +110,7 @@ def test_log_times_out_of_order_repeated_or_set_back_are_told() -> None:
     )
 
 
-def test_topics_that_share_no_clock_are_told() -> None:
+def test_topics_that_share_no_clock_are_reported() -> None:
     boot = STREAM.log_ns() - START_NS
 
     apart_all = said_of(table_of("/can", boot), table_of("/camera", STREAM.log_ns()))
@@ -183,7 +183,7 @@ def test_instants_are_dates_only_where_they_count_from_1970() -> None:
         st.tuples(*[st.integers(-(2**63), 2**63 - 1) | st.integers(0, 10**11)] * 3), max_size=60
     )
 )
-def test_any_times_at_all_are_told_in_plain_lines(rows: list[tuple[int, int, int]]) -> None:
+def test_any_times_at_all_are_reported_in_plain_lines(rows: list[tuple[int, int, int]]) -> None:
     columns = np.array(rows, dtype=np.int64).reshape(-1, 3)
 
     said = said_of(table_of("/a", *columns.T), table_of("/b", columns[:, 1]))

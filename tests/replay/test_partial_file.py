@@ -59,7 +59,7 @@ def test_a_file_of_a_killed_process_is_swept_and_one_of_a_living_process_is_not(
         process.send_signal(signal.SIGKILL)
         process.wait()
 
-    # The process number may be in use again by now; nothing looks at it.
+    # The process number may be in use again by now; nothing examines it.
     sweep(tmp_path, again=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b.txt"]
 

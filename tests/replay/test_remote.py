@@ -172,7 +172,7 @@ def test_a_log_that_grows_while_fetched_is_refused(
         ("nonsense://a/b.log", "nonsense"),
     ],
 )
-def test_what_cannot_be_fetched_is_told(
+def test_what_cannot_be_fetched_is_reported(
     url: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(remote.STORE_VARIABLE, str(tmp_path))

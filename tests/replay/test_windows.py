@@ -96,7 +96,7 @@ class _Watched(list[Block]):
             yield block
 
 
-def test_rows_that_come_too_late_are_told_not_mixed_in() -> None:
+def test_rows_that_come_too_late_are_reported_not_mixed_in() -> None:
     late = wheel_block([7], [9.0])
     blocks = [wheel_block([s * SECOND], [1.0]) for s in range(10)]
     ledger = Ledger("late")

@@ -21,7 +21,7 @@ class Kind:
         suffix: Of the file.
         fd: It can hold CAN FD frames.
         buses: It names buses.
-        tells_end: It shows whether its end is missing, even after a whole line.
+        declares_end: It shows whether its end is missing, even after a whole line.
         start_ns: Log time at which its clock begins.
         step_ns: Its clock's step.
     """
@@ -30,7 +30,7 @@ class Kind:
     suffix: str
     fd: bool = True
     buses: bool = True
-    tells_end: bool = False
+    declares_end: bool = False
     start_ns: int = START_NS
     step_ns: int = 1_000
 
@@ -47,18 +47,18 @@ class Kind:
 
 KINDS = {
     "candump": Kind(candump, ".log"),
-    "asc": Kind(asc, ".asc", tells_end=True),
-    "asc-relative": Kind(lambda f: asc(f, relative=True), ".asc", tells_end=True),
-    "asc-comma": Kind(lambda f: asc(f, mark=","), ".asc", tells_end=True),
+    "asc": Kind(asc, ".asc", declares_end=True),
+    "asc-relative": Kind(lambda f: asc(f, relative=True), ".asc", declares_end=True),
+    "asc-comma": Kind(lambda f: asc(f, mark=","), ".asc", declares_end=True),
     "trc-1.0": Kind(lambda f: trc(f, "1.0"), ".trc", fd=False, buses=False, start_ns=0),
     "trc-1.1": Kind(lambda f: trc(f, "1.1"), ".trc", fd=False, buses=False),
     "trc-1.2": Kind(lambda f: trc(f, "1.2"), ".trc", fd=False),
     "trc-1.3": Kind(lambda f: trc(f, "1.3"), ".trc", fd=False),
     "trc-2.1": Kind(trc, ".trc"),
-    "blf": Kind(blf, ".blf", tells_end=True),
-    "blf-stored": Kind(lambda f: blf(f, stored=True), ".blf", tells_end=True),
-    "blf-old": Kind(lambda f: blf(f, is_old=True), ".blf", tells_end=True, step_ns=10_000),
-    "blf-unclosed": Kind(lambda f: blf(f, is_closed=False), ".blf", tells_end=True, start_ns=0),
+    "blf": Kind(blf, ".blf", declares_end=True),
+    "blf-stored": Kind(lambda f: blf(f, stored=True), ".blf", declares_end=True),
+    "blf-old": Kind(lambda f: blf(f, is_old=True), ".blf", declares_end=True, step_ns=10_000),
+    "blf-unclosed": Kind(lambda f: blf(f, is_closed=False), ".blf", declares_end=True, start_ns=0),
 }
 
 
@@ -67,7 +67,7 @@ class Verdict:
     """How a damaged copy was read.
 
     Attributes:
-        word: ``refused``, ``same``, ``told``, ``undetectable`` or, in capitals, a fault.
+        word: ``refused``, ``same``, ``reported``, ``undetectable`` or, in capitals, a fault.
         why: Numbers behind it.
     """
 
@@ -97,12 +97,12 @@ def judge(kind: Kind, frames: Sequence[Sent], whole: bytes, copy: bytes, path: P
     if new > hit(kind, whole, copy) or read.total() > len(frames):
         return Verdict("INVENTED", numbers)
     events = len(frames) // 50 + 1 if kind.suffix == ".asc" else 0
-    is_empty_told = any("no objects" in notice for notice in ledger.notices)
-    if not ledger.is_whole or ledger.topic("").skipped.total() > events or is_empty_told:
-        return Verdict("told", numbers)
+    is_empty_reported = any("no objects" in notice for notice in ledger.notices)
+    if not ledger.is_whole or ledger.topic("").skipped.total() > events or is_empty_reported:
+        return Verdict("reported", numbers)
     if read.total() < len(frames):
         # Text that ends with a whole line is a shorter log, as good as any other.
-        is_short = not kind.tells_end and whole.startswith(copy) and copy.endswith(b"\n")
+        is_short = not kind.declares_end and whole.startswith(copy) and copy.endswith(b"\n")
         return Verdict("undetectable" if is_short else "SILENT", numbers)
     return Verdict("same" if found == kind.expected(frames) else "undetectable", numbers)
 

@@ -69,7 +69,7 @@ def _run(prepare: Callable[[], None], argv: Sequence[str], said: int) -> NoRetur
 def watched(folder: Path, names: frozenset[str], then: Callable[[int, str], None]) -> None:
     """From now on, for good, call ``then`` before every operation that changes ``folder``.
 
-    It is told a number from 0 and what is to be done.
+    It is reported a number from 0 and what is to be done.
     """
     count = 0
     inside = str(folder)
@@ -93,10 +93,10 @@ def _writes(args: tuple[object, ...]) -> bool:
 
 def operations(folder: Path, names: frozenset[str], argv: Sequence[str]) -> list[str]:
     """All operations on ``folder`` of an untroubled run."""
-    with tempfile.NamedTemporaryFile("r") as told:
+    with tempfile.NamedTemporaryFile("r") as reported:
 
         def prepare() -> None:
-            handle = os.open(told.name, os.O_WRONLY | os.O_APPEND)
+            handle = os.open(reported.name, os.O_WRONLY | os.O_APPEND)
 
             def then(_: int, what: str) -> None:
                 os.write(handle, f"{what}\n".encode())
@@ -105,7 +105,7 @@ def operations(folder: Path, names: frozenset[str], argv: Sequence[str]) -> list
 
         ended = forked(prepare, argv)
         assert ended.status == 0, ended.said
-        return told.read().splitlines()
+        return reported.read().splitlines()
 
 
 def killed_before(folder: Path, operation: int, argv: Sequence[str]) -> Ended:

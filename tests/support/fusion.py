@@ -92,7 +92,7 @@ def drive(
         from_m: First distance to the start of the intersection.
         to_m: Last one, below it; negative is past.
         seen: From cue to (distance below which it is seen until passed, how many). A stop sign
-            tells its range.
+            reports its range.
         step_m: Way between frames.
         begin_ns: Time of the first frame.
     """

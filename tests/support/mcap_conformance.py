@@ -57,13 +57,13 @@ class Conformance:
 
 def load(description: Path) -> Conformance:
     """The file described by one JSON file."""
-    told = json.loads(description.read_text())
-    records = [(r["type"], dict(r["fields"])) for r in told["records"]]
+    reported = json.loads(description.read_text())
+    records = [(r["type"], dict(r["fields"])) for r in reported["records"]]
     stored = description.with_suffix(".mcap").read_bytes()
     pointer = re.search(rb"oid sha256:([0-9a-f]{64})", stored)
     if pointer is None:
         return Conformance(description.stem, stored, _messages(records), True)
-    coded = rebuild(records, frozenset(told["meta"]["variant"]["features"]))
+    coded = rebuild(records, frozenset(reported["meta"]["variant"]["features"]))
     is_exact = hashlib.sha256(coded).hexdigest() == pointer[1].decode()
     return Conformance(description.stem, coded, _messages(records), is_exact)
 

@@ -87,7 +87,7 @@ class Kind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What became of one damaged copy, and the share of messages kept."""
+    """What became of one damaged copy, and the fraction of messages kept."""
 
     kind: Kind
     kept: float = 0.0
@@ -109,8 +109,8 @@ def judge(path: Path, truth: Reading) -> Verdict:
         return Verdict(Kind.CHANGED if only_changed else Kind.WRONG, kept)
     if reading.count() < truth.count():
         accounts = reading.ledger.accounts.values()
-        is_told = not reading.ledger.is_whole or any(one.skipped for one in accounts)
-        return Verdict(Kind.TOLD if is_told else Kind.SILENT, kept)
+        is_annotated = not reading.ledger.is_whole or any(one.skipped for one in accounts)
+        return Verdict(Kind.TOLD if is_annotated else Kind.SILENT, kept)
     if not reading.ledger.is_whole:
         return Verdict(Kind.TOLD, kept)
     said = reading.ledger.notices != truth.ledger.notices

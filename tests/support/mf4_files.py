@@ -359,7 +359,7 @@ def _store(
     for k, part in enumerate(parts):
         one = blocks.add(b"##DZ", [], deflated(part, coding)) if coding >= 0 else 0
         one = one or blocks.add(b"##DT", [], part)
-        # A logger that was cut off never told the list of its last blocks.
+        # A logger that was cut off never reported the list of its last blocks.
         if is_finalized or not flags & 0x10 or k < len(parts) // 2:
             blocks.link(listed, 1 + k, one)
     return at or listed

@@ -140,7 +140,7 @@ def by_topic(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 Verdict = Literal[
-    "refused", "same", "told", "wrong, told", "undetectable", "SILENT LOSS", "SILENT WRONG"
+    "refused", "same", "reported", "wrong, reported", "undetectable", "SILENT LOSS", "SILENT WRONG"
 ]
 
 
@@ -158,17 +158,17 @@ def judge(path: Path, truth: Sequence[Row], calm: frozenset[str] = frozenset()) 
         return "refused"
     ledger = reading.ledger
     _check_identity(ledger, reading.rows)
-    was_told = not ledger.is_whole or bool(set(ledger.notices) - calm)
-    was_told = was_told or any(account.skipped for account in ledger.accounts.values())
+    was_reported = not ledger.is_whole or bool(set(ledger.notices) - calm)
+    was_reported = was_reported or any(account.skipped for account in ledger.accounts.values())
     if by_topic(reading.rows) == by_topic(truth):
         return "same"
     strange = Counter(reading.rows) - Counter(truth)
     if not strange:
-        return "told" if was_told else "SILENT LOSS"
+        return "reported" if was_reported else "SILENT LOSS"
     if _only_payloads_differ(reading.rows, truth, strange, path.suffix == ".db3"):
         assert "cannot be seen" in ledger.integrity
         return "undetectable"
-    return "wrong, told" if was_told else "SILENT WRONG"
+    return "wrong, reported" if was_reported else "SILENT WRONG"
 
 
 def _only_payloads_differ(

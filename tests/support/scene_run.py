@@ -105,7 +105,7 @@ def road(frames: int = FRAMES) -> pa.Table:
 
 
 def frames_seen(frames: int = FRAMES) -> pa.Table:
-    """As the detect stage tells them."""
+    """As the detect stage reports them."""
     times = frame_table(frames)["t_ns"].to_pylist()
     rows = [
         {"frame": i, "t_ns": t, "camera": TOPIC, "width_px": SIZE[0], "height_px": SIZE[1]}

@@ -60,7 +60,7 @@ def truth(
 ) -> DriveTruth:
     """The made-up drive's truth; ranges go on beyond none of its approaches."""
     approaches = [approach()] if approaches is None else approaches
-    told = Truth(
+    reported = Truth(
         version=1,
         start_ns=at(0),
         end_ns=at(end),
@@ -68,7 +68,7 @@ def truth(
         approaches=tuple(approaches),
         source="made up",
     )
-    return DriveTruth(drive, told, true_ranges(approaches))
+    return DriveTruth(drive, reported, true_ranges(approaches))
 
 
 def true_ranges(approaches: Sequence[Approach]) -> TrueRanges:
@@ -198,7 +198,7 @@ def good_truth(drive: str = "made up") -> DriveTruth:
 
 
 def log_row(log: Path, run: RunFolder, sha256: str = "00", *cameras: str) -> LogRow:
-    """A log as a manifest tells of it; of one that is not there, with a made-up identity."""
+    """A log as a manifest reports it; of one that is not there, with a made-up identity."""
     found = identity_of(log) if log.exists() else Identity(log.name, 0, "0" * 64)
     return LogRow(
         name=log.name,
@@ -233,12 +233,12 @@ def truth_folder(path: Path, drive_truth: DriveTruth | None = None) -> Path:
     """The made-up truth as files; the path of ``truth.json`` comes back."""
     path.mkdir(parents=True, exist_ok=True)
     one = good_truth() if drive_truth is None else drive_truth
-    told = one.truth
+    reported = one.truth
     if one.ranges is not None:
         rows = zip(
             one.ranges.t_ns, one.ranges.approach, one.ranges.start_m, one.ranges.end_m, strict=True
         )
         lines = ["t_ns,approach,start_m,end_m", *(f"{t},{a},{s},{e}" for t, a, s, e in rows), ""]
         write_text(path / "ranges.csv", "\n".join(lines))
-        told = told.model_copy(update={"ranges": "ranges.csv"})
-    return save(told, path)
+        reported = reported.model_copy(update={"ranges": "ranges.csv"})
+    return save(reported, path)

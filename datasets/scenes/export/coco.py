@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.datasets.scenes.cues import LEAST_PIXELS
+from crosscue.datasets.scenes.cues import MIN_PIXELS
 from crosscue.datasets.scenes.rendering.render import Picture
 from crosscue.datasets.scenes.world import CATEGORIES
 from crosscue.detectors.rle import encode
@@ -45,7 +45,7 @@ class Objects:
         )
         for seen in picture.seen:
             area = int(seen.mask.sum())
-            if area < LEAST_PIXELS:
+            if area < MIN_PIXELS:
                 continue
             x0, y0, x1, y1 = seen.box_px
             counts = encode(seen.mask, (x0, y0), (wide, high)).decode("ascii")

@@ -15,7 +15,7 @@ from crosscue.detectors.overlay import write_label
 BEFORE_M: Final = 25.0
 """Where the pictures are taken, before the intersection."""
 SHOWN: Final = 0.7
-"""The middle share of each picture, wide and high: the rest is sky, bonnet and kerb."""
+"""The middle fraction of each picture, wide and high: the rest is sky, bonnet and kerb."""
 
 
 def contact_sheet(

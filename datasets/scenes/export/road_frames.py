@@ -18,7 +18,7 @@ class RoadFrames:
 
     Attributes:
         pixels: Shape (N, H, W, 3), uint8, blue, green, red.
-        road: Shape (N, H, W), uint8: 0 to 255, the share of the pixel that is road.
+        road: Shape (N, H, W), uint8: 0 to 255, the fraction of the pixel that is road.
     """
 
     pixels: Bytes

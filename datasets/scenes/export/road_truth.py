@@ -14,7 +14,7 @@ from crosscue.datasets.scenes.rendering.camera import View
 from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M
 
 SKY_UP = -0.002
-"""Rays that fall less than this share of their length do not meet the ground, as in the picture."""
+"""Rays that fall less than this fraction of their length do not meet the ground."""
 
 
 def road_seen(

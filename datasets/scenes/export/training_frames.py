@@ -24,7 +24,7 @@ from crosscue.replay.processes import in_processes
 from .coco import Objects
 
 BEFORE_ENTRY: Final = 0.9
-"""Share of the pictures from before the intersection; the others are from within it."""
+"""Fraction of the pictures from before the intersection; the others are from within it."""
 
 
 def times_s(world: World, count: int, rng: np.random.Generator) -> Floats:

@@ -301,7 +301,7 @@ def cast_shadows(
         painted: The map.
         outlines: Convex outlines of solid shadows, metres, (K, 2) each.
         blobs: Rows of x, y, radius along and across, direction of trees' shadows.
-        remains: Share of light in shadow.
+        remains: Fraction of light in shadow.
     """
     import cv2
 

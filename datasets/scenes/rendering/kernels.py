@@ -22,7 +22,7 @@ Int64s = NDArray[np.int64]
 
 NEAR_M: Final = 0.25
 OPAQUE: Final = 110
-MOST_TAPS: Final = 7
+MAX_TAPS: Final = 7
 
 
 class Kernels(NamedTuple):
@@ -372,7 +372,7 @@ def compose(
                     across = reach / focal * texels_per_m
                     flat = math.sqrt(wx * wx + wy * wy)
                     along = across / (-up)
-                    taps = min(MOST_TAPS, max(1, int(min(along / across, 1.5 * along) + 0.5)))
+                    taps = min(MAX_TAPS, max(1, int(min(along / across, 1.5 * along) + 0.5)))
                     texel = max(across, along / taps)
                     level = 0
                     while texel > 1.5 and level < deepest:

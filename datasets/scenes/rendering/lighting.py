@@ -22,7 +22,7 @@ class Daylight:
 
     Attributes:
         to_sun: Unit vector towards the sun, local frame.
-        sun: Colour of direct light; zero where there is none.
+        sun: Colour of direct light; zero where none exists.
         ambient: Colour of the sky's light.
         haze: Colour that far things fade to, 0 to 255.
         haze_per_m: 1 over the distance at which half is haze.
@@ -64,7 +64,7 @@ class Daylight:
 
     @property
     def in_shadow(self) -> float:
-        """Share of the ground's light that remains in shadow."""
+        """Fraction of the ground's light that remains in shadow."""
         return float((self.ambient.sum()) / self.on_ground.sum())
 
 

@@ -17,7 +17,7 @@ from .kernels import compiled
 from .mesh import Floats, Mesh
 from .textures import smooth_noise
 
-MOST_ABOUT: Final = 3
+MAX_ABOUT: Final = 3
 """An object's picture is measured at most so many pictures about the picture itself."""
 
 
@@ -49,8 +49,8 @@ class Seen:
         thing: The object.
         mask: Shape (H, W), bool, of its box's pixels alone.
         box_px: x0, y0, x1, y1 of the visible part, half open, whole pixels.
-        visible: Share of the object within the picture that nothing hides.
-        in_picture: Share of the object that is within the picture.
+        visible: Fraction of the object within the picture that nothing hides.
+        in_picture: Fraction of the object that is within the picture.
         distance_m: From the rear axle along the car's axis.
     """
 
@@ -266,15 +266,15 @@ class Renderer:
     def _shares(
         self, thing: Thing, t_s: float, view: View, pixels: int, corners: Floats
     ) -> tuple[float, float]:
-        """Visible share of what is in the picture, and the share that is in the picture."""
+        """Visible fraction of what is in the picture, and the fraction that is in the picture."""
         wide, high = self.camera.width_px, self.camera.height_px
         ahead = corners[corners[:, 2] > 0.3]
         if len(ahead) < len(corners):
             return 0.0, 0.0
         left, top = np.floor(ahead[:, :2].min(0)).astype(int)
         right, bottom = np.ceil(ahead[:, :2].max(0)).astype(int)
-        left, right = max(left, -MOST_ABOUT * wide), min(right, (1 + MOST_ABOUT) * wide)
-        top, bottom = max(top, -MOST_ABOUT * high), min(bottom, (1 + MOST_ABOUT) * high)
+        left, right = max(left, -MAX_ABOUT * wide), min(right, (1 + MAX_ABOUT) * wide)
+        top, bottom = max(top, -MAX_ABOUT * high), min(bottom, (1 + MAX_ABOUT) * high)
         covered = np.zeros((max(bottom - top, 1), max(right - left, 1)), np.uint8)
         mesh = thing.mesh_at(t_s)
         total = self._kernels.cover(

@@ -26,7 +26,7 @@ from .network import Plan, build_network
 
 KEY: Final = "crosscue"
 VERSION: Final = 1
-MOST_BYTES: Final = 2 << 30
+MAX_BYTES: Final = 2 << 30
 _PICKLES: Final = frozenset({".pth", ".pt", ".pkl", ".pickle", ".bin", ".ckpt", ".joblib", ".npy"})
 """Suffixes under which pickles travel."""
 
@@ -34,9 +34,9 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Calibration(Settings):
-    """From a network's score s to the share of such detections that are right.
+    """From a network's score s to the fraction of such detections that are right.
 
-    The logit of the share is ``slope * logit(s) + offset`` (Platt 1999).
+    The logit of the fraction is ``slope * logit(s) + offset`` (Platt 1999).
     """
 
     slope: Annotated[float, Field(gt=0.0, le=100.0)] = 1.0
@@ -125,11 +125,11 @@ def _content(path: Path) -> bytes:
             "(convert with safetensors.torch.save_file where you trust the file)"
         )
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
     except OSError as error:
         raise VehicleError(f"{path}: {error.strerror}; check the network's file name") from None
     if content is None:
-        raise VehicleError(f"{path}: more than {MOST_BYTES:,} bytes; want a checkpoint")
+        raise VehicleError(f"{path}: more than {MAX_BYTES:,} bytes; want a checkpoint")
     return content
 
 

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-LEAST_CHANNELS: Final = 48
-LEAST_PIXELS: Final = 256
+MIN_CHANNELS: Final = 48
+MIN_PIXELS: Final = 256
 """Below these the plain sum is as fast: measured from 32 to 512 channels, 100 to 24,000 pixels."""
 
 
@@ -71,7 +71,7 @@ def _is_suited(convolution: nn.Conv2d) -> bool:
         and convolution.dilation == (1, 1)
         and convolution.groups == 1
         and convolution.padding_mode == "zeros"
-        and min(convolution.in_channels, convolution.out_channels) >= LEAST_CHANNELS
+        and min(convolution.in_channels, convolution.out_channels) >= MIN_CHANNELS
     )
 
 
@@ -104,6 +104,6 @@ class Winograd(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """The same size."""
-        if x.shape[2] * x.shape[3] < LEAST_PIXELS:
+        if x.shape[2] * x.shape[3] < MIN_PIXELS:
             return functional.conv2d(x, self.weight, self.bias, padding=1)
         return torch._nnpack_spatial_convolution(x, self.weight, self.bias, (1, 1), (1, 1))

@@ -27,7 +27,7 @@ from torch import Tensor
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Detector, Found, Frame, View
 from crosscue.detectors.devices import chosen_device
-from crosscue.detectors.settings import Settings, Share, identity_of, settings_of
+from crosscue.detectors.settings import Proportion, Settings, identity_of, settings_of
 from crosscue.replay.columns import Bytes, Floats
 from crosscue.replay.errors import CrosscueError, VehicleError
 
@@ -52,11 +52,11 @@ class MaskRcnnSettings(Settings):
 
     network: str = EMBEDDED
     """``embedded``, ``resnet50``, ``resnet50-v2``, or the file name of a checkpoint."""
-    score: Share = 0.5
+    score: Proportion = 0.5
     """Least score of a detection that is given; the cues have their own, higher ones."""
     proposals: Annotated[int, Field(ge=1, le=2000)] = PROPOSALS
-    """Most places that are looked at more closely; torchvision's own number is 1000."""
-    objectness: Share = 0.0
+    """Most places that are examined more closely; torchvision's own number is 1000."""
+    objectness: Proportion = 0.0
     """Least probability that such a place holds anything; torchvision's own is 0."""
     batch: Annotated[int, Field(ge=1, le=256)] | None = None
     """Pictures at a time; without it 1 on a CPU and 8 on a GPU."""
@@ -209,11 +209,11 @@ class MaskRcnnDetector:
             with torch.autocast(self.device.type, enabled=is_halved):
                 raw = detected(self.checkpoint.network, self.parts, pictures)
             return [
-                self._told(frame, one, tensors)
+                self._report_text(frame, one, tensors)
                 for frame, one, tensors in zip(frames, placed, raw, strict=True)
             ]
 
-    def _told(self, frame: Frame, placed: Placed, raw: dict[str, Tensor]) -> Detections:
+    def _report_text(self, frame: Frame, placed: Placed, raw: dict[str, Tensor]) -> Detections:
         facts = self.checkpoint.facts
         names = [facts.plan.classes[int(label) - 1] for label in raw["labels"].tolist()]
         boxes, raw_scores, masks = (
@@ -306,7 +306,7 @@ def _whole(side: int) -> int:
 
 
 def calibrated(score: float, by: Calibration) -> float:
-    """From a network's score to the share of such detections that are right."""
+    """From a network's score to the fraction of such detections that are right."""
     if by == Calibration():
         return score
     kept = min(max(score, 1e-9), 1.0 - 1e-9)

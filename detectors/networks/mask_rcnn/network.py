@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from crosscue.detectors.settings import Settings, Share
+from crosscue.detectors.settings import Proportion, Settings
 
 Architecture = Literal["compact", "resnet50", "resnet50-v2"]
 CHANNELS: Final = 64
@@ -27,7 +27,7 @@ STRIDE: Final = 32
 ANCHORS_PX: Final = ((6, 11), (20, 36), (64, 112), (176, 288))
 ASPECTS: Final = (0.45, 1.0, 2.6)
 """Height over width: an upright light, a sign, a car from the side."""
-MOST_BEFORE_SUPPRESSION: Final = 1000
+MAX_BEFORE_SUPPRESSION: Final = 1000
 """Boxes of a level that compete to be proposals; torchvision's own number."""
 
 
@@ -38,15 +38,15 @@ class Plan(Settings):
         architecture: Which.
         classes: Names of the classes, without the background; None in places not used.
         width_px: Pictures are scaled to this width.
-        top: Share of the picture's height above what the network looks at.
+        top: Fraction of the picture's height above what the network examines.
         bottom: Likewise below.
     """
 
     architecture: Architecture
     classes: Annotated[tuple[str | None, ...], Field(min_length=1, max_length=1000, strict=False)]
     width_px: Annotated[int, Field(ge=64, le=4096)]
-    top: Share = 0.0
-    bottom: Share = 0.0
+    top: Proportion = 0.0
+    bottom: Proportion = 0.0
 
     @model_validator(mode="after")
     def _something_is_left(self) -> Plan:
@@ -73,7 +73,7 @@ def build_network(plan: Plan) -> Any:
 
 
 def set_limits(network: Any, proposals: int, score: float, objectness: float = 0.0) -> None:
-    """Which places the network looks at more closely, and the least score of what it gives.
+    """Which places the network examines more closely, and the least score of what it gives.
 
     Boxes below the score never reach the mask head, so this is also where the masks' time is saved.
 
@@ -85,7 +85,7 @@ def set_limits(network: Any, proposals: int, score: float, objectness: float = 0
             is 0, so that most of its 1000 places are plain background.
     """
     rpn, heads = network.rpn, network.roi_heads
-    before = max(proposals, min(3 * proposals, MOST_BEFORE_SUPPRESSION))
+    before = max(proposals, min(3 * proposals, MAX_BEFORE_SUPPRESSION))
     rpn._pre_nms_top_n = {**rpn._pre_nms_top_n, "testing": before}
     rpn._post_nms_top_n = {**rpn._post_nms_top_n, "testing": proposals}
     rpn.score_thresh = objectness

@@ -90,7 +90,7 @@ def _places(
         # In torchvision's order of sums, so that both round alike.
         at = start + np.float32(i // samples) * cell
         at += (np.float32(i % samples) + np.float32(0.5)) * cell / np.float32(samples)
-        # Written so that a number that is none is outside too.
+        # Written so that a number that is not one is outside too.
         if not (at >= np.float32(-1.0) and at <= np.float32(size)):
             low[i] = -1
             continue

@@ -3,7 +3,7 @@
 Of a thousand proposals about fifty hold an object, yet the box head costs as much for each. Its
 first layer is most of that, and a product of two thin matrices stands in for it roughly (truncated
 singular values; Girshick 2015, section 3.1). Rough scores only rule out: what is
-found was looked at closely.
+found was examined closely.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from .parts import TorchParts
 FEWEST: Final = 200
 """Proposals from which it pays."""
 RANK: Final = 3 / 16
-"""Of the thin matrices, as a share of the layer's outputs."""
+"""Of the thin matrices, as a fraction of the layer's outputs."""
 MARGIN: Final = 2.5
 """Log-odds by which a rough score may be too low before a detection could be lost."""
 CHECKED: Final = 40
-"""Every so many proposals one is looked at closely in any case, to see how wrong the rough is."""
+"""Every so many proposals one is examined closely in any case, to see how wrong the rough is."""
 
 
 def can_screen(network: Any) -> bool:

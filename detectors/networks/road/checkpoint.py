@@ -20,7 +20,7 @@ from crosscue.replay.files.whole_file import write_bytes
 from .network import RoadNetwork
 
 KEY: Final = "crosscue-road"
-MOST_BYTES: Final = 64 << 20
+MAX_BYTES: Final = 64 << 20
 
 
 class RoadFacts(Settings):
@@ -71,9 +71,9 @@ def load_road(path: Path) -> RoadCheckpoint:
     if path.suffix != ".safetensors":
         raise VehicleError(f"{path}: want .safetensors; other files can run programs when read")
     try:
-        content = read_at_most(path, MOST_BYTES)
+        content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise VehicleError(f"{path}: more than {MOST_BYTES:,} bytes; want a road network")
+            raise VehicleError(f"{path}: more than {MAX_BYTES:,} bytes; want a road network")
     except OSError as error:
         raise VehicleError(f"{path}: {error.strerror}; check the file name") from None
     description, tensors = unpacked(content, KEY, path)

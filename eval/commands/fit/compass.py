@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, tell, and write where asked."""
+    """Fit, report, and write where asked."""
     check_vehicle_output(args)
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     with open_logs(args.logs, limits_of(args)) as logs:
@@ -49,13 +49,13 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(_as_json(fitted))
     elif not args.quiet:
-        print(_told(fitted))
+        print(_report_text(fitted))
         if args.output is not None:
             print(f"written to {args.output}")
     return 0
 
 
-def _told(fitted: CompassFit) -> str:
+def _report_text(fitted: CompassFit) -> str:
     sd_deg, turn_deg = math.degrees(fitted.residual_sd_rad), fitted.settings.mounting_yaw_rad
     bound = "at least " if fitted.persists_is_bound else ""
     lines = [

@@ -1,6 +1,6 @@
 """Choose the match threshold for a wanted false-match rate, from labelled pictures.
 
-Half of the query pictures choose it, the other half tell the rates. Pairs come from a CSV file
+Half of the query pictures choose it, the other half gives the rates. Pairs come from a CSV file
 query,known,same (pictures relative to its folder; same is 1 or 0), or from a drive with known poses
 against a database that another drive made.
 
@@ -90,7 +90,7 @@ def _fraction(text: str) -> float:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, tell, and write where asked."""
+    """Fit, report, and write where asked."""
     given = (bool(args.pairs), bool(args.logs), bool(args.database), bool(args.poses))
     if given not in ((True, False, False, False), (False, True, True, True)):
         raise UsageError("fit landmarks: give --pairs, or LOG... with --database and --poses")
@@ -119,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({**asdict(fitted), "is_shown": fitted.is_shown, "matcher": matcher.kind})
     elif not args.quiet:
-        print(_told(fitted))
+        print(_report_text(fitted))
         if args.output is not None:
             print(f"written to {args.output}")
     return 0
@@ -148,7 +148,7 @@ def _pairs_of_logs(args: argparse.Namespace, vehicle: Vehicle, matcher: Matcher)
     return pairs
 
 
-def _told(fitted: LandmarkFit) -> str:
+def _report_text(fitted: LandmarkFit) -> str:
     lines = [
         f"threshold   min_score = {fitted.min_score:g} for a false-match rate of "
         f"{fitted.wanted_rate:g}",

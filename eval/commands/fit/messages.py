@@ -19,7 +19,7 @@ from pathlib import Path
 from crosscue.datasets.truth.truth import load
 from crosscue.eval.commands.shared.options import print_json, refuse_existing
 from crosscue.eval.commands.shared.progress import Done, with_progress
-from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, section_of, told_of
+from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, rates_of, section_of
 from crosscue.eval.runs.folder import open_run
 from crosscue.fusion.fade_fit import FadeFit
 from crosscue.fusion.message_fit import MessageFit, RateFit, Side, fit_messages
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Learn and tell."""
+    """Learn and report."""
     if len(args.runs) != len(args.truth):
         raise UsageError(
             f"fit messages: {len(args.runs)} runs, {len(args.truth)} truth files; give one "
@@ -78,20 +78,20 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(_as_json(fitted, found.used))
     elif not args.quiet:
-        print(_told(fitted, found.used, len(runs)))
+        print(_report_text(fitted, found.used, len(runs)))
         print(section_of(fitted) if args.output is None else f"written to {args.output}")
     return 0
 
 
-def _told(fitted: MessageFit, used: Counter[str], runs: int) -> str:
+def _report_text(fitted: MessageFit, used: Counter[str], runs: int) -> str:
     lines = [f"{runs} runs, {fitted.approaches} approaches to learn from"]
     lines += [f"  {count:5} {what}" for what, count in sorted(used.items())]
     lines += ["", "shares of positive looks, feature there and not there (95 % intervals)"]
-    lines += [_rate_told(one, one.rates) for one in fitted.rates if one.rates is not None]
+    lines += [_rate_text(one, one.rates) for one in fitted.rates if one.rates is not None]
     lines += ["", "too little seen, so the published message stands"]
-    lines += [_unlearned_told(one) for one in fitted.rates if one.rates is None]
+    lines += [_unlearned_text(one) for one in fitted.rates if one.rates is None]
     lines += ["", "looks become independent over"]
-    lines += [_fade_told(one) for one in fitted.fades]
+    lines += [_fade_text(one) for one in fitted.fades]
     scales = ", ".join(f"{name} {value:.2f}" for name, value in fitted.calibrated.exponents.items())
     lines += ["", f"exponents: {scales or 'none: no feature was both there and not there'}", ""]
     return "\n".join(lines)
@@ -101,17 +101,17 @@ def _name_of(one: RateFit) -> str:
     return f"  {one.cue} -> {one.feature}, {'near' if one.near else 'far'}"
 
 
-def _rate_told(one: RateFit, rates: Rates) -> str:
+def _rate_text(one: RateFit, rates: Rates) -> str:
     says = math.log(rates.if_there / rates.if_not)
     silence = math.log((1.0 - rates.if_there) / (1.0 - rates.if_not))
     return (
-        f"{_name_of(one)}\n    there     {_side_told(one.there)}\n"
-        f"    not there {_side_told(one.missing)}\n"
+        f"{_name_of(one)}\n    there     {_side_text(one.there)}\n"
+        f"    not there {_side_text(one.missing)}\n"
         f"    log odds of a detection {says:+.2f}, of none {silence:+.2f}"
     )
 
 
-def _unlearned_told(one: RateFit) -> str:
+def _unlearned_text(one: RateFit) -> str:
     positive = sum(rate > 0.0 for rate in (*one.there.rates, *one.missing.rates))
     return (
         f"{_name_of(one)}: {one.there.places} places with it, {one.missing.places} without, "
@@ -119,16 +119,16 @@ def _unlearned_told(one: RateFit) -> str:
     )
 
 
-def _side_told(side: Side) -> str:
-    told = told_of(side)
+def _side_text(side: Side) -> str:
+    reported = rates_of(side)
     return (
-        f"{told.rate:.2f} ({told.wilson.low:.2f} to {told.wilson.high:.2f} by "
-        f"{side.looks:.0f} looks in {side.frames} frames; {told.places.low:.2f} to "
-        f"{told.places.high:.2f} by {side.places} places)"
+        f"{reported.rate:.2f} ({reported.wilson.low:.2f} to {reported.wilson.high:.2f} by "
+        f"{side.looks:.0f} looks in {side.frames} frames; {reported.places.low:.2f} to "
+        f"{reported.places.high:.2f} by {side.places} places)"
     )
 
 
-def _fade_told(one: FadeFit) -> str:
+def _fade_text(one: FadeFit) -> str:
     fade = one.fade
     scale = f"{fade.way_m:.1f} m" if fade.way_m is not None else f"{fade.time_s:.2f} s"
     why = "" if one.is_learned else ", not learned: too few positive, or always so"
@@ -165,10 +165,10 @@ def _as_json(fitted: MessageFit, used: Counter[str]) -> dict[str, object]:
 
 
 def _side_json(side: Side) -> dict[str, object]:
-    told = told_of(side)
+    reported = rates_of(side)
     return {
         **side._asdict(),
-        "rate": told.rate,
-        "wilson": list(told.wilson),
-        "by_places": list(told.places),
+        "rate": reported.rate,
+        "wilson": list(reported.wilson),
+        "by_places": list(reported.places),
     }

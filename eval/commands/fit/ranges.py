@@ -92,7 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit and tell."""
+    """Fit and report."""
     if not args.bin_m > 0.0:
         raise UsageError(f"--bin-m {args.bin_m}: want more than 0")
     if args.figure is not None and args.figure.exists() and not args.overwrite:
@@ -119,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
         }
         print_json(tree if tested is None else {**tree, "tested": _as_json(tested)})
     elif not args.quiet:
-        print(_told(args.cue, fits, best, tested))
+        print(_report_text(args.cue, fits, best, tested))
     return 0
 
 
@@ -144,7 +144,7 @@ def _pairs(args: argparse.Namespace) -> RangePairs:
     return pairs
 
 
-def _told(cue: str, fits: list[RangeFit], best: RangeFit, tested: RangeFit | None) -> str:
+def _report_text(cue: str, fits: list[RangeFit], best: RangeFit, tested: RangeFit | None) -> str:
     lines = [f"{fit.curve.family:15} residual s.d. {fit.curve.residual_sd_m:.2f} m" for fit in fits]
     lines += [f"{'published':15} residual s.d. {PUBLISHED_SD_M[cue]:.1f} m, on real images"]
     lines += ["", f"{best.curve.family} by distance, {best.pairs} pairs:", *_bins(best.bins)]

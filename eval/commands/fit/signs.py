@@ -1,4 +1,4 @@
-"""Choose the sign detector's threshold for a wanted precision, and tell how good it is elsewhere.
+"""Choose the sign detector's threshold for a wanted precision, and measure it elsewhere.
 
 LABELS is a CSV file: picture,label,x0,y0,x1,y1 with one row for each sign (or an empty label for a
 picture without any), a COCO file as crosscue train frames writes it, or the folder of a drive with
@@ -26,7 +26,7 @@ from crosscue.detectors.training.operating_point import Judged, rates_at, thresh
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.fit.sign_scores import Rules, judged_pictures
-from crosscue.eval.scoring.intervals import Share, share
+from crosscue.eval.scoring.intervals import Proportion, share
 from crosscue.replay.errors import UsageError
 
 LOWEST = 0.05
@@ -125,7 +125,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Choose and tell; 1 when no threshold is precise enough."""
+    """Choose and report; 1 when no threshold is precise enough."""
     for name in ("precision", "overlap"):
         if not 0.0 < getattr(args, name) <= 1.0:
             raise UsageError(f"--{name} {getattr(args, name)}: want above 0, at most 1")
@@ -144,12 +144,12 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(_as_json(score, fitted, tested))
     elif not args.quiet:
-        print(_told(score, fitted, tested, args.precision))
+        print(_report_text(score, fitted, tested, args.precision))
     return 0 if score is not None else 1
 
 
 def _shown(score: float | None) -> float | None:
-    """With as many digits as are printed, rounded down: what is told is told of that number."""
+    """With as many digits as are printed, rounded down: what is printed belongs to that number."""
     return None if score is None else math.floor(score * 1e6) / 1e6
 
 
@@ -180,8 +180,8 @@ def _judged(args: argparse.Namespace) -> tuple[list[Judged], list[Judged]]:
 class _Rates:
     """Precision and recall, with intervals over rows and over files or drives."""
 
-    precision: Share
-    recall: Share
+    precision: Proportion
+    recall: Proportion
 
 
 def _rates(parts: Sequence[Judged], score: float) -> _Rates:
@@ -192,13 +192,13 @@ def _rates(parts: Sequence[Judged], score: float) -> _Rates:
     )
 
 
-def _share(counts: Sequence[tuple[int, int]]) -> Share:
+def _share(counts: Sequence[tuple[int, int]]) -> Proportion:
     is_right = [np.arange(of) < right for right, of in counts]
     which = np.repeat(np.arange(len(counts)), [of for _, of in counts])
     return share(np.concatenate(is_right), which)
 
 
-def _told(
+def _report_text(
     score: float | None, fitted: Sequence[Judged], tested: Sequence[Judged], precision: float
 ) -> str:
     if score is None:
@@ -207,12 +207,12 @@ def _told(
     lines = [f"least_score = {score:g}"]
     for name, parts in (("chosen on", fitted), ("other frames", tested)):
         rates = _rates(parts, score)
-        lines.append(f"{name:13} {_share_told('precision', rates.precision)}")
-        lines.append(f"{'':13} {_share_told('recall', rates.recall)}")
+        lines.append(f"{name:13} {_proportion_text('precision', rates.precision)}")
+        lines.append(f"{'':13} {_proportion_text('recall', rates.recall)}")
     return "\n".join(lines)
 
 
-def _share_told(name: str, part: Share) -> str:
+def _proportion_text(name: str, part: Proportion) -> str:
     if not part.of:
         return f"{name:9} none (0 of 0)"
     interval = f"95 % interval {part.low:.2f} to {part.high:.2f}"

@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({"database": str(args.database), **asdict(counts)})
     elif not args.quiet:
-        print(_told(args.database, counts))
+        print(_report_text(args.database, counts))
     return 0 if is_whole else 3
 
 
@@ -124,7 +124,7 @@ def _add_logs(
     return counts, all(ledger.is_whole for ledger in ledgers)
 
 
-def _told(database: Path, counts: AddCounts) -> str:
+def _report_text(database: Path, counts: AddCounts) -> str:
     left_out = [
         f"{count} {why}"
         for count, why in (

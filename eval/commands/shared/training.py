@@ -24,7 +24,7 @@ def layouts_of(texts: Sequence[str], who: str) -> list[str]:
         who: The command or flag, for the error.
 
     Raises:
-        UsageError: One is none, none lies in a span, one comes twice, or there are too many.
+        UsageError: Not a layout, an empty span, one named twice, or too many.
     """
     names: list[str] = []
     for text in texts:

@@ -2,7 +2,7 @@
 
 33 range runs without landmarks and 10 with at most one landmark at a time, 75 minutes each, compass
 at 25 degrees. Every run is a log, a vehicle file and a truth file, replayed and scored by the code
-that takes real ones; each can be looked at with crosscue view. An interrupted study goes on with
+that takes real ones; each can be examined with crosscue view. An interrupted study goes on with
 the runs that are missing. A run takes seconds to a minute.
 
 examples:
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive, replay, score, tell."""
+    """Drive, replay, score, report."""
     from crosscue.eval.studies.town.field_study import NOTES, PAGE, drive_field, finish_field
     from crosscue.eval.studies.town.settings import FieldStudy
 

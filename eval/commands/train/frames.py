@@ -77,11 +77,15 @@ def run(args: argparse.Namespace) -> int:
         parts.append(part)
     whole = joined(parts)
     whole.save(target, f"{SOURCE}; layouts {' '.join(args.layouts)}, seed {args.seed}")
-    told = {"coco": str(target), "pictures": len(whole.images), "objects": len(whole.annotations)}
+    reported = {
+        "coco": str(target),
+        "pictures": len(whole.images),
+        "objects": len(whole.annotations),
+    }
     if args.json:
-        print_json(told)
+        print_json(reported)
     elif not args.quiet:
-        print(f"{target}: {told['pictures']} pictures, {told['objects']} objects")
+        print(f"{target}: {reported['pictures']} pictures, {reported['objects']} objects")
     return 0
 
 

@@ -2,7 +2,7 @@ r"""Train a Mask R-CNN on COCO annotations: a compact one from nothing, or go on
 
 OUT is a checkpoint (.safetensors) for the detector mask-rcnn. Beside it lie OUT's curve (JSON and
 PNG) and, until the training ends, the state that --resume goes on with. --measure trains nothing:
-it tells average precision (COCO's rules), and precision and recall at the scores that cues take.
+it reports average precision (COCO's rules), and precision and recall at the scores that cues take.
 
 examples:
   crosscue train frames L0-L319 --per-layout 8 -o frames
@@ -34,7 +34,7 @@ CLASSES = ("car", "stop sign", "traffic light")
 EVERY = 10
 PROPOSALS = 100
 """The detector's own."""
-MOST_WINDOW_PX = 4096
+MAX_WINDOW_PX = 4096
 """As wide as the widest picture."""
 
 
@@ -193,7 +193,7 @@ def run(args: argparse.Namespace) -> int:
 
     facts = run_job(job, train, held_out, resume=args.resume, overwrite=args.overwrite, tell=tell)
     _draw(job)
-    _tell(facts, job, args)
+    _report(facts, job, args)
     return 0
 
 
@@ -217,10 +217,10 @@ def _check(args: argparse.Namespace) -> None:
         )
     if not 0.0 <= args.balance <= 1.0:
         raise UsageError(f"--balance {args.balance}: want 0 to 1")
-    if any(side % 32 or not 64 <= side <= MOST_WINDOW_PX for side in args.window):
+    if any(side % 32 or not 64 <= side <= MAX_WINDOW_PX for side in args.window):
         raise UsageError(
             f"--window {args.window[0]} {args.window[1]}: want multiples of 32 from 64 to "
-            f"{MOST_WINDOW_PX}"
+            f"{MAX_WINDOW_PX}"
         )
     if not all(args.classes) or len(set(args.classes)) != len(args.classes):
         raise UsageError("--classes: one is empty or named twice; name each once")
@@ -229,7 +229,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _measure(args: argparse.Namespace) -> int:
-    """Tell how good a network is."""
+    """Measure how good a network is."""
     from dataclasses import replace
 
     from crosscue.detectors.devices import chosen_device
@@ -246,15 +246,17 @@ def _measure(args: argparse.Namespace) -> int:
     if not labelled.pictures:
         count = len(whole.pictures)
         raise UsageError(f"--subset {args.subset}: none of {count} pictures; name others")
-    told = []
+    reported = []
     for proposals in args.proposals:
         settings = MaskRcnnSettings(proposals=proposals, threads=args.threads, backend=args.backend)
         reached = measure(checkpoint, labelled, settings, device)
-        told.append(measured_tree(proposals, reached))
+        reported.append(measured_tree(proposals, reached))
         if not args.quiet and not args.json:
             print(measured_text(args.measure, len(labelled.pictures), proposals, reached))
     if args.json:
-        print_json({"network": args.measure, "pictures": len(labelled.pictures), "measured": told})
+        print_json(
+            {"network": args.measure, "pictures": len(labelled.pictures), "measured": reported}
+        )
     return 0
 
 
@@ -262,7 +264,7 @@ def _slice(text: str | None) -> slice:
     """Of ``A:B:N``, any of which may be missing.
 
     Raises:
-        UsageError: It is none.
+        UsageError: It is not one.
     """
     match = re.fullmatch(r"(\d{0,9}):(\d{0,9})(?::([1-9]\d{0,8})?)?", text or ":")
     if match is None:
@@ -351,7 +353,7 @@ def _draw(job: Job) -> None:
     plt.close(figure)
 
 
-def _tell(facts: Facts, job: Job, args: argparse.Namespace) -> None:
+def _report(facts: Facts, job: Job, args: argparse.Namespace) -> None:
     if args.json:
         print_json(facts.model_dump(mode="json"))
     elif not args.quiet:

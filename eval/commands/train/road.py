@@ -149,7 +149,7 @@ def run(args: argparse.Namespace) -> int:
     facts = RoadFacts(width_px=size[0], height_px=size[1], recipe=recipe)
     save_road(args.output, training.network, facts)
     _state(args).unlink(missing_ok=True)
-    _tell(str(args.output), recipe, args)
+    _report(str(args.output), recipe, args)
     return 0
 
 
@@ -178,7 +178,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _measure(args: argparse.Namespace) -> int:
-    """Tell how well a network does."""
+    """Measure how well a network does."""
     from crosscue.datasets.adapters.road_folder import load_folder
     from crosscue.detectors.devices import chosen_device
     from crosscue.detectors.networks.road.checkpoint import load_road
@@ -189,11 +189,11 @@ def _measure(args: argparse.Namespace) -> int:
     size = (checkpoint.facts.width_px, checkpoint.facts.height_px)
     frames = _scored(args, size) if args.data is None else load_folder(args.data, size)
     network = checkpoint.network.to(device)
-    _tell(args.measure, _measured(network, device, "measured", frames), args)
+    _report(args.measure, _measured(network, device, "measured", frames), args)
     return 0
 
 
-def _tell(name: str, facts: dict[str, str | int | float], args: argparse.Namespace) -> None:
+def _report(name: str, facts: dict[str, str | int | float], args: argparse.Namespace) -> None:
     if args.json:
         print_json({"checkpoint": name, **facts})
     elif not args.quiet:

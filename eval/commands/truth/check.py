@@ -30,17 +30,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check, and tell what the truth holds."""
+    """Check, and print what the truth contains."""
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     found = check_truth(args.truth, args.log, vehicle, limits_of(args))
     if args.json:
         print_json(asdict(found))
     elif not args.quiet:
-        _tell(found)
+        _report(found)
     return 0
 
 
-def _tell(found: TruthFit) -> None:
+def _report(found: TruthFit) -> None:
     print(f"fits       {found.seconds:.1f} s of truth")
     print(f"holds      {found.approaches} approaches, {found.cues} statements about cues,")
     print(f"           {found.objects} objects, {found.ranges} ranges, {found.poses} poses")

@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Import, and tell what came of it."""
+    """Import, and print the result."""
     output = args.output / FILE if args.output.is_dir() else args.output
     if output.exists() and not (args.add or args.overwrite):
         raise OutputError(f"{output}: exists; --add to it, --overwrite it, or give another name")
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(asdict(found) | {"truth": str(found.truth), "objects": str(found.objects)})
     elif not args.quiet:
-        _tell(found)
+        _report(found)
     return 0
 
 
@@ -87,7 +87,7 @@ def _meaning(text: str) -> tuple[str, str]:
     return label, cue
 
 
-def _tell(found: Imported) -> None:
+def _report(found: Imported) -> None:
     print(f"pictures   {found.pictures} with {found.things} things, placed {found.rule}")
     for cue, pictures in found.cues.items():
         print(f"           {cue}: there in {pictures}")

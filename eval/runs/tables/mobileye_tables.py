@@ -91,7 +91,7 @@ class StoredMobileye:
         return state_at(self._fresh(obstacles), self._fresh(lanes), t_ns, self._past)
 
     def forget_before(self, t_ns: int) -> None:
-        """Nothing told before ``t_ns`` counts any more."""
+        """Nothing reported before ``t_ns`` counts any more."""
         self._since_ns = t_ns
 
     def _fresh(self, held: Samples | None) -> Samples | None:

@@ -79,7 +79,7 @@ def write_skipped(
 def _in_bulk(
     single: Sequence[Mapping[str, Any]], log: str, topic: str, account: TopicLine
 ) -> list[dict[str, Any]]:
-    """A row for each reason of which the single rows tell less than the account."""
+    """A row for each reason of which the single rows report less than the account."""
     rows = []
     for known_counts, is_dropped in ((account.skipped, False), (account.dropped, True)):
         listed: Counter[str] = Counter()

@@ -74,12 +74,12 @@ MASK: Final = ("mask", "mask_width_px", "mask_height_px")
 def stored_frames(
     run: RunFolder, detectors: Sequence[DetectorRow], *, with_road_masks: bool = False
 ) -> Iterator[StoredFrame]:
-    """All frames of a run in the order they were looked at; memory holds one batch of rows.
+    """All frames of a run in the order they were examined; memory holds one batch of rows.
 
     Args:
         run: With the tables of the detect stage.
         detectors: The manifest's list: name and role of each.
-        with_road_masks: Give road pixels instead of their shares of the regions.
+        with_road_masks: Give road pixels instead of their fractions of the regions.
 
     Raises:
         RunError: A table is missing or damaged.

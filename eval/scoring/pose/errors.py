@@ -124,7 +124,8 @@ class RpeDelta(NamedTuple):
         size: Frames (a whole number) or metres of the path.
         unit: Which.
         all_pairs: Every pair of that distance, not only one after the other.
-        tolerance: In metres with ``all_pairs``: how far off a pair may be, as a share of ``size``.
+        tolerance: In metres with ``all_pairs``: how far off a pair may be, as a fraction of
+            ``size``.
     """
 
     size: float

@@ -23,7 +23,7 @@ from crosscue.replay.files.whole_file import write_text
 from .errors import NeesSummary, nees, pair, summarise_nees
 from .score import COVARIANCES, MAX_DIFFERENCE_NS, at_truths_point, load_truth
 
-LEAST_STEP_NS: Final = 1_000_000_000
+MIN_STEP_NS: Final = 1_000_000_000
 UPPER: Final = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
 
 
@@ -100,10 +100,10 @@ def score_smoother(run: RunFolder, truth_path: Path) -> SmootherScore:
 
 
 def _thinned(t_ns: Int64s) -> Int64s:
-    """Times at least ``LEAST_STEP_NS`` apart, the last one among them."""
+    """Times at least ``MIN_STEP_NS`` apart, the last one among them."""
     kept: list[int] = []
     for t in reversed(t_ns.tolist()):
-        if not kept or kept[-1] - t >= LEAST_STEP_NS:
+        if not kept or kept[-1] - t >= MIN_STEP_NS:
             kept.append(t)
     return np.array(kept[::-1], np.int64)
 
@@ -138,7 +138,7 @@ def _rms(values: Floats) -> float:
     return math.sqrt(float(np.mean(values**2)))
 
 
-def told(result: SmootherScore) -> str:
+def smoother_text(result: SmootherScore) -> str:
     """For a person, below the score's summary."""
     ratio = result.filter_rmse_m / result.smoother_rmse_m if result.smoother_rmse_m else math.inf
     degrees = 180.0 / math.pi

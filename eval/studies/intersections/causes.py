@@ -3,7 +3,7 @@
 Causes are read off the frames, not guessed from the weather: which cues could have shown a feature,
 in how many frames what they look for was there and to be seen, in how many they found it, and
 whether another cue or the order of things (eq. 18's gate) held the belief back. The conditions of a
-drive are told beside the cause, since the source names its own by them.
+drive are reported beside the cause, since the source names its own by them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring.approaches import NEAR_M, ApproachResult
-from crosscue.eval.scoring.cues import SEEN, CueJudged
+from crosscue.eval.scoring.cues import SEEN, CueFrames
 from crosscue.eval.scoring.drives import DriveJudged
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.replay.vehicle.cue_table import CUES
@@ -30,7 +30,7 @@ Cause = Literal[
 ]  # fmt: skip
 
 MOSTLY: Final = 0.5
-"""Found in less than this share of the frames that show it: the detectors are the cause."""
+"""Found in less than this fraction of the frames that show it: the detectors are the cause."""
 GOOD: Final = frozenset({"clear", "overcast"})
 """Conditions that no failure is laid to."""
 
@@ -70,7 +70,7 @@ class Finding:
         failing: How.
         at_m: True range at which it was believed after all; None for never.
         cause: By the rules of ``_cause``.
-        told: The same in a short sentence with its numbers.
+        reported: The same in a short sentence with its numbers.
         cues: What each cue that speaks of it did.
     """
 
@@ -81,7 +81,7 @@ class Finding:
     failing: Failing
     at_m: float | None
     cause: Cause
-    told: str
+    reported: str
     cues: tuple[CueEvidence, ...]
 
 
@@ -110,7 +110,7 @@ def condition_costs(results: Sequence[ApproachResult]) -> tuple[ConditionCost, .
     """Every bad condition against good ones at the same intersection.
 
     What always holds at an intersection (its vegetation) has nothing to be compared with and is
-    left out of the tags that tell good from bad.
+    left out of the tags that separate good from bad.
     """
     always = _always(results)
     tags = sorted({tag for one in results for tag in one.conditions} - GOOD)
@@ -182,7 +182,7 @@ def by_cause(found: Sequence[Finding]) -> dict[str, Counter[str]]:
     return counts
 
 
-def approach_findings(result: ApproachResult, cues: Sequence[CueJudged]) -> list[Finding]:
+def approach_findings(result: ApproachResult, cues: Sequence[CueFrames]) -> list[Finding]:
     """Those of one approach, from its drive's cues."""
     mine = {one.cue: _evidence(one, result.approach) for one in cues}
     found = []
@@ -193,10 +193,10 @@ def approach_findings(result: ApproachResult, cues: Sequence[CueJudged]) -> list
     return found
 
 
-def _evidence(judged: CueJudged, approach: int) -> CueEvidence:
+def _evidence(judged: CueFrames, approach: int) -> CueEvidence:
     far = (judged.approach == approach) & (judged.distance_m >= NEAR_M)
     is_there = far & (judged.is_object == 1)
-    # Where truth does not tell how much can be seen, it counts as seen.
+    # Where truth does not report how much can be seen, it counts as seen.
     is_seen = is_there & ~(judged.visible < SEEN)
     is_found = far & (judged.count > 0)
     return CueEvidence(
@@ -228,7 +228,7 @@ def _absent(
     result: ApproachResult, feature: str, at_m: float | None, cues: Mapping[str, CueEvidence]
 ) -> Finding:
     for_it, against = _speaking(feature, True, cues), _speaking(feature, False, cues)
-    cause, told = _cause(result, feature, for_it, against)
+    cause, reported = _cause(result, feature, for_it, against)
     return Finding(
         drive=result.drive,
         intersection=result.intersection,
@@ -237,7 +237,7 @@ def _absent(
         failing="missing" if at_m is None else "late",
         at_m=at_m,
         cause=cause,
-        told=told,
+        reported=reported,
         cues=(*for_it, *against),
     )
 
@@ -270,7 +270,7 @@ def _cause(
 def _invented(result: ApproachResult, feature: str, cues: Mapping[str, CueEvidence]) -> Finding:
     for_it = sorted(_speaking(feature, True, cues), key=lambda one: -one.found)
     loud = [one for one in for_it if one.found]
-    told = ", ".join(f"{_name(one.cue)} in {one.found} of {one.frames}" for one in loud)
+    reported = ", ".join(f"{_name(one.cue)} in {one.found} of {one.frames}" for one in loud)
     return Finding(
         drive=result.drive,
         intersection=result.intersection,
@@ -279,7 +279,7 @@ def _invented(result: ApproachResult, feature: str, cues: Mapping[str, CueEviden
         failing="invented",
         at_m=loud[0].first_m if loud else None,
         cause="claimed wrongly",
-        told=told or "no cue of its own: only what others left over",
+        reported=reported or "no cue of its own: only what others left over",
         cues=tuple(for_it),
     )
 

@@ -28,8 +28,8 @@ from .tables import (
     attribution_rows,
     cue_rows,
     intersection_rows,
+    mean_text,
     quoted_rows,
-    told,
 )
 
 PAGE: Final = "study.html"
@@ -101,10 +101,10 @@ def _tables(
         "command": f"crosscue study intersections {flags}",
         "versions": versions(),
         "published": {"detected_m": PUBLISHED_DETECTED_M, "full_m": PUBLISHED_FULL_M},
-        "detected_m": told(approaches.detected_m),
-        "full_m": told(approaches.full_m),
-        "calibrated_detected_m": "" if learned is None else told(learned.detected_m),
-        "calibrated_full_m": "" if learned is None else told(learned.full_m),
+        "detected_m": mean_text(approaches.detected_m),
+        "full_m": mean_text(approaches.full_m),
+        "calibrated_detected_m": "" if learned is None else mean_text(learned.detected_m),
+        "calibrated_full_m": "" if learned is None else mean_text(learned.full_m),
         "intersections": intersection_rows(approaches.results),
         "findings": [asdict(one) for one in found],
         "causes": by_cause(found),
@@ -154,9 +154,9 @@ def summary(done: Sequence[Done[Outcome]], scored: StudyScores, written: StudyFi
         f"simulated drives   {len(scored.scored)} of {len(done)} done, {len(failed)} failed",
         *(f"  failed           {one.job.name}: {one.error}" for one in failed),
         f"detected           {_of(approaches.detected.right, approaches.detected.of)} at "
-        f"{told(approaches.detected_m)}; published 34.4 m",
+        f"{mean_text(approaches.detected_m)}; published 34.4 m",
         f"full intersection  {_of(approaches.full.right, approaches.full.of)} at "
-        f"{told(approaches.full_m)}; published 16.2 m, 76 of 80",
+        f"{mean_text(approaches.full_m)}; published 16.2 m, 76 of 80",
         f"false features     in {_of(wrong.right, wrong.of)}",
         "",
         f"{'intersection':<14}{'detected':>12}{'mean':>9}{'full':>12}{'mean':>9}",
@@ -169,8 +169,8 @@ def summary(done: Sequence[Done[Outcome]], scored: StudyScores, written: StudyFi
         )
     lines += ["", "late, missing or invented (drives):"]
     for cause, places in by_cause(findings([one.judged for one in scored.scored])).items():
-        told_places = ", ".join(f"{place} {drives}" for place, drives in places.items())
-        lines.append(f"  {cause:<20} {told_places}")
+        reported_places = ", ".join(f"{place} {drives}" for place, drives in places.items())
+        lines.append(f"  {cause:<20} {reported_places}")
     lines += ["", f"{'cue':<20}{'precision':>10}{'95 %':>16}{'positives':>11}{'published':>11}"]
     for row in cue_rows(scored.scores.cues):
         ends = f"{_number(row['wilson_low'], 2)} to {_number(row['wilson_high'], 2)}"

@@ -36,7 +36,7 @@ from crosscue.replay.vehicle.fusion import Calibrated
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 from crosscue.replay.versions import versions
 
-LEAST_PLACES: Final = 3
+MIN_PLACES: Final = 3
 """Intersections, so that messages for one can be learned at two others or more."""
 LOG: Final = "drive.mcap"
 VEHICLE: Final = "vehicle.toml"
@@ -206,7 +206,7 @@ def calibrated_vehicles(scored: Sequence[RunScored]) -> list[Vehicle] | None:
     too few intersections to learn from the others, or nothing could be learned.
     """
     places = [_place(one) for one in scored]
-    if len(set(places)) < LEAST_PLACES or any(not place for place in places):
+    if len(set(places)) < MIN_PLACES or any(not place for place in places):
         return None
     fits = {
         place: _learned([one for one, at in zip(scored, places, strict=True) if at != place])

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from crosscue.eval.scoring.approaches import ApproachResult
 from crosscue.eval.scoring.cues import CueScore
-from crosscue.eval.scoring.intervals import Mean, Share, wilson
+from crosscue.eval.scoring.intervals import Mean, Proportion, wilson
 from crosscue.replay.vehicle.cue_table import groups
 
 from .study import StudyScores
@@ -62,7 +62,7 @@ def cue_rows(cues: Mapping[str, CueScore]) -> list[Row]:
     return rows
 
 
-def _pooled(shares: Sequence[Share]) -> float:
+def _pooled(shares: Sequence[Proportion]) -> float:
     of = sum(one.of for one in shares)
     return sum(one.right for one in shares) / of if of else math.nan
 
@@ -147,7 +147,7 @@ def attribution_rows(scored: StudyScores) -> list[Row]:
     return rows
 
 
-def told(mean: Mean) -> str:
+def mean_text(mean: Mean) -> str:
     """A mean with its interval."""
     if math.isnan(mean.value):
         return "none"

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder, locked
-from crosscue.eval.studies.intervals import mean_of, share_of
+from crosscue.eval.studies.intervals import fraction_of, mean_of
 from crosscue.eval.studies.page import Table, write_page
 from crosscue.eval.studies.pictures import figure, save
 from crosscue.eval.studies.words import percent
@@ -48,7 +48,7 @@ NOTES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class FieldRun:
-    """One run, as its replay tells it unless said otherwise.
+    """One run, as its replay states it unless configured.
 
     Attributes:
         name: Of its folder.
@@ -97,7 +97,7 @@ class _Job:
 def drive_field(
     study: FieldStudy, folder: Path, workers: int, *, overwrite: bool = False
 ) -> Iterator[tuple[float, FieldRun]]:
-    """Drive, record, replay and score every run; share done and run, in order.
+    """Drive, record, replay and score every run; fraction done and run, in order.
 
     A run that is there already, of the same study, is not driven again.
 
@@ -197,7 +197,7 @@ def _tables(runs: Sequence[FieldRun]) -> tuple[Table, ...]:
             (
                 label,
                 str(len(chosen)),
-                percent(share_of(len(lost), len(chosen))),
+                percent(fraction_of(len(lost), len(chosen))),
                 f"{mean.value / 1e3:.1f} ({mean.low / 1e3:.1f}..{mean.high / 1e3:.1f})"
                 if len(lost) > 1
                 else "",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.eval.studies.intervals import logistic, share_of
+from crosscue.eval.studies.intervals import fraction_of, logistic
 from crosscue.eval.studies.pictures import COLOURS, figure, save
 from crosscue.localization.town.drive import Outcome
 from crosscue.replay.columns import Floats
@@ -158,7 +158,7 @@ def _success(axes: Axes, part: dict[str, Floats], colour: str, label: str) -> No
         inside = bins == k
         if not inside.any():
             continue
-        share = share_of(int(reached[inside].sum()), int(inside.sum()))
+        share = fraction_of(int(reached[inside].sum()), int(inside.sum()))
         axes.errorbar(
             float(distance_m[inside].mean()) * KM,
             share.value,

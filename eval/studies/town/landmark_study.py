@@ -1,6 +1,6 @@
 """Who reaches the goal: success against distance, range at 80 % success, extra distance driven.
 
-Strategies that share density and rate share cities, starts, goals and sensor errors too, so that
+Strategies that fraction density and rate share cities, starts, goals and sensor errors too, so that
 their differences are the strategies'.
 """
 
@@ -15,11 +15,11 @@ import numpy as np
 
 from crosscue.eval.studies.intervals import (
     Measured,
+    fraction_of,
     mean_of,
     range_at,
     ratio_of,
     ratio_of_means,
-    share_of,
 )
 from crosscue.eval.studies.page import Table
 from crosscue.eval.studies.words import km, percent
@@ -95,7 +95,7 @@ class Comparison:
         extra_reached: Means of all drives that reached the goal, each strategy's own; this one
             reaches farther goals too.
         extra_all: Means of all drives, lost ones as far as they came.
-        published_extra: NaN where there is none.
+        published_extra: NaN where none exists.
         gains_m: Range less that of straight to goal, of cells below 10 per km2 where both are
             known.
         gain_m: Their mean.
@@ -147,7 +147,7 @@ def _cell(settings: Drive, rows: dict[str, Floats]) -> Cell:
         drives=len(outcome),
         lost=int((outcome == Outcome.LOST).sum()),
         given_up=int((outcome == Outcome.GIVEN_UP).sum()),
-        success=share_of(int(reached.sum()), len(outcome)),
+        success=fraction_of(int(reached.sum()), len(outcome)),
         range_m=range_at(rows["straight_m"], reached.astype(np.float64), SUCCESS),
         travelled_m=mean_of(rows["travelled_m"]),
         updates=float(rows["detected"].mean()),

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from crosscue.eval.scoring.consistency import mean_band
-from crosscue.eval.studies.intervals import Measured, mean_of, measured, share_of, weights_of
+from crosscue.eval.studies.intervals import Measured, fraction_of, mean_of, measured, weights_of
 from crosscue.localization.town.drive import Outcome, Result, drive_many
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
@@ -124,7 +124,7 @@ def points(rows: dict[str, Floats]) -> tuple[Floats, Floats]:
 
 
 def law_m(settings: Drive) -> float:
-    """Where a car that drives straight on is lost, by the law r ds D; NaN without a compass."""
+    """Where a car that drives straight is lost, by the law r ds D; NaN without a compass."""
     compass = settings.sensors.compass_2sigma_deg
     if compass is None:
         return math.nan
@@ -181,7 +181,7 @@ def _of_case(settings: Drive, rows: dict[str, Floats]) -> CompassResult:
         lost_after_m=mean_of(lost_m),
         shortest_m=float(lost_m.min()) if len(lost_m) else math.nan,
         longest_m=float(lost_m.max()) if len(lost_m) else math.nan,
-        share_lost=share_of(int(is_lost.sum()), n),
+        share_lost=fraction_of(int(is_lost.sum()), n),
         law_m=law_m(settings),
         growth=fit_growth(
             *points(rows), 4.0 * sensors.start_position_sd_m, settings.navigation.lost_above_m

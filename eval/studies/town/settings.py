@@ -19,7 +19,7 @@ from typing import Annotated, ClassVar, Final, Literal, NamedTuple, Self, TypeVa
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from crosscue.localization.town.settings import City, Drive, Share
+from crosscue.localization.town.settings import City, Drive, Proportion
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import toml_tree
@@ -121,8 +121,14 @@ class LandmarkStudy(_Study):
         5.0,
         10.0,
     )
-    detection_rates: Annotated[tuple[Share, ...], Field(min_length=1)] = (0.2, 0.4, 0.6, 0.8, 1.0)
-    points: tuple[tuple[Density, Share], ...] = ((0.55, 0.6),)
+    detection_rates: Annotated[tuple[Proportion, ...], Field(min_length=1)] = (
+        0.2,
+        0.4,
+        0.6,
+        0.8,
+        1.0,
+    )
+    points: tuple[tuple[Density, Proportion], ...] = ((0.55, 0.6),)
     """More pairs of density and rate, driven landmark to landmark only."""
 
     varied: ClassVar[tuple[str, ...]] = (
@@ -157,7 +163,7 @@ class FieldStudy(_Study):
     minutes: Annotated[float, Field(gt=0.0, le=600.0)] = 75.0
     compass_2sigma_deg: Degrees = 25.0
     landmarks_per_km2: Density = 0.55
-    detection_rate: Share = 0.6
+    detection_rate: Proportion = 0.6
 
     varied: ClassVar[tuple[str, ...]] = (
         "navigation.strategy",

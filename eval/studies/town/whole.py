@@ -53,7 +53,7 @@ def drive_study(
     *,
     overwrite: bool = False,
 ) -> Iterator[float]:
-    """Drive all drives of a study into ``folder``; the share done comes as it grows.
+    """Drive all drives of a study into ``folder``; the fraction done comes as it grows.
 
     Raises:
         RunError: The folder holds another study's results, and ``overwrite`` is not given; or

@@ -114,7 +114,7 @@ class RosBursts:
         return Obstacles(stamp_ns, obstacles.log_ns, leading | obstacles.columns)
 
     def _settle(self, at: NDArray[np.intp], upto: int) -> None:
-        """Tell of announced obstacles that did not come, and forget the bursts before ``upto``."""
+        """Report announced obstacles that did not come, and forget the bursts before ``upto``."""
         upto = max(upto, 0)
         came = np.bincount(at[at >= 0], minlength=upto)[:upto]
         lacking = np.minimum(self._count[:upto], self._slots) - came

@@ -7,7 +7,7 @@ nothing of units, signs or codes for no value. What could be checked, and what i
   with y to the left, which is how the wire has them. Taken as on the wire. Should place and angle
   ever have the same sign, a notice says so.
 * Lanes: on the wire they are positive to the right, yet two public programs draw the messages'
-  polynomials unturned in a frame with y to the left. So ``ros_lane_sign = "auto"`` looks at which
+  polynomials unturned in a frame with y to the left. So ``ros_lane_sign = "auto"`` examines which
   side the left and the right lane lie on, and says what it found.
 * ``Lane`` (0x737), reference points and signs: nothing to check by; taken as on the wire.
 * Codes for no value are recognised by their value on the wire (length 31.5 m, radar 255.9375 m).
@@ -89,7 +89,7 @@ class RosMobileye:
         Args:
             bus: First part of the tables' names, ``BUS/mobileye/TABLE``.
             types: From topic to message type, as the log spells it; other topics are left alone.
-            ledger: Told, under the topic's name, of messages not used.
+            ledger: Reported, under the topic's name, of messages not used.
             settings: Mounting, slots and the lanes' sign.
         """
         self._bus = bus

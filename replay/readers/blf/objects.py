@@ -4,7 +4,7 @@ No official specification of the format is public; the layouts are those that Ve
 python-can write. Every object begins with ``LOBJ``, its header's size and version, its own size
 and its type; the next one follows at its end, after at most seven bytes of padding. All places
 where ``LOBJ`` stands are found at once, and only where they do not form a chain (a payload that
-holds ``LOBJ``, damage) are single objects looked at.
+holds ``LOBJ``, damage) are single objects examined.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def chain_of(
         is_resumed: What came before is lost, so the first object may begin anywhere.
         is_end: No more bytes follow.
         size_max: Largest object to wait for.
-        tally: Told about damage.
+        tally: Reported about damage.
         place: Where the stream lies in the file, in words.
     """
     at = _signatures(stream)
@@ -116,7 +116,7 @@ def chain_of(
     for k in np.flatnonzero(~links[first:]) + first:
         if not keep[k]:
             continue
-        rest = _mend(int(k), at, end, is_sound, links, keep, len(stream), is_end)
+        rest = _repair(int(k), at, end, is_sound, links, keep, len(stream), is_end)
         if rest < 0:
             tally.damage("object does not end where its size says", f"{place}, offset {at[k]}")
             rest = len(stream)
@@ -130,7 +130,7 @@ def chain_of(
     return Chain(at[is_whole], rest)
 
 
-def _mend(
+def _repair(
     k: int,
     at: Int64s,
     end: Int64s,

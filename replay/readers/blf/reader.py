@@ -43,7 +43,7 @@ _BASE: Final = struct.Struct("<4sHHLL")
 _CONTAINER: Final = struct.Struct("<H6xL4x")
 _STORED, _DEFLATED = 0, 2
 _PEEKED: Final = 8
-"""Containers looked at for bus names before the log is read."""
+"""Containers examined for bus names before the log is read."""
 STREAM_BYTES: Final = 1 << 20
 """How much inflated content is put into columns at a time."""
 _SCAN_BYTES: Final = 1 << 20

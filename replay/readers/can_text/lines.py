@@ -34,7 +34,7 @@ class Lines:
         stop: Shape (N,), int64: one past its last character; line ends are left out.
         first_number: Number of the first line in the file, counted from 1.
         done: How many lines are to be taken from here; one fewer than there are when the last one
-            is only to be looked at, since it comes again as the first of the next chunk.
+            is only to be examined, since it comes again as the first of the next chunk.
     """
 
     buffer: Bytes
@@ -148,7 +148,7 @@ def _lines(buffer: Bytes, words: Words, newline: Int64s, number: int, done: int)
 
 
 class Field(NamedTuple):
-    """One word of each of N lines, as ranges; empty, at the line's end, where there is none."""
+    """One word of each of N lines, as ranges; empty, at the line's end, where none exists."""
 
     start: Int64s
     stop: Int64s

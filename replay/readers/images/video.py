@@ -59,7 +59,7 @@ NO_TIME: Final = -1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Index:
-    """What a first pass over the packets tells.
+    """What a first pass over the packets reports.
 
     Attributes:
         t_ns: Shape (N,), int64: time of each packet's picture, or ``NO_TIME``.
@@ -291,7 +291,7 @@ class Video(Closing):
             try:
                 yield from packet.decode()
             except _failures():
-                # The picture is missing from the count at the end, which tells the loss.
+                # The picture is missing from the count at the end, which reports the loss.
                 continue
 
     def _settle(self, index: _Index, ledger: Ledger) -> None:
@@ -356,7 +356,7 @@ def _duration_s(container: InputContainer) -> float | None:
 
 
 def _demuxed(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
-    """Packets until the end or the damage; the first pass has already told the latter."""
+    """Packets until the end or the damage; the first pass has already reported the latter."""
     try:
         yield from container.demux(stream)
     except _failures():

@@ -53,7 +53,7 @@ class Giver:
 
         Args:
             rows: Messages and definitions of a chunk or a run, whose bytes are right.
-            checks: Told of definitions that cannot be read.
+            checks: Reported of definitions that cannot be read.
             at: Where in the file the chunk or run begins.
         """
         begin = 0

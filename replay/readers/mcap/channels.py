@@ -48,11 +48,11 @@ class TopicBook:
         called = channel.topic or UNNAMED
         if schema is None:
             if channel.schema_id:
-                self._tell(f"{called}: its schema {channel.schema_id} is not in the file")
+                self._report(f"{called}: its schema {channel.schema_id} is not in the file")
             return Topic(called, "", channel.message_encoding)
         text = schema.text
         if len(text) > self._limits.schema_bytes:
-            self._tell(
+            self._report(
                 f"{called}: its schema has {len(text)} bytes, the limit is "
                 f"{self._limits.schema_bytes}; messages are given without it"
             )
@@ -66,10 +66,10 @@ class TopicBook:
             name = f"{topic.name}#{self._variants[topic.name] + 1}"
         if name != topic.name:
             what = topic.type_name or topic.encoding or "no type"
-            self._tell(f"{topic.name} has several message types; {what} is given as {name}")
+            self._report(f"{topic.name} has several message types; {what} is given as {name}")
         return name
 
-    def _tell(self, sentence: str) -> None:
+    def _report(self, sentence: str) -> None:
         self.notices[sentence] = None
 
 

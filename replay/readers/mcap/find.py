@@ -29,11 +29,11 @@ from .records import (
 )
 from .rows import NEVER_IN_A_CHUNK, rows_by_scan
 
-HEAD_MOST: Final = PREFIX.size + CHUNK_FIXED + 32
+MAX_HEAD: Final = PREFIX.size + CHUNK_FIXED + 32
 FIRST_PIECE: Final = 4 << 10
 """Searched first; doubled as long as nothing is found."""
 TRIES: Final = 16
-"""Candidates decompressed at most, so that a search stays linear in the bytes it looks at."""
+"""Candidates decompressed at most, so that a search stays linear in the bytes it examines."""
 
 
 def find_bytes(file: ByteFile, at: int, end: int, wanted: bytes) -> int | None:
@@ -71,7 +71,7 @@ def find_chunk(
         behind = min(at + piece, until)
         other = find_bytes(file, at, min(behind + len(begins), end), begins)
         stop = end if other is None else other
-        window = file.read(at, min(piece + HEAD_MOST, stop - at))
+        window = file.read(at, min(piece + MAX_HEAD, stop - at))
         for offset in _candidates(window, min(piece, behind - at)):
             if tries < TRIES and _agrees(file, at + offset, end, limits):
                 tries += 1
@@ -95,7 +95,7 @@ def _candidates(window: Bytes, most: int) -> list[int]:
 
 def _agrees(file: ByteFile, at: int, end: int, limits: Limits) -> bool:
     """Do the lengths of what stands at ``at``, taken for a chunk, agree with each other?"""
-    raw = file.peek(at, HEAD_MOST)
+    raw = file.peek(at, MAX_HEAD)
     length = PREFIX.unpack_from(raw)[1]
     try:
         head = read_chunk_head(raw[PREFIX.size :])
@@ -111,7 +111,7 @@ def _agrees(file: ByteFile, at: int, end: int, limits: Limits) -> bool:
 
 
 def _proves_itself(file: ByteFile, at: int, limits: Limits) -> bool:
-    head = read_chunk_head(file.peek(at, HEAD_MOST)[PREFIX.size :])
+    head = read_chunk_head(file.peek(at, MAX_HEAD)[PREFIX.size :])
     body_at = at + PREFIX.size + head.body_at
     try:
         room = file.buffers.take(head.size + 1)

@@ -76,7 +76,7 @@ class McapLog(Closing):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """From the summary, or from the data section where the summary does not tell."""
+        """From the summary, or from the data section where the summary does not report."""
         declared = declared_counts(self._segments, self._book)
         return tuple(
             Topic(

@@ -158,7 +158,7 @@ class SegmentPass:
         self._finish_checks()
 
     def _window(self) -> Window | None:
-        """Where what was asked for lies, if the index can be trusted; else the reason is told."""
+        """Where the selection lies, if the index can be trusted; else the reason is reported."""
         if not self._may_skip or not self._segment.has_end:
             return None
         found = find_window(self._segment, self._declarations, self._selection)
@@ -267,7 +267,7 @@ class SegmentPass:
     def _stretch(self, chunk: Chunk, load: Load | None) -> Stretch:
         if load is not None:
             return load.stretch()
-        # Not wanted when looked at first, wanted now: a channel was given another meaning.
+        # Not wanted when examined first, wanted now: a channel was given another meaning.
         records = self._loader.load(chunk)
         return Stretch(records, 0, len(records))
 
@@ -479,8 +479,8 @@ class SegmentPass:
             self._notice("it has no data end record")
 
     def _finish_checks(self) -> None:
-        for at, told, found in self._attachments:
-            if found.result() == told:
+        for at, reported, found in self._attachments:
+            if found.result() == reported:
                 self._checks.attachments_right += 1
             else:
                 self._checks.bad_attachments.add(f"at byte {at}")
@@ -511,11 +511,11 @@ class SegmentPass:
         self._ledger.drop("", DAMAGED_SECTION, None, detail)
 
     def settle(self) -> Counter[str] | None:
-        """Compare with the statistics, and tell what is lost; declared counts by topic."""
+        """Compare with the statistics, and report what is lost; declared counts by topic."""
         statistics = self._summary.statistics
         if statistics is None:
             for damage in self._damages:
-                self._tell(damage)
+                self._report(damage)
             return None
         met = self._giver.met + self._giver.dropped
         if self._summary.counts_channels:
@@ -541,7 +541,7 @@ class SegmentPass:
         for channel_id, count in sorted(missing.items()):
             self._giver.lose_of_channel(channel_id, reason, count, detail, t_ns)
 
-    def _tell(self, damage: Damage) -> None:
+    def _report(self, damage: Damage) -> None:
         if not damage.counts:
             self._ledger.drop("", damage.reason, None, damage.detail, damage.t_ns)
         for channel_id, count in damage.counts.items():

@@ -62,7 +62,7 @@ CHUNK_FIXED: Final = 40
 
 
 class BrokenRecordError(LogFormatError):
-    """A record's content does not fit its own lengths; readers turn it into a told loss."""
+    """A record's content does not fit its own lengths; readers turn it into a reported loss."""
 
 
 class Fields:

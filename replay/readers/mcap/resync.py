@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import Bytes, Int64s
 
 from .bytes import ByteFile
-from .find import HEAD_MOST
+from .find import MAX_HEAD
 from .records import (
     ATTACHMENT,
     CHANNEL,
@@ -49,7 +49,7 @@ LATEST: Final = (1 << 63) - 1
 MOST: Final = (1 << 64) - 1
 PIECE_MIN: Final = 4 << 10
 PIECE_MAX: Final = 1 << 20
-DEFINITION_MOST: Final = 1 << 20
+MAX_DEFINITION: Final = 1 << 20
 
 
 class Plausible:
@@ -241,7 +241,7 @@ class Resync:
             return self._is_chunk(at, length)
         if opcode == ATTACHMENT:
             return length >= 36
-        if opcode not in (SCHEMA, CHANNEL, METADATA) or length > DEFINITION_MOST:
+        if opcode not in (SCHEMA, CHANNEL, METADATA) or length > MAX_DEFINITION:
             return False
         content = self._file.read(at + PREFIX.size, length).tobytes()
         if opcode != METADATA:
@@ -254,7 +254,7 @@ class Resync:
 
     def _is_chunk(self, at: int, length: int) -> bool:
         try:
-            head = read_chunk_head(self._file.peek(at, HEAD_MOST)[PREFIX.size :])
+            head = read_chunk_head(self._file.peek(at, MAX_HEAD)[PREFIX.size :])
         except BrokenRecordError:
             return False
         return head.compression in COMPRESSIONS and length == head.body_at + head.body_size

@@ -39,7 +39,7 @@ from .scan import Scan, scan_of
 
 GAPS_WORTH_A_LOOK: Final = 256
 """Stretches between indexed messages beyond which scanning everything is as fast."""
-DEFINITIONS_MOST: Final = 1 << 17
+MAX_DEFINITIONS: Final = 1 << 17
 """Schemas and channels together in one chunk; each has a 16-bit number."""
 
 
@@ -201,7 +201,7 @@ def _between_messages(
             return None
         definitions += others[0]
         ignored += others[1]
-        if len(definitions) + ignored > DEFINITIONS_MOST:
+        if len(definitions) + ignored > MAX_DEFINITIONS:
             return None
     return definitions, ignored
 
@@ -282,8 +282,8 @@ def _definitions(buffer: Bytes, scan: Scan, end: int) -> tuple[list[Definition],
     begins, ends = scan.offset, np.append(scan.offset, scan.end)[1:]
     wanted = ((scan.opcode == SCHEMA) | (scan.opcode == CHANNEL)) & (begins < end)
     at = np.flatnonzero(wanted)
-    if len(at) > DEFINITIONS_MOST:
-        raise BrokenRecordError(f"holds more than {DEFINITIONS_MOST} schemas and channels")
+    if len(at) > MAX_DEFINITIONS:
+        raise BrokenRecordError(f"holds more than {MAX_DEFINITIONS} schemas and channels")
     definitions = [
         Definition(b, code, buffer[b + PREFIX.size : e].tobytes())
         for b, e, code in zip(
@@ -309,7 +309,7 @@ def _others(buffer: Bytes, begin: int, end: int) -> tuple[list[Definition], int]
             found.append(Definition(at, opcode, bytes(view[at + PREFIX.size : after])))
         else:
             ignored += 1
-        if len(found) + ignored > DEFINITIONS_MOST:
+        if len(found) + ignored > MAX_DEFINITIONS:
             return None
         at = after
     return found, ignored

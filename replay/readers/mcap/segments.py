@@ -49,7 +49,7 @@ from .repair import proved_head
 from .rows import NEVER_IN_A_CHUNK, Definition, rows_by_scan
 from .walk import Chunk, End, How, Run, Walk
 
-HEADER_MOST: Final = 1 << 16
+MAX_HEADER: Final = 1 << 16
 NO_CHUNKS: Final = table_of(b"", (), (), 0)
 DATA_END_PREFIX: Final = PREFIX.pack(DATA_END, DATA_END_SIZE - PREFIX.size)
 
@@ -218,7 +218,7 @@ def _begin(file: ByteFile, base: int) -> int:
         return at
     opcode, length = PREFIX.unpack(raw)
     after = at + PREFIX.size + length
-    return after if opcode == HEADER and length <= HEADER_MOST and after <= file.size else at
+    return after if opcode == HEADER and length <= MAX_HEADER and after <= file.size else at
 
 
 def _read_summary(
@@ -371,7 +371,7 @@ def _take(declarations: Declarations, definitions: Sequence[Definition]) -> None
                 list(declarations.topics())  # enters what now gets another meaning
             declarations.declare(definition)
         except BrokenRecordError:
-            continue  # told when it is met again in reading
+            continue  # reported when it is met again in reading
 
 
 def _close(

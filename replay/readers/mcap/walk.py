@@ -466,7 +466,7 @@ class Walk:
     ) -> tuple[tuple[MessageIndex, ...], str]:
         """The message indexes from ``at`` on; leaves the walk behind them."""
         bound = self._bound(self._at)
-        told_end = min(at + index.index_length, bound) if index is not None else at
+        reported_end = min(at + index.index_length, bound) if index is not None else at
         found: list[MessageIndex] = []
         fault = ""
         while at + PREFIX.size <= bound:
@@ -483,8 +483,8 @@ class Walk:
             except BrokenRecordError as error:
                 fault = str(error)
             at = after
-        if at < told_end:
-            at, fault = told_end, fault or "a message index cannot be read"
+        if at < reported_end:
+            at, fault = reported_end, fault or "a message index cannot be read"
         self._at = at
         return tuple(found), fault
 
@@ -500,7 +500,9 @@ def _differences(head: ChunkHead, index: ChunkIndex, length: int) -> str:
         ("compression", head.compression, index.compression),
     )
     return ", ".join(
-        f"{name} {said!r} (the summary says {told!r})" for name, said, told in pairs if said != told
+        f"{name} {said!r} (the summary says {reported!r})"
+        for name, said, reported in pairs
+        if said != reported
     )
 
 

@@ -4,7 +4,7 @@ A summary with a checksum, whose counts add up and whose chunks lie side by side
 outside the time asked for, or without a topic asked for, are not touched. What lies between the
 chunks it names is walked through, so that messages outside chunks are found. A summary without a
 checksum is trusted for times only, where its chunks follow each other in time: a wrong time then
-stands out, or is that of a chunk next to those asked for, which are looked at too.
+stands out, or is that of a chunk next to those asked for, which are examined too.
 """
 
 from __future__ import annotations

@@ -302,7 +302,7 @@ class Blocks:
                 yield from self._unlinked(found[-1] if found else place, missing)
 
     def _unlinked(self, at: int, count: int) -> Iterator[int]:
-        """Data blocks that follow the one at ``at`` and that their list was never told of."""
+        """Data blocks that follow the one at ``at`` and that their list never named."""
         for _ in range(count):
             at = -(-(at + self._head(at)[1]) // 8) * 8
             if at + HEAD_BYTES > self.size or self._head(at)[0] not in (*_DATA, b"##DZ"):

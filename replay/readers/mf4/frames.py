@@ -232,7 +232,7 @@ class CanLayout:
 
 
 def _whole(values: NDArray[np.generic]) -> Int64s:
-    """As whole numbers; -1 for what is none."""
+    """As whole numbers; -1 for what is not one."""
     if values.dtype.kind == "f":
         values = np.rint(np.nan_to_num(values, nan=-1.0, posinf=-1.0, neginf=-1.0))
     return values.astype(np.int64)

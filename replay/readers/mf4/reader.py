@@ -375,7 +375,7 @@ class Mf4Log(Closing):
     ) -> tuple[int, int | None]:
         """The records that may lie in the span of time asked for; all of them without a stop.
 
-        The first records of chunks are looked at by bisection: MDF demands that times ascend.
+        The first records of chunks are examined by bisection: MDF demands that times ascend.
         """
         size, start_ns, end_ns = source.group.record_bytes, selection.start_ns, selection.end_ns
         if not size or (start_ns is None and end_ns is None) or stored.stream.broken:

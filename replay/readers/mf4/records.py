@@ -27,7 +27,7 @@ _KEPT: Final = 3
 PATIENCE: Final = 3_000_000
 """Records that the plain loop may take before Numba is worth its import."""
 PADDING: Final = 64
-"""Bytes after those of a piece, so that every value in it can be looked at with that width."""
+"""Bytes after those of a piece, so that every value in it can be examined with that width."""
 LAST_CUT: Final = "last record is cut"
 _FEW: Final = 16
 """Records that make a run."""

@@ -227,7 +227,7 @@ class Pass:
         self._ledger.integrity = self._checked.words()
 
     def _window(self, index_at: int) -> BagWindow | None:
-        """Where what was asked for lies, if the index can be trusted; else the reason is told."""
+        """Where the selection lies, if the index can be trusted; else the reason is reported."""
         if self._selection == EVERYTHING:
             return None
         found = find_bag_window(
@@ -239,7 +239,7 @@ class Pass:
         return None
 
     def _windowed(self, window: BagWindow, index_at: int) -> Iterator[Block]:
-        """Blocks of the chunks that the index names; the others are looked at if it is wrong."""
+        """Blocks of the chunks that the index names; the others are examined if it is wrong."""
         self._inside = window
         self._file.expect(window.ranges())
         connections = self._contents.connections

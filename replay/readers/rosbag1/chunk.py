@@ -216,7 +216,7 @@ def read_chunk(
 
     Args:
         inflated: Its records.
-        entries: What the index records behind it say, or None where there are none.
+        entries: What the index records behind it say, or None where none exists.
         largest: Most bytes of a message definition.
         most_records: Most records to take from one chunk.
     """

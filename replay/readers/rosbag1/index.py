@@ -42,7 +42,7 @@ class ChunkUnit:
         is_framed: Its length, or the size of its plain content, leads to another record or to the
             file's end, so it is right.
         end: Where the next unit begins.
-        entries: Index records, or None if there are none or they are damaged.
+        entries: Index records, or None if none exist or they are damaged.
     """
 
     record: Record
@@ -184,7 +184,7 @@ def next_chunk(file: BagFile, at: int, known: list[int]) -> int | None:
 
 
 def _searched_chunk(file: BagFile, at: int) -> int | None:
-    """The first chunk header at or after ``at``, told by its operation field."""
+    """The first chunk header at or after ``at``, known by its operation field."""
     while at < file.size:
         window = file.bytes_at(at, at + _SEARCHED_AT_ONCE + 256)
         found = -1

@@ -1,7 +1,7 @@
 """ROS 1 bags, format 2.0: uncompressed, bz2 and lz4, with an index section or without.
 
 The file's bytes are read from the front to the back; the index section and the index records are
-hints, and tell how much a damaged chunk held. Bags of a killed recorder (no index) and
+hints, and report how much a damaged chunk held. Bags of a killed recorder (no index) and
 ``.bag.active`` files read like any other.
 """
 

@@ -118,7 +118,7 @@ def kind_of(fields: dict[bytes, bytes] | None) -> int | None:
 
 
 def record_at(source: bytes | memoryview, at: int, base: int = 0) -> Record | None:
-    """The record at ``at`` of ``source``; None if its header is none. The body may overrun.
+    """The record at ``at`` of ``source``; None if its header is not one. The body may overrun.
 
     Args:
         source: Bytes that hold at least the record's header.
@@ -167,7 +167,7 @@ class BagFile:
         """These ranges, sorted, are going to be read: nothing to do for a file on a disk."""
 
     def record(self, at: int) -> Record | None:
-        """The record at byte ``at``; None if there is none or it does not fit into the file."""
+        """The record at byte ``at``; None if none exists or it does not fit into the file."""
         look = self.bytes_at(at, at + _FIRST_LOOK)
         if len(look) >= 4:
             header = int(_U32.unpack_from(look, 0)[0])

@@ -2,8 +2,8 @@
 
 The index carries no checksum, so it is trusted only where it cannot well be wrong unseen: it names
 as many chunks as the bag's header, these follow each other in time, and the chunks next to those
-asked for are looked at, too. A wrong time then stands out of order, or belongs to a chunk that is
-looked at and says something else itself.
+asked for are examined, too. A wrong time then stands out of order, or belongs to a chunk that is
+examined and says something else itself.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""ROS 2 bags in SQLite (.db3): all rows that SQLite can still reach, the rest told.
+"""ROS 2 bags in SQLite (.db3): all rows that SQLite can still reach, the rest reported.
 
 SQLite has no checksums. What can be known is checked instead: SQLite's own integrity check, the
 time index against the rows, the types and the order of the rows, the file's length. Rows of a file
@@ -79,7 +79,7 @@ class Db3Log(Closing):
 
     @property
     def time_range_ns(self) -> tuple[int, int] | None:
-        """First and last timestamp, or None if there is none or SQLite cannot say."""
+        """First and last timestamp, or None if none exists or SQLite cannot say."""
         try:
             query = "SELECT MIN(timestamp), MAX(timestamp) FROM messages"
             first, last = fetched(self._database, query)[0]
@@ -356,7 +356,7 @@ class _Pass:
 
 
 def _place_table(places: Mapping[int, int]) -> Int64s:
-    """Places by topic number, -1 where there is none; for small numbers, as recorders give them."""
+    """Places by topic number, -1 where none exists; for small numbers, as recorders give them."""
     small = {number: at for number, at in places.items() if 0 <= number < _SMALL}
     table = np.full(max(small, default=-1) + 1, -1, dtype=np.int64)
     table[list(small)] = list(small.values())

@@ -1,4 +1,4 @@
-"""Messages that rosbag2 compressed one by one (zstd), told by their own first bytes."""
+"""Messages that rosbag2 compressed one by one (zstd), known by their own first bytes."""
 
 from __future__ import annotations
 

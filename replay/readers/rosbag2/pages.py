@@ -40,7 +40,7 @@ _DEEPEST: Final = 20
 _LOT_BYTES: Final = BLOCK_BYTES // 2
 _CHAIN_BYTES: Final = 1 << 20
 _ROOM: Final = 256
-"""Zeros behind the last page, so that a cell that runs over its page can be looked at."""
+"""Zeros behind the last page, so that a cell that runs over its page can be examined."""
 _VARINT_BYTES: Final = 9
 _INTEGER_BYTES: Final = np.array([-1, 1, 2, 3, 4, 6, 8, -1, 0, 0] + [-1] * 246, np.int64)
 """Size of an integer by its serial type; -1 if the type is no integer."""

@@ -128,7 +128,7 @@ class RowScan:
             if not is_careful:
                 largest = max(largest, int(part.length.max(initial=0)))
                 mean = max(len(part.payloads) // max(len(part), 1), 1)
-                # Never many large ones, as far as those before tell.
+                # Never many large ones, as far as those before show.
                 room = max(1, min(_LARGEST_FETCH, _PART_BYTES // mean, BLOCK_BYTES // largest))
 
     def _columns(self, rows: list[Row]) -> RowColumns:

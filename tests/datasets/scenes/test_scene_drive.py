@@ -91,7 +91,7 @@ def test_every_row_is_read_back_and_pictures_have_their_size(files: SceneFiles) 
     assert count == files.pictures
 
 
-def test_the_camera_is_the_one_that_the_vehicle_file_tells(files: SceneFiles) -> None:
+def test_the_camera_is_the_one_that_the_vehicle_file_reports(files: SceneFiles) -> None:
     vehicle = load_vehicle(files.vehicle)
     (block, *_) = blocks(files.log, CALIBRATION)
 
@@ -228,7 +228,7 @@ def test_a_drive_is_not_overwritten_unasked(files: SceneFiles) -> None:
         (["simulate", "A", "--seed", "-1", "-o", "x"], "seed -1"),
     ],
 )
-def test_wrong_usage_is_told(
+def test_wrong_usage_is_reported(
     argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(argv) == 2

@@ -1,4 +1,4 @@
-"""Shares of road in regions: scaled with the picture, left for right in a mirror."""
+"""Fractions of road in regions: scaled with the picture, left for right in a mirror."""
 
 import numpy as np
 import pytest

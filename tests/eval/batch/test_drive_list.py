@@ -236,7 +236,7 @@ def test_names_are_safe_and_apart_whatever_the_logs_are_called(texts: list[str])
         assert len(name.encode()) < 200
 
 
-def test_an_unreadable_folder_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreadable_folder_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(self: Path) -> None:
         raise PermissionError(13, "Permission denied")
 

@@ -152,7 +152,7 @@ def test_two_jobs_of_one_name_are_refused(tmp_path: Path) -> None:
         Processes(0)
 
 
-def test_progress_tells_what_is_left(tmp_path: Path) -> None:
+def test_progress_reports_what_is_left(tmp_path: Path) -> None:
     seen: list[Progress] = []
     jobs = made_jobs(tmp_path, ["plain", "damaged", "more"])
     run_many(jobs[:1], letters, in_turn)

@@ -76,7 +76,7 @@ def test_a_column_that_only_some_drives_have_is_null_in_the_others(tmp_path: Pat
     assert table["roundabout"].to_pylist() == [0.5, None]
 
 
-def test_columns_that_do_not_fit_are_told(tmp_path: Path) -> None:
+def test_columns_that_do_not_fit_are_reported(tmp_path: Path) -> None:
     runs = {
         "one": _run(tmp_path / "a", t_ns=pa.array([1])),
         "two": _run(tmp_path / "b", t_ns=pa.array(["noon"])),

@@ -1,4 +1,4 @@
-"""Joining a Ray cluster takes nothing over and tells nobody."""
+"""Joining a Ray cluster takes nothing over and reports nobody."""
 
 import signal
 import socket
@@ -45,7 +45,7 @@ def test_a_cluster_that_is_not_there_is_one_line() -> None:
 
 
 @needs_ray
-def test_an_address_where_nobody_listens_is_told_at_once() -> None:
+def test_an_address_where_nobody_listens_is_reported_at_once() -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"

@@ -1,4 +1,4 @@
-"""Many drives by the command line: failures are told, a second start does what is missing."""
+"""Many drives by the command line: failures are reported, a second start does what is missing."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ def test_one_failing_drive_does_not_stop_the_rest(
 
     assert run(["replay", str(drives), "-o", str(out), "--json"]) == 3
 
-    told = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
-    assert set(told) == {"monday", "tuesday", "broken"}
-    assert "does not begin like MCAP" in told["broken"]["error"]
-    assert told["monday"]["result"]["pose"]["rows"] > 1000
-    assert not (out / told["broken"]["name"] / "manifest.json").exists()
+    reported = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
+    assert set(reported) == {"monday", "tuesday", "broken"}
+    assert "does not begin like MCAP" in reported["broken"]["error"]
+    assert reported["monday"]["result"]["pose"]["rows"] > 1000
+    assert not (out / reported["broken"]["name"] / "manifest.json").exists()
 
     assert run(["replay", str(drives), "-o", str(out), "--json"]) == 3
-    told = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
-    assert told["monday"]["earlier"]
-    assert told["tuesday"]["earlier"]
-    assert not told["broken"]["earlier"]
+    reported = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
+    assert reported["monday"]["earlier"]
+    assert reported["tuesday"]["earlier"]
+    assert not reported["broken"]["earlier"]
 
 
 def test_two_workers_give_the_bytes_of_one(drives: Path, tmp_path: Path) -> None:

@@ -34,15 +34,15 @@ def test_a_broken_vehicle_file_costs_its_own_drive_and_an_edited_dbc_is_seen(
 
     assert run(argv) == 3
 
-    told = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
-    assert told["monday"]["error"] is None
-    assert "not TOML" in told["tuesday"]["error"]
-    assert runs_of([str(tmp_path / "runs")]) == (tmp_path / "runs" / told["monday"]["name"],)
+    reported = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
+    assert reported["monday"]["error"] is None
+    assert "not TOML" in reported["tuesday"]["error"]
+    assert runs_of([str(tmp_path / "runs")]) == (tmp_path / "runs" / reported["monday"]["name"],)
     merged = open_run(tmp_path / "runs" / "merged")
-    assert set(merged.table("pose")["drive"].to_pylist()) == {told["monday"]["name"]}
+    assert set(merged.table("pose")["drive"].to_pylist()) == {reported["monday"]["name"]}
     manifest = merged.manifest()
     assert isinstance(manifest, MergedManifest)
-    assert list(manifest.failures) == [told["tuesday"]["name"]]
+    assert list(manifest.failures) == [reported["tuesday"]["name"]]
     accounts = manifest.account.reading.values()
     assert sum(one.used for one in accounts) > 1000
     for one in accounts:
@@ -51,8 +51,8 @@ def test_a_broken_vehicle_file_costs_its_own_drive_and_an_edited_dbc_is_seen(
     (dbc,) = drives.joinpath("monday").glob("*.dbc")
     dbc.write_text(dbc.read_text() + "\n")
     assert run([*argv, "-q"]) == 1
-    told = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
-    assert "other logs, settings or versions" in told["monday"]["error"]
+    reported = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
+    assert "other logs, settings or versions" in reported["monday"]["error"]
 
 
 def test_a_log_on_an_object_store_is_replayed_and_fetched_again_for_an_estimate(

@@ -84,16 +84,16 @@ def test_tables_say_segment_and_stamp_and_rows_add_up(
 
     status = cli.run(["decode", str(log), "--vehicle", car, "-o", str(out), "--json"])
 
-    told = json.loads(capsys.readouterr().out)
+    reported = json.loads(capsys.readouterr().out)
     assert status == (3 if by_s else 0)
-    assert len(told["time"]["segments"]) == (2 if by_s else 1)
+    assert len(reported["time"]["segments"]) == (2 if by_s else 1)
     speed = pq.read_table(out / "can_WHEEL_SPEEDS.parquet")
     recorded = Clock(set_at_s=6.0, by_s=by_s).recorded(np.arange(140) * ROW + BEGIN)[1]
     assert speed["log_t_ns"].to_pylist() == recorded.tolist()
     assert np.all(np.diff(speed["t_ns"].to_numpy()) > 0)
     assert speed["segment"].to_pylist() == [0] * 60 + [1 if by_s else 0] * 80
     skipped = RunFolder(out).table("skipped").to_pylist()
-    for name, topic in told["account"]["reading"][0]["topics"].items():
+    for name, topic in reported["account"]["reading"][0]["topics"].items():
         counts = [topic["used"], *topic["skipped"].values(), *topic["dropped"].values()]
         assert topic["in"] == sum(counts)
         rows = [row["count"] for row in skipped if row["topic"] == name]

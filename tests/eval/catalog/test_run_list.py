@@ -75,5 +75,5 @@ def test_errors_are_one_line(runs: Path, argument: str, said: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_not_there_is_left_to_be_told_when_opened(tmp_path: Path) -> None:
+def test_what_is_not_there_is_left_to_be_reported_when_opened(tmp_path: Path) -> None:
     assert runs_of([str(tmp_path / "gone")]) == (tmp_path / "gone",)

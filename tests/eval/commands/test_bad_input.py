@@ -1,4 +1,4 @@
-"""Bad input from the command line: what can be read is read, the rest is told in a line."""
+"""Bad input from the command line: what can be read is read, the rest is reported in a line."""
 
 import json
 import os

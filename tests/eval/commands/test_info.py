@@ -33,7 +33,7 @@ NASTY = "/cam\x1b[31m\n\u202e\udcff\x00<b>"
 
 @dataclass(slots=True)
 class MadeLog:
-    """A log made of blocks, with losses as told."""
+    """A log made of blocks, with losses as reported."""
 
     blocks: tuple[Block, ...]
     topics: tuple[Topic, ...]
@@ -130,7 +130,7 @@ def test_identifiers_are_counted_apart_by_length_and_most_frequent_first() -> No
     assert "can0: 3 ids; 0x100 526 Hz, 0x200 263 Hz, 0x100x 263 Hz" in shown(made())
 
 
-def test_losses_are_told_by_topic_reason_and_place() -> None:
+def test_losses_are_reported_by_topic_reason_and_place() -> None:
     summary = summarise(made(dropped=31, unknown=True))
     text = "\n".join(lines_of(summary, 100))
 
@@ -189,7 +189,7 @@ def test_a_log_whose_topics_share_no_clock_says_so() -> None:
     assert any(f.startswith("no two share a clock") for f in summarise(log).findings)
 
 
-def test_logs_shown_together_tell_their_common_time_or_that_there_is_none() -> None:
+def test_logs_shown_together_report_their_common_time_or_that_there_is_none() -> None:
     early = summarise(made(path=Path("a.mcap")))
     late_stream = Stream(300, 50 * MS)
     late = summarise(

@@ -43,7 +43,8 @@ class Drive:
         self.vehicle.write_text(
             self.vehicle.read_text() + DETECTORS.format(folder / "objects.json")
         )
-        # Twice: the manifest tells how many results came from the cache, which is all from now on.
+        # Twice: the manifest reports how many results came from the cache, which is all from now
+        # on.
         assert cli.run(self.replay(folder / "whole", "-q")) == 0
         assert cli.run(self.replay(folder / "whole", "-q", "--overwrite")) == 0
         self.whole = tree(folder / "whole")
@@ -85,7 +86,7 @@ def _some(count: int, of: int, seed: int) -> list[int]:
     return [0, *sorted(between), of - 1]
 
 
-def _is_told(ended: faults.Ended) -> None:
+def _is_text(ended: faults.Ended) -> None:
     assert ended.status == 1, ended
     assert ended.said.startswith("crosscue: ")
     assert ended.said.count("\n") == 1, ended.said
@@ -172,26 +173,26 @@ def test_a_write_that_fails_anywhere_leaves_nothing_half(
     for operation in _some(6, count, seed=4):
         shutil.rmtree(run, ignore_errors=True)
         ended = faults.failing_from(run, operation, argv, once=once)
-        _is_told(ended)
+        _is_text(ended)
         assert "the disk is full" in ended.said
         _left_clean(run, drive)
 
 
-def test_a_disk_that_fails_to_flush_is_told(drive: Drive, tmp_path: Path) -> None:
+def test_a_disk_that_fails_to_flush_is_reported(drive: Drive, tmp_path: Path) -> None:
     for call in (0, 3, 9):
         ended = faults.with_failing_fsync(call, drive.replay(tmp_path / f"run{call}"))
-        _is_told(ended)
+        _is_text(ended)
         assert "Input/output error" in ended.said
         _left_clean(tmp_path / f"run{call}", drive)
 
 
-def test_a_file_that_cannot_grow_is_told(drive: Drive, tmp_path: Path) -> None:
+def test_a_file_that_cannot_grow_is_reported(drive: Drive, tmp_path: Path) -> None:
     # The manifest's timings make it a few bytes longer or shorter from run to run.
     sizes = sorted(p.stat().st_size for p in (drive.folder / "whole").glob("*.parquet"))
 
     for size in (0, 100, sizes[len(sizes) // 2], sizes[-1] - 1):
         ended = faults.with_files_up_to(size, drive.replay(tmp_path / f"run{size}"))
-        _is_told(ended)
+        _is_text(ended)
         _left_clean(tmp_path / f"run{size}", drive)
 
 
@@ -201,7 +202,7 @@ def _left_clean(run: Path, drive: Drive) -> None:
         _is_whole_or_says_so(run, drive.whole)
 
 
-def test_of_two_at_once_the_second_is_refused_and_told_whose_it_is(
+def test_of_two_at_once_the_second_is_refused_and_reported_whose_it_is(
     drive: Drive, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
@@ -259,7 +260,7 @@ def _takes_turns(path: Path, rounds: int) -> int:
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become nobody")
-def test_what_may_not_be_read_or_written_is_told(drive: Drive, tmp_path: Path) -> None:
+def test_what_may_not_be_read_or_written_is_reported(drive: Drive, tmp_path: Path) -> None:
     def as_nobody() -> None:
         os.setgid(65534)
         os.setuid(65534)
@@ -274,7 +275,7 @@ def test_what_may_not_be_read_or_written_is_told(drive: Drive, tmp_path: Path) -
     log = faults.forked(as_nobody, ["replay", str(secret), "-o", str(drive.folder / "theirs")])
 
     for ended in (output, there, estimate):
-        _is_told(ended)
+        _is_text(ended)
         assert "Permission denied" in ended.said
     assert log.status == 4
     assert "no permission to read it" in log.said

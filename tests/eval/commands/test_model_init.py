@@ -131,7 +131,7 @@ def test_several_layouts_are_listed(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert run(["model", "init", str(path), "--kind", "yolox"]) == 0
 
 
-def test_the_real_yolox_is_told_from_its_twin_by_running_it(
+def test_the_real_yolox_is_reported_from_its_twin_by_running_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "yolox.onnx"

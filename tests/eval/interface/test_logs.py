@@ -48,8 +48,8 @@ def test_every_format_gives_tables_and_frames(name: str, tmp_path: Path) -> None
                 rows += sum(frame.rgb.shape[2] == 3 for frame in topic.frames())
                 continue
             table = topic.table()
-            (told,) = json.loads(table.schema.metadata[b"crosscue"]).values()
-            assert len(table) == told["used"] == sum(map(len, topic.batches()))
+            (reported,) = json.loads(table.schema.metadata[b"crosscue"]).values()
+            assert len(table) == reported["used"] == sum(map(len, topic.batches()))
             assert table.column_names[0] == "log_ns"
             rows += len(table)
     assert rows or heard
@@ -124,9 +124,9 @@ def test_what_is_missing_is_warned_of_and_stands_in_the_table(
     with crosscue.open(cut) as log, pytest.warns(crosscue.LossWarning):
         table = log["/can"].table()
 
-    told = json.loads(table.schema.metadata[b"crosscue"])[str(cut)]
-    assert told["used"] == len(table)
-    lost = (told, told["unattributed"])
+    reported = json.loads(table.schema.metadata[b"crosscue"])[str(cut)]
+    assert reported["used"] == len(table)
+    lost = (reported, reported["unattributed"])
     assert any(one["dropped"] or one["dropped_unknown"] for one in lost)
 
 
@@ -134,10 +134,10 @@ def test_the_account_of_a_whole_topic_adds_up(drive: DriveFiles) -> None:
     with crosscue.open(drive.log) as log:
         table = log["/can"].table(end_s=1)
 
-    told = json.loads(table.schema.metadata[b"crosscue"])[str(drive.log)]
-    assert told["used"] == len(table)
-    assert told["found"] == told["used"] + sum(told["skipped"].values())
-    assert not told["dropped"]
+    reported = json.loads(table.schema.metadata[b"crosscue"])[str(drive.log)]
+    assert reported["used"] == len(table)
+    assert reported["found"] == reported["used"] + sum(reported["skipped"].values())
+    assert not reported["dropped"]
 
 
 def test_logs_of_one_drive_are_read_one_after_another(tmp_path: Path) -> None:

@@ -115,20 +115,20 @@ def test_a_second_run_takes_all_from_the_cache_and_gives_the_same(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, cache = _folder(tmp_path), str(tmp_path / "cache.sqlite")
-    told = []
+    reported = []
     for name in ("a", "b"):
         args = ["-o", str(tmp_path / name), "--detectors", BRIGHT, "--cache", cache, "--json"]
         assert run(["detect", str(log), *args]) == 0
-        told.append(json.loads(capsys.readouterr().out))
+        reported.append(json.loads(capsys.readouterr().out))
 
-    assert told[0]["ran"] == {BRIGHT: 5}
-    assert told[1]["ran"] == {BRIGHT: 0}
-    assert told[1]["from_cache"] == {BRIGHT: 5}
+    assert reported[0]["ran"] == {BRIGHT: 5}
+    assert reported[1]["ran"] == {BRIGHT: 0}
+    assert reported[1]["from_cache"] == {BRIGHT: 5}
     first, second = (open_run(tmp_path / name) for name in ("a", "b"))
     assert first.table("detections").equals(second.table("detections"))
 
 
-def test_broken_empty_and_huge_pictures_are_skipped_and_told(tmp_path: Path) -> None:
+def test_broken_empty_and_huge_pictures_are_skipped_and_reported(tmp_path: Path) -> None:
     log = _folder(tmp_path)
     ok, png = cv2.imencode(".png", np.zeros((4, 4), np.uint8))
     assert ok
@@ -151,7 +151,7 @@ def test_broken_empty_and_huge_pictures_are_skipped_and_told(tmp_path: Path) -> 
     assert account.dropped["picture not decoded"] == 1
 
 
-def test_a_camera_that_changes_size_is_followed_and_told(tmp_path: Path) -> None:
+def test_a_camera_that_changes_size_is_followed_and_reported(tmp_path: Path) -> None:
     log = _folder(tmp_path)
     wide = np.zeros((96, 128), np.uint8)
     wide[50:60, 10:20] = 255
@@ -178,7 +178,7 @@ def test_a_camera_that_changes_size_is_followed_and_told(tmp_path: Path) -> None
         ("", "none named; there are:"),
     ],
 )
-def test_a_detector_that_cannot_be_is_told_in_one_line(
+def test_a_detector_that_cannot_be_is_reported_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], detector: str, said: str
 ) -> None:
     log = _folder(tmp_path)
@@ -186,9 +186,9 @@ def test_a_detector_that_cannot_be_is_told_in_one_line(
 
     assert run(["detect", str(log), *args]) in (1, 2)
 
-    told = capsys.readouterr().err
-    assert said in told
-    assert told.count("\n") == 1
+    reported = capsys.readouterr().err
+    assert said in reported
+    assert reported.count("\n") == 1
 
 
 def test_an_unknown_setting_is_refused_with_a_suggestion(
@@ -217,7 +217,7 @@ def test_an_unknown_setting_is_refused_with_a_suggestion(
         ({"weights": '"gone.onnx"'}, "put the weights next to the card"),
     ],
 )
-def test_a_card_that_does_not_fit_is_told_in_one_line(
+def test_a_card_that_does_not_fit_is_reported_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, str], said: str
 ) -> None:
     card = yolox_card(tmp_path, **changes)
@@ -225,9 +225,9 @@ def test_a_card_that_does_not_fit_is_told_in_one_line(
 
     assert run(["detect", str(_folder(tmp_path)), *args]) == 2
 
-    told = capsys.readouterr().err
-    assert said in told
-    assert told.count("\n") == 1
+    reported = capsys.readouterr().err
+    assert said in reported
+    assert reported.count("\n") == 1
 
 
 def test_yolox_finds_the_cars_and_lights_of_a_real_approach(tmp_path: Path) -> None:

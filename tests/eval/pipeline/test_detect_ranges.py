@@ -62,7 +62,7 @@ def test_fit_ranges_writes_a_section_that_the_vehicle_file_takes(
     assert curve.residual_sd_m == pytest.approx(0.5, rel=0.05)
 
 
-def test_a_table_without_its_columns_is_told(
+def test_a_table_without_its_columns_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = tmp_path / "pairs.csv"
@@ -73,7 +73,7 @@ def test_a_table_without_its_columns_is_told(
     assert "want the columns height_px and range_m" in capsys.readouterr().err
 
 
-def test_a_table_that_is_none_is_told_with_its_path_once(
+def test_a_table_that_is_none_is_reported_with_its_path_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "wild.csv").write_bytes(b"\xff\xd8\xff")
@@ -81,9 +81,9 @@ def test_a_table_that_is_none_is_told_with_its_path_once(
     for name, said in (("none.csv", "No such file"), ("wild.csv", "is no text")):
         path = tmp_path / name
         assert run(["fit", "ranges", str(path), "--cue", "stop_sign"]) == 2
-        told = capsys.readouterr().err
-        assert f"{path}: {said}" in told
-        assert told.count(name) == 1
+        reported = capsys.readouterr().err
+        assert f"{path}: {said}" in reported
+        assert reported.count(name) == 1
 
 
 HEIGHTS = {"stop_sign": 750.0, "traffic_light": 1000.0}
@@ -160,10 +160,10 @@ def test_a_curve_is_measured_on_drives_it_was_not_fitted_to(
 
     assert run([*argv, "--json"]) == 0
 
-    told = json.loads(capsys.readouterr().out)
-    assert told["fits"][0]["residual_sd_m"] < 0.01
-    assert told["tested"]["residual_sd_m"] == pytest.approx(1.0, rel=0.3)
-    assert told["tested"]["pairs"] == 60
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["fits"][0]["residual_sd_m"] < 0.01
+    assert reported["tested"]["residual_sd_m"] == pytest.approx(1.0, rel=0.3)
+    assert reported["tested"]["pairs"] == 60
     assert figure.read_bytes().startswith(b"\x89PNG")
     assert run(argv) == 1  # the figure is there already
     assert run([*argv, "--overwrite"]) == 0
@@ -188,7 +188,7 @@ def test_a_runs_detections_are_paired_with_the_truth_of_its_drive(tmp_path: Path
     assert pairs.range_m.tolist() == [67.0]
 
 
-def test_truth_without_objects_or_ranges_is_told(tmp_path: Path) -> None:
+def test_truth_without_objects_or_ranges_is_reported(tmp_path: Path) -> None:
     save(Truth(version=1, start_ns=0, end_ns=9), tmp_path)
 
     with pytest.raises(SchemaError, match="has no ranges"):

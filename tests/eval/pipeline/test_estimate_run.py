@@ -156,8 +156,8 @@ def test_only_a_changed_detector_runs_again(
     ]
     assert run(arguments) == 0
 
-    told = json.loads(capsys.readouterr().out)["detected"]
-    assert told["ran"] == {"oracle": 0, "signs": told["frames"]}
+    reported = json.loads(capsys.readouterr().out)["detected"]
+    assert reported["ran"] == {"oracle": 0, "signs": reported["frames"]}
 
 
 def test_a_resumed_run_gives_the_bytes_of_an_uninterrupted_one(

@@ -135,8 +135,8 @@ def test_a_pause_is_a_gap_with_its_length(tmp_path: Path) -> None:
     assert [one.gap_ns for one in outcome.segments[1:]] == [4 * SECOND + ROW]
     assert "1 gap without odometry, 4.1 s in all" in outcome.notices[0]
     assert set(outcome.run.table("pose")["segment"].to_pylist()) == {0, 1}
-    told = outcome.run.drive_manifest().timeline.segments
-    assert [one.cause for one in told] == ["start", "odometry silent"]
+    reported = outcome.run.drive_manifest().timeline.segments
+    assert [one.cause for one in reported] == ["start", "odometry silent"]
 
 
 def test_a_gap_shorter_than_the_limit_changes_nothing(tmp_path: Path) -> None:

@@ -111,7 +111,7 @@ def test_a_short_gap_keeps_the_approach_and_its_range(tmp_path: Path, pause_s: f
     assert outcome.scene.without_odometry == 1
     after = outcome.run.table("range").to_pylist()
     after = [row for row in after if row["segment"] == 1]
-    # A new range would begin with the second look; this one was carried over the gap.
+    # A new range would begin with the second observation; this one was carried over the gap.
     assert after[0]["t_ns"] == outcome.segments[1].start_ns
     left_m = float(distance_m(np.array([after[0]["t_ns"]]))[0])
     assert after[0]["range_m"] == pytest.approx(left_m, abs=1.0)

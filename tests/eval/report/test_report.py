@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from markupsafe import Markup
 
 from crosscue.eval import cli
-from crosscue.eval.report.page import told_time, write_report
+from crosscue.eval.report.page import reported_time, write_report
 from crosscue.eval.report.scene_figures import (
     draw_belief,
     draw_distances,
@@ -51,11 +51,11 @@ class _Page(HTMLParser):
 def _scored(folder: Path, name: str = "A", **more: Any) -> RunScored:
     """A run in which a car is said to cross that does not, from frame 21 on."""
     run = scene_run(folder, **more)
-    told = truth(
+    reported = truth(
         [*good_truth().truth.cues, span("cross_traffic_right", 0, 40, present=False, count=0)],
         approaches=[approach(intersection=name)],
     )
-    return judge_run(run, truth_folder(folder, told))
+    return judge_run(run, truth_folder(folder, reported))
 
 
 def _written(folder: Path, *scored: RunScored, **more: Any) -> str:
@@ -77,7 +77,7 @@ def test_nothing_that_logs_or_truth_say_becomes_active(tmp_path: Path) -> None:
     assert "/camera/[red]&lt;script&gt;" in page
 
 
-def test_coverage_comes_first_and_losses_are_told(tmp_path: Path) -> None:
+def test_coverage_comes_first_and_losses_are_reported(tmp_path: Path) -> None:
     page = _written(tmp_path, _scored(tmp_path / "drive"))
 
     order = [
@@ -91,7 +91,7 @@ def test_coverage_comes_first_and_losses_are_told(tmp_path: Path) -> None:
     assert "Not scored:</b> pose (the truth tells no track (pose: missing))" in page
 
 
-def test_tables_tell_the_metrics_and_what_was_published(tmp_path: Path) -> None:
+def test_tables_report_the_metrics_and_what_was_published(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
     metrics = metrics_of([one], scores_of([one]))
     page = _written(tmp_path, one)
@@ -109,9 +109,9 @@ def test_simulated_drives_are_called_so(tmp_path: Path) -> None:
     made_up = _scored(tmp_path / "drive")
     assert "Simulated" not in _written(tmp_path, made_up)
 
-    told = json.loads((tmp_path / "drive" / "truth.json").read_text())
-    told["source"] = "simulated by crosscue"
-    (tmp_path / "drive" / "truth.json").write_text(json.dumps(told))
+    reported = json.loads((tmp_path / "drive" / "truth.json").read_text())
+    reported["source"] = "simulated by crosscue"
+    (tmp_path / "drive" / "truth.json").write_text(json.dumps(reported))
     page = _written(tmp_path, judge_run(made_up.run, tmp_path / "drive" / "truth.json"))
 
     assert "<b>Simulated</b>: this drive and the truth were computed" in page
@@ -147,7 +147,7 @@ def test_the_same_scores_give_the_same_bytes(tmp_path: Path) -> None:
     assert _written(tmp_path / "b", again) == first
 
 
-def test_what_a_cue_was_worth_is_told_beside_the_others(tmp_path: Path) -> None:
+def test_what_a_cue_was_worth_is_reported_beside_the_others(tmp_path: Path) -> None:
     nothing = {"value": 0.0, "low": None, "high": None}
     worth = {
         "stop_sign": {
@@ -210,8 +210,8 @@ def test_score_writes_the_page_and_names_it(
     runs = [str(_scored(tmp_path / name, name).run.path) for name in ("one", "two")]
 
     assert cli.run(["score", runs[0]]) == 3
-    told = capsys.readouterr().out
-    assert f"written to {Path(runs[0]) / FOLDER / 'report.html'}" in told
+    reported = capsys.readouterr().out
+    assert f"written to {Path(runs[0]) / FOLDER / 'report.html'}" in reported
     assert cli.run(["score", *runs, "-o", str(tmp_path / "all"), "-q"]) == 3
     assert "<h1>2 drives</h1>" in (tmp_path / "all" / "report.html").read_text()
 
@@ -255,6 +255,6 @@ def test_a_curve_breaks_where_a_value_is_missing() -> None:
     assert drawing.svg().count("<polyline") == 2
 
 
-def test_times_are_told_as_the_viewer_shows_them() -> None:
-    assert told_time(1_700_000_014_250_999_999) == "2023-11-14 22:13:34.250 UTC"
-    assert told_time(2_500_000_000) == "2.500 s"
+def test_times_are_reported_as_the_viewer_shows_them() -> None:
+    assert reported_time(1_700_000_014_250_999_999) == "2023-11-14 22:13:34.250 UTC"
+    assert reported_time(2_500_000_000) == "2.500 s"

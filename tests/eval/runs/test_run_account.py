@@ -46,10 +46,10 @@ def _agrees(run: Path, printed: dict[str, Any]) -> Account:
     found = folder.drive_manifest().account
     check(found)
     assert printed["account"] == found.as_json()
-    told: Counter[tuple[str, str, bool]] = Counter()
+    reported: Counter[tuple[str, str, bool]] = Counter()
     unknown = set()
     for row in folder.table("skipped").to_pylist():
-        told[row["topic"], row["reason"], row["is_dropped"]] += row["count"] or 0
+        reported[row["topic"], row["reason"], row["is_dropped"]] += row["count"] or 0
         if row["count"] is None:
             unknown.add((row["topic"], row["reason"]))
     wanted: Counter[tuple[str, str, bool]] = Counter()
@@ -58,7 +58,7 @@ def _agrees(run: Path, printed: dict[str, Any]) -> Account:
             wanted.update({(topic, why, False): n for why, n in one.skipped.items()})
             wanted.update({(topic, why, True): n for why, n in one.dropped.items()})
             assert {(topic, why) for why in one.dropped_unknown} <= unknown
-    assert +told == +wanted
+    assert +reported == +wanted
     return found
 
 

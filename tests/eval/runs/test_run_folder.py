@@ -47,7 +47,7 @@ def test_a_table_is_named_only_when_whole(tmp_path: Path) -> None:
     assert list(run.path.iterdir()) == []
 
 
-def test_a_flipped_byte_in_a_table_is_told(tmp_path: Path) -> None:
+def test_a_flipped_byte_in_a_table_is_reported(tmp_path: Path) -> None:
     run = create(tmp_path / "run", overwrite=False)
     with TableSink(run, "pose", SCHEMA) as sink:
         sink.write({"t_ns": np.arange(10_000)})
@@ -70,7 +70,7 @@ def test_the_same_rows_give_the_same_bytes(tmp_path: Path) -> None:
     assert first == second
 
 
-def test_where_the_kernel_keeps_no_locks_the_text_tells_who_holds_it(
+def test_where_the_kernel_keeps_no_locks_the_text_reports_who_holds_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = create(tmp_path / "run", overwrite=False)

@@ -312,8 +312,8 @@ def test_nees_of_drawn_errors_lies_in_its_band() -> None:
         summary = summarise_nees(values, dimensions, independent=2000)
         assert summary.band_low < summary.mean < summary.band_high
         assert summary.share_inside_95 == pytest.approx(0.95, abs=0.02)
-        over_sure = summarise_nees(4.0 * values, dimensions, independent=2000)
-        assert over_sure.mean > over_sure.band_high
+        overconfident = summarise_nees(4.0 * values, dimensions, independent=2000)
+        assert overconfident.mean > overconfident.band_high
 
 
 def test_nees_by_hand_and_across_the_seam() -> None:
@@ -353,7 +353,7 @@ def test_the_mean_band_holds_its_share_of_simulated_means() -> None:
 
     low, high = chi_square.mean_band(3, 5)
 
-    # 20,000 draws: the share's own s.d. is 0.0015.
+    # 20,000 draws: the fraction's own s.d. is 0.0015.
     assert np.mean((means > low) & (means < high)) == pytest.approx(0.95, abs=0.006)
 
 

@@ -67,12 +67,12 @@ def test_only_without_sign_or_light_established_presence_stands_for_the_intersec
 ) -> None:
     roads_only = {name: changes for name, changes in BELIEF.items() if name != "intersection"}
     unsaid = belief_table({"intersection": {}, **roads_only})
-    told = truth()
-    (one,) = told.truth.approaches
+    reported = truth()
+    (one,) = reported.truth.approaches
     approaches = (one.model_copy(update={"control": control}),)
-    told = replace(told, truth=told.truth.model_copy(update={"approaches": approaches}))
+    reported = replace(reported, truth=reported.truth.model_copy(update={"approaches": approaches}))
 
-    judged = judge_approaches(tables(belief=unsaid, ranges=range_table(8, 45)), told)
+    judged = judge_approaches(tables(belief=unsaid, ranges=range_table(8, 45)), reported)
 
     assert judged is not None
     (result,) = judged.results
@@ -193,7 +193,7 @@ def test_a_perfectly_calibrated_belief_lies_on_the_diagonal() -> None:
     assert sum(inside) >= 8
 
 
-def test_belief_is_judged_until_the_car_enters_and_the_rest_is_told() -> None:
+def test_belief_is_judged_until_the_car_enters_and_the_rest_is_reported() -> None:
     scores = score_belief(judge_belief(good_tables(), good_truth()))
 
     # Ten steps at 0.5, thirty at 0.95; the last ten lie in the intersection.
@@ -204,7 +204,7 @@ def test_belief_is_judged_until_the_car_enters_and_the_rest_is_told() -> None:
     assert scores["straight"].brier.value == pytest.approx((30 * 0.25 + 10 * 0.04) / 40)
 
 
-def test_frames_for_which_the_run_believes_nothing_are_told() -> None:
+def test_frames_for_which_the_run_believes_nothing_are_reported() -> None:
     run = tables(belief=belief_table(BELIEF, frames=range(15, 50)), frames=50)
     score = score_belief(judge_belief(run, truth()))["left"]
 
@@ -221,7 +221,7 @@ def test_where_no_intersection_is_ahead_only_its_absence_is_judged() -> None:
     assert scores["left"].left_out == {"in the intersection": 10, "no intersection ahead": 20}
 
 
-def test_a_feature_of_the_users_own_is_not_judged_and_told() -> None:
+def test_a_feature_of_the_users_own_is_not_judged_and_reported() -> None:
     run = tables(belief=belief_table({"intersection": {}, "roundabout": {3: 0.99}}))
     score = score_belief(judge_belief(run, truth()))["roundabout"]
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.eval.scoring.cues import judge_cues, score_cues
+from crosscue.eval.scoring.cues import match_cues, score_cues
 from crosscue.eval.scoring.intervals import mean, resampled, share, wilson
 from crosscue.replay.vehicle.cue_table import CUES
 from support.scoring import (
@@ -74,7 +74,7 @@ def test_many_clusters_are_resampled_in_parts_with_the_same_spread() -> None:
 
 
 def test_a_hand_counted_drive() -> None:
-    score = score_cues(judge_cues(good_tables(), good_truth()))["stop_sign"]
+    score = score_cues(match_cues(good_tables(), good_truth()))["stop_sign"]
     objects = score.readings["object"]
 
     # The sign is there in frames 5 to 39, found in 10 to 39; frames 40 to 49 are past it.
@@ -93,7 +93,7 @@ def test_a_hand_counted_drive() -> None:
 
 def test_frames_sum_up_to_scored_and_reasons_in_every_reading() -> None:
     found = {"stop_sign": {3: 1, 7: 0, 45: 1, 80: 2}, "do_not_enter": {0: 1}}
-    scores = score_cues(judge_cues(tables(found, frames=50), good_truth()))
+    scores = score_cues(match_cues(tables(found, frames=50), good_truth()))
 
     assert len(scores) == len(CUES)
     for score in scores.values():
@@ -108,7 +108,7 @@ def test_the_two_readings_differ_where_a_way_is_there_but_closed() -> None:
     one = approach(features={"left": False, "right": True, "straight": False}, one_way="right")
     drive = truth([span("road_left", 0, 40), span("one_way_right", 0, 40, present=False)], [one])
     scores = score_cues(
-        judge_cues(tables({"road_left": {5: 1, 6: 1}, "one_way_right": {7: 1}}), drive)
+        match_cues(tables({"road_left": {5: 1, 6: 1}, "one_way_right": {7: 1}}), drive)
     )
 
     road, sign = scores["road_left"].readings, scores["one_way_right"].readings
@@ -121,7 +121,7 @@ def test_the_two_readings_differ_where_a_way_is_there_but_closed() -> None:
 
 def test_a_cue_of_an_intersection_where_none_is_ahead_is_wrong() -> None:
     far = approach(start_ns=at(20), enter_ns=at(40))
-    judged = judge_cues(tables({"traffic_light": {5: 1, 25: 1}}), truth([], [far]))
+    judged = match_cues(tables({"traffic_light": {5: 1, 25: 1}}), truth([], [far]))
     score = score_cues(judged)["traffic_light"]
 
     # Without truth of lights themselves, the other reading leads and the score says so.
@@ -138,16 +138,16 @@ def test_things_hidden_do_not_count_in_the_recall_of_what_can_be_seen() -> None:
         ]
     )
     found = {"parked_left": {frame: int(frame >= 10) for frame in range(20)}}
-    score = score_cues(judge_cues(tables(found), drive))["parked_left"].readings["object"]
+    score = score_cues(match_cues(tables(found), drive))["parked_left"].readings["object"]
 
     assert score.recall is not None
     assert score.recall_seen is not None
     assert (score.recall.value, score.recall_seen.value) == (0.5, 1.0)
 
 
-def test_a_cue_of_ones_own_is_scored_and_told_where_nothing_looked_for_it() -> None:
+def test_a_cue_of_ones_own_is_scored_and_reported_where_nothing_looked_for_it() -> None:
     drive = truth([span("zebra", 0, 10), span("zebra", 10, 40, present=False), span("gate", 0, 40)])
-    scores = score_cues(judge_cues(tables({"zebra": dict.fromkeys(range(5, 15), 1)}), drive))
+    scores = score_cues(match_cues(tables({"zebra": dict.fromkeys(range(5, 15), 1)}), drive))
 
     zebra, gate = scores["zebra"], scores["gate"]
     assert (zebra.precision.right, zebra.precision.of) == (5, 10)
@@ -156,17 +156,17 @@ def test_a_cue_of_ones_own_is_scored_and_told_where_nothing_looked_for_it() -> N
     assert gate.readings["object"].left_out["not looked for"] == 10
 
 
-def test_moments_without_a_frame_are_told() -> None:
+def test_moments_without_a_frame_are_reported() -> None:
     moment = span("stop_sign", 0, 1).model_copy(
         update={"start_ns": None, "end_ns": None, "t_ns": at(3) + 1}
     )
-    judged = judge_cues(tables({"stop_sign": {3: 1}}), truth([moment]))
+    judged = match_cues(tables({"stop_sign": {3: 1}}), truth([moment]))
 
     assert score_cues(judged)["stop_sign"].moments_unmatched == 1
 
 
 def test_merged_drives_count_as_the_sum_and_know_their_clusters() -> None:
-    judged = [one for name in ("a", "b") for one in judge_cues(good_tables(), good_truth(name))]
+    judged = [one for name in ("a", "b") for one in match_cues(good_tables(), good_truth(name))]
     score = score_cues(judged)["stop_sign"]
 
     assert (score.precision.right, score.precision.of, score.precision.clusters) == (60, 60, 2)
@@ -182,8 +182,8 @@ def test_the_order_of_rows_does_not_matter(frames: dict[int, int]) -> None:
     order = np.random.default_rng(len(frames)).permutation(table.num_rows)
     shuffled = run_tables("made up", cues_table=table.take(order))
 
-    first = score_cues(judge_cues(run_tables("made up", cues_table=table), good_truth()))
-    second = score_cues(judge_cues(shuffled, good_truth()))
+    first = score_cues(match_cues(run_tables("made up", cues_table=table), good_truth()))
+    second = score_cues(match_cues(shuffled, good_truth()))
     assert repr(first) == repr(second)
 
 
@@ -197,8 +197,8 @@ SPANS = st.lists(
 def test_counting_frame_by_frame_gives_the_same(
     spans: list[tuple[int, int, bool]], found: dict[int, int]
 ) -> None:
-    told = [span("stop_sign", first, first + length, there) for first, length, there in spans]
-    score = score_cues(judge_cues(tables({"stop_sign": found}), truth(told)))["stop_sign"]
+    stated = [span("stop_sign", first, first + length, there) for first, length, there in spans]
+    score = score_cues(match_cues(tables({"stop_sign": found}), truth(stated)))["stop_sign"]
 
     positives = rights = theres = hits = 0
     for frame, count in found.items():
@@ -224,7 +224,7 @@ def test_parts_by_distance_sum_up_and_tags_belong_to_their_approach() -> None:
         [span("stop_sign", 0, 20), span("stop_sign", 130, 150, False)], [wet, dry], end=160
     )
     found = {"stop_sign": dict.fromkeys(range(160), 1)}
-    score = score_cues(judge_cues(tables(found), drive))["stop_sign"].readings["object"]
+    score = score_cues(match_cues(tables(found), drive))["stop_sign"].readings["object"]
 
     assert sum(part.frames for part in score.by_distance.values()) == score.scored == 40
     assert {

@@ -75,7 +75,7 @@ def test_a_run_finds_the_truth_beside_its_log_and_leaves_its_scores(
     assert frames.filter(frames["cue"].to_numpy(zero_copy_only=False) == "road_left").num_rows == 50
 
 
-def test_the_summary_tells_coverage_first_and_fits_a_terminal(
+def test_the_summary_reports_coverage_first_and_fits_a_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = [str(_one(tmp_path, name)) for name in ("one", "two")]
@@ -359,7 +359,7 @@ def test_a_run_without_anything_to_score_says_why(
     assert "not scored belief: the run has no belief" in capsys.readouterr().out
 
 
-def test_no_truth_anywhere_is_told_with_the_places_looked_at(
+def test_no_truth_anywhere_is_reported_with_the_places_looked_at(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = run_folder(tmp_path / "run")
@@ -394,15 +394,17 @@ def test_a_run_that_cannot_be_scored_does_not_stop_the_rest(
     argv = ["score", str(tmp_path / "runs"), "-o", str(tmp_path / "all"), "--workers", workers]
 
     assert cli.run(argv) == 3
-    told = capsys.readouterr()
-    assert "runs/b: no manifest.json" in told.err
-    assert "failed     1 of 3 runs" in told.out
+    reported = capsys.readouterr()
+    assert "runs/b: no manifest.json" in reported.err
+    assert "failed     1 of 3 runs" in reported.out
     pooled = json.loads((tmp_path / "all" / "metrics.json").read_text())
     assert [one["drive"][-6:] for one in pooled["coverage"]["by_drive"]] == ["runs/a", "runs/c"]
     assert list(pooled["coverage"]["failed"]) == [str(tmp_path / "runs" / "b")]
 
 
-def test_two_runs_of_one_log_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_runs_of_one_log_are_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     truth_folder(tmp_path)
     runs = [str(run_folder(tmp_path / name).path) for name in ("a", "b")]
 

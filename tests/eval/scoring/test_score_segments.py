@@ -46,8 +46,8 @@ def test_what_a_set_back_makes_ambiguous_is_counted_everywhere(tmp_path: Path) -
     for one in metrics["belief"].values():
         assert one["left_out"][AMBIGUOUS] == belief
         assert one["steps"] >= run.table("belief").num_rows
-    told = [one["left_out"].get(AMBIGUOUS, 0) for one in metrics["range"].values()]
-    assert sum(told) == ranges
+    reported = [one["left_out"].get(AMBIGUOUS, 0) for one in metrics["range"].values()]
+    assert sum(reported) == ranges
     pose = metrics["pose"]["coverage"]
     assert pose["ambiguous"] > 0
     assert metrics["account"]["scoring"]["poses"]["skipped"][AMBIGUOUS] == pose["ambiguous"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from crosscue.eval.scoring.approaches import ApproachResult
-from crosscue.eval.scoring.cues import CueJudged
+from crosscue.eval.scoring.cues import CueFrames
 from crosscue.eval.studies.intersections.causes import (
     Finding,
     approach_findings,
@@ -47,10 +47,10 @@ def _result(**changes: object) -> ApproachResult:
 
 def _cue(
     cue: str, *, found: int = 0, there: int = 0, visible: float = 1.0, approach: int = 0
-) -> CueJudged:
+) -> CueFrames:
     """Things there, and positives, in the first so many frames."""
     first = np.arange(FRAMES)
-    return CueJudged(
+    return CueFrames(
         drive="runs/X-01",
         cue=cue,
         t_ns=first.astype(np.int64),
@@ -68,7 +68,7 @@ def _cue(
     )
 
 
-def _found(result: ApproachResult, *cues: CueJudged) -> list[Finding]:
+def _found(result: ApproachResult, *cues: CueFrames) -> list[Finding]:
     return approach_findings(result, cues)
 
 
@@ -96,16 +96,16 @@ def test_what_is_covered_is_hidden_whatever_detectors_did() -> None:
     (one,) = _found(NO_LEFT, _cue("road_left", there=30, visible=0.4))
 
     assert one.cause == "hidden"
-    assert "30 frames" in one.told
+    assert "30 frames" in one.reported
 
 
 def test_what_is_in_plain_view_and_missed_is_laid_to_the_detectors() -> None:
     (one,) = _found(NO_LEFT, _cue("road_left", there=30, found=4), _cue("parked_left", there=10))
 
     assert one.cause == "not found"
-    assert "4 of 40" in one.told
-    assert "road left 4/30" in one.told
-    assert "parked left 0/10" in one.told
+    assert "4 of 40" in one.reported
+    assert "road left 4/30" in one.reported
+    assert "parked left 0/10" in one.reported
 
 
 def test_a_positive_where_nothing_is_does_not_count_as_finding_it() -> None:
@@ -114,14 +114,14 @@ def test_a_positive_where_nothing_is_does_not_count_as_finding_it() -> None:
     )
 
     assert one.cause == "not found"
-    assert "0 of 8" in one.told
+    assert "0 of 8" in one.reported
 
 
 def test_a_louder_cue_that_rules_it_out_denies_it() -> None:
     (one,) = _found(NO_LEFT, _cue("road_left", there=30, found=4), _cue("one_way_right", found=9))
 
     assert one.cause == "denied"
-    assert "one way right" in one.told
+    assert "one way right" in one.reported
 
 
 def test_found_but_never_counted_waits_for_presence() -> None:
@@ -144,7 +144,7 @@ def test_an_invented_feature_names_who_claimed_it() -> None:
     (one,) = _found(result, _cue("road_straight", found=12), _cue("lanes_past", found=1))
 
     assert (one.failing, one.cause) == ("invented", "claimed wrongly")
-    assert one.told == f"road straight in 12 of {FAR}, lanes past in 1 of {FAR}"
+    assert one.reported == f"road straight in 12 of {FAR}, lanes past in 1 of {FAR}"
     assert one.at_m == pytest.approx(90.0)
 
 

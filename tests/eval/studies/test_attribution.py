@@ -61,7 +61,7 @@ def test_a_cue_that_says_nothing_changes_nothing() -> None:
         assert one.belief["left"].log_score.value == 0.0
 
 
-def test_attribution_is_told_in_metrics_and_in_a_terminal() -> None:
+def test_attribution_is_reported_in_metrics_and_in_a_terminal() -> None:
     drive = _drive("d", {"stop_sign": NEVER})
     found = attribute([drive], GROUPS)
     metrics = as_metrics(score([drive.judged])) | {"attribution": attribution_tree(found)}

@@ -69,7 +69,7 @@ def test_the_tables_say_that_they_are_simulated_and_stand_beside_the_published(s
     assert (study / "detections.jpg").stat().st_size > 10_000
 
 
-def test_truth_told_as_detections_gives_right_cues(study: Path) -> None:
+def test_truth_reported_as_detections_gives_right_cues(study: Path) -> None:
     rows = {row["cue"]: row for row in _tables(study)["cues"]}
 
     assert rows["stop sign"]["precision"] == rows["traffic light"]["precision"] == 1.0

@@ -17,12 +17,12 @@ from pydantic import ValidationError
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.studies.intervals import (
+    fraction_of,
     logistic,
     mean_of,
     range_at,
     ratio_of,
     ratio_of_means,
-    share_of,
 )
 from crosscue.eval.studies.page import Table, write_page
 from crosscue.eval.studies.town import work
@@ -191,7 +191,7 @@ def test_a_folder_with_another_study_is_refused(tmp_path: Path) -> None:
     list(drive_study(other, tmp_path, 1, overwrite=True))
 
 
-def test_ray_gives_the_same_bytes_and_tells_of_dead_workers(
+def test_ray_gives_the_same_bytes_and_reports_of_dead_workers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("ray")
@@ -209,7 +209,7 @@ def test_ray_gives_the_same_bytes_and_tells_of_dead_workers(
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ('version = 1\nkind = "range"\n[drive.car]\ncruize_mps = 9.0\n', r":4: .*cruise_mps"),
         (
@@ -233,12 +233,12 @@ def test_ray_gives_the_same_bytes_and_tells_of_dead_workers(
     ],
 )
 def test_a_study_file_that_does_not_fit_is_named_with_its_line(
-    tmp_path: Path, text: str, told: str
+    tmp_path: Path, text: str, reported: str
 ) -> None:
     path = tmp_path / "s.toml"
     path.write_text(text)
 
-    with pytest.raises(StudyFileError, match=told):
+    with pytest.raises(StudyFileError, match=reported):
         load_study(path, RangeStudy)
 
 
@@ -412,5 +412,5 @@ def test_intervals_hold_what_they_should() -> None:
 
     assert 0.91 < np.mean(held) < 0.98
     assert ratio.low < 1.3 < ratio.high
-    assert share_of(8, 10).value == 0.8
-    assert share_of(0, 0).low == 0.0
+    assert fraction_of(8, 10).value == 0.8
+    assert fraction_of(0, 0).low == 0.0

@@ -290,7 +290,7 @@ def test_features_of_another_matcher_are_refused(tmp_path: Path) -> None:
         LandmarkWriter(path, "orb")
 
 
-def test_a_second_writer_is_told_of_the_first(
+def test_a_second_writer_is_reported_of_the_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("crosscue.localization.landmarks.file._BUSY_S", 0.05)
@@ -369,7 +369,7 @@ def test_a_writer_killed_half_way_leaves_what_was_there(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]
 
 
-def test_a_disk_that_fills_up_is_told_and_leaves_what_was_there(tmp_path: Path) -> None:
+def test_a_disk_that_fills_up_is_reported_and_leaves_what_was_there(tmp_path: Path) -> None:
     """The kernel refuses to let the file grow, as a full disk would."""
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
 
@@ -393,7 +393,7 @@ def test_a_database_that_may_not_grow_says_the_disk_is_full(tmp_path: Path) -> N
         assert len(database) == 3
 
 
-def test_a_folder_that_may_not_be_written_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_may_not_be_written_is_reported(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"lm\.sqlite: .*check the path and its mode"):
         LandmarkWriter(tmp_path / "missing" / "lm.sqlite", "orb")
 

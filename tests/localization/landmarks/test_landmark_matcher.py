@@ -130,7 +130,7 @@ def test_a_picture_file_gives_its_pixels(tmp_path: Path, suffix: str) -> None:
         grey_of(read_picture(path))
 
 
-def test_files_that_are_no_pictures_are_told(tmp_path: Path) -> None:
+def test_files_that_are_no_pictures_are_reported(tmp_path: Path) -> None:
     (tmp_path / "text.png").write_text("hello")
     with pytest.raises(LogFormatError, match=r"text\.png: not a JPEG, PNG or WebP picture"):
         read_picture(tmp_path / "text.png")

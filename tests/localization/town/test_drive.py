@@ -124,7 +124,7 @@ def test_code_kept_by_the_compiler_is_named_after_every_file_that_it_was_made_of
     assert before == again != named()
 
 
-def test_events_tell_all_goals_and_landmarks() -> None:
+def test_events_report_all_goals_and_landmarks() -> None:
     traced = drive_traced(KINDS["field"], 2)
     result = traced.result
 

@@ -1,7 +1,7 @@
 """The simulator's filter is as wrong as it says: NEES and NIS in their chi-square bands.
 
 Here the wheels' encoders are fine enough to be no source of error, because the filter does not know
-of their steps. docs/studies.md tells where the filter is over-sure, and by how much.
+of their steps. docs/studies.md reports where the filter is overconfident, and by how much.
 """
 
 import math

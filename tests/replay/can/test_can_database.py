@@ -162,20 +162,20 @@ def test_sizes_that_would_eat_the_memory_are_refused(
         CanDatabase.load([write(tmp_path, text.replace(old, new, 1))])
 
 
-def test_a_dbc_file_cut_anywhere_is_refused_or_told(tmp_path: Path) -> None:
+def test_a_dbc_file_cut_anywhere_is_refused_or_reported(tmp_path: Path) -> None:
     text = dbc_text([YAW, WHEEL]).rstrip()
     whole = CanDatabase.load([write(tmp_path, text)])
-    told = 0
+    reported = 0
     for cut in range(len(text)):
         try:
             database = CanDatabase.load([write(tmp_path, text[:cut])])
         except SchemaError:
             continue
-        told += 1
+        reported += 1
         # After a whole line of the closing section a cut cannot be seen.
         is_hidden = text[:cut].endswith(";\n")
         assert is_hidden or database.messages == whole.messages or database.notices
-    assert told > 10
+    assert reported > 10
 
 
 def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ FRAME = st.tuples(
 
 @settings(deadline=None)
 @given(frames=st.lists(FRAME, min_size=1, max_size=30), engine=st.sampled_from(["numpy", "numba"]))
-def test_every_frame_is_decoded_or_told_of_by_one_of_the_two(
+def test_every_frame_is_decoded_or_reported_of_by_one_of_the_two(
     frames: list[tuple[int, int, bool, bool, int]], engine: EngineName
 ) -> None:
     ids, kinds, extended, fd, lengths = (np.array(column) for column in zip(*frames, strict=True))

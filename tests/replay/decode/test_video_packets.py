@@ -76,7 +76,7 @@ def test_a_stream_that_begins_within_a_group_loses_what_cannot_be_known(tmp_path
     assert all(found[12 * STEP_NS + k * STEP_NS] == 12 + k for k in range(12))
 
 
-def test_a_broken_packet_is_told_and_the_next_group_is_whole(tmp_path: Path) -> None:
+def test_a_broken_packet_is_reported_and_the_next_group_is_whole(tmp_path: Path) -> None:
     topic, blocks = packets(video(tmp_path / "front.mp4", options={"g": "12", "bf": "0"}))
     (block,) = blocks
     assert isinstance(block.rows, Images)

@@ -128,7 +128,7 @@ def test_one_stall_of_the_host_leaves_the_image_times_alone() -> None:
     np.testing.assert_allclose(found.image_ns, log_ns[0] + image_ns - image_ns[0], atol=MS)
 
 
-def test_a_device_that_starts_anew_is_followed_and_told() -> None:
+def test_a_device_that_starts_anew_is_followed_and_reported() -> None:
     image_ns, counter_ms = camera(400)
     counter_ms = np.where(np.arange(400) < 200, counter_ms, (counter_ms - 100) & 0xFF)
     found = unwrap(counter_ms, image_ns)
@@ -146,12 +146,12 @@ def test_a_log_clock_that_goes_back_starts_image_times_anew() -> None:
     assert found.notices == (f"{WENT_BACK} (1 times, first at {log_ns[50]} ns)",)
 
 
-def test_a_gap_too_long_for_the_drift_is_told() -> None:
+def test_a_gap_too_long_for_the_drift_is_reported() -> None:
     log_ns = np.array([0, GAP_NS + 1], dtype=np.int64)
     assert unwrap(np.array([0, 9]), log_ns).notices[0].startswith(LONG_GAP)
 
 
-def test_a_stall_longer_than_a_wrap_is_told_not_hidden() -> None:
+def test_a_stall_longer_than_a_wrap_is_reported_not_hidden() -> None:
     image_ns, counter_ms = camera(100)
     log_ns = image_ns + 5 * MS
     stalled = (np.arange(100) >= 50) & (log_ns < log_ns[50] + 330 * MS)

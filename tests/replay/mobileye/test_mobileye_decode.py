@@ -103,7 +103,7 @@ def test_a_triple_across_two_status_frames_is_not_joined() -> None:
     assert ledger.topic("can1").dropped.total() == 3
 
 
-def test_a_cut_burst_keeps_its_whole_obstacles_and_tells_the_rest() -> None:
+def test_a_cut_burst_keeps_its_whole_obstacles_and_reports_the_rest() -> None:
     sent = [status(3, 0), *triple(0, 7), *triple(1, 9)[:2], status(0, 66)]
     times = [0, *range(MS, 6 * MS, MS), 66 * MS]
     tables, ledger = decode(frames(sent, times))
@@ -158,7 +158,7 @@ def test_the_same_counter_a_wrap_later_is_a_new_image() -> None:
     assert not skipped(ledger)
 
 
-def test_slots_beyond_the_count_are_told_not_used() -> None:
+def test_slots_beyond_the_count_are_reported_not_used() -> None:
     tables, ledger = decode(frames([status(1, 0), *triple(0, 7), *triple(1, 9)]))
 
     assert tables["obstacles"]["obstacle_id"].tolist() == [7]
@@ -193,7 +193,7 @@ def test_with_ten_slots_the_ids_above_are_foreign() -> None:
     assert any("announces 11 obstacles; there are 10 slots" in n for n in ledger.notices)
 
 
-def test_frames_that_are_no_mobileyes_are_told_by_reason() -> None:
+def test_frames_that_are_no_mobileyes_are_reported_by_reason() -> None:
     good = frames([status(0, 0)])
     odd = [
         frames([status(0, 0)], kind=REMOTE),
@@ -357,11 +357,11 @@ def test_a_log_without_lengths_leaves_missing_what_hangs_on_them() -> None:
     assert isinstance(block.rows, CanFrames)
     block.rows.length[:] = LENGTH_UNKNOWN
     unknown, _ = decode(block)
-    told, _ = decode(block, MobileyeSettings(revision="2.32", mounting=HERE))
+    reported, _ = decode(block, MobileyeSettings(revision="2.32", mounting=HERE))
 
     assert len(unknown["obstacles"]) == 1
     assert unknown["status"]["failsafe"].tolist() == [-1]
-    assert told["status"]["failsafe"].tolist() == [0]
+    assert reported["status"]["failsafe"].tolist() == [0]
 
 
 LDW_BIT = "0000000001000000"

@@ -160,7 +160,7 @@ def obstacle_drive() -> list[Block]:
     return messages_of(frames(sent, times))
 
 
-def test_obstacle_messages_that_did_not_come_are_told() -> None:
+def test_obstacle_messages_that_did_not_come_are_reported() -> None:
     statuses, obstacles = obstacle_drive()
     _, ledger = from_bag([statuses, obstacles.take(np.arange(8) != 3)])
 
@@ -169,7 +169,7 @@ def test_obstacle_messages_that_did_not_come_are_told() -> None:
     assert [(d.t_ns, d.detail) for d in ledger.drops()] == [(1066 * MS, "burst 1")]
 
 
-def test_no_obstacle_messages_at_all_are_told_too() -> None:
+def test_no_obstacle_messages_at_all_are_reported_too() -> None:
     statuses, obstacles = obstacle_drive()
     _, ledger = from_bag([statuses, obstacles.take(np.s_[:0])])
     assert (
@@ -241,7 +241,7 @@ def test_a_mirrored_obstacle_is_noticed() -> None:
     assert any("which side obstacles are on" in n for n in ledger.notices)
 
 
-def test_messages_not_used_are_told_under_their_topic() -> None:
+def test_messages_not_used_are_reported_under_their_topic() -> None:
     statuses, obstacles = obstacle_drive()
     assert isinstance(obstacles.rows, Table)
     fewer = {n: c for n, c in obstacles.rows.columns.items() if n != "obstacle_pos_x"}

@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.detectors.images import MOST_PIXELS
+from crosscue.detectors.images import MAX_PIXELS
 from crosscue.replay.limits import DEFAULT, MIB
 from support.can_files import blf, made
 from support.measured import measured
 from support.pictures import picture_folder
 from support.rosbag_files import rows_of, write_folder
 
-from .test_bombs import BOMB_BYTES, MOST_MB, PIECE, with_zstd
+from .test_bombs import BOMB_BYTES, MAX_MB, PIECE, with_zstd
 
 SIDE_PX = 60_000
-MOST_WITH_DETECTOR_MB = 500
+MAX_WITH_DETECTOR_MB = 500
 """OpenCV and the table of detectors are loaded, too; the pictures ask for 10 GB."""
 
 
@@ -101,7 +101,7 @@ def test_a_bomb_in_a_log_is_refused_with_both_numbers(tmp_path: Path, case: str)
     status, said, peak_mb = measured(["info", str(path)])
 
     assert status == wanted, said
-    assert peak_mb < MOST_MB
+    assert peak_mb < MAX_MB
     for number in numbers:
         assert re.search(number, said), (number, said)
 
@@ -158,6 +158,6 @@ def test_a_picture_bomb_is_dropped_before_it_is_decoded(
     status, said, peak_mb = measured([*argv, "-o", str(tmp_path / "run")])
 
     assert status == 3, said
-    assert peak_mb < MOST_WITH_DETECTOR_MB
+    assert peak_mb < MAX_WITH_DETECTOR_MB
     assert f"{SIDE_PX} x {SIDE_PX}" in said
-    assert f"{MOST_PIXELS:,}" in said
+    assert f"{MAX_PIXELS:,}" in said

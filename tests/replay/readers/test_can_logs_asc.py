@@ -79,7 +79,7 @@ def test_a_line_says_what_it_says(tmp_path: Path, line: str, frame: Sent) -> Non
         "gibberish",
     ],
 )
-def test_a_line_that_can_be_no_frame_is_lost_and_told(tmp_path: Path, line: str) -> None:
+def test_a_line_that_can_be_no_frame_is_lost_and_reported(tmp_path: Path, line: str) -> None:
     found, ledger = read_back(_log(tmp_path, HEAD + LINE + line + "\n" + LINE))
 
     assert len(found["can/1"]) == 2
@@ -184,7 +184,7 @@ def test_two_logs_in_one_file_keep_their_dates(tmp_path: Path) -> None:
     assert ledger.is_whole
 
 
-def test_a_missing_end_of_the_trigger_block_is_told(tmp_path: Path) -> None:
+def test_a_missing_end_of_the_trigger_block_is_reported(tmp_path: Path) -> None:
     begin = "Begin Triggerblock Fri Jul 10 12:00:00.000 pm 2015\n"
 
     _, cut = read_back(_log(tmp_path, HEAD + begin + LINE))

@@ -109,7 +109,7 @@ def test_a_line_says_what_it_says(tmp_path: Path, line: str, frame: Sent) -> Non
         "(1.0) can0 123#" + "A" * 20_000,
     ],
 )
-def test_a_line_that_can_be_no_frame_is_lost_and_told(tmp_path: Path, line: str) -> None:
+def test_a_line_that_can_be_no_frame_is_lost_and_reported(tmp_path: Path, line: str) -> None:
     found, ledger = read_back(_log(tmp_path, WHOLE + line + "\n" + WHOLE))
 
     assert len(found["can0"]) == 2

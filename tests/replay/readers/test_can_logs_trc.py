@@ -81,7 +81,7 @@ def test_a_line_says_what_it_says(tmp_path: Path, text: str, frame: Sent) -> Non
         "gibberish",
     ],
 )
-def test_a_line_that_can_be_no_frame_is_lost_and_told(tmp_path: Path, line: str) -> None:
+def test_a_line_that_can_be_no_frame_is_lost_and_reported(tmp_path: Path, line: str) -> None:
     found, ledger = read_back(_log(tmp_path, V1 + LINE_1 + line + "\n" + LINE_1))
 
     assert len(found["can/1"]) == 2

@@ -1,4 +1,4 @@
-"""Videos: the picture at a time is the one that was filmed then, and what is cut is told."""
+"""Videos: the picture at a time is the one that was filmed then, and what is cut is reported."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_another_codec_is_decoded_here(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", [NO_REORDERING, REORDERING], ids=["plain", "reordered"])
-def test_without_a_time_file_its_own_times_are_used_and_told(
+def test_without_a_time_file_its_own_times_are_used_and_reported(
     tmp_path: Path, options: dict[str, str]
 ) -> None:
     blocks, ledger = read(video(tmp_path / "a.mp4", N, "libx264", options))
@@ -89,7 +89,7 @@ def test_without_a_time_file_its_own_times_are_used_and_told(
     assert ledger.notices[0].startswith("times are the video's own, starting at 0")
 
 
-def test_a_constant_rate_is_told(tmp_path: Path) -> None:
+def test_a_constant_rate_is_reported(tmp_path: Path) -> None:
     path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
     path.with_suffix(".txt").write_text("rate_hz: 10")
 
@@ -100,7 +100,7 @@ def test_a_constant_rate_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("lines", "lost", "skipped"), [(N + 3, 3, 0), (N - 3, 3, 0)])
-def test_more_or_fewer_times_than_pictures_are_told(
+def test_more_or_fewer_times_than_pictures_are_reported(
     tmp_path: Path, lines: int, lost: int, skipped: int
 ) -> None:
     path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
@@ -142,7 +142,7 @@ def test_only_the_part_asked_for_is_given(tmp_path: Path) -> None:
         ("a.mkv", "libx264", {}, "matroska"),
     ],
 )
-def test_a_video_cut_anywhere_is_refused_or_told(
+def test_a_video_cut_anywhere_is_refused_or_reported(
     tmp_path: Path, name: str, codec: str, container: dict[str, str], tail: str, share: float
 ) -> None:
     whole = tmp_path / name

@@ -60,7 +60,7 @@ def test_the_coding_is_what_the_bytes_say_not_the_name(tmp_path: Path) -> None:
     assert block.rows.coding == ("png", "jpeg")
 
 
-def test_names_in_the_time_file_decide_and_the_rest_is_told(tmp_path: Path) -> None:
+def test_names_in_the_time_file_decide_and_the_rest_is_reported(tmp_path: Path) -> None:
     folder = picture_folder(
         tmp_path / "front", 3, "frame_2.png,0.5\nframe_0.png,1.5\ngone.png,2.5\n"
     )
@@ -99,7 +99,7 @@ def test_counts_that_differ_without_a_reason_are_never_zipped_in_silence(tmp_pat
     assert any("7 files and 5 times" in notice for notice in of_more.notices)
 
 
-def test_gaps_in_numbers_with_as_many_times_are_told(tmp_path: Path) -> None:
+def test_gaps_in_numbers_with_as_many_times_are_reported(tmp_path: Path) -> None:
     folder = picture_folder(tmp_path / "front", 6, FIVE)
     (folder / "frame_2.png").unlink()
 
@@ -109,7 +109,7 @@ def test_gaps_in_numbers_with_as_many_times_are_told(tmp_path: Path) -> None:
     assert "leave out 1" in ledger.notices[0]
 
 
-def test_a_constant_rate_is_told_and_keeps_gaps(tmp_path: Path) -> None:
+def test_a_constant_rate_is_reported_and_keeps_gaps(tmp_path: Path) -> None:
     folder = picture_folder(tmp_path / "front", 5, "rate_hz: 2\n")
     (folder / "frame_3.png").unlink()
 
@@ -141,7 +141,7 @@ def test_damaged_cut_and_foreign_files_are_never_given(tmp_path: Path) -> None:
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(share=st.floats(0.0, 0.999))
-def test_a_picture_cut_anywhere_is_told(tmp_path: Path, suffix: str, share: float) -> None:
+def test_a_picture_cut_anywhere_is_reported(tmp_path: Path, suffix: str, share: float) -> None:
     folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5", suffix)
     whole = picture(0, suffix)
     (folder / f"frame_0{suffix}").write_bytes(whole[: int(share * len(whole))])
@@ -157,7 +157,7 @@ def test_a_picture_cut_anywhere_is_told(tmp_path: Path, suffix: str, share: floa
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(at=st.integers(0, 10_000), flip=st.integers(1, 255))
-def test_a_flipped_byte_in_a_png_is_told(tmp_path: Path, at: int, flip: int) -> None:
+def test_a_flipped_byte_in_a_png_is_reported(tmp_path: Path, at: int, flip: int) -> None:
     folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5")
     changed = bytearray(picture(0))
     changed[at % len(changed)] ^= flip

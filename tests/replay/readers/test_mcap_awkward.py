@@ -177,7 +177,7 @@ def test_an_index_that_lies_is_not_believed(tmp_path: Path) -> None:
     assert reading.ledger.is_whole
 
 
-def test_messages_of_an_undeclared_channel_are_told_as_lost(tmp_path: Path) -> None:
+def test_messages_of_an_undeclared_channel_are_reported_as_lost(tmp_path: Path) -> None:
     chunk = ChunkOf([*DEFINED, message(9, 1), message(9, 2), message(1, 3)])
     reading = read_back(stored(tmp_path / "x.mcap", McapFile([chunk])))
 

@@ -1,4 +1,4 @@
-"""Damaged, cut and hostile MCAP files: what can be read comes out, the rest is told, always."""
+"""Damaged, cut and hostile MCAP files: what can be read comes out, the rest is reported, always."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_a_flipped_byte_costs_its_chunk_and_names_it(tmp_path: Path, compression
         assert loss.t_ns == 10**9
 
 
-def test_a_chunk_whose_checksum_was_zeroed_along_with_its_head_is_told(tmp_path: Path) -> None:
+def test_a_chunk_whose_checksum_was_zeroed_along_with_its_head_is_reported(tmp_path: Path) -> None:
     parts = sound_parts("zstd", is_chunked=True)
     third = parts[2]
     assert isinstance(third, ChunkOf)
@@ -263,7 +263,7 @@ BOMBS = {
 
 
 @pytest.mark.parametrize("bomb", list(BOMBS), ids=lambda name: name.replace(" ", "-"))
-def test_a_bomb_is_told_and_soon_over(tmp_path: Path, bomb: str) -> None:
+def test_a_bomb_is_reported_and_soon_over(tmp_path: Path, bomb: str) -> None:
     sound = ChunkOf([*DEFINED, *many(10)])
     path = tmp_path / "log.mcap"
     path.write_bytes(MAGIC + header() + sound.coded() + BOMBS[bomb])
@@ -277,7 +277,7 @@ def test_a_bomb_is_told_and_soon_over(tmp_path: Path, bomb: str) -> None:
     assert not reading.ledger.is_whole
 
 
-def test_a_file_of_128_bytes_that_declares_a_terabyte_is_told(tmp_path: Path) -> None:
+def test_a_file_of_128_bytes_that_declares_a_terabyte_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     coded = MAGIC + header() + BOMBS["declares 2^40"]
     path.write_bytes(coded + bytes(128 - len(coded)))
@@ -369,16 +369,16 @@ def test_one_flipped_byte_outside_chunks_costs_two_messages_at_most(
         assert (given - truth).total() <= 1, at  # the row with the flip, where it cannot be known
         details = " ".join(drop.detail for drop in reading.ledger.drops())
         if "what look like other records" in details:
-            # Without any checksum or count, nothing tells this from a message that holds records.
+            # Without any checksum or count, nothing reports this from a message that holds records.
             assert not is_checked, at
             assert not has_summary, at
             continue
         assert (truth - given).total() <= 2, at
         assert reading.adds_up(), at
         accounts = reading.ledger.accounts.values()
-        is_told = not reading.ledger.is_whole or any(account.skipped for account in accounts)
+        is_annotated = not reading.ledger.is_whole or any(account.skipped for account in accounts)
         is_lost = (truth - given).total() > (given - truth).total()
-        assert is_told or not (is_checked or is_lost), at
+        assert is_annotated or not (is_checked or is_lost), at
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -458,7 +458,7 @@ def test_chunks_without_checksum_are_found_again_behind_a_damaged_one(
     assert any(f"bytes {at} to " in drop.detail for drop in reading.ledger.drops())
 
 
-def test_a_file_that_shrinks_while_open_is_told(tmp_path: Path) -> None:
+def test_a_file_that_shrinks_while_open_is_reported(tmp_path: Path) -> None:
     from crosscue.replay.ledger import Ledger
 
     path = tmp_path / "log.mcap"

@@ -124,7 +124,7 @@ def test_chunks_without_the_topic_are_not_looked_at(tmp_path: Path) -> None:
 def test_an_index_that_contradicts_a_chunk_is_given_up(tmp_path: Path) -> None:
     coded = bytearray(McapFile([*DEFINED, *map(chunk, range(9))]).coded())
     at = coded.index(chunk(4).coded()) + PREFIX.size
-    coded[at : at + 16] = struct.pack("<QQ", 300, 409)  # its head now tells another beginning
+    coded[at : at + 16] = struct.pack("<QQ", 300, 409)  # its head now reports another beginning
     path = tmp_path / "x.mcap"
     path.write_bytes(coded)
 

@@ -389,7 +389,7 @@ def test_two_types_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
     assert reading.ledger.topic("/a").skipped == {"another message type on the same topic": 1}
 
 
-def test_a_renamed_topic_keeps_its_stored_name_and_is_told(tmp_path: Path) -> None:
+def test_a_renamed_topic_keeps_its_stored_name_and_is_reported(tmp_path: Path) -> None:
     renamed = connection(0, b"/old").replace(b"topic=/old", b"topic=/new", 1)
     path = bag(tmp_path / "a.bag", chunk(renamed + message(0, START_NS, b"x")))
     reading = read_rows(path)

@@ -161,7 +161,7 @@ def wal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_sound_write_ahead_log_is_told_sound(wal_folder: Path) -> None:
+def test_a_sound_write_ahead_log_is_reported_sound(wal_folder: Path) -> None:
     state = check_wal(wal_folder / "a.db3-wal")
 
     assert state is not None
@@ -469,6 +469,6 @@ def test_payloads_of_topics_not_asked_for_are_not_fetched(tmp_path: Path) -> Non
 
     assert reading.rows == (Row("/a", 1, b"wanted"),)
     accounts = reading.ledger.accounts
-    # That one of them is no blob is not looked at.
+    # That one of them is no blob is not examined.
     assert accounts["/b"].skipped == {"topic not asked for": 2}
     assert accounts[""].skipped == {"message without a topic": 1}

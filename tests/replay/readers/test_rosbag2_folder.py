@@ -114,7 +114,7 @@ def test_however_rows_are_split_they_come_back_in_order(
     assert by_topic(read_rows(folder).rows) == by_topic(rows)
 
 
-def test_a_file_that_is_not_listed_is_read_and_told(tmp_path: Path) -> None:
+def test_a_file_that_is_not_listed_is_read_and_reported(tmp_path: Path) -> None:
     rows = rows_of(300)
     folder = joined(tmp_path / "bag", rows[:100], rows[100:])
     listing(folder, "part_0.db3", counts=count_by_topic(rows))
@@ -138,7 +138,7 @@ def test_a_listed_file_that_is_missing_is_lost_by_topic(tmp_path: Path) -> None:
         assert ledger.topic(name).in_file == count
 
 
-def test_a_missing_file_without_counts_is_still_told(tmp_path: Path) -> None:
+def test_a_missing_file_without_counts_is_still_reported(tmp_path: Path) -> None:
     folder = joined(tmp_path / "bag", rows_of(50))
     listing(folder, "part_0.db3", "part_1.db3")
     ledger = read_rows(folder).ledger

@@ -60,9 +60,9 @@ def there_and_back(topic: str, rows: Rows, ledger: Ledger | None = None) -> list
         )
         decoder = decoder_for(stored)
         assert decoder is not None
-        told = Ledger("back")
-        back.append(decoder(outgoing.block, told))
-        assert not told.details
+        reported = Ledger("back")
+        back.append(decoder(outgoing.block, reported))
+        assert not reported.details
         _rosbags_reads(outgoing)
     return back
 

@@ -1,0 +1,125 @@
+"""The text of the product uses the field's words: none that the style guide replaces.
+
+Names, comments and docstrings of every module, and the pages of the documentation. A changelog
+keeps the words of its time.
+"""
+
+import ast
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+ROOT: Final = Path(__file__).parents[2]
+FOLDERS: Final = (
+    "replay",
+    "detectors",
+    "fusion",
+    "localization",
+    "datasets",
+    "eval",
+    "benchmarks",
+    "tests",
+    "docs",
+)
+
+PHRASES: Final = {
+    "report": r"(?<!can )(?<!cannot )(?<!could )\b(tell|tells|told|telling)\b(?! (\w+ ){0,4}apart)"
+    r"(?! from)",
+    "fraction of": r"\bshares? of\b",
+    "observations": r"\b(independent|positive|negative|first|second|third|every) looks?\b"
+    r"(?! (like|at|for|up|into|as|ahead|inside))",
+    "examine": r"\b(looked|looks) at\b",
+    "repair": r"\b(mend(s|ed|ing)?|put right)\b",
+    "does not exist, is not one": r"\b(there (is|are) none|is none(?! of))\b",
+    "overconfident": r"\b(over|under)-sure\b",
+    "ego vehicle": r"\bown cars?\b",
+    "all features established": r"\bbelieved in full\b",
+    "exits, fails": r"\bway out\b",
+}
+"""What to write instead, and the words that it replaces in prose."""
+
+NAMES: Final = {
+    "report": r"(^|_)(told|tells|tell)(_|$)(?!apart|from)",
+    "max or min": r"^_?(MOST|LEAST)_",
+    "repair": r"(^|_)mend(s|ed|ing)?(_|$)",
+    "overconfident": r"(^|_)(over|under)_sure(_|$)",
+}
+"""The same for identifiers."""
+
+MAX_LEFT: Final = 40
+"""So many places may still wait for the next pass; this number only falls."""
+
+NAMES_OF_OTHERS: Final = {"tell"}
+"""The method of a file."""
+
+
+def _sources(ending: str) -> list[Path]:
+    return sorted(
+        path
+        for folder in FOLDERS
+        for path in (ROOT / folder).rglob(f"*{ending}")
+        if "_build" not in path.parts and path != Path(__file__)
+    )
+
+
+def _docstring_lines(text: str) -> set[int]:
+    return {
+        node.lineno
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    }
+
+
+def _words(path: Path) -> Iterator[tuple[int, str, dict[str, str]]]:
+    """Line, text and the table that it is held to."""
+    text = path.read_text(encoding="utf-8")
+    docstrings = _docstring_lines(text)
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.NAME and token.string not in NAMES_OF_OTHERS:
+            yield token.start[0], token.string, NAMES
+        elif token.type == tokenize.COMMENT or (
+            token.type == tokenize.STRING and token.start[0] in docstrings
+        ):
+            yield token.start[0], token.string, PHRASES
+
+
+def _replaced(where: str, text: str, table: dict[str, str]) -> Iterator[str]:
+    for instead, pattern in table.items():
+        if found := re.search(pattern, " ".join(text.split())):
+            yield f"{where}: {found[0]!r}; write: {instead}"
+
+
+def test_code_uses_the_words_of_the_style_guide() -> None:
+    found = [
+        line
+        for path in _sources(".py")
+        for number, text, table in _words(path)
+        for line in _replaced(f"{path.relative_to(ROOT)}:{number}", text, table)
+    ]
+
+    assert len(found) <= MAX_LEFT, "\n".join(found)
+
+
+def test_pages_use_the_words_of_the_style_guide() -> None:
+    top = ("README.md", "CONTRIBUTING.md", "SECURITY.md")
+    pages = [*_sources(".md"), *(ROOT / name for name in top)]
+    found = [
+        line
+        for page in pages
+        for number, text in enumerate(page.read_text(encoding="utf-8").splitlines(), 1)
+        for line in _replaced(f"{page.relative_to(ROOT)}:{number}", text, PHRASES)
+    ]
+
+    assert len(found) <= MAX_LEFT, "\n".join(found)
+
+
+def test_a_replaced_word_is_found() -> None:
+    assert list(_replaced("a.py:1", "the reader tells of two losses", PHRASES))
+    assert list(_replaced("a.py:1", "MOST_BYTES", NAMES))
+    assert not list(_replaced("a.py:1", "cannot tell one from the other", PHRASES))
+    assert not list(_replaced("a.py:1", "told apart by their order", PHRASES))
