@@ -136,13 +136,13 @@ def _download(url: str, file: WeightFile, place: Path, name: str, on_progress: P
     except ValueError:
         raise CrosscueError(
             f"{url}: what came is not {file.name} of model {name} (another SHA-256 than "
-            f"{file.sha256}); nothing was kept; fetch it elsewhere and give it with --from FILE"
+            f"{file.sha256}); nothing was kept; fetch it elsewhere and give it with --weights FILE"
         ) from None
     except (HTTPError, URLError, TimeoutError, ConnectionError) as error:
         why = error.reason if isinstance(error, URLError) else error
         raise CrosscueError(
             f"{url}: not fetched: {one_line(Exception(str(why)), 160)}; run it again to go on, "
-            f"fetch it elsewhere and give it with --from FILE, or name a mirror in {MIRROR}"
+            f"fetch it elsewhere and give it with --weights FILE, or name a mirror in {MIRROR}"
         ) from None
     except OSError as error:
         raise cannot_write(place, error) from None

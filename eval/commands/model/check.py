@@ -20,9 +20,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("model", metavar="MODEL", help="a catalog's name or a card's file name")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="run it on this picture")
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="FILE.jpg",
+        "-o",
+        "--output",
+        type=Path,
+        metavar="FILE.jpg",
         help="the picture with what was found (default: beside the picture, .found.jpg)",
-    )  # fmt: skip
+    )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -42,7 +45,10 @@ def run(args: argparse.Namespace) -> int:
         print(f"{card}: fits its network")
         if args.picture is not None:
             counts = result["found"]
-            text = ", ".join(f"{n} {label}" for label, n in counts.items()) if isinstance(
-                counts, dict) else "road"  # fmt: skip
+            text = (
+                ", ".join(f"{n} {label}" for label, n in counts.items())
+                if isinstance(counts, dict)
+                else "road"
+            )
             print(f"found      {text or 'nothing'}; drawn in {result['picture']}")
     return 0

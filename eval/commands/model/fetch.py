@@ -6,7 +6,7 @@ $CROSSCUE_MODELS the folder to keep them in.
 
 example:
   crosscue model fetch yolox-nano
-  crosscue model fetch yolox-s --from Downloads/object_detection_yolox_2022nov.onnx
+  crosscue model fetch yolox-s --weights Downloads/object_detection_yolox_2022nov.onnx
 """
 
 from __future__ import annotations
@@ -24,9 +24,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("models", nargs="+", metavar="MODEL", help="names from crosscue model list")
     parser.add_argument(
-        "--from", dest="given", type=Path, metavar="FILE",
+        "--weights",
+        dest="given",
+        type=Path,
+        metavar="FILE",
         help="take the weights from this file, or a folder with them; no network is used",
-    )  # fmt: skip
+    )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 

@@ -30,13 +30,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("weights", type=Path, metavar="MODEL", help=".onnx, or OpenVINO .xml")
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="CARD.toml",
+        "-o",
+        "--output",
+        type=Path,
+        metavar="CARD.toml",
         help="the card, in the folder of the weights (default: their name, .toml)",
-    )  # fmt: skip
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing card")
     parser.add_argument("--kind", metavar="KIND", help="layout of its outputs, where several fit")
     parser.add_argument(
-        "--classes", type=Path, metavar="FILE", help="class names, one a line, where it has none"
+        "--class-names",
+        type=Path,
+        metavar="FILE",
+        help="class names, one a line, where it has none",
     )
     parser.add_argument(
         "--size", metavar="WxH", help="run at this size, such as 1280x736, where it allows any"
@@ -61,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     if args.kind is None and len(found_kinds) > 1:
         found_kinds = plausible(args.weights, run_once, found_kinds)
     guess = _chosen(args.weights, found_kinds, run_once, args.kind)
-    written = draft(args.weights, model, guess, _names(args.classes), size)
+    written = draft(args.weights, model, guess, _names(args.class_names), size)
     _try(output, written)
     found = None
     if args.picture is not None:

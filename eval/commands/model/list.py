@@ -14,7 +14,7 @@ from crosscue.eval.commands.shared.options import print_json
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("--json", action="store_true", help="print the list as JSON")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -27,8 +27,10 @@ def run(args: argparse.Namespace) -> int:
         return 0
     for row in rows:
         state = "fetched" if row["is_fetched"] else "not fetched"
-        print(f"{row['name']:28} {row['size_mb']:6.1f} MB  {row['licence']:12} {state:12} "
-              f"{row['about']}")  # fmt: skip
+        print(
+            f"{row['name']:28} {row['size_mb']:6.1f} MB  {row['licence']:12} {state:12} "
+            f"{row['about']}"
+        )
     return 0
 
 

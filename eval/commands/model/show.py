@@ -18,7 +18,7 @@ from crosscue.eval.commands.shared.options import print_json
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("model", metavar="MODEL", help="a catalog's name or a card's file name")
-    parser.add_argument("--json", action="store_true", help="print the card as JSON")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

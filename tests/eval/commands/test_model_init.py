@@ -90,7 +90,7 @@ def test_what_the_file_does_not_say_is_assumed_aloud(
 
     assert run(["model", "init", str(path)]) == 2
     assert "3 classes and no names in the file" in capsys.readouterr().err
-    assert run(["model", "init", str(path), "--classes", str(names)]) == 0
+    assert run(["model", "init", str(path), "--class-names", str(names)]) == 0
 
     said = capsys.readouterr().out
     assert "assumed    logits become scores by the logistic function" in said
@@ -108,7 +108,7 @@ def test_sizes_that_a_file_leaves_open_are_found_by_running_it(
     names = tmp_path / "names.txt"
     names.write_text("bright\n", encoding="utf-8")
 
-    args = ["--classes", str(names), "--size", "96x64"]
+    args = ["--class-names", str(names), "--size", "96x64"]
     assert run(["model", "init", str(path), *args]) == 0
 
     assert "my.toml: end-to-end" in capsys.readouterr().out
