@@ -38,7 +38,9 @@ def longest_chain(imports: Graph) -> list[str]:
         open_now.discard(name)
         return (name, *found)
 
-    return list(max(map(from_here, imports), key=len))
+    whole: list[tuple[str, ...]] = [from_here(one) for one in imports]
+    longest = max(whole, key=len)
+    return list(longest)
 
 
 def test_no_chain_of_imports_is_longer_than_it_was(imports: Graph) -> None:
