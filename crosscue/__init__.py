@@ -36,6 +36,36 @@ _EXPORTS: Final = {
     "LogTopic": "eval.interface.logs",
     "CameraFrame": "eval.interface.logs",
     "Signals": "eval.interface.logs",
+    "DriveSummary": "eval.interface.summary",
+    "Run": "eval.interface.runs",
+    "ScoredRun": "eval.interface.runs",
+    "open_run": "eval.interface.runs",
+    "replay_drive": "eval.interface.runs",
+    "detect_drive": "eval.interface.runs",
+    "estimate_run": "eval.interface.runs",
+    "score_run": "eval.interface.runs",
+    "compare_runs": "eval.interface.runs",
+    "save_recording": "eval.interface.runs",
+    "load_vehicle": "eval.interface.runs",
+    "default_cache": "eval.interface.runs",
+    "simulate_approach": "eval.interface.simulate",
+    "simulate_drive": "eval.interface.simulate",
+    "draw_sign": "eval.interface.simulate",
+    "StudyResult": "eval.interface.studies",
+    "run_study": "eval.interface.studies",
+    "RangeStudy": "eval.studies.town.settings",
+    "LandmarkStudy": "eval.studies.town.settings",
+    "SignFit": "eval.fit.sign_threshold",
+    "fit_signs": "eval.fit.sign_threshold",
+    "Detector": "detectors.base",
+    "Detections": "detectors.base",
+    "Frame": "detectors.base",
+    "View": "detectors.base",
+    "nothing_found": "detectors.base",
+    "Settings": "detectors.settings",
+    "settings_of": "detectors.settings",
+    "identity_of": "detectors.settings",
+    "Vehicle": "replay.vehicle.vehicle",
     "plugins": "eval.interface.plugins",
     "CueSpec": "replay.vehicle.cue_spec",
     "Format": "replay.formats",
@@ -61,6 +91,16 @@ _EXPORTS: Final = {
 __all__ = [*_EXPORTS]
 
 if TYPE_CHECKING:
+    from crosscue.detectors.base import Detections as Detections
+    from crosscue.detectors.base import Detector as Detector
+    from crosscue.detectors.base import Frame as Frame
+    from crosscue.detectors.base import View as View
+    from crosscue.detectors.base import nothing_found as nothing_found
+    from crosscue.detectors.settings import Settings as Settings
+    from crosscue.detectors.settings import identity_of as identity_of
+    from crosscue.detectors.settings import settings_of as settings_of
+    from crosscue.eval.fit.sign_threshold import SignFit as SignFit
+    from crosscue.eval.fit.sign_threshold import fit_signs as fit_signs
     from crosscue.eval.interface.logs import CameraFrame as CameraFrame
     from crosscue.eval.interface.logs import Log as Log
     from crosscue.eval.interface.logs import LogTopic as LogTopic
@@ -68,6 +108,25 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.logs import Topics as Topics
     from crosscue.eval.interface.logs import open as open  # noqa: A004
     from crosscue.eval.interface.plugins import plugins as plugins
+    from crosscue.eval.interface.runs import Run as Run
+    from crosscue.eval.interface.runs import ScoredRun as ScoredRun
+    from crosscue.eval.interface.runs import compare_runs as compare_runs
+    from crosscue.eval.interface.runs import default_cache as default_cache
+    from crosscue.eval.interface.runs import detect_drive as detect_drive
+    from crosscue.eval.interface.runs import estimate_run as estimate_run
+    from crosscue.eval.interface.runs import load_vehicle as load_vehicle
+    from crosscue.eval.interface.runs import open_run as open_run
+    from crosscue.eval.interface.runs import replay_drive as replay_drive
+    from crosscue.eval.interface.runs import save_recording as save_recording
+    from crosscue.eval.interface.runs import score_run as score_run
+    from crosscue.eval.interface.simulate import draw_sign as draw_sign
+    from crosscue.eval.interface.simulate import simulate_approach as simulate_approach
+    from crosscue.eval.interface.simulate import simulate_drive as simulate_drive
+    from crosscue.eval.interface.studies import StudyResult as StudyResult
+    from crosscue.eval.interface.studies import run_study as run_study
+    from crosscue.eval.interface.summary import DriveSummary as DriveSummary
+    from crosscue.eval.studies.town.settings import LandmarkStudy as LandmarkStudy
+    from crosscue.eval.studies.town.settings import RangeStudy as RangeStudy
     from crosscue.replay.errors import AccountError as AccountError
     from crosscue.replay.errors import CrosscueError as CrosscueError
     from crosscue.replay.errors import EmptyResultError as EmptyResultError
@@ -86,6 +145,7 @@ if TYPE_CHECKING:
     from crosscue.replay.losses import LossWarning as LossWarning
     from crosscue.replay.plugins import PluginWarning as PluginWarning
     from crosscue.replay.vehicle.cue_spec import CueSpec as CueSpec
+    from crosscue.replay.vehicle.vehicle import Vehicle as Vehicle
 else:
 
     def __getattr__(name: str) -> object:

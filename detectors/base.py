@@ -142,7 +142,7 @@ class Detector(Protocol):
 
     @property
     def identity(self) -> str:
-        """Text that changes whenever its output could: version, settings, hash of the weights."""
+        """Text that changes whenever its output could, as of version, settings or weights."""
         ...
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:

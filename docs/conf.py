@@ -33,6 +33,8 @@ nitpick_ignore_regex = [
     ("py:.*", r"(numpy|np|pyarrow|pa|pathlib|collections|typing|NDArray|polars|pandas)(\..*)?"),
     # Private modules: the interface documents what is public of them under its public name.
     ("py:.*", r"crosscue\.(replay|detectors|fusion|localization|datasets|eval)\..*"),
+    # Private types in annotations, and what pydantic says of a field with limits.
+    ("py:class", r"[A-Z]\w*|.*[ =(].*"),
     ("py:.*", r"(contextlib|ExitStack|Bytes)(\..*)?"),
     ("py:.*", r"(Path|Sequence|Mapping|Callable|Iterator|Iterable|Any|Final|Literal|Detector)"),
 ]

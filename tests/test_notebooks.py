@@ -1,5 +1,6 @@
 """Notebooks are kept without outputs; ``make docs`` executes each and fails if one does."""
 
+import ast
 import json
 from pathlib import Path
 from typing import Any
@@ -24,3 +25,23 @@ def test_it_is_kept_without_outputs(path: Path) -> None:
     code = [cell for cell in _cells(path) if cell["cell_type"] == "code"]
 
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in code)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_it_uses_the_public_interface_alone(path: Path) -> None:
+    sources = ["".join(cell["source"]) for cell in _cells(path) if cell["cell_type"] == "code"]
+    modules = [
+        name
+        for node in ast.walk(ast.parse("\n".join(sources)))
+        for name in (
+            [node.module or ""]
+            if isinstance(node, ast.ImportFrom)
+            else [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else []
+        )
+    ]
+
+    ours = {name for name in modules if name.partition(".")[0] == "crosscue"}
+    assert ours
+    assert ours <= {"crosscue", "crosscue.testing"}

@@ -12,21 +12,18 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.detectors.registry import known
 from crosscue.eval.commands.shared.options import (
     add_log_arguments,
-    limits_of,
+    open_part,
     print_json,
-    selection_of,
 )
 from crosscue.eval.commands.shared.progress import DriveLine, is_shown
-from crosscue.eval.pipeline.detect import DetectOutcome, detect_drive
+from crosscue.eval.interface.runs import detect_drive
+from crosscue.eval.pipeline.detect import DetectOutcome
 from crosscue.eval.runs.account import account_lines, details_of
-from crosscue.eval.runs.folder import create
 from crosscue.replay.errors import UsageError
-from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import visible
-from crosscue.replay.vehicle.vehicle import Vehicle, load
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .replay import add_detector_arguments, cache_of, detectors_of
 
@@ -45,19 +42,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Detect; 3 when something was dropped."""
-    vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     if args.draw < 0:
         raise UsageError(f"--draw {args.draw}: want 0 or more")
-    choices = detectors_of(args, vehicle)
-    if not choices:
-        raise UsageError(f"--detectors: none named; there are: {', '.join(known({}))}")
-    with open_logs(args.logs, limits_of(args)) as logs:
-        selection = selection_of(args, logs)
-        folder = create(args.output, overwrite=args.overwrite)
-        with DriveLine("detecting", is_shown=is_shown(args)) as line:
-            outcome = detect_drive(
-                logs, vehicle, folder, selection, choices, cache_of(args), args.draw, line.at_frame
-            )
+    with (
+        open_part(args, args.logs) as log,
+        DriveLine("detecting", is_shown=is_shown(args)) as line,
+    ):
+        run = detect_drive(
+            log,
+            args.output,
+            args.vehicle or Vehicle(version=1),
+            detectors_of(args),
+            cache=cache_of(args),
+            draw=args.draw,
+            overwrite=args.overwrite,
+            on_frames=line.at_frame,
+        )
+    outcome = run.outcome
+    assert isinstance(outcome, DetectOutcome)
     if args.json:
         print_json(_as_json(outcome))
     elif not args.quiet:

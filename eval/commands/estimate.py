@@ -11,11 +11,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.eval.batch.merge import open_one
 from crosscue.eval.commands.shared.options import add_logs_argument, limits_of, print_json
 from crosscue.eval.commands.shared.progress import DriveLine, is_shown
-from crosscue.eval.pipeline.reestimate import estimate_run
-from crosscue.replay.vehicle.vehicle import load
+from crosscue.eval.interface.runs import estimate_run, open_run
+from crosscue.eval.pipeline.estimate import Outcome
 
 from .replay import as_json, summary
 
@@ -35,10 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Estimate; 3 when something was dropped."""
-    folder = open_one(args.run, args.logs, limits=limits_of(args))
-    vehicle = load(args.vehicle) if args.vehicle else None
+    run = open_run(args.run, args.logs, limits=limits_of(args))
     with DriveLine("estimating", is_shown=is_shown(args)) as line:
-        outcome = estimate_run(folder, vehicle, line.at_time)
+        outcome = estimate_run(run, args.vehicle, on_time=line.at_time).outcome
+    assert isinstance(outcome, Outcome)
     if args.json:
         print_json(as_json(outcome))
     elif not args.quiet:

@@ -16,13 +16,10 @@ examples:
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from crosscue.detectors.registry import Choice, chosen
 from crosscue.eval.batch.drive_list import DriveInput, DriveList, drives_of
 from crosscue.eval.batch.jobs import (
     Done,
@@ -36,21 +33,17 @@ from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
 from crosscue.eval.batch.processes import Processes
 from crosscue.eval.commands.shared.options import (
     add_part_arguments,
-    limits_of,
+    open_part,
     print_json,
-    selection_of,
 )
 from crosscue.eval.commands.shared.progress import DriveLine, DrivesLine, is_shown
-from crosscue.eval.pipeline.detect import choices_of
+from crosscue.eval.interface.runs import default_cache, replay_drive
 from crosscue.eval.pipeline.estimate import Outcome
-from crosscue.eval.pipeline.landmarks import matcher_for, open_for
-from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.pipeline.scene import ApproachSummary, SceneOutcome
 from crosscue.eval.runs.account import account_lines
 from crosscue.eval.runs.folder import create
 from crosscue.eval.runs.input import files_named_in
 from crosscue.replay.errors import CrosscueError, UsageError
-from crosscue.replay.opening import open_logs
 from crosscue.replay.safe_text import terminal_width, visible, wrapped
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 from crosscue.replay.versions import versions
@@ -131,22 +124,18 @@ def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def detectors_of(args: argparse.Namespace, vehicle: Vehicle) -> tuple[Choice, ...]:
-    """The detectors asked for; none where neither flag nor vehicle file names any."""
-    sections = choices_of(vehicle)
-    if args.detectors == "none" or (args.detectors is None and not sections):
-        return ()
-    return chosen(",".join(sections) if args.detectors is None else args.detectors, sections)
+def detectors_of(args: argparse.Namespace) -> Sequence[str] | None:
+    """Names as ``replay_drive`` takes them: None for the vehicle file's, empty for none."""
+    if args.detectors is None:
+        return None
+    return [] if args.detectors == "none" else str(args.detectors).split(",")
 
 
 def cache_of(args: argparse.Namespace) -> Path | None:
     """Where results are kept: as asked for, or in the user's cache folder."""
     if args.no_cache:
         return None
-    if args.cache is not None:
-        return Path(args.cache)
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "crosscue" / "detections.sqlite"
+    return default_cache() if args.cache is None else Path(args.cache)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -175,27 +164,22 @@ def _vehicle(path: Path | None, own: Path | None) -> Vehicle:
 def _replay(
     drive: DriveInput | Job, output: Path, args: argparse.Namespace, line: DriveLine
 ) -> Outcome:
-    vehicle = _vehicle(args.vehicle, drive.vehicle)
-    detecting = Detecting(
-        detectors_of(args, vehicle), cache_of(args), args.draw, args.resume, line.at_frame
-    )
-    with ExitStack() as stack:
-        logs = stack.enter_context(open_logs(drive.logs, limits_of(args)))
-        selection = selection_of(args, logs)
-        landmarks = None
-        if args.landmarks:
-            landmarks = stack.enter_context(open_for(args.landmarks, matcher_for(vehicle)))
-        run_folder = create(output, overwrite=args.overwrite or args.resume)
-        return replay_drive(
-            logs,
-            vehicle,
-            run_folder,
-            selection,
-            line.at_time,
-            landmarks,
-            detecting,
+    with open_part(args, drive.logs) as log:
+        run = replay_drive(
+            log,
+            output,
+            _vehicle(args.vehicle, drive.vehicle),
+            detectors_of(args),
+            landmarks=args.landmarks,
+            cache=cache_of(args),
+            draw=args.draw,
             overwrite=args.overwrite,
+            resume=args.resume,
+            on_frames=line.at_frame,
+            on_time=line.at_time,
         )
+    assert isinstance(run.outcome, Outcome)
+    return run.outcome
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,18 +16,13 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from crosscue.eval.batch.merge import open_one
 from crosscue.eval.commands.shared.options import (
     add_logs_arguments,
     limits_of,
     print_json,
     refuse_existing,
 )
-from crosscue.eval.recording import save
-from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.scoring.pose.score import truth_track
-from crosscue.eval.scoring.pose.truth_track import TruthTrack
-from crosscue.eval.scoring.truth import TrueRanges, load
+from crosscue.eval.interface.runs import open_run, save_recording
 from crosscue.replay.errors import CrosscueError, UsageError
 
 
@@ -57,12 +52,8 @@ def run(args: argparse.Namespace) -> int:
     if args.output is not None and args.output.suffix != ".rrd":
         raise UsageError(f"{args.output}: want a name that ends in .rrd")
     refuse_existing(args)
-    folder = open_one(
-        args.run, args.logs, without_images=args.without_images, limits=limits_of(args)
-    )
-    path = args.output or folder.file("drive.rrd")
-    track, ranges = _truth(args, folder)
-    save(folder, path, track, ranges)
+    made = open_run(args.run, args.logs, without_images=args.without_images, limits=limits_of(args))
+    path = save_recording(made, args.output, args.truth)
     if args.output is not None:
         if args.json:
             print_json({"recording": str(path)})
@@ -70,18 +61,7 @@ def run(args: argparse.Namespace) -> int:
             print(path)
     else:
         _open(path, args.web)
-    return 0 if folder.manifest().account.is_whole else 3
-
-
-def _truth(
-    args: argparse.Namespace, folder: RunFolder
-) -> tuple[TruthTrack | None, TrueRanges | None]:
-    """What the truth reports: the track, where run and truth have one, and the ranges."""
-    if args.truth is None:
-        return None, None
-    reported = load(args.truth, str(folder.path))
-    has_track = reported.truth.pose is not None and folder.file("pose.parquet").exists()
-    return truth_track(args.truth, folder) if has_track else None, reported.ranges
+    return 0 if made.manifest.account.is_whole else 3
 
 
 def _open(path: Path, web: bool) -> None:

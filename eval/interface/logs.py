@@ -34,7 +34,10 @@ from crosscue.replay.topic_part import columns_of
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from crosscue.eval.interface.summary import DriveSummary
     from crosscue.replay.columns import Bytes
+    from crosscue.replay.log_summary import Progress
+    from crosscue.replay.vehicle.vehicle import Vehicle
 
 NOT_ASKED: Final = (NOT_ASKED_TIME, NOT_ASKED_TOPIC)
 
@@ -117,6 +120,26 @@ class Log:
         """
         with unless_damaged(self.logs):
             return replace(self, selection=part_of(self.logs, start_s, end_s, topics))
+
+    def summary(
+        self,
+        vehicle: Vehicle | None = None,
+        *,
+        quick: bool = False,
+        progress: Progress | None = None,
+    ) -> DriveSummary:
+        """Topics, counts, rates, gaps, clocks and account, read in one pass.
+
+        Args:
+            vehicle: Where the wheel speeds are, to find gaps; None for what the log itself says.
+            quick: Only what the log says of itself; its body is not read.
+            progress: Passes blocks on while it shows how far the work is.
+        """
+        from crosscue.eval.interface.summary import summary_of
+        from crosscue.replay.vehicle.vehicle import Vehicle
+
+        settings = vehicle or Vehicle(version=1)
+        return summary_of(self.logs, self.selection, settings, quick=quick, progress=progress)
 
     def signals(
         self, *databases: Path | str, bus: str | None = None, messages: Sequence[str] | None = None

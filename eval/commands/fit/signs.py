@@ -13,23 +13,12 @@ examples:
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from crosscue.detectors.signs.detector import build
 from crosscue.detectors.signs.templates import AMERICAN, KINDS
-from crosscue.detectors.training.operating_point import Judged, rates_at, threshold_for, together
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, with_progress
-from crosscue.eval.fit.sign_scores import Rules, judged_pictures
-from crosscue.eval.scoring.intervals import Proportion, share
-from crosscue.replay.errors import UsageError
-
-LOWEST = 0.05
+from crosscue.eval.fit.sign_threshold import SignFit, SignRates, fit_signs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -126,111 +115,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Choose and report; 1 when no threshold is precise enough."""
-    for name in ("precision", "overlap"):
-        if not 0.0 < getattr(args, name) <= 1.0:
-            raise UsageError(f"--{name} {getattr(args, name)}: want above 0, at most 1")
-    if args.test_every < 1:
-        raise UsageError(f"--test-every {args.test_every}: want 1 or more")
-    if args.threshold is not None and not LOWEST <= args.threshold <= 1.0:
-        raise UsageError(f"--threshold {args.threshold}: want {LOWEST} to 1")
-    fitted, tested = _judged(args)
-    if not sum(part.signs for part in fitted):
-        raise UsageError(
-            f"{args.labels[0]}: no {' or '.join(args.label)} in the pictures that choose; add some"
-        )
-    score = args.threshold
-    if score is None:
-        score = _shown(threshold_for(together(fitted), args.precision))
-    if args.json:
-        print_json(_as_json(score, fitted, tested))
-    elif not args.quiet:
-        print(_report_text(score, fitted, tested, args.precision))
-    return 0 if score is not None else 1
-
-
-def _shown(score: float | None) -> float | None:
-    """With as many digits as are printed, rounded down: what is printed belongs to that number."""
-    return None if score is None else math.floor(score * 1e6) / 1e6
-
-
-def _judged(args: argparse.Namespace) -> tuple[list[Judged], list[Judged]]:
-    """What choosing and measuring pictures say, a part for each file or drive."""
-    detector = build(
-        kinds=tuple(args.kinds),
-        least_score=LOWEST,
+    fitted = fit_signs(
+        args.labels,
+        args.label,
+        test=args.test,
+        test_every=args.test_every,
+        kinds=args.kinds,
+        precision=args.precision,
+        threshold=args.threshold,
+        overlap=args.overlap,
+        min_height_px=args.min_height,
         crop_top=args.crop_top,
         crop_bottom=args.crop_bottom,
         enlarge=args.enlarge,
         levels=args.levels,
         points=args.points,
+        progress=lambda parts, done: with_progress(
+            parts, lambda: Done(*done(), "sets"), args, "looking"
+        ),
     )
-    rules = Rules(args.label, args.overlap, args.min_height)
-    fit = slice(0, None, 1 if args.test else 2)
-    rest = slice(0 if args.test else 1, None, args.test_every * fit.step)
-    work = [(path, fit) for path in args.labels]
-    work += [(path, rest) for path in args.test or args.labels]
-    parts: list[Judged] = []
-    made = (judged_pictures(path, detector, rules, which) for path, which in work)
-    for part in with_progress(made, lambda: Done(len(parts), len(work), "sets"), args, "looking"):
-        parts.append(part)
-    return parts[: len(args.labels)], parts[len(args.labels) :]
+    if args.json:
+        print_json(_as_json(fitted))
+    elif not args.quiet:
+        print(fitted)
+    return 0 if fitted.threshold is not None else 1
 
 
-@dataclass(frozen=True, slots=True)
-class _Rates:
-    """Precision and recall, with intervals over rows and over files or drives."""
-
-    precision: Proportion
-    recall: Proportion
-
-
-def _rates(parts: Sequence[Judged], score: float) -> _Rates:
-    counts = [rates_at(part, score) for part in parts]
-    return _Rates(
-        _share([(one.right, one.found) for one in counts]),
-        _share([(one.right, one.signs) for one in counts]),
-    )
-
-
-def _share(counts: Sequence[tuple[int, int]]) -> Proportion:
-    is_right = [np.arange(of) < right for right, of in counts]
-    which = np.repeat(np.arange(len(counts)), [of for _, of in counts])
-    return share(np.concatenate(is_right), which)
-
-
-def _report_text(
-    score: float | None, fitted: Sequence[Judged], tested: Sequence[Judged], precision: float
-) -> str:
-    if score is None:
-        signs = sum(part.signs for part in fitted)
-        return f"no threshold reaches precision {precision} on {signs} signs"
-    lines = [f"least_score = {score:g}"]
-    for name, parts in (("chosen on", fitted), ("other frames", tested)):
-        rates = _rates(parts, score)
-        lines.append(f"{name:13} {_proportion_text('precision', rates.precision)}")
-        lines.append(f"{'':13} {_proportion_text('recall', rates.recall)}")
-    return "\n".join(lines)
-
-
-def _proportion_text(name: str, part: Proportion) -> str:
-    if not part.of:
-        return f"{name:9} none (0 of 0)"
-    interval = f"95 % interval {part.low:.2f} to {part.high:.2f}"
-    if not math.isnan(part.clusters_low):
-        interval += f", by drive {part.clusters_low:.2f} to {part.clusters_high:.2f}"
-    return f"{name:9} {part.value:.2f} ({part.right} of {part.of}; {interval})"
-
-
-def _as_json(
-    score: float | None, fitted: Sequence[Judged], tested: Sequence[Judged]
-) -> dict[str, object]:
-    out: dict[str, object] = {"least_score": score}
-    for name, parts in (("chosen_on", fitted), ("other_frames", tested)):
-        out[name] = None if score is None else _tree(_rates(parts, score))
+def _as_json(fitted: SignFit) -> dict[str, object]:
+    out: dict[str, object] = {"least_score": fitted.threshold}
+    for name, on_others in (("chosen_on", False), ("other_frames", True)):
+        of = fitted.threshold
+        out[name] = None if of is None else _tree(fitted.rates(of, on_others=on_others))
     return out
 
 
-def _tree(rates: _Rates) -> dict[str, object]:
+def _tree(rates: SignRates) -> dict[str, object]:
     found: dict[str, object] = {
         "found": rates.precision.of,
         "right": rates.recall.right,

@@ -5,16 +5,20 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from crosscue.eval.interface.logs import Log as DriveLog
+from crosscue.eval.interface.logs import open as open_drive
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.log_part import first_ns, named_topics
+from crosscue.replay.opening import unless_damaged
 
 
 def add_log_arguments(parser: argparse.ArgumentParser) -> None:
@@ -139,6 +143,13 @@ def metres(text: str) -> float:
     if not (math.isfinite(value) and value > 0.0):
         raise argparse.ArgumentTypeError(f"{text!r}: want metres, above 0")
     return value
+
+
+@contextmanager
+def open_part(args: argparse.Namespace, logs: Sequence[Path | str]) -> Iterator[DriveLog]:
+    """The drive, open, of which only the part asked for is read."""
+    with open_drive(*logs, limits=limits_of(args)) as log, unless_damaged(log.logs):
+        yield replace(log, selection=selection_of(args, log.logs))
 
 
 def selection_of(args: argparse.Namespace, logs: Sequence[Log]) -> Selection:

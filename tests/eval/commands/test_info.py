@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval.cli import run
-from crosscue.eval.commands.info import lines_of, plain
+from crosscue.eval.interface.summary import lines_of, plain
 from crosscue.replay.columns import DATA, Block, CanFrames, Messages, Topic
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.ledger import Ledger

@@ -1,0 +1,174 @@
+"""The sign threshold for a required precision: chosen on some pictures, measured on others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.detectors.signs.detector import build
+from crosscue.detectors.signs.templates import AMERICAN, KINDS
+from crosscue.detectors.training.operating_point import Judged, rates_at, threshold_for, together
+from crosscue.eval.scoring.intervals import Proportion, share
+from crosscue.replay.errors import UsageError
+
+from .sign_scores import Rules, judged_pictures
+
+Progress = Callable[[Iterable[Judged], Callable[[], tuple[int, int]]], Iterable[Judged]]
+"""Passes parts on while it shows how far the work is; the second argument returns parts done, and
+of how many."""
+
+LOWEST: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class SignRates:
+    """Precision and recall, with intervals over rows and over files or drives."""
+
+    precision: Proportion
+    recall: Proportion
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SignFit:
+    """A threshold, and what pictures say of any.
+
+    Attributes:
+        threshold: For ``least_score``; None where none is precise enough.
+        chosen_on: What the pictures say that chose it, a part for each file or drive.
+        others: The same of the pictures that measure it.
+    """
+
+    threshold: float | None
+    chosen_on: Sequence[Judged]
+    others: Sequence[Judged]
+
+    def rates(self, threshold: float, *, on_others: bool = True) -> SignRates:
+        """Precision and recall at any threshold, on the pictures that did not choose."""
+        parts = self.others if on_others else self.chosen_on
+        counts = [rates_at(part, threshold) for part in parts]
+        return SignRates(
+            _share([(one.right, one.found) for one in counts]),
+            _share([(one.right, one.signs) for one in counts]),
+        )
+
+    def __repr__(self) -> str:
+        if self.threshold is None:
+            signs = sum(part.signs for part in self.chosen_on)
+            return f"no threshold is precise enough on {signs} signs"
+        lines = [f"least_score = {self.threshold:g}"]
+        for name, on_others in (("chosen on", False), ("other frames", True)):
+            rates = self.rates(self.threshold, on_others=on_others)
+            lines.append(f"{name:13} {_proportion_text('precision', rates.precision)}")
+            lines.append(f"{'':13} {_proportion_text('recall', rates.recall)}")
+        return "\n".join(lines)
+
+
+def fit_signs(
+    labels: Sequence[Path | str],
+    label: Sequence[str],
+    *,
+    test: Sequence[Path | str] = (),
+    test_every: int = 1,
+    kinds: Sequence[str] = AMERICAN,
+    precision: float = 0.95,
+    threshold: float | None = None,
+    overlap: float = 0.4,
+    min_height_px: float = 0.0,
+    crop_top: float = 0.0,
+    crop_bottom: float = 0.25,
+    enlarge: float = 2.5,
+    levels: int = 9,
+    points: int = 4000,
+    progress: Progress = lambda parts, done: parts,
+) -> SignFit:
+    """Choose the sign detector's threshold for a required precision.
+
+    Every second picture chooses, the others measure, unless ``test`` names other pictures.
+
+    Args:
+        labels: CSV files ``picture,label,x0,y0,x1,y1``, COCO files, or folders of drives.
+        label: The labels to choose one threshold for.
+        test: Other files or drives to measure on.
+        test_every: Measure on every Nth picture only.
+        kinds: Drawings to look for.
+        precision: Required, above 0 and up to 1.
+        threshold: Measure this one instead of choosing.
+        overlap: With the true box, to be right.
+        min_height_px: Lower true signs count neither as found nor as missed.
+        crop_top: Fraction of the picture that is not searched.
+        crop_bottom: Likewise.
+        enlarge: The first level of the pyramid, for small signs.
+        levels: Of the pyramid.
+        points: Kept at a level.
+        progress: Passes the parts on while it shows how far the work is.
+
+    Raises:
+        UsageError: A value out of range, or pictures without such a sign.
+    """
+    _check(precision, overlap, test_every, threshold, kinds)
+    detector = build(
+        kinds=tuple(kinds),
+        least_score=LOWEST,
+        crop_top=crop_top,
+        crop_bottom=crop_bottom,
+        enlarge=enlarge,
+        levels=levels,
+        points=points,
+    )
+    rules = Rules(label, overlap, min_height_px)
+    fit = slice(0, None, 1 if test else 2)
+    rest = slice(0 if test else 1, None, test_every * fit.step)
+    work = [(Path(path), fit) for path in labels]
+    work += [(Path(path), rest) for path in test or labels]
+    parts: list[Judged] = []
+    made = (judged_pictures(path, detector, rules, which) for path, which in work)
+    for part in progress(made, lambda: (len(parts), len(work))):
+        parts.append(part)
+    chosen_on, others = parts[: len(labels)], parts[len(labels) :]
+    if not sum(part.signs for part in chosen_on):
+        raise UsageError(
+            f"{labels[0]}: no {' or '.join(label)} in the pictures that choose; add some"
+        )
+    if threshold is None:
+        threshold = _shown(threshold_for(together(chosen_on), precision))
+    return SignFit(threshold, chosen_on, others)
+
+
+def _check(
+    precision: float, overlap: float, every: int, threshold: float | None, kinds: Sequence[str]
+) -> None:
+    for name, value in (("precision", precision), ("overlap", overlap)):
+        if not 0.0 < value <= 1.0:
+            raise UsageError(f"--{name} {value}: want above 0, at most 1")
+    if every < 1:
+        raise UsageError(f"--test-every {every}: want 1 or more")
+    if threshold is not None and not LOWEST <= threshold <= 1.0:
+        raise UsageError(f"--threshold {threshold}: want {LOWEST} to 1")
+    for kind in kinds:
+        if kind not in KINDS:
+            raise UsageError(f"--kinds {kind}: no such drawing; there are: {', '.join(KINDS)}")
+
+
+def _shown(score: float | None) -> float | None:
+    """With as many digits as are printed, rounded down: rates are those of that number."""
+    return None if score is None else math.floor(score * 1e6) / 1e6
+
+
+def _share(counts: Sequence[tuple[int, int]]) -> Proportion:
+    is_right = [np.arange(of) < right for right, of in counts]
+    which = np.repeat(np.arange(len(counts)), [of for _, of in counts])
+    return share(np.concatenate(is_right), which)
+
+
+def _proportion_text(name: str, part: Proportion) -> str:
+    if not part.of:
+        return f"{name:9} none (0 of 0)"
+    interval = f"95 % interval {part.low:.2f} to {part.high:.2f}"
+    if not math.isnan(part.clusters_low):
+        interval += f", by drive {part.clusters_low:.2f} to {part.clusters_high:.2f}"
+    return f"{name:9} {part.value:.2f} ({part.right} of {part.of}; {interval})"

@@ -1,0 +1,261 @@
+"""What a drive holds, printed as ``crosscue info`` prints it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from enum import Enum
+from typing import Final
+
+from crosscue.eval.pipeline.drive_time import plan_for_time, time_segments
+from crosscue.replay.clocks.findings import instant_text
+from crosscue.replay.columns import Block
+from crosscue.replay.log import Log, Selection
+from crosscue.replay.log_summary import (
+    LogSummary,
+    Progress,
+    Together,
+    TopicSummary,
+    quick_summary,
+    rows_of_clocks,
+    span_sentence,
+    summarise,
+    together,
+)
+from crosscue.replay.safe_text import table, terminal_width, visible, wrapped
+from crosscue.replay.time.scan import LogWatch, timeline_from
+from crosscue.replay.time.segments import Timeline, gaps_text
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+LOSSES_SHOWN: Final = 10
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, repr=False)
+class DriveSummary:
+    """Topics, counts, rates, gaps, clocks and account of a drive's logs.
+
+    Attributes:
+        logs: One summary for each log.
+        together: What they have in common; None for one log, or a quick look.
+        timeline: The drive's segments of time; None for a quick look.
+    """
+
+    logs: tuple[LogSummary, ...]
+    together: Together | None
+    timeline: Timeline | None = None
+
+    @property
+    def has_gaps(self) -> bool:
+        """Its time has gaps, or a clock was set: it has several segments."""
+        return self.timeline is not None and self.timeline.has_gaps
+
+    @property
+    def is_whole(self) -> bool:
+        """Nothing is known to be dropped."""
+        return all(one.is_whole for one in self.logs)
+
+    def as_dict(self) -> dict[str, object]:
+        """All of it as dictionaries, lists and scalars; what ``crosscue info --json`` prints."""
+        reported = None if self.timeline is None else time_segments(self.timeline).as_json()
+        return {
+            "logs": [plain(one) for one in self.logs],
+            "together": plain(self.together),
+            "time": plain(reported),
+        }
+
+    def __repr__(self) -> str:
+        width = terminal_width()
+        lines = [line for one in self.logs for line in lines_of(one, width)]
+        if self.together is not None:
+            lines += _lines_together(self.together, width)
+        if self.timeline is not None and self.has_gaps:
+            lines += _segments(self.timeline, width)
+        return "\n".join(lines)
+
+
+def summary_of(
+    logs: Sequence[Log],
+    selection: Selection,
+    vehicle: Vehicle,
+    *,
+    quick: bool,
+    progress: Progress | None = None,
+) -> DriveSummary:
+    """Read each log once, or only what it says of itself.
+
+    Args:
+        logs: Of one drive, open.
+        selection: The part that is read.
+        vehicle: Where the wheel speeds are, to find gaps.
+        quick: Do not read the logs' bodies.
+        progress: Passes blocks on while it shows how far the work is.
+    """
+    if quick:
+        return DriveSummary(tuple(map(quick_summary, logs)), None)
+    planned, clocks = plan_for_time(logs, vehicle, selection)
+    watches = [LogWatch(i, planned, vehicle, clocks[i]) for i in range(len(logs))]
+    found = tuple(
+        summarise(log, _watched(watch, progress), selection)
+        for log, watch in zip(logs, watches, strict=True)
+    )
+    timeline = timeline_from(watches, planned, vehicle)
+    return DriveSummary(found, together(found) if len(found) > 1 else None, timeline)
+
+
+def _watched(watch: LogWatch, progress: Progress | None) -> Progress:
+    def see(blocks: Iterable[Block]) -> Iterator[Block]:
+        for block in blocks:
+            watch.add(block)
+            yield block
+
+    return lambda blocks, rows: see(blocks) if progress is None else progress(see(blocks), rows)
+
+
+def plain(value: object) -> object:
+    """A dataclass as dictionaries, lists and scalars, with texts made visible."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Enum):
+        return plain(value.value)
+    if isinstance(value, Mapping):
+        return {visible(str(key)): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return visible(value) if isinstance(value, str) else value
+
+
+def lines_of(summary: LogSummary, width: int) -> Iterator[str]:
+    """A summary as lines of text no wider than ``width``, as far as its numbers allow."""
+    yield wrapped(f"{summary.path} ({summary.format})", width, "")
+    if not summary.is_quick:
+        yield wrapped(span_sentence(summary.start_ns, summary.end_ns), width, "  time       ")
+        yield wrapped(summary.integrity, width, "  integrity  ")
+    yield wrapped(summary.seal, width, "  seal       ")
+    yield ""
+    yield from _topics(summary, width)
+    if not summary.is_quick:
+        yield from _clocks(summary, width)
+        yield from _account(summary, width)
+        yield from _can_ids(summary, width)
+    yield from _bullets("findings", summary.findings, width)
+    yield from _bullets("notices", summary.notices, width)
+    yield from _losses(summary, width)
+
+
+def _topics(summary: LogSummary, width: int) -> Iterator[str]:
+    counted = "declared" if summary.is_quick else "count"
+    rows = [
+        (
+            t.name,
+            t.type_name,
+            t.used_as or "-",
+            _or_dash(t.declared if summary.is_quick else t.used),
+            "-" if t.rate_hz is None else f"{t.rate_hz:.4g}",
+        )
+        for t in summary.topics
+    ]
+    head = ("topic", "type", "used as", counted, "rate Hz")
+    n = 4 if summary.is_quick else 5
+    yield from table(head[:n], [row[:n] for row in rows], width, (0, 1, 2))
+    yield ""
+
+
+def _clocks(summary: LogSummary, width: int) -> Iterator[str]:
+    rows = list(rows_of_clocks(summary.topics))
+    if rows:
+        head = ("topic", "clock", "period", "gaps", "longest", "offset", "drift ppm")
+        yield from table(head, rows, width, (0, 1))
+        yield ""
+
+
+def _account(summary: LogSummary, width: int) -> Iterator[str]:
+    rows = [
+        (
+            t.name,
+            _or_dash(t.declared),
+            str(t.found),
+            str(t.used),
+            str(sum(t.skipped.values())),
+            ">= " * bool(t.dropped_unknown) + str(sum(t.dropped.values())),
+        )
+        for t in summary.topics
+    ]
+    if summary.unattributed_dropped or summary.unattributed_unknown:
+        unknown = ">= " * bool(summary.unattributed_unknown)
+        dropped = f"{unknown}{sum(summary.unattributed_dropped.values())}"
+        rows.append(("(topic not known)", "-", "-", "-", "-", dropped))
+    yield from table(
+        ("topic", "declared", "found", "used", "skipped", "dropped"), rows, width, (0,)
+    )
+    for topic in summary.topics:
+        for reason, count in sorted(topic.skipped.items()):
+            yield wrapped(f"{topic.name}: {count} skipped: {reason}", width, "  ")
+    yield ""
+
+
+def _can_ids(summary: LogSummary, width: int) -> Iterator[str]:
+    buses = [topic for topic in summary.topics if topic.can_ids]
+    for bus in buses:
+        yield wrapped(f"{bus.name}: {_ids_in_words(bus)}", width, "")
+    if buses:
+        yield ""
+
+
+def _ids_in_words(bus: TopicSummary) -> str:
+    named = ", ".join(
+        f"0x{i.arbitration_id:X}{'x' * i.is_extended}"
+        + (f" {i.rate_hz:.3g} Hz" if i.rate_hz else f" {i.count} times")
+        for i in bus.can_ids
+    )
+    most = "most frequent: " if bus.can_id_count > len(bus.can_ids) else ""
+    return f"{bus.can_id_count} ids; {most}{named}"
+
+
+def _losses(summary: LogSummary, width: int) -> Iterator[str]:
+    texts = []
+    for loss in summary.drops[:LOSSES_SHOWN]:
+        count = "an unknown number" if loss.count is None else str(loss.count)
+        begin_ns = summary.start_ns or 0
+        at = "" if loss.t_ns is None else f" at {(loss.t_ns - begin_ns) * 1e-9:.2f} s"
+        detail = f" ({loss.detail})" if loss.detail else ""
+        texts.append(f"{count} of {loss.topic or 'unknown topics'}{at}: {loss.reason}{detail}")
+    if len(summary.drops) > LOSSES_SHOWN:
+        texts.append(f"and {len(summary.drops) - LOSSES_SHOWN} more; --json lists them")
+    if summary.drops:
+        texts.append("to write what can be read: crosscue convert LOG -o OUT.mcap --salvage")
+    yield from _bullets("losses", texts, width)
+
+
+def _lines_together(common: Together, width: int) -> Iterator[str]:
+    if common.start_ns is None:
+        yield wrapped("no time in common", width, "together   ")
+    else:
+        yield wrapped(span_sentence(common.start_ns, common.end_ns), width, "together   ")
+    yield from (wrapped(sentence, width) for sentence in common.findings)
+
+
+def _segments(timeline: Timeline, width: int) -> Iterator[str]:
+    rows = [
+        (
+            str(one.number),
+            one.cause.value,
+            "-" if one.gap_ns is None else f"{one.gap_ns * 1e-9:.2f}",
+            f"{one.by_ns * 1e-9:.2f}" if one.by_ns else "-",
+            instant_text(one.log_start_ns),
+            f"{(one.log_end_ns - one.log_start_ns) * 1e-9:.2f}",
+        )
+        for one in timeline.segments
+    ]
+    head = ("segment", "begins with", "gap s", "clock set s", "from", "length s")
+    yield from table(head, rows, width, (1, 4))
+    yield from (wrapped(sentence, width) for sentence in gaps_text(timeline.segments))
+
+
+def _bullets(title: str, sentences: Iterable[str], width: int) -> Iterator[str]:
+    lines = [wrapped(sentence, width) for sentence in sentences]
+    if lines:
+        yield from (title, *lines, "")
+
+
+def _or_dash(count: int | None) -> str:
+    return "-" if count is None else str(count)

@@ -1,0 +1,123 @@
+"""A run through the public interface: made, printed, estimated again, scored, compared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+import crosscue
+from crosscue.datasets.simulated.log_files import DriveFiles
+from crosscue.eval import cli
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
+    """A short simulated drive."""
+    return crosscue.simulate_drive(tmp_path_factory.mktemp("drive") / "d", seed=3, blocks=2)
+
+
+@pytest.fixture(scope="module")
+def run(drive: DriveFiles, tmp_path_factory: pytest.TempPathFactory) -> crosscue.Run:
+    """Its replay; the vehicle file is the one beside the log."""
+    return crosscue.replay_drive(drive.log, tmp_path_factory.mktemp("runs") / "run")
+
+
+def test_a_run_is_tables(run: crosscue.Run) -> None:
+    assert isinstance(run.pose, pa.Table)
+    assert len(run.pose) > 100
+    assert run.pose == run["pose"]
+    assert "pose" in run.tables
+    head, *lines = repr(run).splitlines()[1:]
+    assert head.split() == ["table", "columns", "rows"]
+    assert [line.split()[0] for line in lines] == list(run.tables)
+    with pytest.raises(crosscue.RunError, match="there are: "):
+        run["nonsense"]
+
+
+def test_it_is_what_the_command_writes(
+    drive: DriveFiles, run: crosscue.Run, tmp_path: Path
+) -> None:
+    argv = ["replay", str(drive.log), "--vehicle", str(drive.vehicle), "-o", str(tmp_path / "r")]
+    assert cli.run([*argv, "-q"]) == 0
+
+    for table in run.tables:
+        name = f"{table}.parquet"
+        assert (tmp_path / "r" / name).read_bytes() == (run.path / name).read_bytes()
+
+
+def test_a_part_of_a_drive_is_replayed(drive: DriveFiles, tmp_path: Path) -> None:
+    with crosscue.open(drive.log) as log:
+        run = crosscue.replay_drive(log.part(end_s=5), tmp_path / "run", drive.vehicle)
+
+    t_ns = run.pose["t_ns"].to_numpy()
+    assert 3e9 < t_ns[-1] - t_ns[0] < 5e9
+
+
+def test_it_is_scored_and_printed(drive: DriveFiles, run: crosscue.Run) -> None:
+    scored = crosscue.score_run(run, drive.truth, has_figures=False)
+
+    assert "APE" in repr(scored)
+    assert scored.report.is_file()
+    assert scored.metrics["pose"]
+    assert scored.true_track.column_names == ["t_ns", "x_m", "y_m", "z_m"]
+    assert isinstance(scored.cues, pa.Table)
+    assert isinstance(scored.curves, pa.Table)
+    with pytest.raises(crosscue.UsageError, match="threshold"):
+        crosscue.score_run(run, drive.truth, threshold=2.0)
+
+
+def test_other_settings_go_beside_it(run: crosscue.Run, drive: DriveFiles) -> None:
+    before = {path.name: path.read_bytes() for path in run.path.glob("*.parquet")}
+    vehicle = crosscue.load_vehicle(drive.vehicle)
+    odometry = vehicle.odometry.model_copy(update={"wheel_scale": 1.1})
+
+    other = crosscue.estimate_run(
+        run, vehicle.model_copy(update={"odometry": odometry}), run.path.with_name("other")
+    )
+
+    assert {path.name: path.read_bytes() for path in run.path.glob("*.parquet")} == before
+    assert crosscue.compare_runs(run, run.path).tables_same == len(before)
+    longer = other.pose["travelled_m"][-1].as_py() / run.pose["travelled_m"][-1].as_py()
+    assert longer == pytest.approx(1.1, rel=1e-3)
+    with pytest.raises(crosscue.OutputError, match="exists"):
+        crosscue.estimate_run(run, vehicle, other.path)
+    with pytest.raises(crosscue.UsageError, match="beside the run"):
+        crosscue.estimate_run(run, vehicle, run.path / "inside")
+
+
+def test_a_recording_has_a_name_that_rerun_knows(run: crosscue.Run) -> None:
+    with pytest.raises(crosscue.UsageError, match="ends in"):
+        crosscue.save_recording(run, run.path / "drive.mp4")
+
+
+def test_a_folder_without_a_run_is_an_error_of_ours(tmp_path: Path) -> None:
+    with pytest.raises(crosscue.RunError):
+        crosscue.open_run(tmp_path)
+
+
+@pytest.mark.parametrize("wrong", [{"width_px": 100}, {"layout": "Z"}, {"rate_hz": 11}])
+def test_a_simulation_that_cannot_be_is_wrong_usage(wrong: dict[str, int], tmp_path: Path) -> None:
+    with pytest.raises(crosscue.UsageError):
+        crosscue.simulate_approach(tmp_path / "d", **wrong)  # type: ignore[arg-type]
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_sign_is_drawn_and_an_unknown_one_named() -> None:
+    assert crosscue.draw_sign("one way left", 48).ndim == 2
+    with pytest.raises(crosscue.UsageError, match="one way left"):
+        crosscue.draw_sign("one way up", 48)
+
+
+def test_a_drive_is_summed_up_as_info_prints_it(
+    drive: DriveFiles, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["info", str(drive.log)]) == 0
+    printed = capsys.readouterr().out
+
+    with crosscue.open(drive.log) as log:
+        summary = log.summary()
+
+    assert repr(summary) == printed.rstrip("\n") + "\n" * repr(summary).endswith("\n")
+    assert summary.is_whole
