@@ -34,6 +34,9 @@ BUILTIN: Final[Mapping[str, str]] = {
 EMBEDDED: Final = "mask-rcnn,road,signs"
 """What demo and studies run: networks that come along and know simulated scenes only."""
 
+_EMBEDDED_BY: Final = {"mask-rcnn": ("network", "embedded"), "road": ("checkpoint", None)}
+"""Setting that names a network, and its default, which is the embedded one."""
+
 
 @dataclass(frozen=True, slots=True)
 class Choice:
@@ -76,6 +79,14 @@ def _choice(name: str, sections: Mapping[str, Choice]) -> Choice:
         stem = name.replace("\\", "/").rsplit("/", 1)[-1].removesuffix(".toml")
         return Choice(stem, "model", {"card": name})
     return Choice(name, name)
+
+
+def knows_simulated_only(choice: Choice) -> bool:
+    """Whether a detector runs a network that has seen nothing but simulated scenes."""
+    if choice.kind not in _EMBEDDED_BY:
+        return False
+    setting, embedded = _EMBEDDED_BY[choice.kind]
+    return bool(choice.settings.get(setting, embedded) == embedded)
 
 
 def known(sections: Mapping[str, Choice]) -> list[str]:

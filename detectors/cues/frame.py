@@ -13,6 +13,7 @@ from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
 from .labelled import count_labels
 from .road import RoadShares, road_shares
 from .rules import counts_of
+from .tally import CueTally
 
 
 class Role(StrEnum):
@@ -86,15 +87,18 @@ class CuePass:
     Attributes:
         vehicle: Regions and thresholds.
         tracker: Pairs cars of two frames.
+        tally: Counts what became of all candidates, where somebody asks.
     """
 
     vehicle: Vehicle
     tracker: Tracker = pair_cars
+    tally: CueTally | None = None
     _before: CarShapes | None = None
 
     def __call__(self, frame: Seen) -> FrameCues:
         """The cues of the next frame."""
         counts: dict[str, int] = {}
+        pairs: Pairs | None = None
         if frame.objects:
             counts |= counts_of("objects", frame.objects, self.vehicle)
             pairs = self._pairs(frame.objects)
@@ -111,7 +115,20 @@ class CuePass:
             road = road_shares(road, self.vehicle.regions)
         if road is not None:
             counts |= counts_of("road", road, self.vehicle)
-        return FrameCues(counts, road)
+        found = FrameCues(counts, road)
+        if self.tally is not None:
+            self._explain(self.tally, frame, pairs, found)
+        return found
+
+    def _explain(self, tally: CueTally, frame: Seen, pairs: Pairs | None, found: FrameCues) -> None:
+        tally.labelled("objects", frame.objects, found.counts)
+        tally.labelled("signs", frame.signs, found.counts)
+        tally.own((*frame.objects, *frame.signs), found.counts)
+        if self._before is not None and frame.objects:
+            again = 0 if pairs is None else len(pairs.nose)
+            tally.cars(frame.objects, len(self._before), again, found.counts)
+        if found.road is not None:
+            tally.road(found.road)
 
     def _pairs(self, boxes: Sequence[Detections]) -> Pairs | None:
         """Cars found again since the frame before; None in the first frame."""

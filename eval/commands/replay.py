@@ -41,6 +41,7 @@ from crosscue.eval.interface.runs import default_cache, replay_drive
 from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.pipeline.scene import ApproachSummary, SceneOutcome
 from crosscue.eval.runs.account import account_lines
+from crosscue.eval.runs.candidates import candidate_lines, candidate_rows
 from crosscue.eval.runs.folder import create
 from crosscue.eval.runs.input import files_named_in
 from crosscue.replay.errors import CrosscueError, UsageError
@@ -340,6 +341,8 @@ def scene_lines(scene: SceneOutcome) -> list[str]:
     """Cues and approaches, for a person."""
     seen = [f"{cue} {count:,}" for cue, count in scene.positive.items()]
     lines = [f"cues     {', '.join(seen) or 'none'} (frames each, of {scene.frames:,})"]
+    rows = candidate_rows(scene.candidates), candidate_rows(scene.ranged)
+    lines += [f"  skip   {sentence}" for sentence in candidate_lines(*rows)]
     lines += [f"  note   {n:,} x {what}" for what, n in scene.counts.items() if n]
     for one in scene.approaches:
         lines.append(f"approach {_approach(one)}")

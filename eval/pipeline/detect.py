@@ -16,7 +16,7 @@ from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.cues.frame import CuePass, FrameCues, Role, role_of, seen
 from crosscue.detectors.overlay import Drawer
 from crosscue.detectors.ranging.height_to_range import range_of
-from crosscue.detectors.registry import Choice, make
+from crosscue.detectors.registry import Choice, knows_simulated_only, make
 from crosscue.detectors.result_cache import ResultCache
 from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
 from crosscue.eval.runs.account import Account, account, detecting_of, reading_of
@@ -40,7 +40,7 @@ from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle
 from crosscue.replay.versions import versions
 
 from .clocks import clock_rows, probe_clocks
@@ -206,7 +206,11 @@ def detect_into(
         made = account(reading_of([ledger]), detecting_of(topic.name, ledger, runner.counts.frames))
         write_skipped(run, [ledger], made.reading, timeline=timeline)
         seconds = time.monotonic() - began
-        notices = (*gaps_text(timeline.segments), *tables.notices)
+        notices = (
+            *gaps_text(timeline.segments),
+            *_simulated_only(choices, vehicle),
+            *tables.notices,
+        )
         write_manifest(
             run,
             DetectManifest(
@@ -252,6 +256,19 @@ def detect_into(
         made,
         timeline.has_gaps,
     )
+
+
+def _simulated_only(choices: Sequence[Choice], vehicle: Vehicle) -> list[str]:
+    """Embedded networks on a log that no vehicle file of ``simulate`` came with."""
+    if vehicle.name == SIMULATED_CAR:
+        return []
+    return [
+        f"warning: {choice.name}: the embedded network knows simulated scenes only, and this log "
+        f'is not simulated (the vehicle file is not named "{SIMULATED_CAR}"); its results mean '
+        "nothing here; choose a model with crosscue model list"
+        for choice in choices
+        if knows_simulated_only(choice)
+    ]
 
 
 def _through(runner: Runner, block: Block, tables: _Tables, on_frame: Callable[[], None]) -> None:

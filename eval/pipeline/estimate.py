@@ -19,6 +19,7 @@ from crosscue.eval.runs.account import (
     joined_accounts,
     reading_of,
 )
+from crosscue.eval.runs.candidates import candidate_rows
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, write_manifest
 from crosscue.eval.runs.logs import log_names, log_rows, relative
 from crosscue.eval.runs.manifest import (
@@ -219,7 +220,7 @@ def estimate_into(
             pose=PoseSummary(
                 rows=tally.rows, travelled_m=tally.travelled_m, major_axis_m=tally.major_axis_m
             ),
-            scene=None if scene is None else _scene_summary(scene),
+            scene=None if scene is None else scene_summary(scene),
             detect=found,
             timings=EstimateTimings(seconds=seconds + before, detect_seconds=before),
         ),
@@ -367,13 +368,16 @@ def _scene(
         )
 
 
-def _scene_summary(scene: SceneOutcome) -> SceneSummary:
+def scene_summary(scene: SceneOutcome) -> SceneSummary:
+    """As the manifest holds it."""
     return SceneSummary(
         frames=scene.frames,
         positive=dict(scene.positive),
         counts=dict(scene.counts),
         without_odometry=scene.without_odometry,
         approaches=tuple(ApproachRow(**asdict(one)) for one in scene.approaches),
+        candidates=candidate_rows(scene.candidates),
+        ranged=candidate_rows(scene.ranged),
     )
 
 

@@ -12,20 +12,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
+from crosscue.detectors.cues.candidates import Candidates
 from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.tally import CueTally
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
 from crosscue.eval.runs.tables.travelled import Odometer, odometer_of
 from crosscue.fusion.approaches import Approaches, FrameEvidence, PastCues, SignRange, Step
 from crosscue.fusion.factor_graph import graph_of
-from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
-from crosscue.replay.vehicle.cue_table import STOP_SIGN, TRAFFIC_LIGHT
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .drive_time import OnTime, report_time, unwatched_time
-from .sign_ranges import sign_ranges
+from .sign_ranges import MEASURED, SignRanges
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -71,6 +71,8 @@ class SceneOutcome:
         approaches: In order.
         counts: What became of the evidence, as ``Approaches`` counts it.
         without_odometry: Frames before which the odometry has a hole.
+        candidates: By cue, what became of everything that could have been it.
+        ranged: By cue, what became of its detections on the way to a range.
     """
 
     frames: int
@@ -78,6 +80,8 @@ class SceneOutcome:
     approaches: tuple[ApproachSummary, ...]
     counts: Mapping[str, int]
     without_odometry: int
+    candidates: Mapping[str, Candidates] = field(default_factory=dict)
+    ranged: Mapping[str, Candidates] = field(default_factory=dict)
 
 
 def nothing_past(_t_ns: int) -> PastCues | None:
@@ -137,6 +141,8 @@ def estimate_scene(
         tuple(scene.summaries.values()),
         scene.approaches.counts,
         scene.without_odometry,
+        scene.tally.by_cue,
+        scene.signs.by_cue,
     )
 
 
@@ -169,6 +175,8 @@ class _Scene:
     odometer: Odometer
     rows: _Rows
     cues: CuePass = field(init=False)
+    tally: CueTally = field(init=False)
+    signs: SignRanges = field(init=False)
     frames: int = 0
     without_odometry: int = 0
     positive: Counter[str] = field(default_factory=Counter)
@@ -176,14 +184,16 @@ class _Scene:
     _last_ns: int | None = None
 
     def __post_init__(self) -> None:
-        self.cues = CuePass(self.vehicle)
+        self.tally = CueTally(self.vehicle)
+        self.signs = SignRanges(self.vehicle)
+        self.cues = CuePass(self.vehicle, tally=self.tally)
 
     def step(self, frame: StoredFrame, past: PastCues | None, without: frozenset[str]) -> None:
         seen = frame.seen
         counts = {cue: count for cue, count in self.cues(seen).counts.items() if cue not in without}
         signs = tuple(
             sign
-            for sign in sign_ranges(seen.objects, frame.heights_px, self.vehicle)
+            for sign in self.signs(seen.objects, frame.heights_px)
             if _MEASURES[sign.reference] not in without
         )
         evidence = self._evidence(seen.t_ns, counts, signs)
@@ -201,7 +211,7 @@ class _Scene:
         """Know nothing of what was before ``t_ns``."""
         self.approaches.restart()
         self.odometer.skip_to(t_ns)
-        self.cues = CuePass(self.vehicle)
+        self.cues = CuePass(self.vehicle, tally=self.tally)
         self._last_ns = None
 
     def _evidence(
@@ -237,7 +247,7 @@ class _Scene:
             one.reference = str(step.ranges[0].reference)
 
 
-_MEASURES: Final = {Reference.START: STOP_SIGN.name, Reference.END: TRAFFIC_LIGHT.name}
+_MEASURES: Final = {reference: cue.name for cue, reference in MEASURED}
 
 
 def _leaving_out(past: PastCues, without: frozenset[str]) -> PastCues:

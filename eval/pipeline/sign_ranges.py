@@ -2,62 +2,100 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
 from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.candidates import BELOW_SCORE, Candidates
+from crosscue.detectors.cues.labelled import labels_of
+from crosscue.detectors.cues.tally import scores_of, threshold_of
 from crosscue.detectors.ranging.height_to_range import range_of
+from crosscue.eval.runs.candidates import NO_CURVE
 from crosscue.fusion.approaches import SignRange
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.columns import Floats
+from crosscue.replay.vehicle.cue_spec import CueSpec
+from crosscue.replay.vehicle.cue_table import STOP_SIGN, TRAFFIC_LIGHT
 from crosscue.replay.vehicle.vehicle import RangeCurve, Vehicle
 
 BORDER_PX: Final = 2.0
 """A sign that reaches the picture's edge is cut, so its height says nothing of its distance."""
 
 
-def sign_ranges(
-    found: Sequence[Detections], heights_px: Sequence[Floats], vehicle: Vehicle
-) -> tuple[SignRange, ...]:
+NO_HEIGHT: Final = "no height"
+CUT: Final = "cut by the picture's edge"
+MEASURED: Final = ((STOP_SIGN, Reference.START), (TRAFFIC_LIGHT, Reference.END))
+"""Cues whose detections measure a distance, and to where: the source's."""
+
+
+@dataclass(frozen=True, slots=True)
+class SignRanges:
     """A stop sign measures the start of the intersection, a traffic light its end.
 
-    Args:
-        found: Of the detectors of objects.
-        heights_px: For each, the rows that every mask spans.
+    Attributes:
         vehicle: Labels, scores and curves; no curve, no range.
+        by_cue: What became of all candidates so far, by the cue that they belong to.
     """
-    cues, ranges = vehicle.cues, vehicle.ranges
-    kinds = (
-        (cues.stop_sign_labels, cues.stop_sign_score, ranges.stop_sign, Reference.START),
-        (cues.traffic_light_labels, cues.traffic_light_score, ranges.traffic_light, Reference.END),
-    )
-    return tuple(
-        one
-        for labels, score, curve, reference in kinds
-        if curve is not None
-        for detections, heights in zip(found, heights_px, strict=True)
-        for one in _of_kind(detections, heights, labels, score, curve, reference)
-    )
+
+    vehicle: Vehicle
+    by_cue: dict[str, Candidates] = field(default_factory=dict)
+
+    def __call__(
+        self, found: Sequence[Detections], heights_px: Sequence[Floats]
+    ) -> tuple[SignRange, ...]:
+        """Ranges of one frame.
+
+        Args:
+            found: Of the detectors of objects.
+            heights_px: For each, the rows that every mask spans.
+        """
+        return tuple(
+            one
+            for cue, reference in MEASURED
+            for one in self._of_cue(found, heights_px, cue, reference)
+        )
+
+    def _of_cue(
+        self,
+        found: Sequence[Detections],
+        heights_px: Sequence[Floats],
+        cue: CueSpec,
+        reference: Reference,
+    ) -> list[SignRange]:
+        labels = labels_of(cue, self.vehicle)
+        curve: RangeCurve | None = getattr(self.vehicle.ranges, cue.name)
+        setting, threshold = threshold_of(cue, self.vehicle)
+        ranges: list[SignRange] = []
+        skipped: Counter[str] = Counter()
+        for detections, heights in zip(found, heights_px, strict=True):
+            for i, label in enumerate(detections.labels):
+                if label not in labels:
+                    continue
+                why = _why_not(detections, heights, i, threshold or 0.0, curve)
+                if why is not None:
+                    skipped[why] += 1
+                elif curve is not None:
+                    range_m = float(range_of(np.array([heights[i]]), curve)[0])
+                    ranges.append(SignRange(reference, range_m, curve.residual_sd_m**2))
+        counted = self.by_cue.setdefault(cue.name, Candidates("detections", setting, threshold))
+        counted.take(scores_of(found, labels), skipped)
+        return ranges
 
 
-def _of_kind(
-    found: Detections,
-    heights_px: Floats,
-    labels: tuple[str, ...],
-    score: float,
-    curve: RangeCurve,
-    reference: Reference,
-) -> list[SignRange]:
+def _why_not(
+    found: Detections, heights_px: Floats, i: int, score: float, curve: RangeCurve | None
+) -> str | None:
+    """Why a detection gives no range; None where it gives one."""
+    if found.scores[i] <= score:
+        return BELOW_SCORE
+    if heights_px[i] <= 0.0:
+        return NO_HEIGHT
     width, height = found.size_px
-    ranges = []
-    for i, label in enumerate(found.labels):
-        if label not in labels or found.scores[i] <= score or heights_px[i] <= 0.0:
-            continue
-        x0, y0, x1, y1 = found.boxes_px[i].tolist()
-        is_cut = min(x0, y0) < BORDER_PX or x1 > width - BORDER_PX or y1 > height - BORDER_PX
-        if not is_cut:
-            range_m = float(range_of(np.array([heights_px[i]]), curve)[0])
-            ranges.append(SignRange(reference, range_m, curve.residual_sd_m**2))
-    return ranges
+    x0, y0, x1, y1 = found.boxes_px[i].tolist()
+    if min(x0, y0) < BORDER_PX or x1 > width - BORDER_PX or y1 > height - BORDER_PX:
+        return CUT
+    return NO_CURVE if curve is None else None

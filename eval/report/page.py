@@ -14,7 +14,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.eval.runs.manifest import DriveManifest
+from crosscue.eval.runs.candidates import CandidateRow, candidate_lines
+from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest
 from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.runs import RunScored
@@ -50,6 +51,9 @@ class _Run:
     name: str
     manifest: DriveManifest
     clocks: str
+    candidates: Mapping[str, CandidateRow]
+    ranged: Mapping[str, CandidateRow]
+    skips: Sequence[str]
     settings: str
     versions: str
 
@@ -148,10 +152,15 @@ def _content(scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> dict[st
 def _run(one: RunScored) -> _Run:
     manifest = one.run.drive_manifest()
     reported = manifest.as_json()
+    scene = manifest.scene if isinstance(manifest, EstimateManifest) else None
+    candidates, ranged = ({}, {}) if scene is None else (scene.candidates, scene.ranged)
     return _Run(
         name=_name(one),
         manifest=manifest,
         clocks=strict_json(reported["clocks"]),
+        candidates=candidates,
+        ranged=ranged,
+        skips=candidate_lines(candidates, ranged),
         settings=strict_json(reported["settings"]),
         versions=strict_json({"versions": reported["versions"], "logs": reported["logs"]}),
     )

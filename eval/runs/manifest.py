@@ -20,9 +20,10 @@ from crosscue.replay.time.segments import LogClock, Segment, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle, tuples
 
 from .account import Account, SummedAccount
+from .candidates import CandidateRow
 from .record import Record
 
-FORMAT_VERSION: Final = 3
+FORMAT_VERSION: Final = 4
 
 
 def _vehicle(given: object) -> object:
@@ -177,6 +178,10 @@ class SceneSummary(Record):
     counts: dict[str, int]
     without_odometry: int
     approaches: tuple[ApproachRow, ...]
+    candidates: dict[str, CandidateRow]
+    """By cue, what became of everything that could have been it."""
+    ranged: dict[str, CandidateRow]
+    """By cue, what became of its detections on the way to a range."""
 
 
 class EstimateTimings(Record):
@@ -187,7 +192,7 @@ class EstimateTimings(Record):
 
 
 class _Versioned(Record):
-    format_version: Literal[3] = FORMAT_VERSION
+    format_version: Literal[4] = FORMAT_VERSION
     versions: dict[str, str]
     """Of crosscue, Python and the libraries that results depend on."""
 
@@ -271,7 +276,7 @@ class MergedDrive(Record):
 class MergedManifest(Record):
     """Many drives as one folder of tables."""
 
-    format_version: Literal[3] = FORMAT_VERSION
+    format_version: Literal[4] = FORMAT_VERSION
     stage: Literal["merged"] = "merged"
     tables: tuple[str, ...]
     drives: tuple[MergedDrive, ...]

@@ -183,6 +183,10 @@ class OwnCue(Section):
     score: Proportion = 0.5
 
 
+SIMULATED_CAR: Final = "crosscue simulated car"
+"""Name in the vehicle files that ``simulate`` writes: the one mark of a log that is simulated."""
+
+
 class Cues(Section):
     """When a detection is a cue; the numbers are the source's for Mask R-CNN."""
 

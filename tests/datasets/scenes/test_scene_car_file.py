@@ -7,8 +7,10 @@ import pytest
 
 from crosscue.datasets.scenes.car_file import vehicle_text
 from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.simulated.drive import DriveSettings
+from crosscue.datasets.simulated.drive import vehicle_text as drive_vehicle_text
 from crosscue.detectors.ranging.height_to_range import range_of
-from crosscue.replay.vehicle.vehicle import Vehicle, parse
+from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle, parse
 from support.scenes import picture_at, world
 
 
@@ -16,6 +18,12 @@ def vehicle(width_px: int) -> Vehicle:
     camera = Camera(width_px=width_px, height_px=width_px * 9 // 16)
     text = vehicle_text(camera, mounting_yaw_rad=0.1, declination_rad=0.0, heading_rad=0.5)
     return parse(text, "vehicle.toml")
+
+
+def test_both_kinds_of_simulated_drives_bear_the_mark_of_a_simulated_log() -> None:
+    plain = parse(drive_vehicle_text(DriveSettings(), "simulated_car.dbc"), "vehicle.toml")
+
+    assert vehicle(640).name == plain.name == SIMULATED_CAR
 
 
 def test_a_sign_half_as_high_in_half_the_picture_is_as_far_away() -> None:

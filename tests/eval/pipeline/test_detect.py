@@ -9,6 +9,7 @@ import pytest
 
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import open_run
+from crosscue.replay.vehicle.vehicle import SIMULATED_CAR
 from support.data import shared
 from support.detecting import yolox_card
 from support.pictures import picture_folder
@@ -278,3 +279,16 @@ def test_each_real_segmentation_sees_the_road_ahead_and_none_in_the_sky(
     }
     assert cues["road_straight"] == 1
     assert cues["road_left"] == 0
+
+
+def test_networks_of_simulated_scenes_warn_on_any_other_log(tmp_path: Path) -> None:
+    log, vehicle = _folder(tmp_path), tmp_path / "car.toml"
+    arguments = ["detect", str(log), "--detectors", "road", "--no-cache", "-q"]
+
+    for name in ("my car", SIMULATED_CAR):
+        vehicle.write_text(f'version = 1\nname = "{name}"\n')
+        assert run([*arguments, "-o", str(tmp_path / name), "--vehicle", str(vehicle)]) == 0
+
+    (notice,) = open_run(tmp_path / "my car").drive_manifest().notices
+    assert notice.startswith("warning: road: the embedded network knows simulated scenes only")
+    assert open_run(tmp_path / SIMULATED_CAR).drive_manifest().notices == ()

@@ -106,6 +106,30 @@ def test_the_manifest_accounts_for_the_camera_and_the_rest(drive: Path) -> None:
     assert manifest["scene"]["frames"] == manifest["detect"]["counts"]["frames"]
 
 
+def test_every_candidate_is_explained_in_manifest_and_summary(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(drive / "run", tmp_path / "run")
+    text = (drive / "vehicle.toml").read_text()
+    curve = text[text.index("[ranges.stop_sign]") : text.index("[ranges.traffic_light]")]
+    none_passes = "\n[cues]\ntraffic_light_score = 1.0\n[cars]\nscore = 1.0\n"
+    (tmp_path / "v.toml").write_text(text.replace(curve, "") + none_passes)
+    shutil.copy(drive / "simulated_car.dbc", tmp_path)
+    arguments = ["estimate", str(tmp_path / "run"), "--logs", str(drive), "--vehicle"]
+    assert run([*arguments, str(tmp_path / "v.toml")]) == 0
+
+    printed = " ".join(capsys.readouterr().out.split())
+    scene = _manifest(tmp_path / "run")["scene"]
+    for one in (*scene["candidates"].values(), *scene["ranged"].values()):
+        assert one["seen"] == one["used"] + sum(one["skipped"].values())
+    cars = scene["candidates"]["parked_left"]
+    assert cars["seen"] == cars["skipped"]["below score"] > 0
+    highest = f"none above 1.00 (highest {cars['max_score']:.2f}); lower [cars] score"
+    assert f"parked_right: {cars['seen']:,} detections, {highest}" in printed
+    signs = scene["ranged"]["stop_sign"]["skipped"]["no range curve"]
+    assert f"range: {signs:,} stop signs measured, no curve" in printed
+
+
 def _never(self: Oracle, frames: Sequence[object]) -> Sequence[object]:
     raise AssertionError("a detector ran")
 

@@ -24,8 +24,11 @@ from crosscue.eval.report.scene_figures import (
 )
 from crosscue.eval.report.svg_plot import Drawing, Panel, ticks
 from crosscue.eval.report.worst_frames import worst_frames
-from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.candidates import CandidateRow
+from crosscue.eval.runs.folder import RunFolder, write_manifest
+from crosscue.eval.runs.manifest import SceneSummary
 from crosscue.eval.scoring.runs import FOLDER, RunScored, judge_run, metrics_of, scores_of
+from support.manifests import estimate_manifest
 from support.scene_run import SIZE, scene_run
 from support.scoring import approach, at, good_truth, span, truth, truth_folder
 
@@ -115,6 +118,38 @@ def test_simulated_drives_are_called_so(tmp_path: Path) -> None:
     page = _written(tmp_path, judge_run(made_up.run, tmp_path / "drive" / "truth.json"))
 
     assert "<b>Simulated</b>: this drive and the truth were computed" in page
+
+
+def test_what_became_of_candidates_is_a_table_with_its_sentences(tmp_path: Path) -> None:
+    scored = _scored(tmp_path / "a")
+    lights = CandidateRow(
+        unit="detections",
+        setting="[cues] traffic_light_score",
+        threshold=0.9,
+        seen=87,
+        used=0,
+        skipped={"below score": 87},
+        max_score=0.62,
+    )
+    scene = SceneSummary(
+        frames=50,
+        positive={},
+        counts={},
+        without_odometry=0,
+        approaches=(),
+        candidates={"traffic_light": lights},
+        ranged={"traffic_light": lights},
+    )
+    whole = estimate_manifest(scored.run)
+    write_manifest(scored.run, whole.model_copy(update={"scene": scene, "notices": ("warning",)}))
+
+    page = _written(tmp_path, scored)
+
+    assert "<li>warning</li>" in page
+    assert "<li>traffic_light: 87 detections, none above 0.90 (highest 0.62)" in page
+    row = "<td>87 detections</td><td>0</td><td>0.62</td><td>0.90</td>"
+    assert f"<td>traffic light</td>{row}" in page
+    assert f"<td>range: traffic light</td>{row}" in page
 
 
 def test_the_worst_frame_is_shown_with_its_box_and_time(tmp_path: Path) -> None:

@@ -1,0 +1,54 @@
+"""What became of everything that a cue or a range could have come from: used, or skipped and why.
+
+A cue that is never positive looks the same whether there was nothing to see or a threshold was too
+high. So candidates are counted, and with them the highest score that was met.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+BELOW_SCORE: Final = "below score"
+TOO_LITTLE_ROAD: Final = "too little road"
+NOT_FROM_THE_SIDE: Final = "not seen from the side"
+NOT_FOUND_BEFORE: Final = "not found in the frame before"
+OTHER_MOTION: Final = "moves or faces otherwise"
+NOT_COUNTED: Final = "not counted by its rule"
+
+Unit = Literal["detections", "frames"]
+
+
+@dataclass(slots=True)
+class Candidates:
+    """Of one cue or range, over a run: ``seen`` = ``used`` + all ``skipped``.
+
+    Attributes:
+        unit: What is counted: detections with the cue's labels, or frames with road in its region.
+        setting: Where the threshold stands in the vehicle file; None where there is none.
+        threshold: Only a higher score counts.
+        seen: How many there were.
+        used: How many became the cue or the range.
+        skipped: How many did not, by reason.
+        max_score: The highest score met; None without any.
+    """
+
+    unit: Unit
+    setting: str | None = None
+    threshold: float | None = None
+    seen: int = 0
+    used: int = 0
+    skipped: dict[str, int] = field(default_factory=dict)
+    max_score: float | None = None
+
+    def take(self, scores: Sequence[float], skipped: Mapping[str, int]) -> None:
+        """Count candidates with these scores, of which so many were skipped."""
+        self.seen += len(scores)
+        self.used += len(scores) - sum(skipped.values())
+        for reason, number in skipped.items():
+            if number:
+                self.skipped[reason] = self.skipped.get(reason, 0) + number
+        if scores:
+            best = max(scores)
+            self.max_score = best if self.max_score is None else max(self.max_score, best)

@@ -1,0 +1,137 @@
+"""Counts, frame by frame, what became of the candidates of every cue."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from crosscue.detectors.base import Detections
+from crosscue.replay.vehicle.cue_spec import CueSpec, Input
+from crosscue.replay.vehicle.cue_table import CUES
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .candidates import (
+    BELOW_SCORE,
+    NOT_COUNTED,
+    NOT_FOUND_BEFORE,
+    NOT_FROM_THE_SIDE,
+    OTHER_MOTION,
+    TOO_LITTLE_ROAD,
+    Candidates,
+    Unit,
+)
+from .labelled import labels_of
+from .road import RoadShares
+
+
+@dataclass(frozen=True, slots=True)
+class CueTally:
+    """Candidates of every cue that was looked for, over the frames of a run.
+
+    Attributes:
+        vehicle: Labels and thresholds.
+        by_cue: Filled frame by frame; cues that no label or region belongs to are not in it.
+    """
+
+    vehicle: Vehicle
+    by_cue: dict[str, Candidates] = field(default_factory=dict)
+
+    def labelled(
+        self, observed_by: Input, boxes: Sequence[Detections], counts: Mapping[str, int]
+    ) -> None:
+        """Of cues that are detections with a label.
+
+        Args:
+            observed_by: Which cues.
+            boxes: What they were counted in.
+            counts: What came out, of all cues.
+        """
+        for cue in CUES.values():
+            labels = labels_of(cue, self.vehicle) if cue.observed_by == observed_by else ()
+            if labels and cue.name in counts:
+                setting, threshold = threshold_of(cue, self.vehicle)
+                self._count(cue.name, scores_of(boxes, labels), setting, threshold, counts)
+
+    def own(self, boxes: Sequence[Detections], counts: Mapping[str, int]) -> None:
+        """Of the user's cues."""
+        for name, cue in self.vehicle.cues.own.items():
+            if name not in counts:
+                continue
+            scores = scores_of(boxes, cue.labels)
+            self._count(name, scores, f"[cues.own.{name}] score", cue.score, counts)
+
+    def cars(
+        self, boxes: Sequence[Detections], shapes: int, pairs: int, counts: Mapping[str, int]
+    ) -> None:
+        """Of cues that follow cars from frame to frame.
+
+        Args:
+            boxes: All detections of the frame.
+            shapes: Cars among them that pass the rules of shape and score.
+            pairs: Cars of these that were in the frame before, too.
+            counts: What came out.
+        """
+        cars = self.vehicle.cars
+        scores = scores_of(boxes, cars.labels)
+        low = sum(score <= cars.score for score in scores)
+        for cue in CUES.values():
+            if cue.observed_by == "car pairs":
+                self._of(cue.name, "detections", "[cars] score", cars.score).take(
+                    scores,
+                    {
+                        BELOW_SCORE: low,
+                        NOT_FROM_THE_SIDE: len(scores) - low - shapes,
+                        NOT_FOUND_BEFORE: shapes - pairs,
+                        OTHER_MOTION: pairs - min(counts.get(cue.name, 0), pairs),
+                    },
+                )
+
+    def road(self, shares: RoadShares) -> None:
+        """Of cues that look for road in a region."""
+        threshold = self.vehicle.cues.road_share
+        for cue in CUES.values():
+            side = cue.supports[0] if cue.supports else ""
+            if cue.observed_by != "road" or side not in RoadShares.__slots__:
+                continue
+            share: float = getattr(shares, side)
+            found = [share] if share > 0.0 else []
+            low = sum(one <= threshold for one in found)
+            counted = self._of(cue.name, "frames", "[cues] road_share", threshold)
+            counted.take(found, {TOO_LITTLE_ROAD: low})
+
+    def _count(
+        self,
+        name: str,
+        scores: Sequence[float],
+        setting: str | None,
+        threshold: float | None,
+        counts: Mapping[str, int],
+    ) -> None:
+        low = 0 if threshold is None else sum(score <= threshold for score in scores)
+        high = len(scores) - low
+        skipped = {BELOW_SCORE: low, NOT_COUNTED: high - min(counts[name], high)}
+        self._of(name, "detections", setting, threshold).take(scores, skipped)
+
+    def _of(
+        self, name: str, unit: Unit, setting: str | None, threshold: float | None
+    ) -> Candidates:
+        return self.by_cue.setdefault(name, Candidates(unit, setting, threshold))
+
+
+def scores_of(boxes: Sequence[Detections], labels: Sequence[str]) -> list[float]:
+    """Scores of all detections with one of the labels."""
+    return [
+        score
+        for found in boxes
+        for label, score in zip(found.labels, found.scores.tolist(), strict=True)
+        if label in labels
+    ]
+
+
+def threshold_of(cue: CueSpec, vehicle: Vehicle) -> tuple[str | None, float | None]:
+    """Where a cue's least score stands in the vehicle file, and the score; None without one."""
+    if cue.settings is None:
+        return None, None
+    name = f"{cue.settings}_score"
+    score: float = getattr(vehicle.cues, name)
+    return f"[cues] {name}", score

@@ -1,0 +1,94 @@
+"""What became of the candidates of cues and ranges, as the manifest and a person are told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, Literal
+
+from crosscue.detectors.cues.candidates import BELOW_SCORE, TOO_LITTLE_ROAD, Candidates
+
+from .record import Record
+
+NO_CURVE: Final = "no range curve"
+
+
+class CandidateRow(Record):
+    """Of one cue or range: ``seen`` = ``used`` + all ``skipped``."""
+
+    unit: Literal["detections", "frames"]
+    """Detections with one of the cue's labels, or frames with road in its region."""
+    setting: str | None
+    """Where the threshold stands in the vehicle file; None where there is none."""
+    threshold: float | None
+    """Only a higher score, or fraction of road, counts."""
+    seen: int
+    used: int
+    skipped: dict[str, int]
+    """By reason."""
+    max_score: float | None
+    """The highest score, or fraction of road, met."""
+
+
+def candidate_rows(found: Mapping[str, Candidates]) -> dict[str, CandidateRow]:
+    """As the manifest holds them."""
+    return {
+        cue: CandidateRow(
+            unit=one.unit,
+            setting=one.setting,
+            threshold=one.threshold,
+            seen=one.seen,
+            used=one.used,
+            skipped=dict(sorted(one.skipped.items())),
+            max_score=one.max_score,
+        )
+        for cue, one in found.items()
+    }
+
+
+def candidate_lines(
+    cues: Mapping[str, CandidateRow], ranged: Mapping[str, CandidateRow]
+) -> list[str]:
+    """A sentence for each cue and range that something was skipped for; alike ones together.
+
+    A road cue gets one only where it never was: a region that is not road is nothing that was
+    skipped.
+    """
+    told: dict[str, list[str]] = {}
+    for cue, one in cues.items():
+        if one.skipped and (one.unit == "detections" or not one.used):
+            told.setdefault(_told(one), []).append(cue)
+    lines = [f"{', '.join(names)}: {text}" for text, names in told.items()]
+    return lines + [text for cue, one in ranged.items() for text in _range_told(cue, one)]
+
+
+def _told(one: CandidateRow) -> str:
+    threshold = "" if one.threshold is None else f"{one.threshold:.2f}"
+    low = one.skipped.get(BELOW_SCORE, 0) + one.skipped.get(TOO_LITTLE_ROAD, 0)
+    if low == one.seen and one.max_score is not None:
+        what = one.unit if one.unit == "detections" else "frames with road"
+        return (
+            f"{one.seen:,} {what}, none above {threshold} (highest {one.max_score:.2f}); "
+            f"lower {one.setting}"
+        )
+    reasons = ", ".join(
+        f"{number:,} {why}" + (f" ({threshold})" if why == BELOW_SCORE else "")
+        for why, number in one.skipped.items()
+    )
+    return f"{one.seen:,} {one.unit}, {one.used:,} used; {reasons}"
+
+
+def _range_told(cue: str, one: CandidateRow) -> list[str]:
+    """Scores are the cue's own affair and told there."""
+    skipped = {why: number for why, number in one.skipped.items() if why != BELOW_SCORE}
+    things = f"{cue.replace('_', ' ')}s"
+    lines = []
+    unmeasured = skipped.pop(NO_CURVE, 0)
+    if unmeasured:
+        lines.append(
+            f"range: {unmeasured:,} {things} measured, no curve: [ranges.{cue}] is not given; "
+            "crosscue fit ranges"
+        )
+    if skipped:
+        reasons = ", ".join(f"{number:,} {why}" for why, number in skipped.items())
+        lines.append(f"range: {one.used:,} {things} used; {reasons}")
+    return lines

@@ -1,0 +1,94 @@
+"""Whatever could have been a cue is counted: used, or skipped with its reason."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.candidates import (
+    BELOW_SCORE,
+    NOT_FOUND_BEFORE,
+    NOT_FROM_THE_SIDE,
+    OTHER_MOTION,
+    TOO_LITTLE_ROAD,
+)
+from crosscue.detectors.cues.frame import CuePass, Seen
+from crosscue.detectors.cues.road import RoadShares
+from crosscue.detectors.cues.tally import CueTally
+from crosscue.replay.vehicle.cue_table import CUES
+from crosscue.replay.vehicle.vehicle import Cues, OwnCue, Vehicle
+
+VEHICLE = Vehicle(version=1, cues=Cues(own={"crossing": OwnCue(labels=("zebra",), score=0.3)}))
+LABELS = ("traffic light", "stop sign", "car", "zebra", "one way left", "dog")
+BOX = st.tuples(st.sampled_from(LABELS), st.floats(0.0, 1.0), st.floats(5.0, 300.0))
+FRAMES = st.lists(st.lists(BOX, max_size=5), min_size=1, max_size=4)
+
+
+def _found(t_ns: int, *things: tuple[str, float, float]) -> Detections:
+    """Things 40 px high at the left, each with a label, score and width."""
+    boxes = np.array([(5.0, 5.0, 5.0 + width, 45.0) for _, _, width in things]).reshape(-1, 4)
+    scores = np.array([score for _, score, _ in things], np.float64)
+    labels = tuple(label for label, _, _ in things)
+    return Detections(t_ns, (640, 480), boxes, scores, labels, (b"",) * len(things))
+
+
+def _pass() -> tuple[CuePass, CueTally]:
+    tally = CueTally(VEHICLE)
+    return CuePass(VEHICLE, tally=tally), tally
+
+
+def test_lights_below_the_threshold_are_counted_with_the_best_score_of_all() -> None:
+    cues, tally = _pass()
+    for t, score in enumerate((0.41, 0.62, 0.3)):
+        cues(Seen(t, objects=(_found(t, ("traffic light", score, 20.0)),)))
+
+    lights = tally.by_cue["traffic_light"]
+    assert (lights.seen, lights.used, lights.skipped) == (3, 0, {BELOW_SCORE: 3})
+    assert (lights.max_score, lights.threshold) == (0.62, 0.9)
+    assert lights.setting == "[cues] traffic_light_score"
+
+
+def test_a_car_is_skipped_for_the_first_rule_that_it_does_not_meet() -> None:
+    cues, tally = _pass()
+    standing = ("car", 0.99, 100.0)
+    cues(Seen(0, objects=(_found(0, standing, ("car", 0.5, 100.0), ("car", 0.99, 50.0)),)))
+    cues(Seen(10**8, objects=(_found(10**8, standing),)))
+
+    cars = tally.by_cue["cross_traffic_left"]
+    assert (cars.seen, cars.used) == (4, 0)
+    assert cars.skipped == {
+        BELOW_SCORE: 1,
+        NOT_FROM_THE_SIDE: 1,
+        NOT_FOUND_BEFORE: 1,
+        OTHER_MOTION: 1,
+    }
+
+
+def test_a_region_with_too_little_road_is_counted_and_one_without_is_not() -> None:
+    cues, tally = _pass()
+    cues(Seen(0, road=RoadShares(left=0.13, straight=0.5, right=0.0)))
+
+    assert tally.by_cue["road_left"].skipped == {TOO_LITTLE_ROAD: 1}
+    assert tally.by_cue["road_left"].max_score == 0.13
+    assert tally.by_cue["road_straight"].used == 1
+    assert tally.by_cue["road_right"].seen == 0
+
+
+@given(FRAMES, FRAMES)
+@settings(max_examples=40, deadline=None)
+def test_used_and_skipped_add_up_for_every_cue(
+    objects: list[list[tuple[str, float, float]]], signs: list[list[tuple[str, float, float]]]
+) -> None:
+    cues, tally = _pass()
+    counted: dict[str, int] = {}
+    for t, (some, others) in enumerate(zip(objects, signs, strict=False)):
+        frame = Seen(t * 10**8, objects=(_found(t, *some),), signs=(_found(t, *others),))
+        for cue, number in cues(frame).counts.items():
+            counted[cue] = counted.get(cue, 0) + number
+
+    for name, one in tally.by_cue.items():
+        assert one.seen == one.used + sum(one.skipped.values())
+        assert all(number > 0 for number in one.skipped.values())
+        assert one.used == counted.get(name, 0)
+    looked = {name for name, cue in CUES.items() if cue.observed_by not in ("road", "mobileye")}
+    assert set(tally.by_cue) == looked | {"crossing"}

@@ -1,0 +1,60 @@
+"""What a person reads of detections that became neither cue nor range."""
+
+from crosscue.eval.runs.candidates import NO_CURVE, CandidateRow, candidate_lines
+
+
+def _row(seen: int, skipped: dict[str, int], **more: object) -> CandidateRow:
+    content = {
+        "unit": "detections",
+        "setting": "[cues] traffic_light_score",
+        "threshold": 0.9,
+        "seen": seen,
+        "used": seen - sum(skipped.values()),
+        "skipped": skipped,
+        "max_score": 0.62 if seen else None,
+        **more,
+    }
+    return CandidateRow.model_validate(content)
+
+
+def test_a_threshold_that_nothing_reaches_is_named_with_the_highest_score() -> None:
+    (line,) = candidate_lines({"traffic_light": _row(87, {"below score": 87})}, {})
+
+    assert line == (
+        "traffic_light: 87 detections, none above 0.90 (highest 0.62); "
+        "lower [cues] traffic_light_score"
+    )
+
+
+def test_cues_with_the_same_fate_share_a_line_and_whole_ones_have_none() -> None:
+    cars = _row(9, {"below score": 4, "not seen from the side": 5})
+    lines = candidate_lines(
+        {"parked_left": cars, "parked_right": cars, "stop_sign": _row(0, {})}, {}
+    )
+
+    assert lines == [
+        "parked_left, parked_right: 9 detections, 0 used; 4 below score (0.90), "
+        "5 not seen from the side"
+    ]
+
+
+def test_a_range_without_a_curve_says_so() -> None:
+    ranged = {"traffic_light": _row(100, {"below score": 15, NO_CURVE: 80, "no height": 5})}
+
+    assert candidate_lines({}, ranged) == [
+        "range: 80 traffic lights measured, no curve: [ranges.traffic_light] is not given; "
+        "crosscue fit ranges",
+        "range: 0 traffic lights used; 5 no height",
+    ]
+
+
+def test_road_is_told_only_where_it_never_was() -> None:
+    road = {"unit": "frames", "setting": "[cues] road_share", "threshold": 0.2}
+    never = _row(8, {"too little road": 8}, **{**road, "max_score": 0.13})
+    lines = candidate_lines(
+        {"road_left": never, "road_right": _row(8, {"too little road": 3}, **road)}, {}
+    )
+
+    assert lines == [
+        "road_left: 8 frames with road, none above 0.20 (highest 0.13); lower [cues] road_share"
+    ]
