@@ -1,0 +1,253 @@
+"""Range and true height of one light or sign together, from how it grows as the car moves.
+
+A pinhole camera of focal length f sees an object of height H at depth R as h = f H / R pixels. Over
+the distance s travelled towards it, 1 / h falls linearly: 1 / h = (R0 - s) / (f H). So the growth
+tells R without knowing H; what is known of H beforehand (``SIZES``) is only the prior. It is all
+there is while the car stands, and is outweighed as the car moves.
+
+In logarithms, ln h = ln f + ln H - ln R + error, and H is lognormal: given R, everything is
+Gaussian, so H is integrated out exactly and the posterior of R is computed on a grid. Its prior is
+flat in ln R, so that size alone errs as often to the far side as to the near. Two things keep the
+result honest:
+
+* heights in successive frames err alike, so an observation soon after another is worth little
+  (``HeightErrors.resemble_m``);
+* an observation far from the others (a box over two lights, another object) counts next to nothing.
+
+The scale of the errors is estimated with the range, from residuals and a weak prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from crosscue.replay.columns import Floats
+
+Kind = Literal["traffic_light", "stop_sign"]
+
+
+@dataclass(frozen=True, slots=True)
+class SizePrior:
+    """What is known of an object's height before it is seen: lognormal.
+
+    Attributes:
+        mean_m: Expected height.
+        spread: Standard deviation as a fraction of the mean.
+    """
+
+    mean_m: float
+    spread: float
+
+    @property
+    def log_var(self) -> float:
+        """Variance of the logarithm."""
+        return float(np.log1p(self.spread**2))
+
+    @property
+    def log_mean(self) -> float:
+        """Mean of the logarithm."""
+        return float(np.log(self.mean_m)) - 0.5 * self.log_var
+
+
+SIZES: Final[Mapping[Kind, SizePrior]] = {
+    "traffic_light": SizePrior(1.2, 0.25),
+    "stop_sign": SizePrior(0.82, 0.15),
+}
+"""Standard sizes. Housings: three lenses of 0.30 m are 1.07 m bare and 1.32 m with a backplate,
+three of 0.20 m are 0.75 m, four of 0.30 m with a backplate 1.68 m. Faces of stop signs: 0.75 m and
+0.90 m across the flats, the small ones 0.60 m. The spread takes in boxes drawn tight or wide."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeightErrors:
+    """How far a box's height is off, before anything is known of this track.
+
+    Attributes:
+        fraction: Standard deviation as a fraction of the height.
+        edges_px: Standard deviation in pixels, added in squares.
+        resemble_m: Distance travelled over which errors resemble each other.
+        worth: How many independent observations this prior of the errors' scale counts for.
+    """
+
+    fraction: float = 0.04
+    edges_px: float = 1.0
+    resemble_m: float = 1.0
+    worth: float = 8.0
+
+
+@dataclass(frozen=True, slots=True)
+class MotionRange:
+    """Range at the last observation, and the object's height.
+
+    Attributes:
+        mean_m: Expected depth along the camera's axis, from the camera.
+        var_m2: Its variance.
+        height_m: The object's height that goes with ``mean_m``.
+        by_motion: How much of the prior variance motion took away, in [0, 1].
+    """
+
+    mean_m: float
+    var_m2: float
+    height_m: float
+    by_motion: float
+
+
+NEAREST_M: Final = 0.5
+FURTHEST_M: Final = 500.0
+GRID: Final = 101
+OUTLIER: Final = 2.5
+"""In standard deviations; further off an observation's weight falls with
+the square of its distance."""
+ROUNDS: Final = 8
+"""Of reweighting; weights settle in three or four."""
+
+
+def range_from_motion(
+    travelled_m: Floats,
+    height_px: Floats,
+    focal_px: float,
+    size: SizePrior,
+    errors: HeightErrors = HeightErrors(),
+) -> MotionRange:
+    """Estimate range and true height of one object from all its observations.
+
+    Args:
+        travelled_m: Shape (N,), N > 0, odometer readings in time order, forwards positive.
+        height_px: Shape (N,), heights of its boxes.
+        focal_px: Of the camera, in the same pixels.
+        size: Prior of its height.
+        errors: Prior of the errors of ``height_px``.
+
+    Raises:
+        ValueError: No observations, shapes that differ, or a height or focal length that is not
+            positive.
+    """
+    seen = _checked(travelled_m, height_px, focal_px, errors)
+    nearest_m = max(NEAREST_M, 1.01 * -float(seen.ahead_m.min()))
+    grid_m = np.geomspace(nearest_m, max(FURTHEST_M, 2.0 * nearest_m), GRID)
+    weights = seen.worth * _first_weights(seen, grid_m)
+    post = _refined(seen, grid_m, weights, size)
+    for _ in range(ROUNDS):
+        residual = seen.excess(np.array([post.mean_m]))[0] - np.log(post.height_m)
+        new = seen.worth * _weights(seen, residual, errors)
+        if np.allclose(new, weights, rtol=1e-3, atol=0.0):
+            break
+        weights = new
+        post = _refined(seen, grid_m, weights, size)
+    unmoved = seen.at_last()
+    before = _refined(unmoved, grid_m, unmoved.worth / unmoved.var, size)
+    by_motion = float(np.clip(1.0 - post.var_m2 / before.var_m2, 0.0, 1.0))
+    return MotionRange(post.mean_m, post.var_m2, post.height_m, by_motion)
+
+
+@dataclass(frozen=True, slots=True)
+class _Observations:
+    """All observations; shape (N,) each.
+
+    Attributes:
+        ahead_m: How much further away the object was than at the last observation.
+        log_angle: ln of height over focal length.
+        var: Of ``log_angle``, before residuals are seen.
+        worth: How many independent observations each one is.
+    """
+
+    ahead_m: Floats
+    log_angle: Floats
+    var: Floats
+    worth: Floats
+
+    def excess(self, range_m: Floats) -> Floats:
+        """Log of the height that each shows if the last was at ``range_m``, shape (G, N)."""
+        depth = np.maximum(range_m[:, None] + self.ahead_m[None, :], 1e-3)
+        return np.asarray(self.log_angle[None, :] + np.log(depth), np.float64)
+
+    def at_last(self) -> _Observations:
+        """The typical last observation as the only one."""
+        angle = np.array([float(np.median(self.log_angle[-5:]))])
+        return _Observations(np.zeros(1), angle, self.var[-1:], np.ones(1))
+
+
+@dataclass(frozen=True, slots=True)
+class _Posterior:
+    mean_m: float
+    var_m2: float
+    height_m: float
+
+
+def _checked(
+    travelled_m: Floats, height_px: Floats, focal_px: float, errors: HeightErrors
+) -> _Observations:
+    if travelled_m.ndim != 1 or travelled_m.shape != height_px.shape or not len(travelled_m):
+        raise ValueError(
+            f"travelled_m, height_px: want (N,), got {travelled_m.shape}, {height_px.shape}"
+        )
+    if not (np.isfinite(travelled_m).all() and np.isfinite(height_px).all()):
+        raise ValueError("travelled_m, height_px: want finite numbers")
+    if not ((height_px > 0.0).all() and 0.0 < focal_px < np.inf):
+        raise ValueError("height_px, focal_px: want positive numbers")
+    step_m = np.abs(np.diff(travelled_m))
+    # Resembling the one before by exp(-step / length), each is worth tanh(step / length / 2).
+    worth = np.concatenate(([1.0], np.tanh(0.5 * step_m / errors.resemble_m)))
+    var = errors.fraction**2 + (errors.edges_px / height_px) ** 2
+    return _Observations(travelled_m[-1] - travelled_m, np.log(height_px / focal_px), var, worth)
+
+
+def _first_weights(seen: _Observations, range_m: Floats) -> Floats:
+    """From the range that the median absolute residual likes best: no outlier sways it."""
+    excess = seen.excess(range_m)
+    away = np.abs(excess - np.median(excess, axis=1, keepdims=True))
+    best = away[int(np.argmin(np.median(away, axis=1) + away.mean(axis=1)))]
+    scale = np.maximum(1.4826 * np.median(best), np.sqrt(seen.var))
+    return np.asarray(_trust(best / scale) / scale**2, np.float64)
+
+
+def _weights(seen: _Observations, residual: Floats, errors: HeightErrors) -> Floats:
+    """Inverse variances, with the errors' scale from the residuals and its prior."""
+    squares = residual**2 / seen.var
+    scale = 1.0
+    for _ in range(ROUNDS):
+        trust = _trust(np.sqrt(squares / scale))
+        # Two observations' worth goes into range and size themselves.
+        left = max(float(seen.worth @ trust) - 2.0, 0.0)
+        scale = (errors.worth + float(seen.worth @ (trust * squares))) / (errors.worth + left)
+    return np.asarray(_trust(np.sqrt(squares / scale)) / (scale * seen.var), np.float64)
+
+
+def _trust(sigmas: Floats) -> Floats:
+    away = np.maximum(np.abs(sigmas) / OUTLIER, 1.0)
+    return np.asarray(1.0 / away**2, np.float64)
+
+
+def _refined(seen: _Observations, range_m: Floats, weights: Floats, size: SizePrior) -> _Posterior:
+    """On finer grids around what the one before found, which may be narrower than its steps."""
+    post = _posterior(seen, range_m, weights, size)
+    for _ in range(2):
+        near = max(int(np.searchsorted(range_m, post.mean_m)), 1)
+        step_m = float(range_m[min(near, len(range_m) - 1)] - range_m[near - 1])
+        reach_m = max(8.0 * float(np.sqrt(post.var_m2)), 2.0 * step_m)
+        near_m, far_m = max(post.mean_m - reach_m, range_m[0]), post.mean_m + reach_m
+        range_m = np.linspace(near_m, min(far_m, range_m[-1]), GRID)
+        post = _posterior(seen, range_m, weights, size)
+    return post
+
+
+def _posterior(
+    seen: _Observations, range_m: Floats, weights: Floats, size: SizePrior
+) -> _Posterior:
+    """Of the range, with the size integrated out; the grid may have any spacing."""
+    excess = seen.excess(range_m)
+    off = excess - size.log_mean
+    precision = float(weights.sum()) + 1.0 / size.log_var
+    pull = off @ weights
+    log_density = -0.5 * (off**2 @ weights - pull**2 / precision)
+    density = np.exp(log_density - log_density.max()) * np.gradient(range_m) / range_m
+    density /= density.sum()
+    mean_m = float(density @ range_m)
+    var_m2 = float(density @ (range_m - mean_m) ** 2)
+    at_mean = seen.excess(np.array([mean_m]))[0] - size.log_mean
+    height_m = float(np.exp(size.log_mean + at_mean @ weights / precision))
+    return _Posterior(mean_m, max(var_m2, 1e-12), height_m)

@@ -1,0 +1,135 @@
+"""Range and height from growth: exact where nothing errs, honest about its own error where it does.
+
+Tracks are simulated by the model itself: sizes from the prior, errors of successive frames alike.
+"""
+
+import numpy as np
+import pytest
+
+from crosscue.detectors.ranging.range_from_motion import (
+    SIZES,
+    HeightErrors,
+    MotionRange,
+    SizePrior,
+    range_from_motion,
+)
+from crosscue.replay.columns import Floats
+
+FOCAL_PX = 1500.0
+LIGHT = SIZES["traffic_light"]
+NO_ERRORS = HeightErrors(fraction=1e-5, edges_px=0.0)
+
+
+def alike(travelled_m: Floats, over_m: float, rng: np.random.Generator) -> Floats:
+    """Standard normal errors that resemble each other by exp(-distance / over_m)."""
+    errors = [float(rng.normal())]
+    for step_m in np.abs(np.diff(travelled_m)).tolist():
+        rho = float(np.exp(-step_m / over_m))
+        errors.append(rho * errors[-1] + np.sqrt(1.0 - rho * rho) * float(rng.normal()))
+    return np.array(errors)
+
+
+def track(
+    travelled_m: Floats, rng: np.random.Generator, size: SizePrior = LIGHT
+) -> tuple[Floats, float]:
+    """Heights of one simulated track, and its true range at the end."""
+    errors = HeightErrors()
+    last_m = float(np.exp(rng.uniform(np.log(15.0), np.log(120.0))))
+    height_m = np.exp(size.log_mean + np.sqrt(size.log_var) * rng.normal())
+    true_px = FOCAL_PX * height_m / (last_m + travelled_m[-1] - travelled_m)
+    sd = np.hypot(errors.fraction, errors.edges_px / true_px)
+    return true_px * np.exp(sd * alike(travelled_m, errors.resemble_m, rng)), last_m
+
+
+@pytest.mark.parametrize("height_m", [0.7, 1.2, 1.7])
+@pytest.mark.parametrize("last_m", [4.0, 35.0, 90.0])
+def test_a_track_without_errors_gives_range_and_height_exactly(
+    height_m: float, last_m: float
+) -> None:
+    travelled_m = np.linspace(3.0, 28.0, 60)
+    height_px = FOCAL_PX * height_m / (last_m + travelled_m[-1] - travelled_m)
+
+    found = range_from_motion(travelled_m, height_px, FOCAL_PX, LIGHT, NO_ERRORS)
+
+    assert found.mean_m == pytest.approx(last_m, rel=2e-3)
+    assert found.height_m == pytest.approx(height_m, rel=2e-3)
+
+
+def test_a_car_that_stands_knows_the_size_table_and_no_more() -> None:
+    height_px = np.full(200, 30.0)
+
+    found = range_from_motion(np.zeros(200), height_px, FOCAL_PX, LIGHT)
+
+    assert found.mean_m == pytest.approx(FOCAL_PX * LIGHT.mean_m / 30.0, rel=0.05)
+    assert np.sqrt(found.var_m2) / found.mean_m == pytest.approx(LIGHT.spread, rel=0.15)
+    assert found.by_motion < 0.02
+
+
+@pytest.mark.parametrize(("gone_m", "step_m"), [(0.0, 0.0), (5.0, 0.3), (20.0, 0.3), (40.0, 0.7)])
+def test_the_interval_holds_the_truth_as_often_as_it_says(gone_m: float, step_m: float) -> None:
+    rng = np.random.default_rng(7)
+    travelled_m = np.arange(0.0, gone_m + 1e-9, step_m) if step_m else np.zeros(10)
+    pairs = [track(travelled_m, rng) for _ in range(1000)]
+
+    found = [range_from_motion(travelled_m, px, FOCAL_PX, LIGHT) for px, _ in pairs]
+
+    sigmas = np.array([_sigmas(one, m) for one, (_, m) in zip(found, pairs, strict=True)])
+    assert 0.93 <= float(np.mean(np.abs(sigmas) < 1.96)) <= 0.97
+    off = np.array([one.mean_m / m - 1.0 for one, (_, m) in zip(found, pairs, strict=True)])
+    # A posterior that leans to the far side has its mean a little beyond its median.
+    assert abs(float(np.median(off))) < 0.06
+    assert abs(float(sigmas.mean())) < 0.15
+
+
+def _sigmas(found: MotionRange, true_m: float) -> float:
+    return float((found.mean_m - true_m) / np.sqrt(found.var_m2))
+
+
+def test_it_becomes_surer_as_the_car_moves_and_the_range_falls() -> None:
+    travelled_m = np.arange(0.0, 45.0, 0.5)
+    height_px = FOCAL_PX * 1.3 / (60.0 - travelled_m)
+
+    found = [
+        range_from_motion(travelled_m[:n], height_px[:n], FOCAL_PX, LIGHT) for n in range(1, 90, 4)
+    ]
+
+    assert (np.diff([one.mean_m for one in found]) < 0.0).all()
+    assert (np.diff([one.var_m2 for one in found]) < 0.0).all()
+    assert found[-1].mean_m == pytest.approx(60.0 - travelled_m[88], rel=0.03)
+
+
+def test_boxes_over_two_lights_sway_it_little() -> None:
+    travelled_m = np.arange(0.0, 40.0, 0.5)
+    height_px = FOCAL_PX * 1.3 / (60.0 - travelled_m)
+    height_px[::7] *= 1.8
+
+    found = range_from_motion(travelled_m, height_px, FOCAL_PX, LIGHT)
+
+    assert found.mean_m == pytest.approx(60.0 - travelled_m[-1], rel=0.05)
+
+
+def test_reverse_makes_it_further_away() -> None:
+    travelled_m = np.concatenate((np.arange(0.0, 20.0, 0.5), np.arange(20.0, 2.0, -0.5)))
+    height_px = FOCAL_PX * 1.2 / (50.0 - travelled_m)
+
+    found = range_from_motion(travelled_m, height_px, FOCAL_PX, LIGHT)
+
+    assert found.mean_m == pytest.approx(50.0 - travelled_m[-1], rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("travelled_m", "height_px", "focal_px"),
+    [
+        ([], [], 1500.0),
+        ([0.0, 1.0], [30.0], 1500.0),
+        ([0.0], [0.0], 1500.0),
+        ([0.0], [float("nan")], 1500.0),
+        ([float("inf")], [30.0], 1500.0),
+        ([0.0], [30.0], 0.0),
+    ],
+)
+def test_looks_that_cannot_be_are_refused(
+    travelled_m: list[float], height_px: list[float], focal_px: float
+) -> None:
+    with pytest.raises(ValueError, match="want"):
+        range_from_motion(np.array(travelled_m), np.array(height_px), focal_px, LIGHT)
