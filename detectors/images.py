@@ -63,7 +63,9 @@ def read_file(path: Path, most_bytes: int = DEFAULT.message_bytes) -> Encoded:
     """
     content = read_at_most(path, most_bytes)
     if content is None:
-        raise LogTooLargeError(f"more than {most_bytes:,} bytes in one picture")
+        raise LogTooLargeError(
+            f"picture of {path.stat().st_size} bytes: more than {most_bytes} are not read"
+        )
     coding = coding_of(content[:MAGIC_BYTES], "")
     if coding is None:
         raise LogFormatError("not a JPEG, PNG or WebP picture" if content else "empty picture")

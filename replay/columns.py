@@ -51,6 +51,8 @@ class Topic:
             or empty.
         declared: Messages that the format itself says there are (statistics, connection counts,
             rows), or None where it says nothing.
+        converted_from: Type of the stream that ``convert`` made this one from, which decides its
+            role: the message type that holds a table may say more or less than the table did.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Topic:
     schema: bytes = b""
     schema_encoding: str = ""
     declared: int | None = None
+    converted_from: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

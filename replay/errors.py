@@ -7,9 +7,11 @@
         * LogTooLargeError   a declared or produced size is over the limit
         * UnknownFormatError no reader knows this file or folder
     * SchemaError            a message type, DBC or truth file cannot be understood
+        * AnnotationError    a file of annotations cannot be read (exit status 4)
     * VehicleError           the vehicle file is wrong or lacks a role
         * MissingTopicError  a topic that it or a flag names is not in the logs
-    * RunError               a run folder is missing, locked, damaged or of another version
+    * RunError               a run folder is locked, or does not hold what was asked for
+        * UnreadableRunError it is missing, damaged or of another version (exit status 4)
     * OutputError            a result cannot be written (disk full, no permission)
     * EmptyResultError       nothing of what was asked for is in the logs
     * AccountError           rows in are not rows used, skipped and dropped: a bug of ours
@@ -56,6 +58,12 @@ class SchemaError(CrosscueError):
     """A message type, DBC or truth file cannot be understood."""
 
 
+class AnnotationError(SchemaError):
+    """A file of annotations is missing, damaged or does not follow its schema."""
+
+    exit_status = 4
+
+
 class VehicleError(CrosscueError):
     """The vehicle file is wrong or lacks a role."""
 
@@ -67,7 +75,13 @@ class MissingTopicError(VehicleError, UsageError):
 
 
 class RunError(CrosscueError):
-    """A run folder is missing, locked, damaged or of another version."""
+    """A run folder is locked, or does not hold what was asked for."""
+
+
+class UnreadableRunError(RunError):
+    """A run folder, or the logs that it names, is missing, damaged or of another version."""
+
+    exit_status = 4
 
 
 class OutputError(CrosscueError):

@@ -11,7 +11,7 @@ from crosscue.datasets.scenes.export.road_frames import RoadFrames, shrunk
 from crosscue.detectors.base import View
 from crosscue.detectors.images import decode, read_file
 from crosscue.replay.columns import Bytes
-from crosscue.replay.errors import LogError, UsageError
+from crosscue.replay.errors import EmptyResultError, LogError, UsageError
 
 SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 
@@ -24,14 +24,17 @@ def load_folder(folder: Path, size_px: tuple[int, int]) -> RoadFrames:
         size_px: Width and height wanted.
 
     Raises:
-        UsageError: No pictures, one without a mask, or of another size than its mask, or one that
-            does not decode.
+        UsageError: A picture is of another size than its mask.
+        EmptyResultError: No pictures.
+        LogError: No folder of pictures; a picture or its mask is missing or does not decode.
     """
     images = sorted(
         path for path in (folder / "images").glob("*") if path.suffix.lower() in SUFFIXES
     )
     if not images:
-        raise UsageError(f"{folder / 'images'}: no pictures; want {', '.join(SUFFIXES)}")
+        if not folder.joinpath("images").is_dir():
+            raise LogError(f"{folder / 'images'}: no such folder; give one with images and masks")
+        raise EmptyResultError(f"{folder / 'images'}: no pictures; want {', '.join(SUFFIXES)}")
     pixels, road = [], []
     for path in images:
         picture = _decoded(path, View())
@@ -50,6 +53,6 @@ def _decoded(path: Path, view: View) -> Bytes:
     try:
         return decode(read_file(path), view)[0]
     except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}; every picture wants its mask") from None
+        raise LogError(f"{path}: {error.strerror}; every picture needs its mask") from None
     except LogError as error:
-        raise UsageError(f"{path}: {error}; mend it or take it out") from None
+        raise type(error)(f"{path}: {error}; repair it or take it out") from None

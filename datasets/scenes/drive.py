@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -23,8 +23,12 @@ from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.replay.columns import Block, Images, Int64s, Messages, Topic
 from crosscue.replay.encode.outgoing import standard_type
 from crosscue.replay.encode.template import filled, template_of
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.made_of import made_of, refuse_another
+from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import sha256_of, write_text
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT
 from crosscue.replay.write.convert import LogWriter
 
 from .car_file import vehicle_text
@@ -34,6 +38,8 @@ from .layout import Layout, layout_named
 from .mobileye import Device
 from .world import World, build
 
+MADE_OF: Final = "simulated.json"
+"""Says which drive a folder holds."""
 CAR_BUS: Final = "/can/car"
 MOBILEYE_BUS: Final = "/can/mobileye"
 IMAGES: Final = "/camera/image/compressed"
@@ -133,7 +139,10 @@ def write_scene(folder: Path, settings: SceneSettings, *, overwrite: bool = Fals
 
     Raises:
         OutputError: A file is there already, or cannot be written.
+        UsageError: Another drive is there, which ``overwrite`` would destroy.
     """
+    if overwrite:
+        refuse_other_drive(folder, settings)
     layout, conditions, world = world_of(settings)
     log = folder / "drive.mcap"
     record = _Record(layout, conditions, world, settings)
@@ -144,6 +153,7 @@ def write_scene(folder: Path, settings: SceneSettings, *, overwrite: bool = Fals
             writer.write(block)
     shutil.copyfile(dbc_path(), folder / "simulated_car.dbc")
     write_text(folder / "vehicle.toml", record.vehicle_text())
+    write_text(folder / MADE_OF, strict_json(made_of([], asdict(settings))) + "\n")
     return SceneFiles(
         log,
         folder / "vehicle.toml",
@@ -151,6 +161,22 @@ def write_scene(folder: Path, settings: SceneSettings, *, overwrite: bool = Fals
         len(record.objects.images),
         len(world.approach.motion) / 100.0,
     )
+
+
+def refuse_other_drive(folder: Path, settings: SceneSettings) -> None:
+    """Let a drive be replaced by itself only.
+
+    Raises:
+        UsageError: The folder holds a drive of other settings, or one of which nothing says what
+            it is.
+    """
+    if not (folder / "drive.mcap").exists():
+        return
+    try:
+        there = json_tree(read_at_most(folder / MADE_OF, DEFAULT.record_bytes) or b"")
+    except (OSError, ValueError):
+        there = None
+    refuse_another(folder, "--overwrite", there, made_of([], asdict(settings)))
 
 
 class _Record:

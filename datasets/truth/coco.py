@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.errors import SchemaError
+from crosscue.replay.errors import AnnotationError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
@@ -22,17 +22,17 @@ def read_coco(path: Path) -> Annotations:
     """Read a COCO file; pictures may carry ``t_ns``, their log time.
 
     Raises:
-        SchemaError: Not there, not COCO, or references that lead nowhere.
+        AnnotationError: Not there, not COCO, or references that lead nowhere.
     """
     try:
         content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
+            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
         tree = json_tree(content)
     except (OSError, ValueError) as error:
-        raise SchemaError(f"{path}: not readable as JSON ({error}); give a COCO file") from None
+        raise AnnotationError(f"{path}: not readable as JSON ({error}); give a COCO file") from None
     if not isinstance(tree, dict):
-        raise SchemaError(f"{path}: want an object with images, annotations and categories")
+        raise AnnotationError(f"{path}: want an object with images, annotations and categories")
     labels = _labels(tree, path)
     pictures = _pictures(tree, path)
     things: dict[int, list[Thing]] = {number: [] for number in pictures}
@@ -40,11 +40,11 @@ def read_coco(path: Path) -> Annotations:
         where = f"annotations.{place}"
         image, label = _key(row.get("image_id")), labels.get(_key(row.get("category_id")))
         if image not in things:
-            raise SchemaError(
+            raise AnnotationError(
                 f"{path}: {where}: image_id {row.get('image_id')!r}: no such image; mend it"
             )
         if label is None:
-            raise SchemaError(
+            raise AnnotationError(
                 f"{path}: {where}: category_id {row.get('category_id')!r}: no such category"
             )
         things[image].append(_thing(row, label, where, path))
@@ -62,7 +62,7 @@ def read_coco(path: Path) -> Annotations:
 def _rows(tree: Mapping[str, Any], name: str, path: Path) -> list[Mapping[str, Any]]:
     rows = tree.get(name)
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise SchemaError(f"{path}: {name}: want a list of objects; give a COCO file")
+        raise AnnotationError(f"{path}: {name}: want a list of objects; give a COCO file")
     return rows
 
 
@@ -76,7 +76,7 @@ def _labels(tree: Mapping[str, Any], path: Path) -> dict[int, str]:
     for place, row in enumerate(_rows(tree, "categories", path)):
         number, name = _key(row.get("id")), row.get("name")
         if number < 0 or number in labels or not isinstance(name, str) or name in labels.values():
-            raise SchemaError(
+            raise AnnotationError(
                 f"{path}: categories.{place}: want an id and a name, neither twice; mend it"
             )
         labels[number] = name
@@ -89,12 +89,14 @@ def _pictures(tree: Mapping[str, Any], path: Path) -> dict[int, Picture]:
         where = f"{path}: images.{place}"
         number, name, t_ns = _key(row.get("id")), row.get("file_name"), row.get("t_ns")
         if number < 0 or number in pictures or not isinstance(name, str):
-            raise SchemaError(f"{where}: want an id that no other has, and a file_name; mend it")
+            raise AnnotationError(
+                f"{where}: want an id that no other has, and a file_name; mend it"
+            )
         size = (_key(row.get("width")), _key(row.get("height")))
         if not (0 < size[0] <= MAX_SIDE and 0 < size[1] <= MAX_SIDE):
-            raise SchemaError(f"{where}: width and height: want whole pixels, 1 to {MAX_SIDE}")
+            raise AnnotationError(f"{where}: width and height: want whole pixels, 1 to {MAX_SIDE}")
         if t_ns is not None and not (_key(t_ns) == t_ns and 0 <= t_ns < 2**62):
-            raise SchemaError(f"{where}: t_ns {t_ns!r}: want whole nanoseconds; mend it")
+            raise AnnotationError(f"{where}: t_ns {t_ns!r}: want whole nanoseconds; mend it")
         pictures[number] = Picture(name, size, t_ns)
     return pictures
 
@@ -102,11 +104,13 @@ def _pictures(tree: Mapping[str, Any], path: Path) -> dict[int, Picture]:
 def _thing(row: Mapping[str, Any], label: str, where: str, path: Path) -> Thing:
     box = row.get("bbox")
     if not (isinstance(box, list) and len(box) == 4 and all(_is_number(value) for value in box)):
-        raise SchemaError(f"{path}: {where}: bbox {box!r}: want four numbers x, y, w, h; mend it")
+        raise AnnotationError(
+            f"{path}: {where}: bbox {box!r}: want four numbers x, y, w, h; mend it"
+        )
     x, y, w, h = (float(value) for value in box)
     visible, track = row.get("visible"), row.get("track_id")
     if visible is not None and not (_is_number(visible) and 0.0 <= visible <= 1.0):
-        raise SchemaError(f"{path}: {where}: visible {visible!r}: want 0 to 1; mend it")
+        raise AnnotationError(f"{path}: {where}: visible {visible!r}: want 0 to 1; mend it")
     return Thing(
         label=label,
         box_px=(x, y, x + w, y + h),

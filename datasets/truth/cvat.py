@@ -16,7 +16,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from crosscue.replay.errors import SchemaError
+from crosscue.replay.errors import AnnotationError
 from crosscue.replay.limits import MIB
 
 from .annotations import Annotations, Picture, Thing
@@ -35,7 +35,7 @@ def read_cvat(path: Path) -> Annotations:
     Boxes, polygons, masks and tags are taken; other shapes are counted under ``ignored``.
 
     Raises:
-        SchemaError: Not there, not such a file, or with a document type declaration.
+        AnnotationError: Not there, not such a file, or with a document type declaration.
     """
     reader = _Reader(str(path))
     parser = expat.ParserCreate()
@@ -46,11 +46,13 @@ def read_cvat(path: Path) -> Annotations:
     parser.buffer_text = True
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
+            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
         with path.open("rb") as file:
             parser.ParseFile(file)
     except (OSError, expat.ExpatError) as error:
-        raise SchemaError(f"{path}: not readable as XML ({error}); give CVAT's XML 1.1") from None
+        raise AnnotationError(
+            f"{path}: not readable as XML ({error}); give CVAT's XML 1.1"
+        ) from None
     return reader.annotations()
 
 
@@ -70,16 +72,18 @@ class _Reader:
     _ignored: dict[str, int] = field(default_factory=dict)
 
     def refuse_doctype(self, *_: object) -> None:
-        raise SchemaError(
+        raise AnnotationError(
             f"{self.where}: has a document type declaration, which may hide entities; CVAT writes "
             "none: take it out"
         )
 
     def start(self, tag: str, found: Mapping[str, str]) -> None:
         if not self._path and tag != "annotations":
-            raise SchemaError(f"{self.where}: <{tag}>: want <annotations>; give CVAT's XML 1.1")
+            raise AnnotationError(f"{self.where}: <{tag}>: want <annotations>; give CVAT's XML 1.1")
         if len(self._path) >= MAX_DEPTH:
-            raise SchemaError(f"{self.where}: elements over {MAX_DEPTH} deep; this is not CVAT's")
+            raise AnnotationError(
+                f"{self.where}: elements over {MAX_DEPTH} deep; this is not CVAT's"
+            )
         self._path.append(tag)
         self._words = []
         if tag == "image":
@@ -122,7 +126,7 @@ class _Reader:
 
     def _check_size(self, size: tuple[int, int]) -> None:
         if not (0 < size[0] <= MAX_SIDE and 0 < size[1] <= MAX_SIDE):
-            raise SchemaError(f"{self.where}: pictures of {size[0]} x {size[1]}: want pixels")
+            raise AnnotationError(f"{self.where}: pictures of {size[0]} x {size[1]}: want pixels")
 
     def _shape(self, tag: str, found: Mapping[str, str]) -> None:
         if self._path[-2] == "track":
@@ -164,12 +168,12 @@ class _Reader:
         except ValueError:
             points = np.empty((0, 0))
         if points.ndim != 2 or points.shape[1:] != (2,) or not np.isfinite(points).all():
-            raise SchemaError(f"{self.where}: points {text[:40]!r}: want x,y;x,y;...; mend it")
+            raise AnnotationError(f"{self.where}: points {text[:40]!r}: want x,y;x,y;...; mend it")
         return points
 
     def _text(self, found: Mapping[str, str], name: str) -> str:
         if name not in found:
-            raise SchemaError(
+            raise AnnotationError(
                 f"{self.where}: <{self._path[-1]}> has no {name}; give CVAT's XML 1.1"
             )
         return found[name]
@@ -177,7 +181,7 @@ class _Reader:
     def _whole(self, found: Mapping[str, str], name: str) -> int:
         text = self._text(found, name)
         if not re.fullmatch(r"[0-9]{1,9}", text):
-            raise SchemaError(
+            raise AnnotationError(
                 f"{self.where}: <{self._path[-1]}> {name} {text[:40]!r}: want a whole number"
             )
         return int(text)
@@ -189,7 +193,7 @@ class _Reader:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise SchemaError(
+            raise AnnotationError(
                 f"{self.where}: <{self._path[-1]}> {name} {text[:40]!r}: want a number"
             )
         return value
@@ -210,12 +214,12 @@ class _Reader:
         filtered = re.search(r"step=([0-9]{1,6})", self._found("frame_filter") or "")
         step = max(int(filtered[1]), 1) if filtered else 1
         if last - first > MAX_FRAMES:
-            raise SchemaError(f"{self.where}: frames {first} to {last}: over {MAX_FRAMES}")
+            raise AnnotationError(f"{self.where}: frames {first} to {last}: over {MAX_FRAMES}")
         frames = range(first, last + 1, step)
         # A thing drawn in a single frame is closed one frame later, maybe behind the last one.
         strange = [n for n, things in self._by_frame.items() if things and n not in frames]
         if strange:
-            raise SchemaError(
+            raise AnnotationError(
                 f"{self.where}: frame {strange[0]}: the task has {first} to {last} by {step}"
             )
         return tuple(
@@ -232,5 +236,5 @@ class _Reader:
         if re.fullmatch(r"[0-9]{1,9}", text):
             return int(text)
         if otherwise is None or text:
-            raise SchemaError(f"{self.where}: meta: {name} {text[:40]!r}: want a whole number")
+            raise AnnotationError(f"{self.where}: meta: {name} {text[:40]!r}: want a whole number")
         return otherwise

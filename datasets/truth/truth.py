@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Literal, Protocol, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from crosscue.replay.errors import SchemaError, UsageError
+from crosscue.replay.errors import AnnotationError, EmptyResultError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
@@ -146,7 +146,9 @@ def write_carried(format_name: str, path: Path, folder: Path) -> Path:
         carried = CARRIED | {name: one.truth for name, one in data_sets().items()}
     if format_name not in carried:
         known = ", ".join(sorted(carried))
-        raise UsageError(f"{path}: a {format_name} log carries no truth; those that do: {known}")
+        raise EmptyResultError(
+            f"{path}: a {format_name} log carries no truth; those that do: {known}"
+        )
     module, _, function = carried[format_name].partition(":")
     return cast("Writer", getattr(import_module(module), function))(path, folder)
 
@@ -161,25 +163,27 @@ def load(path: Path) -> Truth:
     """Read and check a truth file; a folder stands for the ``truth.json`` in it.
 
     Raises:
-        SchemaError: Not there, not JSON, or not what version 1 says.
+        AnnotationError: Not there, not JSON, or not what version 1 says.
     """
     path = path / FILE if path.is_dir() else path
     try:
         content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
+            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
         tree = json_tree(content, object_pairs_hook=_no_twins)
         truth = Truth.model_validate(tree)
     except ValidationError as error:
-        raise SchemaError(explain(error, None, str(path), Truth)) from None
+        raise AnnotationError(explain(error, None, str(path), Truth)) from None
     except FileNotFoundError:
-        raise SchemaError(
+        raise AnnotationError(
             f"{path}: no such truth file; for a data set make it with: crosscue truth LOG -o DIR"
         ) from None
     except (OSError, ValueError) as error:
-        raise SchemaError(f"{path}: not readable as JSON ({error}); mend it") from None
+        raise AnnotationError(f"{path}: not readable as JSON ({error}); mend it") from None
     if truth.end_ns <= truth.start_ns:
-        raise SchemaError(f"{path}: end_ns {truth.end_ns} is not after start_ns {truth.start_ns}")
+        raise AnnotationError(
+            f"{path}: end_ns {truth.end_ns} is not after start_ns {truth.start_ns}"
+        )
     _check_approaches(truth, path)
     _check_cues(truth, path)
     return truth
@@ -189,16 +193,16 @@ def _check_approaches(truth: Truth, path: Path) -> None:
     before: Approach | None = None
     for one in sorted(truth.approaches, key=lambda one: one.start_ns):
         if not truth.start_ns <= one.start_ns < one.enter_ns <= truth.end_ns:
-            raise SchemaError(
+            raise AnnotationError(
                 f"{path}: approach {one.id}: start_ns {one.start_ns}, enter_ns {one.enter_ns}: want"
                 f" start before enter, both from {truth.start_ns} to {truth.end_ns}; mend it"
             )
         if before is not None and one.start_ns < before.enter_ns:
-            raise SchemaError(f"{path}: approaches {before.id} and {one.id} overlap; mend them")
+            raise AnnotationError(f"{path}: approaches {before.id} and {one.id} overlap; mend them")
         before = one
     numbers = [one.id for one in truth.approaches]
     if len(set(numbers)) != len(numbers):
-        raise SchemaError(f"{path}: approaches: an id stands twice in {numbers}; mend it")
+        raise AnnotationError(f"{path}: approaches: an id stands twice in {numbers}; mend it")
 
 
 def _check_cues(truth: Truth, path: Path) -> None:
@@ -209,20 +213,24 @@ def _check_cues(truth: Truth, path: Path) -> None:
         if one.cue not in known:
             near = difflib.get_close_matches(one.cue, known, 1)
             meant = f", meant: {near[0]}" if near else ""
-            raise SchemaError(f"{where}: no such cue{meant}; one of your own goes into own_cues")
+            raise AnnotationError(
+                f"{where}: no such cue{meant}; one of your own goes into own_cues"
+            )
         spans = one.start_ns is not None and one.end_ns is not None
         if spans == (one.t_ns is not None) or (one.start_ns is None) != (one.end_ns is None):
-            raise SchemaError(f"{where}: want either t_ns, or start_ns and end_ns; mend it")
+            raise AnnotationError(f"{where}: want either t_ns, or start_ns and end_ns; mend it")
         first = one.t_ns if one.start_ns is None else one.start_ns
         last = first + 1 if one.end_ns is None and first is not None else one.end_ns
         assert first is not None
         assert last is not None
         if not truth.start_ns <= first < last <= truth.end_ns:
-            raise SchemaError(
+            raise AnnotationError(
                 f"{where}: {first} to {last}: want times from {truth.start_ns} to {truth.end_ns}"
             )
         if one.approach is not None and one.approach not in numbers:
-            raise SchemaError(f"{where}: no approach {one.approach}; there are: {sorted(numbers)}")
+            raise AnnotationError(
+                f"{where}: no approach {one.approach}; there are: {sorted(numbers)}"
+            )
 
 
 def _no_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.replay.columns import Int64s
-from crosscue.replay.errors import SchemaError
+from crosscue.replay.errors import AnnotationError, SchemaError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import json_tree
 
@@ -129,21 +129,21 @@ def _tree(path: Path) -> Mapping[str, Any]:
     try:
         content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: more than {MAX_BYTES:,} bytes of annotations; split it")
+            raise AnnotationError(f"{path}: more than {MAX_BYTES:,} bytes of annotations; split it")
         tree = json_tree(content)
     except OSError as error:
-        raise SchemaError(f"{path}: {error.strerror}; want a COCO file") from None
+        raise AnnotationError(f"{path}: {error.strerror}; want a COCO file") from None
     except ValueError as error:
-        raise SchemaError(f"{path}: no JSON ({error}); want a COCO file") from None
+        raise AnnotationError(f"{path}: no JSON ({error}); want a COCO file") from None
     if not isinstance(tree, dict):
-        raise SchemaError(f"{path}: want a COCO file: images, annotations and categories")
+        raise AnnotationError(f"{path}: want a COCO file: images, annotations and categories")
     return tree
 
 
 def _rows(tree: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
     rows = tree.get(key)
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise SchemaError(f"{path}: {key}: want a list of objects, as COCO files have")
+        raise AnnotationError(f"{path}: {key}: want a list of objects, as COCO files have")
     return rows
 
 

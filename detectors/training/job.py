@@ -53,6 +53,7 @@ class Job:
         device: As the detector's setting.
         threads: On a CPU.
         recipe: Words for the checkpoint.
+        made_of: Annotations, pictures and settings; only the very same training is gone on with.
     """
 
     start: str
@@ -65,6 +66,7 @@ class Job:
     device: str = "auto"
     threads: int = 1
     recipe: dict[str, str | int | float] = field(default_factory=dict)
+    made_of: dict[str, Any] = field(default_factory=dict)
 
     @property
     def state_path(self) -> Path:
@@ -107,11 +109,13 @@ def run_job(
 
     Raises:
         OutputError: Something lies where the results go, or they cannot be written.
-        SchemaError: A picture cannot be read, or the state to go on from does not fit.
+        LogError: A picture cannot be read.
+        SchemaError: The state to go on from is damaged.
+        UsageError: The state to go on from is of another training.
         VehicleError: The network to start from does not fit.
         CrosscueError: The losses are no numbers any more.
     """
-    if not resume:
+    if not (resume and job.state_path.exists()):
         _check_place(job, overwrite)
     device = chosen_device(job.device, "train mask-rcnn")
     torch.set_num_threads(job.threads)
@@ -131,7 +135,8 @@ def _run(
     training = Training(lambda: starting_network(job), job.schedule, device)
     points: list[Point] = []
     if resume and job.state_path.exists():
-        points = [Point(**row) for row in training.resume(job.state_path)["points"]]
+        said = training.resume(job.state_path, job.made_of)
+        points = [Point(**row) for row in said["points"]]
     sampler = Sampler(train, job.plan, job.window, job.schedule.seed)
     for point in _learned(job, training, sampler, held_out, points):
         tell(point)
@@ -144,7 +149,8 @@ def _run(
 def _check_place(job: Job, overwrite: bool) -> None:
     for path in (job.state_path, job.output):
         if path.exists() and not overwrite:
-            raise OutputError(f"{path}: exists; --resume goes on with it, --overwrite begins anew")
+            how = "--resume goes on with it, " if path == job.state_path else ""
+            raise OutputError(f"{path}: exists; {how}--overwrite begins anew")
     job.state_path.unlink(missing_ok=True)
 
 
@@ -200,7 +206,11 @@ def _learned(
             average_precisions(some, found),
         )
         points.append(point)
-        training.save(job.state_path, {"points": [asdict(one) for one in points]})
+        training.save(
+            job.state_path,
+            {"points": [asdict(one) for one in points]},
+            job.made_of,
+        )
         write_text(job.curve_path, strict_json([asdict(one) for one in points]) + "\n")
         checking_s += time.monotonic() - checked
         losses = []

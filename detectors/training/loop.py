@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from crosscue.detectors.networks.mask_rcnn.network import forward_training
 from crosscue.detectors.weights_file import serialised
 from crosscue.replay.errors import CrosscueError, SchemaError, one_line
+from crosscue.replay.files.made_of import NOTHING, refuse_another
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.files.whole_file import write_bytes
 
@@ -95,7 +96,7 @@ class Training:
         """Number and loss of each step, until all are done.
 
         Raises:
-            SchemaError: A picture cannot be read.
+            LogError: A picture cannot be read.
             CrosscueError: The losses are no numbers any more.
         """
         schedule = self.schedule
@@ -160,7 +161,9 @@ class Training:
             else:
                 kept.copy_(now)
 
-    def save(self, path: Path, said: Mapping[str, Any]) -> None:
+    def save(
+        self, path: Path, said: Mapping[str, Any], made_of: Mapping[str, Any] = NOTHING
+    ) -> None:
         """Keep everything needed to go on, with words of the caller's.
 
         Raises:
@@ -172,17 +175,23 @@ class Training:
             tensors |= {f"optimizer.{i}.{k}": v for k, v in state.items()}
         header = {
             STATE_KEY: json.dumps(
-                {"done": self.done, "schedule": asdict(self.schedule), "said": said}
+                {
+                    "done": self.done,
+                    "schedule": asdict(self.schedule),
+                    "said": said,
+                    "made_of": made_of,
+                }
             )
         }
         plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
         write_bytes(path, serialised(plain, header))
 
-    def resume(self, path: Path) -> Mapping[str, Any]:
-        """Go on where ``save`` was called; gives the words kept then.
+    def resume(self, path: Path, made_of: Mapping[str, Any] = NOTHING) -> Mapping[str, Any]:
+        """Go on where ``save`` was called; returns the words kept then.
 
         Raises:
-            SchemaError: Damaged, or of a training with other settings.
+            SchemaError: Damaged.
+            UsageError: Of a training of something else.
         """
         from safetensors import SafetensorError, safe_open
 
@@ -194,6 +203,7 @@ class Training:
             raise SchemaError(
                 f"{path}: damaged ({error}); delete it and begin the training anew"
             ) from None
+        refuse_another(path, "--resume", kept.get("made_of"), made_of)
         if kept.get("schedule") != asdict(self.schedule):
             raise SchemaError(
                 f"{path}: holds a training with other settings; give the same ones, or another -o"

@@ -50,7 +50,7 @@ def measure(
     """Detect in all pictures and compare with their labels.
 
     Raises:
-        SchemaError: A picture cannot be read.
+        LogError: A picture cannot be read.
         CrosscueError: Not even one picture fits into memory.
     """
     facts = checkpoint.facts
@@ -81,7 +81,7 @@ def raw_detections(
         device: Where.
 
     Raises:
-        SchemaError: A picture cannot be read.
+        LogError: A picture cannot be read.
     """
     bare = Checkpoint(Facts(plan=plan), network, "")
     low = settings.model_copy(update={"score": MIN_SCORE})

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -23,10 +23,15 @@ from crosscue.detectors.networks.road.network import RoadNetwork, logits_of
 from crosscue.detectors.weights_file import serialised
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import SchemaError, one_line
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.made_of import NOTHING, refuse_another
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.files.whole_file import write_bytes
+from crosscue.replay.limits import MIB
 
 STATE_KEY: Final = "crosscue_road_training"
+MOST_BYTES: Final = 1024 * MIB
+"""Of a state; the network and its moments take a few."""
 EDGE_WEIGHT: Final = 6.0
 EDGE_PX: Final = 9
 GRADIENT_LIMIT: Final = 5.0
@@ -108,7 +113,7 @@ class RoadTraining:
         self.done += 1
         return float(loss.detach())
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path, made_of: Mapping[str, Any] = NOTHING) -> None:
         """All that ``resume`` needs.
 
         Raises:
@@ -121,24 +126,32 @@ class RoadTraining:
         for number, slot in self._optimizer.state_dict()["state"].items():
             for name, value in slot.items():
                 tensors[f"optimizer.{number}.{name}"] = value.detach().cpu().contiguous().clone()
-        header = {STATE_KEY: json.dumps({"done": self.done, "seed": self.schedule.seed})}
+        header = {
+            STATE_KEY: json.dumps(
+                {"done": self.done, "seed": self.schedule.seed, "made_of": made_of}
+            )
+        }
         write_bytes(path, serialised(tensors, header))
 
-    def resume(self, path: Path) -> None:
+    def resume(self, path: Path, made_of: Mapping[str, Any] = NOTHING) -> None:
         """Go on where ``save`` left off.
 
         Raises:
             SchemaError: Not such a file, or of another seed.
+            UsageError: Of a training of something else.
         """
         from safetensors import SafetensorError
         from safetensors.torch import load
 
         try:
-            content = path.read_bytes()
+            content = read_at_most(path, MOST_BYTES)
+            if content is None:
+                raise ValueError(f"over {MOST_BYTES} bytes")
             tensors = load(content)
             size = int.from_bytes(content[:8], "little")
             state = json_tree(json_tree(content[8 : 8 + size])["__metadata__"][STATE_KEY])
             done, seed = int(state["done"]), int(state["seed"])
+            refuse_another(path, "--resume", state.get("made_of"), made_of)
             self._fill(tensors)
         except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
             why = one_line(error, 120)

@@ -70,15 +70,16 @@ def read_picture(picture: LabelledPicture) -> Bytes:
     """Pixels, blue green red, (H, W, 3).
 
     Raises:
-        SchemaError: No picture, cut short, or of another size than annotated.
+        LogError: No picture, or cut short.
+        SchemaError: Of another size than annotated.
     """
     try:
         pixels, size = decode(read_file(picture.path), View())
     except OSError as error:
-        raise SchemaError(f"{picture.path}: {error.strerror}; check the file") from None
+        raise LogError(f"{picture.path}: {error.strerror}; check the file") from None
     except LogError as error:
-        raise SchemaError(
-            f"{picture.path}: {error}; mend the file or leave it out of the annotations"
+        raise type(error)(
+            f"{picture.path}: {error}; repair the file or leave it out of the annotations"
         ) from None
     if size != picture.size_px:
         width, height = picture.size_px

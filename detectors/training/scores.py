@@ -28,7 +28,7 @@ def detections_on(
     """A detector's results picture by picture.
 
     Raises:
-        SchemaError: A picture cannot be read.
+        LogError: A picture cannot be read.
     """
     for number, picture in enumerate(labelled.pictures):
         frame = Frame(number, "", read_picture(picture), picture.size_px)

@@ -33,7 +33,7 @@ from crosscue.eval.runs.manifest import (
     MergedManifest,
 )
 from crosscue.eval.runs.tables.table_sink import TableSink
-from crosscue.replay.errors import RunError, UsageError, one_line
+from crosscue.replay.errors import RunError, UnreadableRunError, UsageError, one_line
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.limits import DEFAULT, Limits
 
@@ -241,7 +241,7 @@ def _finished(folder: Path) -> list[Path]:
     try:
         inside = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
     except OSError as error:
-        raise RunError(f"{folder}: {error.strerror}; give a folder of runs") from None
+        raise UnreadableRunError(f"{folder}: {error.strerror}; give a folder of runs") from None
     holding = [entry for entry in inside if entry.joinpath(MANIFEST).exists()]
     return [entry for entry in holding if not is_merged(RunFolder(entry))]
 

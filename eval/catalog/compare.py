@@ -19,7 +19,7 @@ import numpy as np
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, open_run
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.eval.scoring.runs import FOLDER, METRICS
-from crosscue.replay.errors import RunError, UsageError
+from crosscue.replay.errors import UnreadableRunError, UsageError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
@@ -267,12 +267,16 @@ def _tree_of(path: Path) -> dict[str, Any]:
     try:
         content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise RunError(f"{path}: over {MAX_BYTES // MIB} MiB; run crosscue score again")
+            raise UnreadableRunError(
+                f"{path}: over {MAX_BYTES // MIB} MiB; run crosscue score again"
+            )
         tree = json_tree(content)
     except (OSError, ValueError) as error:
-        raise RunError(f"{path}: unreadable ({error}); run crosscue score again") from None
+        raise UnreadableRunError(
+            f"{path}: unreadable ({error}); run crosscue score again"
+        ) from None
     if not isinstance(tree, dict):
-        raise RunError(f"{path}: want an object; run crosscue score again")
+        raise UnreadableRunError(f"{path}: want an object; run crosscue score again")
     return tree
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from crosscue.eval.pipeline.drive_time import time_segments, whole_timeline
 from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
-from crosscue.eval.runs.account import Account, account, reading_of
+from crosscue.eval.runs.account import Account, account, details_of, reading_of
 from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
 from crosscue.eval.runs.manifest import DecodeManifest
 from crosscue.eval.runs.tables.skipped import write_skipped
@@ -89,11 +89,13 @@ class Decoded:
         rows: For each file of a stream.
         account: What became of every row.
         timeline: Time segments.
+        details: Where and why the first rows were dropped.
     """
 
     rows: dict[str, int]
     account: Account
     timeline: Timeline
+    details: list[str]
 
     @property
     def exit_status(self) -> int:
@@ -155,7 +157,7 @@ def decode_tables(
             time=time_segments(timeline),
         )
         write_manifest(new, content)
-    return Decoded(rows, made, timeline)
+    return Decoded(rows, made, timeline, details_of(ledgers))
 
 
 def _decoded(

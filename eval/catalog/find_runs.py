@@ -10,7 +10,7 @@ from typing import Final
 
 from crosscue.eval.batch.merge import is_merged
 from crosscue.eval.runs.folder import MANIFEST, RunFolder
-from crosscue.replay.errors import RunError, UsageError
+from crosscue.replay.errors import RunError, UnreadableRunError, UsageError
 from crosscue.replay.files.bounded import read_at_most
 
 METRICS: Final = "metrics.json"
@@ -58,7 +58,9 @@ def _in_folder(folder: Path) -> Iterator[Path]:
         return
     found = list(_below(folder, DEPTH))
     if not found:
-        raise RunError(f"{folder}: neither a run folder nor a folder of some; replay first")
+        raise UnreadableRunError(
+            f"{folder}: neither a run folder nor a folder of some; replay first"
+        )
     yield from found
 
 
@@ -66,7 +68,7 @@ def _below(folder: Path, depth: int) -> Iterator[Path]:
     try:
         entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
     except OSError as error:
-        raise RunError(f"{folder}: {error.strerror}; check its owner and mode") from None
+        raise UnreadableRunError(f"{folder}: {error.strerror}; check its owner and mode") from None
     for entry in entries:
         if _is_run(entry):
             if not _is_merged(entry):

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
         width = max(map(len, rows), default=0)
         for name, count in rows.items():
             print(f"{name:{width}}  {count:>10,} rows")
-        for line in account_lines(account):
+        for line in (*account_lines(account), *done.details):
             print(visible(line))
         for log in account.reading:
             for sentence in log.notices:

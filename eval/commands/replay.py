@@ -40,11 +40,12 @@ from crosscue.eval.commands.shared.progress import DriveLine, DrivesLine, is_sho
 from crosscue.eval.interface.runs import default_cache, replay_drive
 from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.pipeline.scene import ApproachSummary, SceneOutcome
-from crosscue.eval.runs.account import account_lines
+from crosscue.eval.runs.account import account_lines, details_of
 from crosscue.eval.runs.candidates import candidate_lines, candidate_rows
 from crosscue.eval.runs.folder import create
 from crosscue.eval.runs.input import files_named_in
 from crosscue.replay.errors import CrosscueError, UsageError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.safe_text import terminal_width, visible, wrapped
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 from crosscue.replay.versions import versions
@@ -302,7 +303,7 @@ def summary(outcome: Outcome) -> str:
         lines.append(f"log      {log.log}")
         lines.append(f"         integrity: {log.integrity}")
         lines += [f"  note   {sentence}" for sentence in log.notices]
-    lines += account_lines(outcome.account)
+    lines += [*account_lines(outcome.account), *details_of(_ledgers(outcome))]
     if outcome.rows:
         lines += [
             f"pose     {outcome.rows:,} rows over {outcome.travelled_m:.0f} m in "
@@ -326,6 +327,11 @@ def summary(outcome: Outcome) -> str:
         wrapped(visible(line[9:]), width, lead=line[:9]) if len(line) > width else visible(line)
         for line in lines
     )
+
+
+def _ledgers(outcome: Outcome) -> list[Ledger]:
+    detected = () if outcome.detected is None else (outcome.detected.ledger,)
+    return [*detected, *outcome.ledgers]
 
 
 def _detected(outcome: Outcome) -> list[str]:

@@ -27,7 +27,7 @@ from typing import Any
 
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.commands.shared.options import (
-    add_logs_argument,
+    add_logs_arguments,
     limits_of,
     metres,
     print_json,
@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="accept truth made for another file of the same drive, such as a converted log",
     )
-    add_logs_argument(parser)
+    add_logs_arguments(parser)
     parser.add_argument(
         "-o",
         "--output",
@@ -153,6 +153,7 @@ def run(args: argparse.Namespace) -> int:
         args.logs,
         limits_of(args),
         args.has_figures,
+        args.without_images,
     )
     scored, failed = _score_all(paths, work, args)
     if len(paths) == 1:
@@ -208,11 +209,11 @@ def _report_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace
     report = found.report
     if worth:
         with locked(one.run):
-            write_scores(one.run.file(FOLDER), [one], found.metrics)
             _report(one.run.file(FOLDER), [one], scores, found.metrics, args)
+            write_scores(one.run.file(FOLDER), [one], found.metrics)
     if args.output is not None:
-        write_scores(args.output, [one], found.metrics)
         report = _report(args.output, [one], scores, found.metrics, args)
+        write_scores(args.output, [one], found.metrics)
     if args.json or args.quiet:
         return found.metrics
     print(f"run        {visible(str(one.run.path))}")
@@ -271,8 +272,8 @@ def _pool(
     tree["coverage"]["failed"] = {str(one.path): str(one.error) for one in failed}
     worth = _attribution(scored, tree, settings, args)
     if args.output is not None:
-        write_scores(args.output, ones, tree)
         _report(args.output, ones, scores, tree, args)
+        write_scores(args.output, ones, tree)
     if args.json or args.quiet:
         return tree
     print()

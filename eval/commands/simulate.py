@@ -17,7 +17,12 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from crosscue.datasets.scenes.drive import SceneFiles, SceneSettings, write_scene
+from crosscue.datasets.scenes.drive import (
+    SceneFiles,
+    SceneSettings,
+    refuse_other_drive,
+    write_scene,
+)
 from crosscue.datasets.scenes.export.contact_sheet import contact_sheet, sheet_jpeg
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.camera import Camera
@@ -98,6 +103,8 @@ def _made(
     wanted: list[SceneSettings], args: argparse.Namespace
 ) -> Iterator[tuple[SceneSettings, SceneFiles]]:
     """Drives in the order asked for, several made at a time."""
+    for settings in wanted if args.overwrite else ():
+        refuse_other_drive(args.output / settings.name, settings)
     make = partial(_make, output=args.output, overwrite=args.overwrite)
     return zip(wanted, in_processes(make, wanted, args.workers), strict=True)
 

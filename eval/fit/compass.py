@@ -10,7 +10,7 @@ import tomlkit
 from crosscue.eval.pipeline.pose import compass_settings
 from crosscue.localization.compass import course_at
 from crosscue.localization.compass_fit import CompassFit, fit_compass
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.errors import EmptyResultError, VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.losses import warn_of
@@ -26,12 +26,13 @@ def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassF
     """Fit hard iron, soft iron and mounting as far as the drive shows them.
 
     Raises:
-        VehicleError: No magnetometer, or too few readings with a reference.
+        EmptyResultError: No magnetometer.
+        VehicleError: Too few readings with a reference.
     """
     planned = plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
     magnetometer = planned.source_of(Signal.MAGNETIC_FIELD)
     if magnetometer is None:
-        raise VehicleError(f"no magnetometer: {planned.missing[Signal.MAGNETIC_FIELD]}")
+        raise EmptyResultError(f"no magnetometer: {planned.missing[Signal.MAGNETIC_FIELD]}")
     course = planned.source_of(Signal.COURSE)
     wanted = {source.topic.name for source in (magnetometer, course) if source is not None}
     narrowed = Selection(frozenset(wanted), selection.start_ns, selection.end_ns)

@@ -15,6 +15,7 @@ import numpy as np
 from crosscue.datasets.truth.tum import heading_rad
 from crosscue.detectors.images import Encoded
 from crosscue.eval.pipeline.clocks import probe_clocks
+from crosscue.eval.pipeline.landmarks import UNDECODABLE
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.pose.score import load_truth
 from crosscue.localization.angles import interpolate_angle
@@ -22,7 +23,7 @@ from crosscue.localization.landmarks.database import LandmarkWriter, Place
 from crosscue.localization.landmarks.features import Matcher
 from crosscue.localization.landmarks.images import grey_of, picture_of, read_picture
 from crosscue.replay.columns import Block, Floats, Images, Int64s
-from crosscue.replay.errors import LogError, SchemaError, UsageError, VehicleError
+from crosscue.replay.errors import AnnotationError, LogError, UsageError, VehicleError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
@@ -92,7 +93,7 @@ def read_poses(path: Path, vehicle: Vehicle) -> CameraPoses:
 
     Raises:
         RunError: A run that cannot be read.
-        SchemaError: A truth that cannot be read.
+        AnnotationError: A truth that cannot be read.
     """
     if path.is_dir() and (path / "manifest.json").exists():
         return _run_poses(path)
@@ -152,6 +153,12 @@ def camera_frames(
         found.clear()
 
 
+def drop_picture(ledgers: Sequence[Ledger], frame: Frame, error: LogError) -> None:
+    """A camera's picture does not decode: only the camera's log has met its topic."""
+    ledger = next(one for one in ledgers if frame.topic in one.accounts)
+    ledger.spoil(frame.topic, UNDECODABLE, 1, str(error), frame.t_ns)
+
+
 def add_from_log(
     writer: LandmarkWriter,
     matcher: Matcher,
@@ -160,7 +167,7 @@ def add_from_log(
     every_m: float,
     sd_m: float,
     source: str,
-    ledger: Ledger,
+    ledgers: Sequence[Ledger],
 ) -> AddCounts:
     """Add a landmark each ``every_m`` of the way.
 
@@ -176,7 +183,7 @@ def add_from_log(
         sd_m: How far the car may be from the landmark when it matches best; added to the poses'
             own covariance.
         source: Name of the drive; landmarks are called ``source/time``.
-        ledger: Pictures that do not decode are skipped in it.
+        ledgers: Of all logs; pictures that do not decode are dropped in the camera's.
     """
     counts = AddCounts()
     last: Floats | None = None
@@ -193,7 +200,7 @@ def add_from_log(
             features = matcher.describe(grey_of(frame.picture))
         except LogError as error:
             counts.undecodable += 1
-            ledger.skip(frame.topic, "picture does not decode", 1, str(error), frame.t_ns)
+            drop_picture(ledgers, frame, error)
             continue
         if len(features) < MIN_POINTS:
             counts.blank += 1
@@ -231,7 +238,7 @@ def add_from_images(
     ``cov_xy_m2``, ``var_y_m2``, and, if wanted, ``heading_rad`` (counter-clockwise from east).
 
     Raises:
-        SchemaError: The table cannot be understood; names the line.
+        AnnotationError: The table cannot be understood; names the line.
         LogError: A picture is missing or does not decode: here each was asked for by name.
     """
     counts = AddCounts()
@@ -259,18 +266,18 @@ def read_coordinates(path: Path, source: str) -> Iterator[tuple[str, Place]]:
     """Picture names and places of a table; see ``add_from_images``.
 
     Raises:
-        SchemaError: As there.
+        AnnotationError: As there.
     """
     try:
         content = read_at_most(path, MAX_COORDINATE_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: more than {MAX_COORDINATE_BYTES >> 20} MiB; split it")
+            raise AnnotationError(f"{path}: more than {MAX_COORDINATE_BYTES >> 20} MiB; split it")
         with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file)
             known = set(rows.fieldnames or ())
             missing = _PLACE_COLUMNS - known
             if missing or not ("sd_m" in known or known.issuperset(_COV_COLUMNS)):
-                raise SchemaError(
+                raise AnnotationError(
                     f"{path}:1: want columns image,x_m,y_m,sd_m (or {','.join(_COV_COLUMNS)} for "
                     f"sd_m), got {','.join(rows.fieldnames or ())}; mend the header"
                 )
@@ -278,7 +285,7 @@ def read_coordinates(path: Path, source: str) -> Iterator[tuple[str, Place]]:
                 yield str(row["image"]), _place_of(row, f"{path}:{rows.line_num}", source)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
-        raise SchemaError(f"{path}: {why}; give a CSV file in UTF-8") from None
+        raise AnnotationError(f"{path}: {why}; give a CSV file in UTF-8") from None
 
 
 def _place_of(row: dict[str, str], where: str, source: str) -> Place:
@@ -289,14 +296,14 @@ def _place_of(row: dict[str, str], where: str, source: str) -> Place:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise SchemaError(f"{where}: {column}: want a finite number, got {text!r}; mend it")
+            raise AnnotationError(f"{where}: {column}: want a finite number, got {text!r}; mend it")
         return value
 
     xy_m = np.array([number("x_m"), number("y_m")])
     if row.get("sd_m"):
         sd_m = number("sd_m")
         if not sd_m > 0.0:
-            raise SchemaError(f"{where}: sd_m: want > 0, got {sd_m}; mend it")
+            raise AnnotationError(f"{where}: sd_m: want > 0, got {sd_m}; mend it")
         cov = sd_m**2 * np.eye(2)
     else:
         xx, xy, yy = (number(column) for column in _COV_COLUMNS)
@@ -305,7 +312,7 @@ def _place_of(row: dict[str, str], where: str, source: str) -> Place:
     try:
         return Place(f"{source}/{row['image']}", xy_m, cov, heading, source)
     except ValueError as error:
-        raise SchemaError(f"{where}: {error}; mend it") from None
+        raise AnnotationError(f"{where}: {error}; mend it") from None
 
 
 def near_of(text: str | None) -> tuple[Floats, float] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
@@ -18,11 +18,12 @@ from crosscue.localization.landmarks.database import LandmarkDatabase, Nearby
 from crosscue.localization.landmarks.features import Features, Matcher
 from crosscue.localization.landmarks.fit import ScoredPairs
 from crosscue.localization.landmarks.images import grey_of, read_picture
-from crosscue.replay.errors import LogError, SchemaError
+from crosscue.replay.errors import AnnotationError, LogError
 from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import MIB
 
-from .landmark_database import CameraPoses, Frame, place_at
+from .landmark_database import CameraPoses, Frame, drop_picture, place_at
 
 MAX_PAIRS: Final = 1_000_000
 MAX_PAIR_BYTES: Final = 256 * MIB
@@ -35,7 +36,7 @@ def pairs_of_table(path: Path, matcher: Matcher) -> ScoredPairs:
     """Pairs named in a CSV file ``query,known,same``; picture names are relative to its folder.
 
     Raises:
-        SchemaError: The table cannot be understood; names the line.
+        AnnotationError: The table cannot be understood; names the line.
         LogError: A picture cannot be read.
     """
 
@@ -58,22 +59,22 @@ def _labelled(path: Path) -> Iterator[tuple[str, str, bool]]:
     try:
         content = read_at_most(path, MAX_PAIR_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: more than {MAX_PAIR_BYTES // MIB} MiB; split it")
+            raise AnnotationError(f"{path}: more than {MAX_PAIR_BYTES // MIB} MiB; split it")
         with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
             table = csv.DictReader(file)
             if not {"query", "known", "same"} <= set(table.fieldnames or ()):
-                raise SchemaError(f"{path}:1: want columns query,known,same; mend the header")
+                raise AnnotationError(f"{path}:1: want columns query,known,same; mend the header")
             for row in table:
                 label = _LABELS.get(str(row["same"]).strip().lower())
                 if label is None or table.line_num > MAX_PAIRS:
-                    raise SchemaError(
+                    raise AnnotationError(
                         f"{path}:{table.line_num}: same: want 1 or 0 (and at most {MAX_PAIRS:,} "
                         f"lines), got {row['same']!r}; mend it"
                     )
                 yield str(row["query"]), str(row["known"]), label
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
-        raise SchemaError(f"{path}: {why}; give a CSV file in UTF-8") from None
+        raise AnnotationError(f"{path}: {why}; give a CSV file in UTF-8") from None
 
 
 def pairs_of_drive(
@@ -85,6 +86,7 @@ def pairs_of_drive(
     near_m: float,
     far_m: float,
     most_per_frame: int,
+    ledgers: Sequence[Ledger],
 ) -> ScoredPairs:
     """Frames with known poses against landmarks: near ones show the same place, far ones do not.
 
@@ -98,6 +100,7 @@ def pairs_of_drive(
         far_m: Another place above; what lies between is not judged.
         most_per_frame: Landmarks compared with one frame: all near ones first, then far ones drawn
             with a fixed seed.
+        ledgers: Of all logs; pictures that do not decode are dropped in the camera's.
     """
     marks = list(database)
     rng = np.random.default_rng(0)
@@ -110,7 +113,8 @@ def pairs_of_drive(
         last = place.xy_m
         try:
             seen = matcher.describe(grey_of(frame.picture))
-        except LogError:
+        except LogError as error:
+            drop_picture(ledgers, frame, error)
             continue
         apart = [math.dist(mark.place.xy_m, place.xy_m) for mark in marks]
         same = [

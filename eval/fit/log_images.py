@@ -47,7 +47,7 @@ def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT) -> LogP
         def see(block: Block) -> None:
             times.append(block.log_ns)
             if not sizes and isinstance(block.rows, Images):
-                sizes.append(size_of(encoded(block.rows, 0)))
+                sizes.append(_size_of(block, f"{path}: {topic.name}"))
 
         extractor = Extractor(planned, vehicle, 0, Ledger(str(path)), clocks, on_pictures=see)
         for block in log.read(extractor.ledger, wanted):
@@ -58,6 +58,17 @@ def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT) -> LogP
             raise LogError(f"{path}: {topic.name}: not one picture; annotations need them")
         names = _names(log)
     return LogPictures(str(path), np.unique(np.concatenate(times)), sizes[0], names)
+
+
+def _size_of(block: Block, where: str) -> tuple[int, int]:
+    """Of the first picture, by which the annotations are checked."""
+    assert isinstance(block.rows, Images)
+    try:
+        return size_of(encoded(block.rows, 0))
+    except LogError as error:
+        raise type(error)(
+            f"{where}: first picture, at {block.log_ns[0]}ns: {error}; annotations need its size"
+        ) from None
 
 
 def log_span(path: Path, limits: Limits = DEFAULT) -> tuple[int, int]:

@@ -10,10 +10,10 @@ from crosscue.detectors.images import Encoded, encoded
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
 from crosscue.eval.pipeline.clocks import probe_clocks
 from crosscue.replay.columns import Block, Images
-from crosscue.replay.errors import LogError, SchemaError
+from crosscue.replay.errors import AnnotationError, LogError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import MIB
+from crosscue.replay.limits import DEFAULT, MIB, Limits
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_log
@@ -28,42 +28,44 @@ from .truth_check import OBJECTS
 MAX_BYTES: Final = 512 * MIB
 
 
-def drive_pictures(folder: Path) -> Iterator[Labelled]:
+def drive_pictures(folder: Path, limits: Limits = DEFAULT) -> Iterator[Labelled]:
     """All annotated pictures of a drive's folder, in the order of the log.
 
     Raises:
-        SchemaError: The folder is no drive's, or has no annotated objects with times.
+        AnnotationError: The folder is no drive's, or has no annotated objects with times.
         LogError: The log cannot be read, or has no camera.
     """
     drives = drives_of([str(folder)])
     if len(drives.drives) != 1 or len(drives.drives[0].logs) != 1:
-        raise SchemaError(f"{folder}: holds not one log; give the folder of one drive")
-    return _pictures(drives.drives[0], _boxes(folder / OBJECTS))
+        raise AnnotationError(f"{folder}: holds not one log; give the folder of one drive")
+    return _pictures(drives.drives[0], _boxes(folder / OBJECTS), limits)
 
 
 def _boxes(path: Path) -> dict[int, Boxes]:
     try:
         content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
+            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
         text = content.decode("utf-8")
     except OSError as error:
-        raise SchemaError(
+        raise AnnotationError(
             f"{path}: {error.strerror}; labels of a drive's signs stand there"
         ) from None
     except UnicodeDecodeError:
-        raise SchemaError(f"{path}: is no text; labels of a drive's signs stand there") from None
+        raise AnnotationError(
+            f"{path}: is no text; labels of a drive's signs stand there"
+        ) from None
     found: dict[int, Boxes] = {}
     for image, boxes in coco_boxes(text, path):
         if not isinstance(image.get("t_ns"), int):
-            raise SchemaError(f"{path}: images without t_ns; crosscue truth import gives them")
+            raise AnnotationError(f"{path}: images without t_ns; crosscue truth import gives them")
         found[image["t_ns"]] = boxes
     return found
 
 
-def _pictures(drive: DriveInput, boxes: dict[int, Boxes]) -> Iterator[Labelled]:
+def _pictures(drive: DriveInput, boxes: dict[int, Boxes], limits: Limits) -> Iterator[Labelled]:
     vehicle = load(drive.vehicle) if drive.vehicle else Vehicle(version=1)
-    with open_log(Path(drive.logs[0])) as log:
+    with open_log(Path(drive.logs[0]), limits) as log:
         for t_ns, picture in _camera(log, vehicle):
             if t_ns in boxes:
                 name = f"{log.path} at {t_ns}"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.detectors.images import Encoded
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import AnnotationError, EmptyResultError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
@@ -41,7 +41,7 @@ def read_labels(path: Path) -> list[Labelled]:
     """Read a CSV file, where an empty label says that the picture has no sign, or COCO (.json).
 
     Raises:
-        UsageError: Not there, not such a file, or a box that is not one; with the line.
+        AnnotationError: Not there, not such a file, or a box that is not one; with the line.
     """
     text = _text(path)
     return _of_coco(text, path) if path.suffix == ".json" else _of_csv(text, path)
@@ -51,12 +51,12 @@ def _text(path: Path) -> str:
     try:
         content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise UsageError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
+            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
         return content.decode("utf-8")
     except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}; {_WANTED}") from None
+        raise AnnotationError(f"{path}: {error.strerror}; {_WANTED}") from None
     except UnicodeDecodeError:
-        raise UsageError(f"{path}: is no text; {_WANTED}") from None
+        raise AnnotationError(f"{path}: is no text; {_WANTED}") from None
 
 
 def _of_coco(text: str, path: Path) -> list[Labelled]:
@@ -67,7 +67,7 @@ def _of_coco(text: str, path: Path) -> list[Labelled]:
             place = path.parent / image["file_name"]
             place = place if place.exists() else path.parent / "images" / image["file_name"]
         except (KeyError, TypeError) as error:
-            raise UsageError(f"{path}: no COCO file ({error!r}); mend it") from None
+            raise AnnotationError(f"{path}: no COCO file ({error!r}); mend it") from None
         found.append(Labelled(str(place), place, boxes))
     return found
 
@@ -76,7 +76,7 @@ def coco_boxes(text: str, path: Path) -> list[tuple[dict[str, Any], Boxes]]:
     """The images of a COCO file with their boxes, by id.
 
     Raises:
-        UsageError: It is not one, holds no image, or a box is not one.
+        AnnotationError: It is not one, holds no image, or a box is not one.
     """
     try:
         tree = json_tree(text)
@@ -88,19 +88,19 @@ def coco_boxes(text: str, path: Path) -> list[tuple[dict[str, Any], Boxes]]:
             x, y, wide, high = (float(number) for number in one["bbox"])
             box = (x, y, x + wide, y + high)
             if not all(map(math.isfinite, box)) or wide <= 0.0 or high <= 0.0:
-                raise UsageError(f"{path}: annotation {one['id']}: box {box}: want a real one")
+                raise AnnotationError(f"{path}: annotation {one['id']}: box {box}: want a real one")
             found[one["image_id"]][1].setdefault(names[one["category_id"]], []).append(box)
     except (ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"{path}: no COCO file ({error!r}); mend it") from None
+        raise AnnotationError(f"{path}: no COCO file ({error!r}); mend it") from None
     if not found:
-        raise UsageError(f"{path}: no picture in it; add some")
+        raise EmptyResultError(f"{path}: no picture in it; add some")
     return [found[number] for number in sorted(found)]
 
 
 def _of_csv(text: str, path: Path) -> list[Labelled]:
     reader = csv.DictReader(text.splitlines())
     if reader.fieldnames is None or set(COLUMNS) - set(reader.fieldnames):
-        raise UsageError(f"{path}:1: want the columns {','.join(COLUMNS)}")
+        raise AnnotationError(f"{path}:1: want the columns {','.join(COLUMNS)}")
     found: dict[str, Labelled] = {}
     for row in reader:
         where = f"{path}:{reader.line_num}"
@@ -110,7 +110,7 @@ def _of_csv(text: str, path: Path) -> list[Labelled]:
         if row["label"]:
             one.boxes.setdefault(row["label"], []).append(_box(row, where))
     if not found:
-        raise UsageError(f"{path}: no picture in it; add rows")
+        raise EmptyResultError(f"{path}: no picture in it; add rows")
     return [found[name] for name in sorted(found)]
 
 
@@ -118,7 +118,7 @@ def _box(row: dict[str, str], where: str) -> tuple[float, float, float, float]:
     try:
         x0, y0, x1, y1 = (float(row[name]) for name in COLUMNS[2:])
     except (TypeError, ValueError):
-        raise UsageError(f"{where}: want four numbers x0,y0,x1,y1") from None
+        raise AnnotationError(f"{where}: want four numbers x0,y0,x1,y1") from None
     if not all(map(math.isfinite, (x0, y0, x1, y1))) or x0 >= x1 or y0 >= y1:
-        raise UsageError(f"{where}: box {x0}, {y0}, {x1}, {y1}: want x0 < x1 and y0 < y1")
+        raise AnnotationError(f"{where}: box {x0}, {y0}, {x1}, {y1}: want x0 < x1 and y0 < y1")
     return x0, y0, x1, y1

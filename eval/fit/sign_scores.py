@@ -14,6 +14,7 @@ from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.training.operating_point import Judged, judge, together
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogError, UsageError
+from crosscue.replay.limits import DEFAULT, Limits
 
 from .sign_drives import drive_pictures
 from .sign_labels import Labelled, read_labels
@@ -39,7 +40,9 @@ class Rules:
         return self.least_overlap, self.least_height_px
 
 
-def judged_pictures(path: Path, detector: Detector, rules: Rules, every: slice) -> Judged:
+def judged_pictures(
+    path: Path, detector: Detector, rules: Rules, every: slice, limits: Limits = DEFAULT
+) -> Judged:
     """What a detector finds in some of a file's or drive's pictures, and what of it is right.
 
     Args:
@@ -47,18 +50,19 @@ def judged_pictures(path: Path, detector: Detector, rules: Rules, every: slice) 
         detector: For signs.
         rules: Of judging.
         every: Which pictures.
+        limits: For reading a drive's log.
 
     Raises:
-        UsageError: No such file, a picture that cannot be read, or a box outside its picture.
-        LogError: A drive's log cannot be read.
+        UsageError: No such file, or a box outside its picture.
+        LogError: A picture or a drive's log cannot be read.
         SchemaError: A drive has no truth, or it does not fit.
     """
-    chosen = islice(_labelled(path), every.start, every.stop, every.step)
+    chosen = islice(_labelled(path, limits), every.start, every.stop, every.step)
     return together([_judged(one, detector, rules) for one in chosen])
 
 
-def _labelled(path: Path) -> Iterator[Labelled]:
-    yield from drive_pictures(path) if path.is_dir() else read_labels(path)
+def _labelled(path: Path, limits: Limits) -> Iterator[Labelled]:
+    yield from drive_pictures(path, limits) if path.is_dir() else read_labels(path)
 
 
 def _judged(one: Labelled, detector: Detector, rules: Rules) -> Judged:
@@ -66,9 +70,9 @@ def _judged(one: Labelled, detector: Detector, rules: Rules) -> Judged:
         picture = read_file(one.picture) if isinstance(one.picture, Path) else one.picture
         pixels, size = decode(picture, detector.view)
     except OSError as error:
-        raise UsageError(f"{one.name}: {error.strerror}; check the picture column") from None
+        raise LogError(f"{one.name}: {error.strerror}; check the picture column") from None
     except LogError as error:
-        raise UsageError(f"{one.name}: {error}; mend the picture or leave it out") from None
+        raise type(error)(f"{one.name}: {error}; repair the picture or leave it out") from None
     width, height = size
     found = detector([Frame(0, one.name, pixels, size)])[0]
     if not isinstance(found, Detections):

@@ -14,7 +14,8 @@ from crosscue.detectors.signs.detector import build
 from crosscue.detectors.signs.templates import AMERICAN, KINDS
 from crosscue.detectors.training.operating_point import Judged, rates_at, threshold_for, together
 from crosscue.eval.scoring.intervals import Proportion, share
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import EmptyResultError, UsageError
+from crosscue.replay.limits import DEFAULT, Limits
 
 from .sign_scores import Rules, judged_pictures
 
@@ -84,6 +85,7 @@ def fit_signs(
     enlarge: float = 2.5,
     levels: int = 9,
     points: int = 4000,
+    limits: Limits = DEFAULT,
     progress: Progress = lambda parts, done: parts,
 ) -> SignFit:
     """Choose the sign detector's threshold for a required precision.
@@ -105,10 +107,12 @@ def fit_signs(
         enlarge: The first level of the pyramid, for small signs.
         levels: Of the pyramid.
         points: Kept at a level.
+        limits: What drives' logs are read with.
         progress: Passes the parts on while it shows how far the work is.
 
     Raises:
-        UsageError: A value out of range, or pictures without such a sign.
+        UsageError: A value out of range.
+        EmptyResultError: Pictures without such a sign.
     """
     _check(precision, overlap, test_every, threshold, kinds)
     detector = build(
@@ -126,12 +130,12 @@ def fit_signs(
     work = [(Path(path), fit) for path in labels]
     work += [(Path(path), rest) for path in test or labels]
     parts: list[Judged] = []
-    made = (judged_pictures(path, detector, rules, which) for path, which in work)
+    made = (judged_pictures(path, detector, rules, which, limits) for path, which in work)
     for part in progress(made, lambda: (len(parts), len(work))):
         parts.append(part)
     chosen_on, others = parts[: len(labels)], parts[len(labels) :]
     if not sum(part.signs for part in chosen_on):
-        raise UsageError(
+        raise EmptyResultError(
             f"{labels[0]}: no {' or '.join(label)} in the pictures that choose; add some"
         )
     if threshold is None:

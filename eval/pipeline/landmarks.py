@@ -97,7 +97,7 @@ class LandmarkStage:
 
     Attributes:
         search: Owns database, matcher and counts.
-        ledger: The camera's log; pictures that do not decode are skipped in it.
+        ledger: The camera's log; pictures that do not decode are dropped in it.
         interval_ns: Frames closer to the one before are not kept.
         names: From a time to the landmark weighed in then, for the rows of the pose track.
     """

@@ -101,12 +101,13 @@ def write_report(
         has_figures: Draw, which imports matplotlib? Tables and frames are there without.
 
     Raises:
-        RunError: A run's manifest or tables cannot be read.
+        RunError: A run's manifest or tables cannot be read, or the log with the pictures of its
+            worst frames is not found.
         OutputError: It cannot be written.
     """
+    content = _content(scored, metrics)
     if has_figures and len(scored) == 1 and scored[0].poses is not None:
         draw_all(scored[0].poses, folder)
-    content = _content(scored, metrics)
     content["figures"] = _figures(scored, scores) if has_figures else NO_FIGURES
     content["pose_figures"] = _pose_figures(folder) if has_figures and len(scored) == 1 else []
     page = render_page(

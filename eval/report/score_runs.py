@@ -74,6 +74,7 @@ class ScoreWork:
         logs: Where the runs' logs have moved to, if they have.
         limits: What the runs' logs are read with.
         has_figures: Draw figures into the report?
+        without_images: Report without pictures of the worst frames, whose logs may be gone?
     """
 
     truth: Path | None
@@ -84,6 +85,7 @@ class ScoreWork:
     logs: Path | None = None
     limits: Limits = DEFAULT
     has_figures: bool = True
+    without_images: bool = False
 
     def __call__(self, path: Path) -> Scored:
         """Score one run and write its files.
@@ -91,7 +93,7 @@ class ScoreWork:
         Raises:
             CrosscueError: It cannot be scored.
         """
-        folder = open_run(path, self.logs, limits=self.limits)
+        folder = open_run(path, self.logs, without_images=self.without_images, limits=self.limits)
         truth_path = find_truth(folder, self.truth)
         with locked(folder):
             one = judge_run(folder, truth_path, self.settings, self.rpe_m, any_log=self.any_log)
@@ -100,10 +102,11 @@ class ScoreWork:
             smoothed = score_smoother(folder, truth_path) if self.has_smoother else None
             if smoothed is not None:
                 metrics["smoother"] = asdict(smoothed)
-            write_scores(folder.file(FOLDER), [one], metrics)
+            # First what may lack pictures: then nothing is written.
             report = write_report(
                 folder.file(FOLDER), [one], scores, metrics, has_figures=self.has_figures
             )
+            write_scores(folder.file(FOLDER), [one], metrics)
         return Scored(one, metrics, report, smoothed)
 
     def attempt(self, path: Path) -> Scored | Failed:

@@ -76,7 +76,8 @@ def worst_frames(scored: Sequence[RunScored], most: int = MOST) -> list[WorstFra
     """The most confident wrong cues of all runs, most confident first.
 
     Raises:
-        RunError: A run's tables are damaged.
+        RunError: A run's tables are damaged, or the log with its pictures is not found.
+        LogError: That log cannot be opened.
     """
     found = [wrong for one in scored for wrong in _wrong(one)]
     found.sort(key=lambda one: (-(one.confidence or 0.0), -one.frames, one.run, one.t_ns, one.cue))
@@ -145,14 +146,14 @@ def _scores(run: RunFolder, times: set[int]) -> dict[int, list[dict[str, Any]]]:
 def _with_picture(one: WorstFrame, run: RunFolder) -> WorstFrame:
     labels = _labels(one.cue, run.drive_manifest().settings)
     rows = [row for row in _scores(run, {one.t_ns}).get(one.t_ns, []) if row["label"] in labels]
+    camera = camera_of(run)
+    if camera is None:
+        return one
     try:
-        camera = camera_of(run)
-        if camera is None:
-            return one
         picture = picture_at(camera, one.t_ns)
         return one if picture is None else _drawn(picture, one, rows)
     except CrosscueError:
-        # The page is about the run: it says that a picture has gone or cannot be read.
+        # One picture of the log: the page says that it cannot be read.
         return one
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.replay.errors import RunError
+from crosscue.replay.errors import RunError, UnreadableRunError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.parquet import opened
 from crosscue.replay.files.partial_file import is_partial, is_still, lock, sweep
@@ -80,14 +80,16 @@ class RunFolder:
                 raise ValueError(f"over {MAX_MANIFEST_BYTES >> 20} MiB")
             return parse_manifest(content)
         except FileNotFoundError:
-            raise RunError(
+            raise UnreadableRunError(
                 f"{self.path}: no {MANIFEST}: not a run folder, or its run was cut short; "
                 "run crosscue replay again"
             ) from None
         except OtherVersionError as error:
-            raise RunError(f"{path}: {error}: replay again") from None
+            raise UnreadableRunError(f"{path}: {error}: replay again") from None
         except (OSError, ValueError) as error:
-            raise RunError(f"{path}: unreadable ({error}); run crosscue replay again") from None
+            raise UnreadableRunError(
+                f"{path}: unreadable ({error}); run crosscue replay again"
+            ) from None
 
     def drive_manifest(self) -> DriveManifest:
         """The manifest of a run of one drive.
@@ -118,9 +120,11 @@ class RunFolder:
             with opened(path) as file:
                 return pq.read_table(file, columns=columns, page_checksum_verification=True)
         except FileNotFoundError:
-            raise RunError(f"{path}: not there; run crosscue replay again") from None
+            raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
         except (OSError, pa.ArrowException) as error:
-            raise RunError(f"{path}: damaged ({error}); run crosscue replay again") from None
+            raise UnreadableRunError(
+                f"{path}: damaged ({error}); run crosscue replay again"
+            ) from None
 
     def schema(self, name: str) -> pa.Schema:
         """Columns of ``NAME.parquet``.
@@ -136,9 +140,11 @@ class RunFolder:
             with opened(path) as file:
                 return pq.read_schema(file).remove_metadata()
         except FileNotFoundError:
-            raise RunError(f"{path}: not there; run crosscue replay again") from None
+            raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
         except (OSError, pa.ArrowException) as error:
-            raise RunError(f"{path}: damaged ({error}); run crosscue replay again") from None
+            raise UnreadableRunError(
+                f"{path}: damaged ({error}); run crosscue replay again"
+            ) from None
 
     def batches(
         self, name: str, columns: list[str] | None = None, rows: int = 16_384
@@ -159,9 +165,11 @@ class RunFolder:
             ):
                 yield from file.iter_batches(rows, columns=columns)
         except FileNotFoundError:
-            raise RunError(f"{path}: not there; run crosscue replay again") from None
+            raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
         except (OSError, pa.ArrowException) as error:
-            raise RunError(f"{path}: damaged ({error}); run crosscue replay again") from None
+            raise UnreadableRunError(
+                f"{path}: damaged ({error}); run crosscue replay again"
+            ) from None
 
 
 def create(path: Path, *, overwrite: bool) -> RunFolder:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +14,7 @@ from crosscue.detectors.registry import Choice
 from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, RunFolder
 from crosscue.eval.runs.manifest import part_of
 from crosscue.replay.errors import UsageError
+from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.identity import (
     Identity,
     as_row,
@@ -22,7 +22,9 @@ from crosscue.replay.files.identity import (
     identity_of_log,
     of_row,
 )
+from crosscue.replay.files.made_of import difference
 from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.limits import DEFAULT
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.remote.logs import version_of
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -85,7 +87,7 @@ def refuse_another(run: RunFolder, mine: Mapping[str, Any]) -> None:
             f"{run.path}: holds a run of {theirs}, not of {ours}: --resume would destroy it; give "
             "another folder or --overwrite"
         )
-    different = _difference(there["settings"], mine["settings"])
+    different = difference(there["settings"], mine["settings"])
     if different is not None:
         raise UsageError(
             f"{run.path}: holds a run of {theirs} with other settings ({different}), which "
@@ -112,27 +114,12 @@ def files_named_in(settings: object) -> dict[str, str]:
 def _read(run: RunFolder) -> Mapping[str, Any] | None:
     """What the folder's run is made of; None where nothing believable says so."""
     try:
-        found = json_tree(run.file(INPUT).read_text(encoding="utf-8"))
+        content = read_at_most(run.file(INPUT), DEFAULT.record_bytes)
+        found = json_tree(content or b"")
         of_row(found["identity"])
         return found if isinstance(found["settings"], dict) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def _difference(there: object, here: object, name: str = "") -> str | None:
-    """The first setting that is not the same, with both values."""
-    if isinstance(there, dict) and isinstance(here, dict):
-        for key in sorted({*there, *here}):
-            found = _difference(there.get(key), here.get(key), f"{name}.{key}" if name else key)
-            if found is not None:
-                return found
-        return None
-    return None if there == here else f"{name}: {_short(there)} there, {_short(here)} here"
-
-
-def _short(value: object) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def settings_changed(run: RunFolder, vehicle: Vehicle) -> dict[str, Any] | None:

@@ -15,7 +15,7 @@ from typing import Final
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import LogRow
-from crosscue.replay.errors import CrosscueError, RunError
+from crosscue.replay.errors import CrosscueError, UnreadableRunError
 from crosscue.replay.files.identity import identity_of, identity_of_log
 from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.log import Log
@@ -92,18 +92,20 @@ def place_of(run: RunFolder, said: LogRow) -> Path | str:
         try:
             found = identity_of(place)
         except CrosscueError as error:
-            raise RunError(f"{run.path}: its log cannot be looked at: {error}") from None
+            raise UnreadableRunError(f"{run.path}: its log cannot be looked at: {error}") from None
         if found.digest == wanted.digest:
             return place if isinstance(place, str) else Path(os.path.normpath(place))
         others.append((place, found))
     if others:
         place, found = others[0]
-        raise RunError(
+        raise UnreadableRunError(
             f"{run.path}: its log {place} has changed since: {found} there, {wanted} wanted; "
             "--logs DIR says where that is, or replay again"
         )
     gone = f"{places[0]} is gone" if run.logs is None else f"{wanted} is not in {run.logs}"
-    raise RunError(f"{run.path}: its log {gone}; say where it is with --logs DIR, or replay again")
+    raise UnreadableRunError(
+        f"{run.path}: its log {gone}; say where it is with --logs DIR, or replay again"
+    )
 
 
 def _moved(folder: Path, where: Path) -> Iterator[Path]:

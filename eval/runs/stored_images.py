@@ -14,6 +14,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.columns import Block, Images, Topic
+from crosscue.replay.errors import RunError, UnreadableRunError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.log import Selection
@@ -72,7 +73,10 @@ def camera_of(run: RunFolder) -> StoredCamera | None:
     if len(cameras) != 1:
         return None
     number, entry, name = cameras[0]
-    place = place_of(run, entry)
+    try:
+        place = place_of(run, entry)
+    except RunError as error:
+        raise UnreadableRunError(f"{error}; --without-images leaves its pictures out") from None
     with open_log(place, run.limits) as log:
         topic = next(one for one in log.topics if one.name == name)
     part = manifest.selection

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import LABELS, table_in_log_time
 from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import RunError
+from crosscue.replay.errors import UnreadableRunError
 from crosscue.replay.time.segments import Timeline
 
 if TYPE_CHECKING:
@@ -170,7 +170,9 @@ def run_tables(
 def _cues(table: pa.Table, where: str) -> CueRows:
     count = _whole(table, "count", where)
     if len(count) and count.min() < 0:
-        raise RunError(f"{where}: count {count.min()}: want 0 or more; run crosscue replay again")
+        raise UnreadableRunError(
+            f"{where}: count {count.min()}: want 0 or more; run crosscue replay again"
+        )
     return CueRows(
         _whole(table, "t_ns", where), _approach(table, where), _texts(table, "cue", where), count
     )
@@ -180,7 +182,9 @@ def _ranges(table: pa.Table, where: str) -> RangeRows:
     reference = _texts(table, "reference", where)
     strange = sorted(set(reference.tolist()) - {"start", "end"})
     if strange:
-        raise RunError(f"{where}: reference {strange[0]!r}: want start or end; replay again")
+        raise UnreadableRunError(
+            f"{where}: reference {strange[0]!r}: want start or end; replay again"
+        )
     return RangeRows(
         _whole(table, "t_ns", where),
         _approach(table, where),
@@ -198,7 +202,7 @@ def _belief(table: pa.Table, where: str) -> BeliefRows:
         values = _numbers(table, name, where)
         # NaN compares false: it is left out later, and counted.
         if ((values < 0.0) | (values > 1.0)).any():
-            raise RunError(f"{where}: {name}: a probability outside 0 to 1; replay again")
+            raise UnreadableRunError(f"{where}: {name}: a probability outside 0 to 1; replay again")
         features[name] = values
     established = np.zeros(table.num_rows, np.bool_)
     if "established" in table.column_names:
@@ -210,7 +214,9 @@ def _belief(table: pa.Table, where: str) -> BeliefRows:
 def _column(table: pa.Table, name: str, where: str) -> pa.ChunkedArray:
     if name not in table.column_names:
         there = ", ".join(table.column_names)
-        raise RunError(f"{where}: no column {name}; there are: {there}; another version wrote it")
+        raise UnreadableRunError(
+            f"{where}: no column {name}; there are: {there}; another version wrote it"
+        )
     return table[name]
 
 
@@ -219,7 +225,7 @@ def _whole(table: pa.Table, name: str, where: str) -> Int64s:
 
     column = _column(table, name, where)
     if column.null_count or not pa.types.is_integer(column.type):
-        raise RunError(f"{where}: {name}: want whole numbers in every row; replay again")
+        raise UnreadableRunError(f"{where}: {name}: want whole numbers in every row; replay again")
     return np.asarray(column.cast(pa.int64()).to_numpy(), np.int64)
 
 
@@ -229,7 +235,7 @@ def _approach(table: pa.Table, where: str) -> Int64s:
 
     column = _column(table, "approach", where)
     if not (pa.types.is_integer(column.type) or pa.types.is_null(column.type)):
-        raise RunError(f"{where}: approach: want whole numbers or nulls; replay again")
+        raise UnreadableRunError(f"{where}: approach: want whole numbers or nulls; replay again")
     filled = pc.fill_null(column.cast(pa.int64()), NONE)
     return np.asarray(filled.to_numpy(), np.int64)
 
@@ -239,7 +245,7 @@ def _numbers(table: pa.Table, name: str, where: str) -> Floats:
 
     column = _column(table, name, where)
     if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
-        raise RunError(f"{where}: {name}: want numbers, got {column.type}; replay again")
+        raise UnreadableRunError(f"{where}: {name}: want numbers, got {column.type}; replay again")
     return np.asarray(column.cast(pa.float64()).to_numpy(), np.float64)
 
 
@@ -247,5 +253,5 @@ def _texts(table: pa.Table, name: str, where: str) -> NDArray[np.str_]:
     column = _column(table, name, where)
     values = column.to_pylist()
     if not all(isinstance(value, str) for value in values):
-        raise RunError(f"{where}: {name}: want text in every row; replay again")
+        raise UnreadableRunError(f"{where}: {name}: want text in every row; replay again")
     return np.array(values, np.str_)

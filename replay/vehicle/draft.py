@@ -13,6 +13,7 @@ import numpy as np
 
 from crosscue.replay.columns import CanFrames
 from crosscue.replay.decode import decoder_for
+from crosscue.replay.errors import EmptyResultError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.losses import warn_of
@@ -65,8 +66,16 @@ def draft(logs: Sequence[Log], dbc: Sequence[Path], folder: Path) -> str:
         folder: Where the file will lie; DBC paths are written relative to it where possible.
 
     Raises:
+        EmptyResultError: No topic of the logs plays any role.
         SchemaError: A DBC file cannot be read.
     """
+    topics = [topic for log in logs for topic in log.topics]
+    if all(role_of(topic) is None for topic in topics):
+        names = ", ".join(f"{topic.name} ({topic.type_name})" for topic in topics) or "none"
+        raise EmptyResultError(
+            f"{', '.join(map(name_of, logs))}: no topic plays a role in a vehicle file; there are: "
+            f"{names}; give a log with a CAN bus, camera, compass or inertial unit"
+        )
     lines = [
         "# A first vehicle file, made from what the log holds. Check every line against the car:",
         "# what could not be seen in the log stands here as a comment or with its default.",

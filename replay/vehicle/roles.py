@@ -47,6 +47,16 @@ BY_TYPE: Final[Mapping[str, Role]] = {
 }
 """Type names in ROS 2 spelling; ``ros2_spelling`` brings ROS 1 names here."""
 
+OF_TABLES: Final[Mapping[str, Role | None]] = {
+    "crosscue/Table": None,
+    **{
+        name: role
+        for name, role in BY_TYPE.items()
+        if role in (Role.IMU, Role.MAGNETOMETER, Role.GNSS, Role.ODOMETRY, Role.POSE, Role.WHEELS)
+    },
+}
+"""Types whose rows are plain columns: ``convert`` may change them, and the role stays."""
+
 
 def ros2_spelling(type_name: str) -> str:
     """``sensor_msgs/Imu`` as ``sensor_msgs/msg/Imu``; other names stay as they are."""
@@ -56,6 +66,8 @@ def ros2_spelling(type_name: str) -> str:
 
 def role_of(topic: Topic) -> Role | None:
     """What ``topic`` would be used as without configuration, or None."""
+    if topic.converted_from in OF_TABLES:
+        return OF_TABLES[topic.converted_from]
     name = ros2_spelling(topic.type_name)
     if name.startswith("mobileye_560_660_msgs/"):
         return Role.MOBILEYE

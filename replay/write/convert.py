@@ -15,6 +15,7 @@ from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.encode import Encoder, Encoders, Outgoing
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.vehicle.roles import OF_TABLES
 
 from .mcap import Compression, McapWriter, Stretch
 
@@ -60,6 +61,7 @@ class LogWriter:
         self._encoders = Encoders()
         self._known: dict[str, Encoder | str] = {}
         self._details: dict[str, str] = {}
+        self._from: dict[str, str] = {}
         self._mcap = McapWriter(path, compression=compression, overwrite=overwrite)
 
     def add_topic(self, topic: Topic) -> bool:
@@ -74,6 +76,9 @@ class LogWriter:
                 topic, NO_TYPE
             )
             self._details[topic.name] = f"{topic.type_name} ({topic.encoding})"
+            self._from[topic.name] = topic.converted_from or (
+                topic.type_name if topic.encoding == "columns" else ""
+            )
         except SchemaError as error:
             encoder = why_not_decoded(topic, BAD_SCHEMA)
             self._details[topic.name] = str(error)
@@ -115,7 +120,14 @@ class LogWriter:
     def _put(self, outgoing: Outgoing) -> None:
         block, kind = outgoing.block, outgoing.type
         assert isinstance(block.rows, Messages)
-        channel = self._mcap.add_channel(block.topic, kind.name, kind.schema, kind.schema_encoding)
+        of = self._from.get(block.topic, "")
+        channel = self._mcap.add_channel(
+            block.topic,
+            kind.name,
+            kind.schema,
+            kind.schema_encoding,
+            of if of in OF_TABLES and of != kind.name else "",
+        )
         self.types[block.topic] = kind.name
         sequence = block.sequence
         if sequence is None:

@@ -22,6 +22,7 @@ from crosscue.replay.columns import Int64s, Messages
 from crosscue.replay.errors import OutputError
 from crosscue.replay.files.partial_file import PartialFile
 from crosscue.replay.files.whole_file import cannot_write
+from crosscue.replay.readers.mcap.records import CONVERTED_FROM
 
 LIBRARY: Final = "crosscue"
 CHUNK_BYTES: Final = 4 << 20
@@ -108,7 +109,12 @@ class McapWriter:
         self._guarded(lambda: self._writer.start("ros2", LIBRARY))
 
     def add_channel(
-        self, topic: str, type_name: str, schema: bytes, schema_encoding: str = "ros2msg"
+        self,
+        topic: str,
+        type_name: str,
+        schema: bytes,
+        schema_encoding: str = "ros2msg",
+        converted_from: str = "",
     ) -> int:
         """Number of the channel for CDR messages of a topic; the same call gives the same one.
 
@@ -117,6 +123,7 @@ class McapWriter:
             type_name: ROS 2 spelling (``sensor_msgs/msg/Imu``).
             schema: Complete definition with all dependencies.
             schema_encoding: ``ros2msg`` or ``ros2idl``.
+            converted_from: As in ``Topic``; kept in the channel's metadata.
 
         Raises:
             OutputError: More topics than an MCAP file can number.
@@ -126,7 +133,8 @@ class McapWriter:
             if len(self._ids) >= 0xFFFF:
                 raise OutputError(f"{self.path}: over 65535 topics; choose some with --topics")
             schema_id = self._schema(type_name, schema_encoding, schema)
-            self._ids[key] = self._writer.register_channel(topic, "cdr", schema_id)
+            said = {CONVERTED_FROM: converted_from} if converted_from else {}
+            self._ids[key] = self._writer.register_channel(topic, "cdr", schema_id, said)
         return self._ids[key]
 
     def _schema(self, name: str, encoding: str, schema: bytes) -> int:

@@ -12,39 +12,37 @@ import pytest
 from crosscue.eval import cli
 from crosscue.replay.errors import one_line
 
-RECORDING: Final = 4
-"""A recording, database or picture that cannot be read; docs/exit_status.md."""
-RUN: Final = 1
-"""A run folder or annotations."""
+INPUT: Final = 4
+"""Input that cannot be read: a recording, run, database, picture or annotations."""
 SETTINGS: Final = 2
 """A file of settings."""
 
 MISSING: Final[dict[str, tuple[str, int]]] = {
-    "info": ("gone.mcap", RECORDING),
-    "convert": ("gone.mcap -o out.mcap", RECORDING),
-    "vehicle init": ("gone.mcap", RECORDING),
-    "decode": ("gone.mcap -o out", RECORDING),
-    "detect": ("gone.mcap -o out --detectors signs", RECORDING),
-    "estimate": ("gone", RUN),
-    "replay": ("gone.mcap -o out", RECORDING),
-    "score": ("gone", RUN),
-    "compare": ("gone gone2", RUN),
-    "merge": ("gone -o out", RUN),
-    "view": ("gone -o x.rrd", RUN),
+    "info": ("gone.mcap", INPUT),
+    "convert": ("gone.mcap -o out.mcap", INPUT),
+    "vehicle init": ("gone.mcap", INPUT),
+    "decode": ("gone.mcap -o out", INPUT),
+    "detect": ("gone.mcap -o out --detectors signs", INPUT),
+    "estimate": ("gone", INPUT),
+    "replay": ("gone.mcap -o out", INPUT),
+    "score": ("gone", INPUT),
+    "compare": ("gone gone2", INPUT),
+    "merge": ("gone -o out", INPUT),
+    "view": ("gone -o x.rrd", INPUT),
     "fit compass": ("gone.mcap --vehicle gone.toml", SETTINGS),
-    "fit signs": ("gone.json --label a", SETTINGS),
-    "fit ranges": ("--cue stop_sign --truth gone.json", RUN),
-    "fit messages": ("gone --truth gone.json", RUN),
-    "fit landmarks": ("--pairs gone.csv", RUN),
-    "landmarks add": ("gone.db --images gone --coordinates gone.csv", RUN),
-    "landmarks list": ("gone.db", RECORDING),
-    "landmarks match": ("gone.db gone.png", RECORDING),
-    "truth": ("gone -o out", RECORDING),
-    "truth import": ("gone.json --log gone.mcap -o t.json", RUN),
-    "truth check": ("gone.json --log gone.mcap", RUN),
-    "train road": ("--data gone -o x.safetensors", SETTINGS),
-    "train mask-rcnn": ("--data gone.json --images gone -o x.safetensors", RUN),
-    "seal": ("gone.mcap", RECORDING),
+    "fit signs": ("gone.json --label a", INPUT),
+    "fit ranges": ("--cue stop_sign --truth gone.json", INPUT),
+    "fit messages": ("gone --truth gone.json", INPUT),
+    "fit landmarks": ("--pairs gone.csv", INPUT),
+    "landmarks add": ("gone.db --images gone --coordinates gone.csv", INPUT),
+    "landmarks list": ("gone.db", INPUT),
+    "landmarks match": ("gone.db gone.png", INPUT),
+    "truth": ("gone -o out", INPUT),
+    "truth import": ("gone.json --log gone.mcap -o t.json", INPUT),
+    "truth check": ("gone.json --log gone.mcap", INPUT),
+    "train road": ("--data gone -o x.safetensors", INPUT),
+    "train mask-rcnn": ("--data gone.json --images gone -o x.safetensors", INPUT),
+    "seal": ("gone.mcap", INPUT),
     "model show": ("gone", SETTINGS),
     "model check": ("gone.toml", SETTINGS),
     "model init": ("gone.onnx", SETTINGS),

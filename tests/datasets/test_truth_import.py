@@ -115,6 +115,17 @@ def test_adding_keeps_approaches_and_replaces_cues(tmp_path: Path, log: Path) ->
     assert len(load(path).cues) == 2
 
 
+DAMAGED = {
+    "want whole nanoseconds",
+    "no such image",
+    "no such category",
+    "four numbers",
+    "want a list",
+    "neither twice",
+}
+"""What is wrong with the file whatever its log is: it cannot be read, exit status 4."""
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -204,7 +215,8 @@ def test_annotations_that_do_not_fit_are_refused_in_one_line(
         change = change | {"annotations": []}
     source = _write(tmp_path / "coco.json", coco(**change))
 
-    assert _import(source, log, tmp_path / "truth.json") in (1, 2)
+    is_damaged = said in DAMAGED
+    assert _import(source, log, tmp_path / "truth.json") == (4 if is_damaged else 1)
     assert said in _refused(capsys)
     assert not (tmp_path / "truth.json").exists()
 

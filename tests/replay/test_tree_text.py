@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
@@ -40,6 +40,8 @@ _VALUES: Final = st.recursive(
 )
 
 
+# A slow machine is no fault of what is tested: making nested values takes as long as it takes.
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(_VALUES, st.integers(0, MAX_DEPTH + 5))
 def test_what_nests_little_is_read_as_json_reads_it(value: object, around: int) -> None:
     text = "[" * around + json.dumps(value) + "]" * around

@@ -142,6 +142,7 @@ def _pairs_of_logs(args: argparse.Namespace, vehicle: Vehicle, matcher: Matcher)
             args.same_within,
             args.different_beyond,
             args.max_landmarks,
+            ledgers,
         )
     for ledger in ledgers:
         warn_of(ledger)

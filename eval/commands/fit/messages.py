@@ -23,7 +23,7 @@ from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, rates
 from crosscue.eval.runs.folder import open_run
 from crosscue.fusion.fade_fit import FadeFit
 from crosscue.fusion.message_fit import MessageFit, RateFit, Side, fit_messages
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.vehicle.fusion import Rates
 
@@ -71,8 +71,15 @@ def run(args: argparse.Namespace) -> int:
         annotate(folder, load(path), vehicle, found)
         done += 1
     if not found.approaches:
-        raise UsageError("fit messages: no approach of any run lies in an annotated one; give more")
+        raise EmptyResultError(
+            "fit messages: no approach of any run lies in an annotated one; give more"
+        )
     fitted = fit_messages(found.approaches, graph)
+    if all(one.rates is None for one in fitted.rates):
+        raise EmptyResultError(
+            f"fit messages: nothing can be learned of {len(found.approaches)} approaches, so every "
+            "published message stands; give more drives and their truth"
+        )
     if args.output is not None:
         write_text(args.output, section_of(fitted))
     if args.json:

@@ -16,7 +16,7 @@ import argparse
 from pathlib import Path
 
 from crosscue.detectors.signs.templates import AMERICAN, KINDS
-from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
 from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.fit.sign_threshold import SignFit, SignRates, fit_signs
 
@@ -110,6 +110,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PX",
         help="ignore true signs lower than this, in pixels",
     )
+    add_limit_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -130,6 +131,7 @@ def run(args: argparse.Namespace) -> int:
         enlarge=args.enlarge,
         levels=args.levels,
         points=args.points,
+        limits=limits_of(args),
         progress=lambda parts, done: with_progress(
             parts, lambda: Done(*done(), "sets"), args, "looking"
         ),

@@ -32,7 +32,7 @@ from crosscue.eval.fit.landmark_database import (
 from crosscue.eval.pipeline.landmarks import matcher_for
 from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.localization.landmarks.features import Matcher
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_logs
@@ -92,6 +92,7 @@ def run(args: argparse.Namespace) -> int:
         source = visible(args.source or args.images.resolve().name)
         with LandmarkWriter(args.database, matcher.kind) as writer:
             counts = add_from_images(writer, matcher, args.images, args.coordinates, source)
+            _refuse_none(args.database, counts)
     else:
         counts, is_whole = _add_logs(args, vehicle, matcher)
     if args.json:
@@ -117,11 +118,18 @@ def _add_logs(
         source = visible(args.source or args.logs[0].resolve().stem)
         with LandmarkWriter(args.database, matcher.kind) as writer:
             counts = add_from_log(
-                writer, matcher, frames, poses, args.every, args.sd, source, ledgers[0]
+                writer, matcher, frames, poses, args.every, args.sd, source, ledgers
             )
-    for ledger in ledgers:
-        warn_of(ledger)
+            for ledger in ledgers:
+                warn_of(ledger)
+            _refuse_none(args.database, counts)
     return counts, all(ledger.is_whole for ledger in ledgers)
+
+
+def _refuse_none(database: Path, counts: AddCounts) -> None:
+    """Leave the database as it was; within the writer's block, which then takes all back."""
+    if not counts.added:
+        raise EmptyResultError(f"{_report_text(database, counts)}; give other pictures or poses")
 
 
 def _report_text(database: Path, counts: AddCounts) -> str:

@@ -18,12 +18,13 @@ from __future__ import annotations
 import argparse
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from crosscue.detectors.training.summary import measured_text, measured_tree
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.training import check_place
 from crosscue.replay.errors import UsageError
+from crosscue.replay.files.made_of import made_of
 
 if TYPE_CHECKING:
     from crosscue.detectors.networks.mask_rcnn.checkpoint import Facts
@@ -324,6 +325,21 @@ def _job(args: argparse.Namespace) -> Job:
         args.device,
         args.threads,
         {"data": args.data.parent.name, "window": str(args.window), "balance": args.balance},
+        _made_of(args),
+    )
+
+
+def _made_of(args: argparse.Namespace) -> dict[str, Any]:
+    """Annotations, pictures, weights to begin with, and settings: what decides the training."""
+    places = [args.data, args.images, args.val_data, args.val_images]
+    if (start := Path(args.init)).is_file():
+        places.append(start)
+    names = ("classes", "steps", "batch", "learning_rate", "seed", "width", "window", "balance")
+    more = ("crop_top", "crop_bottom", "check_every", "check_images")
+    return made_of(
+        [path for path in places if path is not None],
+        {name: getattr(args, name) for name in (*names, *more)}
+        | {"init": start.name if start.is_file() else args.init},
     )
 
 

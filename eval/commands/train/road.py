@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from crosscue.datasets.scenes.drive import SceneSettings
 from crosscue.datasets.scenes.export.road_frames import RoadFrames, joined, rendered
@@ -27,6 +27,7 @@ from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.commands.shared.training import check_place, layouts_of, learnt_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
+from crosscue.replay.files.made_of import made_of
 
 if TYPE_CHECKING:
     import torch
@@ -207,9 +208,9 @@ def _state(args: argparse.Namespace) -> Path:
 
 def _trained(training: RoadTraining, learn: RoadFrames, args: argparse.Namespace) -> float:
     """Train, keeping the state for ``--resume``; the last loss."""
-    state, loss = _state(args), float("nan")
+    state, made, loss = _state(args), _made_of(args), float("nan")
     if args.resume and state.exists():
-        training.resume(state)
+        training.resume(state, made)
     steps = training.steps(learn.pixels, learn.road)
 
     def at() -> Done:
@@ -218,10 +219,19 @@ def _trained(training: RoadTraining, learn: RoadFrames, args: argparse.Namespace
     for done, now in with_progress(steps, at, args, "training"):
         loss = now
         if done % SAVED_EVERY == 0:
-            training.save(state)
+            training.save(state, made)
         if done == args.stop_at:
             break
     return loss
+
+
+def _made_of(args: argparse.Namespace) -> dict[str, Any]:
+    """Pictures, weights to begin with, and settings: what decides the training."""
+    names = ("layouts", "val_layouts", "per_layout", "steps", "batch", "seed", "width")
+    return made_of(
+        [path for path in (args.data, args.init) if path is not None],
+        {name: getattr(args, name) for name in names},
+    )
 
 
 def _measured(

@@ -30,7 +30,7 @@ from crosscue.localization.town.drive import Keys, Result, drive_many, drive_one
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
 from crosscue.replay.columns import Floats
-from crosscue.replay.errors import CrosscueError, RunError, UsageError
+from crosscue.replay.errors import CrosscueError, RunError, UnreadableRunError, UsageError
 
 from .settings import Case
 
@@ -147,7 +147,9 @@ def assemble(chunks: Sequence[Chunk], folder: Path) -> None:
         for chunk in chunks:
             rows = _read(kept, chunk)
             if rows is None:
-                raise RunError(f"{kept.path}/{chunk.name}.parquet: damaged; run the study again")
+                raise UnreadableRunError(
+                    f"{kept.path}/{chunk.name}.parquet: damaged; run the study again"
+                )
             sink.write(_with_conditions(chunk, rows))
 
 

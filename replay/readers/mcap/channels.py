@@ -49,7 +49,9 @@ class TopicBook:
         if schema is None:
             if channel.schema_id:
                 self._report(f"{called}: its schema {channel.schema_id} is not in the file")
-            return Topic(called, "", channel.message_encoding)
+            return Topic(
+                called, "", channel.message_encoding, converted_from=channel.converted_from
+            )
         text = schema.text
         if len(text) > self._limits.schema_bytes:
             self._report(
@@ -57,7 +59,14 @@ class TopicBook:
                 f"{self._limits.schema_bytes}; messages are given without it"
             )
             text = b""
-        return Topic(called, schema.name, channel.message_encoding, text, schema.encoding)
+        return Topic(
+            called,
+            schema.name,
+            channel.message_encoding,
+            text,
+            schema.encoding,
+            converted_from=channel.converted_from,
+        )
 
     def _free_name(self, topic: Topic) -> str:
         name = topic.name

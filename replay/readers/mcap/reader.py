@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -78,12 +79,7 @@ class McapLog(Closing):
     def topics(self) -> tuple[Topic, ...]:
         """From the summary, or from the data section where the summary does not report."""
         declared = declared_counts(self._segments, self._book)
-        return tuple(
-            Topic(
-                t.name, t.type_name, t.encoding, t.schema, t.schema_encoding, declared.get(t.name)
-            )
-            for t in self._book.topics
-        )
+        return tuple(replace(t, declared=declared.get(t.name)) for t in self._book.topics)
 
     @property
     def touched(self) -> Touched:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -40,6 +40,8 @@ PREFIX: Final = struct.Struct("<BQ")
 """What every record begins with: operation code, length of the content."""
 FOOTER_SIZE: Final = PREFIX.size + 20
 DATA_END_SIZE: Final = PREFIX.size + 4
+CONVERTED_FROM: Final = "crosscue.converted_from"
+"""In a channel's metadata: ``Topic.converted_from``."""
 COMPRESSIONS: Final = frozenset({"", "lz4", "zstd"})
 
 MESSAGE_HEAD: Final = np.dtype(
@@ -108,12 +110,13 @@ class Schema:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A stream of messages; its free-form metadata is not kept."""
+    """A stream of messages; of its free-form metadata only what ``convert`` writes is kept."""
 
     id: int
     schema_id: int
     topic: str
     message_encoding: str
+    converted_from: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,8 +199,22 @@ def read_channel(content: bytes | memoryview) -> Channel:
     """A Channel record."""
     fields = Fields(content)
     channel = Channel(fields.number(2), fields.number(2), fields.text(), fields.text())
-    fields.take(fields.number(4))
-    return channel
+    return replace(channel, converted_from=_converted_from(fields.take(fields.number(4))))
+
+
+def _converted_from(metadata: bytes | memoryview) -> str:
+    """The one entry that is ours; metadata that cannot be understood is nobody's fault."""
+    key = CONVERTED_FROM.encode()
+    if key not in bytes(metadata):
+        return ""
+    fields = Fields(metadata)
+    try:
+        while True:
+            name, value = fields.text(), fields.text()
+            if name == CONVERTED_FROM:
+                return value
+    except BrokenRecordError:
+        return ""
 
 
 def read_chunk_head(content: bytes | memoryview) -> ChunkHead:

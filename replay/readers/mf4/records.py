@@ -269,7 +269,7 @@ class UnsortedData:
             return f"{hole.damage}; unsorted records after it cannot be found", -1
         if not rest:
             return self.stream.broken, -1
-        return LAST_CUT, self._finder.group_of(rest)
+        return self.stream.broken or LAST_CUT, self._finder.group_of(rest)
 
 
 class _Finder:

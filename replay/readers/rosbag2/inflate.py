@@ -44,7 +44,7 @@ def inflated(
     first, parts, bad, size = 0, list[bytes](), dict[int, str](), 0
     for i in range(len(messages)):
         raw = bytes(messages.payload(i))
-        part, fault = _one(raw, limits.message_bytes) if packed[i] else (raw, "")
+        part, fault = _one(raw, limits) if packed[i] else (raw, "")
         if fault:
             bad[i - first] = fault
         parts.append(part)
@@ -60,14 +60,17 @@ def _joined(parts: list[bytes]) -> Messages:
     return Messages(np.frombuffer(b"".join(parts), dtype=np.uint8), stop - length, stop)
 
 
-def _one(raw: bytes, largest: int) -> tuple[bytes, str]:
-    """The message, or nothing and why; never more than ``largest`` bytes are taken."""
+def _one(raw: bytes, limits: Limits) -> tuple[bytes, str]:
+    """The message, or nothing and why; never more than the limits allow is taken."""
     import zstandard
 
+    largest, limit = limits.message_bytes, str(limits.message_bytes)
+    if limits.chunk_bytes < largest:
+        largest, limit = limits.chunk_bytes, f"{limits.chunk_bytes} (--max-chunk)"
     try:
         declared = zstandard.frame_content_size(raw)
         if declared > largest:
-            return b"", f"declares {declared} bytes, the limit is {largest}"
+            return b"", f"declares {declared} bytes, the limit is {limit}"
         room = largest if declared < 0 else declared
         stream = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
         with stream.stream_reader(raw) as reader:
@@ -76,7 +79,7 @@ def _one(raw: bytes, largest: int) -> tuple[bytes, str]:
         return b"", f"{len(raw)} bytes, zstd says: {error}"
     if len(found) > room:
         said = "" if declared < 0 else f", declares {declared}"
-        return b"", f"decompresses to more than {room} bytes{said}; the limit is {largest}"
+        return b"", f"decompresses to more than {room} bytes{said}; the limit is {limit}"
     if 0 <= declared != len(found):
         return b"", f"decompresses to {len(found)} bytes, declares {declared}"
     return found, ""

@@ -24,9 +24,9 @@ from .metadata import Metadata
 STORED: Final = (".db3", ".mcap")
 PACKED: Final = ".zstd"
 PACKED_DAMAGED: Final = "compressed file"
-INFLATE_RATIO: Final = 1000
-"""A packed file may grow to this many times its size, or to ``Limits.chunk_bytes`` if larger."""
 
+_HEAD_BYTES: Final = 18
+"""The longest header of a zstd frame (RFC 8878, 3.1.1)."""
 _READ_BYTES: Final = MIB
 _FED_BYTES: Final = 1024
 _WINDOW_BYTES: Final = 1 << 27
@@ -130,7 +130,9 @@ def unpack(packed: Path, plain: Path, limits: Limits) -> str:
     """
     import zstandard
 
-    most = max(limits.chunk_bytes, INFLATE_RATIO * packed.stat().st_size)
+    most = limits.chunk_bytes
+    if (declared := _declared(packed)) > most:
+        return f"declares {declared} bytes, the limit is {most} (--max-chunk)"
     written = 0
     unpacking = _Unpacking()
     with packed.open("rb") as source, plain.open("wb") as target:
@@ -149,6 +151,17 @@ def unpack(packed: Path, plain: Path, limits: Limits) -> str:
             except zstandard.ZstdError as error:
                 return f"compressed file is damaged after {written} bytes ({error})"
     return "" if unpacking.is_at_end else f"compressed file is cut after {written} bytes"
+
+
+def _declared(packed: Path) -> int:
+    """What the first frame says it holds, which zstd holds it to; -1 where it says nothing."""
+    import zstandard
+
+    with packed.open("rb") as source:
+        try:
+            return zstandard.frame_content_size(source.read(_HEAD_BYTES))
+        except zstandard.ZstdError:
+            return -1  # of a damaged head unpacking says more
 
 
 class _Unpacking:

@@ -160,7 +160,7 @@ def test_pooled_scores_of_several_runs_are_compared_too(
 
     assert cli.run(["compare", str(tmp_path / "good"), str(tmp_path / "both")]) == 1
     assert "WORSE      cues.stop_sign.precision: 1 -> 0.970149" in capsys.readouterr().out
-    assert cli.run(["compare", str(tmp_path / "good"), str(tmp_path)]) == 1
+    assert cli.run(["compare", str(tmp_path / "good"), str(tmp_path)]) == 4
     assert "not a run folder" in capsys.readouterr().err
 
 
@@ -168,7 +168,7 @@ def test_damaged_scores_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[
     good, worse = _pair(tmp_path)
     for text in ("{", "[]", "[" * 100_000):
         (worse / "score" / "metrics.json").write_text(text)
-        assert cli.run(["compare", str(good), str(worse)]) == 1
+        assert cli.run(["compare", str(good), str(worse)]) == 4
         assert "run crosscue score again" in capsys.readouterr().err
 
 

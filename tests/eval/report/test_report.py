@@ -166,11 +166,26 @@ def test_the_worst_frame_is_shown_with_its_box_and_time(tmp_path: Path) -> None:
     assert f"({at(21)} ns): <code>crosscue view {one.run.path}</code>" in page
 
 
-def test_a_log_that_is_gone_leaves_a_page_that_says_so(tmp_path: Path) -> None:
-    one = _scored(tmp_path / "drive")
-    (tmp_path / "drive" / "drive.mcap").unlink()
+def test_a_log_that_is_gone_is_an_error_unless_pictures_are_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = _scored(tmp_path / "drive").run
+    truth = tmp_path / "drive" / "truth.json"
+    (tmp_path / "moved").mkdir()
+    (tmp_path / "drive" / "drive.mcap").rename(tmp_path / "moved" / "drive.mcap")
+    argv = ["score", str(run.path), "--truth", str(truth)]
 
-    assert "Its picture is no longer at hand." in _written(tmp_path, one)
+    assert cli.run(argv) == 4
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "drive.mcap is gone; say where it is with --logs DIR" in said
+    assert "--without-images" in said
+    assert not run.file("score").exists()
+
+    assert cli.run([*argv, "--logs", str(tmp_path / "moved")]) == 3
+    assert "Its picture" not in (run.file("score") / "report.html").read_text()
+    assert cli.run([*argv, "--without-images"]) == 3
+    assert "Its picture is not at hand." in (run.file("score") / "report.html").read_text()
 
 
 def test_the_same_scores_give_the_same_bytes(tmp_path: Path) -> None:

@@ -209,7 +209,7 @@ def test_the_score_command_prints_json_and_refuses_a_foreign_folder(
     found = json.loads(capsys.readouterr().out)
     assert found["metrics"]["pose"]["coverage"]["truth_poses"] == 680
     assert found["runs"] == {str(run.path): found["metrics"]}
-    assert cli.run(["score", str(path.parent), "--truth", str(path)]) == 1
+    assert cli.run(["score", str(path.parent), "--truth", str(path)]) == 4
     assert "neither a run folder" in capsys.readouterr().err
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from crosscue.localization.landmarks.database import (
@@ -233,6 +233,7 @@ def test_a_moved_landmark_is_found(tmp_path: Path) -> None:
 
 
 @given(st.integers(0, 10_000), st.integers(1, 255))
+@example(where=3379, flip=128)
 @settings(max_examples=60, deadline=None)
 def test_damage_is_refused_or_harmless_never_a_crash(
     tmp_path_factory: pytest.TempPathFactory, where: int, flip: int

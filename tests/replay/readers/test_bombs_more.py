@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gzip
 import re
+import shutil
 import sqlite3
 import struct
 import zlib
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -15,6 +18,7 @@ from crosscue.detectors.images import MAX_PIXELS
 from crosscue.replay.limits import DEFAULT, MIB
 from support.can_files import blf, made
 from support.measured import measured
+from support.mf4_files import unsorted
 from support.pictures import picture_folder
 from support.rosbag_files import rows_of, write_folder
 
@@ -72,6 +76,50 @@ def _packed_file(folder: Path) -> Path:
     return bag
 
 
+def _in_wal(folder: Path) -> Path:
+    """The bomb was written last, and its recorder was killed: it stands in the -wal alone."""
+    bag = write_folder(folder / "bag", rows_of(40))
+    (path,) = bag.glob("*.db3")
+    killed = folder / "killed"
+    shutil.copytree(bag, killed)
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("PRAGMA journal_mode = WAL")
+        database.execute("PRAGMA wal_autocheckpoint = 0")
+        database.execute(
+            "UPDATE messages SET data = ? WHERE id = (SELECT max(id) FROM messages)", (_honest(),)
+        )
+        database.commit()
+        for one in bag.glob("*.db3*"):
+            shutil.copy(one, killed / one.name)
+    assert list(killed.glob("*-wal"))
+    return killed
+
+
+def _mf4(size: int, declared: int) -> Callable[[Path], Path]:
+    """A log whose second compressed block is another one, put at the file's end."""
+
+    def make(folder: Path) -> Path:
+        sound = unsorted(made(200), virtual=True, is_finalized=True, stretch=500, coding=0).content
+        packed = _deflated(size)
+        head = struct.pack("<2sBxLQQ", b"DT", 0, 0, declared, len(packed))
+        block = struct.pack("<4s4xQQ", b"##DZ", 24 + len(head) + len(packed), 0) + head + packed
+        second = sound.index(b"##DZ", sound.index(b"##DZ") + 1)
+        sound += bytes(-len(sound) % 8)
+        listed = sound.replace(struct.pack("<Q", second), struct.pack("<Q", len(sound)), 1)
+        path = folder / "bomb.mf4"
+        path.write_bytes(listed + block)
+        return path
+
+    return make
+
+
+def _packed_file_that_declares(folder: Path) -> Path:
+    bag = _packed_file(folder)
+    (packed,) = bag.glob("*.zstd")
+    packed.write_bytes(_honest())
+    return bag
+
+
 LOGS: dict[str, tuple[Callable[[Path], Path], int, tuple[str, str]]] = {
     "BLF over the limit": (
         _blf(BOMB_BYTES),
@@ -88,6 +136,22 @@ LOGS: dict[str, tuple[Callable[[Path], Path], int, tuple[str, str]]] = {
         _in_db3(with_zstd),
         3,
         (f"more than {DEFAULT.message_bytes}", str(DEFAULT.message_bytes)),
+    ),
+    "MF4 over the limit": (
+        _mf4(BOMB_BYTES, BOMB_BYTES),
+        3,
+        (str(BOMB_BYTES), str(DEFAULT.chunk_bytes)),
+    ),
+    "MF4 more than declared": (_mf4(BOMB_BYTES, 500), 3, ("more than 500", "declares 500")),
+    "db3 message in the WAL": (
+        _in_wal,
+        3,
+        (str(BOMB_BYTES), str(DEFAULT.message_bytes)),
+    ),
+    "zstd file that declares": (
+        _packed_file_that_declares,
+        4,
+        (str(BOMB_BYTES), str(DEFAULT.chunk_bytes)),
     ),
     "zstd file": (_packed_file, 4, (r"\d+ bytes unpack", str(DEFAULT.chunk_bytes))),
 }
@@ -112,6 +176,29 @@ def test_max_chunk_moves_the_limit(tmp_path: Path) -> None:
     _, said, _ = measured(["info", str(path), "--max-chunk", "2"])
 
     assert f"the limit is {2 * MIB} (--max-chunk)" in said
+
+
+@pytest.mark.parametrize("kind", ["message", "file"])
+def test_max_chunk_bounds_what_zstd_declares_in_a_bag(tmp_path: Path, kind: str) -> None:
+    path = _in_db3(_honest)(tmp_path) if kind == "message" else _packed_file_that_declares(tmp_path)
+
+    status, said, _ = measured(["info", str(path), "--max-chunk", "2"])
+
+    assert status == (3 if kind == "message" else 4)
+    assert f"declares {BOMB_BYTES} bytes, the limit is {2 * MIB} (--max-chunk)" in said
+
+
+def test_a_log_packed_with_gzip_is_refused_and_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "drive.mcap.gz"
+    with gzip.open(path, "wb", compresslevel=1) as file:
+        for _ in range(BOMB_BYTES >> 20):
+            file.write(PIECE)
+
+    status, said, peak_mb = measured(["info", str(path)])
+
+    assert status == 4, said
+    assert peak_mb < MAX_MB
+    assert "gzip" in said
 
 
 def _png() -> bytes:

@@ -1,0 +1,156 @@
+"""What goes on with a result, or replaces it, refuses one that is made of something else."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from crosscue.datasets.scenes.drive import MADE_OF, SceneSettings
+from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.eval import cli
+from crosscue.replay.errors import OutputError
+from crosscue.replay.files.made_of import made_of
+from crosscue.replay.files.tree_text import strict_json
+from support.pictures import picture
+from support.trees import tree
+
+COMMANDS: dict[str, tuple[str, str, str]] = {
+    "train road": (
+        "--data {folder} -o {out}/net.safetensors --steps 1 --batch 1 --width 128 --device cpu",
+        "--resume",
+        "--seed 3",
+    ),
+    "train mask-rcnn": (
+        "--data {folder}/coco.json --images {folder}/images -o {out}/net.safetensors --steps 1 "
+        "--batch 1 --check-every 1 --window 64 64 --width 128 --device cpu",
+        "--resume",
+        "--seed 3",
+    ),
+    "simulate": ("A -o {out} --width 64", "--overwrite", "--seed 3"),
+}
+"""Arguments, the flag that goes on or replaces, and what makes it another."""
+WRITERS = (
+    "crosscue.detectors.networks.road.checkpoint.save_road",
+    "crosscue.detectors.training.job.save_checkpoint",
+)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Pictures of a road with a stop sign, annotated."""
+    folder = tmp_path / "data"
+    for place in ("images", "masks"):
+        (folder / place).mkdir(parents=True)
+        for number in range(2):
+            (folder / place / f"{number}.png").write_bytes(picture(number, width=128, height=80))
+    box = {"bbox": [10, 10, 40, 40], "segmentation": [[10, 10, 50, 10, 50, 50, 10, 50]]}
+    coco = {
+        "categories": [{"id": 1, "name": "stop sign"}],
+        "images": [
+            {"id": k, "file_name": f"{k}.png", "width": 128, "height": 80} for k in range(2)
+        ],
+        "annotations": [{"id": k, "image_id": k, "category_id": 1, **box} for k in range(2)],
+    }
+    (folder / "coco.json").write_text(json.dumps(coco))
+    return folder
+
+
+def _begun(name: str, folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A training whose state is kept since its result could not be written, or a drive."""
+    argv = [*name.split(), *COMMANDS[name][0].format(folder=folder, out=out).split()]
+    if name == "simulate":
+        drive = out / "A-01"
+        drive.mkdir(parents=True)
+        (drive / "drive.mcap").touch()
+        settings = SceneSettings(camera=Camera(width_px=64, height_px=36))
+        (drive / MADE_OF).write_text(strict_json(made_of([], asdict(settings))))
+        return argv
+    out.mkdir()
+
+    def full(*_: object) -> None:
+        raise OutputError("the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("crosscue.eval.commands.train.road.SAVED_EVERY", 1)
+        for writer in WRITERS:
+            patched.setattr(writer, full)
+        assert cli.run(argv) == 1
+    return argv
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_other_settings_are_refused_and_nothing_is_touched(
+    name: str,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    argv = _begun(name, folder, tmp_path / "out", monkeypatch)
+    _, flag, other = COMMANDS[name]
+    before = tree(tmp_path)
+    capsys.readouterr()
+
+    assert cli.run([*argv, flag, *other.split()]) == 2
+
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "seed: 0 there, 3 here" in said
+    assert f"{flag} would destroy it" in said
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["train road", "train mask-rcnn"])
+def test_other_pictures_are_refused_with_both_identities(
+    name: str,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    argv = _begun(name, folder, tmp_path / "out", monkeypatch)
+    (folder / "images" / "1.png").write_bytes(picture(7, width=128, height=80))
+    before = tree(tmp_path)
+    capsys.readouterr()
+
+    assert cli.run([*argv, "--resume"]) == 2
+
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert said.count(" bytes)") == 2
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_very_same_goes_on(
+    name: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    argv = _begun(name, folder, tmp_path / "out", monkeypatch)
+
+    assert cli.run([*argv, COMMANDS[name][1]]) == 0
+
+
+def test_a_finished_training_is_not_begun_anew_by_resume(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "net.safetensors"
+    out.write_bytes(b"weights")
+    argv = ["train", "mask-rcnn", "--data", str(folder / "coco.json"), "--images"]
+
+    assert cli.run([*argv, str(folder / "images"), "-o", str(out), "--resume"]) == 1
+    assert "--overwrite begins anew" in capsys.readouterr().err
+    assert out.read_bytes() == b"weights"
+
+
+def test_a_drive_of_which_nothing_says_what_it_is_is_not_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "A-01").mkdir()
+    (tmp_path / "A-01" / "drive.mcap").write_bytes(b"recorded")
+
+    assert cli.run(["simulate", "A", "-o", str(tmp_path), "--width", "64", "--overwrite"]) == 2
+    assert "nothing says what it is made of" in capsys.readouterr().err
+    assert (tmp_path / "A-01" / "drive.mcap").read_bytes() == b"recorded"

@@ -1,0 +1,311 @@
+"""No command believes a size: every command that opens logs or pictures keeps the limits."""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.simulated.drive import DriveSettings
+from crosscue.datasets.simulated.log_files import write_drive as simulated
+from crosscue.datasets.truth.truth import Truth, save
+from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.detectors.images import MAX_PIXELS
+from crosscue.eval import cli
+from crosscue.localization.landmarks.database import LandmarkWriter
+from crosscue.replay.columns import Floats
+from crosscue.replay.limits import MIB
+from support.gap_drive import BEGIN, SIZE, Clock, replayed, write_drive
+from support.mcap_files import MAGIC, record, text
+from support.pictures import picture
+from support.rosbag_files import START_NS, Row, write_bag, write_folder
+
+DECLARED = 3 * MIB
+LIMIT_MIB = 2
+SIDE_PX = 60_000
+
+OPENS_LOGS: dict[str, str] = {
+    "info": "{log}",
+    "convert": "{log} -o {out}.mcap",
+    "decode": "{log} -o {out} --vehicle {car}",
+    "detect": "{log} -o {out} --vehicle {car} --detectors grey --no-cache",
+    "replay": "{log} -o {out} --vehicle {car} --detectors grey --no-cache",
+    "estimate": "{run}",
+    "score": "{run} --truth {truth}",
+    "view": "{run} -o {out}.rrd",
+    "vehicle init": "{log} -o {out}.toml",
+    "fit compass": "{compass} --vehicle {its_car}",
+    "fit signs": "{drive} --label stop_sign",
+    "fit landmarks": "{log} --database {db} --poses {truth} --vehicle {car}",
+    "landmarks add": "{out}.db {log} --poses {truth} --vehicle {car}",
+    "truth import": "{coco} --log {log} -o {out}.json --vehicle {car}",
+    "truth check": "{truth} --log {log} --vehicle {car}",
+}
+"""Arguments with which a command reads every chunk of a log."""
+REPORTS_THE_RUN = {"score"}
+"""It reads single pictures, and reports what was dropped as the run does."""
+OPENS_NONE: dict[str, str] = {
+    "compare": "tables", "merge": "tables", "fit ranges": "tables", "fit messages": "tables",
+    "landmarks list": "a database", "landmarks match": "a picture", "train road": "pictures",
+    "train mask-rcnn": "pictures", "train frames": "nothing", "truth schema": "nothing",
+    "run schema": "nothing",
+    "demo": "what it made", "simulate": "nothing", "study range": "what it made",
+    "study landmarks": "what it made", "study field": "what it made",
+    "model check": "pictures, and a network",
+    "model fetch": "a network", "model init": "a network", "model list": "nothing",
+    "model show": "a card", "completion": "nothing", "plugins": "nothing",
+    "study intersections": "what it made", "study drive": "what it made",
+    "seal": "bytes as they are", "truth": "arrays and texts of data sets, not compressed",
+}  # fmt: skip
+
+
+@pytest.fixture
+def names(tmp_path: Path) -> dict[str, Path]:
+    """A drive whose last chunk is a bomb, its run, and what else commands want."""
+    drive = tmp_path / "drive"
+    log = write_drive(drive, Clock(), seconds=4)
+    with_bomb(log)
+    run = replayed(drive, log, "../run")
+    with LandmarkWriter(tmp_path / "known.db", "orb"):
+        pass
+    compass = simulated(tmp_path / "compass", DriveSettings(seed=3, blocks=1, block_m=60.0))
+    with_bomb(compass.log)
+    (drive / "vehicle.toml").write_bytes((drive / "car.toml").read_bytes())
+    objects = drive / "objects.json"
+    objects.write_text(_coco([("0.png", BEGIN)], SIZE))
+    return {
+        "drive": drive,
+        "log": log,
+        "run": run.path,
+        "car": drive / "car.toml",
+        "truth": drive / "truth.json",
+        "coco": objects,
+        "db": tmp_path / "known.db",
+        "out": tmp_path / "out",
+        "compass": compass.log,
+        "its_car": compass.vehicle,
+    }
+
+
+def _words(flags: str, names: dict[str, Path]) -> list[str]:
+    return [word.replace("_sign", " sign") for word in flags.format(**names).split()]
+
+
+def with_bomb(log: Path) -> None:
+    """Put a chunk that declares more than the limit where the recording's data end."""
+    coded, at = log.read_bytes(), len(MAGIC)
+    while coded[at] != 0x0F:
+        at += 9 + int(struct.unpack_from("<Q", coded, at + 1)[0])
+    body = bytes(100)
+    head = struct.pack("<QQQI", 1, 1, DECLARED, 0) + text("zstd") + struct.pack("<Q", len(body))
+    log.write_bytes(coded[:at] + record(6, head + body))
+
+
+def test_every_command_is_in_one_of_the_tables() -> None:
+    assert not OPENS_LOGS.keys() & OPENS_NONE.keys()
+    assert OPENS_LOGS.keys() | OPENS_NONE.keys() == cli.COMMANDS.keys()
+
+
+@pytest.mark.parametrize("command", sorted(OPENS_LOGS))
+def test_max_chunk_reaches_every_command_that_opens_a_log(
+    command: str, names: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = _words(OPENS_LOGS[command], names)
+
+    status = cli.run([*command.split(), *argv, "--max-chunk", str(LIMIT_MIB)])
+
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert status in (1, 3, 4), said
+    if command not in REPORTS_THE_RUN:
+        wanted = rf"declares \d{{7}} bytes, the limit is {LIMIT_MIB * MIB} \(--max-chunk\)"
+        assert re.search(wanted, said), said
+
+
+def _png() -> bytes:
+    def part(kind: bytes, body: bytes) -> bytes:
+        crc = struct.pack(">I", zlib.crc32(kind + body))
+        return struct.pack(">I", len(body)) + kind + body + crc
+
+    head = struct.pack(">IIBBBBB", SIDE_PX, SIDE_PX, 8, 2, 0, 0, 0)
+    body = zlib.compress(bytes(1 << 20))
+    return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", body) + part(b"IEND", b"")
+
+
+def _jpeg() -> bytes:
+    size = struct.pack(">BHHB", 8, SIDE_PX, SIDE_PX, 3) + b"\1\x11\0\2\x11\0\3\x11\0"
+    frame = b"\xff\xc0" + struct.pack(">H", 2 + len(size)) + size
+    return b"\xff\xd8" + frame + b"\xff\xda\0\x0c\3\1\0\2\0\3\0\0?\0" + bytes(1000) + b"\xff\xd9"
+
+
+def _webp() -> bytes:
+    body = b"WEBPVP8X" + struct.pack("<I", 10) + bytes(4)
+    body += (SIDE_PX - 1).to_bytes(3, "little") * 2 + bytes(100)
+    return b"RIFF" + struct.pack("<I", len(body)) + body
+
+
+CODED: dict[str, Callable[[], bytes]] = {"png": _png, "jpeg": _jpeg, "webp": _webp}
+
+
+def _folder(folder: Path, pictures: list[tuple[str, bytes]]) -> Path:
+    log = folder / "cam"
+    log.mkdir()
+    for number, (kind, content) in enumerate(pictures):
+        (log / f"frame_{number}.{kind}").write_bytes(content)
+    (log / "timestamps.txt").write_text("rate_hz: 10\n")
+    return log
+
+
+def _ros1(kind: str, content: bytes) -> bytes:
+    names = b"".join(struct.pack("<I", len(one)) + one for one in (b"cam", kind.encode()))
+    return struct.pack("<III", 0, 10, 0) + names + struct.pack("<I", len(content)) + content
+
+
+def _ros2(kind: str, content: bytes) -> bytes:
+    made = struct.pack("<iI", 10, 0)
+    for one in (b"cam\0", kind.encode() + b"\0"):
+        made += bytes(-len(made) % 4) + struct.pack("<I", len(one)) + one
+    made += bytes(-len(made) % 4) + struct.pack("<I", len(content)) + content
+    return b"\0\1\0\0" + made
+
+
+def _rows(pictures: list[tuple[str, bytes]], wrap: Callable[[str, bytes], bytes]) -> list[Row]:
+    return [
+        Row("/camera/image", START_NS + i * 100_000_000, wrap(*one))
+        for i, one in enumerate(pictures)
+    ]
+
+
+HOLDERS: dict[str, Callable[[Path, list[tuple[str, bytes]]], Path]] = {
+    "folder": _folder,
+    "bag": lambda folder, pictures: write_bag(folder / "cam.bag", _rows(pictures, _ros1), "bz2"),
+    "db3": lambda folder, pictures: write_folder(
+        folder / "cam", _rows(pictures, _ros2), compression="message"
+    ),
+    "mcap": lambda folder, pictures: write_folder(folder / "cam", _rows(pictures, _ros2), "mcap"),
+}
+READS_CAMERA: dict[str, str] = {
+    "detect": "{log} -o {out} --detectors support.gap_drive:build --no-cache",
+    "replay": "{log} -o {out} --detectors support.gap_drive:build --no-cache",
+    "truth import": "{coco} --log {log} -o {out}.json",
+    "landmarks add": "{out}.db {log} --poses {truth}",
+    "fit landmarks": "{log} --database {db} --poses {truth}",
+    "fit signs": "{drive} --label stop_sign",
+}
+"""What decodes a camera's pictures, at least their headers."""
+
+
+@pytest.mark.parametrize("holder", HOLDERS)
+@pytest.mark.parametrize("command", READS_CAMERA)
+def test_a_camera_picture_that_declares_too_much_is_named_with_both_numbers(
+    command: str, holder: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive = tmp_path / "drive"
+    drive.mkdir()
+    coded = [*CODED][[*HOLDERS].index(holder) % len(CODED)]
+    sound = [("png", picture(number)) for number in range(3)]
+    log = HOLDERS[holder](drive, [(coded, CODED[coded]()), *sound])
+    _annotate(drive, 0 if holder == "folder" else START_NS)
+    with LandmarkWriter(tmp_path / "known.db", "orb"):
+        pass
+    names = {
+        "log": log,
+        "out": tmp_path / "out",
+        "drive": drive,
+        "truth": drive / "truth.json",
+        "coco": drive / "objects.json",
+        "db": tmp_path / "known.db",
+    }
+
+    status = cli.run([*command.split(), *_words(READS_CAMERA[command], names)])
+
+    _names_both(status, capsys)
+
+
+def _names_both(status: int, capsys: pytest.CaptureFixture[str]) -> None:
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert status in (1, 3, 4), said
+    assert f"{SIDE_PX} x {SIDE_PX}" in said
+    assert f"{MAX_PIXELS:,}" in said
+
+
+READS_FILES: dict[str, str] = {
+    "landmarks match": "{db} {picture}",
+    "landmarks add": "{db} --images {folder} --coordinates {folder}/places.csv",
+    "fit landmarks": "--pairs {folder}/pairs.csv",
+    "fit signs": "{folder}/labels.csv --label stop_sign",
+    "train road": "--data {folder} -o {out}.safetensors",
+    "train mask-rcnn": "--data {folder}/coco.json --images {folder}/images -o {out}.safetensors "
+    "--steps 1 --batch 1 --check-every 1 --device cpu",
+}
+"""What decodes picture files."""
+
+
+@pytest.mark.parametrize("command", READS_FILES)
+def test_a_picture_file_that_declares_too_much_is_unreadable(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    coded = [*CODED][[*READS_FILES].index(command) % len(CODED)]
+    folder = tmp_path / "photos"
+    for place in (folder, folder / "images", folder / "masks"):
+        place.mkdir()
+        (place / f"a.{coded}").write_bytes(CODED[coded]())
+        (place / "b.png").write_bytes(picture(1))
+    (folder / "places.csv").write_text(f"image,x_m,y_m,sd_m\na.{coded},0,0,1\n")
+    (folder / "pairs.csv").write_text(f"query,known,same\na.{coded},b.png,1\n")
+    (folder / "labels.csv").write_text(f"picture,label,x0,y0,x1,y1\na.{coded},stop sign,1,1,9,9\n")
+    (folder / "coco.json").write_text(_coco([(f"a.{coded}", 0), ("b.png", 1)], (24, 16)))
+    with LandmarkWriter(tmp_path / "known.db", "orb"):
+        pass
+    names = {
+        "db": tmp_path / "known.db",
+        "picture": folder / f"a.{coded}",
+        "folder": folder,
+        "out": tmp_path / "out",
+    }
+
+    status = cli.run([*command.split(), *_words(READS_FILES[command], names)])
+
+    assert status == 4
+    _names_both(status, capsys)
+
+
+def _coco(images: list[tuple[str, int]], size: tuple[int, int]) -> str:
+    """Pictures at their times, a stop sign in the first."""
+    return json.dumps(
+        {
+            "categories": [{"id": 1, "name": "stop sign"}],
+            "images": [
+                {"id": k, "file_name": name, "width": size[0], "height": size[1], "t_ns": t_ns}
+                for k, (name, t_ns) in enumerate(images)
+            ],
+            "annotations": [
+                {
+                    "id": k,
+                    "image_id": k,
+                    "category_id": 1,
+                    "bbox": [1, 1, 9, 9],
+                    "segmentation": [[1, 1, 10, 1, 10, 10, 1, 10]],
+                }
+                for k in range(len(images))
+            ],
+        }
+    )
+
+
+def _annotate(drive: Path, start_ns: int) -> None:
+    """The truth of four pictures, a tenth of a second apart."""
+    t_ns = start_ns + np.arange(4) * 100_000_000
+    times = t_ns.tolist()
+    (drive / "objects.json").write_text(_coco([(f"{t}.png", t) for t in times], (24, 16)))
+    save(
+        Truth(version=1, source="x", start_ns=times[0], end_ns=times[-1] + 1, pose="pose.tum"),
+        drive,
+    )
+    zero: Floats = np.zeros(4)
+    write_tum(drive / "pose.tum", planar(t_ns, zero + 100.0 * np.arange(4), zero, zero), "made up")
