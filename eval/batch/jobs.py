@@ -23,6 +23,7 @@ from crosscue.replay.errors import CrosscueError, RunError, UsageError, one_line
 from crosscue.replay.files.identity import as_row, identity_of, identity_of_all
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.losses import losses_heard, warn_again
 
 JOURNAL: Final = ".drives"
 FORMAT_VERSION: Final = 2
@@ -72,6 +73,8 @@ class Done(Generic[R]):
         result: What the work gave back; None after an error, and for an earlier run.
         seconds: Wall time of the last attempt.
         attempts: How often it was begun; 0 for an earlier run.
+        losses: Met where no account is kept, see ``replay.losses``; the process that asked warns
+            of them.
     """
 
     job: Job
@@ -80,6 +83,7 @@ class Done(Generic[R]):
     result: R | None = None
     seconds: float = 0.0
     attempts: int = 1
+    losses: tuple[str, ...] = ()
 
     @property
     def is_earlier(self) -> bool:
@@ -183,6 +187,7 @@ def run_many(
             for done in events:
                 if done is not None:
                     found[done.job.name] = done
+                    warn_again(done.losses)
                     failed += done.error is not None
                 tell()
     return tuple(found[job.name] for job in jobs)
@@ -219,18 +224,22 @@ def fingerprint_of(*settings: object) -> str:
 def attempt(work: Callable[[Job], R], job: Job) -> Done[R]:
     """Work on one drive here and now, keeping the journal; engines call this in their workers."""
     began = time.monotonic()
+    with losses_heard() as losses:
+        done = _attempted(work, job, losses)
+    return replace(done, losses=tuple(losses), seconds=time.monotonic() - began)
+
+
+def _attempted(work: Callable[[Job], R], job: Job, losses: Sequence[str]) -> Done[R]:
     try:
         inputs = _inputs(job)
         _write_entry(job, {"inputs": inputs})
         result = work(job)
         manifest = _manifest_hash(job)
-        _write_entry(
-            job, {"inputs": inputs, "manifest": manifest, "exit_status": result.exit_status}
-        )
+        status = result.exit_status or (3 if losses else 0)
+        _write_entry(job, {"inputs": inputs, "manifest": manifest, "exit_status": status})
     except Exception as error:
-        status, line = reported_error(error)
-        return Done(job, status, line, seconds=time.monotonic() - began)
-    return Done(job, result.exit_status, None, result, time.monotonic() - began)
+        return Done(job, *reported_error(error))
+    return Done(job, status, None, result)
 
 
 def reported_error(error: Exception) -> tuple[int, str]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,7 @@ from crosscue.replay.readers.timed_files import list_files, pair
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.signals.plan import camera_of
+from crosscue.replay.time.stamp_watch import StampWatch
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 
@@ -71,16 +74,33 @@ def _size_of(block: Block, where: str) -> tuple[int, int]:
         ) from None
 
 
-def log_span(path: Path, limits: Limits = DEFAULT) -> tuple[int, int]:
+@dataclass(frozen=True, slots=True)
+class LogSpan:
+    """When a log's rows are, on its own clock.
+
+    Attributes:
+        start_ns: The first stamp.
+        end_ns: Just after the last one.
+        was_set_back: The clock ran backward, so the drive lasts longer than its stamps say.
+    """
+
+    start_ns: int
+    end_ns: int
+    was_set_back: bool
+
+
+def log_span(path: Path, limits: Limits = DEFAULT) -> LogSpan:
     """Log times of a log's first row and just after its last.
 
     Raises:
         LogError: It cannot be read, or holds no row.
     """
     first, last, ledger = 2**63 - 1, -(2**63), Ledger(str(path))
+    watches: defaultdict[str, StampWatch] = defaultdict(StampWatch)
     with open_log(path, limits) as log:
         for block in log.read(ledger):
             if len(block):
+                watches[block.topic].add(block.log_ns)
                 first, last = (
                     min(first, int(block.log_ns.min())),
                     max(last, int(block.log_ns.max())),
@@ -88,7 +108,9 @@ def log_span(path: Path, limits: Limits = DEFAULT) -> tuple[int, int]:
     warn_of(ledger)
     if last < first:
         raise LogError(f"{path}: holds no row")
-    return first, last + 1
+    for watch in watches.values():
+        watch.finish()
+    return LogSpan(first, last + 1, any(watch.set_backs for watch in watches.values()))
 
 
 def _names(log: Log) -> Mapping[str, int]:

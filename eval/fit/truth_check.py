@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -32,7 +32,7 @@ from crosscue.replay.limits import DEFAULT, Limits
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .log_images import log_pictures, log_span
+from .log_images import LogSpan, log_pictures, log_span
 
 OBJECTS: Final = "objects.json"
 SLACK_NS: Final = 1_000_000_000
@@ -52,6 +52,8 @@ class TruthFit:
         objects: Labelled objects.
         ranges: Rows with true ranges.
         poses: Of the track.
+        outside: Approaches and cues that reach beyond the log's stamps: only where its clock was
+            set back.
         is_checked_by_hash: Whether the truth names the log's hash.
     """
 
@@ -63,6 +65,7 @@ class TruthFit:
     objects: int
     ranges: int
     poses: int
+    outside: int
     is_checked_by_hash: bool
 
 
@@ -104,7 +107,7 @@ def check_truth(path: Path, log_path: Path, vehicle: Vehicle, limits: Limits = D
         raise SchemaError(
             f"{path}: belongs to {truth.log or 'another log'} by its hash, not to {log_path}"
         )
-    _check_times(truth, log_span(log_path, limits), path, log_path)
+    outside = _check_times(truth, log_span(log_path, limits), path, log_path)
     poses = 0
     if truth.pose is not None:
         track = read_tum(folder / truth.pose)
@@ -133,29 +136,41 @@ def check_truth(path: Path, log_path: Path, vehicle: Vehicle, limits: Limits = D
         objects,
         ranges,
         poses,
+        outside,
         has_hash,
     )
 
 
-def _check_times(truth: Truth, span: tuple[int, int], path: Path, log_path: Path) -> None:
-    first, last = span[0] - SLACK_NS, span[1] + SLACK_NS
-    where = f"{log_path} lasts from {span[0]} to {span[1]} ns; give the truth of this log"
+def _check_times(truth: Truth, span: LogSpan, path: Path, log_path: Path) -> int:
+    """Refuse truth outside its log; how many of its parts reach beyond a log that was set back.
+
+    Truth may run on where its log's clock was set back. There, as in ``score``, the two have to
+    share a moment, and no more.
+    """
+    first, last = span.start_ns - SLACK_NS, span.end_ns + SLACK_NS
+    where = f"{log_path} lasts from {span.start_ns} to {span.end_ns} ns; give the truth of this log"
     if truth.start_ns >= last or truth.end_ns <= first:
         raise SchemaError(f"{path}: truth from {truth.start_ns} to {truth.end_ns} ns, but {where}")
+    outside = [
+        f"{what} from {begin} to {end} ns"
+        for what, begin, end in _parts(truth)
+        if begin < first or end > last
+    ]
+    if outside and not span.was_set_back:
+        raise SchemaError(f"{path}: {outside[0]}, but {where}")
+    return len(outside)
+
+
+def _parts(truth: Truth) -> Iterator[tuple[str, int, int]]:
+    """What each part of a truth is, its first and last moment."""
     for one in truth.approaches:
-        if one.start_ns < first or one.enter_ns > last:
-            raise SchemaError(
-                f"{path}: approach {one.id} from {one.start_ns} to {one.enter_ns} ns, but {where}"
-            )
+        yield f"approach {one.id}", one.start_ns, one.enter_ns
     for number, cue in enumerate(truth.cues):
         begin = cue.t_ns if cue.start_ns is None else cue.start_ns
         end = cue.t_ns if cue.end_ns is None else cue.end_ns
         assert begin is not None
         assert end is not None
-        if begin < first or end > last:
-            raise SchemaError(
-                f"{path}: cues.{number} ({cue.cue}) from {begin} to {end} ns, but {where}"
-            )
+        yield f"cues.{number} ({cue.cue})", begin, end
 
 
 def _check_overlap(what: str, t_ns: np.typing.NDArray[np.int64], truth: Truth, path: Path) -> None:

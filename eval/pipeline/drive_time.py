@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import TimeSegments
 from crosscue.replay.clocks.reports import Clock
 from crosscue.replay.columns import Topic
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor
@@ -82,6 +85,27 @@ def camera_timeline(
         planned = with_pictures(Plan((), {}), camera)
         selections = selections_of(logs, planned, selection)
         return scan(logs, planned, vehicle, selections, [{} for _ in logs])
+
+
+def refuse_other_segments(run: RunFolder, timeline: Timeline) -> None:
+    """Say that a run's frames carry other segments than its odometry has.
+
+    The vehicle file that detected may not have fitted the odometry, or have named other wheel
+    speeds.
+
+    Raises:
+        UsageError: Some frame's number differs.
+    """
+    for batch in run.batches("frames", ["t_ns", "segment"]):
+        t_ns, there = (batch[name].to_numpy() for name in ("t_ns", "segment"))
+        wanted = timeline.numbers(t_ns)
+        if (other := np.flatnonzero(wanted != there)).size:
+            at = int(other[0])
+            raise UsageError(
+                f"{run.path}: its frame at {t_ns[at]} ns is in segment {there[at]}, the odometry "
+                f"then in {wanted[at]}: its frames were detected with a vehicle file of other "
+                "odometry; estimate keeps their segments: run crosscue replay again"
+            )
 
 
 def whole_timeline(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> Timeline:

@@ -67,6 +67,7 @@ from .detect import DetectOutcome
 from .drive_time import (
     OnTime,
     drive_timeline,
+    refuse_other_segments,
     report_time,
     selections_of,
     time_segments,
@@ -150,6 +151,7 @@ def estimate_into(
     Raises:
         VehicleError: The vehicle file does not fit the logs.
         EmptyResultError: The part asked for holds nothing to estimate from.
+        UsageError: The frames of the detect stage are labelled with other segments.
         OutputError: The disk is full.
     """
     began = time.monotonic()
@@ -157,6 +159,8 @@ def estimate_into(
     kept = None if found is None else _camera_skips(run, found.camera)
     reading = _Reading(logs, vehicle, selection, landmarks, timeline, found)
     timeline = reading.timeline
+    if found is not None:
+        refuse_other_segments(run, timeline)
     stage = PoseStage(vehicle, turn_signal_of(reading.planned, vehicle), timeline=timeline)
     if reading.camera is not None and landmarks is not None:
         at = reading.camera[0]

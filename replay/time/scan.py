@@ -284,10 +284,14 @@ def _clocks(
             end_ns = max(other.last_ns[number - 1] + shift for other, shift in together)
             start_ns = min(other.first_ns[number] for other, _ in together)
             shifts[i].append(end_ns + gap_ns - start_ns)
-    return tuple(
-        LogClock(tuple(_epochs(one, of_log)), one.marks())
-        for one, of_log in zip(aligned, shifts, strict=True)
-    )
+    clocks = []
+    for i, (one, of_log) in enumerate(zip(aligned, shifts, strict=True)):
+        earlier = () if known is None else known.clock(i).epochs
+        # Other topics may have been examined then: the middle of a set-back lay elsewhere.
+        is_known = len(earlier) == len(of_log)
+        epochs = earlier if is_known else tuple(_epochs(one, of_log))
+        clocks.append(LogClock(epochs, one.marks()))
+    return tuple(clocks)
 
 
 def _is_same(one: _Aligned, other: _Aligned, number: int) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from crosscue.eval.runs.folder import clear, create, locked, write_manifest
 from crosscue.eval.runs.manifest import EstimateTimings
 from crosscue.eval.runs.tables.table_sink import TableSink
 from crosscue.replay.errors import LogFormatError
+from crosscue.replay.losses import LossWarning
 
 from .manifests import estimated, log_account
 
@@ -75,6 +77,8 @@ def _obey(word: str, log: Path) -> None:
     match word:
         case "damaged":
             raise LogFormatError(f"{log}: cut; copy it again")
+        case "warns":
+            warnings.warn(f"{log}: bytes 0 to 5 differ from the seal", LossWarning, stacklevel=1)
         case "bug":
             raise ZeroDivisionError("a\nbug")
         case "memory":

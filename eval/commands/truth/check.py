@@ -44,6 +44,8 @@ def _report(found: TruthFit) -> None:
     print(f"fits       {found.seconds:.1f} s of truth")
     print(f"holds      {found.approaches} approaches, {found.cues} statements about cues,")
     print(f"           {found.objects} objects, {found.ranges} ranges, {found.poses} poses")
+    if found.outside:
+        print(f"outside    {found.outside} of them reach beyond the log, whose clock was set back")
     if found.moments:
         print(f"moments    {found.moments_with_frame} of {found.moments} meet a picture of the log")
     if not found.is_checked_by_hash:

@@ -26,6 +26,7 @@ from crosscue.eval.batch.jobs import (
 )
 from crosscue.eval.batch.processes import Processes
 from crosscue.replay.errors import UsageError
+from crosscue.replay.losses import losses_heard
 from support.drive_work import Letters, letters, made_jobs
 from support.trees import tree
 
@@ -54,6 +55,20 @@ def test_one_failing_drive_does_not_stop_the_rest(tmp_path: Path) -> None:
     attempts = {word: done.attempts for word, done in zip(words, results, strict=True)}
     assert (attempts["dies once"], attempts["plain"]) == (2, 1)
     assert results[1].exit_status == 4
+    assert exit_status_of(results) == 3
+
+
+@pytest.mark.parametrize("engine", [in_turn, TWO])
+def test_losses_met_in_a_worker_are_warned_of_here(tmp_path: Path, engine: Engine) -> None:
+    jobs = made_jobs(tmp_path, ["plain", "warns"])
+
+    with losses_heard() as heard:
+        results = run_many(jobs, letters, engine)
+        again = run_many(jobs, letters, engine)
+
+    assert heard == [f"{jobs[1].logs[0]}: bytes 0 to 5 differ from the seal"]
+    assert [done.exit_status for done in results] == [0, 3]
+    assert [(done.exit_status, done.is_earlier) for done in again] == [(0, True), (3, True)]
     assert exit_status_of(results) == 3
 
 

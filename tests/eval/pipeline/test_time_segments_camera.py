@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 
 from crosscue.eval import cli
 from crosscue.eval.pipeline.estimate import Outcome
-from support.gap_drive import ROW, SECOND, Clock, distance_m, replay, write_drive
+from crosscue.eval.runs.folder import RunFolder
+from support.gap_drive import BEGIN, ROW, SECOND, Clock, distance_m, replay, write_drive
+from support.trees import tree
 
 LABELLED: Final = ("frames", "detections", "road", "cues", "range", "belief", "pose", "skipped")
 NEVER_S: Final = 1e6
@@ -142,3 +144,50 @@ def test_estimate_refuses_another_split_than_the_frames_carry(
     assert "run crosscue replay again" in said
     assert run.file("manifest.json").read_bytes() == before
     assert cli.run(["estimate", str(run.path), "--vehicle", str(tmp_path / "car.toml")]) == 3
+
+
+def _detected_without_odometry(folder: Path, clock: Clock) -> Path:
+    """Frames labelled with a vehicle file whose wheel speeds are not on the bus."""
+    log = write_drive(folder, clock)
+    wrong = folder / "wrong.toml"
+    wrong.write_text((folder / "car.toml").read_text().replace('"WHEEL_SPEEDS.', '"WHEELS.'))
+    argv = ["detect", str(log), "--vehicle", str(wrong), "-o", str(folder / "run"), "--no-cache"]
+    assert cli.run(argv) == 0
+    return folder / "run"
+
+
+def test_estimate_refuses_frames_that_were_split_without_odometry(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = _detected_without_odometry(tmp_path, Clock(pause_s=(5.0, 8.0)))
+    before = tree(run)
+    capsys.readouterr()
+
+    assert cli.run(["estimate", str(run), "--vehicle", str(tmp_path / "car.toml")]) == 2
+
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    first_ns = BEGIN + 80 * ROW
+    assert f"its frame at {first_ns} ns is in segment 0, the odometry then in 1" in said
+    assert "run crosscue replay again" in said
+    assert tree(run) == before
+
+
+def test_estimate_takes_frames_of_a_drive_without_gaps(tmp_path: Path) -> None:
+    run = _detected_without_odometry(tmp_path, Clock())
+
+    assert cli.run(["estimate", str(run), "--vehicle", str(tmp_path / "car.toml")]) == 0
+
+
+@pytest.mark.parametrize("by_s", [3.0, -3.0])
+def test_estimate_keeps_the_segments_of_frames_detected_alone(tmp_path: Path, by_s: float) -> None:
+    log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=by_s))
+    car, run = str(tmp_path / "car.toml"), tmp_path / "run"
+
+    assert cli.run(["detect", str(log), "--vehicle", car, "-o", str(run), "--no-cache"]) == 3
+    detected = RunFolder(run).table("frames")
+    assert cli.run(["estimate", str(run), "--vehicle", car]) == 3
+
+    assert set(detected["segment"].to_pylist()) == {0, 1}
+    assert RunFolder(run).table("frames").equals(detected)
+    assert set(RunFolder(run).table("pose")["segment"].to_pylist()) == {0, 1}

@@ -1,0 +1,60 @@
+"""``truth check`` and ``score`` hold a truth to the same rule where a log's clock was set back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from crosscue.eval import cli
+from support.gap_drive import SECOND, Clock, replayed, write_drive
+
+NEVER_S = 1e6
+
+
+def _checked(folder: Path, log: Path) -> int:
+    return cli.run(["truth", "check", str(folder / "truth.json"), "--log", str(log)])
+
+
+def _scored(folder: Path, log: Path) -> int:
+    run = replayed(folder, log)
+    return cli.run(["score", str(run.path), "--truth", str(folder / "truth.json")])
+
+
+@pytest.mark.parametrize("by_s", [-7.0, -3600.0])
+def test_truth_of_a_log_that_was_set_back_fits(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], by_s: float
+) -> None:
+    log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=by_s))
+
+    assert _checked(tmp_path, log) == 0
+    # The approach and its stop sign end at 11.6 s, the log's own clock at 6 or 7.
+    assert "outside    2 of them reach beyond the log" in capsys.readouterr().out
+    assert _scored(tmp_path, log) == 0
+
+
+def test_truth_that_outlasts_a_log_of_one_clock_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = write_drive(tmp_path, Clock(pause_s=(6.0, NEVER_S)))
+
+    assert _checked(tmp_path, log) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "approach 0 from" in said
+    assert "give the truth of this log" in said
+
+
+def test_truth_of_another_time_is_refused_by_both(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=-7.0))
+    truth = json.loads((tmp_path / "truth.json").read_text())
+    for part in (truth, *truth["approaches"], *truth["cues"]):
+        for name in part.keys() & {"start_ns", "end_ns", "enter_ns"}:
+            part[name] += 1000 * SECOND
+    (tmp_path / "truth.json").write_text(json.dumps(truth))
+
+    assert _checked(tmp_path, log) == _scored(tmp_path, log) == 1
+    assert capsys.readouterr().err.count("\n") == 2
