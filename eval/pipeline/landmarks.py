@@ -76,6 +76,9 @@ class NoLandmarks(NoLooks):
         """None at any time."""
         return [None] * len(t_ns)
 
+    def cross_gap(self) -> None:
+        """Nothing is remembered."""
+
     def let_go(self, before_ns: int) -> None:
         """Nothing is held."""
 
@@ -134,6 +137,10 @@ class LandmarkStage:
             if sighting.outcome == ACCEPTED:
                 self.names[sighting.t_ns] = sighting.name
         return found
+
+    def cross_gap(self) -> None:
+        """What was in view before a gap in time says nothing of where the car is after it."""
+        self.search.cross_gap()
 
     def take_sightings(self) -> list[Sighting]:
         """The sightings since the last call."""

@@ -159,6 +159,7 @@ class PoseStage:
         )
         self._state = replace(self._state, belief=crossed.belief, counted_ns=None)
         self._measured.append(gap_rows(before_ns, crossed))
+        self.landmarks.cross_gap()
         self._gap = None
 
     def take_measured(self) -> list[dict[str, object]]:

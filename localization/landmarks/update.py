@@ -253,6 +253,10 @@ class LandmarkSearch:
         passed = self._passed(best, belief, travelled_m)
         return None if passed is None else self._weigh(belief, travelled_m, passed)
 
+    def cross_gap(self) -> None:
+        """Forget the landmark in view: nobody measured how far it has been left behind."""
+        self._peak = None
+
     def take_sightings(self) -> list[Sighting]:
         """The sightings since the last call."""
         taken, self.sightings = self.sightings, []

@@ -107,6 +107,7 @@ def write_drive(
     seconds: int = 14,
     rows_a_block: int = 7,
     name: str = "drive.mcap",
+    topics: Sequence[Topic] = (BUS, CAMERA),
 ) -> Path:
     """Write log, vehicle file and truth; the log's path comes back."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -114,12 +115,14 @@ def write_drive(
     true_ns = np.arange(seconds * 10) * ROW + BEGIN
     rows, stamps = clock.recorded(true_ns)
     with LogWriter(log, Ledger(str(log)), overwrite=True) as writer:
-        for topic in (BUS, CAMERA):
+        for topic in topics:
             writer.add_topic(topic)
         for part in np.array_split(np.arange(len(rows)), max(len(rows) // rows_a_block, 1)):
             at = stamps[part]
-            writer.write(Block(BUS.name, at, _wheels(len(at))))
-            writer.write(Block(CAMERA.name, at, _pictures(rows[part])))
+            if BUS in topics:
+                writer.write(Block(BUS.name, at, _wheels(len(at))))
+            if CAMERA in topics:
+                writer.write(Block(CAMERA.name, at, _pictures(rows[part])))
     shutil.copyfile(dbc_path(), folder / "simulated_car.dbc")
     (folder / "car.toml").write_text(VEHICLE, encoding="utf-8")
     _write_truth(folder, true_ns)

@@ -1,0 +1,262 @@
+"""Every stage and command across a gap: two logs, parts of a log, landmarks, smoother, batches."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pytest
+
+from crosscue.eval import cli
+from crosscue.eval.pipeline.detect import choices_of
+from crosscue.eval.pipeline.estimate import Outcome
+from crosscue.eval.pipeline.replay import Detecting, replay_drive
+from crosscue.eval.runs.folder import RunFolder, create
+from crosscue.eval.scoring.pose.smoother import score_smoother
+from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
+from crosscue.replay.columns import Floats
+from crosscue.replay.log import EVERYTHING
+from crosscue.replay.opening import open_log
+from crosscue.replay.vehicle.vehicle import load
+from support.gap_drive import (
+    BEGIN,
+    BUS,
+    CAMERA,
+    ROW,
+    SECOND,
+    SPEED_MPS,
+    START_M,
+    Clock,
+    replayed,
+    write_drive,
+)
+from support.gap_landmarks import STEP_M, PlaceByNumber
+from support.landmark_drive import there
+
+PAUSE: Final = Clock(pause_s=(4.0, 10.0))
+"""Longer than ``time.restart_after_s``: the pose stays where the car was last seen."""
+MATCHER: Final = "support.gap_landmarks:matcher"
+
+
+def _two_logs(folder: Path, wheels: Clock, camera: Clock, run: str) -> Outcome:
+    """Wheels in one log, pictures in another, each with a clock of its own."""
+    paths = [
+        write_drive(folder, wheels, name=f"{run}_bus.mcap", topics=[BUS]),
+        write_drive(folder, camera, name=f"{run}_camera.mcap", topics=[CAMERA]),
+    ]
+    vehicle = load(folder / "car.toml")
+    detecting = Detecting(tuple(choices_of(vehicle).values()), cache=folder / "cache.sqlite")
+    with ExitStack() as stack:
+        logs = [stack.enter_context(open_log(path)) for path in paths]
+        into = create(folder / run, overwrite=True)
+        return replay_drive(logs, vehicle, into, EVERYTHING, detecting=detecting)
+
+
+def _column(run: RunFolder, name: str, column: str) -> np.typing.NDArray[np.float64]:
+    return np.asarray(run.table(name)[column].to_numpy())
+
+
+def test_a_camera_log_set_back_alone_leaves_the_wheels_as_they_are(tmp_path: Path) -> None:
+    straight = _two_logs(tmp_path, Clock(), Clock(), "straight")
+    camera = Clock(set_at_s=6.0, by_s=-3.0)
+
+    whole = _two_logs(tmp_path, Clock(), camera, "whole")
+
+    assert (straight.exit_status, len(straight.segments)) == (0, 1)
+    assert (whole.exit_status, len(whole.segments)) == (3, 2)
+    assert whole.travelled_m == straight.travelled_m
+    for column in ("t_ns", "log_t_ns", "x_m", "travelled_m"):
+        np.testing.assert_array_equal(
+            _column(whole.run, "pose", column), _column(straight.run, "pose", column)
+        )
+    frames = whole.run.table("frames")
+    true_ns = np.arange(140) * ROW + BEGIN
+    assert frames["log_t_ns"].to_pylist() == camera.recorded(true_ns)[1].tolist()
+    assert np.all(np.diff(frames["t_ns"].to_numpy()) > 0)
+    assert frames["segment"].to_pylist() == [0] * 60 + [1] * 80
+
+
+def test_a_wheel_log_that_jumps_alone_is_a_gap_and_no_distance(tmp_path: Path) -> None:
+    straight = _two_logs(tmp_path, Clock(), Clock(), "straight")
+
+    whole = _two_logs(tmp_path, Clock(set_at_s=6.0, by_s=3.0), Clock(), "whole")
+
+    assert (whole.exit_status, len(whole.segments)) == (3, 2)
+    assert whole.segments[1].gap_ns == 3 * SECOND + ROW
+    assert whole.travelled_m == pytest.approx(straight.travelled_m - STEP_M, abs=1e-6)
+    frames = whole.run.table("frames")
+    assert frames["t_ns"].equals(frames["log_t_ns"])
+    assert frames["t_ns"].to_pylist() == straight.run.table("frames")["t_ns"].to_pylist()
+    # The odometry's second half begins at 9 s; pictures up to a second before are of it.
+    assert frames["segment"].to_pylist() == [0] * 80 + [1] * 60
+
+
+def _replayed_part(folder: Path, log: Path, run: str, *part: str) -> tuple[int, RunFolder]:
+    argv = ["replay", str(log), "--vehicle", str(folder / "car.toml"), "-o", str(folder / run)]
+    return cli.run([*argv, "--no-cache", *part]), RunFolder(folder / run)
+
+
+@pytest.mark.parametrize(
+    ("part", "status", "rows", "way_m"),
+    [
+        (("--from", "3", "--to", "11"), 3, [20, 30], (19 + 29) * STEP_M),
+        (("--from", "3", "--to", "6.5"), 0, [20], 19 * STEP_M),
+        (("--from", "6"), 0, [60], 59 * STEP_M),
+    ],
+)
+def test_a_part_of_a_log_has_the_gaps_within_it(
+    tmp_path: Path, part: tuple[str, ...], status: int, rows: list[int], way_m: float
+) -> None:
+    log = write_drive(tmp_path, Clock(pause_s=(5.0, 8.0)))
+
+    ended, run = _replayed_part(tmp_path, log, "run", *part)
+
+    assert ended == status
+    numbers = run.table("frames")["segment"].to_pylist()
+    assert [numbers.count(n) for n in sorted(set(numbers))] == rows
+    assert _column(run, "pose", "travelled_m")[-1] == pytest.approx(way_m, abs=0.01)
+
+
+def test_a_moment_that_comes_twice_is_read_twice(tmp_path: Path) -> None:
+    log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=-3.0))
+
+    # From the log's first message; 3 s to 6 s come twice.
+    ended, run = _replayed_part(tmp_path, log, "run", "--from", "4", "--to", "5")
+
+    assert ended == 3
+    frames = run.table("frames")
+    seconds = [(t_ns - BEGIN) / SECOND for t_ns in frames["log_t_ns"].to_pylist()]
+    once = [4 + tenth / 10 for tenth in range(10)]
+    assert seconds == pytest.approx([*once, *once])
+    assert frames["segment"].to_pylist() == [0] * 10 + [1] * 10
+    assert _column(run, "pose", "travelled_m")[-1] == pytest.approx(18 * STEP_M, abs=0.01)
+
+
+def test_detect_alone_says_segments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, out = write_drive(tmp_path, Clock(pause_s=(5.0, 8.0))), tmp_path / "run"
+    argv = ["detect", str(log), "--vehicle", str(tmp_path / "car.toml"), "-o", str(out)]
+
+    assert cli.run([*argv, "--no-cache"]) == 3
+
+    assert "1 gap without odometry, 3.1 s in all" in capsys.readouterr().out
+    for name in ("frames", "detections", "cues"):
+        table = RunFolder(out).table(name)
+        is_after = table["log_t_ns"].to_numpy() >= BEGIN + 8 * SECOND
+        assert table["segment"].to_pylist() == is_after.astype(int).tolist()
+        assert 0 < is_after.sum() < len(is_after)
+
+
+def test_merge_keeps_the_segments_of_each_drive(tmp_path: Path) -> None:
+    runs = []
+    for name, clock in (("gap", Clock(pause_s=(5.0, 8.0))), ("whole", Clock())):
+        log = write_drive(tmp_path, clock, name=f"{name}.mcap")
+        runs.append(replayed(tmp_path, log, f"runs/{name}"))
+
+    assert cli.run(["merge", str(tmp_path / "runs"), "-o", str(tmp_path / "merged")]) in (0, 3)
+
+    for name in ("frames", "cues", "range", "belief", "pose"):
+        merged = RunFolder(tmp_path / "merged").table(name).to_pylist()
+        for run in runs:
+            mine = [row for row in merged if row["drive"].startswith(run.path.name)]
+            assert [{key: row[key] for key in row if key != "drive"} for row in mine] == (
+                run.table(name).to_pylist()
+            )
+    assert {row["segment"] for row in merged} == {0, 1}
+
+
+def test_compare_names_the_rows_whose_segment_differs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    jumped = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=3.0))
+    gap = replayed(tmp_path, jumped, "gap").path
+    whole = replayed(tmp_path, write_drive(tmp_path, Clock(), name="whole.mcap"), "whole").path
+    capsys.readouterr()
+
+    changed = []
+    for before, status in ((gap, 0), (whole, 1)):
+        assert cli.run(["compare", str(before), str(gap), "--json"]) == status
+        tables = json.loads(capsys.readouterr().out)["tables"]
+        changed.append({one["name"]: sorted(one["columns"]) for one in tables})
+
+    assert changed[0] == {}
+    assert {"log_t_ns", "segment", "t_ns"} <= set(changed[1]["frames"])
+
+
+def _with_landmarks(folder: Path, clock: Clock) -> Outcome:
+    """Past a landmark every 4 m, each picture knowing where it was taken."""
+    log = write_drive(folder, clock)
+    with (folder / "car.toml").open("a") as file:
+        file.write(f'[landmarks]\nmatcher = "{MATCHER}"\nrevisit_m = 10.0\n')
+    path = folder / "marks.sqlite"
+    with LandmarkWriter(path, PlaceByNumber.kind) as writer:
+        for x_m in np.arange(2.0, 90.0, 4.0):
+            xy = np.array([x_m, 0.0])
+            writer.add(Place(f"{x_m:g}", xy, 0.25 * np.eye(2), 0.0), there(xy))
+    vehicle = load(folder / "car.toml")
+    with open_log(log) as opened, LandmarkDatabase(path) as database:
+        into = create(folder / "run", overwrite=True)
+        return replay_drive([opened], vehicle, into, EVERYTHING, landmarks=database)
+
+
+def _off_m(run: RunFolder) -> Floats:
+    """How far each pose is from the true one; only for clocks that were not set."""
+    true_m = SPEED_MPS * (_column(run, "pose", "log_t_ns") - BEGIN) / SECOND
+    off_m: Floats = np.hypot(_column(run, "pose", "x_m") - true_m, _column(run, "pose", "y_m"))
+    return off_m
+
+
+@pytest.fixture(scope="module")
+def marked(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    return _with_landmarks(tmp_path_factory.mktemp("marked"), PAUSE)
+
+
+def test_landmarks_find_the_car_again_after_a_gap(marked: Outcome, tmp_path: Path) -> None:
+    without = replayed(tmp_path, write_drive(tmp_path, PAUSE))
+
+    after = _column(marked.run, "pose", "segment") == 1
+    names = marked.run.table("pose")["landmark"].to_pylist()
+    later = [name for name, is_after in zip(names, after, strict=True) if is_after and name]
+
+    assert marked.exit_status == 3
+    assert _off_m(without)[-1] > 30.0
+    assert later
+    assert all(float(name) > START_M - 15.0 for name in later)
+    assert _off_m(marked.run)[-1] < 2.0
+    # The way from pose to pose is measured motion; what a landmark moves the pose is none.
+    assert _column(marked.run, "pose", "travelled_m")[-1] == pytest.approx(
+        _column(without, "pose", "travelled_m")[-1], abs=1e-6
+    )
+
+
+def test_the_pose_filter_grows_by_what_a_car_could_have_done(tmp_path: Path) -> None:
+    run = replayed(tmp_path, write_drive(tmp_path, Clock(pause_s=(4.0, 7.0))))
+    last, first = (
+        int(np.flatnonzero(_column(run, "pose", "segment") == n)[-1 + n]) for n in (0, 1)
+    )
+    pose = {name: _column(run, "pose", name)[[last, first]] for name in ("t_ns", "travelled_m")}
+    x_m, var_m2 = (_column(run, "pose", name)[[last, first]] for name in ("x_m", "cov_xx_m2"))
+    gap_s = float(np.diff(pose["t_ns"])[0]) * 1e-9
+    limits = load(tmp_path / "car.toml").time
+
+    # As docs/explanation/time_segments.md says: speeding up or braking all the while, or turning.
+    off_m = 0.5 * limits.max_accel_mps2 * gap_s**2
+    off_m += 0.5 * SPEED_MPS * gap_s * limits.max_turn_rate_radps * gap_s
+    off_m = min(off_m, SPEED_MPS * gap_s + 0.5 * limits.max_accel_mps2 * gap_s**2)
+    assert gap_s > 3.0
+    assert float(np.diff(x_m)[0]) == pytest.approx(SPEED_MPS * gap_s, abs=0.2)
+    assert float(np.diff(var_m2)[0]) == pytest.approx(off_m**2 / 4.0, rel=0.1)
+    assert float(np.diff(pose["travelled_m"])[0]) <= STEP_M + 1e-6
+
+
+def test_the_smoother_crosses_a_gap(marked: Outcome) -> None:
+    pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
+
+    score = score_smoother(marked.run, marked.run.path.parent / "truth.json")
+
+    assert score.poses == 14
+    # It knows afterwards where the car came out.
+    assert score.smoother_rmse_m < score.filter_rmse_m
+    assert score.smoother_end_m < 2.0
