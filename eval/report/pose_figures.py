@@ -146,7 +146,8 @@ def _nees(axes: Axes, poses: ScoredPoses) -> None:
 
 
 def _major_axis(axes: Axes, poses: ScoredPoses) -> None:
-    axes.plot(poses.travelled_m, poses.major_axis_m, color=ESTIMATE, lw=1.4)
+    columns = _broken(poses, poses.travelled_m, poses.major_axis_m)
+    axes.plot(*columns, color=ESTIMATE, lw=1.4)
     axes.axhline(poses.lost_above_m, color="0.3", ls="--", lw=1.0)
     axes.annotate(
         "lost above this",

@@ -103,6 +103,8 @@ def test_the_report_shades_each_gap_with_its_length(
     for axes in over_time:
         assert [text.get_text() for text in axes.texts] == ["gap of 2.2 s"]
         assert np.isnan(np.asarray(axes.lines[0].get_xdata(), np.float64)).sum() == 1
+    (by_way,) = [f.axes[0] for f in figures if "travelled" in f.axes[0].get_xlabel()]
+    assert np.isnan(np.asarray(by_way.lines[0].get_ydata(), np.float64)).sum() == 1
 
 
 def test_a_long_gap_does_not_squeeze_the_rest() -> None:
