@@ -140,14 +140,23 @@ class CanFrames:
         """The frames picked by ``index``."""
         if isinstance(index, np.ndarray) and index.dtype == np.bool_:
             index = np.flatnonzero(index)
-        # Rows of a payload are picked fifteen times faster by ``take`` than by an index.
-        data = self.data[index] if isinstance(index, slice) else self.data.take(index, axis=0)
+        if not isinstance(index, slice):
+            # Faster than an index: for rows of a payload fifteen times.
+            return CanFrames(
+                self.arbitration_id.take(index),
+                self.is_extended.take(index),
+                self.kind.take(index),
+                self.length.take(index),
+                self.data.take(index, axis=0),
+                self.is_fd.take(index),
+                None if self.is_tx is None else self.is_tx.take(index),
+            )
         return CanFrames(
             self.arbitration_id[index],
             self.is_extended[index],
             self.kind[index],
             self.length[index],
-            data,
+            self.data[index],
             self.is_fd[index],
             None if self.is_tx is None else self.is_tx[index],
         )

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import difflib
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -17,6 +17,7 @@ from crosscue.replay.errors import LogTooLargeError, SchemaError, one_line
 from crosscue.replay.limits import DEFAULT, Limits
 
 from .dbc_text import read_dbc
+from .extract import Extractor
 from .layout import CanMessage, CanSignal, layout_problem, overlaps
 from .layout_cache import LayoutEntry, cache_folder
 from .sources import DatabaseText, doubts, read_text, refuse_bombs
@@ -63,6 +64,9 @@ class CanDatabase:
     messages: tuple[CanMessage, ...]
     notices: tuple[str, ...] = ()
     conflicts: tuple[Conflict, ...] = ()
+    _extractors: dict[tuple[int, bool, frozenset[str] | None], Extractor] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @classmethod
     def load(
@@ -126,6 +130,19 @@ class CanDatabase:
         """The message with this identifier; 11-bit and 29-bit ones are never mixed up."""
         wanted = (arbitration_id, is_extended)
         return next((m for m in self.messages if m.key == wanted), None)
+
+    def extractor(self, message: CanMessage, wanted: Collection[str] | None = None) -> Extractor:
+        """What takes signals out of a message of this database; planned once for all logs.
+
+        Args:
+            message: One of ``messages``, without ``problem``.
+            wanted: Names of the signals to give, or None for all.
+        """
+        key = (*message.key, None if wanted is None else frozenset(wanted))
+        found = self._extractors.get(key)
+        if found is None:
+            found = self._extractors.setdefault(key, Extractor(message, wanted))
+        return found
 
     def named(self, name: str) -> CanMessage:
         """The message called ``name``, or with that ``topic_name``.

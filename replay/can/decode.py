@@ -126,7 +126,7 @@ class BusDecoder:
         self._frames_seen = 0
         self.counts: dict[CountKey, int] = {}
         chosen = _chosen(database, wanted)
-        entries = [_entry(message, chosen) for message in database.messages]
+        entries = [_entry(database, message, chosen) for message in database.messages]
         # The engines want the messages that are decoded first.
         self._entries = tuple(sorted(entries, key=lambda entry: bool(entry.refusal)))
         self._refused = np.array([False, *(bool(entry.refusal) for entry in self._entries)])
@@ -269,9 +269,9 @@ class _Times:
     """The times of a block in another order, and blocks made of runs of it."""
 
     def __init__(self, block: Block, order: NDArray[np.intp]) -> None:
-        self._log = block.log_ns[order]
-        self._publish = None if block.publish_ns is None else block.publish_ns[order]
-        self._header = None if block.header_ns is None else block.header_ns[order]
+        self._log = block.log_ns.take(order)
+        self._publish = None if block.publish_ns is None else block.publish_ns.take(order)
+        self._header = None if block.header_ns is None else block.header_ns.take(order)
 
     def block(
         self,
@@ -309,12 +309,13 @@ def _chosen(database: CanDatabase, wanted: Wanted | None) -> _Chosen | None:
     return chosen
 
 
-def _entry(message: CanMessage, chosen: _Chosen | None) -> _Entry:
+def _entry(database: CanDatabase, message: CanMessage, chosen: _Chosen | None) -> _Entry:
     if chosen is not None and message.key not in chosen:
         return _Entry(message, None, NOT_ASKED_TOPIC)
     if message.problem:
         return _Entry(message, None, message.problem)
-    return _Entry(message, Extractor(message, None if chosen is None else chosen[message.key]), "")
+    wanted = None if chosen is None else chosen[message.key]
+    return _Entry(message, database.extractor(message, wanted), "")
 
 
 def _rules(entry: _Entry, settings: DecodeSettings) -> Rules:

@@ -49,7 +49,7 @@ class NumpyEngine:
     def _sort(self, number: NDArray[np.uint16]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """All frames in order of ``number``, and where each number ends."""
         order = np.argsort(number, kind="stable")  # a radix sort on 16 bits
-        return order, np.searchsorted(number[order], self._numbers, side="right")
+        return order, np.searchsorted(number.take(order), self._numbers, side="right")
 
     def _all_fit(self, frames: CanFrames, order: NDArray[np.intp], stops: NDArray[np.intp]) -> bool:
         """Whether every frame of a decodable message fits: the usual case, told from extremes."""
@@ -59,7 +59,7 @@ class NumpyEngine:
         groups = np.flatnonzero(np.diff(ends))
         if not len(groups):
             return True
-        lengths = frames.length[order[: ends[-1]]]
+        lengths = frames.length.take(order[: ends[-1]])
         least = np.minimum.reduceat(lengths, ends[groups])
         most = np.maximum.reduceat(lengths, ends[groups])
         fits = self._tables.fits[frames.data.shape[1]][0, groups + 1]

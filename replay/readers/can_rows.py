@@ -178,18 +178,21 @@ def blocks_by_bus(
         is_here = rows.bus == bus
         if not bool(is_here.any()):
             continue
-        here = rows if bool(is_here.all()) else rows.take(is_here)
-        ledger.find(name, len(here))
+        log_ns, frames = rows.log_ns, rows.frames
+        if not bool(is_here.all()):
+            at = np.flatnonzero(is_here)
+            log_ns, frames = log_ns.take(at), frames.take(at)
+        ledger.find(name, len(log_ns))
         if not selection.wants(name):
-            ledger.skip(name, NOT_ASKED_TOPIC, len(here))
+            ledger.skip(name, NOT_ASKED_TOPIC, len(log_ns))
             continue
-        inside = in_time(here.log_ns, selection)
+        inside = in_time(log_ns, selection)
         if inside is not None:
-            ledger.skip(name, NOT_ASKED_TIME, len(here) - int(np.count_nonzero(inside)))
-            here = here.take(inside)
-        for k in range(0, len(here), BLOCK_ROWS):
-            part = here.take(slice(k, k + BLOCK_ROWS))
-            yield Block(name, part.log_ns, narrowed(part.frames))
+            ledger.skip(name, NOT_ASKED_TIME, len(log_ns) - int(np.count_nonzero(inside)))
+            log_ns, frames = log_ns[inside], frames.take(inside)
+        for k in range(0, len(log_ns), BLOCK_ROWS):
+            part = slice(k, k + BLOCK_ROWS)
+            yield Block(name, log_ns[part], narrowed(frames.take(part)))
 
 
 def in_time(log_ns: Int64s, selection: Selection) -> NDArray[np.bool_] | None:

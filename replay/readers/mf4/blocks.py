@@ -22,6 +22,8 @@ _BLOCK_MAX: Final = 1 << 20
 _TEXT_MAX: Final = 1 << 16
 _CHAIN_MAX: Final = 200_000
 """Most blocks in one chain of links; a longer one runs in a circle."""
+_WINDOW: Final = 1 << 16
+"""Loggers write the blocks that describe a file close together; they are read at once."""
 _TX: Final = re.compile(rb"<TX[^>]*>(.*?)</TX>", re.DOTALL)
 _DATA: Final = (b"##DT", b"##SD", b"##RD")
 
@@ -181,6 +183,8 @@ class Blocks:
         """
         self._file, self.size, self._limits, self._note = file, size, limits, note
         self._linked: set[int] = set()
+        self._window, self._window_at = b"", 0
+        self._texts: dict[int, str] = {}
 
     def header(self, path: str) -> Header:
         """Read identification and header.
@@ -232,20 +236,22 @@ class Blocks:
         if not is_sound or length > _BLOCK_MAX or at + length > self.size:
             raise BrokenBlockError(f"{kind.decode()} at byte {at} has impossible sizes")
         self._note(at, length)
-        raw = self._file.read(length - HEAD_BYTES)
+        raw = self._near(at + HEAD_BYTES, length - HEAD_BYTES)
         found_links: tuple[int, ...] = struct.unpack_from(f"<{count}Q", raw)
         self._linked.update(found_links)
         return RawBlock(found_links, raw[8 * count :])
 
-    def data_groups(self, first: int) -> Iterator[DataGroup]:
-        """All data groups.
+    def data_groups(self, first: int, unfinished: int) -> Iterator[DataGroup]:
+        """All data groups; channels of groups that are known to hold nothing are not read.
 
         Raises:
             BrokenBlockError: The chain is damaged from here on.
         """
         for block in self._chain(first, b"##DG", 4, 1):
+            may_hold = bool(unfinished) or self._has_data(block.links[2])
             groups = tuple(
-                self._group(one, at) for at, one in self._chain_at(block.links[1], b"##CG", 6, 32)
+                self._group(one, at, may_hold)
+                for at, one in self._chain_at(block.links[1], b"##CG", 6, 32)
             )
             yield DataGroup(block.body[0], block.links[2], groups)
 
@@ -331,7 +337,7 @@ class Blocks:
 
     def _compressed(self, at: int, start: int) -> Stretch:
         _, length, _ = self._head(at)
-        head = self._file.read(24)
+        head = self._near(at + HEAD_BYTES, 24)
         if len(head) < 24:
             raise BrokenBlockError(f"compressed block at byte {at} is cut by the file's end")
         method, parameter, original, stored = struct.unpack_from("<2xBxLQQ", head)
@@ -348,9 +354,17 @@ class Blocks:
     def _head(self, at: int) -> tuple[bytes, int, int]:
         if at % 2 or at + HEAD_BYTES > self.size:
             raise BrokenBlockError(f"a link leads to byte {at}, outside the file")
-        self._file.seek(at)
-        kind, length, count = _HEAD.unpack(self._file.read(HEAD_BYTES))
+        kind, length, count = _HEAD.unpack(self._near(at, HEAD_BYTES))
         return kind, length, count
+
+    def _near(self, at: int, count: int) -> bytes:
+        """Bytes of the file, kept for the next block: those that describe a file lie together."""
+        start = at - self._window_at
+        if start < 0 or start + count > len(self._window):
+            start = at % _WINDOW
+            self._window_at = self._file.seek(at - start)
+            self._window = self._file.read(max(start + count, _WINDOW))
+        return self._window[start : start + count]
 
     def _chain(self, at: int, kind: bytes, links: int, body: int) -> Iterator[RawBlock]:
         for _, block in self._chain_at(at, kind, links, body):
@@ -368,14 +382,25 @@ class Blocks:
             yield at, block
             at = block.links[0]
 
-    def _group(self, block: RawBlock, at: int) -> Group:
+    def _has_data(self, link: int) -> bool:
+        """Loggers declare kinds of frames that never come; their data blocks are empty."""
+        if not link:
+            return False
+        try:
+            kind, length, _ = self._head(link)
+        except BrokenBlockError:
+            return True  # whoever reads the data says so
+        return kind not in _DATA or length != HEAD_BYTES
+
+    def _group(self, block: RawBlock, at: int, may_hold: bool) -> Group:
         record_id, records, flags, _, value_bytes, invalid_bytes = struct.unpack_from(
             "<QQHH4xLL", block.body
         )
         if value_bytes + invalid_bytes > self._limits.message_bytes:
             raise BrokenBlockError(f"##CG at byte {at} declares records of {value_bytes} bytes")
         name = self._text(block.links[2]) or self._source(block.links[3])
-        channels = tuple(self._channels(block.links[1], depth=0))
+        is_needed = may_hold or records or not value_bytes
+        channels = tuple(self._channels(block.links[1], depth=0)) if is_needed else ()
         return Group(name, record_id, records, flags, value_bytes, invalid_bytes, channels, at)
 
     def _channels(self, first: int, depth: int) -> Iterator[Channel]:
@@ -424,11 +449,16 @@ class Blocks:
         """A text block, or the text inside an XML one; nothing in it is parsed as XML."""
         if not at:
             return ""
+        if at not in self._texts:
+            self._texts[at] = self._read_text(at)
+        return self._texts[at]
+
+    def _read_text(self, at: int) -> str:
         kind, length, count = self._head(at)
         if kind not in (b"##TX", b"##MD") or length < HEAD_BYTES or count:
             raise BrokenBlockError(f"no text block at byte {at}: {kind!r}")
         self._note(at, min(length, _TEXT_MAX))
-        raw = self._file.read(min(length - HEAD_BYTES, _TEXT_MAX)).split(b"\0", 1)[0]
+        raw = self._near(at + HEAD_BYTES, min(length - HEAD_BYTES, _TEXT_MAX)).split(b"\0", 1)[0]
         if kind == b"##MD":
             found = _TX.search(raw)
             raw = found[1] if found else b""

@@ -120,9 +120,10 @@ class CanLayout:
             is_extended = ((identifier >> 31) & 1 != 0) | is_long
         ok = is_extended | ~is_long | np.bool_(self._kind == ERROR)
         count = len(words)
-        length, is_fd = np.zeros(count, np.int64), np.zeros(count, np.bool_)
-        payload, whole = np.zeros((count, _CLASSIC), np.uint8), np.ones(count, np.bool_)
-        if self._kind == DATA:
+        if self._kind != DATA:
+            length, is_fd = np.zeros(count, np.int64), np.zeros(count, np.bool_)
+            payload, whole = np.zeros((count, _CLASSIC), np.uint8), np.ones(count, np.bool_)
+        else:
             length, is_fd = self._lengths(words)
             if count and (length.min() < 0 or length.max() > _CLASSIC):
                 is_fd_length = IS_FD_LENGTH[np.clip(length, 0, _FD)]
@@ -206,7 +207,7 @@ class CanLayout:
             if channel.bit_count <= 8:
                 # Few values are possible: each is converted once.
                 table = _whole(physical(conversion, np.arange(1 << channel.bit_count)))
-                return table[bits]
+                return table.take(bits.view(np.int64))
         values = raw(channel, words)
         return _whole(physical(conversion, values) if is_applied(conversion) else values)
 
@@ -244,6 +245,7 @@ def _cut(payload: Bytes, length: Int64s) -> Bytes:
     if bool((length == width).all()):
         return payload
     if width == _CLASSIC:
-        words = payload.view(np.uint64)[:, 0] & _MASK[length].astype(np.uint64)
+        words: NDArray[np.uint64] = _MASK.take(length)
+        words &= payload.view(np.uint64)[:, 0]
         return words.view(np.uint8).reshape(-1, _CLASSIC)
     return np.where(np.arange(width) < length[:, None], payload, np.uint8(0))

@@ -60,8 +60,6 @@ _NAMES_SHOWN: Final = 5
 _PEEK_ROWS: Final = 4096
 _CHUNK_BYTES: Final = 1 << 16
 """Bytes of records that are read or left out together when a span of time is asked for."""
-_BUFFER_BYTES: Final = 1 << 16
-"""Loggers write the blocks that describe a file close together; they are read at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,7 +130,7 @@ class Mf4Log(Closing):
         self._path, self._limits = path, limits
         keep_memory()
         self.touched: Final = Touched()
-        self._file = path.open("rb", buffering=_BUFFER_BYTES)
+        self._file = path.open("rb")
         note = partial(self.touched.add, path)
         self._blocks = Blocks(self._file, path.stat().st_size, limits, note)
         self._buses: dict[str, int] = {}
@@ -407,7 +405,9 @@ class Mf4Log(Closing):
     def _times(self, source: _Source, words: Words) -> Int64s | None:
         assert source.master is not None
         since = times_ns(source.master, raw(source.master, words))
-        return None if since is None else since + self._header.start_ns
+        if since is not None:
+            since += self._header.start_ns
+        return since
 
     def _frames(
         self, stored: _Stored, source: _Source, records: Records, ledger: Ledger
@@ -437,7 +437,9 @@ class Mf4Log(Closing):
         if low == high:
             channels, codes = rows.bus[:1], None
         elif low >= 0 and high < BUSES_MAX:
-            channels, codes = np.flatnonzero(np.bincount(rows.bus)), None
+            is_there = np.zeros(BUSES_MAX, np.bool_)
+            is_there[rows.bus] = True
+            channels, codes = np.flatnonzero(is_there), None
         else:
             channels, codes = np.unique(rows.bus, return_inverse=True)
         numbers = np.array([bus_number(str(c), self._buses) for c in channels.tolist()], np.int64)
@@ -446,7 +448,7 @@ class Mf4Log(Closing):
         elif codes is None:
             table = np.zeros(BUSES_MAX, np.int64)
             table[channels] = numbers
-            bus = table[rows.bus]
+            bus = table.take(rows.bus)
         else:
             bus = numbers[codes]
         named = FrameRows(rows.place, bus, rows.log_ns, rows.frames)
@@ -528,7 +530,7 @@ class Mf4Log(Closing):
     def _found(self) -> Iterator[_Stored]:
         names: dict[str, NDArray[np.generic]] = {}
         try:
-            for data in self._blocks.data_groups(self._header.first_group):
+            for data in self._blocks.data_groups(self._header.first_group, self._header.unfinished):
                 stream = Stream(self._blocks, data.data, self._header.unfinished)
                 unsorted = None
                 if data.id_bytes:

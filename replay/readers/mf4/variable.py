@@ -116,15 +116,16 @@ def _windows(key: Int64s) -> Iterator[tuple[int, int, NDArray[np.intp]]]:
     rows = np.flatnonzero(key >= 0)
     if not len(rows):
         return
-    low, high = int(key[rows].min()), int(key[rows].max())
+    some = key if len(rows) == len(key) else key[rows]
+    low, high = int(some.min()), int(some.max())
     if high - low <= _SPAN:
         yield low, high, rows
         return
-    window = key[rows] // _SPAN
+    window = some // _SPAN
     found, count = np.unique(window, return_counts=True)
     for one in np.sort(found[np.argsort(-count, kind="stable")][:_WINDOWS_MAX]):
-        some = rows[window == one]
-        yield int(key[some].min()), int(key[some].max()), some
+        there = rows[window == one]
+        yield int(key[there].min()), int(key[there].max()), there
 
 
 def _take(
@@ -132,21 +133,25 @@ def _take(
 ) -> None:
     """Fill in the values that lie whole in ``content``, at ``place``."""
     size, width = len(content), payload.shape[1]
-    inside = (place >= 0) & (place + 4 <= size)
-    if not bool(inside.all()):
+    if len(place) and (place.min() < 0 or place.max() + 4 > size):
+        inside = (place >= 0) & (place + 4 <= size)
         place, rows = place[inside], rows[inside]
-    buffer = np.frombuffer(content + bytes(4 + width), np.uint8)
-    numbers: NDArray[np.uint32] = np.ndarray((size,), np.dtype("<u4"), buffer.data, strides=(1,))
-    found = numbers[place].astype(np.int64)
-    is_whole = place + 4 + found <= size
+    # One look at length and value together: the places are at odd bytes, which makes each dear.
+    kind = np.dtype([("length", "<u4"), ("value", "<u8", (width // 8,))])
+    padded = content + bytes(kind.itemsize)
+    near: NDArray[np.void] = np.ndarray((size,), f"V{kind.itemsize}", padded, strides=(1,))
+    found = near[place].view(kind)
+    stored = found["length"].astype(np.int64)
+    is_whole = place + stored <= size - 4
     if not bool(is_whole.all()):
-        place, rows, found = place[is_whole], rows[is_whole], found[is_whole]
+        rows, found, stored = rows[is_whole], found[is_whole], stored[is_whole]
+    values = payload.view("<u8")
     if len(rows) == len(length):
-        np.copyto(payload, windowed(buffer, width, place + 4))
-        np.copyto(length, found)
+        np.copyto(values, found["value"])
+        np.copyto(length, stored)
         return
-    payload[rows] = windowed(buffer, width, place + 4)
-    length[rows] = found
+    values[rows] = found["value"]
+    length[rows] = stored
 
 
 def windowed(buffer: Bytes, width: int, place: Int64s) -> Bytes:

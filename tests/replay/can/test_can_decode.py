@@ -218,3 +218,15 @@ def test_encoding_asks_for_every_signal_and_knows_no_other() -> None:
     pair = replace(WIDE, signals=(CanSignal("a", 0, 8), CanSignal("b", 8, 8)))
     with pytest.raises(ValueError, match="no column for signal b"):
         encode(pair, {"a": np.array([1])})
+
+
+def test_the_buses_and_logs_of_a_database_share_the_plan_of_a_message(tmp_path: Path) -> None:
+    whole = CanSignal("speed", 0, 16), CanSignal("mode", 16, 4)
+    message = CanMessage("drive", 0x123, False, 8, whole)
+    database, _ = read_back(message, tmp_path)
+    (known,) = database.messages
+    assert database.extractor(known) is database.extractor(known)
+    some = database.extractor(known, {"mode"})
+    assert some is database.extractor(known, ["mode"])
+    assert [s.name for s in some.signals] == ["mode"]
+    assert [s.name for s in database.extractor(known).signals] == ["speed", "mode"]
