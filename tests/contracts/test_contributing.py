@@ -1,0 +1,79 @@
+"""The worked examples of CONTRIBUTING.md, run as they are written there."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
+
+import pytest
+
+from crosscue.detectors.registry import BUILTIN, Choice, make
+from crosscue.replay.formats import FORMATS, Format
+from crosscue.replay.vehicle.cue_spec import CueSpec
+from crosscue.testing import check_cue, check_detector, check_reader
+from support import one_row
+from support.every_format import _bytes
+
+PAGE = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+def _code(title: str) -> list[str]:
+    """The Python of one example, block by block."""
+    (part,) = re.findall(rf"^## Example: {title}\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE)
+    return re.findall(r"```python\n(.*?)```", part, re.DOTALL)
+
+
+def _row(code: str, **names: object) -> Any:
+    """A row of a table: what stands behind the key and before the comma."""
+    code = dedent(code).strip().removesuffix(",")
+    return eval("{" + code + "}" if code.startswith('"') else code, names)
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], str]:
+    """Writes a module that can be imported, and returns its name."""
+
+    def write(name: str, code: str) -> str:
+        (tmp_path / f"{name}.py").write_text(code)
+        monkeypatch.syspath_prepend(tmp_path)
+        return name
+
+    return write
+
+
+def test_the_cue(module: Callable[[str, str], str]) -> None:
+    rule, row = _code("a cue")
+    cue: CueSpec = _row(
+        row.replace("crosscue.detectors.cues.pedestrians", module("example_cue", rule)),
+        CueSpec=CueSpec,
+    )
+
+    assert cue.name == "pedestrians"
+    check_cue(cue)
+
+
+def test_the_reader(
+    module: Callable[[str, str], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader, row, small_log, damage = _code("a reader")
+    place = module("example_reader", reader)
+    row = row.replace("crosscue.replay.readers.speed.reader", place)
+    monkeypatch.setitem(FORMATS, "speed", _row(row, Format=Format)["speed"])
+    every = _row(small_log, _bytes=_bytes)
+    write, damage_one = _row(damage, EVERY_FORMAT=every, _garbled_line=one_row._garbled_line)[
+        "speed"
+    ]
+
+    check_reader(write(tmp_path), damage_one)
+
+
+def test_the_detector(module: Callable[[str, str], str]) -> None:
+    (code,) = _code("a detector")
+    place = f"{module('example_detector', code)}:build"
+
+    check_detector(lambda: make(Choice("lamp", "lamp"), {**BUILTIN, "lamp": place}))
+    assert import_module("example_detector").Lamp
