@@ -37,6 +37,7 @@ from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_file
 POSE_FILE: Final = "pose.tum"
 MAX_FILE_BYTES: Final = 64 * MIB
 FRONT: Final = "front_camera"
+NO_PARTNER: Final = "a row without its time, or a time without its row"
 _GNSS: Final = {
     "lat": "latitude_deg",
     "long": "longitude_deg",
@@ -55,12 +56,14 @@ class Poses:
         xyz_m: Shape (N, 3), float64, local frame.
         forward: Shape (N, 3): the optical axis in that frame.
         left: Shape (N, 3): leftwards in the picture.
+        declared: How many there are times or poses for, whichever are more.
     """
 
     t_ns: Int64s
     xyz_m: Floats
     forward: Floats
     left: Floats
+    declared: int
 
     def speed_mps(self) -> Floats:
         """Forward speed at each pose, shape (N,): central differences, one-sided at both ends.
@@ -92,7 +95,7 @@ class _Rows:
 
     def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
         name, n = self.topic.name, len(self.t_ns)
-        ledger.declare(name, n)
+        ledger.declare(name, self.topic.declared)
         ledger.find(name, n)
         if not selection.wants(name):
             ledger.skip(name, NOT_ASKED_TOPIC, n)
@@ -102,7 +105,7 @@ class _Rows:
             if wanted.any():
                 yield Block(name, self.t_ns, self.table).take(wanted)
         if selection.start_ns is None and selection.end_ns is None:
-            ledger.settle(name)
+            ledger.settle(name, NO_PARTNER)
 
 
 class Drive(Closing):
@@ -144,11 +147,14 @@ class Drive(Closing):
         yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Pictures without a time, times without a picture; see ``KnowsItsEnd``."""
+        """Pictures and rows without a time, times without them; see ``KnowsItsEnd``."""
         for loss in self._unreadable:
             ledger.drop(*loss)
         for camera in self._cameras:
             camera.report_missing(ledger)
+        for rows in self._rows:
+            missing = (rows.topic.declared or 0) - len(rows.t_ns)
+            ledger.drop(rows.topic.name, NO_PARTNER, missing)
 
     def close(self) -> None:
         """Nothing is held open."""
@@ -214,7 +220,7 @@ def read_poses(path: Path, camera: str = FRONT) -> Poses:
     if n < 2 or not np.isfinite(xyz).all() or not (np.diff(t_ns) > 0).all():
         raise LogFormatError(f"{folder / 'poses.json'}: {n} poses in order; expected two or more")
     forward, left = (turn.apply(axis) for axis in ((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)))
-    return Poses(t_ns[:n], xyz[:n], forward[:n], left[:n])
+    return Poses(t_ns[:n], xyz[:n], forward[:n], left[:n], max(len(t_ns), len(xyz)))
 
 
 def read_intrinsics(path: Path, camera: str = FRONT) -> tuple[float, tuple[float, float]]:
@@ -262,7 +268,7 @@ def _odometry(path: Path) -> _Rows | None:
     if not (path / "camera" / FRONT / "poses.json").is_file():
         return None
     poses = read_poses(path)
-    topic = Topic("odometry", "nav_msgs/msg/Odometry", "columns", declared=len(poses.t_ns))
+    topic = Topic("odometry", "nav_msgs/msg/Odometry", "columns", declared=poses.declared)
     return _Rows(topic, poses.t_ns, poses.odometry())
 
 
@@ -280,8 +286,8 @@ def _gnss(path: Path) -> _Rows | None:
         raise LogFormatError(
             f"{file}: expected {', '.join(_GNSS)} in each row: {error!r}"
         ) from None
-    n = len(columns["latitude_deg"])
-    topic = Topic("gnss", "sensor_msgs/msg/NavSatFix", "columns", declared=n)
+    n, declared = len(columns["latitude_deg"]), max(len(t_ns), len(rows))
+    topic = Topic("gnss", "sensor_msgs/msg/NavSatFix", "columns", declared=declared)
     return _Rows(topic, t_ns[:n], Table(columns))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sqlite3
 import struct
@@ -178,6 +179,13 @@ def _images(folder: Path) -> Path:
     return log
 
 
+def _pandaset(folder: Path) -> Path:
+    log = EVERY_FORMAT["pandaset"](folder)
+    fixes = json.loads((log / "meta" / "gps.json").read_text())
+    (log / "meta" / "gps.json").write_text(json.dumps(fixes[:7] + fixes[8:]))
+    return log
+
+
 ONE_TAKEN_OUT: Final[dict[str, Callable[[Path], Path]]] = {
     "mcap": _mcap,
     "rosbag1": _bag,
@@ -188,6 +196,7 @@ ONE_TAKEN_OUT: Final[dict[str, Callable[[Path], Path]]] = {
     "mf4": _mf4,
     "comma2k19": _comma2k19,
     "kitti-raw": _kitti,
+    "pandaset": _pandaset,
     "video": _video,
     "images": _images,
 }

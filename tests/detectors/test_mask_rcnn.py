@@ -272,9 +272,11 @@ def test_a_mask_laid_into_its_box_is_the_one_torchvision_pastes(
     )
     theirs = pasted[0, 0].numpy() > 0.5
 
-    # Torchvision rounds the widened box to whole pixels, so the outline may be a pixel elsewhere.
-    wide = cv2.dilate(theirs.astype(np.uint8), np.ones((3, 3), np.uint8))
-    narrow = cv2.erode(theirs.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1)
+    # Torchvision rounds the widened box to whole pixels, so the outline may be a pixel elsewhere;
+    # beyond the picture's top and left it rounds towards zero, which is another pixel.
+    kernel = np.ones((3, 3) if box[:2].min() > 1 else (5, 5), np.uint8)
+    wide = cv2.dilate(theirs.astype(np.uint8), kernel)
+    narrow = cv2.erode(theirs.astype(np.uint8), kernel, borderValue=1)
     assert (np.asarray(wide)[ours] == 1).all()
     assert ours[np.asarray(narrow) == 1].all()
 

@@ -56,7 +56,8 @@ def _yolox() -> Sample:
 
 
 def _yolov5() -> Sample:
-    rows = np.zeros((1, 12, 8))
+    # Three anchors in each cell of strides 8, 16 and 32.
+    rows = np.zeros((1, 3 * (80 * 40 + 40 * 20 + 20 * 10), 8))
     rows[0, 7] = [*_centered(), 0.5, 0.0, 0.1, SCORE * 2]
     return Sample({"kind": "yolov5", "name": "output0"}, {"output0": rows})
 
