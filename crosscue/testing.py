@@ -78,8 +78,9 @@ def check_detector(build: Callable[[], Detector], *, tolerance: float = 1e-3) ->
     """Check that a detector keeps the contract on black, white and noisy frames.
 
     It gives one result for each frame, in order, with the frame's time and size; boxes lie in the
-    picture and scores in 0 to 1; frames stay as they were; the same frames give the same result,
-    one by one or together; and its identity is the same when it is built again.
+    picture and scores in 0 to 1; every label is one of its ``labels``, where it has any; frames
+    stay as they were; the same frames give the same result, one by one or together; and its
+    identity is the same when it is built again.
 
     Args:
         build: Makes the detector, with its default settings.
@@ -88,9 +89,12 @@ def check_detector(build: Callable[[], Detector], *, tolerance: float = 1e-3) ->
     Raises:
         AssertionError: The contract is broken; the message says where.
     """
+    from crosscue.detectors.base import reportable
+
     detect = build()
     _expect(isinstance(detect.identity, str) and bool(detect.identity), "identity: want a text")
     _expect(build().identity == detect.identity, "identity: differs when it is built again")
+    labels = reportable(detect)
     frames = _frames(detect.view.is_grey)
     before = [frame.pixels.copy() for frame in frames]
     together = detect(frames)
@@ -99,6 +103,7 @@ def check_detector(build: Callable[[], Detector], *, tolerance: float = 1e-3) ->
     _expect(len(together) == len(frames), f"{len(frames)} frames, {len(together)} results")
     for frame, found in zip(frames, together, strict=True):
         _check_found(frame, found)
+        _check_labels(found, labels)
         (alone,) = detect([frame])
         _expect(_is_same(alone, found, tolerance), f"frame {frame.t_ns}: alone it gives another")
     _expect(len(detect([])) == 0, "no frames: want no results")
@@ -297,6 +302,14 @@ def _check_found(frame: Frame, found: Found) -> None:
     _expect(all(found.labels), f"{where}: an empty label")
     for mask in filter(None, found.masks):
         decode(mask, frame.size_px)
+
+
+def _check_labels(found: Found, labels: Sequence[str] | None) -> None:
+    from crosscue.detectors.base import Detections
+
+    if labels is not None and isinstance(found, Detections):
+        more = {*found.labels} - {*labels}
+        _expect(not more, f"frame {found.t_ns}: {sorted(more)} are not among its labels")
 
 
 def _is_same(one: Found, other: Found, tolerance: float) -> bool:

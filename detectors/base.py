@@ -133,7 +133,11 @@ Found: TypeAlias = Detections | RoadMask
 
 
 class Detector(Protocol):
-    """From frames to what is in each; no memory of earlier frames (that is a tracker)."""
+    """From frames to what is in each; no memory of earlier frames (that is a tracker).
+
+    It may have ``labels``, a tuple of all class names that it can report: none for one of road. A
+    cue whose labels no detector can report is not looked for; without ``labels`` it may be any.
+    """
 
     @property
     def view(self) -> View:
@@ -148,3 +152,9 @@ class Detector(Protocol):
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         """One result for each frame, in order; an empty one is valid."""
         ...
+
+
+def reportable(detector: Detector) -> tuple[str, ...] | None:
+    """All class names that a detector can report, sorted; None where it does not say."""
+    labels: Sequence[str] | None = getattr(detector, "labels", None)
+    return None if labels is None else tuple(sorted({*labels}))

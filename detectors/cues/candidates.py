@@ -15,6 +15,7 @@ TOO_LITTLE_ROAD: Final = "too little road"
 NOT_FROM_THE_SIDE: Final = "not seen from the side"
 NOT_FOUND_BEFORE: Final = "not found in the frame before"
 OTHER_MOTION: Final = "moves or faces otherwise"
+NO_CURVE: Final = "no range curve"
 NOT_COUNTED: Final = "not counted by its rule"
 
 Unit = Literal["detections", "frames"]

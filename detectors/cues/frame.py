@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -13,7 +13,7 @@ from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
 from .labelled import count_labels
 from .road import RoadShares, road_shares
 from .rules import counts_of
-from .tally import CueTally
+from .tally import CueTally, cue_labels
 
 
 class Role(StrEnum):
@@ -33,12 +33,29 @@ class Seen:
         objects: Of detectors of objects; empty where none ran.
         signs: Of detectors of one-way and do-not-enter signs; empty where none ran.
         road: Road pixels, or their shares where these are known already.
+        labels: What the detectors of objects and signs can report; None for anything.
     """
 
     t_ns: int
     objects: tuple[Detections, ...] = ()
     signs: tuple[Detections, ...] = ()
     road: RoadMask | RoadShares | None = None
+    labels: frozenset[str] | None = None
+
+    @property
+    def boxes(self) -> tuple[Detections, ...]:
+        """Of all detectors of objects and signs."""
+        return (*self.objects, *self.signs)
+
+
+def all_labels(labels: Iterable[Sequence[str] | None]) -> frozenset[str] | None:
+    """What several detectors can report together; None for anything, if one does not say."""
+    known: set[str] = set()
+    for one in labels:
+        if one is None:
+            return None
+        known.update(one)
+    return frozenset(known)
 
 
 def role_of(found: Found, is_for_signs: bool) -> Role:
@@ -48,13 +65,19 @@ def role_of(found: Found, is_for_signs: bool) -> Role:
     return Role.SIGNS if is_for_signs else Role.OBJECTS
 
 
-def seen(t_ns: int, found: Sequence[Found], is_for_signs: Sequence[bool]) -> Seen:
+def seen(
+    t_ns: int,
+    found: Sequence[Found],
+    is_for_signs: Sequence[bool],
+    labels: frozenset[str] | None = None,
+) -> Seen:
     """One frame's results, sorted by role.
 
     Args:
         t_ns: Log time of the frame.
         found: One result for each detector.
         is_for_signs: Whether that detector looks for one-way and do-not-enter signs.
+        labels: What all detectors can report together.
     """
     boxes: dict[bool, list[Detections]] = {True: [], False: []}
     road: RoadMask | None = None
@@ -63,7 +86,7 @@ def seen(t_ns: int, found: Sequence[Found], is_for_signs: Sequence[bool]) -> See
             boxes[for_signs].append(one)
         elif road is None:
             road = one
-    return Seen(t_ns, tuple(boxes[False]), tuple(boxes[True]), road)
+    return Seen(t_ns, tuple(boxes[False]), tuple(boxes[True]), road, labels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,12 +127,17 @@ class CuePass:
             pairs = self._pairs(frame.objects)
             if pairs is not None:
                 counts |= counts_of("car pairs", pairs, self.vehicle)
-        if frame.signs:
-            counts |= counts_of("signs", frame.signs, self.vehicle)
-        if frame.objects or frame.signs:
-            boxes = (*frame.objects, *frame.signs)
+        if frame.boxes:
+            counts |= counts_of("signs", frame.boxes, self.vehicle)
             for name, own in self.vehicle.cues.own.items():
-                counts[name] = count_labels(boxes, own.labels, own.score)
+                counts[name] = count_labels(frame.boxes, own.labels, own.score)
+        if frame.labels is not None:
+            wanted = cue_labels(self.vehicle)
+            counts = {
+                cue: count
+                for cue, count in counts.items()
+                if not wanted[cue] or not frame.labels.isdisjoint(wanted[cue])
+            }
         road = frame.road
         if isinstance(road, RoadMask):
             road = road_shares(road, self.vehicle.regions)
@@ -122,9 +150,10 @@ class CuePass:
 
     def _explain(self, tally: CueTally, frame: Seen, pairs: Pairs | None, found: FrameCues) -> None:
         tally.labelled("objects", frame.objects, found.counts)
-        tally.labelled("signs", frame.signs, found.counts)
-        tally.own((*frame.objects, *frame.signs), found.counts)
-        if self._before is not None and frame.objects:
+        tally.labelled("signs", frame.boxes, found.counts)
+        tally.own(frame.boxes, found.counts)
+        is_any = frame.labels is None or not frame.labels.isdisjoint(self.vehicle.cars.labels)
+        if self._before is not None and frame.objects and is_any:
             again = 0 if pairs is None else len(pairs.nose)
             tally.cars(frame.objects, len(self._before), again, found.counts)
         if found.road is not None:

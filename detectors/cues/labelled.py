@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 from crosscue.detectors.base import Detections
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.vehicle import Vehicle
+
+SAME_SIGN: Final = {"do not enter": ("do not enter", "no entry")}
+"""The American and the international sign, which say the same."""
 
 
 def labels_of(cue: CueSpec, vehicle: Vehicle) -> tuple[str, ...]:
@@ -16,7 +20,7 @@ def labels_of(cue: CueSpec, vehicle: Vehicle) -> tuple[str, ...]:
     if cue.settings is not None:
         labels: tuple[str, ...] = getattr(vehicle.cues, f"{cue.settings}_labels")
         return labels
-    return () if cue.label is None else (cue.label,)
+    return () if cue.label is None else SAME_SIGN.get(cue.label, (cue.label,))
 
 
 def count(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:

@@ -135,3 +135,9 @@ def threshold_of(cue: CueSpec, vehicle: Vehicle) -> tuple[str | None, float | No
     name = f"{cue.settings}_score"
     score: float = getattr(vehicle.cues, name)
     return f"[cues] {name}", score
+
+
+def cue_labels(vehicle: Vehicle) -> dict[str, tuple[str, ...]]:
+    """From every cue, a user's own among them, to the labels it is made of; none for road."""
+    own = {name: one.labels for name, one in vehicle.cues.own.items()}
+    return {name: labels_of(cue, vehicle) for name, cue in CUES.items()} | own

@@ -61,6 +61,11 @@ class BoxModel:
     identity: str
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        """What the card's classes mean."""
+        return tuple(map(self.card.meaning, range(len(self.output.classes))))
+
+    @property
     def view(self) -> View:
         """No finer than the network's input; the full size for tiles."""
         if self.card.tiles is not None:

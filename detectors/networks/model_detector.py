@@ -94,6 +94,11 @@ class RoadModel:
     identity: str
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        """None: road is no object."""
+        return ()
+
+    @property
     def view(self) -> View:
         """No finer than the network's input."""
         return View(least_width_px=self.card.input.width_px)

@@ -150,6 +150,11 @@ class SignDetector:
     gallery: _Gallery
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        """Of the kinds that it has drawings of."""
+        return tuple(LABELS.get(kind, kind) for kind in self.settings.kinds)
+
+    @property
     def view(self) -> View:
         """Full size, grey: signs are small."""
         return View(is_grey=True)

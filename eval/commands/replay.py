@@ -41,7 +41,7 @@ from crosscue.eval.interface.runs import default_cache, replay_drive
 from crosscue.eval.pipeline.estimate import Outcome
 from crosscue.eval.pipeline.scene import ApproachSummary, SceneOutcome
 from crosscue.eval.runs.account import account_lines, details_of
-from crosscue.eval.runs.candidates import candidate_lines, candidate_rows
+from crosscue.eval.runs.candidates import candidate_lines, candidate_rows, not_looked_lines
 from crosscue.eval.runs.folder import create
 from crosscue.eval.runs.input import files_named_in
 from crosscue.replay.errors import CrosscueError, UsageError
@@ -349,6 +349,7 @@ def scene_lines(scene: SceneOutcome) -> list[str]:
     lines = [f"cues     {', '.join(seen) or 'none'} (frames each, of {scene.frames:,})"]
     rows = candidate_rows(scene.candidates), candidate_rows(scene.ranged)
     lines += [f"  skip   {sentence}" for sentence in candidate_lines(*rows)]
+    lines += [f"  skip   {sentence}" for sentence in not_looked_lines(scene.not_looked_for)]
     lines += [f"  note   {n:,} x {what}" for what, n in scene.counts.items() if n]
     for one in scene.approaches:
         lines.append(f"approach {_approach(one)}")

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crosscue.detectors import rle
-from crosscue.detectors.base import Detections, RoadMask
-from crosscue.detectors.cues.frame import CuePass, FrameCues, Role, role_of, seen
+from crosscue.detectors.base import Detections, RoadMask, reportable
+from crosscue.detectors.cues.frame import CuePass, FrameCues, Role, all_labels, role_of, seen
 from crosscue.detectors.overlay import Drawer
 from crosscue.detectors.ranging.height_to_range import range_of
 from crosscue.detectors.registry import Choice, knows_simulated_only, make
@@ -227,6 +227,7 @@ def detect_into(
                         identity=one.detector.identity,
                         kind=choice.kind,
                         role=tables.roles.get(one.name),
+                        labels=reportable(one.detector),
                         settings=dict(choice.settings),
                     )
                     for one, choice in zip(named, choices, strict=True)
@@ -299,6 +300,8 @@ class _Tables:
     _held: dict[str, list[dict[str, object]]] = field(default_factory=dict)
     _size: tuple[int, int] | None = None
     _frame: int = -1
+    _labels: frozenset[str] | None = None
+    """What the detectors that give boxes can report; known from the first frame on."""
 
     def __enter__(self) -> _Tables:
         with ExitStack() as stack:
@@ -326,7 +329,13 @@ class _Tables:
             )
         self._size = result.size_px
         self._frame += 1
-        sorted_by_role = seen(result.t_ns, result.found, self.is_for_signs)
+        if self._frame == 0:
+            self._labels = all_labels(
+                reportable(named.detector)
+                for named, found in zip(self.detectors, result.found, strict=True)
+                if isinstance(found, Detections)
+            )
+        sorted_by_role = seen(result.t_ns, result.found, self.is_for_signs, self._labels)
         cues = self.cues(sorted_by_role)
         self._held["frames"].append(
             {

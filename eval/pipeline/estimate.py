@@ -382,6 +382,7 @@ def scene_summary(scene: SceneOutcome) -> SceneSummary:
         approaches=tuple(ApproachRow(**asdict(one)) for one in scene.approaches),
         candidates=candidate_rows(scene.candidates),
         ranged=candidate_rows(scene.ranged),
+        not_looked_for=dict(scene.not_looked_for),
     )
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.detectors.cues.candidates import Candidates
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.tally import CueTally
+from crosscue.detectors.cues.tally import CueTally, cue_labels
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
@@ -25,6 +25,7 @@ from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .drive_time import OnTime, report_time, unwatched_time
+from .looked_for import not_looked_for
 from .sign_ranges import MEASURED, SignRanges
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ class SceneOutcome:
         without_odometry: Frames before which the odometry has a hole.
         candidates: By cue, what became of everything that could have been it.
         ranged: By cue, what became of its detections on the way to a range.
+        not_looked_for: Cues without any row, and why.
     """
 
     frames: int
@@ -82,6 +84,7 @@ class SceneOutcome:
     without_odometry: int
     candidates: Mapping[str, Candidates] = field(default_factory=dict)
     ranged: Mapping[str, Candidates] = field(default_factory=dict)
+    not_looked_for: Mapping[str, str] = field(default_factory=dict)
 
 
 def nothing_past(_t_ns: int) -> PastCues | None:
@@ -143,6 +146,7 @@ def estimate_scene(
         scene.without_odometry,
         scene.tally.by_cue,
         scene.signs.by_cue,
+        not_looked_for(scene.looked, detected.detectors, cue_labels(vehicle)),
     )
 
 
@@ -180,6 +184,7 @@ class _Scene:
     frames: int = 0
     without_odometry: int = 0
     positive: Counter[str] = field(default_factory=Counter)
+    looked: set[str] = field(default_factory=set)
     summaries: dict[int, ApproachSummary] = field(default_factory=dict)
     _last_ns: int | None = None
 
@@ -203,6 +208,7 @@ class _Scene:
             else self.approaches(evidence, _leaving_out(past, without))
         )
         self.frames += 1
+        self.looked.update(step.counts)
         self.positive.update(cue for cue, count in step.counts.items() if count)
         self.rows.add(step)
         self._sum_up(step)

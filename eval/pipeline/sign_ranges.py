@@ -10,15 +10,12 @@ from typing import Final
 import numpy as np
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.cues.candidates import BELOW_SCORE, Candidates
-from crosscue.detectors.cues.labelled import labels_of
-from crosscue.detectors.cues.tally import scores_of, threshold_of
+from crosscue.detectors.cues.candidates import BELOW_SCORE, NO_CURVE, Candidates
+from crosscue.detectors.cues.tally import cue_labels, scores_of, threshold_of
 from crosscue.detectors.ranging.height_to_range import range_of
-from crosscue.eval.runs.candidates import NO_CURVE
 from crosscue.fusion.approaches import SignRange
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.columns import Floats
-from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.cue_table import STOP_SIGN, TRAFFIC_LIGHT
 from crosscue.replay.vehicle.vehicle import RangeCurve, Vehicle
 
@@ -54,19 +51,15 @@ class SignRanges:
             heights_px: For each, the rows that every mask spans.
         """
         return tuple(
-            one
-            for cue, reference in MEASURED
-            for one in self._of_cue(found, heights_px, cue, reference)
+            one for row in range(len(MEASURED)) for one in self._of_cue(found, heights_px, row)
         )
 
     def _of_cue(
-        self,
-        found: Sequence[Detections],
-        heights_px: Sequence[Floats],
-        cue: CueSpec,
-        reference: Reference,
+        self, found: Sequence[Detections], heights_px: Sequence[Floats], row: int
     ) -> list[SignRange]:
-        labels = labels_of(cue, self.vehicle)
+        """Of one row of ``MEASURED``."""
+        cue, reference = MEASURED[row]
+        labels = cue_labels(self.vehicle)[cue.name]
         curve: RangeCurve | None = getattr(self.vehicle.ranges, cue.name)
         setting, threshold = threshold_of(cue, self.vehicle)
         ranges: list[SignRange] = []

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.eval.runs.candidates import CandidateRow, candidate_lines
+from crosscue.eval.runs.candidates import CandidateRow, candidate_lines, not_looked_lines
 from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest
 from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.drives import Scores
@@ -155,13 +155,14 @@ def _run(one: RunScored) -> _Run:
     reported = manifest.as_json()
     scene = manifest.scene if isinstance(manifest, EstimateManifest) else None
     candidates, ranged = ({}, {}) if scene is None else (scene.candidates, scene.ranged)
+    not_looked_for = {} if scene is None else scene.not_looked_for
     return _Run(
         name=_name(one),
         manifest=manifest,
         clocks=strict_json(reported["clocks"]),
         candidates=candidates,
         ranged=ranged,
-        skips=candidate_lines(candidates, ranged),
+        skips=[*candidate_lines(candidates, ranged), *not_looked_lines(not_looked_for)],
         settings=strict_json(reported["settings"]),
         versions=strict_json({"versions": reported["versions"], "logs": reported["logs"]}),
     )

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final, Literal
+from typing import Literal
 
-from crosscue.detectors.cues.candidates import BELOW_SCORE, TOO_LITTLE_ROAD, Candidates
+from crosscue.detectors.cues.candidates import BELOW_SCORE, NO_CURVE, TOO_LITTLE_ROAD, Candidates
 
 from .record import Record
-
-NO_CURVE: Final = "no range curve"
 
 
 class CandidateRow(Record):
@@ -59,6 +57,14 @@ def candidate_lines(
             told.setdefault(_told(one), []).append(cue)
     lines = [f"{', '.join(names)}: {text}" for text, names in told.items()]
     return lines + [text for cue, one in ranged.items() for text in _range_told(cue, one)]
+
+
+def not_looked_lines(cues: Mapping[str, str]) -> list[str]:
+    """A sentence for each reason for which cues were not looked for."""
+    same: dict[str, list[str]] = {}
+    for cue, why in cues.items():
+        same.setdefault(why, []).append(cue)
+    return [f"not looked for, {why}: {', '.join(names)}" for why, names in same.items()]
 
 
 def _told(one: CandidateRow) -> str:

@@ -110,6 +110,8 @@ class DetectorRow(Record):
     kind: str
     role: str | None
     """None where it found nothing to report its role by."""
+    labels: tuple[str, ...] | None
+    """All class names that it can report: none for road, None where it does not say."""
     settings: dict[str, Any]
 
 
@@ -180,6 +182,8 @@ class SceneSummary(Record):
     approaches: tuple[ApproachRow, ...]
     candidates: dict[str, CandidateRow]
     """By cue, what became of everything that could have been it."""
+    not_looked_for: dict[str, str]
+    """Cues that have no row in the whole run, and why."""
     ranged: dict[str, CandidateRow]
     """By cue, what became of its detections on the way to a range."""
 

@@ -53,6 +53,10 @@ class _Painting(BrightBlob):
         return found
 
 
+class _Unannounced(BrightBlob):
+    labels = ("zebra",)
+
+
 class _Remembering(BrightBlob):
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         return [self._one(frames[0]) for _ in frames]
@@ -65,6 +69,7 @@ class _Remembering(BrightBlob):
         (_Outside, "outside the picture"),
         (_OverSure, "outside 0 to 1"),
         (_Painting, "changed a frame's pixels"),
+        (_Unannounced, "are not among its labels"),
         (_Remembering, "frame 17: the result's time"),
     ],
 )

@@ -66,7 +66,9 @@ def detected(camera: str, detectors: dict[str, str], **changes: Any) -> DetectMa
         "camera": camera,
         "camera_log": 0,
         "detectors": tuple(
-            DetectorRow(name=name, identity="0", kind="made up", role=role, settings={})
+            DetectorRow(
+                name=name, identity="0", kind="made up", role=role, labels=None, settings={}
+            )
             for name, role in detectors.items()
         ),
         "counts": DetectCounts(frames=0, decoded=0, ran={}, from_cache={}, objects={}, cues={}),

@@ -155,6 +155,11 @@ class MaskRcnnDetector:
     _batch: _Batch = field(repr=False)
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        """The checkpoint's classes."""
+        return tuple(name for name in self.checkpoint.facts.plan.classes if name)
+
+    @property
     def view(self) -> View:
         """No finer than the network's input."""
         return View(least_width_px=self.checkpoint.facts.plan.width_px)

@@ -60,6 +60,11 @@ class RoadNetworkDetector:
     device: torch.device
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        """None: road is no object."""
+        return ()
+
+    @property
     def view(self) -> View:
         """No finer than the network's input."""
         return View(least_width_px=self.checkpoint.facts.width_px)

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.detectors.base import Detections, RoadMask
-from crosscue.detectors.cues.frame import Role, Seen
+from crosscue.detectors.cues.frame import Role, Seen, all_labels
 from crosscue.detectors.cues.road import RoadShares
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectorRow
@@ -86,6 +86,7 @@ def stored_frames(
     """
     objects = [d.name for d in detectors if d.role == Role.OBJECTS]
     signs = [d.name for d in detectors if d.role == Role.SIGNS]
+    labels = all_labels(d.labels for d in detectors if d.role in (Role.OBJECTS, Role.SIGNS))
     has_road = any(d.role == Role.ROAD for d in detectors)
     found = _Rows(run.batches("detections", ["frame", *FOUND]), FOUND)
     columns = MASK if with_road_masks else SHARES
@@ -106,6 +107,7 @@ def stored_frames(
                     some,
                     tuple(_detections(t_ns, size, by_name.get(name, [])) for name in signs),
                     _road(t_ns, size, shares[0], with_road_masks) if shares else None,
+                    labels,
                 ),
                 size,
                 tuple(

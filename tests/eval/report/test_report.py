@@ -139,6 +139,7 @@ def test_what_became_of_candidates_is_a_table_with_its_sentences(tmp_path: Path)
         approaches=(),
         candidates={"traffic_light": lights},
         ranged={"traffic_light": lights},
+        not_looked_for={"do_not_enter": "no detector can report their labels"},
     )
     whole = estimate_manifest(scored.run)
     write_manifest(scored.run, whole.model_copy(update={"scene": scene, "notices": ("warning",)}))
@@ -147,6 +148,7 @@ def test_what_became_of_candidates_is_a_table_with_its_sentences(tmp_path: Path)
 
     assert "<li>warning</li>" in page
     assert "<li>traffic_light: 87 detections, none above 0.90 (highest 0.62)" in page
+    assert "<li>not looked for, no detector can report their labels: do_not_enter</li>" in page
     row = "<td>87 detections</td><td>0</td><td>0.62</td><td>0.90</td>"
     assert f"<td>traffic light</td>{row}" in page
     assert f"<td>range: traffic light</td>{row}" in page

@@ -1,6 +1,7 @@
 """What a person reads of detections that became neither cue nor range."""
 
-from crosscue.eval.runs.candidates import NO_CURVE, CandidateRow, candidate_lines
+from crosscue.detectors.cues.candidates import NO_CURVE
+from crosscue.eval.runs.candidates import CandidateRow, candidate_lines
 
 
 def _row(seen: int, skipped: dict[str, int], **more: object) -> CandidateRow:

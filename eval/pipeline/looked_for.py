@@ -1,0 +1,48 @@
+"""Cues that nothing looked for in a run, and why: a cue without rows is not one that found none."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Final
+
+from crosscue.detectors.cues.frame import Role, all_labels
+from crosscue.eval.runs.manifest import DetectorRow
+from crosscue.replay.vehicle.cue_table import CUES
+
+NO_LABEL: Final = "no detector can report their labels"
+NO_OBJECTS: Final = "no detector of objects"
+NO_ROAD: Final = "no detector of road"
+NO_MOBILEYE: Final = "no Mobileye, or no range to an intersection"
+NEVER: Final = "no frame in which they could be computed"
+
+
+def not_looked_for(
+    looked: Collection[str],
+    detectors: Sequence[DetectorRow],
+    cue_labels: Mapping[str, Sequence[str]],
+) -> dict[str, str]:
+    """From each cue, a user's own among them, that has no row to the reason.
+
+    Args:
+        looked: Cues that have rows.
+        detectors: As the manifest has them.
+        cue_labels: All cues, with the labels they are made of.
+    """
+    roles = {one.role for one in detectors}
+    finders = [one for one in detectors if one.role in (Role.OBJECTS, Role.SIGNS)]
+    labels = all_labels(one.labels for one in finders)
+
+    def why(cue: str) -> str:
+        observed_by = CUES[cue].observed_by if cue in CUES else "objects"
+        if observed_by == "mobileye":
+            return NO_MOBILEYE
+        if observed_by == "road":
+            return NEVER if Role.ROAD in roles else NO_ROAD
+        wanted = cue_labels[cue]
+        if labels is not None and finders and wanted and labels.isdisjoint(wanted):
+            return NO_LABEL
+        can_be_signs = observed_by == "signs" or cue not in CUES
+        has_any = bool(finders) if can_be_signs else Role.OBJECTS in roles
+        return NEVER if has_any else NO_OBJECTS
+
+    return {cue: why(cue) for cue in cue_labels if cue not in looked}

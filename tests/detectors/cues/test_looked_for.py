@@ -1,0 +1,97 @@
+"""A cue that no detector can report is not looked for, which is not the same as found none."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.detectors.base import Detections, reportable
+from crosscue.detectors.cues.frame import CuePass, Seen, all_labels
+from crosscue.detectors.cues.tally import cue_labels
+from crosscue.detectors.registry import Choice, make
+from crosscue.eval.pipeline.looked_for import (
+    NEVER,
+    NO_LABEL,
+    NO_MOBILEYE,
+    NO_OBJECTS,
+    NO_ROAD,
+    not_looked_for,
+)
+from crosscue.eval.runs.manifest import DetectorRow
+from crosscue.replay.vehicle.cue_table import CUES
+from crosscue.replay.vehicle.vehicle import Cues, OwnCue, Vehicle
+from support.detecting import yolox_card
+
+VEHICLE = Vehicle(version=1, cues=Cues(own={"crossing": OwnCue(labels=("zebra",))}))
+SIGNS = {"one_way_left", "one_way_right", "do_not_enter"}
+CONTROLS = {"stop_sign", "traffic_light"}
+
+
+def _found(*labels: str) -> Detections:
+    n = len(labels)
+    boxes = np.tile((5.0, 5.0, 25.0, 45.0), (n, 1)).reshape(-1, 4)
+    return Detections(0, (640, 480), boxes, np.full(n, 0.99), labels, (b"",) * n)
+
+
+def _counts(labels: tuple[str, ...] | None, *found: str) -> dict[str, int]:
+    seen = Seen(0, objects=(_found(*found),), labels=all_labels([labels]))
+    return dict(CuePass(VEHICLE)(seen).counts)
+
+
+def test_only_cues_with_a_label_that_can_be_reported_are_looked_for() -> None:
+    assert _counts(("dog", "traffic light")) == {"traffic_light": 0}
+    assert _counts(("zebra",)) == {"crossing": 0}
+    assert _counts(()) == {}
+
+
+def test_a_detector_that_does_not_say_may_report_anything() -> None:
+    assert set(_counts(None)) == CONTROLS | SIGNS | {"crossing"}
+
+
+@pytest.mark.parametrize(
+    ("label", "cue"),
+    [
+        ("one way left", "one_way_left"),
+        ("one way right", "one_way_right"),
+        ("do not enter", "do_not_enter"),
+        ("no entry", "do_not_enter"),
+    ],
+)
+def test_sign_cues_take_their_labels_from_any_detector(label: str, cue: str) -> None:
+    assert _counts((label, "car"), label) == {cue: 1}
+
+
+def test_one_detector_that_does_not_say_makes_all_unknown() -> None:
+    assert all_labels([("car",), None]) is None
+    assert all_labels([("car",), ("stop sign", "car")]) == frozenset({"car", "stop sign"})
+
+
+def test_detectors_of_crosscue_say_what_they_report(tmp_path: Path) -> None:
+    signs = make(Choice("signs", "signs"))
+    card = make(Choice("yolox", "model", {"card": str(yolox_card(tmp_path))}))
+
+    assert reportable(signs) == ("do not enter", "one way left", "one way right")
+    assert reportable(make(Choice("road", "road"))) == ()
+    assert {"car"} < {*(reportable(card) or ())}
+    assert {"car", "stop sign", "traffic light"} <= {
+        *(reportable(make(Choice("cars", "mask-rcnn"))) or ())
+    }
+
+
+def _row(role: str, labels: tuple[str, ...] | None) -> DetectorRow:
+    return DetectorRow(name=role, identity="0", kind="", role=role, labels=labels, settings={})
+
+
+def test_every_cue_without_a_row_has_its_reason() -> None:
+    lights = [_row("objects", ("traffic light",))]
+    why = not_looked_for({"traffic_light"}, lights, cue_labels(VEHICLE))
+    assert set(why) == {*CUES, "crossing"} - {"traffic_light"}
+    assert {why[cue] for cue in SIGNS | {"stop_sign", "parked_left", "crossing"}} == {NO_LABEL}
+    assert why["road_left"] == NO_ROAD
+    assert why["lanes_past"] == NO_MOBILEYE
+
+    only_road = not_looked_for((), [_row("road", ())], cue_labels(VEHICLE))
+    assert {only_road[cue] for cue in CONTROLS | SIGNS} == {NO_OBJECTS}
+    assert only_road["road_left"] == NEVER
+
+    assert not_looked_for((), [_row("objects", None)], cue_labels(VEHICLE))["parked_left"] == NEVER
