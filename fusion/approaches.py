@@ -52,6 +52,23 @@ class SignRange:
 
 
 @dataclass(frozen=True, slots=True)
+class RangePosterior:
+    """All that is known of a range, from a tracker that has weighed its observations itself.
+
+    Attributes:
+        reference: What it goes to.
+        range_m: From the rear axle to there.
+        var_m2: Its variance.
+        measured_m: What this frame's observation alone says.
+    """
+
+    reference: Reference
+    range_m: float
+    var_m2: float
+    measured_m: float
+
+
+@dataclass(frozen=True, slots=True)
 class FrameEvidence:
     """What one frame brings.
 
@@ -67,6 +84,7 @@ class FrameEvidence:
         turned_rad: Change of heading since the evidence before, counter-clockwise, where known.
         assumed_m: How much of the way was assumed across a gap in time: on it nobody looked, so no
             approach becomes stale by it.
+        posteriors: Ranges that replace what is believed of their reference.
     """
 
     t_ns: int
@@ -78,6 +96,7 @@ class FrameEvidence:
     is_new_picture: bool = True
     turned_rad: float | None = None
     assumed_m: float = 0.0
+    posteriors: tuple[RangePosterior, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,14 +188,15 @@ class Approaches:
             self._go_on(self._open, evidence, moved.way_m)
         self._rest_m = max(0.0, self._rest_m - moved.way_m)
         signs = self._sane(evidence.signs)
+        ranged = {**signs, **{o.reference: (o.range_m, o.var_m2) for o in evidence.posteriors}}
         speaks = any(evidence.counts.get(cue, 0) > 0 for cue in self._first)
-        if self._open is not None and _is_about_another(self._open, signs, self._fusion.longest_m):
+        if self._open is not None and _is_about_another(self._open, ranged, self._fusion.longest_m):
             self._close("another ahead")
-        if self._open is None and (signs or (speaks and self._rest_m <= 0.0)):
+        if self._open is None and (ranged or (speaks and self._rest_m <= 0.0)):
             self._begin()
         if self._open is None:
             return Step(evidence.t_ns, None, evidence.counts)
-        if signs or speaks:
+        if ranged or speaks:
             self._open.since_evidence_m = 0.0
         return self._step(self._open, evidence, signs, past, moved)
 
@@ -283,7 +303,7 @@ class Approaches:
         past: PastCues,
         moved: _Moved,
     ) -> Step:
-        ranges = self._measured(at_hand, signs)
+        ranges = self._measured(at_hand, signs, evidence.posteriors)
         best, reference = _best(at_hand, Reference(self._fusion.reference))
         more = past(best, reference)
         counts = {**evidence.counts, **more} if more else evidence.counts
@@ -312,14 +332,23 @@ class Approaches:
         return Step(evidence.t_ns, at_hand.number, counts, ranges, now, belief.is_established)
 
     def _measured(
-        self, at_hand: _Open, signs: Mapping[Reference, tuple[float, float]]
+        self,
+        at_hand: _Open,
+        signs: Mapping[Reference, tuple[float, float]],
+        posteriors: Sequence[RangePosterior],
     ) -> tuple[RangeRow, ...]:
-        """Weigh in the signs; the rows to write."""
+        """Weigh in the signs and take posteriors over as they are; the rows to write."""
         start_m = end_m = None
         if Reference.START in signs:
             at_hand.start, start_m = self._weigh(at_hand.start, *signs[Reference.START])
         if Reference.END in signs:
             at_hand.end, end_m = self._weigh(at_hand.end, *signs[Reference.END])
+        for one in posteriors:
+            track = RangeTrack(RangeBelief(one.range_m, one.var_m2))
+            if one.reference is Reference.START:
+                at_hand.start, start_m = track, one.measured_m
+            else:
+                at_hand.end, end_m = track, one.measured_m
         rows = (
             (Reference.START, at_hand.start.belief, start_m),
             (Reference.END, at_hand.end.belief, end_m),

@@ -21,13 +21,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from crosscue.replay.columns import Floats
-
-Kind = Literal["traffic_light", "stop_sign"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +51,14 @@ class SizePrior:
         return float(np.log(self.mean_m)) - 0.5 * self.log_var
 
 
-SIZES: Final[Mapping[Kind, SizePrior]] = {
+SIZES: Final[Mapping[str, SizePrior]] = {
     "traffic_light": SizePrior(1.2, 0.25),
     "stop_sign": SizePrior(0.82, 0.15),
 }
-"""Standard sizes. Housings: three lenses of 0.30 m are 1.07 m bare and 1.32 m with a backplate,
-three of 0.20 m are 0.75 m, four of 0.30 m with a backplate 1.68 m. Faces of stop signs: 0.75 m and
-0.90 m across the flats, the small ones 0.60 m. The spread takes in boxes drawn tight or wide."""
+"""Standard sizes by cue. Housings: three lenses of 0.30 m are 1.07 m bare and 1.32 m with a
+backplate, three of 0.20 m are 0.75 m, four of 0.30 m with a backplate 1.68 m. Faces of stop signs:
+0.75 m and 0.90 m across the flats, the small ones 0.60 m. The spread takes in boxes drawn tight or
+wide."""
 
 
 @dataclass(frozen=True, slots=True)

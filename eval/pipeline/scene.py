@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.detectors.cues.candidates import Candidates
@@ -26,6 +26,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .drive_time import OnTime, report_time, unwatched_time
 from .looked_for import not_looked_for
+from .motion_ranges import MotionRanges
 from .sign_ranges import MEASURED, SignRanges
 
 if TYPE_CHECKING:
@@ -142,7 +143,7 @@ def estimate_scene(
         scene.frames,
         dict(sorted(scene.positive.items())),
         tuple(scene.summaries.values()),
-        scene.approaches.counts,
+        scene.approaches.counts + scene.motion.counts,
         scene.without_odometry,
         scene.tally.by_cue,
         scene.signs.by_cue,
@@ -181,6 +182,7 @@ class _Scene:
     cues: CuePass = field(init=False)
     tally: CueTally = field(init=False)
     signs: SignRanges = field(init=False)
+    motion: MotionRanges = field(init=False)
     frames: int = 0
     without_odometry: int = 0
     positive: Counter[str] = field(default_factory=Counter)
@@ -192,6 +194,7 @@ class _Scene:
         self.tally = CueTally(self.vehicle)
         self.signs = SignRanges(self.vehicle)
         self.cues = CuePass(self.vehicle, tally=self.tally)
+        self.motion = MotionRanges(self.vehicle)
 
     def step(self, frame: StoredFrame, past: PastCues | None, without: frozenset[str]) -> None:
         seen = frame.seen
@@ -201,7 +204,12 @@ class _Scene:
             for sign in self.signs(seen.objects, frame.heights_px)
             if _MEASURES[sign.reference] not in without
         )
+        gap_ns = 0 if self._last_ns is None else seen.t_ns - self._last_ns
         evidence = self._evidence(seen.t_ns, counts, signs)
+        seconds = max(gap_ns, 0) * 1e-9
+        posteriors = self.motion(evidence, seconds, seen.objects, frame.heights_px)
+        kept = tuple(one for one in posteriors if _MEASURES[one.reference] not in without)
+        evidence = replace(evidence, posteriors=kept)
         step = (
             self.approaches(evidence)
             if past is None
@@ -218,6 +226,7 @@ class _Scene:
         self.approaches.restart()
         self.odometer.skip_to(t_ns)
         self.cues = CuePass(self.vehicle, tally=self.tally)
+        self.motion.restart()
         self._last_ns = None
 
     def _evidence(

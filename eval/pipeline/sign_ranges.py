@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -23,6 +23,7 @@ BORDER_PX: Final = 2.0
 """A sign that reaches the picture's edge is cut, so its height says nothing of its distance."""
 
 
+Source = Literal["curve", "motion"]
 NO_HEIGHT: Final = "no height"
 CUT: Final = "cut by the picture's edge"
 MEASURED: Final = ((STOP_SIGN, Reference.START), (TRAFFIC_LIGHT, Reference.END))
@@ -34,7 +35,8 @@ class SignRanges:
     """A stop sign measures the start of the intersection, a traffic light its end.
 
     Attributes:
-        vehicle: Labels, scores and curves; no curve, no range.
+        vehicle: Labels, scores and curves; of objects whose range comes from motion none is made
+            here, but candidates are counted.
         by_cue: What became of all candidates so far, by the cue that they belong to.
     """
 
@@ -62,16 +64,17 @@ class SignRanges:
         labels = cue_labels(self.vehicle)[cue.name]
         curve: RangeCurve | None = getattr(self.vehicle.ranges, cue.name)
         setting, threshold = threshold_of(cue, self.vehicle)
+        source = source_of(self.vehicle, cue.name)
         ranges: list[SignRange] = []
         skipped: Counter[str] = Counter()
         for detections, heights in zip(found, heights_px, strict=True):
             for i, label in enumerate(detections.labels):
                 if label not in labels:
                     continue
-                why = _why_not(detections, heights, i, threshold or 0.0, curve)
+                why = _why_not(detections, heights, i, threshold or 0.0, source)
                 if why is not None:
                     skipped[why] += 1
-                elif curve is not None:
+                elif curve is not None and source == "curve":
                     range_m = float(range_of(np.array([heights[i]]), curve)[0])
                     ranges.append(SignRange(reference, range_m, curve.residual_sd_m**2))
         counted = self.by_cue.setdefault(cue.name, Candidates("detections", setting, threshold))
@@ -79,10 +82,18 @@ class SignRanges:
         return ranges
 
 
+def source_of(vehicle: Vehicle, cue: str) -> Source | None:
+    """Where ranges to a cue's objects come from; None if there is neither curve nor camera."""
+    chosen = vehicle.ranges.kind
+    if chosen != "motion" and getattr(vehicle.ranges, cue) is not None:
+        return "curve"
+    return None if chosen == "curve" or vehicle.camera.focal_px is None else "motion"
+
+
 def _why_not(
-    found: Detections, heights_px: Floats, i: int, score: float, curve: RangeCurve | None
+    found: Detections, heights_px: Floats, i: int, score: float, source: Source | None
 ) -> str | None:
-    """Why a detection gives no range; None where it gives one."""
+    """Why a detection gives no range; None where it gives one, or belongs to a track that does."""
     if found.scores[i] <= score:
         return BELOW_SCORE
     if heights_px[i] <= 0.0:
@@ -91,4 +102,21 @@ def _why_not(
     x0, y0, x1, y1 = found.boxes_px[i].tolist()
     if min(x0, y0) < BORDER_PX or x1 > width - BORDER_PX or y1 > height - BORDER_PX:
         return CUT
-    return NO_CURVE if curve is None else None
+    return NO_CURVE if source is None else None
+
+
+def usable(
+    vehicle: Vehicle, row: int, found: Sequence[Detections], heights_px: Sequence[Floats]
+) -> tuple[Floats, Floats]:
+    """Boxes (N, 4) and heights (N,) of one row of ``MEASURED``; ``SignRanges`` counts the rest."""
+    cue, _ = MEASURED[row]
+    labels = cue_labels(vehicle)[cue.name]
+    score = threshold_of(cue, vehicle)[1] or 0.0
+    some = [
+        (detections.boxes_px[i], float(heights[i]))
+        for detections, heights in zip(found, heights_px, strict=True)
+        for i, label in enumerate(detections.labels)
+        if label in labels and _why_not(detections, heights, i, score, "motion") is None
+    ]
+    boxes = np.array([box for box, _ in some]).reshape(-1, 4)
+    return boxes, np.array([height for _, height in some])

@@ -92,7 +92,7 @@ def _range_told(cue: str, one: CandidateRow) -> list[str]:
     if unmeasured:
         lines.append(
             f"range: {unmeasured:,} {things} measured, no curve: [ranges.{cue}] is not given; "
-            "crosscue fit ranges"
+            "crosscue fit ranges, or give camera.focal_px for ranges from motion"
         )
     if skipped:
         reasons = ", ".join(f"{number:,} {why}" for why, number in skipped.items())

@@ -11,7 +11,8 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
+from pydantic_core import PydanticCustomError
 
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.files.bounded import read_at_most
@@ -236,8 +237,12 @@ class RangeCurve(Section):
 
 
 class Ranges(Section):
-    """One curve for each kind of object that measures a distance."""
+    """Where ranges to an intersection come from, and a curve for each kind of object."""
 
+    kind: Literal["curve", "motion"] | None = None
+    """``curve``: the curves below, and no range without one. ``motion``: range and true height
+    together, from how an object grows as the car moves; wants ``camera.focal_px``. Left out: a
+    curve where one is given, else motion where ``camera.focal_px`` is."""
     stop_sign: RangeCurve | None = None
     traffic_light: RangeCurve | None = None
 
@@ -297,6 +302,14 @@ class Vehicle(Section):
     detectors: dict[str, DetectorSection] = Field(default_factory=dict)
     lost_above_m: Positive = 100.0
     """The pose counts as lost while the 2-sigma ellipse's full major axis exceeds this."""
+
+    @field_validator("ranges")
+    @classmethod
+    def _focal_length(cls, ranges: Ranges, info: ValidationInfo) -> Ranges:
+        camera = info.data.get("camera")
+        if ranges.kind == "motion" and camera is not None and camera.focal_px is None:
+            raise PydanticCustomError("ranges", 'kind = "motion" wants camera.focal_px')
+        return ranges
 
 
 def load(path: Path) -> Vehicle:

@@ -1,0 +1,244 @@
+"""Lights or signs of one kind followed through the frames, each with its own range from motion.
+
+A standing object is looked for where it must be now: as the car goes on, it moves away from the
+picture's centre and grows by the ratio of the ranges before and after; as the car turns, it shifts
+sideways. So two lights side by side stay two, and no range mixes their heights. Whether a light
+faces the car is not known here: a housing seen from behind is followed, too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from crosscue.replay.columns import Floats
+
+from .range_from_motion import SIZES, MotionRange, SizePrior, range_from_motion
+
+NEAR_HEIGHTS: Final = 1.0
+"""A box belongs to a track whose predicted box is nearer than so many of its heights: the car's
+pitch shifts a far object by about its own height, and lights stand further apart."""
+GROWTH: Final = 1.5
+"""And if their heights differ by less than this factor."""
+SAME_IOU: Final = 0.3
+"""A box that overlaps with one already taken is the same object again, not another track."""
+MERGE_M: Final = 0.2
+"""Observations so close to each other count as one, with their mean height."""
+MAX_OBSERVATIONS: Final = 400
+"""Of one track, the newest: 80 m and more."""
+GONE_M: Final = 5.0
+GONE_S: Final = 1.0
+"""A track unseen for this way and this time is over."""
+STRAIGHT_RAD: Final = 0.15
+"""Heights follow the way only while the car goes straight; after such a turn they begin anew."""
+
+
+class Motion(NamedTuple):
+    """Of the car since the frame before.
+
+    Attributes:
+        way_m: Forwards positive; None where unknown.
+        var_m2: Its variance.
+        turned_rad: Counter-clockwise; 0 where unknown.
+        seconds: Time passed.
+    """
+
+    way_m: float | None
+    var_m2: float
+    turned_rad: float
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """The pinhole camera.
+
+    Attributes:
+        focal_px: Focal length.
+        center_px: What does not move as the car goes straight ahead.
+    """
+
+    focal_px: float
+    center_px: tuple[float, float]
+
+
+@dataclass(slots=True)
+class Track:
+    """One object.
+
+    Attributes:
+        number: Of the track, from 1.
+        box_px: Where it is now: as seen, or as predicted.
+        height_px: Of its box, the same way.
+        estimate: Range and height at the last observation.
+        seen: In how many frames.
+        is_seen: In the newest frame.
+        since_m: Way gone since the last observation.
+        unseen_m: The same without sign.
+        unseen_s: Time since then.
+    """
+
+    number: int
+    box_px: Floats
+    height_px: float
+    estimate: MotionRange
+    seen: int = 1
+    is_seen: bool = True
+    since_m: float = 0.0
+    unseen_m: float = 0.0
+    unseen_s: float = 0.0
+    _way_m: list[float] = field(default_factory=list)
+    _height_px: list[float] = field(default_factory=list)
+    _merged: int = 0
+    _at_m: float = 0.0
+    _way_var_m2: float = 0.0
+    _turned_rad: float = 0.0
+
+    @property
+    def range_m(self) -> float:
+        """Depth from the camera now."""
+        return self.estimate.mean_m - self.since_m
+
+    @property
+    def var_m2(self) -> float:
+        """Its variance, the odometer's error included: a way too long is a range too far."""
+        way_m = abs(self._way_m[-1] - self._way_m[0])
+        if way_m < MERGE_M:
+            return self.estimate.var_m2
+        stretch = self.estimate.by_motion * math.sqrt(self._way_var_m2) / way_m
+        return self.estimate.var_m2 + (stretch * self.estimate.mean_m) ** 2
+
+    def go_on(self, motion: Motion, lens: Lens) -> None:
+        """Carry it to the next frame, where it has not been looked for yet."""
+        way_m = motion.way_m or 0.0
+        scale = self.range_m / max(self.range_m - way_m, 0.1 * self.range_m, 1e-3)
+        shift_px = lens.focal_px * math.tan(max(min(motion.turned_rad, 1.0), -1.0))
+        center = np.array([*lens.center_px, *lens.center_px])
+        self.box_px = center + (self.box_px - center) * scale
+        self.box_px += np.array([shift_px, 0.0, shift_px, 0.0])
+        self.height_px *= scale
+        self.is_seen = False
+        self.since_m += way_m
+        self.unseen_m += abs(way_m)
+        self.unseen_s += motion.seconds
+        self._at_m += way_m
+        self._way_var_m2 += motion.var_m2
+        self._turned_rad += motion.turned_rad
+        if motion.way_m is None or abs(self._turned_rad) > STRAIGHT_RAD:
+            self._forget()
+
+    def observe(self, box_px: Floats, height_px: float, size: SizePrior, lens: Lens) -> None:
+        """Take the box of the newest frame."""
+        if self._way_m and abs(self._at_m - self._way_m[-1]) < MERGE_M and self._merged:
+            self._merged += 1
+            self._height_px[-1] += (height_px - self._height_px[-1]) / self._merged
+        else:
+            self._way_m.append(self._at_m)
+            self._height_px.append(height_px)
+            self._merged = 1
+            del self._way_m[:-MAX_OBSERVATIONS], self._height_px[:-MAX_OBSERVATIONS]
+        found = range_from_motion(
+            np.array(self._way_m), np.array(self._height_px), lens.focal_px, size
+        )
+        self.estimate, self.since_m = found, self._at_m - self._way_m[-1]
+        self.box_px, self.height_px = box_px.copy(), height_px
+        self.seen += 1
+        self.is_seen, self.unseen_m, self.unseen_s = True, 0.0, 0.0
+
+    def _forget(self) -> None:
+        """What heights said so far fits no straight way; the last estimate stands until seen."""
+        self._way_m, self._height_px, self._merged = [self._at_m], [self.height_px], 0
+        self._way_var_m2 = self._turned_rad = 0.0
+
+
+class ObjectTracks:
+    """Follows all objects of one kind; memory holds those in view.
+
+    Attributes:
+        tracks: In the order in which they were first seen.
+        counts: What became of boxes, by outcome.
+    """
+
+    def __init__(self, cue: str, focal_px: float, center_px: tuple[float, float]) -> None:
+        self.tracks: list[Track] = []
+        self.counts: Counter[str] = Counter()
+        self._size = SIZES[cue]
+        self._lens = Lens(focal_px, center_px)
+
+    def __call__(self, motion: Motion, boxes_px: Floats, heights_px: Floats) -> Sequence[Track]:
+        """Take the next frame's boxes.
+
+        Args:
+            motion: Of the car since the frame before.
+            boxes_px: Shape (N, 4): x0, y0, x1, y1.
+            heights_px: Shape (N,), positive.
+
+        Returns:
+            All tracks, those unseen in this frame as predicted.
+        """
+        for track in self.tracks:
+            track.go_on(motion, self._lens)
+        taken = self._assign(boxes_px, heights_px)
+        for i in range(len(boxes_px)):
+            if i in taken:
+                continue
+            if any(iou(boxes_px[i], boxes_px[j]) > SAME_IOU for j in taken):
+                self.counts["boxes of an object already found"] += 1
+                continue
+            self._begin(boxes_px[i], float(heights_px[i]))
+            taken.append(i)
+        self.tracks = [one for one in self.tracks if not _is_over(one)]
+        return self.tracks
+
+    def _assign(self, boxes_px: Floats, heights_px: Floats) -> list[int]:
+        """Nearest pairs first; the boxes that were taken."""
+        pairs = [
+            (away, i, j)
+            for j, track in enumerate(self.tracks)
+            for i in range(len(boxes_px))
+            if (away := _away(track, boxes_px[i], float(heights_px[i]))) < NEAR_HEIGHTS
+        ]
+        boxes: list[int] = []
+        tracks: set[int] = set()
+        for _, i, j in sorted(pairs):
+            if i not in boxes and j not in tracks:
+                self.tracks[j].observe(boxes_px[i], float(heights_px[i]), self._size, self._lens)
+                boxes.append(i)
+                tracks.add(j)
+        return boxes
+
+    def _begin(self, box_px: Floats, height_px: float) -> None:
+        self.counts["objects followed"] += 1
+        first = range_from_motion(
+            np.zeros(1), np.array([height_px]), self._lens.focal_px, self._size
+        )
+        track = Track(self.counts["objects followed"], box_px.copy(), height_px, first)
+        track.observe(box_px, height_px, self._size, self._lens)
+        track.seen = 1
+        self.tracks.append(track)
+
+
+def iou(one: Floats, other: Floats) -> float:
+    """Intersection over union of two boxes."""
+    low, high = np.maximum(one[:2], other[:2]), np.minimum(one[2:], other[2:])
+    inside = float(np.prod(np.maximum(high - low, 0.0)))
+    both = float(np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2]))
+    return inside / (both - inside) if both > inside else 0.0
+
+
+def _away(track: Track, box_px: Floats, height_px: float) -> float:
+    """Distance from the predicted box in heights; infinite if it is another's for its height."""
+    if abs(math.log(height_px / track.height_px)) > math.log(GROWTH):
+        return math.inf
+    apart = 0.5 * (box_px[:2] + box_px[2:] - track.box_px[:2] - track.box_px[2:])
+    return float(np.hypot(*apart)) / max(height_px, track.height_px)
+
+
+def _is_over(track: Track) -> bool:
+    is_gone = track.unseen_m > GONE_M and track.unseen_s > GONE_S
+    return is_gone or track.range_m <= 0.0

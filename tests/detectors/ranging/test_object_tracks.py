@@ -1,0 +1,117 @@
+"""Objects followed through frames: each keeps its own heights, wherever boxes come from."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from crosscue.detectors.ranging.object_tracks import Motion, ObjectTracks, Track
+from crosscue.detectors.ranging.range_from_motion import SIZES
+from crosscue.replay.columns import Floats
+
+FOCAL_PX = 1500.0
+CENTER_PX = (960.0, 540.0)
+AHEAD = Motion(1.0, 0.0, 0.0, 0.1)
+Light = tuple[float, float, float, float]
+"""Range at the start, metres to the right and up, height."""
+NEAR: Light = (57.0, -5.0, 5.0, 1.3)
+FAR: Light = (84.0, 0.0, 5.0, 1.0)
+BESIDE: Light = (84.0, 4.0, 5.0, 1.5)
+
+
+def tracks() -> ObjectTracks:
+    return ObjectTracks("traffic_light", FOCAL_PX, CENTER_PX)
+
+
+def box_of(light: Light, gone_m: float, turned_rad: float = 0.0) -> Floats:
+    start_m, right_m, up_m, height_m = light
+    scale = FOCAL_PX / (start_m - gone_m)
+    x = CENTER_PX[0] + right_m * scale + FOCAL_PX * turned_rad
+    y = CENTER_PX[1] - up_m * scale
+    half = 0.5 * height_m * scale
+    return np.array([x - 0.4 * half, y - half, x + 0.4 * half, y + half])
+
+
+def take(
+    followed: ObjectTracks, lights: Sequence[Light], gone_m: float, motion: Motion = AHEAD
+) -> Sequence[Track]:
+    boxes = np.array([box_of(one, gone_m) for one in lights]).reshape(-1, 4)
+    return followed(motion, boxes, boxes[:, 3] - boxes[:, 1])
+
+
+def test_several_lights_are_several_tracks_with_a_range_each() -> None:
+    followed = tracks()
+    rng = np.random.default_rng(4)
+    for gone_m in range(40):
+        order = rng.permutation(3)
+        now = take(followed, [(NEAR, FAR, BESIDE)[i] for i in order], float(gone_m))
+
+    assert [one.seen for one in now] == [40, 40, 40]
+    assert sorted(one.range_m for one in now) == pytest.approx([18.0, 45.0, 45.0], rel=0.04)
+    heights = sorted(one.estimate.height_m for one in now)
+    assert heights == pytest.approx([1.0, 1.3, 1.5], rel=0.04)
+
+
+def test_a_light_not_seen_for_some_frames_is_the_same_afterwards() -> None:
+    followed = tracks()
+    for gone_m in range(20):
+        seen = [FAR] if gone_m % 5 < 2 else []
+        (track,) = take(followed, seen, float(gone_m))
+        assert track.is_seen == bool(seen)
+
+    assert track.seen == 8
+    assert track.range_m == pytest.approx(84.0 - 19.0, abs=2.0 * np.sqrt(track.var_m2))
+    assert track.height_px == pytest.approx(FOCAL_PX / 65.0, rel=0.1)
+
+
+def test_a_light_that_is_gone_is_dropped() -> None:
+    followed = tracks()
+    take(followed, [FAR], 0.0)
+
+    left = [len(take(followed, [], float(gone_m))) for gone_m in range(1, 14)]
+
+    assert left[5] == 1
+    assert left[-1] == 0
+
+
+def test_a_turn_of_the_car_makes_no_new_object() -> None:
+    followed = tracks()
+    for i in range(12):
+        box = box_of(FAR, 0.0, turned_rad=0.04 * i)
+        motion = Motion(0.0, 0.0, 0.04 if i else 0.0, 0.1)
+        now = followed(motion, box[None, :], np.array([box[3] - box[1]]))
+
+    assert [one.seen for one in now] == [12]
+
+
+def test_two_boxes_of_one_object_are_counted_and_make_one_track() -> None:
+    followed = tracks()
+    box = box_of(FAR, 0.0)
+    boxes = np.array([box, box + 1.0])
+
+    now = followed(AHEAD, boxes, boxes[:, 3] - boxes[:, 1])
+
+    assert len(now) == 1
+    assert followed.counts["boxes of an object already found"] == 1
+
+
+def test_without_odometry_only_the_size_speaks() -> None:
+    followed = tracks()
+    for gone_m in range(20):
+        (track,) = take(followed, [FAR], float(gone_m), Motion(None, 0.0, 0.0, 0.1))
+
+    height_px = FOCAL_PX * FAR[3] / (84.0 - 19.0)
+    alone_m = FOCAL_PX * SIZES["traffic_light"].mean_m / height_px
+    assert track.seen == 20
+    assert track.range_m == pytest.approx(alone_m, rel=0.1)
+    assert np.sqrt(track.var_m2) == pytest.approx(0.25 * track.range_m, rel=0.2)
+
+
+def test_an_odometer_that_errs_makes_the_range_less_sure() -> None:
+    exact, loose = tracks(), tracks()
+    for gone_m in range(30):
+        (one,) = take(exact, [FAR], float(gone_m))
+        (other,) = take(loose, [FAR], float(gone_m), Motion(1.0, 0.1, 0.0, 0.1))
+
+    assert other.range_m == one.range_m
+    assert other.var_m2 > 1.2 * one.var_m2

@@ -1,0 +1,143 @@
+"""Which light or sign tells the range, and what happens where nothing can."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.candidates import NO_CURVE
+from crosscue.eval.pipeline.motion_ranges import MotionRanges
+from crosscue.eval.pipeline.sign_ranges import CUT, SignRanges, source_of
+from crosscue.fusion.approaches import Approaches, FrameEvidence, RangePosterior
+from crosscue.fusion.factor_graph import graph_of
+from crosscue.fusion.intersection_range import Reference
+from crosscue.replay.vehicle.vehicle import Vehicle, parse
+
+SIZE = (1920, 1080)
+AHEAD = FrameEvidence(0, 1.0, 0.0, (), {})
+CAMERA = "[camera]\nfocal_px = 1500.0\nx_m = 1.5\n"
+CURVE = "[ranges.traffic_light]\nparameters = [1800.0]\nresidual_sd_m = 4.0\n"
+Thing = tuple[str, float, float, float]
+"""Label, range from the camera at the start, metres to the right, height."""
+NEAR: Thing = ("traffic light", 57.0, -5.0, 1.3)
+FAR: Thing = ("traffic light", 84.0, 2.0, 1.3)
+
+
+def vehicle(text: str = CAMERA) -> Vehicle:
+    return parse("version = 1\n" + text, "v.toml")
+
+
+def found(things: Sequence[Thing], gone_m: float, t_ns: int = 0) -> Detections:
+    boxes = []
+    for _, start_m, right_m, height_m in things:
+        scale = 1500.0 / (start_m - gone_m)
+        x, y, half = 960.0 + right_m * scale, 540.0 - 3.0 * scale, 0.5 * height_m * scale
+        boxes.append([x - 0.4 * half, y - half, x + 0.4 * half, y + half])
+    labels = tuple(one[0] for one in things)
+    return Detections(
+        t_ns,
+        SIZE,
+        np.array(boxes).reshape(-1, 4),
+        np.full(len(boxes), 0.95),
+        labels,
+        (b"",) * len(boxes),
+    )
+
+
+def drive(
+    ranges: MotionRanges, things: Sequence[Thing], until_m: int
+) -> list[tuple[RangePosterior, ...]]:
+    rows = []
+    for gone_m in range(until_m):
+        seen = found(things, float(gone_m))
+        spans = seen.boxes_px[:, 3] - seen.boxes_px[:, 1]
+        rows.append(ranges(AHEAD, 0.1, [seen], [spans]))
+    return rows
+
+
+def test_the_far_lights_tell_the_end_and_groups_are_never_averaged() -> None:
+    beside: Thing = ("traffic light", 57.0, -9.0, 1.3)
+    rows = drive(MotionRanges(vehicle()), [NEAR, beside, FAR], 45)
+
+    (last,) = rows[-1]
+    assert last.reference is Reference.END
+    assert last.range_m == pytest.approx(84.0 - 44.0 + 1.5, rel=0.04)
+    assert last.measured_m == pytest.approx(last.range_m, rel=0.02)
+    assert rows[0] == ()
+
+
+def test_a_larger_light_that_comes_into_view_does_not_take_over() -> None:
+    ranges = MotionRanges(vehicle())
+    drive(ranges, [FAR], 30)
+    seen = found([NEAR, FAR], 30.0)
+
+    (one,) = ranges(AHEAD, 0.1, [seen], [seen.boxes_px[:, 3] - seen.boxes_px[:, 1]])
+
+    assert one.range_m == pytest.approx(84.0 - 30.0 + 1.5, rel=0.06)
+
+
+def test_the_nearest_stop_sign_tells_the_start() -> None:
+    near: Thing = ("stop sign", 40.0, 4.0, 0.75)
+    far: Thing = ("stop sign", 65.0, -4.0, 0.75)
+
+    (last,) = drive(MotionRanges(vehicle()), [far, near], 30)[-1]
+
+    assert last.reference is Reference.START
+    assert last.range_m == pytest.approx(40.0 - 29.0 + 1.5, rel=0.04)
+
+
+@pytest.mark.parametrize(
+    ("text", "source"),
+    [
+        (CAMERA, "motion"),
+        (CAMERA + CURVE, "curve"),
+        (CURVE, "curve"),
+        ("", None),
+        (CAMERA + "[ranges]\nkind = 'curve'\n", None),
+        (CAMERA + "[ranges]\nkind = 'motion'\n" + CURVE, "motion"),
+    ],
+)
+def test_one_source_of_ranges_at_a_time(text: str, source: str | None) -> None:
+    given = vehicle(text)
+    ranges = MotionRanges(given)
+    rows = drive(ranges, [FAR], 5)
+    seen = found([FAR], 0.0)
+
+    by_curve = SignRanges(given)
+    made = by_curve([seen], [seen.boxes_px[:, 3] - seen.boxes_px[:, 1]])
+
+    assert source_of(given, "traffic_light") == source
+    assert bool(rows[-1]) == (source == "motion")
+    assert bool(made) == (source == "curve")
+    assert bool(ranges.counts) == (source == "motion")
+    skipped = {NO_CURVE: 1} if source is None else {}
+    assert by_curve.by_cue["traffic_light"].skipped == skipped
+
+
+def test_boxes_cut_by_the_edge_give_no_range_and_are_counted() -> None:
+    aside: Thing = ("traffic light", 20.0, -12.75, 1.3)
+    given = vehicle()
+    seen = found([aside], 0.0)
+    counted = SignRanges(given)
+    counted([seen], [seen.boxes_px[:, 3] - seen.boxes_px[:, 1]])
+
+    assert drive(MotionRanges(given), [aside], 3)[0] == ()
+    assert counted.by_cue["traffic_light"].skipped == {CUT: 1}
+
+
+def test_a_posterior_is_taken_over_as_it_is_and_carried_on_by_odometry() -> None:
+    settings = vehicle()
+    loop = Approaches(graph_of(settings.fusion), settings.fusion, settings.range_filter)
+    told = RangePosterior(Reference.END, 50.0, 9.0, 51.0)
+    steps = [
+        loop(FrameEvidence(i, 1.0, 0.01, (), {"traffic_light": 1}, posteriors=some))
+        for i, some in enumerate(((told,), (told,), ()), start=1)
+    ]
+
+    first, again, carried = (step.ranges for step in steps)
+    assert [(row.range_m, row.var_m2, row.measured_m) for row in first] == [(50.0, 9.0, 51.0)]
+    assert again == first
+    assert carried[0].range_m == pytest.approx(49.0)
+    assert carried[0].var_m2 == pytest.approx(9.01)
+    assert carried[0].measured_m is None
