@@ -70,7 +70,7 @@ def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) ->
     Raises:
         RunError: A table is missing or damaged, or nothing of the run lies in the truth's time.
     """
-    refuse_set_back(run, "fit messages")
+    refuse_set_back(run.drive_manifest().timeline, run.path, "fit messages")
     belief = run.table("belief", ["t_ns", "approach", "established"])
     t_ns = _whole(belief["t_ns"])
     number, established = _whole(belief["approach"]), np.asarray(belief["established"])

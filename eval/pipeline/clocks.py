@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from crosscue.eval.runs.manifest import ClockRow
-from crosscue.replay.clocks.reports import Clock
+from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor
 

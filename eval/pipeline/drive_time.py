@@ -8,7 +8,7 @@ import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import TimeSegments
-from crosscue.replay.clocks.reports import Clock
+from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.ledger import Ledger

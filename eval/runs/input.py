@@ -15,13 +15,8 @@ from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, RunFolder
 from crosscue.eval.runs.manifest import part_of
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.identity import (
-    Identity,
-    as_row,
-    identity_of_all,
-    identity_of_log,
-    of_row,
-)
+from crosscue.replay.files.identity import identity_of_all, identity_of_log
+from crosscue.replay.files.log_identity import Identity, as_row, of_row
 from crosscue.replay.files.made_of import difference
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.limits import DEFAULT

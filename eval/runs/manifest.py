@@ -12,8 +12,8 @@ from typing import Annotated, Any, Final, Literal, TypeAlias
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError
 
-from crosscue.replay.clocks.reports import Clock
-from crosscue.replay.files.identity import Identity
+from crosscue.replay.clocks.clock import Clock
+from crosscue.replay.files.log_identity import Identity
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.log import Selection
 from crosscue.replay.time.segments import LogClock, Segment, Timeline

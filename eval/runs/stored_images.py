@@ -12,7 +12,7 @@ import numpy as np
 from crosscue.detectors.images import Encoded, encoded
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
-from crosscue.replay.clocks.reports import Clock
+from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.columns import Block, Images, Topic
 from crosscue.replay.errors import RunError, UnreadableRunError
 from crosscue.replay.ledger import Ledger

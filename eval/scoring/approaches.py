@@ -26,15 +26,13 @@ from numpy.typing import NDArray
 from crosscue.datasets.truth.truth import Approach
 from crosscue.replay.columns import Floats, Int64s
 
-from .cues import has_feature
+from .columns import NONE, BeliefRows, RunTables
 from .intervals import Mean, Proportion, mean, share
-from .run_tables import NONE, BeliefRows, RunTables
-from .truth import DriveTruth
+from .truth import FEATURES, DriveTruth, has_feature
 
 THRESHOLD: Final = 0.9
 NEAR_M: Final = 8.0
 """The source's full detections all came at least this far away."""
-FEATURES: Final = ("intersection", "left", "right", "straight")
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,12 +18,10 @@ from numpy.typing import NDArray
 from crosscue.eval.runs.tables.log_time import AMBIGUOUS
 from crosscue.replay.columns import Floats, Int64s
 
-from .approaches import FEATURES
-from .cues import has_feature
+from .columns import NONE, RunTables
 from .intervals import Mean, Proportion, mean, share
 from .pooling import cluster_numbers, first_reasons, summed
-from .run_tables import NONE, RunTables
-from .truth import DriveTruth
+from .truth import FEATURES, DriveTruth, has_feature
 
 CLIP: Final = 1e-6
 """Log scores are taken of probabilities clipped to this and one minus this."""

@@ -17,27 +17,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.datasets.truth.truth import Approach
 from crosscue.eval.runs.tables.log_time import AMBIGUOUS
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.cue_spec import Scoring
 from crosscue.replay.vehicle.cue_table import CUES
 
+from .columns import NONE, CueRows, RunTables
 from .intervals import Proportion, share
-from .pooling import cluster_numbers, first_reasons, summed
-from .run_tables import NONE, CueRows, RunTables
-from .truth import DriveTruth, cue_at
+from .pooling import BINS_M, cluster_numbers, distance_bins, first_reasons, summed
+from .truth import DriveTruth, cue_at, has_feature
 
 Reading = Scoring
 
 
-BINS_M: Final = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
 SEEN: Final = 0.5
 """A thing of which less than this fraction can be seen does not count in ``recall_seen``."""
 
@@ -233,18 +230,6 @@ def _feature_at(cue: str, t_ns: Int64s, truth: DriveTruth) -> NDArray[np.int8]:
     return found
 
 
-def has_feature(approach: Approach, feature: str) -> bool | None:
-    """Whether an approach's intersection has a feature; None for one that truth does not know."""
-    if feature == "intersection":
-        return True
-    there = {
-        "left": approach.features.left,
-        "right": approach.features.right,
-        "straight": approach.features.straight,
-    }
-    return there.get(feature)
-
-
 def _reasons(
     has_truth: NDArray[np.bool_],
     was_looked: NDArray[np.bool_],
@@ -386,16 +371,6 @@ class _Cut:
 
     def part(self, rows: NDArray[np.bool_]) -> Part:
         return Part(int(rows.sum()), self.precision(rows), self.recall(rows))
-
-
-def distance_bins(distance_m: Floats, borders_m: Sequence[float]) -> dict[str, NDArray[np.bool_]]:
-    """Which rows lie in which half-open bin; every row lies in exactly one."""
-    found = {f"under {borders_m[0]:g}": distance_m < borders_m[0]}
-    for low, high in pairwise(borders_m):
-        found[f"{low:g}-{high:g}"] = (distance_m >= low) & (distance_m < high)
-    found[f"over {borders_m[-1]:g}"] = distance_m >= borders_m[-1]
-    found["unknown"] = np.isnan(distance_m)
-    return found
 
 
 def _things(pooled: _Pooled) -> Things:

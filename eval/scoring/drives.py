@@ -20,9 +20,10 @@ from . import intervals
 from . import truth as score_truth
 from .approaches import ApproachesJudged, ApproachScore, judge_approaches
 from .belief import BeliefJudged, BeliefScore, judge_belief
-from .cues import BINS_M, CueFrames, CueScore, match_cues, score_cues
+from .columns import RunTables
+from .cues import CueFrames, CueScore, match_cues, score_cues
+from .pooling import BINS_M
 from .ranges import RangeJudged, RangeScore, judge_range, score_range
-from .run_tables import RunTables
 from .truth import DriveTruth
 
 FORMAT: Final = 1

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Int64s
+from crosscue.replay.columns import Floats, Int64s
+
+BINS_M: Final = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
+"""Borders of bins of true range."""
 
 
 def cluster_numbers(drives: Sequence[str], approaches: Sequence[Int64s]) -> Int64s:
@@ -59,3 +64,13 @@ def first_reasons(
             counts[reason] = gone
         rows = rows & ~holds
     return rows, counts
+
+
+def distance_bins(distance_m: Floats, borders_m: Sequence[float]) -> dict[str, NDArray[np.bool_]]:
+    """Which rows lie in which half-open bin; every row lies in exactly one."""
+    found = {f"under {borders_m[0]:g}": distance_m < borders_m[0]}
+    for low, high in pairwise(borders_m):
+        found[f"{low:g}-{high:g}"] = (distance_m >= low) & (distance_m < high)
+    found[f"over {borders_m[-1]:g}"] = distance_m >= borders_m[-1]
+    found["unknown"] = np.isnan(distance_m)
+    return found

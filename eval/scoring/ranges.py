@@ -13,10 +13,9 @@ from crosscue.eval.runs.tables.log_time import AMBIGUOUS
 from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
 from crosscue.replay.columns import Floats, Int64s
 
-from .cues import BINS_M, distance_bins
+from .columns import RunTables
 from .intervals import Mean, mean
-from .pooling import cluster_numbers, first_reasons, summed
-from .run_tables import RunTables
+from .pooling import BINS_M, cluster_numbers, distance_bins, first_reasons, summed
 from .truth import DriveTruth
 
 

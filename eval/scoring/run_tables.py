@@ -4,111 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import LABELS, table_in_log_time
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import UnreadableRunError
 from crosscue.replay.time.segments import Timeline
 
+from .columns import NONE, BeliefRows, CueRows, RangeRows, RunTables
+
 if TYPE_CHECKING:
     import pyarrow as pa
-
-NONE: Final = -1
-"""Stands for a null approach."""
-NAMES: Final = ("frames", "cues", "range", "belief")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CueRows:
-    """N rows: what was looked for in a frame and how many were found.
-
-    Attributes:
-        t_ns: Shape (N,).
-        approach: Shape (N,); ``NONE`` outside approaches.
-        cue: Shape (N,), names.
-        count: Shape (N,), never negative.
-    """
-
-    t_ns: Int64s
-    approach: Int64s
-    cue: NDArray[np.str_]
-    count: Int64s
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RangeRows:
-    """N rows of the range filter; ``reference`` is ``start`` or ``end``."""
-
-    t_ns: Int64s
-    approach: Int64s
-    reference: NDArray[np.str_]
-    range_m: Floats
-    var_m2: Floats
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BeliefRows:
-    """N steps.
-
-    Attributes:
-        t_ns: Shape (N,).
-        approach: Shape (N,); ``NONE`` outside approaches.
-        features: A feature's name to its N probabilities, NaN where missing.
-        established: Shape (N,): presence of the intersection is established.
-    """
-
-    t_ns: Int64s
-    approach: Int64s
-    features: Mapping[str, Floats]
-    established: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RunTables:
-    """What a run says; None where it has no such table.
-
-    Attributes:
-        frames_ns: Sorted times of all frames examined.
-        cues: From ``cues.parquet``.
-        ranges: From ``range.parquet``.
-        belief: From ``belief.parquet``.
-        ambiguous: Rows left out, as their log time comes twice: of ``frames``, of ``belief``, and
-            of ranges by reference (``start``, ``end``).
-    """
-
-    frames_ns: Int64s | None
-    cues: CueRows | None
-    ranges: RangeRows | None
-    belief: BeliefRows | None
-    ambiguous: Mapping[str, int] = field(default_factory=dict)
-
-    def span_ns(self) -> tuple[int, int] | None:
-        """First and last time in any table, or None for nothing at all."""
-        tables = (self.cues, self.ranges, self.belief)
-        times = [part.t_ns for part in tables if part is not None]
-        if self.frames_ns is not None:
-            times.append(self.frames_ns)
-        times = [t_ns for t_ns in times if len(t_ns)]
-        if not times:
-            return None
-        return min(int(t.min()) for t in times), max(int(t.max()) for t in times)
-
-
-def tables_of(run: RunFolder) -> RunTables:
-    """Read a run's tables; one that is not there becomes None.
-
-    Raises:
-        RunError: A table is damaged or has other columns.
-    """
-    timeline = run.drive_manifest().timeline
-    found = {name: run.table(name) for name in NAMES if run.file(f"{name}.parquet").exists()}
-    return in_log_time(str(run.path), found, timeline)
 
 
 def in_log_time(where: str, tables: Mapping[str, pa.Table], timeline: Timeline) -> RunTables:

@@ -31,17 +31,19 @@ from crosscue.replay.remote.logs import is_remote
 
 from . import intervals
 from . import truth as score_truth
-from .approaches import FEATURES
+from .columns import RunTables
 from .drives import DEFAULTS, DriveJudged, Scores, ScoreSettings, as_metrics, judge, score
 from .pose import score as score_pose
 from .pose.score import PoseScore, ScoredPoses
-from .run_tables import RunTables, tables_of
-from .truth import DriveTruth
+from .run_tables import in_log_time
+from .truth import FEATURES, DriveTruth
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 FOLDER: Final = "score"
+TABLES: Final = ("frames", "cues", "range", "belief")
+"""Of a run, that are scored."""
 METRICS: Final = "metrics.json"
 CURVES: Final = "curves"
 CUE_FRAMES: Final = "cue_frames"
@@ -126,7 +128,7 @@ def judge_run(
     truth = score_truth.load(truth_path, str(run.path))
     if not any_log:
         _check_log(run, truth.truth, truth_path)
-    tables = tables_of(run)
+    tables = _tables_of(run)
     _check_times(run, truth.truth, tables, truth_path)
     judged = judge(tables, truth, settings)
     why = _why_no_pose(run, truth.truth)
@@ -136,6 +138,17 @@ def judge_run(
         reasons = "; ".join(dict.fromkeys([*nothing.values(), why]))
         raise SchemaError(f"{truth_path}: nothing of {run.path} can be scored: {reasons}")
     return RunScored(run, truth_path, truth, judged, pose, poses, why)
+
+
+def _tables_of(run: RunFolder) -> RunTables:
+    """Read a run's tables; one that is not there becomes None.
+
+    Raises:
+        RunError: A table is damaged or has other columns.
+    """
+    timeline = run.drive_manifest().timeline
+    found = {name: run.table(name) for name in TABLES if run.file(f"{name}.parquet").exists()}
+    return in_log_time(str(run.path), found, timeline)
 
 
 def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:

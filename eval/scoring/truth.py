@@ -17,7 +17,7 @@ from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.limits import MIB
 
-from .run_tables import NONE
+from .columns import NONE
 
 COLUMNS: Final = ("t_ns", "approach", "start_m", "end_m")
 MAX_BYTES: Final = 256 * MIB
@@ -25,6 +25,7 @@ NEAREST_NS: Final = 500_000_000
 """A true range further away in time than this says nothing about a moment."""
 CROSSING_NS: Final = 10_000_000_000
 """After entering, so long is the car taken to be in the intersection: nothing is judged then."""
+FEATURES: Final = ("intersection", "left", "right", "straight")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,3 +238,15 @@ def cue_at(spans: list[CueTruth], t_ns: Int64s) -> CueTruthAt:
         count[rows] = reported
         visible[rows] = math.nan if span.visible is None else span.visible
     return CueTruthAt(present, count, visible)
+
+
+def has_feature(approach: Approach, feature: str) -> bool | None:
+    """Whether an approach's intersection has a feature; None for one that truth does not know."""
+    if feature == "intersection":
+        return True
+    there = {
+        "left": approach.features.left,
+        "right": approach.features.right,
+        "straight": approach.features.straight,
+    }
+    return there.get(feature)

@@ -17,6 +17,7 @@ from crosscue.eval.pipeline.variants import scene_tables
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.approaches import ApproachResult
 from crosscue.eval.scoring.belief import BeliefDifference, compare_belief
+from crosscue.eval.scoring.columns import RunTables
 from crosscue.eval.scoring.drives import (
     DEFAULTS,
     DriveJudged,
@@ -28,7 +29,7 @@ from crosscue.eval.scoring.drives import (
 )
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.metric_values import metric_values
-from crosscue.eval.scoring.run_tables import RunTables, in_log_time
+from crosscue.eval.scoring.run_tables import in_log_time
 from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.replay.vehicle import cue_table
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -6,8 +6,10 @@ from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
+from crosscue.replay.clocks.clock import Clock
+
 from .order import ClockStep
-from .reports import MAX_OFFSET_NS, Clock, ClockReport, StampReport
+from .reports import MAX_OFFSET_NS, ClockReport, StampReport
 
 SECOND_NS: Final = 1_000_000_000
 DRIFT_WORTH_TELLING_PPM: Final = 50.0

@@ -21,13 +21,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import Final
 
 import numpy as np
 
 from crosscue.replay.columns import Block, Int64s
 
+from .clock import LATEST_NS, Clock
 from .offset import ClockLine, OffsetWatch
 from .order import ClockStep, OrderWatch
 
@@ -37,19 +37,9 @@ MAX_DRIFT_PPM: Final = 1000.0
 MIN_SHARE: Final = 0.99
 MAX_LATE_SHARE: Final = 0.01
 
-_LATEST_NS: Final = 1 << 62
-"""Stamps from the year 2116 on are nonsense; below it, differences fit into 64 bits."""
 _STEADY_RATIO: Final = 2.5
 _PERIODS_FOR_GAPS: Final = 8
 _BATCH_ROWS: Final = 4096
-
-
-class Clock(Enum):
-    """Which of a row's times."""
-
-    LOG = "log time"
-    PUBLISH = "publish time"
-    HEADER = "header stamp"
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,17 +178,6 @@ def choose(
     return Clock.LOG, "; ".join(against) or "no other clock in the log"
 
 
-def times_of(block: Block, clock: Clock) -> Int64s:
-    """The times of a block's rows on ``clock``, shape (N,).
-
-    A row without that stamp (absent, 0 or absurd) gets its log time, so times stay comparable.
-    """
-    column = {Clock.PUBLISH: block.publish_ns, Clock.HEADER: block.header_ns}.get(clock)
-    if column is None:
-        return block.log_ns
-    return np.where((column > 0) & (column < _LATEST_NS), column, block.log_ns)
-
-
 def _disagreement(count: int, stamps: StampReport) -> str | None:
     """Why a clock cannot stand in for the log clock, or None."""
     line = stamps.line
@@ -234,7 +213,7 @@ class _StampWatch:
 
     def add(self, log_ns: Int64s, stamps_ns: Int64s) -> None:
         """Take in rows, shape (N,) each."""
-        usable = (stamps_ns >= 0) & (stamps_ns < _LATEST_NS)
+        usable = (stamps_ns >= 0) & (stamps_ns < LATEST_NS)
         self.absurd += len(stamps_ns) - int(np.count_nonzero(usable))
         if not self.is_log:
             is_set = stamps_ns != 0
@@ -245,7 +224,7 @@ class _StampWatch:
             log_ns, stamps_ns = log_ns[usable], stamps_ns[usable]
         self.order.add(stamps_ns, log_ns)
         if not self.is_log:
-            both = (log_ns >= 0) & (log_ns < _LATEST_NS)
+            both = (log_ns >= 0) & (log_ns < LATEST_NS)
             self.offset.add(log_ns[both], stamps_ns[both])
 
     def finish(self) -> StampReport:

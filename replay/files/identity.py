@@ -23,11 +23,11 @@ import re
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Final, Protocol
 
 from crosscue.replay.errors import LogError
+from crosscue.replay.files.log_identity import Identity
 from crosscue.replay.limits import MIB
 from crosscue.replay.log import Log
 from crosscue.replay.remote.logs import RangedLog, RemoteFiles, by_ranges, fetch, is_remote
@@ -38,49 +38,12 @@ MIN_BYTES: Final = 64 << 10
 EDGE_BYTES: Final = 64 << 10
 BLOCKS: Final = 32
 INDEX_BYTES: Final = 64 * MIB
-SHORT: Final = 8
-"""Hex digits that stand in a run's name."""
 BESIDE: Final = frozenset({"vehicle.toml", "truth.json"})
 
 _MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 _MCAP_FOOTER: Final = struct.Struct("<BQQQI8s")
 _BAG_MAGIC: Final = b"#ROSBAG V2.0\n"
 _BAG_INDEX: Final = re.compile(rb"index_pos=(.{8})", re.DOTALL)
-
-
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """Which log, or which logs of one drive.
-
-    Attributes:
-        name: Of the file or folder.
-        size: Bytes in all; None in runs of earlier versions.
-        digest: 64 hex digits.
-    """
-
-    name: str
-    size: int | None
-    digest: str
-
-    @property
-    def short(self) -> str:
-        """Enough of it for a person."""
-        return self.digest[:SHORT]
-
-    def __str__(self) -> str:
-        size = "" if self.size is None else f", {self.size:,} bytes"
-        return f"{self.name} ({self.short}{size})"
-
-
-def as_row(identity: Identity) -> dict[str, object]:
-    """For a manifest."""
-    return {"name": identity.name, "size": identity.size, "digest": identity.digest}
-
-
-def of_row(row: Mapping[str, object]) -> Identity:
-    """From a manifest."""
-    size = row["size"]
-    return Identity(str(row["name"]), size if isinstance(size, int) else None, str(row["digest"]))
 
 
 def identity_of(place: Path | str) -> Identity:

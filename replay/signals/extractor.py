@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crosscue.replay.clocks.reports import MAX_OFFSET_NS, Clock, ClockWatch, times_of
+from crosscue.replay.clocks.clock import Clock, times_of
+from crosscue.replay.clocks.reports import MAX_OFFSET_NS, ClockWatch
 from crosscue.replay.columns import Block, Images, Int64s
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.ledger import Ledger

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.clocks.reports import Clock
+from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.columns import Block
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.log import Log, Selection

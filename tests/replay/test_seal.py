@@ -15,7 +15,7 @@ import pytest
 from crosscue.eval.cli import run
 from crosscue.eval.fit.log_images import log_span
 from crosscue.eval.runs.stored_images import StoredCamera, read_pictures
-from crosscue.replay.clocks.reports import Clock
+from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.errors import LogError
 from crosscue.replay.formats import FORMATS
 from crosscue.replay.ledger import CHANGED, DIFFERS, Ledger

@@ -14,9 +14,11 @@ from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, s
 from crosscue.eval.runs.folder import RunFolder, create, write_manifest
 from crosscue.eval.runs.logs import relative
 from crosscue.eval.runs.manifest import LogRow
-from crosscue.eval.scoring.run_tables import RunTables, run_tables
+from crosscue.eval.scoring.columns import RunTables
+from crosscue.eval.scoring.run_tables import run_tables
 from crosscue.eval.scoring.truth import DriveTruth, TrueRanges
-from crosscue.replay.files.identity import Identity, identity_of
+from crosscue.replay.files.identity import identity_of
+from crosscue.replay.files.log_identity import Identity
 from crosscue.replay.files.whole_file import write_text
 
 from .manifests import estimated

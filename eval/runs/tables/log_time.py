@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import RunError
 from crosscue.replay.time.segments import Cause, Timeline
@@ -93,15 +93,6 @@ def table_in_log_time(table: pa.Table, timeline: Timeline) -> pa.Table:
     return moved.filter(pa.array(keep)).sort_by("t_ns")
 
 
-def pose_in_log_time(run: RunFolder) -> pa.Table:
-    """``pose.parquet`` so.
-
-    Raises:
-        RunError: It is missing or damaged.
-    """
-    return table_in_log_time(run.table("pose"), run.drive_manifest().timeline)
-
-
 def comes_twice(timeline: Timeline, log_ns: Int64s) -> NDArray[np.bool_]:
     """Which moments of the log's clock lie in more than one segment, shape (N,)."""
     inside = np.zeros(len(log_ns), np.int64)
@@ -110,14 +101,14 @@ def comes_twice(timeline: Timeline, log_ns: Int64s) -> NDArray[np.bool_]:
     return np.asarray(inside > 1)
 
 
-def refuse_set_back(run: RunFolder, what: str) -> None:
+def refuse_set_back(timeline: Timeline, run: Path, what: str) -> None:
     """Say that a run's times do not fit the truth's.
 
     Raises:
         RunError: A clock was set back during it.
     """
-    if was_set_back(run.drive_manifest().timeline):
+    if was_set_back(timeline):
         raise RunError(
-            f"{run.path}: a clock was set back during the drive, so its times are not the truth's; "
+            f"{run}: a clock was set back during the drive, so its times are not the truth's; "
             f"{what} takes drives without: replay each side alone with --from and --to"
         )

@@ -19,7 +19,7 @@ from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.tables.log_time import Gap, comes_twice, gaps_of, pose_in_log_time
+from crosscue.eval.runs.tables.log_time import Gap, comes_twice, gaps_of, table_in_log_time
 from crosscue.localization.angles import wrap_all
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
@@ -158,7 +158,7 @@ def truth_track(path: Path, run: RunFolder) -> TruthTrack:
         SchemaError: The truth does not fit the run.
     """
     _, track = load_truth(path)
-    table = pose_in_log_time(run)
+    table = table_in_log_time(run.table("pose"), run.drive_manifest().timeline)
     inside = _inside(track, table, path)
     return TruthTrack(track.t_ns[inside], track.xyz_m[inside, 0], track.xyz_m[inside, 1])
 
@@ -178,7 +178,7 @@ def measure(
         SchemaError: The truth does not fit the run.
     """
     truth, track = load_truth(truth_path)
-    table = pose_in_log_time(run)
+    table = table_in_log_time(run.table("pose"), run.drive_manifest().timeline)
     vehicle = run.drive_manifest().settings
     _inside(track, table, truth_path)
     estimate, cov = _estimate(table, vehicle, truth)

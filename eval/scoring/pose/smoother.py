@@ -63,7 +63,7 @@ def score_smoother(run: RunFolder, truth_path: Path) -> SmootherScore:
         SchemaError: The truth does not fit the run.
     """
     truth, track = load_truth(truth_path)
-    refuse_set_back(run, "the smoother")
+    refuse_set_back(run.drive_manifest().timeline, run.path, "the smoother")
     measured = read_measured(run)
     vehicle = run.drive_manifest().settings
     first_ns, last_ns = measured.start.t_ns, int(measured.increments.stop_ns[-1])

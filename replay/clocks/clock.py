@@ -1,0 +1,32 @@
+"""Which of a row's three times is meant, and the rows' times on it."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Block, Int64s
+
+LATEST_NS: Final = 1 << 62
+"""Stamps from the year 2116 on are nonsense; below it, differences fit into 64 bits."""
+
+
+class Clock(Enum):
+    """Which of a row's times."""
+
+    LOG = "log time"
+    PUBLISH = "publish time"
+    HEADER = "header stamp"
+
+
+def times_of(block: Block, clock: Clock) -> Int64s:
+    """The times of a block's rows on ``clock``, shape (N,).
+
+    A row without that stamp (absent, 0 or absurd) gets its log time, so times stay comparable.
+    """
+    column = {Clock.PUBLISH: block.publish_ns, Clock.HEADER: block.header_ns}.get(clock)
+    if column is None:
+        return block.log_ns
+    return np.where((column > 0) & (column < LATEST_NS), column, block.log_ns)
