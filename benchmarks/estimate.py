@@ -21,8 +21,7 @@ import numpy as np
 from crosscue.datasets.simulated.drive import DriveSettings, drive, sense, vehicle_text
 from crosscue.datasets.simulated.log_files import BUS, GYRO, MAGNETOMETER, sensor_blocks
 from crosscue.detectors import rle
-from crosscue.detectors.base import Detections, Found, Frame, View
-from crosscue.detectors.registry import Choice
+from crosscue.detectors.base import Choice, Detections, Found, Frame, View
 from crosscue.eval.pipeline.detect import detect_drive
 from crosscue.eval.pipeline.reestimate import estimate_run
 from crosscue.eval.runs.folder import create, open_run

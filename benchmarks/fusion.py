@@ -18,9 +18,10 @@ import gtsam
 import numpy as np
 
 from crosscue.fusion.approaches import Approaches, FrameEvidence, SignRange
-from crosscue.fusion.belief import Situation, begin, multiply, probabilities, source_speaker
+from crosscue.fusion.belief import begin, multiply, probabilities, source_speaker
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
+from crosscue.fusion.situation import Situation
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.fusion import Calibrated, Fusion, RangeFilter, Rates
 

@@ -23,8 +23,9 @@ from crosscue.replay.columns import BLOCK_ROWS, Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.encode import bursts_of, encode_tables
+from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.layout import Field, Message, layout
-from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting
+from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.mobileye.tables import table_block
 from crosscue.replay.mobileye.wire import Columns
 

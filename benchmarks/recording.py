@@ -30,7 +30,7 @@ from estimate import (  # type: ignore[import-not-found]  # a script beside this
 
 from crosscue.datasets.simulated.drive import DriveSettings, vehicle_text
 from crosscue.detectors import rle
-from crosscue.detectors.registry import Choice
+from crosscue.detectors.base import Choice
 from crosscue.eval.pipeline.detect import detect_drive
 from crosscue.eval.pipeline.reestimate import estimate_run
 from crosscue.eval.recording import save

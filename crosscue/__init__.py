@@ -47,7 +47,7 @@ _EXPORTS: Final = {
     "compare_runs": "eval.interface.runs",
     "save_recording": "eval.interface.runs",
     "load_vehicle": "eval.interface.runs",
-    "default_cache": "eval.interface.runs",
+    "default_cache": "detectors.result_cache",
     "simulate_approach": "eval.interface.simulate",
     "simulate_drive": "eval.interface.simulate",
     "draw_sign": "eval.interface.simulate",
@@ -96,6 +96,7 @@ if TYPE_CHECKING:
     from crosscue.detectors.base import Frame as Frame
     from crosscue.detectors.base import View as View
     from crosscue.detectors.base import nothing_found as nothing_found
+    from crosscue.detectors.result_cache import default_cache as default_cache
     from crosscue.detectors.settings import Settings as Settings
     from crosscue.detectors.settings import identity_of as identity_of
     from crosscue.detectors.settings import settings_of as settings_of
@@ -111,7 +112,6 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.runs import Run as Run
     from crosscue.eval.interface.runs import ScoredRun as ScoredRun
     from crosscue.eval.interface.runs import compare_runs as compare_runs
-    from crosscue.eval.interface.runs import default_cache as default_cache
     from crosscue.eval.interface.runs import detect_drive as detect_drive
     from crosscue.eval.interface.runs import estimate_run as estimate_run
     from crosscue.eval.interface.runs import load_vehicle as load_vehicle

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol, Self, TypeAlias
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol, Self, TypeAlias
 
 import numpy as np
 
@@ -158,3 +158,18 @@ def reportable(detector: Detector) -> tuple[str, ...] | None:
     """All class names that a detector can report, sorted; None where it does not say."""
     labels: Sequence[str] | None = getattr(detector, "labels", None)
     return None if labels is None else tuple(sorted({*labels}))
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """One detector as asked for.
+
+    Attributes:
+        name: What it is called in tables.
+        kind: As the module's text says.
+        settings: For its factory.
+    """
+
+    name: str
+    kind: str
+    settings: Mapping[str, Any] = field(default_factory=dict)

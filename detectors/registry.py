@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any, Final, cast
+from typing import Final, cast
 
 from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.plugins import GROUPS
 
-from .base import Detector
+from .base import Choice, Detector
 from .catalog import entries as catalog
 
 GROUP: Final = GROUPS["detector"]
@@ -36,21 +35,6 @@ EMBEDDED: Final = "mask-rcnn,road,signs"
 
 _EMBEDDED_BY: Final = {"mask-rcnn": ("network", "embedded"), "road": ("checkpoint", None)}
 """Setting that names a network, and its default, which is the embedded one."""
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """One detector as asked for.
-
-    Attributes:
-        name: What it is called in tables.
-        kind: As the module's text says.
-        settings: For its factory.
-    """
-
-    name: str
-    kind: str
-    settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 def chosen(names: str, sections: Mapping[str, Choice]) -> tuple[Choice, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import sqlite3
 import zlib
 from collections.abc import Sequence
@@ -28,6 +29,12 @@ _SCHEMA: Final = (
     "CREATE TABLE IF NOT EXISTS found "
     "(key BLOB PRIMARY KEY, text BLOB NOT NULL, crc INTEGER NOT NULL) WITHOUT ROWID"
 )
+
+
+def default_cache() -> Path:
+    """Where the command line keeps results of detectors, in the user's cache folder."""
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "crosscue" / "detections.sqlite"
 
 
 def picture_key(picture: Encoded) -> bytes:

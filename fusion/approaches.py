@@ -24,9 +24,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from crosscue.fusion.situation import Situation
 from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
 
-from .belief import Belief, Situation, Speaker, begin, establish, multiply, probabilities
+from .belief import Belief, Speaker, begin, establish, multiply, probabilities
 from .factor_graph import FactorGraph
 from .intersection_range import RangeBelief, Reference
 from .range_track import NOTHING, RangeTrack, Verdict, advance, measure, predict_without_odometry

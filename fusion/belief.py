@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from .factor_graph import FactorGraph, log_odds, probability
+from .situation import Situation
 
 
 class Belief(NamedTuple):
@@ -50,31 +51,6 @@ def probabilities(belief: Belief, graph: FactorGraph) -> dict[str, float]:
         name: probability(odds)
         for name, odds in zip(graph.feature_names, belief.log_odds, strict=True)
     }
-
-
-@dataclass(frozen=True, slots=True)
-class Situation:
-    """All that decides what the cues of one frame say.
-
-    Attributes:
-        counts: From cue to how many; 0 is looked for and not found, absent is not looked for.
-        is_established: Presence was established by earlier frames.
-        is_near: The intersection is known to be near, or passed.
-        may_dissent: It is, and the car has moved since dissent was last sent.
-        objects: From cue to identities of the counted things, where a tracker gives them.
-        is_new_picture: Not the same picture as before.
-        moved_m: Way gone since the frame before, forwards or back.
-        passed_s: Time since then.
-    """
-
-    counts: Mapping[str, int]
-    is_established: bool
-    is_near: bool = False
-    may_dissent: bool = False
-    objects: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    is_new_picture: bool = True
-    moved_m: float = 0.0
-    passed_s: float = 0.0
 
 
 Speaker = Callable[[Situation], Sequence[float]]

@@ -28,9 +28,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from crosscue.fusion.situation import Situation
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
 
-from .belief import Situation
 from .factor_graph import CueNode, FactorGraph, log_odds
 from .independence import effective_sample_fraction
 

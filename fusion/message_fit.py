@@ -19,11 +19,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from crosscue.fusion.situation import Situation
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
 
 from .annotated_approach import NOT_LOOKED, AnnotatedApproach
-from .belief import Situation
 from .calibrated import CalibratedMessageModel, voices_of
 from .factor_graph import CueNode, FactorGraph, log_odds
 from .fade_fit import FadeFit, fit_fade

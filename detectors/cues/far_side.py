@@ -13,7 +13,7 @@ import numpy as np
 
 from crosscue.replay.columns import Floats
 from crosscue.replay.mobileye.geometry import evaluate
-from crosscue.replay.mobileye.samples import LANE_COLUMNS, OBSTACLE_COLUMNS
+from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.mobileye_cues import Past
 

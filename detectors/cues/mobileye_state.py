@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crosscue.replay.columns import Floats
-from crosscue.replay.mobileye.samples import LANE_COLUMNS, OBSTACLE_COLUMNS
-from crosscue.replay.signals.kinds import Samples
+from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS, Samples
 from crosscue.replay.vehicle.mobileye_cues import Past
 
 _BURST, _X = OBSTACLE_COLUMNS.index("burst"), OBSTACLE_COLUMNS.index("x_m")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias, get_args
 
@@ -170,3 +170,44 @@ def static(shape: tuple[int | str | None, ...], axis: int) -> int | None:
     """A declared size as a number; None where it is open or has no such axis."""
     size = shape[axis] if -len(shape) <= axis < len(shape) else None
     return size if isinstance(size, int) else None
+
+
+def cell_count(size_px: Size, strides: Sequence[int], *, round_up: bool = False) -> int:
+    """How many cells the grids of all strides have over a picture."""
+    return sum(w * h for w, h in _grids(size_px, strides, round_up))
+
+
+def cells(
+    size_px: Size, strides: Sequence[int], *, round_up: bool = False
+) -> tuple[Floats, Floats]:
+    """Column and row of each cell, shape (N, 2), and its stride in pixels, shape (N, 1)."""
+    grids = _grids(size_px, strides, round_up)
+    corners = [
+        np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1).reshape(-1, 2) for w, h in grids
+    ]
+    steps = [np.full((w * h, 1), s) for (w, h), s in zip(grids, strides, strict=True)]
+    return np.concatenate(corners).astype(np.float64), np.concatenate(steps).astype(np.float64)
+
+
+def _grids(size_px: Size, strides: Sequence[int], round_up: bool) -> list[Size]:
+    width, height = size_px
+    if round_up:
+        return [(-(-width // s), -(-height // s)) for s in strides]
+    return [(width // s, height // s) for s in strides]
+
+
+def class_numbers(values: Floats, count: int) -> Int64s:
+    """Class numbers that came as floating-point values or integers, checked.
+
+    Raises:
+        ValueError: One that is no index of ``count`` classes.
+    """
+    bad = len(values) - int(np.isfinite(values).sum())
+    if bad:
+        raise ValueError(f"{bad} of {len(values)} candidates are not finite numbers")
+    numbers: Int64s = values.astype(np.int64)
+    if len(numbers) and not (numbers.min() >= 0 and numbers.max() < count):
+        raise ValueError(
+            f"class numbers {numbers.min()} to {numbers.max()}, but {count} classes are listed"
+        )
+    return numbers

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from typing import Literal
 
-import numpy as np
 from typing_extensions import override
 
-from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.columns import Floats
 
-from .base import BoxOutput, Candidates, Guess, Interface, Outputs, Size, named, rows_of, static
+from .base import (
+    BoxOutput,
+    Candidates,
+    Guess,
+    Interface,
+    Outputs,
+    Size,
+    class_numbers,
+    named,
+    rows_of,
+    static,
+)
 from .yolo import PICTURE, PrototypeMasks, prototype_output, prototypes_of
 
 
@@ -55,20 +65,3 @@ class EndToEndOutput(BoxOutput):
             ("boxes are in input pixels",),
             PICTURE,
         )
-
-
-def class_numbers(values: Floats, count: int) -> Int64s:
-    """Class numbers that came as floating-point values or integers, checked.
-
-    Raises:
-        ValueError: One that is no index of ``count`` classes.
-    """
-    bad = len(values) - int(np.isfinite(values).sum())
-    if bad:
-        raise ValueError(f"{bad} of {len(values)} candidates are not finite numbers")
-    numbers: Int64s = values.astype(np.int64)
-    if len(numbers) and not (numbers.min() >= 0 and numbers.max() < count):
-        raise ValueError(
-            f"class numbers {numbers.min()} to {numbers.max()}, but {count} classes are listed"
-        )
-    return numbers

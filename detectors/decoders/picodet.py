@@ -18,11 +18,12 @@ from .base import (
     Size,
     Tensor,
     best_class,
+    cell_count,
+    cells,
     named,
     rows_of,
     static,
 )
-from .grids import cell_count, cells
 
 _STRIDES = (8, 16, 32, 64)
 

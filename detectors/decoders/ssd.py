@@ -7,8 +7,17 @@ from typing import Final, Literal
 import numpy as np
 from typing_extensions import override
 
-from .base import BoxOutput, Candidates, Guess, Interface, Outputs, Size, named, static
-from .end_to_end import class_numbers
+from .base import (
+    BoxOutput,
+    Candidates,
+    Guess,
+    Interface,
+    Outputs,
+    Size,
+    class_numbers,
+    named,
+    static,
+)
 
 _BOXES: Final = "detection_boxes"
 

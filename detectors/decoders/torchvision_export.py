@@ -10,8 +10,18 @@ from typing_extensions import override
 
 from crosscue.replay.columns import Floats, Int64s
 
-from .base import Array, BoxOutput, Candidates, Guess, Interface, Outputs, Size, Tensor, named
-from .end_to_end import class_numbers
+from .base import (
+    Array,
+    BoxOutput,
+    Candidates,
+    Guess,
+    Interface,
+    Outputs,
+    Size,
+    Tensor,
+    class_numbers,
+    named,
+)
 
 
 class TorchvisionOutput(BoxOutput):

@@ -19,13 +19,13 @@ from .base import (
     Outputs,
     Size,
     best_class,
+    cell_count,
     from_centers,
     named,
     rows_of,
     sigmoid,
     static,
 )
-from .grids import cell_count
 
 PICTURE: Final = {"colour": "rgb", "fit": "letterbox-center", "scale": (1 / 255,) * 3}
 _COEFFICIENTS: Final = 32

@@ -9,8 +9,19 @@ from typing_extensions import override
 
 from crosscue.replay.columns import Floats
 
-from .base import BoxOutput, Candidates, Guess, Interface, Outputs, Size, best_class, named, static
-from .grids import cell_count, cells
+from .base import (
+    BoxOutput,
+    Candidates,
+    Guess,
+    Interface,
+    Outputs,
+    Size,
+    best_class,
+    cell_count,
+    cells,
+    named,
+    static,
+)
 
 _STRIDES = (8, 16, 32)
 

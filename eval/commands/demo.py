@@ -16,6 +16,7 @@ from crosscue.datasets.scenes.drive import SceneSettings, write_scene
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.detectors.registry import EMBEDDED, chosen
 from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.outcome import summary as replay_summary
 from crosscue.eval.commands.shared.progress import DriveLine, is_shown
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
@@ -29,8 +30,6 @@ from crosscue.replay.errors import UsageError
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
-
-from .replay import summary as replay_summary
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

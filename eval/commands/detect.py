@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from crosscue.eval.commands.shared.detectors import add_detector_arguments, cache_of, detectors_of
 from crosscue.eval.commands.shared.options import (
     add_log_arguments,
     open_part,
@@ -19,13 +20,11 @@ from crosscue.eval.commands.shared.options import (
 )
 from crosscue.eval.commands.shared.progress import DriveLine, is_shown
 from crosscue.eval.interface.runs import detect_drive
-from crosscue.eval.pipeline.detect import DetectOutcome
+from crosscue.eval.pipeline.outcome import DetectOutcome
 from crosscue.eval.runs.account import account_lines, details_of
 from crosscue.replay.errors import UsageError
 from crosscue.replay.safe_text import visible
 from crosscue.replay.vehicle.vehicle import Vehicle
-
-from .replay import add_detector_arguments, cache_of, detectors_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

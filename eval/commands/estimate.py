@@ -12,11 +12,10 @@ import argparse
 from pathlib import Path
 
 from crosscue.eval.commands.shared.options import add_logs_argument, limits_of, print_json
+from crosscue.eval.commands.shared.outcome import as_json, summary
 from crosscue.eval.commands.shared.progress import DriveLine, is_shown
 from crosscue.eval.interface.runs import estimate_run, open_run
-from crosscue.eval.pipeline.estimate import Outcome
-
-from .replay import as_json, summary
+from crosscue.eval.pipeline.outcome import Outcome
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -17,36 +17,33 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from crosscue.eval.batch.drive_list import DriveInput, DriveList, drives_of
+from crosscue.eval.batch.engine import engine_of
 from crosscue.eval.batch.jobs import (
     Done,
-    Engine,
     Job,
     exit_status_of,
     fingerprint_of,
     run_many,
 )
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
-from crosscue.eval.batch.processes import Processes
+from crosscue.eval.commands.shared.detectors import add_detector_arguments, cache_of, detectors_of
 from crosscue.eval.commands.shared.options import (
     add_part_arguments,
     open_part,
     print_json,
 )
+from crosscue.eval.commands.shared.outcome import as_json, summary
 from crosscue.eval.commands.shared.progress import DriveLine, DrivesLine, is_shown
-from crosscue.eval.interface.runs import default_cache, replay_drive
-from crosscue.eval.pipeline.estimate import Outcome
-from crosscue.eval.pipeline.scene import ApproachSummary, SceneOutcome
-from crosscue.eval.runs.account import account_lines, details_of
-from crosscue.eval.runs.candidates import candidate_lines, candidate_rows, not_looked_lines
+from crosscue.eval.interface.runs import replay_drive
+from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import create
 from crosscue.eval.runs.input import files_named_in
 from crosscue.replay.errors import CrosscueError, UsageError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.safe_text import terminal_width, visible, wrapped
+from crosscue.replay.safe_text import visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 from crosscue.replay.versions import versions
 
@@ -96,48 +93,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--resume", action="store_true", help="continue an interrupted run and keep finished parts"
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
-
-
-def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
-    """``--detectors``, ``--draw``, ``--cache`` and ``--no-cache``."""
-    parser.add_argument(
-        "--detectors",
-        metavar="NAMES",
-        help="comma-separated names (default: all in the vehicle file); "
-        "none estimates only the pose",
-    )
-    parser.add_argument(
-        "--draw",
-        type=int,
-        default=0,
-        metavar="N",
-        help="write up to N camera images with detections, spread over the drive",
-    )
-    parser.add_argument(
-        "--cache",
-        type=Path,
-        metavar="FILE",
-        help="detection cache (default: ~/.cache/crosscue/detections.sqlite)",
-    )
-    parser.add_argument(
-        "--no-cache",
-        action="store_true",
-        help="run every detector again instead of using the cache",
-    )
-
-
-def detectors_of(args: argparse.Namespace) -> Sequence[str] | None:
-    """Names as ``replay_drive`` takes them: None for the vehicle file's, empty for none."""
-    if args.detectors is None:
-        return None
-    return [] if args.detectors == "none" else str(args.detectors).split(",")
-
-
-def cache_of(args: argparse.Namespace) -> Path | None:
-    """Where results are kept: as asked for, or in the user's cache folder."""
-    if args.no_cache:
-        return None
-    return default_cache() if args.cache is None else Path(args.cache)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -253,21 +208,6 @@ def _fingerprint(args: argparse.Namespace, drive: DriveInput) -> str:
     return fingerprint_of(settings, flags, versions(), files_named_in([settings, flags]))
 
 
-def engine_of(workers: int | None, ray: str | None) -> Engine:
-    """Where many drives are worked on.
-
-    Raises:
-        UsageError: Too few workers.
-    """
-    if workers is not None and workers < 1:
-        raise UsageError(f"--workers {workers}: want 1 or more")
-    if ray is not None:
-        from crosscue.eval.batch.ray_jobs import OnRay
-
-        return OnRay(ray, workers)
-    return Processes(workers or 1)
-
-
 def _drive_lines(done: Sequence[Done[Outcome]]) -> list[str]:
     lines = []
     for one in done:
@@ -293,105 +233,4 @@ def _drive_as_json(one: Done[Outcome]) -> dict[str, object]:
         "attempts": one.attempts,
         "seconds": one.seconds,
         "result": None if one.result is None else as_json(one.result),
-    }
-
-
-def summary(outcome: Outcome) -> str:
-    """What happened, for a person, in 80 columns."""
-    lines = [f"run      {outcome.run.path}"]
-    for log in outcome.account.reading:
-        lines.append(f"log      {log.log}")
-        lines.append(f"         integrity: {log.integrity}")
-        lines += [f"  note   {sentence}" for sentence in log.notices]
-    lines += [*account_lines(outcome.account), *details_of(_ledgers(outcome))]
-    if outcome.rows:
-        lines += [
-            f"pose     {outcome.rows:,} rows over {outcome.travelled_m:.0f} m in "
-            f"{outcome.drive_seconds:.0f} s;",
-            f"         2-sigma ellipse {outcome.major_axis_m:.1f} m long at the end",
-        ]
-    else:
-        lines.append("pose     none")
-    if outcome.detected is not None:
-        lines += _detected(outcome)
-    if outcome.scene is not None:
-        lines += scene_lines(outcome.scene)
-    if outcome.landmark_counts:
-        lines.append(f"marks    {_landmarks(outcome.landmark_counts)}")
-    lines += [f"  note   {sentence}" for sentence in outcome.notices]
-    speed = outcome.drive_seconds / max(outcome.seconds, 1e-9)
-    digits = 0 if speed >= 10 else 1
-    lines.append(f"took     {outcome.seconds:.2f} s, {speed:.{digits}f} times real time")
-    width = min(terminal_width(), 80)
-    return "\n".join(
-        wrapped(visible(line[9:]), width, lead=line[:9]) if len(line) > width else visible(line)
-        for line in lines
-    )
-
-
-def _ledgers(outcome: Outcome) -> list[Ledger]:
-    detected = () if outcome.detected is None else (outcome.detected.ledger,)
-    return [*detected, *outcome.ledgers]
-
-
-def _detected(outcome: Outcome) -> list[str]:
-    assert outcome.detected is not None
-    counts = outcome.detected.counts
-    lines = [f"frames   {counts.frames:,} looked at"]
-    for name, ran in counts.ran.items():
-        lines.append(f"         {name}: ran on {ran:,}, {counts.from_cache[name]:,} from the cache")
-    return lines
-
-
-def scene_lines(scene: SceneOutcome) -> list[str]:
-    """Cues and approaches, for a person."""
-    seen = [f"{cue} {count:,}" for cue, count in scene.positive.items()]
-    lines = [f"cues     {', '.join(seen) or 'none'} (frames each, of {scene.frames:,})"]
-    rows = candidate_rows(scene.candidates), candidate_rows(scene.ranged)
-    lines += [f"  skip   {sentence}" for sentence in candidate_lines(*rows)]
-    lines += [f"  skip   {sentence}" for sentence in not_looked_lines(scene.not_looked_for)]
-    lines += [f"  note   {n:,} x {what}" for what, n in scene.counts.items() if n]
-    for one in scene.approaches:
-        lines.append(f"approach {_approach(one)}")
-    return lines
-
-
-def _approach(one: ApproachSummary) -> str:
-    said = ", ".join(f"{feature} {p:.2f}" for feature, p in one.probabilities.items())
-    where = "not detected"
-    if one.detected_m is not None:
-        where = f"detected {one.detected_m:.1f} m before its {one.reference}"
-    return f"{one.number}: {where}; at the end {said}"
-
-
-def _landmarks(counts: dict[str, int]) -> str:
-    looked = counts["frames"] - counts["thinned"] - counts["late"]
-    return (
-        f"{counts['accepted']} landmarks weighed in, {counts['gated']} refused by the gate; "
-        f"{counts['matched']} of {looked} frames looked at matched one"
-    )
-
-
-def as_json(outcome: Outcome) -> dict[str, object]:
-    """The result for other programs."""
-    return {
-        "run": str(outcome.run.path),
-        "account": outcome.account.as_json(),
-        "pose": {
-            "rows": outcome.rows,
-            "travelled_m": outcome.travelled_m,
-            "major_axis_m": outcome.major_axis_m,
-        },
-        "landmarks": outcome.landmark_counts,
-        "detected": None
-        if outcome.detected is None
-        else {
-            "frames": outcome.detected.counts.frames,
-            "ran": outcome.detected.counts.ran,
-            "from_cache": outcome.detected.counts.from_cache,
-            "objects": outcome.detected.objects,
-        },
-        "scene": None if outcome.scene is None else asdict(outcome.scene),
-        "notices": list(outcome.notices),
-        "seconds": outcome.seconds,
     }

@@ -57,8 +57,8 @@ from crosscue.eval.studies.attribution import (
     attribute,
     attribution_lines,
     attribution_tree,
-    estimate_of,
 )
+from crosscue.eval.studies.estimated_again import estimate_of
 from crosscue.replay.errors import UsageError, one_line
 from crosscue.replay.safe_text import visible
 

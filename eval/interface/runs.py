@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -23,10 +22,9 @@ from crosscue.replay.vehicle.vehicle import Vehicle, load
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from crosscue.detectors.registry import Choice
+    from crosscue.detectors.base import Choice
     from crosscue.eval.catalog.compare import Comparison
-    from crosscue.eval.pipeline.detect import DetectOutcome
-    from crosscue.eval.pipeline.estimate import Outcome
+    from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
     from crosscue.eval.report.score_runs import Scored
 
 VEHICLE: Final = "vehicle.toml"
@@ -417,12 +415,6 @@ def save_recording(
             track = truth_track(Path(truth), folder)
     save(folder, path, track, ranges)
     return path
-
-
-def default_cache() -> Path:
-    """Where the command line keeps results of detectors, in the user's cache folder."""
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "crosscue" / "detections.sqlite"
 
 
 def choices_for(vehicle: Vehicle, detectors: Sequence[str] | None) -> tuple[Choice, ...]:

@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crosscue.detectors import rle
-from crosscue.detectors.base import Detections, RoadMask, reportable
+from crosscue.detectors.base import Choice, Detections, RoadMask, reportable
 from crosscue.detectors.cues.frame import CuePass, FrameCues, Role, all_labels, role_of, seen
 from crosscue.detectors.overlay import Drawer
 from crosscue.detectors.ranging.height_to_range import range_of
-from crosscue.detectors.registry import Choice, knows_simulated_only, make
+from crosscue.detectors.registry import knows_simulated_only, make
 from crosscue.detectors.result_cache import ResultCache
-from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
-from crosscue.eval.runs.account import Account, account, detecting_of, reading_of
+from crosscue.detectors.runner import FrameResult, Named, Runner
+from crosscue.eval.pipeline.outcome import DetectOutcome
+from crosscue.eval.runs.account import account, detecting_of, reading_of
 from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
 from crosscue.eval.runs.input import input_of
 from crosscue.eval.runs.logs import log_names, log_rows
@@ -57,38 +58,6 @@ OnFrames = Callable[[int, int | None], None]
 
 def no_progress(_done: int, _of: int | None) -> None:
     """Nobody looks."""
-
-
-@dataclass(frozen=True, slots=True)
-class DetectOutcome:
-    """What a detection run did.
-
-    Attributes:
-        run: Its folder.
-        ledger: The camera log's account.
-        counts: Frames, by detector what ran and what came from the cache.
-        objects: Detections by detector and label.
-        cues: Frames in which each cue was positive.
-        notices: Plain sentences.
-        seconds: Wall time.
-        account: What became of every row and frame.
-        has_gaps: The drive has more than one time segment.
-    """
-
-    run: RunFolder
-    ledger: Ledger
-    counts: Counts
-    objects: dict[str, int]
-    cues: dict[str, int]
-    notices: tuple[str, ...]
-    seconds: float
-    account: Account
-    has_gaps: bool = False
-
-    @property
-    def exit_status(self) -> int:
-        """3 when anything was dropped or the drive has gaps, else 0."""
-        return 0 if self.account.is_whole and not self.has_gaps else 3
 
 
 def choices_of(vehicle: Vehicle) -> dict[str, Choice]:

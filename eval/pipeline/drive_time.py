@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -21,23 +21,6 @@ from crosscue.replay.time.segments import Timeline, gaps_text
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .clocks import probe_clocks
-
-OnTime = Callable[[float, float], None]
-"""Called with the seconds of a drive that are done, and those there are."""
-
-
-def unwatched_time(_done_s: float, _of_s: float) -> None:
-    """Nobody wants to know."""
-
-
-def report_time(on_time: OnTime, timeline: Timeline, t_ns: int) -> None:
-    """Call ``on_time`` for a drive that has been worked through up to ``t_ns``."""
-    first, last = timeline.segments[0], timeline.segments[-1]
-    if last.end_ns > first.start_ns:
-        # The last window ends after the last wheel speed.
-        on_time(
-            (min(t_ns, last.end_ns) - first.start_ns) * 1e-9, (last.end_ns - first.start_ns) * 1e-9
-        )
 
 
 def drive_timeline(

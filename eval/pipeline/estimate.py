@@ -9,12 +9,19 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
+from crosscue.eval.pipeline.outcome import (
+    DetectOutcome,
+    OnTime,
+    Outcome,
+    SceneOutcome,
+    report_time,
+    unwatched_time,
+)
 from crosscue.eval.runs.account import (
     UNATTRIBUTED,
-    Account,
     account,
     joined_accounts,
     reading_of,
@@ -49,9 +56,7 @@ from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import camera_of, plan, with_pictures
 from crosscue.replay.time.segments import (
-    ONE_SEGMENT,
     LogClock,
-    Segment,
     TimedLog,
     Timeline,
     gaps_text,
@@ -63,63 +68,14 @@ from crosscue.replay.versions import versions
 from crosscue.replay.windows import windows
 
 from .clocks import clock_changes, clock_rows, probe_clocks
-from .detect import DetectOutcome
-from .drive_time import (
-    OnTime,
-    drive_timeline,
-    refuse_other_segments,
-    report_time,
-    selections_of,
-    time_segments,
-    unwatched_time,
-)
+from .drive_time import drive_timeline, refuse_other_segments, selections_of, time_segments
 from .empty_result import empty_result, silent_roles
 from .landmarks import looking
 from .pose import PoseStage, estimating_of, turn_signal_of
-from .scene import SceneOutcome, estimate_scene, features_of, schemas
+from .scene import estimate_scene, features_of, schemas
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What a replay, or its second stage alone, did.
-
-    Attributes:
-        run: Its folder.
-        ledgers: One account for each log.
-        rows: Pose rows written.
-        travelled_m: Along the estimated track.
-        major_axis_m: At the end; NaN without any pose.
-        notices: Plain sentences for the person who ran it.
-        seconds: Wall time, detection included where it ran.
-        drive_seconds: Log time from first to last pose row.
-        landmark_counts: What became of camera frames; empty where no landmarks were given.
-        account: What became of every row, frame and reading.
-        detected: What the detect stage did, where it ran just now.
-        scene: Cues, ranges and beliefs, where detectors have run.
-        segments: Time segments of the drive.
-    """
-
-    run: RunFolder
-    ledgers: tuple[Ledger, ...]
-    rows: int
-    travelled_m: float
-    major_axis_m: float
-    notices: tuple[str, ...]
-    seconds: float
-    drive_seconds: float
-    landmark_counts: dict[str, int]
-    account: Account
-    detected: DetectOutcome | None = None
-    scene: SceneOutcome | None = None
-    segments: tuple[Segment, ...] = ONE_SEGMENT.segments
-
-    @property
-    def exit_status(self) -> int:
-        """3 when anything was dropped or the drive has gaps, else 0."""
-        return 0 if self.account.is_whole and len(self.segments) == 1 else 3
 
 
 def estimate_into(

@@ -6,6 +6,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from crosscue.eval.pipeline.outcome import OnTime, Outcome, unwatched_time
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, locked, staged, write_input
 from crosscue.eval.runs.input import settings_changed
 from crosscue.eval.runs.logs import reopened
@@ -15,8 +16,7 @@ from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.log import Log
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .drive_time import OnTime, unwatched_time
-from .estimate import Outcome, begin_again, estimate_into
+from .estimate import begin_again, estimate_into
 
 
 def estimate_run(

@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from crosscue.detectors.registry import Choice, make
+from crosscue.detectors.base import Choice
+from crosscue.detectors.registry import make
+from crosscue.eval.pipeline.outcome import DetectOutcome, OnTime, Outcome, unwatched_time
 from crosscue.eval.runs.folder import RunFolder, clear, locked, staged
 from crosscue.eval.runs.input import input_of, refuse_another
 from crosscue.eval.runs.logs import log_rows
@@ -20,10 +22,10 @@ from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .detect import DetectOutcome, OnFrames, detect_into, no_progress
-from .drive_time import OnTime, drive_timeline, unwatched_time
+from .detect import OnFrames, detect_into, no_progress
+from .drive_time import drive_timeline
 from .empty_result import nothing_left
-from .estimate import Outcome, estimate_into
+from .estimate import estimate_into
 
 TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
 """What the second stage reads of the first."""

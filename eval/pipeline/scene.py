@@ -12,9 +12,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.detectors.cues.candidates import Candidates
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.tally import CueTally, cue_labels
+from crosscue.eval.pipeline.outcome import (
+    ApproachSummary,
+    OnTime,
+    SceneOutcome,
+    report_time,
+    unwatched_time,
+)
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
@@ -24,7 +30,6 @@ from crosscue.fusion.factor_graph import graph_of
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .drive_time import OnTime, report_time, unwatched_time
 from .looked_for import not_looked_for
 from .motion_ranges import MotionRanges
 from .sign_ranges import MEASURED, SignRanges
@@ -38,54 +43,6 @@ FEATURES: Final = ("intersection", "left", "right", "straight")
 
 Sink = Callable[[str, dict[str, list[Any]]], None]
 """Takes a batch of a table: its name and columns."""
-
-
-@dataclass(slots=True)
-class ApproachSummary:
-    """One approach as the run itself saw it; no truth is asked.
-
-    Attributes:
-        number: From 1 in the order of the drive.
-        start_ns: First step.
-        end_ns: Last step.
-        detected_ns: When the intersection was first held present with a range known.
-        detected_m: The range then.
-        reference: What that range goes to.
-        probabilities: At the last step.
-    """
-
-    number: int
-    start_ns: int
-    end_ns: int
-    detected_ns: int | None = None
-    detected_m: float | None = None
-    reference: str | None = None
-    probabilities: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class SceneOutcome:
-    """What the scene part did.
-
-    Attributes:
-        frames: Looked at.
-        positive: Frames in which each cue was positive.
-        approaches: In order.
-        counts: What became of the evidence, as ``Approaches`` counts it.
-        without_odometry: Frames before which the odometry has a hole.
-        candidates: By cue, what became of everything that could have been it.
-        ranged: By cue, what became of its detections on the way to a range.
-        not_looked_for: Cues without any row, and why.
-    """
-
-    frames: int
-    positive: Mapping[str, int]
-    approaches: tuple[ApproachSummary, ...]
-    counts: Mapping[str, int]
-    without_odometry: int
-    candidates: Mapping[str, Candidates] = field(default_factory=dict)
-    ranged: Mapping[str, Candidates] = field(default_factory=dict)
-    not_looked_for: Mapping[str, str] = field(default_factory=dict)
 
 
 def nothing_past(_t_ns: int) -> PastCues | None:

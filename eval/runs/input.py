@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from crosscue.detectors.registry import Choice
+from crosscue.detectors.base import Choice
 from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, RunFolder
 from crosscue.eval.runs.manifest import part_of
 from crosscue.replay.errors import UsageError

@@ -13,8 +13,6 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
-from crosscue.eval.pipeline.variants import scene_tables
-from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.approaches import ApproachResult
 from crosscue.eval.scoring.belief import BeliefDifference, compare_belief
 from crosscue.eval.scoring.columns import RunTables
@@ -29,10 +27,8 @@ from crosscue.eval.scoring.drives import (
 )
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.metric_values import metric_values
-from crosscue.eval.scoring.run_tables import in_log_time
 from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.replay.vehicle import cue_table
-from crosscue.replay.vehicle.vehicle import Vehicle
 
 SHOWN: Final = ("approaches", "belief", "range")
 PASSED_OVER: Final = frozenset(
@@ -92,26 +88,6 @@ class Attribution:
     full_only_with: int
     full_only_without: int
     belief: dict[str, BeliefDifference]
-
-
-def estimate_of(run: RunFolder, vehicle: Vehicle | None = None) -> EstimateWithout:
-    """Estimates from a run's own detections and pose; no picture is opened.
-
-    Args:
-        run: With a finished detect stage.
-        vehicle: Other settings; the run's, if left out.
-
-    Raises (when called):
-        RunError: No detector has examined the run's camera.
-    """
-
-    def estimate(cues: frozenset[str], /) -> RunTables:
-        timeline = run.drive_manifest().timeline
-        tables = scene_tables(run, vehicle, cues)
-        frames = run.table("frames", ["t_ns", "segment", "log_t_ns"])
-        return in_log_time(str(run.path), {"frames": frames, **tables}, timeline)
-
-    return estimate
 
 
 def attribute(

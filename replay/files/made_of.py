@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.replay.errors import UsageError
+from crosscue.replay.files.log_identity import as_row, of_row
 
-from .identity import as_row, identity_of, identity_of_all, of_row
+from .identity import identity_of, identity_of_all
 from .tree_text import json_tree, strict_json
 
 NOTHING: Final[Mapping[str, Any]] = {}

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table
+from crosscue.replay.mobileye.geometry import AT_REAR_AXLE, Mounting
 
 from .bits import Words, payloads_of
 from .clock import MS
 from .layout import UNKNOWN, VARIANTS, Message, layout
-from .settings import AT_REAR_AXLE, DEFAULTS, MobileyeSettings, Mounting
+from .settings import DEFAULTS, MobileyeSettings
 from .tables import floats, instance_of_lane, table_block, to_device
 from .wire import Column, Columns, Variant, variant_number, words_from
 

@@ -8,12 +8,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import cos, sin
+from typing import Final
 
 import numpy as np
 
 from crosscue.replay.columns import Floats
 
-from .settings import Mounting
+
+@dataclass(frozen=True, slots=True)
+class Mounting:
+    """Where the device's reference point lies: a calibration entry.
+
+    Attributes:
+        x_m: Ahead of the rear axle. The device measures from a reference point, not its camera.
+        y_m: Left of the vehicle's middle.
+        yaw_rad: Turn of the device's axes to the left of the vehicle's.
+    """
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    yaw_rad: float = 0.0
+
+
+AT_REAR_AXLE: Final = Mounting()
 
 
 @dataclass(frozen=True, slots=True)

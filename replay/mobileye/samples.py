@@ -9,35 +9,13 @@ import numpy as np
 
 from crosscue.replay.columns import Block, CanFrames, Floats, Table
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.ros.reader import RosMobileye
-from crosscue.replay.signals.kinds import Samples, Signal
+from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS, Samples, Signal
 from crosscue.replay.vehicle.vehicle import Mobileye
 
 from .decode import MobileyeDecoder
-from .settings import MobileyeSettings, Mounting
-
-OBSTACLE_COLUMNS: Final = (
-    "burst",
-    "x_m",
-    "y_m",
-    "vx_mps",
-    "type",
-    "status",
-    "valid",
-    "age_frames",
-)
-"""A row with nothing but ``burst`` opens the burst of one image, which may hold no obstacle."""
-LANE_COLUMNS: Final = (
-    "side",
-    "lane_type",
-    "quality",
-    "c0_m",
-    "c1",
-    "c2_per_m",
-    "c3_per_m2",
-    "x_end_m",
-)
-"""``c0_m`` and ``x_end_m`` are NaN on a side without a marking."""
+from .settings import MobileyeSettings
 
 
 class MobileyeStream:

@@ -7,27 +7,11 @@ from typing import Final, Literal, TypeAlias
 
 from crosscue.replay.ledger import Ledger
 
+from .geometry import AT_REAR_AXLE, Mounting
+
 Revision: TypeAlias = Literal["auto", "classic", "2.32"]
 Family: TypeAlias = Literal["auto", "extended", "tsr"]
 LaneSign: TypeAlias = Literal["auto", "right", "left"]
-
-
-@dataclass(frozen=True, slots=True)
-class Mounting:
-    """Where the device's reference point lies: a calibration entry.
-
-    Attributes:
-        x_m: Ahead of the rear axle. The device measures from a reference point, not its camera.
-        y_m: Left of the vehicle's middle.
-        yaw_rad: Turn of the device's axes to the left of the vehicle's.
-    """
-
-    x_m: float = 0.0
-    y_m: float = 0.0
-    yaw_rad: float = 0.0
-
-
-AT_REAR_AXLE: Final = Mounting()
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Block, Floats, Int64s, Table
+from crosscue.replay.mobileye.geometry import Mounting
 
 from .geometry import (
     Pose,
@@ -27,7 +28,6 @@ from .geometry import (
     vehicle_T_device,
 )
 from .layout import layout
-from .settings import Mounting
 from .wire import Column, Columns, unit_of
 
 LEFT: Final = 1

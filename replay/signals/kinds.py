@@ -75,3 +75,27 @@ class Plan:
     def source_of(self, signal: Signal) -> Source | None:
         """Who gives ``signal``."""
         return next((source for source in self.sources if signal in source.signals), None)
+
+
+OBSTACLE_COLUMNS: Final = (
+    "burst",
+    "x_m",
+    "y_m",
+    "vx_mps",
+    "type",
+    "status",
+    "valid",
+    "age_frames",
+)
+"""A row with nothing but ``burst`` opens the burst of one image, which may hold no obstacle."""
+LANE_COLUMNS: Final = (
+    "side",
+    "lane_type",
+    "quality",
+    "c0_m",
+    "c1",
+    "c2_per_m",
+    "c3_per_m2",
+    "x_end_m",
+)
+"""``c0_m`` and ``x_end_m`` are NaN on a side without a marking."""

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 import pytest
 
-from crosscue.detectors.base import Detections, Found, Frame
-from crosscue.detectors.registry import BUILTIN, Choice, make
+from crosscue.detectors.base import Choice, Detections, Found, Frame
+from crosscue.detectors.registry import BUILTIN, make
 from crosscue.testing import check_detector
 from support.detecting import BrightBlob, BrightSettings, build, too_few, yolox_card
 

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from crosscue.detectors.base import Choice
 from crosscue.detectors.catalog import entries, fetch
 from crosscue.detectors.catalog.card import ModelCard, WeightFile
 from crosscue.detectors.catalog.class_names import COCO_80, COCO_90, meaning_of
-from crosscue.detectors.registry import Choice, make
+from crosscue.detectors.registry import make
 from crosscue.eval.cli import run
 from crosscue.replay.errors import CrosscueError, UsageError, VehicleError
 from support.data import shared

@@ -23,7 +23,7 @@ from torchvision.models.detection.roi_heads import paste_masks_in_image
 
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.detectors import rle, weights_file
-from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.base import Choice, Detections, Frame
 from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.devices import chosen_device
 from crosscue.detectors.networks.mask_rcnn.checkpoint import (
@@ -48,7 +48,7 @@ from crosscue.detectors.networks.mask_rcnn.detector import (
 )
 from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network, set_limits
 from crosscue.detectors.networks.mask_rcnn.parts import Body, Parts, as_input
-from crosscue.detectors.registry import Choice, make
+from crosscue.detectors.registry import make
 from crosscue.detectors.weights_file import SUM
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import CrosscueError, VehicleError

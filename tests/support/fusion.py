@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from crosscue.fusion.annotated_approach import AnnotatedApproach
 from crosscue.fusion.approaches import FrameEvidence, SignRange
-from crosscue.fusion.belief import Situation
 from crosscue.fusion.factor_graph import CueNode, Edge, FactorGraph, Feature
 from crosscue.fusion.intersection_range import Reference
+from crosscue.fusion.situation import Situation
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.cue_table import CUES
 

@@ -20,7 +20,7 @@ from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, s
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.detectors.base import Detections, Found, Frame, View, nothing_found
 from crosscue.eval.pipeline.detect import choices_of
-from crosscue.eval.pipeline.estimate import Outcome
+from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.replay.can.database import CanDatabase

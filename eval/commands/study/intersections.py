@@ -14,8 +14,8 @@ from pathlib import Path
 
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.detectors.registry import EMBEDDED
+from crosscue.eval.batch.engine import engine_of
 from crosscue.eval.batch.jobs import exit_status_of
-from crosscue.eval.commands.replay import engine_of
 from crosscue.eval.commands.shared.progress import DrivesLine, is_shown
 from crosscue.eval.studies.intersections.report import TABLES, summary, write_study
 from crosscue.eval.studies.intersections.study import StudySettings, run_drives, score_study

@@ -19,8 +19,13 @@ from crosscue.detectors.cues.mobileye_state import MobileyeState, state_at
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.fusion.approaches import PastCues
 from crosscue.fusion.intersection_range import RangeBelief, Reference
-from crosscue.replay.mobileye.samples import LANE_COLUMNS, OBSTACLE_COLUMNS
-from crosscue.replay.signals.kinds import MOBILEYE_SIGNALS, Samples, Signal
+from crosscue.replay.signals.kinds import (
+    LANE_COLUMNS,
+    MOBILEYE_SIGNALS,
+    OBSTACLE_COLUMNS,
+    Samples,
+    Signal,
+)
 from crosscue.replay.time.segments import BEGINNING, LogClock, Timeline
 from crosscue.replay.vehicle.mobileye_cues import Past
 

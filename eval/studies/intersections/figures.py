@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
 from crosscue.eval.scoring.approaches import ApproachResult, Curve
 from crosscue.eval.scoring.belief import BeliefScore
 from crosscue.replay.files.whole_file import write_whole
-
-from .tables import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

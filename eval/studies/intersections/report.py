@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.eval.batch.jobs import Done
-from crosscue.eval.pipeline.estimate import Outcome
+from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.report.html import render_page
+from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
 from crosscue.eval.scoring.approaches import ApproachScore
 from crosscue.eval.scoring.runs import metrics_of, write_scores
+from crosscue.eval.studies.intersections.scores import StudyScores
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.versions import versions
@@ -21,16 +23,8 @@ from crosscue.replay.versions import versions
 from .causes import Finding, by_cause, condition_costs, findings
 from .contact_sheet import write_sheet
 from .figures import draw_beliefs, draw_distances, draw_reliability
-from .study import StudyScores, StudySettings
-from .tables import (
-    PUBLISHED_DETECTED_M,
-    PUBLISHED_FULL_M,
-    attribution_rows,
-    cue_rows,
-    intersection_rows,
-    mean_text,
-    quoted_rows,
-)
+from .study import StudySettings
+from .tables import attribution_rows, cue_rows, intersection_rows, mean_text, quoted_rows
 
 PAGE: Final = "study.html"
 TEMPLATE: Final = "intersections.html.j2"

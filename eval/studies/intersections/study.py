@@ -21,13 +21,15 @@ from crosscue.detectors.registry import EMBEDDED, chosen
 from crosscue.eval.batch.jobs import Done, Engine, Job, Progress, fingerprint_of, run_many
 from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs
 from crosscue.eval.pipeline.detect import choices_of
-from crosscue.eval.pipeline.estimate import Outcome
+from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import create, open_run
-from crosscue.eval.scoring.belief import BeliefDifference, compare_belief
-from crosscue.eval.scoring.drives import Scores, judge, score
+from crosscue.eval.scoring.belief import compare_belief
+from crosscue.eval.scoring.drives import judge, score
 from crosscue.eval.scoring.runs import RunScored, judge_run
-from crosscue.eval.studies.attribution import Attribution, Drive, attribute, estimate_of
+from crosscue.eval.studies.attribution import Drive, attribute
+from crosscue.eval.studies.estimated_again import estimate_of
+from crosscue.eval.studies.intersections.scores import StudyScores
 from crosscue.fusion.message_fit import fit_messages
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.log import EVERYTHING
@@ -143,26 +145,6 @@ def run_drives(
     ]
     work = Work(out / "drives", scenes, settings.vehicle, settings.detectors, out / "cache")
     return run_many(jobs, work, engine, overwrite=True, on_progress=on_progress)
-
-
-@dataclass(frozen=True, slots=True)
-class StudyScores:
-    """The scored study.
-
-    Attributes:
-        scored: Every drive beside its truth.
-        scores: All together.
-        worth: What each of the nine cues was worth; empty where that was not asked.
-        calibrated: All again, each intersection with messages learned at the others; None where
-            there are too few.
-        difference: Calibrated less source, by feature.
-    """
-
-    scored: tuple[RunScored, ...]
-    scores: Scores
-    worth: dict[str, Attribution]
-    calibrated: Scores | None
-    difference: dict[str, BeliefDifference]
 
 
 def score_study(out: Path, names: Sequence[str], *, attribution: bool = True) -> StudyScores:

@@ -10,12 +10,9 @@ from typing import Any, Final
 from crosscue.eval.scoring.approaches import ApproachResult
 from crosscue.eval.scoring.cues import CueScore
 from crosscue.eval.scoring.intervals import Mean, Proportion, wilson
+from crosscue.eval.studies.intersections.scores import StudyScores
 from crosscue.replay.vehicle.cue_table import groups
 
-from .study import StudyScores
-
-PUBLISHED_DETECTED_M: Final = 34.4
-PUBLISHED_FULL_M: Final = 16.2
 PUBLISHED_RUNS: Final[Mapping[str, tuple[float, float]]] = {
     "E-01": (38.6, 19.8), "F-05": (41.2, 29.4), "A-07": (75.2, 30.1), "B-10": (47.7, 17.6),
     "G-03": (43.5, 9.8), "E-07": (8.2, 7.6), "D-10": (30.1, 11.8),

@@ -14,7 +14,8 @@ from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.replay.columns import Block, Messages, Table, Topic
 from crosscue.replay.log import EVERYTHING
 from crosscue.replay.mobileye.encode import bursts_of, encode_tables
-from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting
+from crosscue.replay.mobileye.geometry import Mounting
+from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.vehicle.vehicle import Mobileye, Vehicle
 from support.data import shared
 from support.gap_drive import BEGIN, ROW, Clock, write_drive

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from crosscue.eval import cli
-from crosscue.eval.pipeline.estimate import Outcome
+from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import create
 from crosscue.replay.columns import Block

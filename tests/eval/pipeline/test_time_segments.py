@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from crosscue.eval.pipeline.estimate import Outcome
+from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import create
 from crosscue.localization.ekf import PoseBelief

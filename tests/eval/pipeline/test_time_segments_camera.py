@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
-from crosscue.eval.pipeline.estimate import Outcome
+from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import RunFolder
 from support.gap_drive import BEGIN, ROW, SECOND, Clock, distance_m, replay, write_drive
 from support.trees import tree

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.decode import MobileyeDecoder
+from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.layout import VARIANTS
-from crosscue.replay.mobileye.settings import MobileyeSettings, Mounting
+from crosscue.replay.mobileye.settings import MobileyeSettings
 from support.mobileye_frames import MS, frames, join, random_drive, status, triple, values
 
 HERE = Mounting()

@@ -15,10 +15,11 @@ from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.decode import MobileyeDecoder
+from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.layout import layout
 from crosscue.replay.mobileye.ros.reader import RosMobileye, tables_from_ros
 from crosscue.replay.mobileye.ros.sign import VOTES_WANTED
-from crosscue.replay.mobileye.settings import LaneSign, MobileyeSettings, Mounting
+from crosscue.replay.mobileye.settings import LaneSign, MobileyeSettings
 from support.mobileye_frames import (
     MS,
     frames,

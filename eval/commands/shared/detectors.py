@@ -1,0 +1,51 @@
+"""Options of commands that run detectors."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from crosscue.detectors.result_cache import default_cache
+
+
+def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--detectors``, ``--draw``, ``--cache`` and ``--no-cache``."""
+    parser.add_argument(
+        "--detectors",
+        metavar="NAMES",
+        help="comma-separated names (default: all in the vehicle file); "
+        "none estimates only the pose",
+    )
+    parser.add_argument(
+        "--draw",
+        type=int,
+        default=0,
+        metavar="N",
+        help="write up to N camera images with detections, spread over the drive",
+    )
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        metavar="FILE",
+        help="detection cache (default: ~/.cache/crosscue/detections.sqlite)",
+    )
+    parser.add_argument(
+        "--no-cache",
+        action="store_true",
+        help="run every detector again instead of using the cache",
+    )
+
+
+def detectors_of(args: argparse.Namespace) -> Sequence[str] | None:
+    """Names as ``replay_drive`` takes them: None for the vehicle file's, empty for none."""
+    if args.detectors is None:
+        return None
+    return [] if args.detectors == "none" else str(args.detectors).split(",")
+
+
+def cache_of(args: argparse.Namespace) -> Path | None:
+    """Where results are kept: as asked for, or in the user's cache folder."""
+    if args.no_cache:
+        return None
+    return default_cache() if args.cache is None else Path(args.cache)

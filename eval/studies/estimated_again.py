@@ -1,0 +1,30 @@
+"""A run's tables estimated again, with other settings or without a cue, ready to be scored."""
+
+from __future__ import annotations
+
+from crosscue.eval.pipeline.variants import scene_tables
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.scoring.columns import RunTables
+from crosscue.eval.scoring.run_tables import in_log_time
+from crosscue.eval.studies.attribution import EstimateWithout
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+
+def estimate_of(run: RunFolder, vehicle: Vehicle | None = None) -> EstimateWithout:
+    """Estimates from a run's own detections and pose; no picture is opened.
+
+    Args:
+        run: With a finished detect stage.
+        vehicle: Other settings; the run's, if left out.
+
+    Raises (when called):
+        RunError: No detector has examined the run's camera.
+    """
+
+    def estimate(cues: frozenset[str], /) -> RunTables:
+        timeline = run.drive_manifest().timeline
+        tables = scene_tables(run, vehicle, cues)
+        frames = run.table("frames", ["t_ns", "segment", "log_t_ns"])
+        return in_log_time(str(run.path), {"frames": frames, **tables}, timeline)
+
+    return estimate
