@@ -13,7 +13,7 @@ PACKAGES = [
     f"crosscue.{name}"
     for name in ("replay", "detectors", "fusion", "localization", "datasets", "eval")
 ]
-LONGEST_CHAIN = 15
+LONGEST_CHAIN = 16
 IMPORTS_PER_MODULE = 4.7
 Graph = dict[str, set[str]]
 

@@ -12,7 +12,7 @@ import pytest
 
 from crosscue.eval import cli
 from crosscue.eval.pipeline.detect import choices_of
-from crosscue.eval.pipeline.estimate import Outcome
+from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.smoother import score_smoother
