@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from crosscue.detectors.registry import BUILTIN, Choice, make
+from crosscue.detectors.base import Choice
+from crosscue.detectors.registry import BUILTIN, make
 from crosscue.replay.formats import FORMATS, Format
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.testing import check_cue, check_detector, check_reader

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.detectors.base import Detections, reportable
+from crosscue.detectors.base import Choice, Detections, reportable
 from crosscue.detectors.cues.frame import CuePass, Seen, all_labels
 from crosscue.detectors.cues.tally import cue_labels
-from crosscue.detectors.registry import Choice, make
+from crosscue.detectors.registry import make
 from crosscue.eval.pipeline.looked_for import (
     NEVER,
     NO_LABEL,
