@@ -284,7 +284,9 @@ class Approaches:
         """
         found: dict[Reference, list[SignRange]] = {}
         for sign in signs:
-            is_sane = 0.0 < sign.range_m <= self._filter.most_m and 0.0 < sign.var_m2 < math.inf
+            # Less sure than the furthest range is long: no measurement, and its square overflows.
+            max_m = self._filter.most_m
+            is_sane = 0.0 < sign.range_m <= max_m and 0.0 < sign.var_m2 <= max_m * max_m
             if is_sane:
                 found.setdefault(sign.reference, []).append(sign)
             else:

@@ -128,3 +128,16 @@ def test_a_frame_that_comes_twice_changes_nothing(
     doubled = [one for one in single for _ in range(2)]
 
     assert run(doubled, fusion)[0][::2] == run(single, fusion)[0]
+
+
+def test_a_range_less_sure_than_any_range_is_long_is_refused() -> None:
+    """Squares of such variances overflow in the filter."""
+    fusion = Fusion()
+    approaches = Approaches(graph_of(fusion), fusion, RangeFilter())
+
+    for i in range(1, 6):
+        approaches(
+            FrameEvidence(i * 10**8, 0.0, 0.0, (SignRange(Reference.START, 1.0, 1e300),), {})
+        )
+
+    assert approaches.counts["ranges refused: beyond reason"] == 5
