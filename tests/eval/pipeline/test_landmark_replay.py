@@ -278,12 +278,12 @@ def test_pictures_with_coordinates_become_landmarks(
 @pytest.mark.parametrize(
     ("table", "status", "why"),
     [
-        ("image,x_m,y_m\n0.png,1,2\n", 1, "at.csv:1: want columns image,x_m,y_m,sd_m"),
-        ("image,x_m,y_m,sd_m\n0.png,nan,2,1\n", 1, "at.csv:2: x_m: want a finite number"),
-        ("image,x_m,y_m,sd_m\n0.png,1,2,1\n1.png,1,inf,1\n", 1, "at.csv:3: y_m"),
-        ("image,x_m,y_m,sd_m\n0.png,1,2,-1\n", 1, "at.csv:2: sd_m: want > 0, got -1"),
-        ("image,x_m,y_m,sd_m\n0.png,1\n", 1, "at.csv:2: y_m: want a finite number, got None"),
-        ("image,x_m,y_m,var_x_m2,cov_xy_m2,var_y_m2\n0.png,1,2,1,2,1\n", 1, "positive definite"),
+        ("image,x_m,y_m\n0.png,1,2\n", 4, "at.csv:1: want columns image,x_m,y_m,sd_m"),
+        ("image,x_m,y_m,sd_m\n0.png,nan,2,1\n", 4, "at.csv:2: x_m: want a finite number"),
+        ("image,x_m,y_m,sd_m\n0.png,1,2,1\n1.png,1,inf,1\n", 4, "at.csv:3: y_m"),
+        ("image,x_m,y_m,sd_m\n0.png,1,2,-1\n", 4, "at.csv:2: sd_m: want > 0, got -1"),
+        ("image,x_m,y_m,sd_m\n0.png,1\n", 4, "at.csv:2: y_m: want a finite number, got None"),
+        ("image,x_m,y_m,var_x_m2,cov_xy_m2,var_y_m2\n0.png,1,2,1,2,1\n", 4, "positive definite"),
         ("image,x_m,y_m,sd_m\nbad.png,1,2,1\n", 4, "bad.png: not a JPEG, PNG or WebP picture"),
         ("image,x_m,y_m,sd_m\nmissing.png,1,2,1\n", 4, "missing.png: No such file"),
         ("image,x_m,y_m,sd_m\n0.png,1,2,1\n0.png,1,2,1\n", 2, "'photos/0.png' is there already"),

@@ -100,9 +100,9 @@ def test_a_run_of_the_old_format_is_refused(
     ):
         argv = [str(tmp_path / word) if word in ("old", "all") else word for word in argv]
         assert run(argv) == 4
-        assert "format 1, this crosscue reads 3: replay again" in capsys.readouterr().err
+        assert "format 1, this crosscue reads 4: replay again" in capsys.readouterr().err
     assert _replay(drives / "D-0", manifest.parent, "--resume") == 4
-    assert "format 1, this crosscue reads 3: replay again" in capsys.readouterr().err
+    assert "format 1, this crosscue reads 4: replay again" in capsys.readouterr().err
 
 
 def test_a_run_is_the_same_bytes_from_wherever_it_is_made(
