@@ -1,10 +1,10 @@
 """PandaSet: one sequence in its published folder layout as a log; its truth from the poses.
 
 ``camera/NAME/`` holds ``NN.jpg``, ``timestamps.json`` (seconds since 1970), ``poses.json``
-(position and orientation of the camera in a local frame; its axes are right, down, forward) and
-``intrinsics.json``; ``meta/gps.json`` with ``meta/timestamps.json`` one GNSS/INS row for each sweep
-of the lidar. Lidar and annotations are not read: as published, annotations are pickles, and a
-pickle runs code when it is read.
+(position and orientation of the camera in a local frame; its axes are right, down, forward);
+``meta/gps.json`` with ``meta/timestamps.json`` one GNSS/INS row for each sweep of the lidar. Lidar,
+intrinsics and annotations are not read: as published, annotations are pickles, and a pickle runs
+code when it is read.
 
 Topics: one per camera; ``odometry`` (forward speed and yaw rate of the car, from the front camera's
 poses, so it is no wheel speed and as good as the poses are); ``gnss``.
@@ -221,21 +221,6 @@ def read_poses(path: Path, camera: str = FRONT) -> Poses:
         raise LogFormatError(f"{folder / 'poses.json'}: {n} poses in order; expected two or more")
     forward, left = (turn.apply(axis) for axis in ((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)))
     return Poses(t_ns[:n], xyz[:n], forward[:n], left[:n], max(len(t_ns), len(xyz)))
-
-
-def read_intrinsics(path: Path, camera: str = FRONT) -> tuple[float, tuple[float, float]]:
-    """Focal length and principal point of a camera, pixels.
-
-    Raises:
-        LogFormatError: The file is missing or damaged.
-    """
-    file = path / "camera" / camera / "intrinsics.json"
-    found = _json(file)
-    try:
-        focal = (float(found["fx"]) + float(found["fy"])) / 2.0
-        return focal, (float(found["cx"]), float(found["cy"]))
-    except (TypeError, KeyError, ValueError):
-        raise LogFormatError(f"{file}: expected the numbers fx, fy, cx, cy") from None
 
 
 def write_truth(path: Path, folder: Path) -> Path:

@@ -7,7 +7,6 @@ publisher, for ``MIRROR/NAME``; ``$CROSSCUE_DATA`` a folder whose ``weights`` ar
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -19,7 +18,7 @@ from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
 from crosscue.replay.errors import CrosscueError, UsageError, one_line
-from crosscue.replay.files.whole_file import cannot_write, write_whole
+from crosscue.replay.files.whole_file import cannot_write, file_sha256, write_whole
 from crosscue.replay.limits import MIB
 
 from .card import ModelCard, WeightFile
@@ -77,14 +76,14 @@ def _fetched(
     environment: Mapping[str, str],
 ) -> Fetched:
     place = place_of(card, file)
-    if place.exists() and _sha256(place) == file.sha256:
+    if place.exists() and file_sha256(place) == file.sha256:
         return Fetched(place, "the cache")
     if given is not None:
         source = given / file.name if given.is_dir() else given
         _take(source, file, place, name)
         return Fetched(place, str(source))
     for source in _at_hand(file, environment):
-        if _sha256(source) == file.sha256:
+        if file_sha256(source) == file.sha256:
             _take(source, file, place, name)
             return Fetched(place, str(source))
     mirror = environment.get(MIRROR)
@@ -104,7 +103,7 @@ def _at_hand(file: WeightFile, environment: Mapping[str, str]) -> Iterator[Path]
 
 def _take(source: Path, file: WeightFile, place: Path, name: str) -> None:
     try:
-        found = _sha256(source)
+        found = file_sha256(source)
     except OSError as error:
         raise UsageError(f"{source}: {error.strerror}; give {file.name} of model {name}") from None
     if found != file.sha256:
@@ -186,8 +185,3 @@ def _opened(url: str, start: int, size_bytes: int) -> HTTPResponse:
     headers = {"Range": f"bytes={start}-{size_bytes - 1}"} if start else {}
     answer: HTTPResponse = urlopen(Request(url, headers=headers), timeout=TIMEOUT_S)  # noqa: S310
     return answer
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

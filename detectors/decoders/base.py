@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias, get_args
@@ -103,18 +104,18 @@ class BoxOutput(Settings):
     overlap: Proportion = 0.45
     """Of two boxes of one class that overlap more (intersection over union), the better stays."""
 
+    @abstractmethod
     def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
         """Decode the outputs for one picture of ``size_px``, the network's input.
 
         Raises:
             ValueError: The outputs do not have the shape that the card asks for.
         """
-        raise NotImplementedError
 
     @classmethod
+    @abstractmethod
     def recognise(cls, model: Interface, /) -> Guess | None:
         """What a model file would have to be for this layout; None where it cannot be."""
-        raise NotImplementedError
 
 
 def kind_of(decoder: type[BoxOutput]) -> str:

@@ -124,12 +124,6 @@ class Progress:
     failed: int
     seconds: float
 
-    @property
-    def seconds_left(self) -> float | None:
-        """Judged by the drives done so far; None before the first."""
-        left = self.total - self.earlier - self.done
-        return self.seconds / self.done * left if self.done else None
-
 
 class State(StrEnum):
     """What lies in a job's run folder."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar, TypeVar, overload
 
@@ -37,9 +38,9 @@ class Listing(Sequence[T]):
         """Keep the records."""
         self._rows = tuple(rows)
 
+    @abstractmethod
     def cells(self, row: T) -> tuple[object, ...]:
         """What is printed of a record, in the order of ``head``."""
-        raise NotImplementedError
 
     @overload
     def __getitem__(self, which: int) -> T: ...

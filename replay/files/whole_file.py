@@ -68,11 +68,16 @@ def sha256_of(path: Path) -> dict[str, str]:
         OSError: A file cannot be read.
     """
     if path.is_file():
-        return {path.name: _sha256(path)}
+        return {path.name: file_sha256(path)}
     files = sorted(entry for entry in path.rglob("*") if entry.is_file())
-    return {entry.relative_to(path).as_posix(): _sha256(entry) for entry in files}
+    return {entry.relative_to(path).as_posix(): file_sha256(entry) for entry in files}
 
 
-def _sha256(path: Path) -> str:
+def file_sha256(path: Path) -> str:
+    """SHA-256 of one file, in hexadecimal.
+
+    Raises:
+        OSError: It cannot be read.
+    """
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

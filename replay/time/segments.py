@@ -139,10 +139,6 @@ class Timeline:
         begins = np.array([one.begins_ns for one in self.segments], np.int64)
         return (np.searchsorted(begins, drive_ns, side="right") - 1).astype(np.int32)
 
-    def segment_at(self, drive_ns: int) -> Segment:
-        """The segment of one drive time."""
-        return self.segments[int(self.numbers(np.array([drive_ns], np.int64))[0])]
-
     def number_of_stamp(self, log_ns: int | None) -> int | None:
         """The segment of a stamp as recorded; None where several or none could be meant."""
         if len(self.segments) == 1:

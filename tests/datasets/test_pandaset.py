@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.datasets.adapters.pandaset import read_intrinsics, read_poses
+from crosscue.datasets.adapters.pandaset import read_poses
 from crosscue.datasets.truth.truth import load, write_carried
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.replay.errors import LogFormatError
@@ -60,12 +60,6 @@ def test_truth_is_the_camera_s_track(tmp_path: Path) -> None:
     )
 
 
-def test_intrinsics_are_one_focal_length_and_the_middle(tmp_path: Path) -> None:
-    focal_px, center_px = read_intrinsics(pandaset_drive(tmp_path / "002"))
-
-    assert (focal_px, center_px) == (1971.0, (970.5, 483.0))
-
-
 @pytest.mark.parametrize("number", [0, 7, COUNT - 1])
 def test_a_picture_that_is_gone_is_dropped_at_its_time(tmp_path: Path, number: int) -> None:
     path = pandaset_drive(tmp_path / "002")
@@ -77,7 +71,7 @@ def test_a_picture_that_is_gone_is_dropped_at_its_time(tmp_path: Path, number: i
     assert ledger.accounts["front_camera"].dropped == {"a time without its picture": 1}
 
 
-@pytest.mark.parametrize("name", ["poses.json", "timestamps.json", "intrinsics.json"])
+@pytest.mark.parametrize("name", ["poses.json", "timestamps.json"])
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '["a"]', "null", "[" * 9999])
 def test_a_damaged_file_is_a_loss(tmp_path: Path, name: str, text: str) -> None:
     path = pandaset_drive(tmp_path / "002")
@@ -85,11 +79,8 @@ def test_a_damaged_file_is_a_loss(tmp_path: Path, name: str, text: str) -> None:
 
     found, ledger = rows(path)
 
-    assert ledger.is_whole == (name == "intrinsics.json")
+    assert not ledger.is_whole
     assert found["gnss"] == COUNT
-    if name == "intrinsics.json":
-        with pytest.raises(LogFormatError, match=r"intrinsics\.json"):
-            read_intrinsics(path)
 
 
 def test_poses_out_of_order_are_refused(tmp_path: Path) -> None:

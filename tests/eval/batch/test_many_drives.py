@@ -176,9 +176,6 @@ def test_progress_reports_what_is_left(tmp_path: Path) -> None:
 
     last = seen[-1]
     assert (last.total, last.earlier, last.done, last.failed) == (3, 1, 2, 1)
-    assert last.seconds_left == 0.0
-    assert Progress(4, 0, 2, 0, 10.0).seconds_left == pytest.approx(10.0)
-    assert Progress(4, 0, 0, 0, 10.0).seconds_left is None
 
 
 def test_the_exit_status_of_many() -> None:
