@@ -85,6 +85,18 @@ _EXPORTS: Final = {
     "EmptyResultError": "replay.errors",
     "AccountError": "replay.errors",
     "LossWarning": "replay.losses",
+    "convert": "eval.interface.convert",
+    "Converted": "eval.interface.convert",
+    "seal": "eval.interface.seals",
+    "check_seal": "eval.interface.seals",
+    "Sealed": "eval.interface.seals",
+    "Seals": "eval.interface.seals",
+    "SealCheck": "eval.interface.seals",
+    "SealChecks": "eval.interface.seals",
+    "decode": "eval.interface.tables",
+    "merge": "eval.interface.tables",
+    "MergedRuns": "eval.interface.tables",
+    "Decoded": "eval.catalog.decoded_logs",
 }
 """From a public name to its module."""
 
@@ -100,8 +112,11 @@ if TYPE_CHECKING:
     from crosscue.detectors.settings import Settings as Settings
     from crosscue.detectors.settings import identity_of as identity_of
     from crosscue.detectors.settings import settings_of as settings_of
+    from crosscue.eval.catalog.decoded_logs import Decoded as Decoded
     from crosscue.eval.fit.sign_threshold import SignFit as SignFit
     from crosscue.eval.fit.sign_threshold import fit_signs as fit_signs
+    from crosscue.eval.interface.convert import Converted as Converted
+    from crosscue.eval.interface.convert import convert as convert
     from crosscue.eval.interface.logs import CameraFrame as CameraFrame
     from crosscue.eval.interface.logs import Log as Log
     from crosscue.eval.interface.logs import LogTopic as LogTopic
@@ -119,12 +134,21 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.runs import replay_drive as replay_drive
     from crosscue.eval.interface.runs import save_recording as save_recording
     from crosscue.eval.interface.runs import score_run as score_run
+    from crosscue.eval.interface.seals import SealCheck as SealCheck
+    from crosscue.eval.interface.seals import SealChecks as SealChecks
+    from crosscue.eval.interface.seals import Sealed as Sealed
+    from crosscue.eval.interface.seals import Seals as Seals
+    from crosscue.eval.interface.seals import check_seal as check_seal
+    from crosscue.eval.interface.seals import seal as seal
     from crosscue.eval.interface.simulate import draw_sign as draw_sign
     from crosscue.eval.interface.simulate import simulate_approach as simulate_approach
     from crosscue.eval.interface.simulate import simulate_drive as simulate_drive
     from crosscue.eval.interface.studies import StudyResult as StudyResult
     from crosscue.eval.interface.studies import run_study as run_study
     from crosscue.eval.interface.summary import DriveSummary as DriveSummary
+    from crosscue.eval.interface.tables import MergedRuns as MergedRuns
+    from crosscue.eval.interface.tables import decode as decode
+    from crosscue.eval.interface.tables import merge as merge
     from crosscue.eval.studies.town.settings import LandmarkStudy as LandmarkStudy
     from crosscue.eval.studies.town.settings import RangeStudy as RangeStudy
     from crosscue.replay.errors import AccountError as AccountError

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from crosscue.eval.pipeline.drive_time import time_segments, whole_timeline
 from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
-from crosscue.eval.runs.account import Account, account, details_of, reading_of
+from crosscue.eval.runs.account import Account, account, account_lines, details_of, reading_of
 from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
 from crosscue.eval.runs.manifest import DecodeManifest
 from crosscue.eval.runs.tables.skipped import write_skipped
@@ -27,7 +27,8 @@ from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.mobileye.samples import settings_of
 from crosscue.replay.remote.logs import name_of
-from crosscue.replay.time.segments import LogClock, TimedLog, Timeline
+from crosscue.replay.safe_text import visible
+from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text
 from crosscue.replay.topic_part import columns_of
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -81,21 +82,40 @@ class _Table:
         self.held, self.held_rows = [], 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Decoded:
-    """What was written.
+    """A drive that was decoded; printed as the list of its tables.
 
     Attributes:
+        path: The folder of the tables.
         rows: For each file of a stream.
         account: What became of every row.
         timeline: Time segments.
         details: Where and why the first rows were dropped.
     """
 
+    path: Path
     rows: dict[str, int]
     account: Account
     timeline: Timeline
     details: list[str]
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue decode --json`` prints."""
+        return {
+            "tables": self.rows,
+            "account": self.account.as_json(),
+            "time": time_segments(self.timeline).as_json(),
+        }
+
+    def __repr__(self) -> str:
+        width = max(map(len, self.rows), default=0)
+        lines = [f"{name:{width}}  {count:>10,} rows" for name, count in self.rows.items()]
+        lines += map(visible, (*account_lines(self.account), *self.details))
+        notices = [text for log in self.account.reading for text in log.notices]
+        lines += [f"note     {visible(text)}" for text in notices]
+        lines += [f"note     {text}" for text in gaps_text(self.timeline.segments)]
+        return "\n".join(lines)
 
     @property
     def exit_status(self) -> int:
@@ -157,7 +177,7 @@ def decode_tables(
             time=time_segments(timeline),
         )
         write_manifest(new, content)
-    return Decoded(rows, made, timeline, details_of(ledgers))
+    return Decoded(run.path, rows, made, timeline, details_of(ledgers))
 
 
 def _decoded(

@@ -9,21 +9,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.eval.catalog.decoded_logs import decode_tables
-from crosscue.eval.commands.shared.options import (
-    add_log_arguments,
-    limits_of,
-    print_json,
-    selection_of,
-)
-from crosscue.eval.commands.shared.progress import Done, progress_line
-from crosscue.eval.pipeline.drive_time import time_segments
-from crosscue.eval.runs.account import account_lines
-from crosscue.eval.runs.folder import create
-from crosscue.replay.opening import open_logs
-from crosscue.replay.safe_text import visible
-from crosscue.replay.time.segments import gaps_text
-from crosscue.replay.vehicle.vehicle import Vehicle, load
+import crosscue
+from crosscue.eval.commands.shared.options import add_log_arguments, open_part, print_result
+from crosscue.eval.commands.shared.progress import progress_line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,32 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Decode; 3 when something was dropped or the clock has gaps."""
-    vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
-    with open_logs(args.logs, limits_of(args)) as logs:
-        folder = create(args.output, overwrite=args.overwrite)
-        selection = selection_of(args, logs)
-        with progress_line(args, "decoding") as shown:
-            done = decode_tables(
-                logs, vehicle, folder, selection, lambda n, of: shown.at(Done(n, of, "rows"))
-            )
-    rows, account = done.rows, done.account
-    if args.json:
-        print_json(
-            {
-                "tables": rows,
-                "account": account.as_json(),
-                "time": time_segments(done.timeline).as_json(),
-            }
+    with open_part(args, args.logs) as log, progress_line(args, "decoding") as line:
+        found = crosscue.decode(
+            log,
+            args.output,
+            args.vehicle or crosscue.Vehicle(version=1),
+            overwrite=args.overwrite,
+            on_rows=line.counting("rows"),
         )
-    elif not args.quiet:
-        width = max(map(len, rows), default=0)
-        for name, count in rows.items():
-            print(f"{name:{width}}  {count:>10,} rows")
-        for line in (*account_lines(account), *done.details):
-            print(visible(line))
-        for log in account.reading:
-            for sentence in log.notices:
-                print(f"note     {visible(sentence)}")
-        for sentence in gaps_text(done.timeline.segments):
-            print(f"note     {sentence}")
-    return done.exit_status
+    print_result(found, args)
+    return found.exit_status

@@ -13,11 +13,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.eval.batch.merge import gathered, merge_runs
-from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.runs.folder import create
-from crosscue.replay.errors import RunError
-from crosscue.replay.safe_text import visible
+import crosscue
+from crosscue.eval.commands.shared.options import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,25 +31,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Merge; 3 when a drive of a batch has failed."""
-    runs, failures = gathered(args.folders)
-    if not runs:
-        raise RunError(f"{args.folders[0]}: no finished run in it; replay first")
-    merged = merge_runs(runs, create(args.output, overwrite=args.overwrite), failures)
-    if args.json:
-        print_json(
-            {
-                "merged": str(merged.run.path),
-                "drives": sorted(runs),
-                "failures": failures,
-                "rows": merged.rows,
-            }
-        )
-    elif not args.quiet:
-        failed = [f"failed   {name}: {why}" for name, why in sorted(failures.items())]
-        lines = [
-            *failed,
-            f"drives   {merged.drives}, {len(failures)} failed",
-            f"tables   {merged.run.path}",
-        ]
-        print("\n".join(visible(line) for line in lines))
-    return 3 if failures else 0
+    found = crosscue.merge(args.folders, args.output, overwrite=args.overwrite)
+    print_result(found, args)
+    return 3 if found.failures else 0

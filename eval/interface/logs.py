@@ -6,7 +6,7 @@ import difflib
 import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -68,6 +68,15 @@ def open(*paths: Path | str, limits: Limits = DEFAULT) -> Log:  # noqa: A001
         files.close()
         raise
     return Log(logs, files, limits)
+
+
+@contextmanager
+def opened(log: Log | Path | str) -> Iterator[Log]:
+    """The drive, open as long as the ``with`` block lasts; one that was open stays so."""
+    with ExitStack() as files:
+        drive = log if isinstance(log, Log) else files.enter_context(open(log))
+        with unless_damaged(drive.logs):
+            yield drive
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

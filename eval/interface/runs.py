@@ -9,14 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.eval.interface.logs import Log
-from crosscue.eval.interface.logs import open as open_drive
+from crosscue.eval.interface.logs import Log, opened
 from crosscue.eval.interface.show import listing
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.runs.manifest import Manifest
 from crosscue.replay.errors import OutputError, RunError, UsageError
 from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.opening import unless_damaged
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 if TYPE_CHECKING:
@@ -238,9 +236,7 @@ def replay_drive(
     from crosscue.eval.pipeline.replay import Detecting
     from crosscue.eval.pipeline.replay import replay_drive as replay_into
 
-    with ExitStack() as stack:
-        drive = _opened(log, stack)
-        stack.enter_context(unless_damaged(drive.logs))
+    with opened(log) as drive, ExitStack() as stack:
         settings = vehicle_of(drive, vehicle)
         detecting = Detecting(
             choices_for(settings, detectors), _path(cache), draw, resume, on_frames
@@ -278,9 +274,7 @@ def detect_drive(
     from crosscue.detectors.registry import known
     from crosscue.eval.pipeline.detect import detect_drive as detect_into
 
-    with ExitStack() as stack:
-        drive = _opened(log, stack)
-        stack.enter_context(unless_damaged(drive.logs))
+    with opened(log) as drive:
         settings = vehicle_of(drive, vehicle)
         choices = choices_for(settings, detectors)
         if not choices:
@@ -440,10 +434,6 @@ def vehicle_of(log: Log, given: Vehicle | Path | str | None) -> Vehicle:
 
 def _vehicle(given: Vehicle | Path | str) -> Vehicle:
     return given if isinstance(given, Vehicle) else load(Path(given))
-
-
-def _opened(log: Log | Path | str, stack: ExitStack) -> Log:
-    return log if isinstance(log, Log) else stack.enter_context(open_drive(log))
 
 
 def _run(run: Run | Path | str) -> Run:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 from crosscue.eval.interface.logs import Log as DriveLog
 from crosscue.eval.interface.logs import open as open_drive
@@ -182,6 +183,22 @@ def _time_ns(flag: str, text: str | None, logs: Sequence[Log]) -> int | None:
             f"{flag} {text}: want seconds after the start (12.5) or absolute time (17...ns)"
         )
     return first_ns(logs) + round(seconds * 1e9)
+
+
+class Result(Protocol):
+    """What a function of the interface returns: printed as text, or as JSON."""
+
+    def as_dict(self) -> object:
+        """Dictionaries, lists and scalars."""
+        ...
+
+
+def print_result(found: Result, args: argparse.Namespace) -> None:
+    """The result, as ``--json`` or as it prints itself; nothing with ``--quiet``."""
+    if args.json:
+        print_json(found.as_dict())
+    elif not args.quiet:
+        print(found)
 
 
 def print_json(value: object) -> None:

@@ -76,11 +76,20 @@ class ProgressLine:
         # Only now is there something to show.
         bar.start()
 
+    def counting(self, unit: str, per: float = 1.0) -> Callable[[float, float | None], None]:
+        """A function to be called with what is done and the total, of which ``per`` are a unit."""
+
+        def count(done: float, of: float | None) -> None:
+            self.at(Done(done / per, None if of is None else of / per, unit))
+
+        return count
+
     def end(self) -> None:
         """Take the line away."""
         if self._bar is not None:
             self._bar.stop()
-        self._bar = None
+        self._bar = self._task = None
+        self._began = time.monotonic()
 
     def _amount(self, done: Done) -> str:
         rate = done.amount / max(time.monotonic() - self._began, 1e-9)

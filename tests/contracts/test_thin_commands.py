@@ -1,0 +1,96 @@
+"""Every command is a thin call of a public function: whatever it does, Python can do as well."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from importlib import import_module
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+import crosscue
+from crosscue.eval import cli
+
+ROOT: Final = Path(__file__).parents[2]
+CALLS: Final = {
+    "convert": ("convert",),
+    "seal": ("seal", "check_seal"),
+    "decode": ("decode",),
+    "merge": ("merge",),
+}
+"""The public functions that a command is made of."""
+NOT_YET: Final = frozenset(
+    {
+        "info", "vehicle init", "detect", "estimate", "replay", "score", "compare", "view",
+        "model list", "model show", "model fetch", "model init", "model check", "fit compass",
+        "fit signs", "fit ranges", "fit messages", "fit landmarks", "landmarks add",
+        "landmarks list", "landmarks match", "truth", "truth import", "truth check", "run schema",
+        "truth schema", "simulate", "train frames", "train mask-rcnn", "train road",
+        "study intersections", "study range", "study landmarks", "study field", "study drive",
+        "demo", "plugins",
+    }
+)  # fmt: skip
+"""Commands with logic of their own."""
+WITHOUT: Final = {"completion": "it is about the shell"}
+ALLOWED: Final = re.compile(r"crosscue(\.eval\.commands(\..+)?|\.replay\.(errors|safe_text))?")
+"""What a command may import of ours: the public interface, options, errors, and safe text."""
+
+
+def tree_of(command: str) -> ast.Module:
+    """The source of a command's module."""
+    module = import_module(f"crosscue.eval.commands.{cli.COMMANDS[command][0]}")
+    return ast.parse(inspect.getsource(module))
+
+
+def test_every_command_is_in_one_of_the_tables() -> None:
+    assert not CALLS.keys() & (NOT_YET | WITHOUT.keys())
+    assert CALLS.keys() | NOT_YET | WITHOUT.keys() == cli.COMMANDS.keys()
+
+
+@pytest.mark.parametrize("command", CALLS)
+def test_a_command_calls_public_functions(command: str) -> None:
+    called = {
+        node.func.attr
+        for node in ast.walk(tree_of(command))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and isinstance(node.func.value, ast.Name)
+        and node.func.value.id == "crosscue"
+    }
+
+    assert {*CALLS[command]} <= called
+    assert called <= {*crosscue.__all__}
+
+
+@pytest.mark.parametrize("command", CALLS)
+def test_a_command_imports_nothing_but_the_interface(command: str) -> None:
+    imported = {
+        name
+        for node in ast.walk(tree_of(command))
+        for name in (
+            [node.module or ""]
+            if isinstance(node, ast.ImportFrom) and not node.level
+            else [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else []
+        )
+        if name.partition(".")[0] == "crosscue"
+    }
+
+    assert [name for name in sorted(imported) if not ALLOWED.fullmatch(name)] == []
+
+
+@pytest.mark.parametrize("name", sorted({name for names in CALLS.values() for name in names}))
+def test_a_public_function_is_documented(name: str) -> None:
+    function = getattr(crosscue, name)
+    page = (ROOT / "docs" / "reference" / "interface.md").read_text(encoding="utf-8")
+
+    assert callable(function)
+    assert f".. autofunction:: crosscue.{name}\n" in page
+    described = inspect.getdoc(function) or ""
+    for argument in inspect.signature(function).parameters:
+        assert f"{argument}:" in described or "; as ``" in described, argument
+    assert inspect.signature(function).return_annotation is not inspect.Signature.empty

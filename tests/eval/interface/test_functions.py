@@ -1,0 +1,77 @@
+"""What commands do, done from Python: each function returns a record that prints as its table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import crosscue
+from support.gap_drive import Clock, write_drive
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A drive of four seconds; ``car.toml`` and ``truth.json`` beside it."""
+    return write_drive(tmp_path_factory.mktemp("drive"), Clock(), seconds=4)
+
+
+def test_a_log_is_converted_in_part(drive: Path, tmp_path: Path) -> None:
+    asked = []
+    with crosscue.open(drive) as log:
+        found = crosscue.convert(
+            log.part(1.0, 2.0),
+            tmp_path / "part.mcap",
+            on_rows=lambda done, of: asked.append((done, of)),
+        )
+
+    assert found.is_whole
+    with crosscue.open(found.path) as part:
+        assert found.written.total() == sum(topic.declared or 0 for topic in part.topics.values())
+    assert repr(found).startswith("topic ")
+    assert repr(found).endswith(", read back")
+    assert found.as_dict()["bytes"] == found.path.stat().st_size
+    assert asked[-1][0] <= asked[-1][1]
+
+
+def test_several_logs_are_not_one_file(drive: Path, tmp_path: Path) -> None:
+    with (
+        crosscue.open(drive, drive) as log,
+        pytest.raises(crosscue.UsageError, match="2 logs; expected one"),
+    ):
+        crosscue.convert(log, tmp_path / "both.mcap")
+
+
+def test_a_drive_is_decoded(drive: Path, tmp_path: Path) -> None:
+    found = crosscue.decode(drive, tmp_path / "tables", drive.parent / "car.toml")
+
+    assert found.path == tmp_path / "tables"
+    assert {*found.rows} == {one.name for one in found.path.glob("*.parquet")} - {"skipped.parquet"}
+    assert all(f"{name} " in repr(found) for name in found.rows)
+
+
+def test_logs_are_sealed_and_checked(drive: Path, tmp_path: Path) -> None:
+    logs = [tmp_path / name for name in ("a.mcap", "b.mcap")]
+    for log in logs:
+        log.write_bytes(drive.read_bytes())
+
+    sealed = crosscue.seal(*logs)
+    assert [one.is_new for one in sealed] == [True, True]
+    assert [one.is_new for one in crosscue.seal(*logs)] == [False, False]
+    content = bytearray(drive.read_bytes())
+    content[100] ^= 1
+    logs[1].write_bytes(content)
+    checked = crosscue.check_seal(*logs)
+
+    assert [one.is_whole for one in checked] == [True, False]
+    assert [line.split()[-1] for line in repr(checked).splitlines()[1:]] == ["matches", "differs"]
+    assert checked[1].differences == [
+        f"{logs[1]}: b.mcap: bytes 0 to {min(1 << 20, len(content))} differ from the seal"
+    ]
+
+
+def test_a_url_among_logs_is_refused_before_any_is_sealed(drive: Path) -> None:
+    with pytest.raises(crosscue.UsageError, match="a URL cannot be sealed"):
+        crosscue.seal(drive, "https://host/drive.mcap")
+
+    assert not drive.with_name("drive.mcap.seal").exists()
