@@ -29,7 +29,7 @@ from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.detectors.base import Detections, Found, Frame, View
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import open_run
-from crosscue.replay.errors import RunError
+from crosscue.replay.base import RunError
 
 MIN_S = 0.001
 

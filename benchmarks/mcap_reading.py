@@ -32,9 +32,8 @@ from mcap.writer import CompressionType, Writer
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
+from crosscue.replay.base import DEFAULT_LIMITS, Ledger
 from crosscue.replay.decode import decoder_for
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT
 from crosscue.replay.readers.mcap.bytes import ByteFile
 from crosscue.replay.readers.mcap.channels import TopicBook
 from crosscue.replay.readers.mcap.reader import open_mcap
@@ -158,13 +157,13 @@ def write_log(path: Path, compression: CompressionType, minutes: int = 1) -> Non
 
 
 def ours(path: Path) -> int:
-    with open_mcap(path, DEFAULT) as log:
+    with open_mcap(path, DEFAULT_LIMITS) as log:
         return sum(len(block) for block in log.read(Ledger(str(path))))
 
 
 def ours_decoded(path: Path) -> int:
     count, ledger = 0, Ledger(str(path))
-    with open_mcap(path, DEFAULT) as log:
+    with open_mcap(path, DEFAULT_LIMITS) as log:
         decoders = {topic.name: decoder_for(topic) for topic in log.topics}
         for block in log.read(ledger):
             decode = decoders[block.topic]
@@ -202,9 +201,11 @@ def mcap_package(path: Path) -> int:
 def bare(path: Path, is_checked: bool = False) -> int:
     """Read and decompress every chunk, perhaps with its checksum, nothing else; on one thread."""
     file = ByteFile(path)
-    segment = find_segments(file, path, TopicBook(DEFAULT), DEFAULT)[0]
+    segment = find_segments(file, path, TopicBook(DEFAULT_LIMITS), DEFAULT_LIMITS)[0]
     inflater = zstandard.ZstdDecompressor()
-    walk = Walk(file, segment.begin, segment.end, segment.rail(file, DEFAULT), DEFAULT)
+    walk = Walk(
+        file, segment.begin, segment.end, segment.rail(file, DEFAULT_LIMITS), DEFAULT_LIMITS
+    )
     for item in walk:
         if isinstance(item, Chunk) and item.head is not None:
             body: bytes | memoryview = file.read(item.body_at, item.head.body_size).data
@@ -321,7 +322,7 @@ def memory(megabytes: int) -> None:
 PEAK = """
 import sys
 from pathlib import Path
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Ledger
 from crosscue.replay.opening import open_log
 import crosscue.replay.readers.mcap.reader
 

@@ -19,15 +19,23 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.columns import CanFrames, Images, Messages, Table
+from crosscue.replay.base import (
+    EVERYTHING,
+    NOT_ASKED_TIME,
+    NOT_ASKED_TOPIC,
+    CanFrames,
+    Images,
+    Ledger,
+    Messages,
+    Selection,
+    Table,
+)
 from crosscue.replay.formats import known_formats
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
-from crosscue.replay.log import EVERYTHING, Selection
 from crosscue.replay.opening import open_log
 
 if TYPE_CHECKING:
     from crosscue.detectors.base import Detector, Found, Frame
-    from crosscue.replay.columns import Block
+    from crosscue.replay.base import Block
     from crosscue.replay.vehicle.cue_spec import CueSpec
 
 __all__ = ["check_cue", "check_dataset", "check_detector", "check_reader"]

@@ -12,12 +12,16 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import Bytes, Images
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Bytes,
+    Images,
+    LogFormatError,
+    LogTooLargeError,
+    read_at_most,
+)
 from crosscue.replay.decode.coding import MAGIC_BYTES, coding_of
-from crosscue.replay.errors import LogFormatError, LogTooLargeError
-from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.image_header import size_in_header
-from crosscue.replay.limits import DEFAULT
 from crosscue.replay.readers.images.damage import damage_of
 
 from .base import View
@@ -53,7 +57,7 @@ def encoded(images: Images, row: int) -> Encoded:
     return Encoded(coding, content, (width, height, step, images.pixel_format[row]))
 
 
-def read_file(path: Path, most_bytes: int = DEFAULT.message_bytes) -> Encoded:
+def read_file(path: Path, most_bytes: int = DEFAULT_LIMITS.message_bytes) -> Encoded:
     """A picture file's bytes; their format is known from the first of them, not from the name.
 
     Raises:

@@ -10,8 +10,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.detectors.cues.frame import FrameCues
-from crosscue.replay.columns import Bytes
-from crosscue.replay.files.whole_file import write_bytes
+from crosscue.replay.base import Bytes, write_bytes
 
 from . import rle
 from .base import Detections, Found, RoadMask, View

@@ -19,8 +19,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from crosscue.replay.errors import OutputError
-from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.base import OutputError, json_tree
 
 from .base import Detections, Found, RoadMask
 from .images import Encoded

@@ -7,8 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Final
 
-from crosscue.replay.columns import Block, Bytes, Images
-from crosscue.replay.errors import CrosscueError, LogError, UsageError, one_line
+from crosscue.replay.base import Block, Bytes, CrosscueError, Images, LogError, UsageError, one_line
 
 from .base import Detector, Found, Frame, View
 from .images import Encoded, decode, encoded, reduction, size_of

@@ -14,8 +14,7 @@ from typing import Final
 
 from torch import Tensor
 
-from crosscue.replay.errors import VehicleError, one_line
-from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.base import VehicleError, json_tree, one_line
 
 SUM: Final = "crosscue-sha256"
 EMBEDDED: Final[Mapping[str, str]] = {

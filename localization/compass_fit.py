@@ -21,8 +21,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.base import Floats, Int64s, VehicleError
 
 from .angles import circular_mean, wrap_all
 from .compass import IDENTITY, CompassSettings, Vector, heading, level_field

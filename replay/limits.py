@@ -27,4 +27,4 @@ class Limits:
     record_bytes: int = 64 * MIB
 
 
-DEFAULT: Final = Limits()
+DEFAULT_LIMITS: Final = Limits()

@@ -5,11 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
+from crosscue.replay.base import Ledger, Log, MissingTopicError, Selection, UsageError
 from crosscue.replay.remote.logs import RangedLog, name_of
-
-from .errors import MissingTopicError, UsageError
-from .ledger import Ledger
-from .log import Log, Selection
 
 
 def part_of(

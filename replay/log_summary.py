@@ -12,6 +12,20 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from crosscue.replay.base import (
+    EVERYTHING,
+    Block,
+    CanFrames,
+    Detail,
+    Ledger,
+    Log,
+    Messages,
+    SchemaError,
+    Selection,
+    Topic,
+    TopicAccount,
+    report_missing,
+)
 from crosscue.replay.clocks.findings import (
     ROWS_FOR_OFFSET,
     apart,
@@ -23,11 +37,6 @@ from crosscue.replay.clocks.reports import ClockReport, ClockWatch
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.seal.log import sealed_sentence
 from crosscue.replay.vehicle.roles import Role, role_of
-
-from .columns import Block, CanFrames, Messages, Topic
-from .errors import SchemaError
-from .ledger import Detail, Ledger, TopicAccount
-from .log import EVERYTHING, Log, Selection, report_missing
 
 if TYPE_CHECKING:
     from .decode import Decoder

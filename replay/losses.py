@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
-    from .ledger import Ledger
+    from crosscue.replay.base import Ledger
 
 
 T = TypeVar("T")

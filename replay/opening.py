@@ -8,14 +8,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import cast
 
-from .errors import LogError, MissingTopicError
+from crosscue.replay.base import DEFAULT_LIMITS, Ledger, Limits, Log, LogError, MissingTopicError
+
 from .formats import FORMATS, format_of, known_formats
-from .ledger import Ledger
-from .limits import DEFAULT, Limits
-from .log import Log
 
 
-def open_log(path: Path | str, limits: Limits = DEFAULT) -> Log:
+def open_log(path: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:
     """Open any recording by its suffix or, for a folder, by what lies in it.
 
     A text with ``://`` is a URL: see ``remote``. Of a log with a seal beside
@@ -36,7 +34,7 @@ def open_log(path: Path | str, limits: Limits = DEFAULT) -> Log:
     return with_seal(place, lambda: open_unsealed(place, limits))
 
 
-def open_unsealed(path: Path, limits: Limits = DEFAULT) -> Log:
+def open_unsealed(path: Path, limits: Limits = DEFAULT_LIMITS) -> Log:
     """As ``open_log`` of a file or folder, without looking at its seal."""
     name = format_of(path)
     module, _, function = (FORMATS.get(name) or known_formats()[name]).opener.partition(":")
@@ -52,7 +50,9 @@ def open_unsealed(path: Path, limits: Limits = DEFAULT) -> Log:
 
 
 @contextmanager
-def open_logs(paths: Sequence[Path | str], limits: Limits = DEFAULT) -> Iterator[tuple[Log, ...]]:
+def open_logs(
+    paths: Sequence[Path | str], limits: Limits = DEFAULT_LIMITS
+) -> Iterator[tuple[Log, ...]]:
     """Several logs of one drive, open as long as the ``with`` block lasts; as ``open_log``."""
     with ExitStack() as stack:
         logs = tuple(stack.enter_context(open_log(path, limits)) for path in paths)

@@ -11,13 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.base import Block, CanFrames, Ledger, Log, Selection, Table, Topic, UsageError
 from crosscue.replay.remote.logs import name_of
 
-from .columns import Block, CanFrames, Table, Topic
 from .decode import decoder_for
-from .errors import UsageError
-from .ledger import Ledger
-from .log import Log, Selection
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,9 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from .columns import Block
-from .ledger import Ledger
-from .log import Readable, Selection
+from crosscue.replay.base import Block, Ledger, Readable, Selection
+
 from .signals.extractor import Extractor
 from .signals.kinds import Plan, Samples, Signal
 

@@ -25,12 +25,21 @@ from numpy.typing import NDArray
 from crosscue.datasets.geodesy import geodetic_to_enu
 from crosscue.datasets.truth.truth import Origin, Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
-from crosscue.replay.columns import Block, Int64s, Table, Topic
-from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    EVERYTHING,
+    NOT_ASKED_TIME,
+    NOT_ASKED_TOPIC,
+    Block,
+    Closing,
+    Int64s,
+    Ledger,
+    Limits,
+    LogFormatError,
+    Selection,
+    Table,
+    Topic,
+)
 from crosscue.replay.readers.images.files import SUFFIXES, PictureFiles
 from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files, pair
@@ -182,7 +191,7 @@ def write_truth(path: Path, folder: Path) -> Path:
         LogFormatError: Fewer than two packets with times.
         OutputError: It cannot be written.
     """
-    oxts = open_drive(path, DEFAULT).oxts
+    oxts = open_drive(path, DEFAULT_LIMITS).oxts
     packets = _in_time_order(_packets(list(oxts.lines()))) if oxts is not None else None
     if packets is None or len(packets) < 2:
         raise LogFormatError(f"{path}/oxts: fewer than two packets; the drive carries no truth")

@@ -23,14 +23,24 @@ from scipy.spatial.transform import Rotation
 
 from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
-from crosscue.replay.columns import Block, Floats, Int64s, Table, Topic
-from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.closing import Closing
-from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
-from crosscue.replay.limits import MIB, Limits
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import (
+    EVERYTHING,
+    MIB,
+    NOT_ASKED_TIME,
+    NOT_ASKED_TOPIC,
+    Block,
+    Closing,
+    Floats,
+    Int64s,
+    Ledger,
+    Limits,
+    LogFormatError,
+    Selection,
+    Table,
+    Topic,
+    json_tree,
+    read_at_most,
+)
 from crosscue.replay.readers.images.files import SUFFIXES, PictureFiles
 from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files
 

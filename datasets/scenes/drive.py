@@ -20,15 +20,23 @@ from crosscue.datasets.simulated.drive import START_NS, DriveSettings, TrueMotio
 from crosscue.datasets.simulated.log_files import sensor_blocks
 from crosscue.datasets.truth.truth import Approach, Features, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
-from crosscue.replay.columns import Block, Images, Int64s, Messages, Topic
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Block,
+    Images,
+    Int64s,
+    Ledger,
+    Messages,
+    Topic,
+    json_tree,
+    read_at_most,
+    sha256_of,
+    strict_json,
+    write_text,
+)
 from crosscue.replay.encode.outgoing import standard_type
 from crosscue.replay.encode.template import filled, template_of
-from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.made_of import made_of, refuse_another
-from crosscue.replay.files.tree_text import json_tree, strict_json
-from crosscue.replay.files.whole_file import sha256_of, write_text
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT
 from crosscue.replay.write.convert import LogWriter
 
 from .car_file import vehicle_text
@@ -173,7 +181,7 @@ def refuse_other_drive(folder: Path, settings: SceneSettings) -> None:
     if not (folder / "drive.mcap").exists():
         return
     try:
-        there = json_tree(read_at_most(folder / MADE_OF, DEFAULT.record_bytes) or b"")
+        there = json_tree(read_at_most(folder / MADE_OF, DEFAULT_LIMITS.record_bytes) or b"")
     except (OSError, ValueError):
         there = None
     refuse_another(folder, "--overwrite", there, made_of([], asdict(settings)))

@@ -11,11 +11,19 @@ import numpy as np
 
 from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.replay.base import (
+    DATA,
+    Block,
+    CanFrames,
+    Floats,
+    Int64s,
+    Ledger,
+    Table,
+    Topic,
+    write_text,
+)
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
-from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table, Topic
-from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 
 from .drive import DriveSettings, Sensed, TrueMotion, dbc_path, drive, sense, vehicle_text

@@ -17,8 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from crosscue.replay.columns import Int64s
-from crosscue.replay.errors import SchemaError, UsageError
+from crosscue.replay.base import Int64s, SchemaError, UsageError
 from crosscue.replay.vehicle.cue_table import CUES
 
 from .truth import CueTruth

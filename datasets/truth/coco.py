@@ -7,10 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.errors import AnnotationError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.limits import MIB
+from crosscue.replay.base import MIB, AnnotationError, json_tree, read_at_most
 
 from .annotations import Annotations, Picture, Thing
 

@@ -16,8 +16,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from crosscue.replay.errors import AnnotationError
-from crosscue.replay.limits import MIB
+from crosscue.replay.base import MIB, AnnotationError
 
 from .annotations import Annotations, Picture, Thing
 

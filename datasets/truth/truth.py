@@ -13,12 +13,16 @@ from typing import Annotated, Any, Final, Literal, Protocol, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from crosscue.replay.errors import AnnotationError, EmptyResultError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.tree_text import json_tree, strict_json
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.base import (
+    MIB,
+    AnnotationError,
+    EmptyResultError,
+    json_tree,
+    read_at_most,
+    strict_json,
+    write_text,
+)
 from crosscue.replay.formats import data_sets
-from crosscue.replay.limits import MIB
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.validation_errors import explain
 

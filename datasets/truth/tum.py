@@ -15,10 +15,16 @@ from typing import Final, TextIO
 
 import numpy as np
 
-from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
-from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Floats,
+    Int64s,
+    Limits,
+    LogError,
+    LogFormatError,
+    LogTooLargeError,
+    write_text,
+)
 
 _COLUMNS: Final = 8
 _LINE_CHARACTERS: Final = 4096
@@ -84,7 +90,7 @@ def heading_rad(trajectory: Trajectory) -> Floats:
     return np.arctan2(north, east)
 
 
-def read_tum(path: Path, limits: Limits = DEFAULT) -> Trajectory:
+def read_tum(path: Path, limits: Limits = DEFAULT_LIMITS) -> Trajectory:
     """Read a trajectory; times beyond the nanosecond are rounded to it.
 
     Raises:

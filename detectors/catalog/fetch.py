@@ -17,9 +17,15 @@ from typing import Any, Final
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
-from crosscue.replay.errors import CrosscueError, UsageError, one_line
-from crosscue.replay.files.whole_file import cannot_write, file_sha256, write_whole
-from crosscue.replay.limits import MIB
+from crosscue.replay.base import (
+    MIB,
+    CrosscueError,
+    UsageError,
+    cannot_write,
+    file_sha256,
+    one_line,
+    write_whole,
+)
 
 from .card import ModelCard, WeightFile
 from .entries import entry, place_of

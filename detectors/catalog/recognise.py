@@ -15,8 +15,7 @@ from crosscue.detectors.decoders.table import DECODERS
 from crosscue.detectors.networks.backends import Network, load_network
 from crosscue.detectors.networks.openvino import import_openvino
 from crosscue.detectors.networks.picture_input import prepared
-from crosscue.replay.errors import UsageError, one_line
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.base import UsageError, one_line, read_at_most
 
 from .card import MAX_BYTES, Input, Weights
 

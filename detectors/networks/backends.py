@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.catalog.card import Weights
-from crosscue.replay.errors import VehicleError, one_line
-from crosscue.replay.versions import installed
+from crosscue.replay.base import VehicleError, installed, one_line
 
 from .free_size import Size, free_size, resized
 from .onnx_input import input_shape

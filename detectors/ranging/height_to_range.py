@@ -12,8 +12,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from crosscue.replay.columns import Floats
-from crosscue.replay.errors import UsageError
+from crosscue.replay.base import Floats, UsageError
 from crosscue.replay.vehicle.vehicle import RangeCurve
 
 Family = Literal["pinhole", "pinhole-offset", "power"]

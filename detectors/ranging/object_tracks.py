@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from crosscue.replay.columns import Floats
+from crosscue.replay.base import Floats
 
 from .range_from_motion import SIZES, MotionRange, SizePrior, range_from_motion
 

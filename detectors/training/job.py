@@ -22,9 +22,7 @@ from crosscue.detectors.networks.mask_rcnn.checkpoint import (
 from crosscue.detectors.networks.mask_rcnn.coco import COCO_NETWORKS
 from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, checkpoint_named
 from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network
-from crosscue.replay.errors import OutputError
-from crosscue.replay.files.tree_text import json_tree, strict_json
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.base import OutputError, json_tree, strict_json, write_text
 
 from .annotations import LabelledSet
 from .calibration import fitted, judged

@@ -19,11 +19,17 @@ from pathlib import Path
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
 from crosscue.eval.runs.folder import MANIFEST, RunFolder
-from crosscue.replay.errors import CrosscueError, RunError, UsageError, one_line
+from crosscue.replay.base import (
+    CrosscueError,
+    RunError,
+    UsageError,
+    json_tree,
+    one_line,
+    strict_json,
+    write_text,
+)
 from crosscue.replay.files.identity import identity_of, identity_of_all
 from crosscue.replay.files.log_identity import as_row
-from crosscue.replay.files.tree_text import json_tree, strict_json
-from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.losses import losses_heard, warn_again
 
 JOURNAL: Final = ".drives"

@@ -33,9 +33,15 @@ from crosscue.eval.runs.manifest import (
     MergedManifest,
 )
 from crosscue.eval.runs.tables.table_sink import TableSink
-from crosscue.replay.errors import RunError, UnreadableRunError, UsageError, one_line
-from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Limits,
+    RunError,
+    UnreadableRunError,
+    UsageError,
+    one_line,
+    strict_json,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -271,7 +277,7 @@ def open_one(
     logs: Path | None = None,
     *,
     without_images: bool = False,
-    limits: Limits = DEFAULT,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> RunFolder:
     """The run of one drive; arguments as of ``open_run``.
 

@@ -19,10 +19,7 @@ import numpy as np
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, open_run
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.eval.scoring.runs import FOLDER, METRICS
-from crosscue.replay.errors import UnreadableRunError, UsageError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.limits import MIB
+from crosscue.replay.base import MIB, UnreadableRunError, UsageError, json_tree, read_at_most
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -15,24 +15,32 @@ from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_ma
 from crosscue.eval.runs.manifest import DecodeManifest
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.eval.runs.tables.table_sink import TableSink
-from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
+from crosscue.replay.base import (
+    Block,
+    CanFrames,
+    Images,
+    Ledger,
+    Log,
+    Messages,
+    SchemaError,
+    Selection,
+    Table,
+    Topic,
+    versions,
+    visible,
+)
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
-from crosscue.replay.errors import SchemaError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Log, Selection
 from crosscue.replay.log_summary import rows_declared, rows_read
 from crosscue.replay.mobileye.admit import all_ids
 from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.mobileye.samples import settings_of
 from crosscue.replay.remote.logs import name_of
-from crosscue.replay.safe_text import visible
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text
 from crosscue.replay.topic_part import columns_of
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
-from crosscue.replay.versions import versions
 
 if TYPE_CHECKING:
     import numpy as np

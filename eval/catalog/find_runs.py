@@ -10,8 +10,7 @@ from typing import Final
 
 from crosscue.eval.batch.merge import is_merged
 from crosscue.eval.runs.folder import MANIFEST, RunFolder
-from crosscue.replay.errors import RunError, UnreadableRunError, UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.base import RunError, UnreadableRunError, UsageError, read_at_most
 
 METRICS: Final = "metrics.json"
 """What a folder of pooled scores holds, which has tables, too."""

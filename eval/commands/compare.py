@@ -30,7 +30,7 @@ from crosscue.eval.catalog.compare import (
     read_tolerance,
 )
 from crosscue.eval.commands.shared.options import print_json
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import visible
 
 T = TypeVar("T")
 MAX_LINES = 20

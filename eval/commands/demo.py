@@ -26,8 +26,7 @@ from crosscue.eval.report.summary import pose_summary, summary
 from crosscue.eval.runs.folder import create
 from crosscue.eval.scoring.pose.score import truth_track
 from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of, write_scores
-from crosscue.replay.errors import UsageError
-from crosscue.replay.log import EVERYTHING
+from crosscue.replay.base import EVERYTHING, UsageError
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 

@@ -22,8 +22,7 @@ from crosscue.eval.commands.shared.progress import DriveLine, is_shown
 from crosscue.eval.interface.runs import detect_drive
 from crosscue.eval.pipeline.outcome import DetectOutcome
 from crosscue.eval.runs.account import account_lines, details_of
-from crosscue.replay.errors import UsageError
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import UsageError, visible
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 

@@ -42,10 +42,8 @@ from crosscue.eval.interface.runs import replay_drive
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import create
 from crosscue.eval.runs.input import files_named_in
-from crosscue.replay.errors import CrosscueError, UsageError
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import CrosscueError, UsageError, versions, visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load
-from crosscue.replay.versions import versions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

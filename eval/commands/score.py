@@ -59,8 +59,7 @@ from crosscue.eval.studies.attribution import (
     attribution_tree,
 )
 from crosscue.eval.studies.estimated_again import estimate_of
-from crosscue.replay.errors import UsageError, one_line
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import UsageError, one_line, visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

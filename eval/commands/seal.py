@@ -20,7 +20,7 @@ from pathlib import Path
 import crosscue
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, progress_line
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import visible
 
 SHOWN = 20
 MEGABYTE = 1_000_000

@@ -28,8 +28,7 @@ from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, with_progress
-from crosscue.replay.errors import OutputError, UsageError
-from crosscue.replay.files.whole_file import write_bytes
+from crosscue.replay.base import OutputError, UsageError, write_bytes
 from crosscue.replay.processes import in_processes
 
 PUBLISHED_RUNS = 10

@@ -10,9 +10,7 @@ import tomlkit
 from crosscue.eval.pipeline.pose import compass_settings
 from crosscue.localization.compass import course_at
 from crosscue.localization.compass_fit import CompassFit, fit_compass
-from crosscue.replay.errors import EmptyResultError, VehicleError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Log, Selection
+from crosscue.replay.base import EmptyResultError, Ledger, Log, Selection, VehicleError
 from crosscue.replay.losses import warn_of
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.signals.extractor import Extractor

@@ -22,11 +22,20 @@ from crosscue.localization.angles import interpolate_angle
 from crosscue.localization.landmarks.database import LandmarkWriter, Place
 from crosscue.localization.landmarks.features import Matcher
 from crosscue.localization.landmarks.images import grey_of, picture_of, read_picture
-from crosscue.replay.columns import Block, Floats, Images, Int64s
-from crosscue.replay.errors import AnnotationError, LogError, UsageError, VehicleError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Log, Selection
+from crosscue.replay.base import (
+    AnnotationError,
+    Block,
+    Floats,
+    Images,
+    Int64s,
+    Ledger,
+    Log,
+    LogError,
+    Selection,
+    UsageError,
+    VehicleError,
+    read_at_most,
+)
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan
 from crosscue.replay.signals.plan import camera_of, with_pictures

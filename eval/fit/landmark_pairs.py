@@ -18,10 +18,7 @@ from crosscue.localization.landmarks.database import LandmarkDatabase, Nearby
 from crosscue.localization.landmarks.features import Features, Matcher
 from crosscue.localization.landmarks.fit import ScoredPairs
 from crosscue.localization.landmarks.images import grey_of, read_picture
-from crosscue.replay.errors import AnnotationError, LogError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import MIB
+from crosscue.replay.base import MIB, AnnotationError, Ledger, LogError, read_at_most
 
 from .landmark_database import CameraPoses, Frame, drop_picture, place_at
 

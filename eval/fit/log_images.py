@@ -12,11 +12,17 @@ import numpy as np
 from crosscue.datasets.truth.annotations import LogPictures
 from crosscue.detectors.images import encoded, size_of
 from crosscue.eval.pipeline.clocks import probe_clocks
-from crosscue.replay.columns import Block, Images
-from crosscue.replay.errors import LogError, VehicleError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import Log, Selection
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Block,
+    Images,
+    Ledger,
+    Limits,
+    Log,
+    LogError,
+    Selection,
+    VehicleError,
+)
 from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_log
 from crosscue.replay.readers.images.files import SUFFIXES
@@ -29,7 +35,7 @@ from crosscue.replay.time.stamp_watch import StampWatch
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 
-def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT) -> LogPictures:
+def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT_LIMITS) -> LogPictures:
     """The pictures of the one camera of a log; warns of what was dropped.
 
     Raises:
@@ -89,7 +95,7 @@ class LogSpan:
     was_set_back: bool
 
 
-def log_span(path: Path, limits: Limits = DEFAULT) -> LogSpan:
+def log_span(path: Path, limits: Limits = DEFAULT_LIMITS) -> LogSpan:
     """Log times of a log's first row and just after its last.
 
     Raises:
@@ -119,7 +125,7 @@ def _names(log: Log) -> Mapping[str, int]:
         return {}
     time_file = find_time_file(log.path)
     assert time_file is not None
-    files = pair(list_files(log.path, SUFFIXES), read_time_file(time_file, DEFAULT))
+    files = pair(list_files(log.path, SUFFIXES), read_time_file(time_file, DEFAULT_LIMITS))
     return {
         path.name: t_ns
         for path, t_ns in zip(files.paths, files.t_ns.tolist(), strict=True)

@@ -24,8 +24,7 @@ from crosscue.eval.scoring.truth import CROSSING_NS
 from crosscue.fusion.annotated_approach import NOT_LOOKED, AnnotatedApproach
 from crosscue.fusion.factor_graph import FactorGraph, graph_of
 from crosscue.fusion.message_fit import MessageFit, RateFit, Side
-from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import RunError, UsageError
+from crosscue.replay.base import Floats, Int64s, RunError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 COVERED: Final = 0.9

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from crosscue.detectors.ranging.height_to_range import RangeFit, range_of
-from crosscue.replay.files.whole_file import write_whole
+from crosscue.replay.base import write_whole
 
 from .range_pairs import RangePairs
 

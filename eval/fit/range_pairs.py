@@ -10,12 +10,16 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from crosscue.datasets.truth.truth import FILE, load
-from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import SchemaError, UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.base import (
+    MIB,
+    Floats,
+    Int64s,
+    SchemaError,
+    UsageError,
+    json_tree,
+    read_at_most,
+)
 from crosscue.replay.files.parquet import opened
-from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.limits import MIB
 
 MAX_BYTES: Final = 256 * MIB
 LABELS: Final[Mapping[str, str]] = {"stop_sign": "stop sign", "traffic_light": "traffic light"}

@@ -9,12 +9,19 @@ from typing import Final
 from crosscue.detectors.images import Encoded, encoded
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
 from crosscue.eval.pipeline.clocks import probe_clocks
-from crosscue.replay.columns import Block, Images
-from crosscue.replay.errors import AnnotationError, LogError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT, MIB, Limits
-from crosscue.replay.log import Log, Selection
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    MIB,
+    AnnotationError,
+    Block,
+    Images,
+    Ledger,
+    Limits,
+    Log,
+    LogError,
+    Selection,
+    read_at_most,
+)
 from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
@@ -28,7 +35,7 @@ from .truth_check import OBJECTS
 MAX_BYTES: Final = 512 * MIB
 
 
-def drive_pictures(folder: Path, limits: Limits = DEFAULT) -> Iterator[Labelled]:
+def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[Labelled]:
     """All annotated pictures of a drive's folder, in the order of the log.
 
     Raises:

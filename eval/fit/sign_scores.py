@@ -12,9 +12,7 @@ import numpy as np
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.training.operating_point import Judged, judge, together
-from crosscue.replay.columns import Floats
-from crosscue.replay.errors import LogError, UsageError
-from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.base import DEFAULT_LIMITS, Floats, Limits, LogError, UsageError
 
 from .sign_drives import drive_pictures
 from .sign_labels import Labelled, read_labels
@@ -41,7 +39,7 @@ class Rules:
 
 
 def judged_pictures(
-    path: Path, detector: Detector, rules: Rules, every: slice, limits: Limits = DEFAULT
+    path: Path, detector: Detector, rules: Rules, every: slice, limits: Limits = DEFAULT_LIMITS
 ) -> Judged:
     """What a detector finds in some of a file's or drive's pictures, and what of it is right.
 

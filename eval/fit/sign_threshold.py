@@ -14,8 +14,7 @@ from crosscue.detectors.signs.detector import build
 from crosscue.detectors.signs.templates import AMERICAN, KINDS
 from crosscue.detectors.training.operating_point import Judged, rates_at, threshold_for, together
 from crosscue.eval.scoring.intervals import Proportion, share
-from crosscue.replay.errors import EmptyResultError, UsageError
-from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.base import DEFAULT_LIMITS, EmptyResultError, Limits, UsageError
 
 from .sign_scores import Rules, judged_pictures
 
@@ -85,7 +84,7 @@ def fit_signs(
     enlarge: float = 2.5,
     levels: int = 9,
     points: int = 4000,
-    limits: Limits = DEFAULT,
+    limits: Limits = DEFAULT_LIMITS,
     progress: Progress = lambda parts, done: parts,
 ) -> SignFit:
     """Choose the sign detector's threshold for a required precision.

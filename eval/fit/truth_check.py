@@ -25,10 +25,15 @@ from crosscue.datasets.truth.cvat import read_cvat
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import read_tum
 from crosscue.eval.scoring import truth as score_truth
-from crosscue.replay.errors import SchemaError, UsageError
-from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.files.whole_file import sha256_of, write_text
-from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Limits,
+    SchemaError,
+    UsageError,
+    sha256_of,
+    strict_json,
+    write_text,
+)
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -92,7 +97,9 @@ class Imported:
     ignored: Mapping[str, int]
 
 
-def check_truth(path: Path, log_path: Path, vehicle: Vehicle, limits: Limits = DEFAULT) -> TruthFit:
+def check_truth(
+    path: Path, log_path: Path, vehicle: Vehicle, limits: Limits = DEFAULT_LIMITS
+) -> TruthFit:
     """Check a truth file and all files that it names against a log.
 
     Raises:
@@ -212,7 +219,7 @@ def import_annotations(
     own: Mapping[str, str],
     *,
     add: bool = False,
-    limits: Limits = DEFAULT,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> Imported:
     """Turn annotated pictures of a log into its truth.
 

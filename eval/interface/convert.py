@@ -11,11 +11,8 @@ from typing import Final
 from crosscue.eval.interface.logs import NOT_ASKED, Log, opened
 from crosscue.eval.interface.show import listing
 from crosscue.eval.pipeline.empty_result import empty_result
-from crosscue.replay.columns import Topic
-from crosscue.replay.errors import LogError, OutputError, UsageError
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Ledger, LogError, OutputError, Topic, UsageError, visible
 from crosscue.replay.opening import open_log
-from crosscue.replay.safe_text import visible
 from crosscue.replay.seal.seal import seal_path
 from crosscue.replay.write.convert import LogWriter
 from crosscue.replay.write.mcap import Compression

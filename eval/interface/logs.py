@@ -15,15 +15,28 @@ from typing import TYPE_CHECKING, Final, Self
 import numpy as np
 
 from crosscue.eval.interface.show import listing
-from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    EVERYTHING,
+    NOT_ASKED_TIME,
+    NOT_ASKED_TOPIC,
+    Block,
+    CanFrames,
+    Images,
+    Ledger,
+    Limits,
+    MissingTopicError,
+    SchemaError,
+    Selection,
+    Table,
+    Topic,
+    TopicAccount,
+    UsageError,
+)
+from crosscue.replay.base import Log as OneLog
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.decode.packets import PacketDecoder, is_stream
-from crosscue.replay.errors import MissingTopicError, SchemaError, UsageError
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger, TopicAccount
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import EVERYTHING, Selection
-from crosscue.replay.log import Log as OneLog
 from crosscue.replay.log_part import part_of
 from crosscue.replay.losses import LossWarning, warn_of
 from crosscue.replay.opening import open_log as open_one
@@ -35,14 +48,14 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from crosscue.eval.interface.summary import DriveSummary
-    from crosscue.replay.columns import Bytes
+    from crosscue.replay.base import Bytes
     from crosscue.replay.log_summary import Progress
     from crosscue.replay.vehicle.vehicle import Vehicle
 
 NOT_ASKED: Final = (NOT_ASKED_TIME, NOT_ASKED_TOPIC)
 
 
-def open(*paths: Path | str, limits: Limits = DEFAULT) -> Log:  # noqa: A001
+def open(*paths: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:  # noqa: A001
     """Open a recorded drive: one log or several, in any format that crosscue reads.
 
     The log is read when a topic, a frame or a summary is asked for, and only as far as its index
@@ -94,7 +107,7 @@ class Log:
 
     logs: tuple[OneLog, ...]
     _files: ExitStack
-    limits: Limits = DEFAULT
+    limits: Limits = DEFAULT_LIMITS
     selection: Selection = EVERYTHING
 
     @property

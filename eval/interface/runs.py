@@ -13,8 +13,7 @@ from crosscue.eval.interface.logs import Log, opened
 from crosscue.eval.interface.show import listing
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.runs.manifest import Manifest
-from crosscue.replay.errors import OutputError, RunError, UsageError
-from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.base import DEFAULT_LIMITS, Limits, OutputError, RunError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 if TYPE_CHECKING:
@@ -177,7 +176,7 @@ def open_run(
     logs: Path | str | None = None,
     *,
     without_images: bool = False,
-    limits: Limits = DEFAULT,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> Run:
     """Open a finished run.
 

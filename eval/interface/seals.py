@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crosscue.eval.interface.show import Listing
-from crosscue.replay.errors import CrosscueError, LogError, UsageError
+from crosscue.replay.base import CrosscueError, LogError, UsageError, visible
 from crosscue.replay.formats import format_of
-from crosscue.replay.safe_text import visible
 from crosscue.replay.seal.seal import (
     HASH,
     SUFFIX,

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crosscue.replay.errors import UsageError
+from crosscue.replay.base import UsageError
 
 if TYPE_CHECKING:
     from crosscue.datasets.scenes.drive import SceneFiles
     from crosscue.datasets.simulated.log_files import DriveFiles
-    from crosscue.replay.columns import Bytes
+    from crosscue.replay.base import Bytes
 
 
 def simulate_approach(

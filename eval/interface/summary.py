@@ -8,9 +8,8 @@ from enum import Enum
 from typing import Final
 
 from crosscue.eval.pipeline.drive_time import plan_for_time, time_segments
+from crosscue.replay.base import Block, Log, Selection
 from crosscue.replay.clocks.findings import instant_text
-from crosscue.replay.columns import Block
-from crosscue.replay.log import Log, Selection
 from crosscue.replay.log_summary import (
     LogSummary,
     Progress,

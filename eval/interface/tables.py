@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 from crosscue.eval.interface.logs import Log, opened
 from crosscue.eval.interface.runs import vehicle_of
 from crosscue.eval.runs.folder import create
-from crosscue.replay.errors import RunError
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import RunError, visible
 
 if TYPE_CHECKING:
     from crosscue.eval.catalog.decoded_logs import Decoded

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from crosscue.eval.runs.manifest import ClockRow
+from crosscue.replay.base import Log, Selection
 from crosscue.replay.clocks.clock import Clock
-from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor
 
 if TYPE_CHECKING:

@@ -33,16 +33,12 @@ from crosscue.eval.runs.manifest import (
 )
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.skipped import write_skipped
-from crosscue.replay.columns import Block
-from crosscue.replay.errors import VehicleError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Log, Selection
+from crosscue.replay.base import Block, Ledger, Log, Selection, VehicleError, versions
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle
-from crosscue.replay.versions import versions
 
 from .clocks import clock_rows, probe_clocks
 from .drive_time import camera_timeline, time_segments

@@ -8,11 +8,8 @@ import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import TimeSegments
+from crosscue.replay.base import Ledger, Log, Selection, Topic, UsageError, VehicleError
 from crosscue.replay.clocks.clock import Clock
-from crosscue.replay.columns import Topic
-from crosscue.replay.errors import UsageError, VehicleError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import plan, with_pictures

@@ -8,9 +8,7 @@ from contextlib import contextmanager
 from typing import Final
 
 from crosscue.eval.runs.folder import RunFolder, clear
-from crosscue.replay.errors import CrosscueError, EmptyResultError, LogError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Log, Selection
+from crosscue.replay.base import CrosscueError, EmptyResultError, Ledger, Log, LogError, Selection
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.signals.kinds import Plan, Signal
 

@@ -48,10 +48,7 @@ from crosscue.eval.runs.tables.pose_tables import PoseTally, pose_rows, pose_sch
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.eval.runs.tables.table_sink import TableSink
 from crosscue.localization.landmarks.database import LandmarkDatabase
-from crosscue.replay.columns import Topic
-from crosscue.replay.files.whole_file import sha256_of
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Log, Selection
+from crosscue.replay.base import Ledger, Log, Selection, Topic, sha256_of, versions
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import camera_of, plan, with_pictures
@@ -64,7 +61,6 @@ from crosscue.replay.time.segments import (
 )
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
-from crosscue.replay.versions import versions
 from crosscue.replay.windows import windows
 
 from .clocks import clock_changes, clock_rows, probe_clocks

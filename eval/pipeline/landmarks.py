@@ -16,9 +16,7 @@ from crosscue.localization.landmarks.features import CameraGeometry, Features, M
 from crosscue.localization.landmarks.images import grey_of, picture_of
 from crosscue.localization.landmarks.update import LandmarkSearch, LandmarkSettings, Sighting
 from crosscue.localization.pose_track import ACCEPTED, NoLooks
-from crosscue.replay.columns import Block, Images, Int64s
-from crosscue.replay.errors import LogError, UsageError
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Block, Images, Int64s, Ledger, LogError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 UNDECODABLE: Final = "picture does not decode"

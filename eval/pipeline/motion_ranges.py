@@ -22,7 +22,7 @@ from crosscue.detectors.base import Detections
 from crosscue.detectors.ranging.object_tracks import Motion, ObjectTracks, Track
 from crosscue.fusion.approaches import FrameEvidence, RangePosterior
 from crosscue.fusion.intersection_range import Reference
-from crosscue.replay.columns import Floats
+from crosscue.replay.base import Floats
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .sign_ranges import MEASURED, source_of, usable

@@ -9,7 +9,7 @@ from crosscue.detectors.cues.candidates import Candidates
 from crosscue.detectors.runner import Counts
 from crosscue.eval.runs.account import Account
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Ledger
 from crosscue.replay.time.segments import ONE_SEGMENT, Segment, Timeline
 
 OnTime = Callable[[float, float], None]

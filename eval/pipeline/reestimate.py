@@ -11,9 +11,7 @@ from crosscue.eval.runs.folder import MANIFEST, RunFolder, locked, staged, write
 from crosscue.eval.runs.input import settings_changed
 from crosscue.eval.runs.logs import reopened
 from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest, LogRow
-from crosscue.replay.errors import RunError, UsageError
-from crosscue.replay.files.whole_file import sha256_of
-from crosscue.replay.log import Log
+from crosscue.replay.base import Log, RunError, UsageError, sha256_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .estimate import begin_again, estimate_into

@@ -15,9 +15,7 @@ from crosscue.eval.runs.input import input_of, refuse_another
 from crosscue.eval.runs.logs import log_rows
 from crosscue.eval.runs.manifest import DetectManifest, part_of
 from crosscue.localization.landmarks.database import LandmarkDatabase
-from crosscue.replay.columns import Topic
-from crosscue.replay.errors import RunError
-from crosscue.replay.log import Log, Selection
+from crosscue.replay.base import Log, RunError, Selection, Topic
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle

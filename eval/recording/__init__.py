@@ -17,8 +17,7 @@ from crosscue.eval.runs.manifest import DriveManifest
 from crosscue.eval.runs.stored_images import StoredCamera, camera_of
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges
-from crosscue.replay.columns import Floats
-from crosscue.replay.files.whole_file import write_whole
+from crosscue.replay.base import Floats, write_whole
 
 if TYPE_CHECKING:
     import rerun as rr

@@ -10,8 +10,7 @@ import rerun as rr
 from crosscue.detectors.base import View
 from crosscue.detectors.images import Encoded, decode, encoded
 from crosscue.eval.runs.stored_images import StoredCamera, read_pictures
-from crosscue.replay.columns import Block, Images
-from crosscue.replay.errors import LogError
+from crosscue.replay.base import Block, Images, LogError
 
 from .drive_time import DriveTime
 

@@ -19,8 +19,7 @@ from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest
 from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.runs import RunScored
-from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.base import strict_json, write_text
 from crosscue.replay.vehicle.cue_table import CUES
 
 from .html import render_page

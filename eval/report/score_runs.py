@@ -21,10 +21,7 @@ from crosscue.eval.scoring.runs import (
     scores_of,
     write_scores,
 )
-from crosscue.replay.errors import CrosscueError
-from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, strict_json, write_text
 from crosscue.replay.processes import in_processes
 
 from .page import write_report
@@ -83,7 +80,7 @@ class ScoreWork:
     has_smoother: bool = False
     any_log: bool = False
     logs: Path | None = None
-    limits: Limits = DEFAULT
+    limits: Limits = DEFAULT_LIMITS
     has_figures: bool = True
     without_images: bool = False
 

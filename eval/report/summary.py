@@ -15,7 +15,7 @@ from crosscue.eval.scoring.intervals import Mean, Proportion
 from crosscue.eval.scoring.metric_values import MetricValue
 from crosscue.eval.scoring.pose.score import Errors, PoseScore
 from crosscue.eval.scoring.ranges import RangeScore
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import visible
 
 WIDTH: Final = 80
 LABEL: Final = 11

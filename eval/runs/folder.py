@@ -15,13 +15,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.replay.errors import RunError, UnreadableRunError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Limits,
+    RunError,
+    UnreadableRunError,
+    cannot_write,
+    read_at_most,
+    strict_json,
+    write_text,
+)
 from crosscue.replay.files.parquet import opened
 from crosscue.replay.files.partial_file import is_partial, is_still, lock, sweep
-from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.files.whole_file import cannot_write, write_text
-from crosscue.replay.limits import DEFAULT, Limits
 
 from .manifest import (
     FORMAT_VERSION,
@@ -60,7 +65,7 @@ class RunFolder:
     path: Path
     logs: Path | None = None
     without_images: bool = False
-    limits: Limits = DEFAULT
+    limits: Limits = DEFAULT_LIMITS
     home: Path | None = None
 
     def file(self, name: str) -> Path:
@@ -294,7 +299,7 @@ def open_run(
     logs: Path | None = None,
     *,
     without_images: bool = False,
-    limits: Limits = DEFAULT,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> RunFolder:
     """An existing run folder, its manifest checked.
 

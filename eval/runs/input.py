@@ -13,17 +13,21 @@ from typing import Any
 from crosscue.detectors.base import Choice
 from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, RunFolder
 from crosscue.eval.runs.manifest import part_of
-from crosscue.replay.errors import UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Log,
+    Selection,
+    UsageError,
+    json_tree,
+    read_at_most,
+    strict_json,
+    versions,
+)
 from crosscue.replay.files.identity import identity_of_all, identity_of_log
 from crosscue.replay.files.log_identity import Identity, as_row, of_row
 from crosscue.replay.files.made_of import difference
-from crosscue.replay.files.tree_text import json_tree, strict_json
-from crosscue.replay.limits import DEFAULT
-from crosscue.replay.log import Log, Selection
 from crosscue.replay.remote.logs import version_of
 from crosscue.replay.vehicle.vehicle import Vehicle
-from crosscue.replay.versions import versions
 
 
 def input_of(
@@ -109,7 +113,7 @@ def files_named_in(settings: object) -> dict[str, str]:
 def _read(run: RunFolder) -> Mapping[str, Any] | None:
     """What the folder's run is made of; None where nothing believable says so."""
     try:
-        content = read_at_most(run.file(INPUT), DEFAULT.record_bytes)
+        content = read_at_most(run.file(INPUT), DEFAULT_LIMITS.record_bytes)
         found = json_tree(content or b"")
         of_row(found["identity"])
         return found if isinstance(found["settings"], dict) else None

@@ -12,10 +12,9 @@ from typing import Annotated, Any, Final, Literal, TypeAlias
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError
 
+from crosscue.replay.base import Selection, json_tree
 from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.files.log_identity import Identity
-from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.log import Selection
 from crosscue.replay.time.segments import LogClock, Segment, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle, tuples
 

@@ -12,12 +12,18 @@ import numpy as np
 from crosscue.detectors.images import Encoded, encoded
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Block,
+    Images,
+    Ledger,
+    Limits,
+    RunError,
+    Selection,
+    Topic,
+    UnreadableRunError,
+)
 from crosscue.replay.clocks.clock import Clock
-from crosscue.replay.columns import Block, Images, Topic
-from crosscue.replay.errors import RunError, UnreadableRunError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import Selection
 from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
@@ -49,7 +55,7 @@ class StoredCamera:
     clock: Clock
     selection: Selection
     time: LogClock = UNSHIFTED
-    limits: Limits = DEFAULT
+    limits: Limits = DEFAULT_LIMITS
 
 
 def camera_of(run: RunFolder) -> StoredCamera | None:

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import LABELS, table_in_log_time
-from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import UnreadableRunError
+from crosscue.replay.base import Floats, Int64s, UnreadableRunError
 from crosscue.replay.time.segments import Timeline
 
 from .columns import NONE, BeliefRows, CueRows, RangeRows, RunTables

@@ -24,9 +24,14 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.logs import place_of
 from crosscue.eval.runs.manifest import LogRow
 from crosscue.eval.runs.tables.log_time import AMBIGUOUS
-from crosscue.replay.errors import RunError, SchemaError, UsageError
-from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.files.whole_file import write_text, write_whole
+from crosscue.replay.base import (
+    RunError,
+    SchemaError,
+    UsageError,
+    strict_json,
+    write_text,
+    write_whole,
+)
 from crosscue.replay.remote.logs import is_remote
 
 from . import intervals

@@ -13,9 +13,7 @@ import numpy as np
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.truth import Approach, CueTruth, Truth
 from crosscue.datasets.truth.tum import read_tum
-from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import SchemaError
-from crosscue.replay.limits import MIB
+from crosscue.replay.base import MIB, Floats, Int64s, SchemaError
 
 from .columns import NONE
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.base import write_text
 
 HEAD: Final = """\
 <meta charset="utf-8">

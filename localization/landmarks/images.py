@@ -8,9 +8,7 @@ from typing import Final
 
 from crosscue.detectors.base import View
 from crosscue.detectors.images import Encoded, decode, encoded, read_file
-from crosscue.replay.columns import Bytes, Images
-from crosscue.replay.errors import LogError
-from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.base import DEFAULT_LIMITS, Bytes, Images, Limits, LogError
 
 GREY: Final = View(is_grey=True)
 
@@ -21,7 +19,7 @@ def picture_of(images: Images, row: int) -> Encoded:
     return replace(picture, content=memoryview(bytes(picture.content)))
 
 
-def read_picture(path: Path, limits: Limits = DEFAULT) -> Encoded:
+def read_picture(path: Path, limits: Limits = DEFAULT_LIMITS) -> Encoded:
     """A picture file, not decoded yet.
 
     Raises:

@@ -16,8 +16,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes
-from crosscue.replay.errors import UsageError
+from crosscue.replay.base import Bytes, UsageError
 
 from .features import CameraGeometry, Features, Match
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.replay.errors import LogTooLargeError, SchemaError, one_line
-from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.base import DEFAULT_LIMITS, Limits, LogTooLargeError, SchemaError, one_line
 
 from .dbc_text import read_dbc
 from .extract import Extractor
@@ -72,7 +71,7 @@ class CanDatabase:
     def load(
         cls,
         paths: Sequence[Path | str],
-        limits: Limits = DEFAULT,
+        limits: Limits = DEFAULT_LIMITS,
         *,
         keep_first: bool = False,
     ) -> CanDatabase:

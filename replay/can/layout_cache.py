@@ -21,9 +21,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, overload
 
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.limits import MIB
+from crosscue.replay.base import MIB, json_tree, read_at_most
 
 from .layout import CanMessage, CanSignal
 from .sources import DatabaseText

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.errors import LogTooLargeError, SchemaError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.limits import Limits
+from crosscue.replay.base import Limits, LogTooLargeError, SchemaError, read_at_most
 
 _MAX_BITS: Final = 8 * 2048
 """No message is longer: 1785 bytes is the longest multi-packet message there is."""

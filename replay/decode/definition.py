@@ -13,9 +13,8 @@ from enum import Enum
 from functools import cache
 from typing import Final
 
-from crosscue.replay.errors import SchemaError
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.vehicle.roles import ros2_spelling
+from crosscue.replay.base import DEFAULT_LIMITS, Limits, SchemaError
+from crosscue.replay.decode.type_names import ros2_spelling
 
 PRIMITIVES: Final[Mapping[str, str]] = {
     "bool": "u1",
@@ -82,7 +81,7 @@ _ANNOTATION: Final = re.compile(r"(?:@\w{1,64}(?:\([^)]{0,200}\))?[ \t]*){0,16}"
 
 
 def definitions_of(
-    type_name: str, schema: bytes, schema_encoding: str, limits: Limits = DEFAULT
+    type_name: str, schema: bytes, schema_encoding: str, limits: Limits = DEFAULT_LIMITS
 ) -> Definitions:
     """All types that a schema defines, by name in ROS 2 spelling.
 

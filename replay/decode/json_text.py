@@ -13,11 +13,17 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Block, Messages, Table, Topic
-from crosscue.replay.errors import SchemaError, one_line
-from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Block,
+    Ledger,
+    Messages,
+    SchemaError,
+    Table,
+    Topic,
+    json_tree,
+    one_line,
+)
 
 from .coding import MAGIC_BYTES
 from .foxglove import PICTURES, TABLES, Picture, Source
@@ -36,10 +42,10 @@ def json_decoder(topic: Topic) -> Callable[[Block, Ledger], Block]:
     Raises:
         SchemaError: The schema is too large, or no JSON object.
     """
-    if len(topic.schema) > DEFAULT.schema_bytes:
+    if len(topic.schema) > DEFAULT_LIMITS.schema_bytes:
         raise SchemaError(
             f"{topic.name}: JSON schema has {len(topic.schema)} bytes, over the limit of "
-            f"{DEFAULT.schema_bytes}"
+            f"{DEFAULT_LIMITS.schema_bytes}"
         )
     if topic.schema.strip():
         try:

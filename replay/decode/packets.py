@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crosscue.replay.columns import Block, Images, Messages
-from crosscue.replay.errors import LogError, one_line
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Block, Images, Ledger, LogError, Messages, one_line
 
 if TYPE_CHECKING:
     from av import VideoFrame

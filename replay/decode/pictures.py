@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import Block, Bytes, ImageCoding, Images, Messages
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Block, Bytes, ImageCoding, Images, Ledger, Messages
 
 from .coding import STREAMS, coding_of
 from .foxglove import Picture

@@ -14,9 +14,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.columns import Int64s
-from crosscue.replay.errors import SchemaError
-from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.base import DEFAULT_LIMITS, Int64s, Limits, SchemaError
 
 from .definition import DURATION, PRIMITIVES, TIME, Definitions, Field, Shape, well_known
 
@@ -125,7 +123,9 @@ class Plan:
     sequences: Mapping[str, Items]
 
 
-def plan_of(type_name: str, known: Definitions, *, is_cdr: bool, limits: Limits = DEFAULT) -> Plan:
+def plan_of(
+    type_name: str, known: Definitions, *, is_cdr: bool, limits: Limits = DEFAULT_LIMITS
+) -> Plan:
     """Plan the walk through ``type_name``.
 
     Raises:

@@ -23,10 +23,16 @@ from google.protobuf.descriptor import (  # type: ignore[import-untyped]
 from google.protobuf.message import DecodeError, Message  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Block, Messages, Table, Topic
-from crosscue.replay.errors import SchemaError, one_line
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Block,
+    Ledger,
+    Messages,
+    SchemaError,
+    Table,
+    Topic,
+    one_line,
+)
 
 from .coding import MAGIC_BYTES
 from .foxglove import PICTURES, TABLES, Picture, Source
@@ -71,10 +77,10 @@ def protobuf_decoder(topic: Topic) -> Callable[[Block, Ledger], Block] | None:
 
 def _descriptor(topic: Topic) -> Descriptor:
     name = topic.type_name
-    if len(topic.schema) > DEFAULT.schema_bytes:
+    if len(topic.schema) > DEFAULT_LIMITS.schema_bytes:
         raise SchemaError(
             f"{name}: descriptor has {len(topic.schema)} bytes, over the limit of "
-            f"{DEFAULT.schema_bytes}"
+            f"{DEFAULT_LIMITS.schema_bytes}"
         )
     pool = descriptor_pool.DescriptorPool()
     try:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from crosscue.replay.columns import Block
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Block, Ledger
 
 MISFIT: Final = "does not fit its schema"
 WRONG_CODING: Final = "CDR representation not supported"

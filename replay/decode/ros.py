@@ -8,10 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import Block, Messages, Topic
-from crosscue.replay.errors import SchemaError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.vehicle.roles import ros2_spelling
+from crosscue.replay.base import Block, Ledger, Messages, SchemaError, Topic
+from crosscue.replay.decode.type_names import ros2_spelling
 
 from .definition import Definitions, definitions_of, well_known
 from .fields import Fields, Part, WalkedFields

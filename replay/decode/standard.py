@@ -13,7 +13,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import (
+from crosscue.replay.base import (
     DATA,
     ERROR,
     REMOTE,
@@ -22,9 +22,9 @@ from crosscue.replay.columns import (
     Images,
     Int64s,
     Messages,
+    SchemaError,
     Table,
 )
-from crosscue.replay.errors import SchemaError
 
 from .coding import JPEG, MAGIC_BYTES, STREAMS, coding_of
 from .fields import Fields

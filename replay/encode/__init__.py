@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
+from crosscue.replay.base import Block, CanFrames, Images, Ledger, Messages, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.definition import definitions_of
 from crosscue.replay.decode.ros import RosDecoder
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.vehicle.roles import ros2_spelling
+from crosscue.replay.decode.type_names import ros2_spelling
 
 from .can import can_messages
 from .definitions import completed, standard_text

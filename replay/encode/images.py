@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import Block, Images, Int64s, Messages
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Block, Images, Int64s, Ledger, Messages
 
 from .outgoing import Outgoing, stamps, standard_type
 from .template import ENCAPSULATION

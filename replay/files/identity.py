@@ -26,10 +26,8 @@ from contextlib import closing, suppress
 from pathlib import Path, PurePosixPath
 from typing import Final, Protocol
 
-from crosscue.replay.errors import LogError
+from crosscue.replay.base import MIB, Log, LogError
 from crosscue.replay.files.log_identity import Identity
-from crosscue.replay.limits import MIB
-from crosscue.replay.log import Log
 from crosscue.replay.remote.logs import RangedLog, RemoteFiles, by_ranges, fetch, is_remote
 from crosscue.replay.remote.ranges import RangedFile
 

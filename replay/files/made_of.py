@@ -11,11 +11,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.errors import UsageError
+from crosscue.replay.base import UsageError, json_tree, strict_json
 from crosscue.replay.files.log_identity import as_row, of_row
 
 from .identity import identity_of, identity_of_all
-from .tree_text import json_tree, strict_json
 
 NOTHING: Final[Mapping[str, Any]] = {}
 """Of a result that need not be told from others."""

@@ -7,8 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import DATA, ERROR, LENGTH_UNKNOWN, REMOTE, CanFrames, Int64s
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import DATA, ERROR, LENGTH_UNKNOWN, REMOTE, CanFrames, Int64s, Ledger
 
 from .bits import Words, words_of
 from .layout import Message, layout

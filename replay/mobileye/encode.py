@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table
+from crosscue.replay.base import DATA, Block, CanFrames, Floats, Int64s, Table
 from crosscue.replay.mobileye.geometry import AT_REAR_AXLE, Mounting
 
 from .bits import Words, payloads_of

@@ -9,8 +9,7 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
-from crosscue.replay.errors import SchemaError
-from crosscue.replay.files.tree_text import toml_tree
+from crosscue.replay.base import SchemaError, toml_tree
 
 Kind: TypeAlias = Literal["real", "code", "flag"]
 Beyond: TypeAlias = Literal["refuse", "clip", "drop"]

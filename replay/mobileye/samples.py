@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import Block, CanFrames, Floats, Table
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Block, CanFrames, Floats, Ledger, Table
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS, Samples, Signal

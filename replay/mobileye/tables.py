@@ -15,7 +15,7 @@ from typing import Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Block, Floats, Int64s, Table
+from crosscue.replay.base import Block, Floats, Int64s, Table
 from crosscue.replay.mobileye.geometry import Mounting
 
 from .geometry import (

@@ -14,7 +14,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.base import Floats, Int64s
 
 from .bits import Words, extract, place
 from .layout import UNKNOWN, VARIANTS, Field, Message

@@ -9,9 +9,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import BLOCK_ROWS, Block, CanFrames, Int64s, Topic
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
-from crosscue.replay.log import Selection
+from crosscue.replay.base import (
+    BLOCK_ROWS,
+    NOT_ASKED_TIME,
+    NOT_ASKED_TOPIC,
+    Block,
+    CanFrames,
+    Int64s,
+    Ledger,
+    Selection,
+    Topic,
+)
 
 BUSES_MAX: Final = 256
 """Most buses of one log; more names than that are damage, not buses."""

@@ -9,10 +9,18 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import BLOCK_ROWS, Block, Bytes, Int64s, Messages
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
-from crosscue.replay.limits import Limits
-from crosscue.replay.log import Selection
+from crosscue.replay.base import (
+    BLOCK_ROWS,
+    NOT_ASKED_TIME,
+    NOT_ASKED_TOPIC,
+    Block,
+    Bytes,
+    Int64s,
+    Ledger,
+    Limits,
+    Messages,
+    Selection,
+)
 
 from .timed_files import is_inside
 

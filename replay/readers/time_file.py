@@ -31,10 +31,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from crosscue.replay.columns import Int64s
-from crosscue.replay.errors import LogFormatError, LogTooLargeError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.limits import Limits
+from crosscue.replay.base import Int64s, Limits, LogFormatError, LogTooLargeError, read_at_most
 
 NAMES: Final = ("timestamps.txt", "times.txt", "rgb.txt")
 """Tried in this order inside a folder, before any ``.csv``."""

@@ -17,9 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Int64s
-from crosscue.replay.errors import LogFormatError
-from crosscue.replay.log import Selection
+from crosscue.replay.base import Int64s, LogFormatError, Selection
 
 from .time_file import TimeFile
 

@@ -23,22 +23,27 @@ from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import Any, BinaryIO, Final, Protocol, Self, TypeVar, cast
 
-from crosscue.replay.columns import Block, Topic
-from crosscue.replay.errors import (
+from crosscue.replay.base import (
+    EVERYTHING,
+    Block,
+    Closing,
     CrosscueError,
+    KnowsItsEnd,
+    Ledger,
+    Limits,
+    Log,
     LogError,
     LogTooLargeError,
     OutputError,
+    Selection,
+    Topic,
     UsageError,
+    cannot_write,
     one_line,
+    report_missing,
 )
-from crosscue.replay.files.closing import Closing
 from crosscue.replay.files.partial_file import is_still
-from crosscue.replay.files.whole_file import cannot_write
 from crosscue.replay.formats import known_formats
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import Limits
-from crosscue.replay.log import EVERYTHING, KnowsItsEnd, Log, Selection, report_missing
 
 from .ranges import RangedFile, Spool
 

@@ -12,11 +12,19 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, Protocol, runtime_checkable
 
-from crosscue.replay.columns import Block, Topic
-from crosscue.replay.errors import LogError
-from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import CHANGED, DIFFERS, Ledger
-from crosscue.replay.log import EVERYTHING, Log, Selection, report_missing
+from crosscue.replay.base import (
+    CHANGED,
+    DIFFERS,
+    EVERYTHING,
+    Block,
+    Closing,
+    Ledger,
+    Log,
+    LogError,
+    Selection,
+    Topic,
+    report_missing,
+)
 
 from .seal import HASH, Check, Seal, seal_over, seal_path
 from .touched import Blocks, Touched
@@ -64,7 +72,7 @@ def with_seal(path: Path, opened: Callable[[], Log], *, is_part: bool = False) -
 
 
 class SealedLog(Closing):
-    """Stands for a log; see ``crosscue.replay.log.Log`` and the module's text."""
+    """Stands for a log; see ``crosscue.replay.base.Log`` and the module's text."""
 
     def __init__(self, log: Log, seal: Seal, folders: Path | None = None) -> None:
         """Stand for ``log``; ``folders`` is the seal file if it is that of a folder around it."""

@@ -20,10 +20,7 @@ from typing import Any, Final
 
 import xxhash
 
-from crosscue.replay.errors import LogError, OutputError, one_line
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.limits import MIB
+from crosscue.replay.base import MIB, LogError, OutputError, json_tree, one_line, read_at_most
 
 SUFFIX: Final = ".seal"
 KIND: Final = "crosscue seal"
@@ -236,14 +233,14 @@ def write_seal(log: Path, seal: Seal, *, overwrite: bool) -> bool:
             f"{path}: the log differs from its seal of {kept.sealed_at}; see "
             f"'crosscue seal --check {log}', and give --overwrite only if the log is right"
         )
-    from crosscue.replay.files.whole_file import write_text
+    from crosscue.replay.base import write_text
 
     write_text(path, _as_text(seal))
     return True
 
 
 def _as_text(seal: Seal) -> str:
-    from crosscue.replay.files.tree_text import strict_json
+    from crosscue.replay.base import strict_json
 
     tree = {
         "kind": KIND,

@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.replay.columns import Block, Floats, Int64s, Table
-from crosscue.replay.errors import VehicleError
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Block, Floats, Int64s, Ledger, Table, VehicleError
 from crosscue.replay.vehicle.vehicle import AngleSignal, Vehicle
 
 from .kinds import Samples, Signal

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from crosscue.replay.base import Block, Images, Int64s, Ledger
 from crosscue.replay.clocks.clock import Clock, times_of
 from crosscue.replay.clocks.reports import MAX_OFFSET_NS, ClockWatch
-from crosscue.replay.columns import Block, Images, Int64s
 from crosscue.replay.decode import Decoder, decoder_for
-from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 

@@ -15,10 +15,8 @@ from typing import Final
 
 import numpy as np
 
+from crosscue.replay.base import Block, Ledger, Log, Selection
 from crosscue.replay.clocks.clock import Clock
-from crosscue.replay.columns import Block
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Log, Selection
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Samples, Signal, Source
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -11,11 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.replay.columns import CanFrames
+from crosscue.replay.base import CanFrames, EmptyResultError, Ledger, Log, Selection
 from crosscue.replay.decode import decoder_for
-from crosscue.replay.errors import EmptyResultError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Log, Selection
 from crosscue.replay.losses import warn_of
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.signals.converters import ANGLE_UNITS, SPEED_UNITS

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Final
 
-from crosscue.replay.columns import Topic
+from crosscue.replay.base import Topic
+from crosscue.replay.decode.type_names import ros2_spelling
 
 
 class Role(Enum):
@@ -56,12 +57,6 @@ OF_TABLES: Final[Mapping[str, Role | None]] = {
     },
 }
 """Types whose rows are plain columns: ``convert`` may change them, and the role stays."""
-
-
-def ros2_spelling(type_name: str) -> str:
-    """``sensor_msgs/Imu`` as ``sensor_msgs/msg/Imu``; other names stay as they are."""
-    parts = type_name.split("/")
-    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 and parts[0] != "crosscue" else type_name
 
 
 def role_of(topic: Topic) -> Role | None:

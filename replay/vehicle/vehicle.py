@@ -14,10 +14,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
 
-from crosscue.replay.errors import VehicleError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.tree_text import toml_tree
-from crosscue.replay.limits import MIB
+from crosscue.replay.base import MIB, VehicleError, read_at_most, toml_tree
 
 from .cue_table import CUES
 from .fusion import Fusion, Name, RangeFilter

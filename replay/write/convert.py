@@ -10,11 +10,9 @@ from typing import Final, Self
 
 import numpy as np
 
-from crosscue.replay.columns import Block, Messages, Topic
+from crosscue.replay.base import Block, Ledger, Messages, SchemaError, Topic
 from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.encode import Encoder, Encoders, Outgoing
-from crosscue.replay.errors import SchemaError
-from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.roles import OF_TABLES
 
 from .mcap import Compression, McapWriter, Stretch

@@ -11,9 +11,8 @@ import pytest
 from crosscue.datasets.scenes.drive import MADE_OF, SceneSettings
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.eval import cli
-from crosscue.replay.errors import OutputError
+from crosscue.replay.base import OutputError, strict_json
 from crosscue.replay.files.made_of import made_of
-from crosscue.replay.files.tree_text import strict_json
 from support.pictures import picture
 from support.trees import tree
 

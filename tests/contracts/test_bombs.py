@@ -19,8 +19,7 @@ from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.detectors.images import MAX_PIXELS
 from crosscue.eval import cli
 from crosscue.localization.landmarks.database import LandmarkWriter
-from crosscue.replay.columns import Floats
-from crosscue.replay.limits import MIB
+from crosscue.replay.base import MIB, Floats
 from support.gap_drive import BEGIN, SIZE, Clock, replayed, write_drive
 from support.mcap_files import MAGIC, record, text
 from support.pictures import picture

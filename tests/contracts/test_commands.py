@@ -10,7 +10,7 @@ from typing import Final
 import pytest
 
 from crosscue.eval import cli
-from crosscue.replay.errors import one_line
+from crosscue.replay.base import one_line
 
 INPUT: Final = 4
 """Input that cannot be read: a recording, run, database, picture or annotations."""

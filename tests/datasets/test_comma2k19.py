@@ -7,10 +7,14 @@ import pytest
 from numpy.typing import NDArray
 
 from crosscue.datasets.adapters.npy import read_column
-from crosscue.replay.columns import CanFrames, Table
-from crosscue.replay.errors import LogFormatError, UnknownFormatError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Selection
+from crosscue.replay.base import (
+    CanFrames,
+    Ledger,
+    LogFormatError,
+    Selection,
+    Table,
+    UnknownFormatError,
+)
 from crosscue.replay.opening import open_log
 from support.data import shared
 

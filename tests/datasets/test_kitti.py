@@ -15,11 +15,18 @@ from crosscue.datasets.adapters.kitti import TOPICS, open_drive, write_truth
 from crosscue.datasets.adapters.kitti_oxts import COLUMNS, Packets, parse
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.eval.cli import run
-from crosscue.replay.columns import Block, Images, Table
-from crosscue.replay.errors import LogFormatError
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
-from crosscue.replay.limits import DEFAULT
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    EVERYTHING,
+    NOT_ASKED_TIME,
+    NOT_ASKED_TOPIC,
+    Block,
+    Images,
+    Ledger,
+    LogFormatError,
+    Selection,
+    Table,
+)
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.roles import Role, role_of
 from support.data import shared
@@ -270,7 +277,9 @@ def test_a_tracking_file_cut_anywhere_gives_whole_lines_only(tmp_path: Path, sha
     path.write_text(cut)
 
     ledger = Ledger("drive")
-    blocks = list(open_drive(tmp_path, DEFAULT).read(ledger, Selection(frozenset({"oxts/imu"}))))
+    blocks = list(
+        open_drive(tmp_path, DEFAULT_LIMITS).read(ledger, Selection(frozenset({"oxts/imu"})))
+    )
 
     account = ledger.topic("oxts/imu")
     assert sum(len(b) for b in blocks) == account.used

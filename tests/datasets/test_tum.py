@@ -18,8 +18,7 @@ from crosscue.datasets.truth.tum import (
     seconds_text,
     write_tum,
 )
-from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
-from crosscue.replay.limits import Limits
+from crosscue.replay.base import Limits, LogError, LogFormatError, LogTooLargeError
 
 POSE = "1.5 1 2 3 0 0 0 1"
 

@@ -12,7 +12,7 @@ import pytest
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.networks.model_detector import build
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.base import VehicleError
 from support.data import shared
 from support.detecting import yolox_card
 from support.onnx_models import bright_box_model, constant_model

@@ -21,8 +21,7 @@ from crosscue.localization.compass_fit import (
     fit_compass,
     persistence,
 )
-from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.base import Floats, Int64s, VehicleError
 
 DOWN_T = 42e-6
 LEVEL_T = 23e-6

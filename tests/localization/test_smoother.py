@@ -22,8 +22,7 @@ from crosscue.localization.pose_track import (
     start_belief,
 )
 from crosscue.localization.smoother import Fixes, smooth
-from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import UsageError
+from crosscue.replay.base import Floats, Int64s, UsageError
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
 
 pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crosscue.replay.errors import AccountError
-from crosscue.replay.ledger import DETAILS_KEPT, Ledger
+from crosscue.replay.base import DETAILS_KEPT, AccountError, Ledger
 
 _COUNTS = st.integers(0, 1000)
 

@@ -7,9 +7,7 @@ from pathlib import Path
 import pytest
 
 from crosscue.replay import opening
-from crosscue.replay.errors import LogError
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import Log
+from crosscue.replay.base import DEFAULT_LIMITS, Limits, Log, LogError
 from crosscue.replay.opening import open_logs
 from support.memory_log import MemoryLog
 
@@ -20,7 +18,7 @@ class Opened:
     def __init__(self) -> None:
         self.closed: list[str] = []
 
-    def __call__(self, path: Path | str, limits: Limits = DEFAULT) -> Log:
+    def __call__(self, path: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:
         """A log, unless its name is ``broken``."""
         if str(path) == "broken":
             raise LogError("broken: not a log")

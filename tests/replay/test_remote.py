@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.replay.errors import LogError, LogTooLargeError, OutputError, UsageError
+from crosscue.replay.base import Ledger, LogError, LogTooLargeError, OutputError, UsageError
 from crosscue.replay.files.identity import SHARE_BYTES, identity_of
-from crosscue.replay.ledger import Ledger
 from crosscue.replay.opening import open_log
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.remote.logs import Store, fetch, is_remote, matches, version_of

@@ -11,10 +11,7 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from crosscue.eval.cli import run as crosscue
-from crosscue.replay.columns import Block
-from crosscue.replay.errors import LogError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import EVERYTHING, Block, Ledger, LogError, Selection
 from crosscue.replay.opening import open_log
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.remote import ranges as remote_ranges

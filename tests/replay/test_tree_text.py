@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
-from crosscue.replay.files.tree_text import MAX_DEPTH, json_tree, toml_tree
+from crosscue.replay.base import MAX_DEPTH, json_tree, toml_tree
 from support.scoring import run_folder, truth_folder
 
 ROOT: Final = Path(__file__).parents[2]

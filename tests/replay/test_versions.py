@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from crosscue.replay.versions import installed
+from crosscue.replay.base import installed
 
 
 def test_a_version_is_that_of_what_is_installed() -> None:

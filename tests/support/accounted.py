@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
-from crosscue.replay.columns import Block
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import DEFAULT_LIMITS, EVERYTHING, Block, Ledger, Limits, Selection
 from crosscue.replay.opening import open_log
 
 
 def read(
-    path: Path, selection: Selection = EVERYTHING, limits: Limits = DEFAULT
+    path: Path, selection: Selection = EVERYTHING, limits: Limits = DEFAULT_LIMITS
 ) -> tuple[list[Block], Ledger]:
     """All blocks; what was found was used or skipped, and used is what was handed on."""
     ledger = Ledger(str(path))

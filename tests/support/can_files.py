@@ -11,9 +11,7 @@ from pathlib import Path
 
 import can
 
-from crosscue.replay.columns import DATA, ERROR, REMOTE, CanFrames
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import DATA, ERROR, EVERYTHING, REMOTE, CanFrames, Ledger, Selection
 from crosscue.replay.opening import open_log
 
 START_NS = 1_436_529_600_000_000_000

@@ -17,7 +17,7 @@ from crosscue.eval.runs.account import LogAccount, account
 from crosscue.eval.runs.folder import clear, create, locked, write_manifest
 from crosscue.eval.runs.manifest import EstimateTimings
 from crosscue.eval.runs.tables.table_sink import TableSink
-from crosscue.replay.errors import LogFormatError
+from crosscue.replay.base import LogFormatError
 from crosscue.replay.losses import LossWarning
 
 from .manifests import estimated, log_account

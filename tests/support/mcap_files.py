@@ -12,10 +12,7 @@ from typing import TypeAlias
 import lz4.frame
 import zstandard
 
-from crosscue.replay.columns import Messages
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import DEFAULT_LIMITS, EVERYTHING, Ledger, Limits, Messages, Selection
 from crosscue.replay.readers.mcap.reader import open_mcap
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -233,7 +230,9 @@ class Reading:
         ) and set(self.messages) <= set(accounts)
 
 
-def read_back(path: Path, selection: Selection = EVERYTHING, limits: Limits = DEFAULT) -> Reading:
+def read_back(
+    path: Path, selection: Selection = EVERYTHING, limits: Limits = DEFAULT_LIMITS
+) -> Reading:
     """Read a file to its end, as plain tuples."""
     given: dict[str, list[Message]] = {}
     ledger = Ledger(str(path))

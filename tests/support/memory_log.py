@@ -10,9 +10,16 @@ from typing import Self
 
 import numpy as np
 
-from crosscue.replay.columns import Block, Floats, Table, Topic
-from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import (
+    EVERYTHING,
+    NOT_ASKED_TOPIC,
+    Block,
+    Floats,
+    Ledger,
+    Selection,
+    Table,
+    Topic,
+)
 
 WHEELS = Topic("wheels", "crosscue/WheelSpeeds", "columns")
 GYRO = Topic("gyro", "sensor_msgs/msg/Imu", "columns")

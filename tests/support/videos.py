@@ -9,7 +9,7 @@ from typing import cast
 import av
 import numpy as np
 
-from crosscue.replay.columns import Block, Images
+from crosscue.replay.base import Block, Images
 
 STEP = 9
 """Shades between two pictures; coding changes a shade by less than half of it."""

@@ -10,8 +10,7 @@ from crosscue.datasets.scenes.cues import MIN_PIXELS
 from crosscue.datasets.scenes.rendering.render import Picture
 from crosscue.datasets.scenes.world import CATEGORIES
 from crosscue.detectors.rle import encode
-from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.base import strict_json, write_text
 
 COCO_IDS: Final = {
     "car": (3, "car"), "traffic_light": (10, "traffic light"), "stop_sign": (13, "stop sign"),

@@ -30,9 +30,7 @@ from crosscue.eval.fit.landmark_pairs import pairs_of_drive, pairs_of_table, wit
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.features import Matcher
 from crosscue.localization.landmarks.fit import LandmarkFit, Rate, ScoredPairs, fit_landmarks
-from crosscue.replay.errors import SchemaError, UsageError
-from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Ledger, SchemaError, UsageError, write_text
 from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_logs
 from crosscue.replay.vehicle.vehicle import Vehicle, load, parse

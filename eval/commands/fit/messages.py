@@ -23,8 +23,7 @@ from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, rates
 from crosscue.eval.runs.folder import open_run
 from crosscue.fusion.fade_fit import FadeFit
 from crosscue.fusion.message_fit import MessageFit, RateFit, Side, fit_messages
-from crosscue.replay.errors import EmptyResultError, UsageError
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.base import EmptyResultError, UsageError, write_text
 from crosscue.replay.vehicle.fusion import Rates
 
 

@@ -32,11 +32,9 @@ from crosscue.eval.fit.landmark_database import (
 from crosscue.eval.pipeline.landmarks import matcher_for
 from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.localization.landmarks.features import Matcher
-from crosscue.replay.errors import EmptyResultError, UsageError
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import EmptyResultError, Ledger, UsageError, visible
 from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_logs
-from crosscue.replay.safe_text import visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 

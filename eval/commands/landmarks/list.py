@@ -14,8 +14,7 @@ from pathlib import Path
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.fit.landmark_database import near_of
 from crosscue.localization.landmarks.database import LandmarkDatabase, Place
-from crosscue.replay.errors import UsageError
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import UsageError, visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -15,8 +15,7 @@ from crosscue.eval.fit.landmark_database import near_of
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.features import Match
 from crosscue.localization.landmarks.images import grey_of, read_picture
-from crosscue.replay.errors import UsageError
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import UsageError, visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 

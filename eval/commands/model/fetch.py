@@ -17,7 +17,7 @@ from pathlib import Path
 from crosscue.detectors.catalog.fetch import Fetched, Progress, fetch
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, ProgressLine, progress_line
-from crosscue.replay.errors import UsageError
+from crosscue.replay.base import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -20,10 +20,7 @@ from crosscue.detectors.decoders.base import Guess, Interface
 from crosscue.detectors.networks.model_detector import build
 from crosscue.eval.commands.model.shared import look
 from crosscue.eval.commands.shared.options import print_json
-from crosscue.replay.errors import UsageError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.limits import MIB
+from crosscue.replay.base import MIB, UsageError, read_at_most, write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

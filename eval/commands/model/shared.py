@@ -8,8 +8,7 @@ from crosscue.detectors.base import Detections, Detector, Frame, View
 from crosscue.detectors.catalog.entries import card_path
 from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.overlay import picture_of
-from crosscue.replay.errors import LogError, UsageError
-from crosscue.replay.files.whole_file import write_bytes
+from crosscue.replay.base import LogError, UsageError, write_bytes
 
 
 def card_of(name: str) -> Path:

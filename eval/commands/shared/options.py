@@ -13,11 +13,16 @@ from typing import Protocol
 
 from crosscue.eval.interface.logs import Log as DriveLog
 from crosscue.eval.interface.logs import open as open_drive
-from crosscue.replay.errors import OutputError, UsageError
-from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import Log, Selection
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Limits,
+    Log,
+    OutputError,
+    Selection,
+    UsageError,
+    strict_json,
+    write_text,
+)
 from crosscue.replay.log_part import first_ns, named_topics
 from crosscue.replay.opening import unless_damaged
 
@@ -50,16 +55,16 @@ def add_limit_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--max-chunk",
         type=_mebibytes,
-        default=DEFAULT.chunk_bytes,
+        default=DEFAULT_LIMITS.chunk_bytes,
         metavar="MIB",
         help="largest chunk, container or page to decompress, in MiB "
-        f"(default: {DEFAULT.chunk_bytes >> 20})",
+        f"(default: {DEFAULT_LIMITS.chunk_bytes >> 20})",
     )
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
     """The limits that a log is read with."""
-    return replace(DEFAULT, chunk_bytes=args.max_chunk)
+    return replace(DEFAULT_LIMITS, chunk_bytes=args.max_chunk)
 
 
 def _mebibytes(text: str) -> int:

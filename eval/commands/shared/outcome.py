@@ -7,7 +7,7 @@ from dataclasses import asdict
 from crosscue.eval.pipeline.outcome import ApproachSummary, Outcome, SceneOutcome
 from crosscue.eval.runs.account import account_lines, details_of
 from crosscue.eval.runs.candidates import candidate_lines, candidate_rows, not_looked_lines
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Ledger
 from crosscue.replay.safe_text import terminal_width, visible, wrapped
 
 

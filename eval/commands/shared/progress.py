@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeVar
 
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import visible
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from crosscue.replay.errors import UsageError
-from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.base import UsageError, json_tree
 
 from .options import print_json
 from .progress import Done, with_progress

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.datasets.scenes.layout import SCORED
-from crosscue.replay.errors import UsageError
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.base import UsageError, write_text
 
 MOST: Final = 100_000
 """Layouts a command takes; far more than anybody has the time to render."""

@@ -19,8 +19,7 @@ from crosscue.eval.batch.jobs import exit_status_of
 from crosscue.eval.commands.shared.progress import DrivesLine, is_shown
 from crosscue.eval.studies.intersections.report import TABLES, summary, write_study
 from crosscue.eval.studies.intersections.study import StudySettings, run_drives, score_study
-from crosscue.replay.errors import RunError
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import RunError, visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

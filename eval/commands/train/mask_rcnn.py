@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from crosscue.detectors.training.summary import measured_text, measured_tree
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.training import check_place
-from crosscue.replay.errors import UsageError
+from crosscue.replay.base import UsageError
 from crosscue.replay.files.made_of import made_of
 
 if TYPE_CHECKING:
@@ -350,7 +350,7 @@ def _draw(job: Job) -> None:
     from matplotlib import pyplot as plt
 
     from crosscue.detectors.training.job import read_curve
-    from crosscue.replay.files.whole_file import write_whole
+    from crosscue.replay.base import write_whole
 
     points = read_curve(job.curve_path)
     figure, (above, below) = plt.subplots(2, 1, sharex=True, figsize=(7, 6))

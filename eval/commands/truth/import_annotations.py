@@ -21,8 +21,7 @@ from pathlib import Path
 from crosscue.datasets.truth.truth import FILE
 from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
 from crosscue.eval.fit.truth_check import Imported, import_annotations
-from crosscue.replay.errors import OutputError, UsageError
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import OutputError, UsageError, visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 

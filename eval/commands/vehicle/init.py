@@ -15,7 +15,7 @@ from crosscue.eval.commands.shared.options import (
     print_json,
     refuse_existing,
 )
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.base import write_text
 from crosscue.replay.opening import open_logs
 from crosscue.replay.vehicle.draft import draft
 from crosscue.replay.vehicle.vehicle import parse

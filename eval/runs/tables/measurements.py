@@ -21,8 +21,7 @@ from crosscue.localization.landmarks.update import Sighting
 from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
 from crosscue.localization.pose_track import ACCEPTED, HeadingColumns, Headings
 from crosscue.localization.smoother import Fixes
-from crosscue.replay.columns import Floats
-from crosscue.replay.errors import RunError
+from crosscue.replay.base import Floats, RunError
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -8,8 +8,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.replay.base import cannot_write
 from crosscue.replay.files.partial_file import PartialFile
-from crosscue.replay.files.whole_file import cannot_write
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from crosscue.datasets.truth.tum import Trajectory, heading_rad
 from crosscue.eval.scoring.consistency import mean_band, quantile
 from crosscue.localization.angles import wrap_all
-from crosscue.replay.columns import Floats
-from crosscue.replay.errors import UsageError
+from crosscue.replay.base import Floats, UsageError
 
 from .quaternions import about_z, angle_rad, between, inverse, product, rotate
 

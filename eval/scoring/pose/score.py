@@ -21,8 +21,7 @@ from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tu
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import Gap, comes_twice, gaps_of, table_in_log_time
 from crosscue.localization.angles import wrap_all
-from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import SchemaError
+from crosscue.replay.base import Floats, Int64s, SchemaError
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .errors import (

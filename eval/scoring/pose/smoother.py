@@ -15,10 +15,7 @@ from crosscue.eval.runs.tables.log_time import refuse_set_back
 from crosscue.eval.runs.tables.measurements import read_measured
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.smoother import smooth
-from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import SchemaError
-from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.base import Floats, Int64s, SchemaError, strict_json, write_text
 
 from .errors import NeesSummary, nees, pair, summarise_nees
 from .score import COVARIANCES, MAX_DIFFERENCE_NS, at_truths_point, load_truth

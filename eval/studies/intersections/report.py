@@ -16,9 +16,7 @@ from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_F
 from crosscue.eval.scoring.approaches import ApproachScore
 from crosscue.eval.scoring.runs import metrics_of, write_scores
 from crosscue.eval.studies.intersections.scores import StudyScores
-from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.versions import versions
+from crosscue.replay.base import strict_json, versions, write_text
 
 from .causes import Finding, by_cause, condition_costs, findings
 from .contact_sheet import write_sheet

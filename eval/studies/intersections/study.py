@@ -31,12 +31,10 @@ from crosscue.eval.studies.attribution import Drive, attribute
 from crosscue.eval.studies.estimated_again import estimate_of
 from crosscue.eval.studies.intersections.scores import StudyScores
 from crosscue.fusion.message_fit import fit_messages
-from crosscue.replay.errors import RunError, UsageError
-from crosscue.replay.log import EVERYTHING
+from crosscue.replay.base import EVERYTHING, RunError, UsageError, versions
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.fusion import Calibrated
 from crosscue.replay.vehicle.vehicle import Vehicle, load
-from crosscue.replay.versions import versions
 
 MIN_PLACES: Final = 3
 """Intersections, so that messages for one can be learned at two others or more."""

@@ -22,9 +22,7 @@ from crosscue.eval.studies.page import Table, write_page
 from crosscue.eval.studies.pictures import figure, save
 from crosscue.eval.studies.words import percent
 from crosscue.localization.town.random_stream import key_of
-from crosscue.replay.errors import RunError
-from crosscue.replay.files.tree_text import json_tree, strict_json
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.base import RunError, json_tree, strict_json, write_text
 from crosscue.replay.processes import in_processes
 
 from .replayed import through_log

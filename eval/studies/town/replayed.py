@@ -13,7 +13,7 @@ from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.score import PoseScore
 from crosscue.localization.town.drive import Traced, drive_traced
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.log import EVERYTHING
+from crosscue.replay.base import EVERYTHING
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 

@@ -20,9 +20,7 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from crosscue.localization.town.settings import City, Drive, Proportion
-from crosscue.replay.errors import CrosscueError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.tree_text import toml_tree
+from crosscue.replay.base import CrosscueError, read_at_most, toml_tree
 from crosscue.replay.vehicle.section import Section
 from crosscue.replay.vehicle.validation_errors import explain
 from crosscue.replay.vehicle.vehicle import tuples

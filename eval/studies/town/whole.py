@@ -12,9 +12,7 @@ from crosscue.eval.runs.folder import RunFolder, locked
 from crosscue.eval.studies.page import Table, write_page
 from crosscue.eval.studies.words import km, percent
 from crosscue.localization.town.drive import Result
-from crosscue.replay.errors import RunError
-from crosscue.replay.files.tree_text import json_tree, strict_json
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.base import RunError, json_tree, strict_json, write_text
 
 from . import landmark_figure, landmark_study, range_figure, range_study
 from .settings import LandmarkStudy, RangeStudy

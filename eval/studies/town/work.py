@@ -29,8 +29,7 @@ from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import Keys, Result, drive_many, drive_one
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.columns import Floats
-from crosscue.replay.errors import CrosscueError, RunError, UnreadableRunError, UsageError
+from crosscue.replay.base import CrosscueError, Floats, RunError, UnreadableRunError, UsageError
 
 from .settings import Case
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from io import BufferedReader
 from typing import Final, NamedTuple
 
-from crosscue.replay.log import Selection
+from crosscue.replay.base import Selection
 
 from .objects import BASE_BYTES, CONTAINER, FRAME_TYPES, MAGIC, PADDING_MAX
 

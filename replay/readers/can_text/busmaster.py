@@ -13,8 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import DATA, REMOTE, Int64s
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import DATA, REMOTE, Int64s, Ledger
 
 from .dialect import Damage, Dialect, Fast, Frame, Mark, Other, Outcome
 from .digits import NANOS, TIME_MAX_NS, Bools, decimal, within_range

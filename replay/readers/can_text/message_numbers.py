@@ -11,8 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import Int64s
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Int64s, Ledger
 
 from .digits import Bools
 

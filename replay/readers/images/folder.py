@@ -10,12 +10,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.columns import Block, Topic
-from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import Limits
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import (
+    EVERYTHING,
+    Block,
+    Closing,
+    Ledger,
+    Limits,
+    LogFormatError,
+    Selection,
+    Topic,
+)
 from crosscue.replay.readers.time_file import find_time_file, read_time_file
 from crosscue.replay.readers.timed_files import list_files, pair
 from crosscue.replay.seal.touched import Touched

@@ -12,8 +12,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Final
 
-from crosscue.replay.columns import Topic
-from crosscue.replay.limits import Limits
+from crosscue.replay.base import Limits, Topic
 
 from .records import CHANNEL, Channel, Schema, read_channel, read_schema
 from .rows import Definition

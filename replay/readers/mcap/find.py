@@ -11,8 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import Bytes
-from crosscue.replay.limits import Limits
+from crosscue.replay.base import Bytes, Limits
 
 from .bytes import PIECE, ByteFile
 from .inflate import inflate

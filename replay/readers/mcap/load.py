@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 from threading import Event
 from typing import Final, Self
 
-from crosscue.replay.columns import Bytes
-from crosscue.replay.limits import Limits
+from crosscue.replay.base import Bytes, Limits
 
 from .bytes import ByteFile
 from .inflate import inflate, inflate_prefix

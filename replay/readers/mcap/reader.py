@@ -21,11 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.columns import Block, Topic
-from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import Limits
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import EVERYTHING, Block, Closing, Ledger, Limits, Selection, Topic
 from crosscue.replay.remote.ranges import RangedFile
 from crosscue.replay.seal.touched import Touched
 
@@ -41,7 +37,7 @@ SUMMARY_GUESS: Final = 64 << 10
 
 
 class McapLog(Closing):
-    """An open MCAP file; see ``crosscue.replay.log.Log``."""
+    """An open MCAP file; see ``crosscue.replay.base.Log``."""
 
     def __init__(self, path: Path, limits: Limits, file: ByteFile | None = None) -> None:
         """Find the topics.

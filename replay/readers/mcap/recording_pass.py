@@ -11,10 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import Block, Bytes
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import Limits
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import EVERYTHING, Block, Bytes, Ledger, Limits, Selection
 
 from .blocks import Giver
 from .bytes import ByteFile

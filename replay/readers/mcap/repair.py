@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from crosscue.replay.limits import Limits
+from crosscue.replay.base import Limits
 
 from .bytes import ByteFile
 from .inflate import inflate

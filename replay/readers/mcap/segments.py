@@ -13,9 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.errors import LogFormatError
+from crosscue.replay.base import Limits, LogFormatError
 from crosscue.replay.files.checksum import crc32
-from crosscue.replay.limits import Limits
 
 from .bytes import PIECE, ByteFile
 from .channels import Declarations, TopicBook

@@ -16,8 +16,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.columns import Bytes
-from crosscue.replay.limits import Limits
+from crosscue.replay.base import Bytes, Limits
 
 from .bytes import ByteFile
 from .find import find_chunk

@@ -17,8 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.limits import Limits
-from crosscue.replay.log import Selection
+from crosscue.replay.base import Limits, Selection
 
 from .bytes import ByteFile
 from .channels import Declarations

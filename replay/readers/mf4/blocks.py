@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, Final
 
-from crosscue.replay.errors import LogFormatError
-from crosscue.replay.limits import Limits
+from crosscue.replay.base import Limits, LogFormatError
 
 _HEAD: Final = struct.Struct("<4s4xQQ")
 HEAD_BYTES: Final = 24

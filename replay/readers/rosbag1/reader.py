@@ -11,12 +11,18 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from crosscue.replay.columns import Block, Topic
-from crosscue.replay.errors import LogError, LogFormatError
-from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    EVERYTHING,
+    Block,
+    Closing,
+    Ledger,
+    Limits,
+    LogError,
+    LogFormatError,
+    Selection,
+    Topic,
+)
 from crosscue.replay.remote.ranges import RangedFile
 from crosscue.replay.seal.touched import Touched
 
@@ -28,7 +34,7 @@ from .window import find_bag_window
 
 
 class BagLog(Closing):
-    """An open ROS 1 bag; see ``crosscue.replay.log.Log``."""
+    """An open ROS 1 bag; see ``crosscue.replay.base.Log``."""
 
     def __init__(self, path: Path, limits: Limits, file: BagFile | None = None) -> None:
         """Open the bag and learn its topics.
@@ -189,7 +195,7 @@ class BagLog(Closing):
             self._losses.append(("file is cut", detail))
 
 
-def open_bag(path: Path, limits: Limits = DEFAULT) -> BagLog:
+def open_bag(path: Path, limits: Limits = DEFAULT_LIMITS) -> BagLog:
     """Open a ROS 1 bag.
 
     Raises:

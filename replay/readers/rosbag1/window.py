@@ -12,8 +12,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
-from crosscue.replay.limits import Limits
-from crosscue.replay.log import Selection
+from crosscue.replay.base import Limits, Selection
 
 from .index import ChunkUnit, Contents, Gap, units
 from .records import BagFile, ChunkInfo, Record

@@ -14,11 +14,20 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import Block, Int64s, Messages, Topic
-from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    EVERYTHING,
+    NOT_ASKED_TIME,
+    NOT_ASKED_TOPIC,
+    Block,
+    Closing,
+    Int64s,
+    Ledger,
+    Limits,
+    Messages,
+    Selection,
+    Topic,
+)
 from crosscue.replay.readers.can_rows import keep_memory
 from crosscue.replay.readers.mixed import MixedRows, blocks_of
 from crosscue.replay.readers.timed_files import is_inside
@@ -42,7 +51,7 @@ INDEX_DIFFERS: Final = "row and time index disagree"
 
 
 class Db3Log(Closing):
-    """An open ROS 2 SQLite bag; see ``crosscue.replay.log.Log``."""
+    """An open ROS 2 SQLite bag; see ``crosscue.replay.base.Log``."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
         """Open it and learn its topics.
@@ -385,7 +394,7 @@ def _stamp(path: Path) -> tuple[int, int, int]:
     return at.st_ino, at.st_size, at.st_mtime_ns
 
 
-def open_db3(path: Path, limits: Limits = DEFAULT) -> Db3Log:
+def open_db3(path: Path, limits: Limits = DEFAULT_LIMITS) -> Db3Log:
     """Open a ROS 2 SQLite bag.
 
     Raises:

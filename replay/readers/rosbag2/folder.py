@@ -14,12 +14,19 @@ from typing import Final, cast
 
 import numpy as np
 
-from crosscue.replay.columns import Block, Messages, Topic
-from crosscue.replay.errors import LogError
-from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import DETAILS_KEPT, Ledger
-from crosscue.replay.limits import DEFAULT, Limits
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    DETAILS_KEPT,
+    EVERYTHING,
+    Block,
+    Closing,
+    Ledger,
+    Limits,
+    LogError,
+    Messages,
+    Selection,
+    Topic,
+)
 
 from .inflate import DAMAGED, inflated
 from .merge import Stream, merged
@@ -33,7 +40,7 @@ OTHER_TYPE: Final = "another message type on the same topic"
 
 
 class FolderLog(Closing):
-    """An open ROS 2 bag folder; see ``crosscue.replay.log.Log``."""
+    """An open ROS 2 bag folder; see ``crosscue.replay.base.Log``."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
         """Find its storage files and learn their topics.
@@ -253,7 +260,7 @@ def _absorb(ledger: Ledger, own: Ledger, name: str) -> None:
         ledger.notice(f"{name}: {sentence}")
 
 
-def open_folder(path: Path, limits: Limits = DEFAULT) -> FolderLog:
+def open_folder(path: Path, limits: Limits = DEFAULT_LIMITS) -> FolderLog:
     """Open a ROS 2 bag folder.
 
     Raises:

@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import BLOCK_BYTES, Bytes, Int64s, Messages
-from crosscue.replay.limits import Limits
+from crosscue.replay.base import BLOCK_BYTES, Bytes, Int64s, Limits, Messages
 
 ZSTD_MAGIC: Final = 0xFD2FB528
 """As a little-endian number; no CDR message begins so."""

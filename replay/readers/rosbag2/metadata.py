@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.base import read_at_most
 
 METADATA_BYTES: Final = 1 << 20
 _BRACKETS: Final = 10_000

@@ -19,8 +19,7 @@ from typing import BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import BLOCK_BYTES, Bytes, Int64s, Messages
-from crosscue.replay.limits import MIB, Limits
+from crosscue.replay.base import BLOCK_BYTES, MIB, Bytes, Int64s, Limits, Messages
 
 from .sqlite import FAULTS, Database
 from .tables import fetched

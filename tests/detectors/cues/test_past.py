@@ -16,10 +16,7 @@ from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.truth.truth import load as load_truth
 from crosscue.detectors.cues.far_side import end_of, past_counts, vehicles_past
 from crosscue.detectors.cues.mobileye_state import MobileyeState, state_at
-from crosscue.replay.columns import Block, Floats, Topic
-from crosscue.replay.errors import VehicleError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import Selection
+from crosscue.replay.base import Block, Floats, Ledger, Selection, Topic, VehicleError
 from crosscue.replay.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import MOBILEYE_SIGNALS, Samples, Signal

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.road import RoadShares, region_mask, road_shares
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.base import VehicleError
 from crosscue.replay.vehicle.vehicle import Regions, parse
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from crosscue.detectors.ranging.object_tracks import Motion, ObjectTracks, Track
 from crosscue.detectors.ranging.range_from_motion import SIZES
-from crosscue.replay.columns import Floats
+from crosscue.replay.base import Floats
 
 FOCAL_PX = 1500.0
 CENTER_PX = (960.0, 540.0)

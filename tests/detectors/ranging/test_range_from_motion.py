@@ -13,7 +13,7 @@ from crosscue.detectors.ranging.range_from_motion import (
     SizePrior,
     range_from_motion,
 )
-from crosscue.replay.columns import Floats
+from crosscue.replay.base import Floats
 
 FOCAL_PX = 1500.0
 LIGHT = SIZES["traffic_light"]

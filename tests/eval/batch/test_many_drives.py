@@ -25,7 +25,7 @@ from crosscue.eval.batch.jobs import (
     state_of,
 )
 from crosscue.eval.batch.processes import Processes
-from crosscue.replay.errors import UsageError
+from crosscue.replay.base import UsageError
 from crosscue.replay.losses import losses_heard
 from support.drive_work import Letters, letters, made_jobs
 from support.trees import tree

@@ -11,7 +11,7 @@ from crosscue.eval.batch.merge import is_merged, merge_runs
 from crosscue.eval.runs.folder import RunFolder, create, open_run, write_manifest
 from crosscue.eval.runs.manifest import MergedManifest
 from crosscue.eval.runs.tables.table_sink import TableSink
-from crosscue.replay.errors import RunError
+from crosscue.replay.base import RunError
 from support.drive_work import letters, made_jobs
 from support.manifests import estimated
 from support.trees import tree

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import pytest
 
 from crosscue.eval.batch.ray_cluster import LOCAL, joined
-from crosscue.replay.errors import CrosscueError, UsageError
+from crosscue.replay.base import CrosscueError, UsageError
 
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed")
 

@@ -13,7 +13,7 @@ from crosscue.eval import cli
 from crosscue.eval.catalog.compare import compare_metrics, compare_runs, read_tolerance
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.metric_values import MetricValue
-from crosscue.replay.errors import UsageError
+from crosscue.replay.base import UsageError
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.scoring import (

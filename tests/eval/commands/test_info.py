@@ -17,10 +17,17 @@ from hypothesis import strategies as st
 
 from crosscue.eval.cli import run
 from crosscue.eval.interface.summary import lines_of, plain
-from crosscue.replay.columns import DATA, Block, CanFrames, Messages, Topic
-from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import (
+    DATA,
+    EVERYTHING,
+    Block,
+    CanFrames,
+    Ledger,
+    Messages,
+    Selection,
+    Topic,
+    strict_json,
+)
 from crosscue.replay.log_summary import quick_summary, summarise, together
 from crosscue.replay.safe_text import cells, table, visible, wrapped
 from support.clock_streams import SECOND_NS, START_NS, Stream, table_of

@@ -20,7 +20,7 @@ from crosscue.datasets.scenes.drive import SceneSettings, write_scene
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import create, locked, open_run
-from crosscue.replay.errors import RunError
+from crosscue.replay.base import RunError
 from support import faults
 from support.trees import tree
 

@@ -10,9 +10,7 @@ from crosscue.eval import cli
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import create
-from crosscue.replay.columns import Block
-from crosscue.replay.errors import EmptyResultError, RunError, VehicleError
-from crosscue.replay.log import EVERYTHING
+from crosscue.replay.base import EVERYTHING, Block, EmptyResultError, RunError, VehicleError
 from crosscue.replay.vehicle.time import Time
 from crosscue.replay.vehicle.vehicle import Start, Vehicle, parse
 from support.data import shared

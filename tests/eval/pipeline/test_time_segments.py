@@ -16,8 +16,7 @@ from crosscue.eval.runs.folder import create
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.pose_track import start_belief
-from crosscue.replay.columns import Block, Int64s
-from crosscue.replay.log import EVERYTHING
+from crosscue.replay.base import EVERYTHING, Block, Int64s
 from crosscue.replay.time.stamp_watch import StampWatch
 from crosscue.replay.vehicle.time import Time
 from crosscue.replay.vehicle.vehicle import Start, Vehicle

@@ -22,8 +22,7 @@ from crosscue.eval.runs.account import (
 )
 from crosscue.eval.runs.folder import create, open_run
 from crosscue.eval.runs.tables.skipped import write_skipped
-from crosscue.replay.errors import AccountError
-from crosscue.replay.ledger import DETAILS_KEPT, Ledger
+from crosscue.replay.base import DETAILS_KEPT, AccountError, Ledger
 from support.manifests import log_account
 from support.pictures import picture_folder
 

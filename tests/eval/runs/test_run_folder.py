@@ -13,8 +13,7 @@ import pytest
 from crosscue.eval.runs import folder
 from crosscue.eval.runs.folder import create, locked, open_run
 from crosscue.eval.runs.tables.table_sink import TableSink
-from crosscue.replay.errors import OutputError, RunError
-from crosscue.replay.files.whole_file import write_text, write_whole
+from crosscue.replay.base import OutputError, RunError, write_text, write_whole
 
 SCHEMA = pa.schema([("t_ns", pa.int64())])
 

@@ -20,10 +20,16 @@ from crosscue.eval.report.score_runs import score_pose
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
 from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of
-from crosscue.replay.columns import Block, Images, Messages, Topic
-from crosscue.replay.errors import RunError, SchemaError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.log import EVERYTHING
+from crosscue.replay.base import (
+    EVERYTHING,
+    Block,
+    Images,
+    Ledger,
+    Messages,
+    RunError,
+    SchemaError,
+    Topic,
+)
 from crosscue.replay.opening import open_log
 from crosscue.replay.vehicle.vehicle import Camera, Start, Vehicle
 from crosscue.replay.write.convert import LogWriter

@@ -41,8 +41,7 @@ from crosscue.eval.studies.town.whole import drive_study, finish_landmarks, fini
 from crosscue.eval.studies.town.work import WorkerError, assemble, chunks_of, run
 from crosscue.localization.town.drive import Keys, Result, drive_many
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
-from crosscue.replay.columns import Floats
-from crosscue.replay.errors import RunError, UsageError
+from crosscue.replay.base import Floats, RunError, UsageError
 
 TOWN = Drive(city=City(largest_km2=2.0))
 SMALL = LandmarkStudy(

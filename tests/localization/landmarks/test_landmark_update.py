@@ -27,7 +27,7 @@ from crosscue.localization.pose_track import (
     advance,
     start_belief,
 )
-from crosscue.replay.columns import Floats
+from crosscue.replay.base import Floats
 from support.landmark_drive import PlaceLooks, landmarks_along, search_in, there
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
 

@@ -30,7 +30,7 @@ from crosscue.localization.town.drive import (
     drive_traced,
 )
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
-from crosscue.replay.columns import Floats
+from crosscue.replay.base import Floats
 
 FIELD = {name: i for i, name in enumerate(Result._fields)}
 TOWN = City(largest_km2=3.0)

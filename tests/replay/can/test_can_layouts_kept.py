@@ -14,6 +14,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Block,
+    CanFrames,
+    Ledger,
+    SchemaError,
+    Table,
+    json_tree,
+)
 from crosscue.replay.can import database
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.dbc_text import read_dbc
@@ -21,11 +30,6 @@ from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.can.layout import CanMessage
 from crosscue.replay.can.layout_cache import VARIABLE, cache_folder
 from crosscue.replay.can.sources import DatabaseText, read_text
-from crosscue.replay.columns import Block, CanFrames, Table
-from crosscue.replay.errors import SchemaError
-from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT
 from support.can_layouts import dbc_text, messages
 from support.data import shared
 
@@ -76,7 +80,7 @@ def test_every_real_file_reads_as_cantools_reads_it() -> None:
 
     assert len(files) >= 11
     for path in files:
-        source = read_text(path, DEFAULT)
+        source = read_text(path, DEFAULT_LIMITS)
         quick = read_dbc(source.text)
         assert quick is not None, path
         assert _spelled(quick) == _spelled(_by_cantools(source)), path

@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from crosscue.eval import cli
-from crosscue.replay.columns import Topic
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Ledger, Topic
 from support.ros_messages import (
     block_of,
     must_decode,

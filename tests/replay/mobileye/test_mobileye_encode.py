@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.columns import Block, CanFrames, Floats, Table
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.base import Block, CanFrames, Floats, Ledger, Table
 from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.encode import FRAME_NS, bursts_of, encode_burst, encode_tables
 from crosscue.replay.mobileye.geometry import Mounting

@@ -12,7 +12,7 @@ import lz4.frame
 import pytest
 import zstandard
 
-from crosscue.replay.limits import DEFAULT
+from crosscue.replay.base import DEFAULT_LIMITS
 from support.mcap_files import MAGIC, ChunkOf, channel, header, message, record, schema, text
 from support.measured import measured
 from support.rosbag_files import header_field
@@ -92,5 +92,5 @@ def test_a_bomb_is_refused_with_both_numbers_in_bounded_memory(tmp_path: Path, c
     assert status == 3
     assert peak_mb < MAX_MB
     assert str(declared) in said
-    other = str(DEFAULT.chunk_bytes) if "limit" in case else "more"
+    other = str(DEFAULT_LIMITS.chunk_bytes) if "limit" in case else "more"
     assert re.search(rf"\b{other}\b", said)

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from crosscue.detectors.images import MAX_PIXELS
-from crosscue.replay.limits import DEFAULT, MIB
+from crosscue.replay.base import DEFAULT_LIMITS, MIB
 from support.can_files import blf, made
 from support.measured import measured
 from support.mf4_files import unsorted
@@ -124,36 +124,36 @@ LOGS: dict[str, tuple[Callable[[Path], Path], int, tuple[str, str]]] = {
     "BLF over the limit": (
         _blf(BOMB_BYTES),
         3,
-        (str(BOMB_BYTES), str(DEFAULT.chunk_bytes)),
+        (str(BOMB_BYTES), str(DEFAULT_LIMITS.chunk_bytes)),
     ),
     "BLF more than declared": (_blf(1000), 3, ("more than 1000", "declares 1000")),
     "db3 message over the limit": (
         _in_db3(_honest),
         3,
-        (str(BOMB_BYTES), str(DEFAULT.message_bytes)),
+        (str(BOMB_BYTES), str(DEFAULT_LIMITS.message_bytes)),
     ),
     "db3 message that says nothing": (
         _in_db3(with_zstd),
         3,
-        (f"more than {DEFAULT.message_bytes}", str(DEFAULT.message_bytes)),
+        (f"more than {DEFAULT_LIMITS.message_bytes}", str(DEFAULT_LIMITS.message_bytes)),
     ),
     "MF4 over the limit": (
         _mf4(BOMB_BYTES, BOMB_BYTES),
         3,
-        (str(BOMB_BYTES), str(DEFAULT.chunk_bytes)),
+        (str(BOMB_BYTES), str(DEFAULT_LIMITS.chunk_bytes)),
     ),
     "MF4 more than declared": (_mf4(BOMB_BYTES, 500), 3, ("more than 500", "declares 500")),
     "db3 message in the WAL": (
         _in_wal,
         3,
-        (str(BOMB_BYTES), str(DEFAULT.message_bytes)),
+        (str(BOMB_BYTES), str(DEFAULT_LIMITS.message_bytes)),
     ),
     "zstd file that declares": (
         _packed_file_that_declares,
         4,
-        (str(BOMB_BYTES), str(DEFAULT.chunk_bytes)),
+        (str(BOMB_BYTES), str(DEFAULT_LIMITS.chunk_bytes)),
     ),
-    "zstd file": (_packed_file, 4, (r"\d+ bytes unpack", str(DEFAULT.chunk_bytes))),
+    "zstd file": (_packed_file, 4, (r"\d+ bytes unpack", str(DEFAULT_LIMITS.chunk_bytes))),
 }
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import can
 import pytest
 
-from crosscue.replay.columns import DATA, ERROR, REMOTE
-from crosscue.replay.errors import LogFormatError
+from crosscue.replay.base import DATA, ERROR, REMOTE, LogFormatError
 from crosscue.replay.opening import open_log
 from support.can_files import Sent, read_back, same_as_python_can
 from support.data import shared

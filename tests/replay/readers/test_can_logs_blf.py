@@ -13,11 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.columns import ERROR
-from crosscue.replay.errors import LogFormatError
-from crosscue.replay.ledger import NOT_ASKED_TIME, Ledger
-from crosscue.replay.limits import Limits
-from crosscue.replay.log import Selection
+from crosscue.replay.base import ERROR, NOT_ASKED_TIME, Ledger, Limits, LogFormatError, Selection
 from crosscue.replay.opening import open_log
 from support.can_files import START_NS, Sent, blf, by_bus, made, read_back, same_as_python_can
 from support.data import shared

@@ -13,11 +13,15 @@ import can
 import numpy as np
 import pytest
 
-from crosscue.replay.columns import Table
-from crosscue.replay.errors import CrosscueError, LogFormatError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import Limits
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import (
+    EVERYTHING,
+    CrosscueError,
+    Ledger,
+    Limits,
+    LogFormatError,
+    Selection,
+    Table,
+)
 from crosscue.replay.opening import open_log
 from crosscue.replay.readers.mf4.blocks import Blocks
 from support.can_files import Sent, made, read_back, same_as_python_can

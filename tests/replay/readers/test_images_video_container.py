@@ -10,10 +10,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval.cli import run
-from crosscue.replay.columns import Images
-from crosscue.replay.errors import LogError, LogFormatError
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
-from crosscue.replay.log import Selection
+from crosscue.replay.base import (
+    NOT_ASKED_TIME,
+    NOT_ASKED_TOPIC,
+    Images,
+    LogError,
+    LogFormatError,
+    Selection,
+)
 from crosscue.replay.opening import open_log
 from support.accounted import read
 from support.videos import number_of, numbers_at_times, video

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.errors import LogFormatError, LogTooLargeError
-from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.base import DEFAULT_LIMITS, Limits, LogFormatError, LogTooLargeError
 from crosscue.replay.readers.time_file import (
     TimeFile,
     find_time_file,
@@ -30,7 +29,7 @@ EUROC = [1403636579763555584, 1403636579813555456]
 def read(folder: Path, text: str) -> TimeFile:
     path = folder / "timestamps.txt"
     path.write_text(text, encoding="utf-8")
-    return read_time_file(path, DEFAULT)
+    return read_time_file(path, DEFAULT_LIMITS)
 
 
 @quick
@@ -123,7 +122,7 @@ def test_bytes_that_are_no_text_are_named_by_line(tmp_path: Path) -> None:
     (tmp_path / "times.txt").write_bytes(b"0.1\n0.2\n\xff\xfe\n")
 
     with pytest.raises(LogFormatError, match="line 3: not UTF-8 text"):
-        read_time_file(tmp_path / "times.txt", DEFAULT)
+        read_time_file(tmp_path / "times.txt", DEFAULT_LIMITS)
 
 
 def test_a_time_file_over_the_limit_is_not_read(tmp_path: Path) -> None:
@@ -140,7 +139,7 @@ def test_any_bytes_are_read_or_refused_in_our_words(tmp_path: Path, raw: bytes) 
     path.write_bytes(raw)
     refusal, count = "", 1
     try:
-        times = read_time_file(path, DEFAULT)
+        times = read_time_file(path, DEFAULT_LIMITS)
         count = 1 if times.period else len(times.t_ns)
     except LogFormatError as error:
         refusal = str(error)

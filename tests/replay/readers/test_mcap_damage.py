@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 import zstandard
 
-from crosscue.replay.errors import CrosscueError, LogFormatError
-from crosscue.replay.limits import DEFAULT, Limits
+from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, LogFormatError
 from crosscue.replay.readers.mcap.reader import open_mcap
 from support.mcap_damage import Kind, copies, judge, sound_files, sound_parts
 from support.mcap_files import (
@@ -219,7 +218,7 @@ def test_what_is_no_recording_is_refused_in_one_line(
     path = tmp_path / "log.mcap"
     path.write_bytes(content)
     with pytest.raises(LogFormatError, match=what) as refusal:
-        open_mcap(path, DEFAULT)
+        open_mcap(path, DEFAULT_LIMITS)
 
     assert "\n" not in str(refusal.value)
     assert str(path) in str(refusal.value)
@@ -459,13 +458,13 @@ def test_chunks_without_checksum_are_found_again_behind_a_damaged_one(
 
 
 def test_a_file_that_shrinks_while_open_is_reported(tmp_path: Path) -> None:
-    from crosscue.replay.ledger import Ledger
+    from crosscue.replay.base import Ledger
 
     path = tmp_path / "log.mcap"
     coded = McapFile(sound_parts("zstd", is_chunked=True)).coded()
     path.write_bytes(coded)
     ledger = Ledger(str(path))
-    with open_mcap(path, DEFAULT) as log:
+    with open_mcap(path, DEFAULT_LIMITS) as log:
         with path.open("r+b") as stream:
             stream.truncate(len(coded) // 2)
         given = sum(len(block) for block in log.read(ledger))

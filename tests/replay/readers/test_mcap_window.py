@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.log import Selection
+from crosscue.replay.base import Selection
 from crosscue.replay.readers.mcap import recording_pass as mcap_pass
 from crosscue.replay.readers.mcap.chunk_table import run_of, table_of
 from crosscue.replay.readers.mcap.records import PREFIX

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.log import Selection
+from crosscue.replay.base import Selection
 from crosscue.replay.readers.rosbag1 import bag_pass as rosbag1_pass
 from crosscue.replay.readers.rosbag1.reader import open_bag
 from support.rosbag_files import START_NS, Reading, by_topic, read_rows, rows_of, write_bag

@@ -14,9 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import Reader
 
-from crosscue.replay.errors import LogError
-from crosscue.replay.ledger import NOT_ASKED_TIME
-from crosscue.replay.log import Selection
+from crosscue.replay.base import NOT_ASKED_TIME, LogError, Selection
 from crosscue.replay.opening import open_log
 from support.data import shared
 from support.rosbag_files import Row, by_topic, read_rows, rows_of, write_folder
@@ -273,7 +271,7 @@ def test_a_packed_file_cut_at_its_start_is_refused_by_its_own_name(tmp_path: Pat
 def test_a_packed_file_that_grows_without_bound_is_stopped(tmp_path: Path) -> None:
     import zstandard
 
-    from crosscue.replay.limits import Limits
+    from crosscue.replay.base import Limits
     from crosscue.replay.readers.rosbag2.split import unpack
 
     packed = tmp_path / "a.db3.zstd"
@@ -316,7 +314,7 @@ def test_nothing_is_left_behind_in_the_temporary_folder(
     scratch.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(scratch))
     with open_log(folder) as log:
-        from crosscue.replay.ledger import Ledger
+        from crosscue.replay.base import Ledger
 
         blocks = log.read(Ledger("a"))
         next(iter(blocks))

@@ -14,10 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.errors import CrosscueError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT
-from crosscue.replay.log import EVERYTHING, Selection
+from crosscue.replay.base import DEFAULT_LIMITS, EVERYTHING, CrosscueError, Ledger, Selection
 from crosscue.replay.readers.rosbag2 import db3
 from crosscue.replay.readers.rosbag2.db3 import open_db3
 from crosscue.replay.readers.rosbag2.pages import PageRows, page_rows
@@ -48,9 +45,9 @@ def stored_rows(path: Path) -> list[Stored]:
 
 def rows_in_pages(path: Path, topics: frozenset[int] | None = None) -> list[Stored]:
     """The rows as they come out of the pages."""
-    database = open_database(path, DEFAULT)
+    database = open_database(path, DEFAULT_LIMITS)
     try:
-        return [row for lot in page_rows(database, topics, DEFAULT) for row in plain(lot)]
+        return [row for lot in page_rows(database, topics, DEFAULT_LIMITS) for row in plain(lot)]
     finally:
         database.close()
 
@@ -141,8 +138,8 @@ def test_long_payloads_in_pages_out_of_order_come_whole_and_in_bounded_lots(tmp_
     db.executemany("INSERT INTO messages VALUES(?, 1, ?, ?)", large)
     db.execute("COMMIT")
     db.close()
-    database = open_database(path, DEFAULT)
-    lots = list(page_rows(database, None, DEFAULT))
+    database = open_database(path, DEFAULT_LIMITS)
+    lots = list(page_rows(database, None, DEFAULT_LIMITS))
     database.close()
 
     assert [row for lot in lots for row in plain(lot)] == stored_rows(path)

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from crosscue.replay.columns import (
+from crosscue.replay.base import (
     LENGTH_UNKNOWN,
     Block,
     CanFrames,
     Images,
+    Ledger,
     Messages,
     Rows,
     Table,
@@ -26,7 +27,6 @@ from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.refuse import MISFIT
 from crosscue.replay.encode import Encoders, Outgoing
 from crosscue.replay.encode.outgoing import TIME_MISFIT
-from crosscue.replay.ledger import Ledger
 from support.ros_messages import (
     block_of,
     messages_of,

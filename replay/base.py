@@ -1,4 +1,11 @@
-"""What every open recording can do, whatever its format; ``opening.open_log`` opens one."""
+"""What every module may ask of a log, and the ground that all of crosscue stands on.
+
+What every open recording can do, whatever its format, is written here (``opening.open_log`` opens
+one). With it comes the ground that all of crosscue stands on, so that one line imports it: what a
+log gives (``columns``), the account of it (``ledger``), how much it may cost (``limits``), what is
+raised (``errors``), and files read and written with care. Whoever stands above imports these names
+from here; the modules that define them import nothing but each other.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +15,136 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Protocol, Self, runtime_checkable
 
-from .columns import Block, Topic
-from .ledger import Ledger
+from .columns import (
+    BLOCK_BYTES,
+    BLOCK_ROWS,
+    DATA,
+    ERROR,
+    LENGTH_UNKNOWN,
+    REMOTE,
+    Block,
+    Bytes,
+    CanFrames,
+    Floats,
+    ImageCoding,
+    Images,
+    Int64s,
+    Messages,
+    Rows,
+    Table,
+    Topic,
+)
+from .errors import (
+    AccountError,
+    AnnotationError,
+    CrosscueError,
+    EmptyResultError,
+    LogError,
+    LogFormatError,
+    LogTooLargeError,
+    MissingTopicError,
+    OutputError,
+    RunError,
+    SchemaError,
+    UnknownFormatError,
+    UnreadableRunError,
+    UsageError,
+    VehicleError,
+    one_line,
+)
+from .files.bounded import PIECE_BYTES, read_at_most
+from .files.closing import Closing
+from .files.tree_text import MAX_DEPTH, json_tree, strict_json, toml_tree
+from .files.whole_file import (
+    cannot_write,
+    file_sha256,
+    sha256_of,
+    write_bytes,
+    write_text,
+    write_whole,
+)
+from .ledger import (
+    CHANGED,
+    DETAILS_KEPT,
+    DIFFERS,
+    NOT_ASKED_TIME,
+    NOT_ASKED_TOPIC,
+    Detail,
+    Ledger,
+    TopicAccount,
+)
+from .limits import DEFAULT_LIMITS, MIB, Limits
+from .safe_text import visible
+from .versions import installed, versions
+
+__all__ = [
+    "BLOCK_BYTES",
+    "BLOCK_ROWS",
+    "CHANGED",
+    "DATA",
+    "DEFAULT_LIMITS",
+    "DETAILS_KEPT",
+    "DIFFERS",
+    "ERROR",
+    "EVERYTHING",
+    "LENGTH_UNKNOWN",
+    "MAX_DEPTH",
+    "MIB",
+    "NOT_ASKED_TIME",
+    "NOT_ASKED_TOPIC",
+    "PIECE_BYTES",
+    "REMOTE",
+    "AccountError",
+    "AnnotationError",
+    "Block",
+    "Bytes",
+    "CanFrames",
+    "Closing",
+    "CrosscueError",
+    "Detail",
+    "EmptyResultError",
+    "Floats",
+    "ImageCoding",
+    "Images",
+    "Int64s",
+    "KnowsItsEnd",
+    "Ledger",
+    "Limits",
+    "Log",
+    "LogError",
+    "LogFormatError",
+    "LogTooLargeError",
+    "Messages",
+    "MissingTopicError",
+    "OutputError",
+    "Readable",
+    "Rows",
+    "RunError",
+    "SchemaError",
+    "Selection",
+    "Table",
+    "Topic",
+    "TopicAccount",
+    "UnknownFormatError",
+    "UnreadableRunError",
+    "UsageError",
+    "VehicleError",
+    "cannot_write",
+    "file_sha256",
+    "installed",
+    "json_tree",
+    "one_line",
+    "read_at_most",
+    "report_missing",
+    "sha256_of",
+    "strict_json",
+    "toml_tree",
+    "versions",
+    "visible",
+    "write_bytes",
+    "write_text",
+    "write_whole",
+]
 
 
 @dataclass(frozen=True, slots=True)
