@@ -30,6 +30,7 @@ from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
 from .belief import Belief, Speaker, begin, establish, multiply, probabilities
 from .factor_graph import FactorGraph
 from .intersection_range import RangeBelief, Reference
+from .persistence import Confirmed, Persistence, PersistentSpeaker
 from .range_track import NOTHING, RangeTrack, Verdict, advance, measure, predict_without_odometry
 from .speakers import speakers_of
 
@@ -121,6 +122,8 @@ class Step:
         ranges: One row for each reference that has a belief.
         probabilities: By feature; empty outside approaches.
         established: Presence of the intersection is established.
+        not_believed: From each cue that was positive and said nothing to the reason; filled where
+            persistence counts.
     """
 
     t_ns: int
@@ -129,6 +132,7 @@ class Step:
     ranges: tuple[RangeRow, ...] = ()
     probabilities: Mapping[str, float] = field(default_factory=dict)
     established: bool = False
+    not_believed: Mapping[str, str] = field(default_factory=dict)
 
 
 PastCues = Callable[[RangeBelief | None, Reference | None], Mapping[str, int]]
@@ -176,6 +180,7 @@ class Approaches:
         self._filter = range_filter
         self._new_speaker = speakers_of(graph, fusion)
         self._first = tuple(cue.name for cue in graph.cues if cue.speaks_first)
+        self._persistence = Persistence(graph) if fusion.kind == "persistent" else None
         self._open: _Open | None = None
         self._last_ns: int | None = None
         self._rest_m = 0.0
@@ -190,21 +195,25 @@ class Approaches:
         self._rest_m = max(0.0, self._rest_m - moved.way_m)
         signs = self._sane(evidence.signs)
         ranged = {**signs, **{o.reference: (o.range_m, o.var_m2) for o in evidence.posteriors}}
-        speaks = any(evidence.counts.get(cue, 0) > 0 for cue in self._first)
+        heard = self._heard(evidence.counts, evidence.is_new_picture)
+        speaks = any(heard.counts.get(cue, 0) > 0 for cue in self._first)
         if self._open is not None and _is_about_another(self._open, ranged, self._fusion.longest_m):
             self._close("another ahead")
         if self._open is None and (ranged or (speaks and self._rest_m <= 0.0)):
             self._begin()
         if self._open is None:
-            return Step(evidence.t_ns, None, evidence.counts)
+            self._count_silent(heard.silent)
+            return Step(evidence.t_ns, None, evidence.counts, not_believed=heard.silent)
         if ranged or speaks:
             self._open.since_evidence_m = 0.0
-        return self._step(self._open, evidence, signs, past, moved)
+        return self._step(self._open, evidence, heard, signs, past, moved)
 
     def restart(self) -> None:
         """Begin anew after a gap in time: what was believed is about another place."""
         if self._open is not None:
             self._close("a gap in time")
+        if self._persistence is not None:
+            self._persistence.restart()
         self._last_ns = None
         self._rest_m = 0.0
 
@@ -212,6 +221,15 @@ class Approaches:
         """Say that the drive is over; an approach still open is counted as such."""
         if self._open is not None:
             self._close("the drive ended")
+
+    def _heard(self, counts: Mapping[str, int], is_new_picture: bool) -> Confirmed:
+        """What of some counts may be believed: all, unless persistence counts."""
+        if self._persistence is None:
+            return Confirmed(counts, {})
+        return self._persistence(counts, is_new_picture=is_new_picture)
+
+    def _count_silent(self, silent: Mapping[str, str]) -> None:
+        self.counts.update(f"{cue} not believed: {why}" for cue, why in silent.items())
 
     def _moved(self, evidence: FrameEvidence) -> _Moved | None:
         """Way without sign, reckoned where unknown, and time; None for evidence refused."""
@@ -302,6 +320,7 @@ class Approaches:
         self,
         at_hand: _Open,
         evidence: FrameEvidence,
+        heard: Confirmed,
         signs: Mapping[Reference, tuple[float, float]],
         past: PastCues,
         moved: _Moved,
@@ -310,13 +329,16 @@ class Approaches:
         best, reference = _best(at_hand, Reference(self._fusion.reference))
         more = past(best, reference)
         counts = {**evidence.counts, **more} if more else evidence.counts
+        if more:
+            also = self._heard(more, evidence.is_new_picture)
+            heard = Confirmed({**heard.counts, **also.counts}, {**heard.silent, **also.silent})
         is_near = best is not None and best.mean_m <= self._fusion.dissent_within_m
         may_dissent = is_near and at_hand.since_dissent_m >= self._fusion.dissent_every_m
         if may_dissent:
             at_hand.since_dissent_m = 0.0
         messages = at_hand.speaker(
             Situation(
-                counts,
+                heard.counts,
                 at_hand.belief.is_established,
                 is_near,
                 may_dissent,
@@ -324,15 +346,22 @@ class Approaches:
                 evidence.is_new_picture,
                 moved.way_m,
                 moved.time_s,
+                None if best is None else best.mean_m,
             )
         )
+        silent = heard.silent
+        if isinstance(at_hand.speaker, PersistentSpeaker):
+            silent = {**silent, **at_hand.speaker.silent}
+        self._count_silent(silent)
         was_established = at_hand.belief.is_established
         belief = multiply(at_hand.belief, messages)
         at_hand.belief = belief = establish(belief, self._graph, self._fusion.established)
         if belief.is_established and not was_established:
             self.counts["approaches established"] += 1
         now = probabilities(belief, self._graph)
-        return Step(evidence.t_ns, at_hand.number, counts, ranges, now, belief.is_established)
+        return Step(
+            evidence.t_ns, at_hand.number, counts, ranges, now, belief.is_established, silent
+        )
 
     def _measured(
         self,

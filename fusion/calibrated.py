@@ -26,16 +26,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from crosscue.fusion.situation import Situation
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
 
-from .factor_graph import CueNode, FactorGraph, log_odds
+from .factor_graph import USUAL_FADE, CueNode, FactorGraph, log_odds
 from .independence import effective_sample_fraction
-
-USUAL_FADE: Final = Fade(way_m=10.0)
-"""For a cue of which no fade was learned."""
 
 
 class Learned(NamedTuple):

@@ -10,8 +10,10 @@ import math
 from dataclasses import dataclass, replace
 from typing import Final, Self
 
-from crosscue.replay.vehicle.fusion import Fusion
+from crosscue.replay.vehicle.fusion import Fade, Fusion
 
+USUAL_FADE: Final = Fade(way_m=10.0)
+"""Of a cue of which nothing else is known."""
 LOG_ODDS_LIMIT: Final = 30.0
 """Beyond it a probability is reported as that of the limit, 1e-13 from 0 or 1. Sums are kept
 whole, so that evidence can turn a belief round and the order in which it came does not matter."""
@@ -58,6 +60,10 @@ class CueNode:
         speaks_first: Sends before presence is established.
         counted: One message for each detection.
         dissents: Near the intersection its absence speaks against what it supports.
+        seen_frames: Where persistence counts: believed once positive in so many frames ...
+        of_frames: ... of the last so many.
+        within_m: Likewise: says nothing of an intersection known to be further away.
+        fade: Likewise: over what its errors become independent.
     """
 
     name: str
@@ -65,6 +71,10 @@ class CueNode:
     speaks_first: bool = False
     counted: bool = False
     dissents: bool = False
+    seen_frames: int = 1
+    of_frames: int = 1
+    within_m: float = math.inf
+    fade: Fade = USUAL_FADE
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +149,17 @@ def graph_of(fusion: Fusion) -> FactorGraph:
     return FactorGraph(
         tuple(Feature(name, f.prior, f.establishes) for name, f in features.items()),
         tuple(
-            CueNode(name, c.precision, c.speaks_first, c.counted, c.dissents)
+            CueNode(
+                name,
+                c.precision,
+                c.speaks_first,
+                c.counted,
+                c.dissents,
+                c.seen_frames,
+                c.of_frames,
+                c.within_m,
+                c.fade,
+            )
             for name, c in cues.items()
         ),
         tuple(edges),

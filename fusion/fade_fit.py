@@ -18,8 +18,7 @@ from crosscue.replay.base import Floats, Int64s
 from crosscue.replay.vehicle.fusion import Fade
 
 from .annotated_approach import AnnotatedApproach, Bools
-from .calibrated import USUAL_FADE
-from .factor_graph import CueNode, FactorGraph
+from .factor_graph import USUAL_FADE, CueNode, FactorGraph
 
 MIN_POSITIVES: Final = 20
 """Fewer positive observations do not determine a fade."""

@@ -19,6 +19,7 @@ class Situation:
         is_new_picture: Not the same picture as before.
         moved_m: Way gone since the frame before, forwards or back.
         passed_s: Time since then.
+        range_m: To the intersection, as far as known.
     """
 
     counts: Mapping[str, int]
@@ -29,3 +30,4 @@ class Situation:
     is_new_picture: bool = True
     moved_m: float = 0.0
     passed_s: float = 0.0
+    range_m: float | None = None

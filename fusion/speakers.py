@@ -9,6 +9,7 @@ from crosscue.replay.vehicle.fusion import Fusion
 from .belief import Speaker, source_speaker
 from .calibrated import CalibratedMessageModel, voices_of
 from .factor_graph import FactorGraph
+from .persistence import PersistentSpeaker
 
 
 def speakers_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], Speaker]:
@@ -17,7 +18,9 @@ def speakers_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], Speaker]:
     Raises:
         ValueError: ``calibrated`` without what was learned; no vehicle file can say that.
     """
-    if fusion.kind == "source":
+    if fusion.kind == "persistent":
+        return lambda: PersistentSpeaker(graph, fusion.dissent)
+    if fusion.kind in ("source", None):
         speaker = source_speaker(graph, fusion.dissent)
         return lambda: speaker
     if fusion.calibrated is None:

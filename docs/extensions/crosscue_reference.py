@@ -144,7 +144,7 @@ def _schemas() -> dict[str, pa.Schema]:
 
     return {
         **detect.schemas(),
-        **scene.schemas(),
+        **scene.schemas(gives_reasons=True),
         "pose": pose_tables.pose_schema(),
         measurements.TABLE: measurements.schema(),
         "skipped": skipped.skipped_schema(),

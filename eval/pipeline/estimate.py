@@ -68,7 +68,7 @@ from .drive_time import drive_timeline, refuse_other_segments, selections_of, ti
 from .empty_result import empty_result, silent_roles
 from .landmarks import looking
 from .pose import PoseStage, estimating_of, turn_signal_of
-from .scene import estimate_scene, features_of, schemas
+from .scene import estimate_scene, features_of, gives_reasons, schemas
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -310,7 +310,9 @@ def _scene(
     with ExitStack() as stack:
         sinks = {
             name: stack.enter_context(LabelledSink(run, name, schema, timeline, clock))
-            for name, schema in schemas(features_of(vehicle)).items()
+            for name, schema in schemas(
+                features_of(vehicle), gives_reasons=gives_reasons(vehicle)
+            ).items()
         }
         past = StoredMobileye(run, vehicle.past)
         return estimate_scene(

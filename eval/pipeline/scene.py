@@ -12,7 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.detectors.cues.frame import CuePass
+import numpy as np
+
+from crosscue.detectors.cues.frame import CuePass, Seen
 from crosscue.detectors.cues.tally import CueTally, cue_labels
 from crosscue.eval.pipeline.outcome import (
     ApproachSummary,
@@ -83,7 +85,7 @@ def estimate_scene(
         vehicle,
         Approaches(graph, vehicle.fusion, vehicle.range_filter),
         odometer_of(run),
-        _Rows(sink, features_of(vehicle)),
+        _Rows(sink, features_of(vehicle), gives_reasons(vehicle)),
     )
     restarts = _Restarts(vehicle, timeline)
     fresh_regions = detected.settings.regions != vehicle.regions
@@ -146,6 +148,7 @@ class _Scene:
     looked: set[str] = field(default_factory=set)
     summaries: dict[int, ApproachSummary] = field(default_factory=dict)
     _last_ns: int | None = None
+    _before: Seen | None = None
 
     def __post_init__(self) -> None:
         self.tally = CueTally(self.vehicle)
@@ -166,7 +169,7 @@ class _Scene:
         seconds = max(gap_ns, 0) * 1e-9
         posteriors = self.motion(evidence, seconds, seen.objects, frame.heights_px)
         kept = tuple(one for one in posteriors if _MEASURES[one.reference] not in without)
-        evidence = replace(evidence, posteriors=kept)
+        evidence = replace(evidence, posteriors=kept, is_new_picture=self._is_new(seen))
         step = (
             self.approaches(evidence)
             if past is None
@@ -178,13 +181,23 @@ class _Scene:
         self.rows.add(step)
         self._sum_up(step)
 
+    def _is_new(self, seen: Seen) -> bool:
+        """False where a camera repeats a picture, which shows as detections equal to the last bit.
+
+        Only beliefs that count persistence ask.
+        """
+        if self.vehicle.fusion.kind != "persistent":
+            return True
+        before, self._before = self._before, seen
+        return before is None or not _is_repeated(before, seen)
+
     def restart(self, t_ns: int) -> None:
         """Know nothing of what was before ``t_ns``."""
         self.approaches.restart()
         self.odometer.skip_to(t_ns)
         self.cues = CuePass(self.vehicle, tally=self.tally)
         self.motion.restart()
-        self._last_ns = None
+        self._last_ns = self._before = None
 
     def _evidence(
         self, t_ns: int, counts: Mapping[str, int], signs: tuple[SignRange, ...]
@@ -219,6 +232,18 @@ class _Scene:
             one.reference = str(step.ranges[0].reference)
 
 
+def _is_repeated(before: Seen, now: Seen) -> bool:
+    """Is everything that was found the same, and was anything found?"""
+    if len(before.boxes) != len(now.boxes) or not any(map(len, now.boxes)):
+        return False
+    return all(
+        one.labels == other.labels
+        and np.array_equal(one.boxes_px, other.boxes_px)
+        and np.array_equal(one.scores, other.scores)
+        for one, other in zip(before.boxes, now.boxes, strict=True)
+    )
+
+
 _MEASURES: Final = {reference: cue.name for cue, reference in MEASURED}
 
 
@@ -236,6 +261,7 @@ class _Rows:
 
     sink: Sink
     features: Sequence[str]
+    gives_reasons: bool
     cues: list[tuple[Any, ...]] = field(default_factory=list)
     ranges: list[tuple[Any, ...]] = field(default_factory=list)
     beliefs: list[tuple[Any, ...]] = field(default_factory=list)
@@ -249,7 +275,10 @@ class _Rows:
         ]
         if number is not None:
             values = (step.probabilities[feature] for feature in self.features)
-            self.beliefs.append((t_ns, number, *values, step.established))
+            row = (t_ns, number, *values, step.established)
+            if self.gives_reasons:
+                row = (*row, "; ".join(f"{cue}: {why}" for cue, why in step.not_believed.items()))
+            self.beliefs.append(row)
         if len(self.cues) > ROWS_HELD:
             self.flush()
 
@@ -257,12 +286,16 @@ class _Rows:
         for name, rows, columns in (
             ("cues", self.cues, CUE_COLUMNS),
             ("range", self.ranges, RANGE_COLUMNS),
-            ("belief", self.beliefs, ("t_ns", "approach", *self.features, "established")),
+            ("belief", self.beliefs, self._belief_columns()),
         ):
             if rows:
                 parts = zip(*rows, strict=True)
                 self.sink(name, dict(zip(columns, map(list, parts), strict=True)))
                 rows.clear()
+
+    def _belief_columns(self) -> tuple[str, ...]:
+        reasons = ("not_believed",) if self.gives_reasons else ()
+        return ("t_ns", "approach", *self.features, "established", *reasons)
 
 
 CUE_COLUMNS: Final = ("t_ns", "approach", "cue", "count")
@@ -274,11 +307,19 @@ def features_of(vehicle: Vehicle) -> tuple[str, ...]:
     return tuple(feature.name for feature in graph_of(vehicle.fusion).features)
 
 
-def schemas(features: Sequence[str] = FEATURES) -> dict[str, pa.Schema]:
+def gives_reasons(vehicle: Vehicle) -> bool:
+    """Does ``belief.parquet`` say which cues were seen and not believed, and why?"""
+    return vehicle.fusion.kind == "persistent"
+
+
+def schemas(
+    features: Sequence[str] = FEATURES, *, gives_reasons: bool = False
+) -> dict[str, pa.Schema]:
     """Columns of the tables that this stage writes."""
     import pyarrow as pa
 
     number, integer, text = pa.float64(), pa.int64(), pa.string()
+    reasons = [("not_believed", text)] if gives_reasons else []
     return {
         "cues": pa.schema(
             [("t_ns", integer), ("approach", integer), ("cue", text), ("count", integer)]
@@ -299,6 +340,7 @@ def schemas(features: Sequence[str] = FEATURES) -> dict[str, pa.Schema]:
                 ("approach", integer),
                 *((name, number) for name in features),
                 ("established", pa.bool_()),
+                *reasons,
             ]
         ),
     }

@@ -10,7 +10,7 @@ from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
 from crosscue.replay.base import RunError
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .scene import estimate_scene, features_of, schemas
+from .scene import estimate_scene, features_of, gives_reasons, schemas
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -36,7 +36,7 @@ def scene_tables(
     if detected is None:
         raise RunError(f"{run.path}: no detector has looked at its camera; replay with detectors")
     settings = manifest.settings if vehicle is None else vehicle
-    wanted = schemas(features_of(settings))
+    wanted = schemas(features_of(settings), gives_reasons=gives_reasons(settings))
     parts: dict[str, list[pa.Table]] = {
         name: [schema.empty_table()] for name, schema in wanted.items()
     }

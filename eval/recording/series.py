@@ -15,6 +15,7 @@ from crosscue.eval.runs.tables.log_time import LABELS
 from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.base import Floats, Int64s
 from crosscue.replay.vehicle import cue_table
+from crosscue.replay.vehicle.fusion import NOT_FEATURES
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .colours import END, QUIET, START, TRUTH, of_feature
@@ -33,7 +34,7 @@ POSE: Final[Mapping[str, str]] = {
     "ellipse": "2-sigma ellipse, full major axis (m)",
 }
 """Plots of the pose and their titles."""
-NOT_IN_BELIEF: Final = ("t_ns", "approach", "established", *LABELS)
+NOT_IN_BELIEF: Final = (*NOT_FEATURES, *LABELS)
 
 
 def log_pose_series(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from crosscue.eval.runs.tables.log_time import LABELS, table_in_log_time
 from crosscue.replay.base import Floats, Int64s, UnreadableRunError
 from crosscue.replay.time.segments import Timeline
+from crosscue.replay.vehicle.fusion import NOT_FEATURES
 
 from .columns import NONE, BeliefRows, CueRows, RangeRows, RunTables
 
@@ -106,7 +107,7 @@ def _ranges(table: pa.Table, where: str) -> RangeRows:
 def _belief(table: pa.Table, where: str) -> BeliefRows:
     features: dict[str, Floats] = {}
     for name in table.column_names:
-        if name in ("t_ns", "approach", "established", *LABELS):
+        if name in (*NOT_FEATURES, *LABELS):
             continue
         values = _numbers(table, name, where)
         # NaN compares false: it is left out later, and counted.

@@ -38,6 +38,12 @@ class CueSpec:
         label: Detector label that it counts, if it is fixed.
         settings: Prefix of its labels and score under ``[cues]`` of the vehicle file, if any.
         colour: In recordings: red, green, blue.
+        seen_frames: Where persistence counts, it must be positive in so many ...
+        of_frames: ... of the last so many frames in which it was looked for.
+        within_m: Where persistence counts, it says nothing of an intersection further away: the
+            source's runs begin 100 m before theirs, so no cue was validated beyond.
+        fade_m: Way over which its errors resemble each other, if it is about a standing thing.
+        fade_s: Time likewise, for what moves by itself; then it replaces ``fade_m``.
     """
 
     name: str
@@ -56,6 +62,11 @@ class CueSpec:
     label: str | None = None
     settings: str | None = None
     colour: Colour = FEATURE_COLOURS["intersection"]
+    seen_frames: int = 3
+    of_frames: int = 5
+    within_m: float = 100.0
+    fade_m: float = 10.0
+    fade_s: float | None = None
 
     @property
     def claim(self) -> tuple[str, bool]:

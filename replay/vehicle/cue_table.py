@@ -42,7 +42,15 @@ def _road(side: str, *, can_start: bool) -> CueSpec:
     )
 
 
-def _cars(group: str, title: str, rule: str, precision: float, side: str) -> CueSpec:
+SIGN_FRAMES: Final = 2
+"""Sign search is tuned to precision and accepts a low recall (eq. 17), so two frames in five."""
+MOVES_FADE_S: Final = 2.0
+"""About as long as a crossing car is in view; the next one is another car."""
+
+
+def _cars(
+    group: str, title: str, rule: str, precision: float, side: str, fade_s: float | None = None
+) -> CueSpec:
     return CueSpec(
         name=f"{group}_{side}",
         group=group,
@@ -54,7 +62,12 @@ def _cars(group: str, title: str, rule: str, precision: float, side: str) -> Cue
         per_detection=True,
         absence_counts=True,
         colour=FEATURE_COLOURS[side],
+        fade_s=fade_s,
     )
+
+
+def _crossing(side: str) -> CueSpec:
+    return _cars("cross_traffic", "cross traffic", "cars:count_crossing", 0.86, side, MOVES_FADE_S)
 
 
 def _past(name: str, title: str, *, per_detection: bool) -> CueSpec:
@@ -70,6 +83,7 @@ def _past(name: str, title: str, *, per_detection: bool) -> CueSpec:
         per_detection=per_detection,
         absence_counts=True,
         colour=FEATURE_COLOURS["straight"],
+        fade_s=MOVES_FADE_S if per_detection else None,
     )
 
 
@@ -86,6 +100,7 @@ def _one_way(side: str, other: str) -> CueSpec:
         excludes=(other,),
         label=f"one way {side}",
         colour=FEATURE_COLOURS[side],
+        seen_frames=SIGN_FRAMES,
     )
 
 
@@ -101,6 +116,7 @@ DO_NOT_ENTER: Final = CueSpec(
     precision_is_lower_bound=True,
     excludes=("straight",),
     label="do not enter",
+    seen_frames=SIGN_FRAMES,
 )
 
 BUILTIN_CUES: Final[dict[str, CueSpec]] = {
@@ -111,8 +127,8 @@ BUILTIN_CUES: Final[dict[str, CueSpec]] = {
         _road("left", can_start=True),
         _road("straight", can_start=False),
         _road("right", can_start=True),
-        _cars("cross_traffic", "cross traffic", "cars:count_crossing", 0.86, "left"),
-        _cars("cross_traffic", "cross traffic", "cars:count_crossing", 0.86, "right"),
+        _crossing("left"),
+        _crossing("right"),
         _cars("parked", "parked cars", "cars:count_parked", 0.83, "left"),
         _cars("parked", "parked cars", "cars:count_parked", 0.83, "right"),
         _past("lanes_past", "lane lines past", per_detection=False),

@@ -24,7 +24,7 @@ from .section import NotNegative, Positive, Section
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
-NOT_FEATURES: Final = ("t_ns", "approach", "established")
+NOT_FEATURES: Final = ("t_ns", "approach", "established", "not_believed")
 """Columns of ``belief.parquet`` that no feature may be called."""
 
 
@@ -65,6 +65,19 @@ class FeatureEntry(Section):
     use: bool = True
 
 
+class Fade(Section):
+    """Over what a cue's looks become independent: a way, or a time for what moves by itself."""
+
+    way_m: Positive | None = None
+    time_s: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.way_m is None) == (self.time_s is None):
+            raise _refused("want either way_m or time_s")
+        return self
+
+
 class CueEntry(Section):
     """One cue: how far it is to be believed, and about what."""
 
@@ -80,7 +93,24 @@ class CueEntry(Section):
     """Sends one message for each detection, not one for each frame."""
     dissents: bool = False
     """Near the intersection its absence speaks against what it supports."""
+    seen_frames: Annotated[int, Field(ge=1)] = 3
+    """With ``kind = "persistent"`` it is believed once positive in so many ..."""
+    of_frames: Annotated[int, Field(ge=1, le=1000)] = 5
+    """... of the last so many frames in which it was looked for."""
+    within_m: Positive = 100.0
+    """With ``kind = "persistent"`` it says nothing of an intersection known to be further away:
+    no further was it ever validated. An unknown range limits nothing."""
+    fade: Fade = Fade(way_m=10.0)
+    """With ``kind = "persistent"``: over what its errors become independent."""
     use: bool = True
+
+    @model_validator(mode="after")
+    def _can_be_seen(self) -> Self:
+        if self.seen_frames > self.of_frames:
+            raise _refused(
+                f"seen_frames {self.seen_frames} of of_frames {self.of_frames}: never; want no more"
+            )
+        return self
 
 
 FEATURES: Final[Mapping[str, FeatureEntry]] = {
@@ -101,22 +131,13 @@ def usual_cues() -> dict[str, CueEntry]:
             speaks_first=cue.can_start,
             counted=cue.per_detection,
             dissents=cue.absence_counts,
+            seen_frames=cue.seen_frames,
+            of_frames=cue.of_frames,
+            within_m=cue.within_m,
+            fade=Fade(way_m=cue.fade_m) if cue.fade_s is None else Fade(time_s=cue.fade_s),
         )
         for name, cue in CUES.items()
     }
-
-
-class Fade(Section):
-    """Over what a cue's looks become independent: a way, or a time for what moves by itself."""
-
-    way_m: Positive | None = None
-    time_s: Positive | None = None
-
-    @model_validator(mode="after")
-    def _one_of_both(self) -> Self:
-        if (self.way_m is None) == (self.time_s is None):
-            raise _refused("want either way_m or time_s")
-        return self
 
 
 class Rates(Section):
@@ -143,8 +164,11 @@ class Calibrated(Section):
 class Fusion(Section):
     """Belief over the features of an intersection (eq. 18)."""
 
-    kind: Literal["source", "calibrated"] = "source"
-    """``source`` multiplies every message in; ``calibrated`` takes learned ratios, discounted."""
+    kind: Literal["source", "calibrated", "persistent"] | None = None
+    """``source`` multiplies every message in (eq. 18); ``calibrated`` takes learned ratios,
+    discounted; ``persistent`` believes the published messages only of what is seen in several
+    frames, near enough, and discounts frames that resemble each other. Left out: ``source`` in a
+    simulated car's file, ``persistent`` in every other."""
     established: Probability = 0.9
     """Presence is established once a feature that establishes it is more probable than this."""
     dissent: Probability = 0.49

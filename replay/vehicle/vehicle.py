@@ -295,10 +295,18 @@ class Vehicle(Section):
     ranges: Ranges = Ranges()
     range_filter: RangeFilter = RangeFilter()
     past: Past = Past()
-    fusion: Fusion = Fusion()
+    fusion: Annotated[Fusion, Field(validate_default=True)] = Fusion()
     detectors: dict[str, DetectorSection] = Field(default_factory=dict)
     lost_above_m: Positive = 100.0
     """The pose counts as lost while the 2-sigma ellipse's full major axis exceeds this."""
+
+    @field_validator("fusion")
+    @classmethod
+    def _kind_of_belief(cls, fusion: Fusion, info: ValidationInfo) -> Fusion:
+        if fusion.kind is not None:
+            return fusion
+        is_simulated = info.data.get("name") == SIMULATED_CAR
+        return fusion.model_copy(update={"kind": "source" if is_simulated else "persistent"})
 
     @field_validator("ranges")
     @classmethod

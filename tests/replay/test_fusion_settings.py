@@ -16,7 +16,7 @@ def fusion_of(text: str) -> Fusion:
 
 
 def test_a_file_that_says_nothing_has_the_published_table() -> None:
-    assert fusion_of("") == Fusion()
+    assert fusion_of("") == Fusion(kind="persistent")
     assert fusion_of("").cues == usual_cues()
 
 
@@ -31,7 +31,7 @@ def test_one_number_changes_and_the_rest_of_the_entry_stays() -> None:
 
 def test_a_cue_and_a_feature_of_ones_own_are_a_line_each() -> None:
     fusion = fusion_of(
-        "[fusion.features]\nzebra = { prior = 0.2 }\n"
+        "[fusion]\nkind = 'source'\n[fusion.features]\nzebra = { prior = 0.2 }\n"
         "[fusion.cues]\nstripes = { precision = 0.8, supports = ['zebra'], speaks_first = true }"
     )
     graph = graph_of(fusion)

@@ -14,6 +14,7 @@ from crosscue.eval.runs.tables import measurements
 from crosscue.eval.runs.tables.table_sink import TableSink
 from crosscue.fusion.approaches import Approaches, FrameEvidence, Step
 from crosscue.fusion.factor_graph import graph_of
+from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .fusion import NONE_SEEN, SECOND_NS, sign
@@ -45,7 +46,7 @@ def write_run(
     folder: Path, evidence: Iterable[FrameEvidence], vehicle: Vehicle | None = None
 ) -> RunFolder:
     """A finished run over the evidence."""
-    vehicle = vehicle or Vehicle(version=1)
+    vehicle = vehicle or Vehicle(version=1, fusion=Fusion(kind="source"))
     run = create(folder, overwrite=False)
     loop = Approaches(graph_of(vehicle.fusion), vehicle.fusion, vehicle.range_filter)
     taken = list(evidence)
