@@ -275,7 +275,7 @@ class _Rows:
         ]
         if number is not None:
             values = (step.probabilities[feature] for feature in self.features)
-            row = (t_ns, number, *values, step.established)
+            row: tuple[Any, ...] = (t_ns, number, *values, step.established)
             if self.gives_reasons:
                 row = (*row, "; ".join(f"{cue}: {why}" for cue, why in step.not_believed.items()))
             self.beliefs.append(row)
