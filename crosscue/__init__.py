@@ -97,6 +97,16 @@ _EXPORTS: Final = {
     "merge": "eval.interface.tables",
     "MergedRuns": "eval.interface.tables",
     "Decoded": "eval.catalog.decoded_logs",
+    "write_truth": "eval.interface.truth",
+    "truth_schema": "eval.interface.truth",
+    "draft_vehicle": "eval.interface.vehicles",
+    "VehicleDraft": "eval.interface.vehicles",
+    "run_schema": "eval.interface.runs",
+    "Comparison": "eval.catalog.compare",
+    "check_truth": "eval.fit.truth_check",
+    "import_truth": "eval.fit.truth_check",
+    "TruthFit": "eval.fit.truth_check",
+    "ImportedTruth": "eval.fit.truth_check",
 }
 """From a public name to its module."""
 
@@ -112,9 +122,14 @@ if TYPE_CHECKING:
     from crosscue.detectors.settings import Settings as Settings
     from crosscue.detectors.settings import identity_of as identity_of
     from crosscue.detectors.settings import settings_of as settings_of
+    from crosscue.eval.catalog.compare import Comparison as Comparison
     from crosscue.eval.catalog.decoded_logs import Decoded as Decoded
     from crosscue.eval.fit.sign_threshold import SignFit as SignFit
     from crosscue.eval.fit.sign_threshold import fit_signs as fit_signs
+    from crosscue.eval.fit.truth_check import ImportedTruth as ImportedTruth
+    from crosscue.eval.fit.truth_check import TruthFit as TruthFit
+    from crosscue.eval.fit.truth_check import check_truth as check_truth
+    from crosscue.eval.fit.truth_check import import_truth as import_truth
     from crosscue.eval.interface.convert import Converted as Converted
     from crosscue.eval.interface.convert import convert as convert
     from crosscue.eval.interface.logs import CameraFrame as CameraFrame
@@ -132,6 +147,7 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.runs import load_vehicle as load_vehicle
     from crosscue.eval.interface.runs import open_run as open_run
     from crosscue.eval.interface.runs import replay_drive as replay_drive
+    from crosscue.eval.interface.runs import run_schema as run_schema
     from crosscue.eval.interface.runs import save_recording as save_recording
     from crosscue.eval.interface.runs import score_run as score_run
     from crosscue.eval.interface.seals import SealCheck as SealCheck
@@ -149,6 +165,10 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.tables import MergedRuns as MergedRuns
     from crosscue.eval.interface.tables import decode as decode
     from crosscue.eval.interface.tables import merge as merge
+    from crosscue.eval.interface.truth import truth_schema as truth_schema
+    from crosscue.eval.interface.truth import write_truth as write_truth
+    from crosscue.eval.interface.vehicles import VehicleDraft as VehicleDraft
+    from crosscue.eval.interface.vehicles import draft_vehicle as draft_vehicle
     from crosscue.eval.studies.town.settings import LandmarkStudy as LandmarkStudy
     from crosscue.eval.studies.town.settings import RangeStudy as RangeStudy
     from crosscue.replay.errors import AccountError as AccountError

@@ -9,21 +9,29 @@ from __future__ import annotations
 import fnmatch
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, open_run
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.eval.scoring.runs import FOLDER, METRICS
-from crosscue.replay.base import MIB, UnreadableRunError, UsageError, json_tree, read_at_most
+from crosscue.replay.base import (
+    MIB,
+    UnreadableRunError,
+    UsageError,
+    json_tree,
+    read_at_most,
+    visible,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+T = TypeVar("T")
 Direction = Literal["higher", "lower"]
 BETTER: Final[Mapping[str, Direction]] = {
     **dict.fromkeys(
@@ -51,6 +59,8 @@ COMPARED: Final = {
 }  # fmt: skip
 """Parts of a manifest."""
 MAX_BYTES: Final = 256 * MIB
+MAX_LINES: Final = 20
+"""Of settings, and of metrics, in the printed comparison."""
 
 
 class Tolerance(NamedTuple):
@@ -130,9 +140,9 @@ class MetricChange:
     is_worse: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Comparison:
-    """Everything that differs.
+    """Everything that differs between two runs; printed as ``crosscue compare`` prints it.
 
     Attributes:
         changes: Versions, settings, detectors, selection, logs.
@@ -141,6 +151,7 @@ class Comparison:
         tables_same: How many tables are equal.
         metrics_same: How many metrics are equal.
         why_no_metrics: Empty where both runs were scored.
+        is_whole: Nothing was dropped in either.
     """
 
     changes: tuple[Change, ...]
@@ -149,6 +160,7 @@ class Comparison:
     tables_same: int
     metrics_same: int
     why_no_metrics: str
+    is_whole: bool = True
 
     @property
     def worse(self) -> tuple[str, ...]:
@@ -157,6 +169,15 @@ class Comparison:
         if self.why_no_metrics:
             found += tuple(f"table {one.name}" for one in self.tables)
         return found
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue compare --json`` prints."""
+        tree = asdict(self)
+        del tree["is_whole"]
+        return tree | {"worse": self.worse}
+
+    def __repr__(self) -> str:
+        return "\n".join(_lines(self))
 
 
 def read_tolerance(text: str) -> Tolerance:
@@ -201,6 +222,7 @@ def compare_runs(
     tables = [found for name in names if (found := _compare_table(name, first, second)) is not None]
     scores = [_metrics_of(run) for run in (first, second)]
     same = len(names) - len(tables)
+    is_whole = _is_whole_run(first) and _is_whole_run(second)
     if scores[0] is None or scores[1] is None:
         bare = [
             str(run.path)
@@ -208,9 +230,9 @@ def compare_runs(
             if found is None
         ]
         why = f"not scored: {', '.join(bare)}"
-        return Comparison(changes, tuple(tables), (), same, 0, why)
+        return Comparison(changes, tuple(tables), (), same, 0, why, is_whole)
     metrics, metrics_same = compare_metrics(scores[0], scores[1], tolerances)
-    return Comparison(changes, tuple(tables), metrics, same, metrics_same, "")
+    return Comparison(changes, tuple(tables), metrics, same, metrics_same, "", is_whole)
 
 
 def open_scored(path: Path) -> RunFolder:
@@ -222,7 +244,7 @@ def open_scored(path: Path) -> RunFolder:
     return RunFolder(path) if _is_pooled(path) else open_run(path)
 
 
-def is_whole_run(run: RunFolder) -> bool:
+def _is_whole_run(run: RunFolder) -> bool:
     """Was nothing dropped in the run, or in any of those that were scored together?"""
     if not _is_pooled(run.path):
         return run.manifest().account.is_whole
@@ -361,3 +383,51 @@ def _compare_column(before: pa.ChunkedArray, after: pa.ChunkedArray) -> ColumnCh
     apart = np.abs(old[differs].astype(np.float64) - new[differs].astype(np.float64))
     known = apart[np.isfinite(apart)]
     return ColumnChange(int(differs.sum()), float(known.max()) if len(known) else math.nan)
+
+
+def _lines(found: Comparison) -> Iterator[str]:
+    for one in _first_of(found.changes, "settings"):
+        if isinstance(one, str):
+            yield one
+        else:
+            yield f"setting    {visible(one.path)}: {_short(one.before)} -> {_short(one.after)}"
+    for table in found.tables:
+        yield from _table_lines(table)
+    for metric in _first_of(found.metrics, "metrics"):
+        yield metric if isinstance(metric, str) else _metric_line(metric)
+    yield (
+        f"equal      {found.tables_same} tables, {found.metrics_same} metrics; different: "
+        f"{len(found.changes)} settings, {len(found.tables)} tables, {len(found.metrics)} metrics"
+    )
+    if found.why_no_metrics:
+        yield f"{visible(found.why_no_metrics)}; judged by tables alone"
+    yield f"worse      {len(found.worse)}" if found.worse else "nothing is worse"
+
+
+def _first_of(things: tuple[T, ...], what: str) -> Iterator[T | str]:
+    yield from things[:MAX_LINES]
+    if len(things) > MAX_LINES:
+        yield f"           and {len(things) - MAX_LINES} more {what}; --json shows all"
+
+
+def _short(value: object) -> str:
+    text = "nothing" if value is None else visible(str(value))
+    return text if len(text) <= 30 else text[:27] + "..."
+
+
+def _table_lines(one: TableChange) -> Iterator[str]:
+    rows = f"{_short(one.rows_before)} and {_short(one.rows_after)} rows"
+    yield f"table      {visible(one.name)}: {visible(one.what)} ({rows})"
+    for name, column in one.columns.items():
+        far = "" if math.isnan(column.largest) else f", by up to {column.largest:.3g}"
+        yield f"           {visible(name)}: {column.rows} rows differ{far}"
+
+
+def _metric_line(one: MetricChange) -> str:
+    label = "WORSE" if one.is_worse else "metric"
+    allowed = f" (allowed {one.allowed:.3g})" if one.is_worse else ""
+    return f"{label:11}{visible(one.path)}: {_value(one.before)} -> {_value(one.after)}{allowed}"
+
+
+def _value(value: float) -> str:
+    return "not scored" if math.isnan(value) else f"{value:.6g}"

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -28,14 +29,16 @@ from crosscue.eval.scoring import truth as score_truth
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     Limits,
+    OutputError,
     SchemaError,
     UsageError,
     sha256_of,
     strict_json,
+    visible,
     write_text,
 )
 from crosscue.replay.vehicle.cue_table import CUES
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 
 from .log_images import LogSpan, log_pictures, log_span
 
@@ -44,9 +47,9 @@ SLACK_NS: Final = 1_000_000_000
 """Truth may begin or end so far outside its log: clocks and last pictures differ a little."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class TruthFit:
-    """What a truth file that fits its log contains.
+    """What a truth file that fits its log contains; printed as ``truth check`` prints it.
 
     Attributes:
         seconds: Its length.
@@ -73,10 +76,32 @@ class TruthFit:
     outside: int
     is_checked_by_hash: bool
 
+    def as_dict(self) -> dict[str, object]:
+        """Its attributes."""
+        return asdict(self)
 
-@dataclass(frozen=True, slots=True)
-class Imported:
-    """What came of an import.
+    def __repr__(self) -> str:
+        lines = [
+            f"fits       {self.seconds:.1f} s of truth",
+            f"holds      {self.approaches} approaches, {self.cues} statements about cues,",
+            f"           {self.objects} objects, {self.ranges} ranges, {self.poses} poses",
+        ]
+        if self.outside:
+            lines.append(
+                f"outside    {self.outside} of them reach beyond the log, whose clock was set back"
+            )
+        if self.moments:
+            lines.append(
+                f"moments    {self.moments_with_frame} of {self.moments} meet a picture of the log"
+            )
+        if not self.is_checked_by_hash:
+            lines.append("log        not checked by hash: the truth names none (log_sha256)")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class ImportedTruth:
+    """What came of an import; printed as ``truth import`` prints it.
 
     Attributes:
         truth: Path of the truth file.
@@ -96,37 +121,62 @@ class Imported:
     cues: dict[str, int]
     ignored: Mapping[str, int]
 
+    def as_dict(self) -> dict[str, object]:
+        """Its attributes."""
+        return asdict(self) | {"truth": str(self.truth), "objects": str(self.objects)}
+
+    def __repr__(self) -> str:
+        lines = [f"pictures   {self.pictures} with {self.things} things, placed {self.rule}"]
+        lines += [f"           {cue}: there in {count}" for cue, count in self.cues.items()]
+        if not self.cues:
+            lines.append("           no label is a cue; only objects were imported")
+        lines += [f"not taken  {count} {kind}" for kind, count in self.ignored.items()]
+        lines.append(f"written to {visible(str(self.truth))}")
+        lines.append(f"           {visible(str(self.objects))}")
+        return "\n".join(lines)
+
 
 def check_truth(
-    path: Path, log_path: Path, vehicle: Vehicle, limits: Limits = DEFAULT_LIMITS
+    truth: Path | str,
+    log: Path | str,
+    vehicle: Vehicle | Path | str | None = None,
+    *,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> TruthFit:
     """Check a truth file and all files that it names against a log.
+
+    Args:
+        truth: The file, or the folder with ``truth.json``.
+        log: The log it belongs to.
+        vehicle: The vehicle file, where the log has several cameras.
+        limits: What the log is read with.
 
     Raises:
         SchemaError: Something does not fit; the first thing found is reported.
         LogError: The log or the track cannot be read.
     """
+    path, log_path, settings = Path(truth), Path(log), vehicle_given(vehicle)
     drive = score_truth.load(path, str(log_path))
-    truth = drive.truth
+    known = drive.truth
     folder = path if path.is_dir() else path.parent
-    has_hash = bool(truth.log_sha256)
-    if has_hash and not set(truth.log_sha256.values()) & set(sha256_of(log_path).values()):
+    has_hash = bool(known.log_sha256)
+    if has_hash and not set(known.log_sha256.values()) & set(sha256_of(log_path).values()):
         raise SchemaError(
-            f"{path}: belongs to {truth.log or 'another log'} by its hash, not to {log_path}"
+            f"{path}: belongs to {known.log or 'another log'} by its hash, not to {log_path}"
         )
-    outside = _check_times(truth, log_span(log_path, limits), path, log_path)
+    outside = _check_times(known, log_span(log_path, limits), path, log_path)
     poses = 0
-    if truth.pose is not None:
-        track = read_tum(folder / truth.pose)
+    if known.pose is not None:
+        track = read_tum(folder / known.pose)
         poses = len(track.t_ns)
-        _check_overlap(f"{folder / truth.pose}: track", track.t_ns, truth, path)
-    moments = np.array([one.t_ns for one in truth.cues if one.t_ns is not None], np.int64)
+        _check_overlap(f"{folder / known.pose}: track", track.t_ns, known, path)
+    moments = np.array([one.t_ns for one in known.cues if one.t_ns is not None], np.int64)
     pictures, objects = None, 0
-    if len(moments) or truth.objects is not None:
-        pictures = log_pictures(log_path, vehicle, limits)
-    if truth.objects is not None:
+    if len(moments) or known.objects is not None:
+        pictures = log_pictures(log_path, settings, limits)
+    if known.objects is not None:
         assert pictures is not None
-        objects = _check_objects(folder / truth.objects, pictures, truth.own_cues)
+        objects = _check_objects(folder / known.objects, pictures, known.own_cues)
     matched = 0 if pictures is None else int(np.isin(moments, pictures.t_ns).sum())
     if len(moments) and not matched:
         raise SchemaError(
@@ -135,9 +185,9 @@ def check_truth(
         )
     ranges = 0 if drive.ranges is None else len(drive.ranges.t_ns)
     return TruthFit(
-        (truth.end_ns - truth.start_ns) * 1e-9,
-        len(truth.approaches),
-        len(truth.cues),
+        (known.end_ns - known.start_ns) * 1e-9,
+        len(known.approaches),
+        len(known.cues),
         matched,
         len(moments),
         objects,
@@ -211,33 +261,51 @@ def read_annotations(path: Path) -> Annotations:
     raise UsageError(f"{path}: want a COCO .json or a CVAT .xml file")
 
 
-def import_annotations(
-    source: Path,
-    log_path: Path,
-    output: Path,
-    vehicle: Vehicle,
-    own: Mapping[str, str],
+def import_truth(
+    annotations: Path | str,
+    log: Path | str,
+    output: Path | str,
+    vehicle: Vehicle | Path | str | None = None,
     *,
+    labels: Mapping[str, str] = MappingProxyType({}),
     add: bool = False,
+    overwrite: bool = False,
     limits: Limits = DEFAULT_LIMITS,
-) -> Imported:
+) -> ImportedTruth:
     """Turn annotated pictures of a log into its truth.
 
     Args:
-        source: COCO or CVAT.
-        log_path: The log whose pictures were annotated.
-        output: The truth file to write; labelled objects go beside it.
+        annotations: COCO (``.json``) or CVAT 1.1 (``.xml``).
+        log: The log whose pictures were annotated.
+        output: The truth file, or its folder; labelled objects go beside it.
         vehicle: Names the camera where the log has several, and cues of the user's own.
-        own: From label to cue, see ``meanings``.
+        labels: From label to cue; an empty cue says that the label is none.
         add: Keep everything but cues and objects of the truth file that is there.
+        overwrite: Replace a truth file that is there.
         limits: What the log is read with.
 
     Raises:
         SchemaError: The annotations do not fit the log.
-        OutputError: The files cannot be written.
+        OutputError: The truth file exists, or the files cannot be written.
     """
+    source, log_path, place_of = Path(annotations), Path(log), Path(output)
+    target = place_of / truth_file.FILE if place_of.is_dir() else place_of
+    if target.exists() and not (add or overwrite):
+        raise OutputError(f"{target}: exists; --add to it, --overwrite it, or give another name")
+    return _imported(source, log_path, target, vehicle_given(vehicle), labels, add, limits)
+
+
+def _imported(
+    source: Path,
+    log_path: Path,
+    output: Path,
+    vehicle: Vehicle,
+    labels: Mapping[str, str],
+    add: bool,
+    limits: Limits,
+) -> ImportedTruth:
     annotations = read_annotations(source)
-    cues = meanings(annotations, own, tuple(vehicle.cues.own))
+    cues = meanings(annotations, labels, tuple(vehicle.cues.own))
     check_boxes(annotations)
     pictures = log_pictures(log_path, vehicle, limits)
     placed = place(annotations, pictures)
@@ -259,7 +327,7 @@ def import_annotations(
     there: dict[str, int] = {}
     for one in truth.cues:
         there[one.cue] = there.get(one.cue, 0) + one.present
-    return Imported(
+    return ImportedTruth(
         output,
         objects,
         len(annotations.pictures),

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Final
 from crosscue.eval.interface.logs import Log, opened
 from crosscue.eval.interface.show import listing
 from crosscue.eval.runs.folder import RunFolder, create
-from crosscue.eval.runs.manifest import Manifest
+from crosscue.eval.runs.manifest import Manifest, json_schema
 from crosscue.replay.base import DEFAULT_LIMITS, Limits, OutputError, RunError, UsageError
-from crosscue.replay.vehicle.vehicle import Vehicle, load
+from crosscue.replay.vehicle.vehicle import Vehicle, load, vehicle_given
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -309,7 +309,7 @@ def estimate_run(
     folder = _run(run).folder
     if output is not None:
         folder = _copied(folder, Path(output))
-    settings = None if vehicle is None else _vehicle(vehicle)
+    settings = None if vehicle is None else vehicle_given(vehicle)
     return Run(folder, estimate_in(folder, settings, on_time))
 
 
@@ -357,6 +357,11 @@ def score_run(
     return ScoredRun(scored, scored.metrics, scored.report)
 
 
+def run_schema() -> dict[str, Any]:
+    """The JSON Schema of a run's ``manifest.json``, for editors and other tools."""
+    return json_schema()
+
+
 def compare_runs(
     first: Run | Path | str, second: Run | Path | str, tolerances: Sequence[str] = ()
 ) -> Comparison:
@@ -369,9 +374,9 @@ def compare_runs(
     """
     from crosscue.eval.catalog import compare
 
+    allowed = [compare.read_tolerance(text) for text in tolerances]
     paths = [one.path if isinstance(one, Run) else Path(one) for one in (first, second)]
     before, after = (compare.open_scored(path) for path in paths)
-    allowed = [compare.read_tolerance(text) for text in tolerances]
     return compare.compare_runs(before, after, allowed)
 
 
@@ -423,16 +428,12 @@ def choices_for(vehicle: Vehicle, detectors: Sequence[str] | None) -> tuple[Choi
 def vehicle_of(log: Log, given: Vehicle | Path | str | None) -> Vehicle:
     """The settings given, or those of the ``vehicle.toml`` beside the log, or none."""
     if given is not None:
-        return _vehicle(given)
+        return vehicle_given(given)
     for one in log.logs:
         beside = (one.path if one.path.is_dir() else one.path.parent) / VEHICLE
         if beside.is_file():
             return load(beside)
     return Vehicle(version=1)
-
-
-def _vehicle(given: Vehicle | Path | str) -> Vehicle:
-    return given if isinstance(given, Vehicle) else load(Path(given))
 
 
 def _run(run: Run | Path | str) -> Run:

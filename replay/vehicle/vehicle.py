@@ -344,6 +344,13 @@ def load(path: Path) -> Vehicle:
     return vehicle.model_copy(update=changed)
 
 
+def vehicle_given(given: Vehicle | Path | str | None) -> Vehicle:
+    """Settings as they are, or of a file; the defaults for None."""
+    if given is None:
+        return Vehicle(version=1)
+    return given if isinstance(given, Vehicle) else load(Path(given))
+
+
 def parse(text: str, where: str) -> Vehicle:
     """Check the text of a vehicle file; ``where`` names it in errors.
 

@@ -20,22 +20,29 @@ CALLS: Final = {
     "seal": ("seal", "check_seal"),
     "decode": ("decode",),
     "merge": ("merge",),
+    "compare": ("compare_runs",),
+    "vehicle init": ("draft_vehicle",),
+    "truth": ("write_truth",),
+    "truth import": ("import_truth",),
+    "truth check": ("check_truth",),
+    "truth schema": ("truth_schema",),
+    "run schema": ("run_schema",),
 }
 """The public functions that a command is made of."""
 NOT_YET: Final = frozenset(
     {
-        "info", "vehicle init", "detect", "estimate", "replay", "score", "compare", "view",
+        "info", "detect", "estimate", "replay", "score", "view",
         "model list", "model show", "model fetch", "model init", "model check", "fit compass",
         "fit signs", "fit ranges", "fit messages", "fit landmarks", "landmarks add",
-        "landmarks list", "landmarks match", "truth", "truth import", "truth check", "run schema",
-        "truth schema", "simulate", "train frames", "train mask-rcnn", "train road",
+        "landmarks list", "landmarks match",
+        "simulate", "train frames", "train mask-rcnn", "train road",
         "study intersections", "study range", "study landmarks", "study field", "study drive",
         "demo", "plugins",
     }
 )  # fmt: skip
 """Commands with logic of their own."""
 WITHOUT: Final = {"completion": "it is about the shell"}
-ALLOWED: Final = re.compile(r"crosscue(\.eval\.commands(\..+)?|\.replay\.(errors|safe_text))?")
+ALLOWED: Final = re.compile(r"crosscue(\.eval\.commands(\..+)?|\.replay\.(base|safe_text))?")
 """What a command may import of ours: the public interface, options, errors, and safe text."""
 
 

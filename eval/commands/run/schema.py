@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import argparse
 
+import crosscue
 from crosscue.eval.commands.shared.options import add_schema_output, print_schema
-from crosscue.eval.runs.manifest import json_schema
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,5 +19,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print or write it."""
-    print_schema(json_schema(), args)
+    print_schema(crosscue.run_schema(), args)
     return 0

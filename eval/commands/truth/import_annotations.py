@@ -15,14 +15,11 @@ examples:
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
 
-from crosscue.datasets.truth.truth import FILE
-from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
-from crosscue.eval.fit.truth_check import Imported, import_annotations
-from crosscue.replay.base import OutputError, UsageError, visible
-from crosscue.replay.vehicle.vehicle import Vehicle, load
+import crosscue
+from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_result
+from crosscue.replay.base import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,18 +61,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Import, and print the result."""
-    output = args.output / FILE if args.output.is_dir() else args.output
-    if output.exists() and not (args.add or args.overwrite):
-        raise OutputError(f"{output}: exists; --add to it, --overwrite it, or give another name")
-    vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
-    own = dict(_meaning(text) for text in args.map)
-    found = import_annotations(
-        args.source, args.log, output, vehicle, own, add=args.add, limits=limits_of(args)
+    found = crosscue.import_truth(
+        args.source,
+        args.log,
+        args.output,
+        args.vehicle,
+        labels=dict(_meaning(text) for text in args.map),
+        add=args.add,
+        overwrite=args.overwrite,
+        limits=limits_of(args),
     )
-    if args.json:
-        print_json(asdict(found) | {"truth": str(found.truth), "objects": str(found.objects)})
-    elif not args.quiet:
-        _report(found)
+    print_result(found, args)
     return 0
 
 
@@ -84,14 +80,3 @@ def _meaning(text: str) -> tuple[str, str]:
     if not equals or not label:
         raise UsageError(f"--map {text}: want LABEL=CUE")
     return label, cue
-
-
-def _report(found: Imported) -> None:
-    print(f"pictures   {found.pictures} with {found.things} things, placed {found.rule}")
-    for cue, pictures in found.cues.items():
-        print(f"           {cue}: there in {pictures}")
-    if not found.cues:
-        print("           no label is a cue; only objects were imported")
-    for kind, count in found.ignored.items():
-        print(f"not taken  {count} {kind}")
-    print(f"written to {visible(str(found.truth))}\n           {visible(str(found.objects))}")

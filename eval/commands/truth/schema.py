@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 
-from crosscue.datasets.truth.truth import json_schema
+import crosscue
 from crosscue.eval.commands.shared.options import add_schema_output, print_schema
 
 
@@ -19,5 +19,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print or write it."""
-    print_schema(json_schema(), args)
+    print_schema(crosscue.truth_schema(), args)
     return 0

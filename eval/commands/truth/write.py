@@ -9,9 +9,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.datasets.truth.truth import write_carried
+import crosscue
 from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
-from crosscue.replay.opening import open_log
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,8 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write truth.json."""
-    with open_log(args.log, limits_of(args)) as log:
-        written = write_carried(log.format, args.log, args.output)
+    written = crosscue.write_truth(args.log, args.output, limits=limits_of(args))
     if args.json:
         print_json({"truth": str(written)})
     elif not args.quiet:

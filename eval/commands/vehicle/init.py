@@ -9,16 +9,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.eval.commands.shared.options import (
-    add_limit_arguments,
-    limits_of,
-    print_json,
-    refuse_existing,
-)
-from crosscue.replay.base import write_text
-from crosscue.replay.opening import open_logs
-from crosscue.replay.vehicle.draft import draft
-from crosscue.replay.vehicle.vehicle import parse
+import crosscue
+from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,17 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draft the file, check that it reads back, write or print it."""
-    refuse_existing(args)
-    folder = args.output.parent if args.output is not None else Path.cwd()
-    with open_logs(args.logs, limits_of(args)) as logs:
-        text = draft(logs, args.dbc, folder)
-    parse(text, "the draft")
-    if args.output is not None:
-        write_text(args.output, text)
+    with crosscue.open(*args.logs, limits=limits_of(args)) as log:
+        found = crosscue.draft_vehicle(log, args.dbc, args.output, overwrite=args.overwrite)
     if args.json:
-        print_json({"vehicle": None if args.output is None else str(args.output), "text": text})
-    elif args.output is None:
-        print(text, end="")
+        print_json(found.as_dict())
+    elif found.path is None:
+        print(found)
     elif not args.quiet:
-        print(args.output)
+        print(found.path)
     return 0

@@ -75,3 +75,29 @@ def test_a_url_among_logs_is_refused_before_any_is_sealed(drive: Path) -> None:
         crosscue.seal(drive, "https://host/drive.mcap")
 
     assert not drive.with_name("drive.mcap.seal").exists()
+
+
+def test_a_vehicle_file_is_drafted_and_reads_back(drive: Path, tmp_path: Path) -> None:
+    found = crosscue.draft_vehicle(drive, [drive.parent / "simulated_car.dbc"])
+
+    assert found.path is None
+    assert found.vehicle.name == "unnamed"
+    assert repr(found) + "\n" == found.text
+    written = crosscue.draft_vehicle(drive, output=tmp_path / "car.toml")
+    assert (tmp_path / "car.toml").read_text(encoding="utf-8") == written.text
+    with pytest.raises(crosscue.OutputError, match="exists"):
+        crosscue.draft_vehicle(drive, output=tmp_path / "car.toml")
+
+
+def test_truth_is_held_against_its_log(drive: Path) -> None:
+    found = crosscue.check_truth(drive.parent / "truth.json", drive)
+
+    assert found.approaches == found.as_dict()["approaches"]
+    assert repr(found).startswith("fits  ")
+
+
+def test_truth_is_carried_by_data_sets_alone(drive: Path, tmp_path: Path) -> None:
+    with pytest.raises(crosscue.EmptyResultError, match="carries no truth"):
+        crosscue.write_truth(drive, tmp_path)
+    assert crosscue.truth_schema()["title"] == "Truth"
+    assert "anyOf" in crosscue.run_schema() or "oneOf" in crosscue.run_schema()
