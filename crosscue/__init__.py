@@ -47,6 +47,10 @@ _EXPORTS: Final = {
     "compare_runs": "eval.interface.runs",
     "save_recording": "eval.interface.runs",
     "load_vehicle": "eval.interface.runs",
+    "demo": "eval.interface.demo",
+    "Demo": "eval.interface.demo",
+    "fetch_drive": "eval.interface.demo",
+    "KnownDrive": "eval.interface.demo",
     "default_cache": "detectors.result_cache",
     "simulate_approach": "eval.interface.simulate",
     "simulate_drive": "eval.interface.simulate",
@@ -132,6 +136,10 @@ if TYPE_CHECKING:
     from crosscue.eval.fit.truth_check import import_truth as import_truth
     from crosscue.eval.interface.convert import Converted as Converted
     from crosscue.eval.interface.convert import convert as convert
+    from crosscue.eval.interface.demo import Demo as Demo
+    from crosscue.eval.interface.demo import KnownDrive as KnownDrive
+    from crosscue.eval.interface.demo import demo as demo
+    from crosscue.eval.interface.demo import fetch_drive as fetch_drive
     from crosscue.eval.interface.logs import CameraFrame as CameraFrame
     from crosscue.eval.interface.logs import Log as Log
     from crosscue.eval.interface.logs import LogTopic as LogTopic

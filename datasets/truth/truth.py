@@ -70,7 +70,8 @@ class Approach(Section):
     intersection: str
     start_ns: int
     enter_ns: int
-    """When the rear axle is at the start of the intersection."""
+    """When the rear axle is at the start of the intersection, or the end of a log that ends
+    before."""
     control: Literal["stop_sign", "traffic_light", "none"]
     features: Features
     one_way: Literal["left", "right"] | None = None

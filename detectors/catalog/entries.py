@@ -29,16 +29,27 @@ def cache_folder(environment: Mapping[str, str] = os.environ) -> Path:
         UsageError: No such place can be named: the machine has no home folder.
     """
     asked = environment.get(VARIABLE)
-    if asked:
-        return Path(asked)
+    return Path(asked) if asked else user_cache(VARIABLE, environment) / "models"
+
+
+def user_cache(variable: str, environment: Mapping[str, str] = os.environ) -> Path:
+    """The user's cache folder of crosscue.
+
+    Args:
+        variable: That names another place, for errors.
+        environment: For ``$XDG_CACHE_HOME``.
+
+    Raises:
+        UsageError: No such place can be named: the machine has no home folder.
+    """
     base = Path(environment.get("XDG_CACHE_HOME", ""))
     try:
         base = base if base.is_absolute() else Path.home() / ".cache"
     except RuntimeError:
         raise UsageError(
-            f"no home folder to keep models in; name one in the variable {VARIABLE}"
+            f"no home folder to keep files in; name one in the variable {variable}"
         ) from None
-    return base / "crosscue" / "models"
+    return base / "crosscue"
 
 
 @cache

@@ -14,10 +14,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.detectors.catalog.fetch import Fetched, Progress, fetch
+from crosscue.detectors.catalog.fetch import Fetched, fetch
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, ProgressLine, progress_line
 from crosscue.replay.base import UsageError
+from crosscue.replay.files.transfer import Progress
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fetch."""
     if args.given is not None and len(args.models) > 1:
-        raise UsageError("--from: one model at a time")
+        raise UsageError("--weights: one model at a time")
     found: dict[str, list[Fetched]] = {}
     for name in args.models:
         with progress_line(args, "fetching") as line:

@@ -1,0 +1,184 @@
+"""Published recordings with a hash for each file, and where they are kept once fetched.
+
+One folder here for each: ``recording.toml`` says where its files are published, ``vehicle.toml``
+and ``truth.json`` are ours. ``$CROSSCUE_DRIVES`` names the folder to keep recordings in, else the
+user's cache; ``$CROSSCUE_DRIVE_MIRROR`` a server to ask instead of the publisher, for
+``MIRROR/NAME/FILE``; ``$CROSSCUE_DATA`` a folder whose ``sequences`` are searched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Final, Literal
+
+from pydantic import Field, ValidationError
+
+from crosscue.detectors.catalog.card import Hash
+from crosscue.detectors.catalog.entries import user_cache
+from crosscue.detectors.catalog.fetch import DATA
+from crosscue.detectors.settings import Settings
+from crosscue.replay.base import (
+    MIB,
+    UsageError,
+    VehicleError,
+    toml_tree,
+)
+from crosscue.replay.files.transfer import Progress, download, is_there, take
+from crosscue.replay.vehicle.validation_errors import explain
+from crosscue.replay.vehicle.vehicle import tuples
+
+FOLDER: Final = Path(__file__).parent
+VARIABLE: Final = "CROSSCUE_DRIVES"
+MIRROR: Final = "CROSSCUE_DRIVE_MIRROR"
+OTHERWISE: Final = f"give its folder with --data FOLDER or {DATA}, or name a mirror in {MIRROR}"
+
+
+class RecordedFile(Settings):
+    """One file of a recording."""
+
+    name: Annotated[str, Field(pattern=r"^\w[\w.-]*(/\w[\w.-]*)*$")]
+    """Its path inside the recording."""
+    size_bytes: Annotated[int, Field(gt=0, le=64 * MIB)]
+    sha256: Hash
+
+
+class Recording(Settings):
+    """A published recording."""
+
+    version: Literal[1]
+    name: Annotated[str, Field(pattern=r"^\w+$")]
+    """Of its folder, here and where it is kept."""
+    about: str
+    """What it shows, in a line."""
+    licence: str
+    attribution: str
+    """Whom to name wherever its pictures are shown."""
+    url: Annotated[str, Field(pattern="^https?://")]
+    """The folder with its files, at one commit."""
+    folders: tuple[str, ...]
+    """Where it may lie below a folder given with ``--data``, or below ``$CROSSCUE_DATA``."""
+    files: Annotated[tuple[RecordedFile, ...], Field(min_length=1)]
+
+    @property
+    def size_bytes(self) -> int:
+        """Of all its files."""
+        return sum(file.size_bytes for file in self.files)
+
+    @property
+    def vehicle(self) -> Path:
+        """Our vehicle file."""
+        return FOLDER / self.name / "vehicle.toml"
+
+    @property
+    def truth(self) -> Path:
+        """Our annotations."""
+        return FOLDER / self.name / "truth.json"
+
+    def needs(self) -> str:
+        """What it takes to fetch it, for people."""
+        return (
+            f"recording {self.name}: {len(self.files)} files, {self.size_bytes / 1e6:.1f} MB, "
+            f"{self.licence}"
+        )
+
+
+def recording(name: str) -> Recording:
+    """A recording that crosscue knows.
+
+    Raises:
+        VehicleError: Its file here is damaged.
+    """
+    path = FOLDER / name / "recording.toml"
+    text = path.read_text(encoding="utf-8")
+    try:
+        return Recording.model_validate(tuples(toml_tree(text)))
+    except ValidationError as error:
+        raise VehicleError(explain(error, text, str(path), Recording)) from None
+
+
+def place_of(known: Recording, environment: Mapping[str, str] = os.environ) -> Path:
+    """The folder where a recording is kept, or would be: one for each list of files."""
+    of_files = hashlib.sha256("".join(file.sha256 for file in known.files).encode()).hexdigest()
+    asked = environment.get(VARIABLE)
+    base = Path(asked) if asked else user_cache(VARIABLE, environment) / "drives"
+    return base / of_files[:16] / known.name
+
+
+def fetch(
+    known: Recording,
+    given: Path | None = None,
+    on_progress: Progress = lambda name, done, total: None,
+    environment: Mapping[str, str] = os.environ,
+) -> Path:
+    """Bring a recording into the cache, every file checked; what is there already stays.
+
+    Args:
+        known: The recording.
+        given: A folder that holds it; no network is used.
+        on_progress: Reported the file, and the bytes of the whole recording that are there.
+        environment: For the variables named above.
+
+    Returns:
+        Its folder, to be opened as a log.
+
+    Raises:
+        UsageError: ``given`` holds another recording, or part of it.
+        CrosscueError: A file cannot be had, or is not the published one.
+        OutputError: The cache cannot be written.
+    """
+    place, total, done = place_of(known, environment), known.size_bytes, 0
+    source = _folder_in(known, given)
+    at_hand = None
+    if source is None and environment.get(DATA):
+        at_hand = _folder_below(known, Path(environment[DATA]))
+    mirror = environment.get(MIRROR)
+    url = f"{mirror.rstrip('/')}/{known.name}" if mirror else known.url
+    owner = f"recording {known.name}"
+    for file in known.files:
+        target, before = place / file.name, done
+        if is_there(file, target):
+            pass
+        elif source is not None:
+            take(source / file.name, file, target, owner)
+        elif at_hand is not None and is_there(file, at_hand / file.name):
+            take(at_hand / file.name, file, target, owner)
+        else:
+            download(
+                f"{url}/{file.name}",
+                file,
+                target,
+                owner,
+                OTHERWISE,
+                _after(before, total, on_progress),
+            )
+        done += file.size_bytes
+        on_progress(file.name, done, total)
+    return place
+
+
+def _after(before: int, total: int, on_progress: Progress) -> Progress:
+    """Report of a file's bytes as so many more of the whole recording's."""
+    return lambda name, have, _: on_progress(name, before + have, total)
+
+
+def _folder_in(known: Recording, given: Path | None) -> Path | None:
+    if given is None:
+        return None
+    found = _folder_below(known, given)
+    if found is None:
+        raise UsageError(
+            f"{given}: expected a folder with {known.files[0].name} of recording {known.name}, "
+            f"itself or in {' or '.join(known.folders)}"
+        )
+    return found
+
+
+def _folder_below(known: Recording, folder: Path) -> Path | None:
+    """The folder with the recording's first file."""
+    for below in (".", *known.folders):
+        if (folder / below / known.files[0].name).is_file():
+            return folder / PurePosixPath(below)
+    return None

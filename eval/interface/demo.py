@@ -1,0 +1,189 @@
+"""A drive replayed, scored and shown in one call: simulated here, or a real one fetched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from crosscue.eval.interface.runs import (
+    Run,
+    ScoredRun,
+    replay_drive,
+    save_recording,
+    score_run,
+)
+from crosscue.eval.interface.simulate import simulate_approach
+from crosscue.replay.base import CrosscueError, UsageError
+
+REAL: Final = "pandaset_002"
+MODEL: Final = "yolox-nano"
+
+
+@dataclass(frozen=True, slots=True)
+class KnownDrive:
+    """A drive with all that it takes to replay and to score it.
+
+    Attributes:
+        log: The recording.
+        vehicle: Its vehicle file.
+        truth: What is there to be found.
+        attribution: Whom to name wherever its pictures are shown; empty if simulated.
+        detectors: Names of detectors; None for the vehicle file's own.
+    """
+
+    log: Path
+    vehicle: Path
+    truth: Path
+    attribution: str = ""
+    detectors: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Demo:
+    """What a demonstration made; printed as ``crosscue demo`` prints it.
+
+    Attributes:
+        drive: What was replayed.
+        run: The replay.
+        scored: The replay beside the truth.
+        recording: The replay as a Rerun recording, the true track and ranges with it.
+    """
+
+    drive: KnownDrive
+    run: Run
+    scored: ScoredRun
+    recording: Path
+
+    def as_dict(self) -> dict[str, object]:
+        """As ``crosscue demo --json`` prints it."""
+        return {
+            "log": str(self.drive.log),
+            "vehicle": str(self.drive.vehicle),
+            "truth": str(self.drive.truth),
+            "attribution": self.drive.attribution,
+            "run": str(self.run.path),
+            "report": str(self.scored.report),
+            "recording": str(self.recording),
+            "metrics": self.scored.metrics,
+        }
+
+    def __repr__(self) -> str:
+        lines = [repr(self.scored), "", f"report     {self.scored.report.resolve()}"]
+        lines.append(f"recording  {self.recording.resolve()}")
+        lines.append(
+            f"           look at it with: crosscue view {self.run.path} --truth {self.drive.truth}"
+        )
+        if self.drive.attribution:
+            lines.append(f"pictures   {self.drive.attribution}")
+        return "\n".join(lines)
+
+
+def fetch_drive(
+    source: Path | str | None = None,
+    *,
+    on_fetch: Callable[[str, int, int], None] = lambda file, done, of: None,
+) -> KnownDrive:
+    """Bring PandaSet's sequence 002 and the network yolox-nano to this machine, once, checked.
+
+    Recording and weights are kept in the user's cache. They come from ``source``, else from
+    ``$CROSSCUE_DATA``, else from their publishers (25 MB).
+
+    Args:
+        source: A folder that holds recording and weights; nothing is fetched.
+        on_fetch: Called with a file's name, the bytes that are there, and of how many.
+
+    Raises:
+        CrosscueError: One of them cannot be had; the line names all that is needed.
+        UsageError: ``source`` has another recording, or none.
+    """
+    from crosscue.datasets.real import recordings
+    from crosscue.detectors.catalog.entries import entry
+    from crosscue.detectors.catalog.fetch import fetch
+
+    known, card = recordings.recording(REAL), entry(MODEL)
+    given = None if source is None else Path(source)
+    try:
+        log = recordings.fetch(known, given, on_fetch)
+        fetch(MODEL, None if given is None else _below(given, card.weights), on_fetch)
+    except UsageError:
+        raise
+    except CrosscueError as error:
+        size = sum(file.size_bytes for file in card.files) / 1e6
+        raise type(error)(
+            f"needed: {known.needs()}; model {MODEL}: {size:.1f} MB, {card.licence}; {error}"
+        ) from None
+    return KnownDrive(log, known.vehicle, known.truth, known.attribution)
+
+
+def demo(
+    folder: Path | str | None = None,
+    *,
+    real: bool = False,
+    source: Path | str | None = None,
+    overwrite: bool = False,
+) -> Demo:
+    """Replay a drive up to an intersection, score it, and write report and recording.
+
+    Args:
+        folder: Gets the run, and a simulated drive; ``demo``, or ``demo-real``, if left out.
+        real: Take the drive of ``fetch_drive``; else one that is simulated on this machine.
+        source: As of ``fetch_drive``.
+        overwrite: Replace an earlier demonstration.
+
+    Raises:
+        CrosscueError: Recording or weights are missing and cannot be fetched.
+        UsageError: ``source`` without ``real``.
+        RunError: The folder holds something else.
+    """
+    if real:
+        return show_drive(fetch_drive(source), folder or "demo-real", overwrite=overwrite)
+    if source is not None:
+        raise UsageError("demo: source is for the real drive; add real=True")
+    return show_drive(simulated(folder or "demo", overwrite=overwrite), folder or "demo", overwrite)
+
+
+def simulated(
+    folder: Path | str,
+    layout: str = "C",
+    run: int = 1,
+    seed: int = 0,
+    *,
+    width_px: int = 1280,
+    overwrite: bool = False,
+) -> KnownDrive:
+    """A drive as of ``simulate_approach`` in ``folder/drive``, for the embedded networks."""
+    from crosscue.detectors.registry import EMBEDDED
+
+    files = simulate_approach(
+        Path(folder) / "drive", layout, run, seed, width_px=width_px, overwrite=overwrite
+    )
+    return KnownDrive(files.log, files.vehicle, files.truth, "", tuple(EMBEDDED.split(",")))
+
+
+def show_drive(
+    drive: KnownDrive,
+    folder: Path | str,
+    overwrite: bool = False,
+    on_frames: Callable[[int, int | None], None] = lambda done, of: None,
+    on_time: Callable[[float, float], None] = lambda done_s, of_s: None,
+) -> Demo:
+    """Replay and score a drive in ``folder/run``; arguments as of ``replay_drive``."""
+    run = replay_drive(
+        drive.log,
+        Path(folder) / "run",
+        drive.vehicle,
+        drive.detectors,
+        overwrite=overwrite,
+        on_frames=on_frames,
+        on_time=on_time,
+    )
+    scored = score_run(run, drive.truth)
+    return Demo(drive, run, scored, save_recording(run, truth=drive.truth))
+
+
+def _below(folder: Path, name: str) -> Path | None:
+    """A file of that name in a folder or its ``weights``; None: it may be in the cache."""
+    found = [*sorted(folder.glob(name)), *sorted(folder.glob(f"weights/*/{name}"))]
+    return found[0] if found else None

@@ -1,0 +1,216 @@
+"""The real demonstration: fetched once and checked, replayed, scored, shown."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import crosscue
+from crosscue.datasets.real import annotate_pandaset, recordings
+from crosscue.datasets.truth.truth import load as load_truth
+from crosscue.detectors.catalog import entries
+from crosscue.detectors.catalog import fetch as weights
+from crosscue.eval.cli import run
+from crosscue.eval.interface import demo as real_demo
+from crosscue.replay.vehicle.vehicle import load as load_vehicle
+from support.data import shared
+from support.range_server import serving
+from support.stand_in import StandIn, stand_in
+
+PICTURE = "drive/camera/front_camera/03.jpg"
+
+
+@pytest.fixture
+def made_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[StandIn]:
+    monkeypatch.chdir(tmp_path)
+    with serving() as server:
+        yield stand_in(tmp_path / "stand_in", server, monkeypatch)
+
+
+def test_it_is_fetched_once_replayed_scored_and_shown(
+    made_up: StandIn, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["demo", "--real"]) == 0
+    printed = capsys.readouterr().out
+    asked = len(made_up.server.gets)
+
+    assert asked == len(made_up.known.files) + 1
+    assert "against our annotations" in printed
+    assert "stop_sign" in printed
+    assert "pictures   nobody" in printed
+    for line in ("report     ", "recording  "):
+        (named,) = [one for one in printed.splitlines() if one.startswith(line)]
+        assert Path(named.removeprefix(line)).is_file()
+
+    assert run(["demo", "--real", "--overwrite", "--json"]) == 0
+    tree = json.loads(capsys.readouterr().out)
+    assert len(made_up.server.gets) == asked
+    assert Path(tree["log"]) == recordings.place_of(made_up.known)
+    assert tree["metrics"]["coverage"]
+
+
+def test_a_demo_that_is_there_is_not_replaced(
+    made_up: StandIn, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["demo", "--real", "-q"]) == 0
+    assert run(["demo", "--real"]) == 1
+
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_from_a_folder_or_the_data_folder_nothing_is_asked(
+    made_up: StandIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run(["demo", "--real", "--data", str(made_up.folder), "-q"]) == 0
+    shutil.rmtree(recordings.place_of(made_up.known).parent)
+    shutil.rmtree(entries.cache_folder())
+    monkeypatch.setenv(weights.DATA, str(made_up.folder))
+
+    drive = crosscue.fetch_drive()
+
+    assert drive.log.is_dir()
+    assert not made_up.server.gets
+
+
+def test_a_cut_transfer_goes_on_where_it_stopped(
+    made_up: StandIn, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made_up.server.failing = 1
+    assert run(["demo", "--real"]) == 1
+    first = capsys.readouterr().err
+    assert "needed: recording pandaset_002: " in first
+    assert "cut after" in first
+    assert first.count("\n") == 1
+    assert not Path("demo-real").exists()
+
+    crosscue.fetch_drive()
+
+    assert made_up.server.gets[1].startswith("bytes=")
+    assert not list(recordings.place_of(made_up.known).rglob("*.part"))
+
+
+@pytest.mark.parametrize("name", [PICTURE, "net.onnx"])
+def test_another_file_than_the_published_one_is_not_kept(made_up: StandIn, name: str) -> None:
+    made_up.server.files[name] = made_up.server.files[name][:-1] + b"\0"
+
+    with pytest.raises(crosscue.CrosscueError, match="another SHA-256"):
+        crosscue.fetch_drive()
+
+    below = (recordings.place_of(made_up.known), entries.cache_folder())
+    names = [path.name for folder in below for path in folder.rglob("*")]
+    assert Path(name).name not in names
+
+
+def test_a_file_that_changed_in_the_cache_is_fetched_again(made_up: StandIn) -> None:
+    drive = crosscue.fetch_drive()
+    picture = drive.log / PICTURE.removeprefix("drive/")
+    whole = picture.read_bytes()
+    picture.write_bytes(whole[:-1] + b"\0")
+
+    crosscue.fetch_drive()
+
+    assert picture.read_bytes() == whole
+
+
+def test_without_a_network_one_line_names_all_that_is_needed(
+    made_up: StandIn, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv(recordings.MIRROR, "http://127.0.0.1:9")
+
+    assert run(["demo", "--real"]) == 1
+
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    for part in (
+        "pandaset_002: 11 files",
+        "CC BY 4.0",
+        "yolox-nano",
+        "--data FOLDER",
+        weights.DATA,
+    ):
+        assert part in said
+    assert not Path("demo-real").exists()
+
+
+def test_a_mirror_is_asked_instead(made_up: StandIn, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in made_up.server.files if name.startswith("drive/")]:
+        moved = name.replace("drive/", "mirror/pandaset_002/")
+        made_up.server.files[moved] = made_up.server.files.pop(name)
+    monkeypatch.setenv(recordings.MIRROR, f"{made_up.server.base}/mirror")
+
+    assert crosscue.fetch_drive().log.is_dir()
+
+
+def test_a_folder_without_the_recording_or_with_another_is_wrong_usage(
+    made_up: StandIn, tmp_path: Path
+) -> None:
+    with pytest.raises(crosscue.UsageError, match="expected a folder with"):
+        crosscue.fetch_drive(tmp_path)
+
+    other = made_up.folder / "sequences" / "pandaset_002" / PICTURE.removeprefix("drive/")
+    other.write_bytes(b"another")
+    with pytest.raises(crosscue.UsageError, match="recording pandaset_002 needs"):
+        crosscue.fetch_drive(made_up.folder)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("--real --layout C", "--layout: for a simulated drive"),
+        ("--real --seed 0", "--seed: for a simulated drive"),
+        ("--data .", "--data: for a real drive; add --real"),
+    ],
+)
+def test_options_of_the_other_demo_are_wrong_usage(
+    line: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["demo", *line.split()]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_python_refuses_a_source_for_a_simulated_drive() -> None:
+    with pytest.raises(crosscue.UsageError, match="add real=True"):
+        crosscue.demo(source="folder")
+
+
+def test_our_files_of_the_real_drive_fit_together() -> None:
+    known = recordings.recording(real_demo.REAL)
+    vehicle, truth = load_vehicle(known.vehicle), load_truth(known.truth)
+
+    assert len(known.files) == 83
+    assert len({file.name for file in known.files}) == 83
+    assert [section.kind for section in vehicle.detectors.values()] == [real_demo.MODEL]
+    assert [one.control for one in truth.approaches] == ["traffic_light"]
+    assert truth.ranges is not None
+    assert (known.truth.parent / truth.ranges).is_file()
+
+
+def test_the_truth_is_what_the_script_writes(tmp_path: Path) -> None:
+    sequence = shared("sequences", "pandaset_002")
+
+    annotate_pandaset.annotate(sequence, tmp_path)
+
+    for name in ("truth.json", "ranges.csv"):
+        assert (tmp_path / name).read_bytes() == (annotate_pandaset.FOLDER / name).read_bytes()
+
+
+def test_the_real_drive_is_replayed_and_scored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = shared("sequences", "pandaset_002").parents[1]
+    shared("weights", "yolox_nano")
+    monkeypatch.setenv(recordings.VARIABLE, str(tmp_path / "drives"))
+    monkeypatch.setenv(entries.VARIABLE, str(tmp_path / "models"))
+
+    made = crosscue.demo(tmp_path / "demo", real=True, source=source)
+
+    cues = {row["cue"]: row for row in made.scored.cues.to_pylist()}
+    assert cues["traffic_light"]["precision"] >= 0.95
+    assert cues["traffic_light"]["recall"] >= 0.8
+    assert cues["stop_sign"]["precision_of"] == 0
+    assert made.recording.stat().st_size > 1_000_000
+    assert "PandaSet" in repr(made)
