@@ -66,6 +66,8 @@ class Detections:
         labels: N class names.
         masks: N masks as compressed runs over the picture (``crosscue.detectors.rle``), empty
             where the detector gives only a box.
+        lenses: N names of the lit lens (``crosscue.detectors.ranging.lens``), empty for what is no
+            traffic light; no entries at all where nobody looked.
     """
 
     t_ns: int
@@ -74,6 +76,7 @@ class Detections:
     scores: Floats
     labels: tuple[str, ...]
     masks: tuple[bytes, ...]
+    lenses: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse columns that do not line up, and numbers that are none.
@@ -88,6 +91,8 @@ class Detections:
             raise ValueError(f"scores: want ({n},), got {self.scores.shape}")
         if len(self.masks) != n:
             raise ValueError(f"masks: want {n}, got {len(self.masks)}")
+        if len(self.lenses) not in (0, n):
+            raise ValueError(f"lenses: want {n} or none, got {len(self.lenses)}")
         if not (np.isfinite(self.boxes_px).all() and np.isfinite(self.scores).all()):
             raise ValueError("boxes_px, scores: want finite numbers")
 
@@ -104,6 +109,7 @@ class Detections:
             self.scores[keep],
             tuple(self.labels[i] for i in keep),
             tuple(self.masks[i] for i in keep),
+            tuple(self.lenses[i] for i in keep) if self.lenses else (),
         )
 
 

@@ -120,6 +120,7 @@ def _as_json(found: Found) -> dict[str, Any]:
         "scores": found.scores.tolist(),
         "labels": found.labels,
         "masks": [mask.decode("ascii") for mask in found.masks],
+        "lenses": found.lenses,
     }
 
 
@@ -136,4 +137,5 @@ def _from_json(kept: dict[str, Any]) -> Found:
         np.array(kept["scores"], np.float64),
         tuple(kept["labels"]),
         tuple(mask.encode("ascii") for mask in kept["masks"]),
+        tuple(kept["lenses"]),
     )

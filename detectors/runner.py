@@ -9,8 +9,9 @@ from typing import Final
 
 from crosscue.replay.base import Block, Bytes, CrosscueError, Images, LogError, UsageError, one_line
 
-from .base import Detector, Found, Frame, View
+from .base import Detections, Detector, Found, Frame, View
 from .images import Encoded, decode, encoded, reduction, size_of
+from .ranging.lens import VERSION, with_lenses
 from .result_cache import ResultCache, picture_key
 
 BATCH: Final = 8
@@ -74,6 +75,7 @@ class Runner:
         camera: Topic.
         depth_bits: Of 16-bit pictures.
         on_skip: Reported the time and reason of each picture that cannot be decoded.
+        light_labels: Labels of traffic lights, whose lenses are looked at.
         counts: Grow as it works.
     """
 
@@ -82,6 +84,7 @@ class Runner:
     camera: str
     depth_bits: int
     on_skip: Callable[[int, str, str], None]
+    light_labels: tuple[str, ...] = ()
     counts: Counts = field(default_factory=Counts)
 
     def __call__(self, block: Block) -> Iterator[FrameResult]:
@@ -106,7 +109,7 @@ class Runner:
 
     def _known(self, picture: Encoded, t_ns: int) -> _Prepared:
         key = picture_key(picture)
-        known = [self.cache.get(key, named.detector.identity, t_ns) for named in self.detectors]
+        known = [self.cache.get(key, self._identity(named), t_ns) for named in self.detectors]
         return _Prepared(t_ns, picture, key, (0, 0), known, {})
 
     def _decoded(self, pictures: list[_Prepared]) -> list[_Prepared]:
@@ -137,7 +140,7 @@ class Runner:
                 continue
             for picture, found in zip(missing, self._detect(named, missing), strict=True):
                 picture.known[i] = found
-                fresh.append((picture.key, named.detector.identity, found))
+                fresh.append((picture.key, self._identity(named), found))
         self.cache.put(fresh)
         self.counts.frames += len(pictures)
         for picture in pictures:
@@ -164,7 +167,14 @@ class Runner:
                 f"detector {named.name}: gave {len(found)} results for {len(frames)} frames; "
                 "want one for each"
             )
-        return found
+        return [
+            with_lenses(one, frame, self.light_labels) if isinstance(one, Detections) else one
+            for one, frame in zip(found, frames, strict=True)
+        ]
+
+    def _identity(self, named: Named) -> str:
+        """Of all that decides a result: the detector, and the rule that looks at its lights."""
+        return f"{named.detector.identity} lens {VERSION} {' '.join(self.light_labels)}"
 
     def _count(self, name: str, ran: int, from_cache: int) -> None:
         self.counts.ran[name] = self.counts.ran.get(name, 0) + ran

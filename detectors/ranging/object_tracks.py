@@ -2,8 +2,8 @@
 
 A standing object is looked for where it must be now: as the car goes on, it moves away from the
 picture's centre and grows by the ratio of the ranges before and after; as the car turns, it shifts
-sideways. So two lights side by side stay two, and no range mixes their heights. Whether a light
-faces the car is not known here: a housing seen from behind is followed, too.
+sideways. So two lights side by side stay two, and no range mixes their heights. A housing seen from
+behind or from the side is followed, too; ``Track.facing`` says so, from the lenses seen lit.
 """
 
 from __future__ import annotations
@@ -12,12 +12,14 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from crosscue.replay.base import Floats
 
+from .lens import HUES
 from .range_from_motion import SIZES, MotionRange, SizePrior, range_from_motion
 
 NEAR_HEIGHTS: Final = 1.0
@@ -34,8 +36,24 @@ MAX_OBSERVATIONS: Final = 400
 GONE_M: Final = 5.0
 GONE_S: Final = 1.0
 """A track unseen for this way and this time is over."""
+MIN_LIT: Final = 2
+MIN_LIT_FRACTION: Final = 0.15
+"""A light faces the car if a lens was lit in so many frames, and in this fraction of those that
+were large enough: lamps flicker, hoods hide them, and the rule of one frame misses four in ten of
+small or blurred ones."""
+MIN_DARK: Final = 10
+MAX_LIT_FRACTION: Final = 0.05
+"""And does not face it if it was dark in so many frames and lit in at most this fraction."""
 STRAIGHT_RAD: Final = 0.15
 """Heights follow the way only while the car goes straight; after such a turn they begin anew."""
+
+
+class Facing(StrEnum):
+    """Whether a light is for this car to see."""
+
+    EGO = "ego"
+    AWAY = "away"
+    UNKNOWN = "unknown"
 
 
 class Motion(NamedTuple):
@@ -81,6 +99,8 @@ class Track:
         since_m: Way gone since the last observation.
         unseen_m: The same without sign.
         unseen_s: Time since then.
+        lit: In how many frames a lens was lit.
+        dark: And in how many none was, though the box was large enough.
     """
 
     number: int
@@ -92,6 +112,8 @@ class Track:
     since_m: float = 0.0
     unseen_m: float = 0.0
     unseen_s: float = 0.0
+    lit: int = 0
+    dark: int = 0
     _way_m: list[float] = field(default_factory=list)
     _height_px: list[float] = field(default_factory=list)
     _merged: int = 0
@@ -103,6 +125,20 @@ class Track:
     def range_m(self) -> float:
         """Depth from the camera now."""
         return self.estimate.mean_m - self.since_m
+
+    @property
+    def facing(self) -> Facing:
+        """From all frames so far; one that nobody looked at is unknown."""
+        looked = self.lit + self.dark
+        if self.lit >= MIN_LIT and self.lit >= MIN_LIT_FRACTION * looked:
+            return Facing.EGO
+        is_away = self.dark >= MIN_DARK and self.lit <= MAX_LIT_FRACTION * looked
+        return Facing.AWAY if is_away else Facing.UNKNOWN
+
+    def look(self, lens: str) -> None:
+        """Take the lens of the newest frame's box (``lens_of``; empty where nobody looked)."""
+        self.lit += lens in HUES
+        self.dark += lens == "dark"
 
     @property
     def var_m2(self) -> float:
@@ -170,32 +206,40 @@ class ObjectTracks:
         self._size = SIZES[cue]
         self._lens = Lens(focal_px, center_px)
 
-    def __call__(self, motion: Motion, boxes_px: Floats, heights_px: Floats) -> Sequence[Track]:
+    def __call__(
+        self,
+        motion: Motion,
+        boxes_px: Floats,
+        heights_px: Floats,
+        lenses: Sequence[str] = (),
+    ) -> Sequence[Track]:
         """Take the next frame's boxes.
 
         Args:
             motion: Of the car since the frame before.
             boxes_px: Shape (N, 4): x0, y0, x1, y1.
             heights_px: Shape (N,), positive.
+            lenses: N of them, or none where nobody looked.
 
         Returns:
             All tracks, those unseen in this frame as predicted.
         """
         for track in self.tracks:
             track.go_on(motion, self._lens)
-        taken = self._assign(boxes_px, heights_px)
+        lenses = lenses or [""] * len(boxes_px)
+        taken = self._assign(boxes_px, heights_px, lenses)
         for i in range(len(boxes_px)):
             if i in taken:
                 continue
             if any(iou(boxes_px[i], boxes_px[j]) > SAME_IOU for j in taken):
                 self.counts["boxes of an object already found"] += 1
                 continue
-            self._begin(boxes_px[i], float(heights_px[i]))
+            self._begin(boxes_px[i], float(heights_px[i]), lenses[i])
             taken.append(i)
         self.tracks = [one for one in self.tracks if not _is_over(one)]
         return self.tracks
 
-    def _assign(self, boxes_px: Floats, heights_px: Floats) -> list[int]:
+    def _assign(self, boxes_px: Floats, heights_px: Floats, lenses: Sequence[str]) -> list[int]:
         """Nearest pairs first; the boxes that were taken."""
         pairs = [
             (away, i, j)
@@ -208,17 +252,19 @@ class ObjectTracks:
         for _, i, j in sorted(pairs):
             if i not in boxes and j not in tracks:
                 self.tracks[j].observe(boxes_px[i], float(heights_px[i]), self._size, self._lens)
+                self.tracks[j].look(lenses[i])
                 boxes.append(i)
                 tracks.add(j)
         return boxes
 
-    def _begin(self, box_px: Floats, height_px: float) -> None:
+    def _begin(self, box_px: Floats, height_px: float, lens: str) -> None:
         self.counts["objects followed"] += 1
         first = range_from_motion(
             np.zeros(1), np.array([height_px]), self._lens.focal_px, self._size
         )
         track = Track(self.counts["objects followed"], box_px.copy(), height_px, first)
         track.observe(box_px, height_px, self._size, self._lens)
+        track.look(lens)
         track.seen = 1
         self.tracks.append(track)
 

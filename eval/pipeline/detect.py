@@ -144,6 +144,7 @@ def detect_into(
             lambda t_ns, reason, why: ledger.spoil(
                 topic.name, reason, 1, why, int(clock.log_times(np.array([t_ns]))[0])
             ),
+            vehicle.cues.traffic_light_labels,
         )
         drawer = Drawer(run.path / "pictures", draw)
         tables = _Tables(
@@ -370,6 +371,7 @@ class _Tables:
                     "y1": y1,
                     "mask": found.masks[i] or None,
                     "height_px": height,
+                    "lens": (found.lenses[i] or None) if found.lenses else None,
                     "range_m": self._range_m(label, height),
                     "picture_width_px": found.size_px[0],
                     "picture_height_px": found.size_px[1],
@@ -428,6 +430,7 @@ def schemas() -> dict[str, pa.Schema]:
                 ("y1", number),
                 ("mask", pa.binary()),
                 ("height_px", number),
+                ("lens", text),
                 ("range_m", number),
                 ("picture_width_px", pa.int32()),
                 ("picture_height_px", pa.int32()),

@@ -1,13 +1,16 @@
 """Ranges to an intersection from the motion of its lights and signs, one object for each reference.
 
-Which object tells the range:
+Which object reports the range:
 
-* **Traffic lights** stand on both sides of the crossing; the far ones mark its end. Of the lights
-  that persist, one is chosen that no other is clearly (two standard deviations) further than.
-* **Stop signs** mark the start: one that no other is clearly nearer than.
+* **Traffic lights** stand on both sides of the crossing. Of those that face the car, one that no
+  other is clearly (two standard deviations) further than marks the **end**. One of a nearer group,
+  which may well be seen from behind, marks the **start**. A light that is known not to face the car
+  never marks the end. Where only one group was seen, the run says so.
+* **Stop signs** mark the **start**: one that no other is clearly nearer than. They come before
+  lights.
 
 The choice stays while that holds, groups are never averaged, and every range is that object's own
-posterior. Whether a light faces the car is unknown so far.
+posterior. Lights of which nobody knows where they face count as facing where no other does.
 """
 
 from __future__ import annotations
@@ -16,21 +19,50 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.ranging.object_tracks import Motion, ObjectTracks, Track
+from crosscue.detectors.ranging.object_tracks import Facing, Motion, ObjectTracks, Track
 from crosscue.fusion.approaches import FrameEvidence, RangePosterior
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.base import Floats
+from crosscue.replay.vehicle.cue_table import TRAFFIC_LIGHT
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .sign_ranges import MEASURED, source_of, usable
+from .sign_ranges import MEASURED, Usable, source_of, usable
 
 CLEARLY: Final = 2.0
 """Standard deviations of the difference of two ranges."""
 WIDEST_M: Final = 60.0
 """Lights further behind the nearest than this are another intersection's."""
+NARROWEST_M: Final = 8.0
+"""Groups nearer to each other than a street of two lanes with its kerbs is wide are one."""
+ONE_GROUP: Final = "frames with only one group of lights"
+ONLY_AWAY: Final = "frames with only lights that do not face the ego vehicle"
+
+
+class RangedObject(NamedTuple):
+    """One tracked object in one frame, as ``ranged_objects.parquet`` has it.
+
+    Attributes:
+        cue: What it is.
+        object: Its number; of one cue and one stretch without a restart.
+        facing: For lights, from the lenses seen lit so far.
+        reference: What it marks in this frame; None for nothing.
+        range_m: From the rear axle to the object.
+        var_m2: Its variance.
+        height_m: Its estimated height.
+        box_px: x0, y0, x1, y1.
+    """
+
+    cue: str
+    object: int
+    facing: Facing
+    reference: Reference | None
+    range_m: float
+    var_m2: float
+    height_m: float
+    box_px: tuple[float, float, float, float]
 
 
 @dataclass(slots=True)
@@ -39,12 +71,15 @@ class MotionRanges:
 
     Attributes:
         vehicle: Settings.
-        counts: Objects followed, boxes of one object, and changes of choice.
+        counts: Objects followed, boxes of one object, changes of choice, and frames with only one
+            group.
+        objects: All that were seen in the newest frame.
     """
 
     vehicle: Vehicle
     counts: Counter[str] = field(default_factory=Counter)
-    _chains: dict[Reference, _Chain] = field(default_factory=dict)
+    objects: tuple[RangedObject, ...] = ()
+    _chains: dict[str, _Chain] = field(default_factory=dict)
 
     def __call__(
         self,
@@ -52,6 +87,7 @@ class MotionRanges:
         seconds: float,
         found: Sequence[Detections],
         heights_px: Sequence[Floats],
+        without: frozenset[str] = frozenset(),
     ) -> tuple[RangePosterior, ...]:
         """The next frame: at most one range for each reference.
 
@@ -60,33 +96,119 @@ class MotionRanges:
             seconds: Time since the frame before.
             found: Of the detectors of objects.
             heights_px: For each, the rows that every mask spans.
+            without: Cues to leave out.
         """
         turned_rad = evidence.turned_rad or 0.0
         motion = Motion(evidence.travelled_m, evidence.travelled_var_m2, turned_rad, seconds)
-        ranges = []
-        for row, (cue, reference) in enumerate(MEASURED):
-            if source_of(self.vehicle, cue.name) != "motion":
+        ranges: dict[Reference, RangePosterior] = {}
+        objects: list[RangedObject] = []
+        for row, (cue, _) in enumerate(MEASURED):
+            if cue.name in without or source_of(self.vehicle, cue.name) != "motion":
                 continue
-            boxes, heights = usable(self.vehicle, row, found, heights_px)
-            if not len(boxes) and reference not in self._chains:
+            boxes = usable(self.vehicle, row, found, heights_px)
+            if not len(boxes.boxes_px) and cue.name not in self._chains:
                 continue
-            if reference not in self._chains:
-                self._chains[reference] = self._chain(reference, cue.name, found[0].size_px)
-            one = self._chains[reference](motion, boxes, heights)
-            if one is not None:
-                ranges.append(one)
-        return tuple(ranges)
+            if cue.name not in self._chains:
+                self._chains[cue.name] = self._chain(cue.name, found[0].size_px)
+            for one in self._chains[cue.name](motion, boxes):
+                ranges.setdefault(one.reference, one)
+            objects += self._chains[cue.name].objects()
+        self.objects = tuple(objects)
+        return tuple(ranges.values())
 
     def restart(self) -> None:
         """Know nothing of what was before."""
         self._chains.clear()
+        self.objects = ()
 
-    def _chain(self, reference: Reference, cue: str, size_px: tuple[int, int]) -> _Chain:
+    def _chain(self, cue: str, size_px: tuple[int, int]) -> _Chain:
         camera = self.vehicle.camera
         center_px = camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1])
         tracks = ObjectTracks(cue, camera.focal_px or 0.0, center_px)
         tracks.counts = self.counts
-        return _Chain(self.vehicle, reference, tracks, self.counts)
+        choices = {
+            reference: _Choice(self.vehicle, reference, self.counts) for reference in Reference
+        }
+        return _Chain(self.vehicle, cue, tracks, self.counts, choices)
+
+
+@dataclass(slots=True)
+class _Chain:
+    """One kind of objects, and which of them report the ranges."""
+
+    vehicle: Vehicle
+    cue: str
+    tracks: ObjectTracks
+    counts: Counter[str]
+    choices: dict[Reference, _Choice]
+
+    def __call__(self, motion: Motion, boxes: Usable) -> list[RangePosterior]:
+        tracks = self.tracks(motion, boxes.boxes_px, boxes.heights_px, boxes.lenses)
+        for choice in self.choices.values():
+            choice.go_on(motion)
+        if self.cue != TRAFFIC_LIGHT.name:
+            return self._posteriors({Reference.START: self.choices[Reference.START](tracks)})
+        end = self.choices[Reference.END](_may_end(tracks))
+        start = self.choices[Reference.START](_may_start(tracks, end))
+        is_seen = any(one.is_seen for one in tracks)
+        self.counts[ONE_GROUP] += is_seen and end is not None and start is None
+        self.counts[ONLY_AWAY] += is_seen and end is None and start is not None
+        return self._posteriors({Reference.END: end, Reference.START: start})
+
+    def objects(self) -> list[RangedObject]:
+        """All seen in the newest frame, by number."""
+        marks = {choice.chosen: reference for reference, choice in self.choices.items()}
+        return [
+            RangedObject(
+                self.cue,
+                one.number,
+                one.facing,
+                marks.get(one.number),
+                one.range_m + self.vehicle.camera.x_m,
+                _var_m2(one, self.vehicle),
+                one.estimate.height_m,
+                tuple(one.box_px.tolist()),
+            )
+            for one in self.tracks.tracks
+            if one.is_seen
+        ]
+
+    def _posteriors(self, chosen: dict[Reference, Track | None]) -> list[RangePosterior]:
+        """Of the chosen that were seen in this frame."""
+        camera, ranges = self.vehicle.camera, self.vehicle.ranges
+        found = []
+        for reference, one in chosen.items():
+            if one is None or not one.is_seen:
+                continue
+            shift_m, place_var_m2 = camera.x_m, 0.0
+            if self.cue == TRAFFIC_LIGHT.name:
+                place_var_m2 = ranges.light_place_sd_m**2
+                shift_m -= ranges.light_beyond_end_m if reference is Reference.END else 0.0
+            measured_m = (camera.focal_px or 0.0) * one.estimate.height_m / one.height_px
+            found.append(
+                RangePosterior(
+                    reference,
+                    one.range_m + shift_m,
+                    _var_m2(one, self.vehicle) + place_var_m2,
+                    measured_m + shift_m,
+                )
+            )
+        return found
+
+
+def _may_end(tracks: Sequence[Track]) -> list[Track]:
+    """Lights that face the car, or may; those that do come first."""
+    facing = [one for one in tracks if one.facing is Facing.EGO]
+    return facing or [one for one in tracks if one.facing is Facing.UNKNOWN]
+
+
+def _may_start(tracks: Sequence[Track], end: Track | None) -> list[Track]:
+    """Lights of a group that is clearly nearer than the end; any that do not face the car."""
+    if end is None:
+        return [one for one in tracks if one.facing is Facing.AWAY]
+    return [
+        one for one in tracks if end.range_m - one.range_m > NARROWEST_M and _is_apart(one, end)
+    ]
 
 
 @dataclass(slots=True)
@@ -99,45 +221,37 @@ class _Held:
 
 
 @dataclass(slots=True)
-class _Chain:
-    """One reference: its objects, and which of them tells the range."""
+class _Choice:
+    """Which object marks one reference; it stays while no other is clearly better."""
 
     vehicle: Vehicle
     reference: Reference
-    tracks: ObjectTracks
     counts: Counter[str]
-    _chosen: int | None = None
+    chosen: int | None = None
     _held: _Held | None = None
 
-    def __call__(
-        self, motion: Motion, boxes_px: Floats, heights_px: Floats
-    ) -> RangePosterior | None:
+    def go_on(self, motion: Motion) -> None:
+        """Carry what is held to the next frame."""
         if self._held is not None:
             self._held.range_m -= motion.way_m or 0.0
             self._held.var_m2 += motion.var_m2
             if motion.way_m is None or self._held.range_m <= 0.0:
                 self._held = None
-        best = self._choose(self.tracks(motion, boxes_px, heights_px))
+
+    def __call__(self, tracks: Sequence[Track]) -> Track | None:
+        """Choose among those that may mark it."""
+        best = self._best(tracks)
         if best is None:
             return None
-        if best.number != self._chosen:
+        if best.number != self.chosen:
             self.counts[f"ranges to the {self.reference}: another object chosen"] += (
-                self._chosen is not None
+                self.chosen is not None
             )
-            self._chosen = best.number
-        self._held = _Held(best.range_m, self._var_m2(best), best.seen)
-        if not best.is_seen:
-            return None
-        camera, estimate = self.vehicle.camera, best.estimate
-        measured_m = (camera.focal_px or 0.0) * estimate.height_m / best.height_px
-        return RangePosterior(
-            self.reference,
-            best.range_m + camera.x_m,
-            self._var_m2(best),
-            measured_m + camera.x_m,
-        )
+            self.chosen = best.number
+        self._held = _Held(best.range_m, _var_m2(best, self.vehicle), best.seen)
+        return best
 
-    def _choose(self, tracks: Sequence[Track]) -> Track | None:
+    def _best(self, tracks: Sequence[Track]) -> Track | None:
         able = [one for one in tracks if self._is_able(one)]
         if not able:
             return None
@@ -145,8 +259,8 @@ class _Chain:
         able = [one for one in able if one.range_m <= nearest_m + WIDEST_M]
         sign = 1.0 if self.reference is Reference.END else -1.0
         extreme = max(able, key=lambda one: sign * one.range_m)
-        group = [one for one in able if not self._apart(one, extreme)]
-        kept = [one for one in group if one.number == self._chosen]
+        group = [one for one in able if not _is_apart(one, extreme)]
+        kept = [one for one in group if one.number == self.chosen]
         if kept:
             return kept[0]
         enough = 0.5 * max(one.seen for one in group)
@@ -154,20 +268,22 @@ class _Chain:
 
     def _is_able(self, one: Track) -> bool:
         settings = self.vehicle.range_filter
-        sd_m = math.sqrt(self._var_m2(one))
+        sd_m = math.sqrt(_var_m2(one, self.vehicle))
         if one.seen < settings.begin_after or sd_m > settings.most_sd_m:
             return False
-        if one.range_m > settings.most_m or one.number == self._chosen:
+        if one.range_m > settings.most_m or one.number == self.chosen:
             return one.range_m <= settings.most_m
         held = self._held
         if held is None or one.seen >= held.seen:
             return True
         off_m = abs(one.range_m - held.range_m)
-        return off_m <= CLEARLY * math.sqrt(self._var_m2(one) + held.var_m2)
+        return off_m <= CLEARLY * math.sqrt(_var_m2(one, self.vehicle) + held.var_m2)
 
-    def _apart(self, one: Track, other: Track) -> bool:
-        off_m = abs(one.range_m - other.range_m)
-        return off_m > CLEARLY * math.sqrt(self._var_m2(one) + self._var_m2(other))
 
-    def _var_m2(self, one: Track) -> float:
-        return one.var_m2 + (self.vehicle.range_filter.sd_share * one.range_m) ** 2
+def _is_apart(one: Track, other: Track) -> bool:
+    """Are they clearly at different ranges?"""
+    return abs(one.range_m - other.range_m) > CLEARLY * math.sqrt(one.var_m2 + other.var_m2)
+
+
+def _var_m2(one: Track, vehicle: Vehicle) -> float:
+    return one.var_m2 + (vehicle.range_filter.sd_share * one.range_m) ** 2

@@ -33,7 +33,7 @@ from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .looked_for import not_looked_for
-from .motion_ranges import MotionRanges
+from .motion_ranges import MotionRanges, RangedObject
 from .sign_ranges import MEASURED, SignRanges
 
 if TYPE_CHECKING:
@@ -167,9 +167,9 @@ class _Scene:
         gap_ns = 0 if self._last_ns is None else seen.t_ns - self._last_ns
         evidence = self._evidence(seen.t_ns, counts, signs)
         seconds = max(gap_ns, 0) * 1e-9
-        posteriors = self.motion(evidence, seconds, seen.objects, frame.heights_px)
-        kept = tuple(one for one in posteriors if _MEASURES[one.reference] not in without)
-        evidence = replace(evidence, posteriors=kept, is_new_picture=self._is_new(seen))
+        posteriors = self.motion(evidence, seconds, seen.objects, frame.heights_px, without)
+        evidence = replace(evidence, posteriors=posteriors, is_new_picture=self._is_new(seen))
+        self.rows.add_objects(seen.t_ns, self.motion.objects)
         step = (
             self.approaches(evidence)
             if past is None
@@ -265,6 +265,23 @@ class _Rows:
     cues: list[tuple[Any, ...]] = field(default_factory=list)
     ranges: list[tuple[Any, ...]] = field(default_factory=list)
     beliefs: list[tuple[Any, ...]] = field(default_factory=list)
+    objects: list[tuple[Any, ...]] = field(default_factory=list)
+
+    def add_objects(self, t_ns: int, objects: Sequence[RangedObject]) -> None:
+        self.objects += [
+            (
+                t_ns,
+                one.cue,
+                one.object,
+                str(one.facing),
+                None if one.reference is None else str(one.reference),
+                one.range_m,
+                one.var_m2,
+                one.height_m,
+                *one.box_px,
+            )
+            for one in objects
+        ]
 
     def add(self, step: Step) -> None:
         t_ns, number = step.t_ns, step.approach
@@ -287,6 +304,7 @@ class _Rows:
             ("cues", self.cues, CUE_COLUMNS),
             ("range", self.ranges, RANGE_COLUMNS),
             ("belief", self.beliefs, self._belief_columns()),
+            ("ranged_objects", self.objects, OBJECT_COLUMNS),
         ):
             if rows:
                 parts = zip(*rows, strict=True)
@@ -299,6 +317,20 @@ class _Rows:
 
 
 CUE_COLUMNS: Final = ("t_ns", "approach", "cue", "count")
+OBJECT_COLUMNS: Final = (
+    "t_ns",
+    "cue",
+    "object",
+    "facing",
+    "reference",
+    "range_m",
+    "var_m2",
+    "height_m",
+    "x0",
+    "y0",
+    "x1",
+    "y1",
+)
 RANGE_COLUMNS: Final = ("t_ns", "approach", "reference", "range_m", "var_m2", "measured_m")
 
 
@@ -341,6 +373,19 @@ def schemas(
                 *((name, number) for name in features),
                 ("established", pa.bool_()),
                 *reasons,
+            ]
+        ),
+        "ranged_objects": pa.schema(
+            [
+                ("t_ns", integer),
+                ("cue", text),
+                ("object", integer),
+                ("facing", text),
+                ("reference", text),
+                ("range_m", number),
+                ("var_m2", number),
+                ("height_m", number),
+                *((name, number) for name in ("x0", "y0", "x1", "y1")),
             ]
         ),
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -105,18 +105,33 @@ def _why_not(
     return NO_CURVE if source is None else None
 
 
+class Usable(NamedTuple):
+    """N detections that may give a range.
+
+    Attributes:
+        boxes_px: Shape (N, 4).
+        heights_px: Shape (N,).
+        lenses: N lenses of lights, empty where nobody looked.
+    """
+
+    boxes_px: Floats
+    heights_px: Floats
+    lenses: tuple[str, ...]
+
+
 def usable(
     vehicle: Vehicle, row: int, found: Sequence[Detections], heights_px: Sequence[Floats]
-) -> tuple[Floats, Floats]:
-    """Boxes (N, 4) and heights (N,) of one row of ``MEASURED``; ``SignRanges`` counts the rest."""
+) -> Usable:
+    """Detections of one row of ``MEASURED``; ``SignRanges`` counts the rest."""
     cue, _ = MEASURED[row]
     labels = cue_labels(vehicle)[cue.name]
     score = threshold_of(cue, vehicle)[1] or 0.0
     some = [
-        (detections.boxes_px[i], float(heights[i]))
+        (detections.boxes_px[i], float(heights[i]), *(detections.lenses[i : i + 1] or ("",)))
         for detections, heights in zip(found, heights_px, strict=True)
         for i, label in enumerate(detections.labels)
         if label in labels and _why_not(detections, heights, i, score, "motion") is None
     ]
-    boxes = np.array([box for box, _ in some]).reshape(-1, 4)
-    return boxes, np.array([height for _, height in some])
+    boxes = np.array([box for box, _, _ in some]).reshape(-1, 4)
+    heights = np.array([height for _, height, _ in some])
+    return Usable(boxes, heights, tuple(lens for _, _, lens in some))

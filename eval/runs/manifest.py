@@ -22,7 +22,7 @@ from .account import Account, SummedAccount
 from .candidates import CandidateRow
 from .record import Record
 
-FORMAT_VERSION: Final = 4
+FORMAT_VERSION: Final = 5
 
 
 def _vehicle(given: object) -> object:
@@ -195,7 +195,7 @@ class EstimateTimings(Record):
 
 
 class _Versioned(Record):
-    format_version: Literal[4] = FORMAT_VERSION
+    format_version: Literal[5] = FORMAT_VERSION
     versions: dict[str, str]
     """Of crosscue, Python and the libraries that results depend on."""
 
@@ -279,7 +279,7 @@ class MergedDrive(Record):
 class MergedManifest(Record):
     """Many drives as one folder of tables."""
 
-    format_version: Literal[4] = FORMAT_VERSION
+    format_version: Literal[5] = FORMAT_VERSION
     stage: Literal["merged"] = "merged"
     tables: tuple[str, ...]
     drives: tuple[MergedDrive, ...]

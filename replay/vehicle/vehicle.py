@@ -242,6 +242,11 @@ class Ranges(Section):
     curve where one is given, else motion where ``camera.focal_px`` is."""
     stop_sign: RangeCurve | None = None
     traffic_light: RangeCurve | None = None
+    light_beyond_end_m: Finite = 3.0
+    """With ``motion``: the far lights stand so far behind the end of the intersection, on poles at
+    the far corners; a fitted curve knows this from its pairs."""
+    light_place_sd_m: NotNegative = 2.0
+    """How much that differs from one intersection to another (the same at its start)."""
 
 
 class DetectorSection(Section):

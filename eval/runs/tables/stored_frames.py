@@ -66,7 +66,7 @@ class _Rows:
         return True
 
 
-FOUND: Final = ("detector", "label", "score", "x0", "y0", "x1", "y1", "mask", "height_px")
+FOUND: Final = ("detector", "label", "score", "x0", "y0", "x1", "y1", "mask", "height_px", "lens")
 SHARES: Final = ("share_left", "share_straight", "share_right")
 MASK: Final = ("mask", "mask_width_px", "mask_height_px")
 
@@ -127,6 +127,7 @@ def _detections(t_ns: int, size: tuple[int, int], rows: list[tuple[Any, ...]]) -
         np.array([row[2] for row in rows], np.float64),
         tuple(row[1] for row in rows),
         tuple(row[7] or b"" for row in rows),
+        tuple(row[9] or "" for row in rows),
     )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from crosscue.detectors.ranging.object_tracks import Motion, ObjectTracks, Track
+from crosscue.detectors.ranging.object_tracks import Facing, Motion, ObjectTracks, Track
 from crosscue.detectors.ranging.range_from_motion import SIZES
 from crosscue.replay.base import Floats
 
@@ -93,6 +93,31 @@ def test_two_boxes_of_one_object_are_counted_and_make_one_track() -> None:
 
     assert len(now) == 1
     assert followed.counts["boxes of an object already found"] == 1
+
+
+@pytest.mark.parametrize(
+    ("lenses", "facing"),
+    [
+        (["red"], Facing.UNKNOWN),
+        (["red", "dark", "green"], Facing.EGO),
+        (["dark"] * 9, Facing.UNKNOWN),
+        (["dark"] * 10, Facing.AWAY),
+        (["unknown"] * 30, Facing.UNKNOWN),
+        ([""] * 30, Facing.UNKNOWN),
+        (["dark"] * 28 + ["red"], Facing.AWAY),
+        (["dark"] * 18 + ["red"] * 2, Facing.UNKNOWN),
+        (["dark"] * 8 + ["yellow"] * 2, Facing.EGO),
+    ],
+)
+def test_facing_is_said_of_many_frames_and_only_with_enough(
+    lenses: list[str], facing: Facing
+) -> None:
+    followed = tracks()
+    for gone_m, lens in enumerate(lenses):
+        box = box_of(FAR, float(gone_m))[None, :]
+        (track,) = followed(AHEAD, box, box[:, 3] - box[:, 1], [lens])
+
+    assert track.facing is facing
 
 
 def test_without_odometry_only_the_size_speaks() -> None:

@@ -7,16 +7,17 @@ import pytest
 
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.candidates import NO_CURVE
-from crosscue.eval.pipeline.motion_ranges import MotionRanges
+from crosscue.eval.pipeline.motion_ranges import ONE_GROUP, ONLY_AWAY, MotionRanges
 from crosscue.eval.pipeline.sign_ranges import CUT, SignRanges, source_of
 from crosscue.fusion.approaches import Approaches, FrameEvidence, RangePosterior
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
-from crosscue.replay.vehicle.vehicle import Vehicle, parse
+from crosscue.replay.vehicle.vehicle import Ranges, Vehicle, parse
 
 SIZE = (1920, 1080)
 AHEAD = FrameEvidence(0, 1.0, 0.0, (), {})
 CAMERA = "[camera]\nfocal_px = 1500.0\nx_m = 1.5\n"
+BEYOND_M = Ranges().light_beyond_end_m
 CURVE = "[ranges.traffic_light]\nparameters = [1800.0]\nresidual_sd_m = 4.0\n"
 Thing = tuple[str, float, float, float]
 """Label, range from the camera at the start, metres to the right, height."""
@@ -28,7 +29,9 @@ def vehicle(text: str = CAMERA) -> Vehicle:
     return parse("version = 1\n" + text, "v.toml")
 
 
-def found(things: Sequence[Thing], gone_m: float, t_ns: int = 0) -> Detections:
+def found(
+    things: Sequence[Thing], gone_m: float, t_ns: int = 0, lenses: Sequence[str] = ()
+) -> Detections:
     boxes = []
     for _, start_m, right_m, height_m in things:
         scale = 1500.0 / (start_m - gone_m)
@@ -42,15 +45,16 @@ def found(things: Sequence[Thing], gone_m: float, t_ns: int = 0) -> Detections:
         np.full(len(boxes), 0.95),
         labels,
         (b"",) * len(boxes),
+        tuple(lenses),
     )
 
 
 def drive(
-    ranges: MotionRanges, things: Sequence[Thing], until_m: int
+    ranges: MotionRanges, things: Sequence[Thing], until_m: int, lenses: Sequence[str] = ()
 ) -> list[tuple[RangePosterior, ...]]:
     rows = []
     for gone_m in range(until_m):
-        seen = found(things, float(gone_m))
+        seen = found(things, float(gone_m), lenses=lenses)
         spans = seen.boxes_px[:, 3] - seen.boxes_px[:, 1]
         rows.append(ranges(AHEAD, 0.1, [seen], [spans]))
     return rows
@@ -60,11 +64,57 @@ def test_the_far_lights_tell_the_end_and_groups_are_never_averaged() -> None:
     beside: Thing = ("traffic light", 57.0, -9.0, 1.3)
     rows = drive(MotionRanges(vehicle()), [NEAR, beside, FAR], 45)
 
-    (last,) = rows[-1]
+    last, near = rows[-1]
     assert last.reference is Reference.END
-    assert last.range_m == pytest.approx(84.0 - 44.0 + 1.5, rel=0.04)
+    assert last.range_m == pytest.approx(84.0 - 44.0 + 1.5 - BEYOND_M, rel=0.04)
     assert last.measured_m == pytest.approx(last.range_m, rel=0.02)
+    assert near.reference is Reference.START
+    assert near.range_m == pytest.approx(57.0 - 44.0 + 1.5, rel=0.04)
     assert rows[0] == ()
+
+
+def test_a_light_that_does_not_face_the_car_never_marks_the_end() -> None:
+    behind: Thing = ("traffic light", 95.0, -9.0, 1.3)
+    ranges = MotionRanges(vehicle())
+
+    rows = drive(ranges, [NEAR, FAR, behind], 45, ("red", "red", "dark"))
+
+    end, start = rows[-1]
+    assert end.reference is Reference.END
+    assert end.range_m == pytest.approx(84.0 - 44.0 + 1.5 - BEYOND_M, rel=0.04)
+    assert start.range_m == pytest.approx(57.0 - 44.0 + 1.5, rel=0.04)
+    far_m = [one.range_m - 1.5 + 44.0 for one in ranges.objects]
+    assert far_m == pytest.approx([57.0, 84.0, 95.0], rel=0.04)
+    assert [str(one.facing) for one in ranges.objects] == ["ego", "ego", "away"]
+    assert [one.reference for one in ranges.objects] == [Reference.START, Reference.END, None]
+
+
+def test_a_cue_that_is_left_out_gives_no_range_to_either_end() -> None:
+    ranges = MotionRanges(vehicle())
+    drive(ranges, [NEAR, FAR], 30)
+    seen = found([NEAR, FAR], 30.0)
+    spans = [seen.boxes_px[:, 3] - seen.boxes_px[:, 1]]
+
+    assert ranges(AHEAD, 0.1, [seen], spans, frozenset({"stop_sign"}))
+    assert ranges(AHEAD, 0.1, [seen], spans, frozenset({"traffic_light"})) == ()
+
+
+def test_lights_seen_from_behind_alone_mark_the_start_and_the_run_says_so() -> None:
+    ranges = MotionRanges(vehicle())
+
+    rows = drive(ranges, [NEAR], 40, ("dark",))
+
+    assert [one.reference for one in rows[-1]] == [Reference.START]
+    assert ranges.counts[ONLY_AWAY] >= 25
+
+
+def test_one_group_of_lights_is_the_end_and_the_run_says_so() -> None:
+    ranges = MotionRanges(vehicle())
+
+    rows = drive(ranges, [FAR], 40, ("green",))
+
+    assert [one.reference for one in rows[-1]] == [Reference.END]
+    assert ranges.counts[ONE_GROUP] == sum(bool(row) for row in rows)
 
 
 def test_a_larger_light_that_comes_into_view_does_not_take_over() -> None:
@@ -74,7 +124,7 @@ def test_a_larger_light_that_comes_into_view_does_not_take_over() -> None:
 
     (one,) = ranges(AHEAD, 0.1, [seen], [seen.boxes_px[:, 3] - seen.boxes_px[:, 1]])
 
-    assert one.range_m == pytest.approx(84.0 - 30.0 + 1.5, rel=0.06)
+    assert one.range_m == pytest.approx(84.0 - 30.0 + 1.5 - BEYOND_M, rel=0.06)
 
 
 def test_the_nearest_stop_sign_tells_the_start() -> None:

@@ -15,9 +15,11 @@ from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.runs.input import identity_in
+from crosscue.eval.runs.manifest import FORMAT_VERSION
 from support.trees import tree
 
 DRIVES: int = 4
+REFUSAL: str = f"format 1, this crosscue reads {FORMAT_VERSION}: replay again"
 
 
 @pytest.fixture(scope="module")
@@ -100,9 +102,9 @@ def test_a_run_of_the_old_format_is_refused(
     ):
         argv = [str(tmp_path / word) if word in ("old", "all") else word for word in argv]
         assert run(argv) == 4
-        assert "format 1, this crosscue reads 4: replay again" in capsys.readouterr().err
+        assert REFUSAL in capsys.readouterr().err
     assert _replay(drives / "D-0", manifest.parent, "--resume") == 4
-    assert "format 1, this crosscue reads 4: replay again" in capsys.readouterr().err
+    assert REFUSAL in capsys.readouterr().err
 
 
 def test_a_run_is_the_same_bytes_from_wherever_it_is_made(

@@ -88,7 +88,7 @@ def _changed(run: RunFolder, **changes: Any) -> RunFolder:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"format_version": 2}, r"format 2, this crosscue reads 4: replay again"),
+        ({"format_version": 2}, rf"format 2, this crosscue reads {FORMAT_VERSION}: replay again"),
         ({"format_version": None}, r"format None"),
         ({"stage": "dream"}, r"stage: .*'dream'.*replay again"),
         ({"settings": {"version": 1, "wings": 2}}, r"settings: wings: extra inputs.*replay again"),

@@ -1,0 +1,118 @@
+"""A lit lens is told from a housing seen from behind: drawn ones, and real ones judged by eye."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.ranging.lens import Lens, lens_of, with_lenses
+from crosscue.detectors.result_cache import ResultCache
+from crosscue.replay.base import Bytes
+from support.data import shared
+
+BGR = {"red": (40, 30, 230), "yellow": (20, 180, 240), "green": (200, 230, 60)}
+WALL = (150, 180, 205)
+BOX = np.array([20.0, 10.0, 44.0, 62.0])
+
+
+def housing(lit: str | None, at: int = 0) -> Bytes:
+    """A dark housing of three lenses before a pale wall."""
+    picture = np.full((80, 64, 3), WALL, np.uint8)
+    picture[10:62, 20:44] = (45, 40, 38)
+    for i in range(3):
+        colour = BGR[lit] if lit is not None and i == at else (60, 50, 55)
+        cv2.circle(picture, (32, 18 + 18 * i), 7, colour, -1)
+    return picture
+
+
+@pytest.mark.parametrize(("colour", "at"), [("red", 0), ("yellow", 1), ("green", 2)])
+def test_a_lit_lens_is_found_wherever_it_is(colour: str, at: int) -> None:
+    assert lens_of(housing(colour, at), BOX) == colour
+
+
+def test_a_housing_from_behind_is_dark_also_before_a_coloured_wall() -> None:
+    behind = housing(None)
+    assert lens_of(behind, BOX) == "dark"
+
+    # A box drawn wide shows some of a red wall on either side: high and narrow, no lens.
+    red = behind.copy()
+    red[:, :20], red[:, 44:] = BGR["red"], BGR["red"]
+    assert lens_of(red, BOX + np.array([-3.0, 0.0, 3.0, 0.0])) == "dark"
+
+
+def test_a_spot_too_small_or_too_large_for_a_lens_is_none() -> None:
+    for across in (1, 30):
+        picture = housing(None)
+        cv2.circle(picture, (32, 36), across, BGR["red"], -1)
+        assert lens_of(picture, BOX) == "dark"
+
+
+def test_what_is_too_small_or_grey_or_outside_says_nothing() -> None:
+    picture = housing("red")
+
+    assert lens_of(picture, BOX * 0.2) == "unknown"
+    assert lens_of(picture[:, :, 0].copy(), BOX) == "unknown"
+    assert lens_of(picture, BOX + 200.0) == "unknown"
+
+
+def test_only_lights_are_looked_at_in_the_pixels_that_there_are_and_the_cache_keeps_it(
+    tmp_path: Path,
+) -> None:
+    boxes = np.array([2.0 * BOX, 2.0 * BOX])
+    found = Detections(7, (128, 160), boxes, np.ones(2), ("traffic light", "car"), (b"", b""))
+    frame = Frame(7, "front", housing("green", 2), (128, 160))
+
+    seen = with_lenses(found, frame, ("traffic light",))
+
+    assert seen.lenses == ("green", "")
+    assert with_lenses(found, frame, ("ampel",)).lenses == ()
+    assert seen.above(1.0).lenses == seen.lenses
+    with ResultCache(tmp_path / "kept.sqlite") as cache:
+        cache.put([(b"picture", "detector", seen)])
+        kept = cache.get(b"picture", "detector", 9)
+    assert isinstance(kept, Detections)
+    assert kept.lenses == seen.lenses
+    with pytest.raises(ValueError, match="lenses: want 2 or none, got 1"):
+        replace(found, lenses=("red",))
+
+
+@pytest.mark.parametrize("colour", ["red", "yellow", "green"])
+def test_real_lit_lights_are_seldom_another_colour(colour: Lens) -> None:
+    """60 crops each from LISA, all lit, 32 px across and squeezed: a hard case, as is said."""
+    files = sorted((shared("signs/traffic_light_state_crops") / colour).glob("*.jpg"))
+    found = Counter(_whole(cv2.imread(str(file))) for file in files)
+
+    assert len(files) == 60
+    assert found[colour] >= 30
+    assert len(files) - found[colour] - found["dark"] <= 6
+
+
+def _whole(picture: object) -> Lens:
+    pixels = np.asarray(picture, np.uint8)
+    return lens_of(pixels, np.array([0.0, 0.0, pixels.shape[1], pixels.shape[0]]))
+
+
+@pytest.mark.parametrize(
+    ("frame", "box", "lens"),
+    [
+        (0, (722, 292, 744, 339), "dark"),
+        (0, (932, 365, 948, 397), "green"),
+        (60, (660, 234, 686, 289), "dark"),
+        (60, (766, 329, 782, 363), "red"),
+        (79, (264, 282, 283, 330), "dark"),
+        (79, (572, 182, 608, 256), "dark"),
+        (79, (732, 320, 755, 366), "red"),
+        (79, (919, 330, 941, 375), "green"),
+    ],
+)
+def test_lights_of_a_real_crossing_as_seen_by_eye(
+    frame: int, box: tuple[int, int, int, int], lens: Lens
+) -> None:
+    folder = shared("sequences/pandaset_002") / "camera/front_camera"
+    picture = np.asarray(cv2.imread(str(folder / f"{frame:02d}.jpg")), np.uint8)
+
+    assert lens_of(picture, np.array(box, np.float64)) == lens
