@@ -23,10 +23,9 @@ from crosscue.replay.base import BLOCK_ROWS, Block, CanFrames, Ledger, Table
 from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import Mounting
-from crosscue.replay.mobileye.layout import Field, Message, layout
+from crosscue.replay.mobileye.layout import Columns, Field, Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.mobileye.tables import table_block
-from crosscue.replay.mobileye.wire import Columns
 
 ROUNDS: Final = 7
 IMAGES: Final = 3000

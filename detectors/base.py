@@ -8,7 +8,7 @@ from typing import Any, Protocol, Self, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.base import Bytes, Floats
+from crosscue.replay.columns import Bytes, Floats
 
 
 @dataclass(frozen=True, slots=True)

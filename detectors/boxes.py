@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 
 def overlaps(box: Floats, others: Floats) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from crosscue.replay.base import VehicleError
+from crosscue.replay.errors import VehicleError
 
 
 def chosen_device(asked: str, who: str) -> torch.device:

@@ -14,7 +14,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Final, cast
 
-from crosscue.replay.base import UsageError, VehicleError
+from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.plugins import GROUPS
 
 from .base import Choice, Detector

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 _BASE: Final = 48
 _MORE: Final = 0x20

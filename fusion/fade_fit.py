@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.fusion import Fade
 
 from .annotated_approach import AnnotatedApproach, Bools

@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.fusion.situation import Situation
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
 
 from .annotated_approach import NOT_LOOKED, AnnotatedApproach

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 TWO_PI: Final = 2.0 * math.pi
 

@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from . import pose_filter
 from .angles import wrap

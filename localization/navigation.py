@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .angles import wrap
 

@@ -20,7 +20,7 @@ from typing import Final, Literal, NamedTuple, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 Bools: TypeAlias = NDArray[np.bool_]
 TurnKind: TypeAlias = Literal["yaw rate", "steering"]

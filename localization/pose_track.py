@@ -28,7 +28,7 @@ from typing import Final, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 from .angles import wrap
 from .ekf import PoseBelief, coast, packed, unpacked

@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import LogError, UnknownFormatError
+from crosscue.replay.errors import LogError, UnknownFormatError
 
 from .plugins import loaded
 

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
 from crosscue.replay.base import Block, Ledger, Readable, Selection
 
-from .signals.extractor import Extractor
 from .signals.kinds import Plan, Samples, Signal
 
 WIDTH_NS: Final = 1_000_000_000
@@ -31,6 +30,23 @@ class Window:
     start_ns: int
     end_ns: int
     samples: Mapping[Signal, Samples]
+
+
+class Extracting(Protocol):
+    """What gives the samples of a log's blocks, as ``replay.signals.extractor.Extractor`` does."""
+
+    @property
+    def ledger(self) -> Ledger:
+        """Where skips are reported."""
+        ...
+
+    def __call__(self, block: Block) -> Iterator[Samples]:
+        """The samples of one block."""
+        ...
+
+    def finish(self) -> Iterator[tuple[str, Samples]]:
+        """What was held back until the log's end, by topic."""
+        ...
 
 
 @dataclass(slots=True)
@@ -60,7 +76,7 @@ class _Progress:
 
 def windows(
     logs: Sequence[Readable],
-    extractors: Sequence[Extractor],
+    extractors: Sequence[Extracting],
     selections: Sequence[Selection],
     planned: Plan,
     width_ns: int = WIDTH_NS,

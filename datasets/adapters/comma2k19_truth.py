@@ -10,7 +10,7 @@ import numpy as np
 from crosscue.datasets.geodesy import ecef_to_enu_matrix, ecef_to_geodetic
 from crosscue.datasets.truth.truth import Origin, Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
-from crosscue.replay.base import LogFormatError
+from crosscue.replay.errors import LogFormatError
 
 from .npy import read_column
 

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Floats, Int64s, Table
+from crosscue.replay.columns import Floats, Int64s, Table
 
 COLUMNS: Final = (
     "lat", "lon", "alt", "roll", "pitch", "yaw",

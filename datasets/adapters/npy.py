@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from crosscue.replay.base import LogFormatError
+from crosscue.replay.errors import LogFormatError
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.random import Generator
 
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 WHEELBASE_M: Final = 2.7
 TRACK_WIDTH_M: Final = 1.55

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.detectors.decoders.base import Guess, Interface, static
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 
 from .class_names import COCO_80, COCO_90, meaning_of
 from .recognise import DEFAULT_SIDE_PX, size_in

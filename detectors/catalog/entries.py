@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import UsageError, VehicleError
+from crosscue.replay.errors import UsageError, VehicleError
 
 from .card import ModelCard, WeightFile, read_card
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 from crosscue.replay.files.transfer import Progress, download, is_there, take
 
 from .card import ModelCard, WeightFile

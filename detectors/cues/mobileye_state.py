@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS, Samples
 from crosscue.replay.vehicle.mobileye_cues import Past
 

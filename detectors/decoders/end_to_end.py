@@ -6,7 +6,7 @@ from typing import Literal
 
 from typing_extensions import override
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .base import (
     BoxOutput,

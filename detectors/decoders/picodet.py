@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from typing_extensions import override
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .base import (
     BoxOutput,

@@ -8,7 +8,7 @@ from typing import Final, Literal
 import numpy as np
 from typing_extensions import override
 
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 from .base import (
     Array,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any
 
-from crosscue.replay.base import VehicleError
+from crosscue.replay.errors import VehicleError
 
 Size = tuple[int, int]
 

@@ -24,7 +24,7 @@ from crosscue.detectors.catalog.card import (
 from crosscue.detectors.catalog.entries import weights_folder
 from crosscue.detectors.decoders.base import Array, named
 from crosscue.detectors.settings import Proportion, Settings, identity_of, settings_of
-from crosscue.replay.base import VehicleError, one_line
+from crosscue.replay.errors import VehicleError, one_line
 
 from .backends import Network, load_network
 from .box_model import BoxModel

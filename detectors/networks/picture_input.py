@@ -9,7 +9,7 @@ import numpy as np
 
 from crosscue.detectors.catalog.card import Input
 from crosscue.detectors.decoders.base import Array, Size
-from crosscue.replay.base import Bytes, Floats
+from crosscue.replay.columns import Bytes, Floats
 
 _AXES: Final = {"nchw": (2, 0, 1), "chw": (2, 0, 1), "nhwc": (0, 1, 2)}
 

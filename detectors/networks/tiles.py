@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from crosscue.detectors.catalog.card import Tiles
 from crosscue.detectors.decoders.base import Size
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 Corner = tuple[int, int]
 EDGE_PX = 2.0

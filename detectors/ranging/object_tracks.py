@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .lens import HUES
 from .range_from_motion import SIZES, MotionRange, SizePrior, range_from_motion

@@ -17,7 +17,7 @@ from pydantic import Field
 
 from crosscue.detectors.base import Detections, Detector, Found, Frame, View
 from crosscue.detectors.settings import Proportion, Settings, identity_of, settings_of
-from crosscue.replay.base import Bytes, Floats, Int64s
+from crosscue.replay.columns import Bytes, Floats, Int64s
 
 from .matching import Counts, Words, nearest, window_counts
 from .templates import AMERICAN, LABELS, Drawing, Kind, drawings

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Int64s
+from crosscue.replay.columns import Int64s
 
 Words = NDArray[np.uint64]
 Counts = NDArray[np.int32]

@@ -14,7 +14,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 
 Kind = Literal["one way left", "one way right", "do not enter", "no entry"]
 KINDS: Final[tuple[Kind, ...]] = ("one way left", "one way right", "do not enter", "no entry")

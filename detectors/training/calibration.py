@@ -17,7 +17,7 @@ from crosscue.detectors.base import Detections
 from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Calibration
 from crosscue.detectors.rle import area_px
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .annotations import Labelled, LabelledPicture, LabelledSet
 from .operating_point import Judged

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.boxes import overlaps
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.rle import area_px, encode
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 
 from .annotations import LabelledPicture, LabelledSet, mask_of
 from .samples import read_picture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from crosscue.eval.batch.jobs import Engine
 from crosscue.eval.batch.processes import Processes
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 
 
 def engine_of(workers: int | None, ray: str | None) -> Engine:

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from crosscue.replay.base import CrosscueError, UsageError, one_line
+from crosscue.replay.errors import CrosscueError, UsageError, one_line
 
 LOCAL: Final = "local"
 WAIT_S: Final = 5.0

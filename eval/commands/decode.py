@@ -10,7 +10,8 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import add_log_arguments, open_part, print_result
+from crosscue.eval.commands.shared.drive_part import open_part
+from crosscue.eval.commands.shared.options import add_log_arguments, print_result
 from crosscue.eval.commands.shared.progress import progress_line
 
 

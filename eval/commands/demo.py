@@ -27,8 +27,7 @@ from crosscue.eval.commands.shared.progress import (
 )
 from crosscue.eval.interface.demo import KnownDrive, fetch_drive, show_drive, simulated
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.replay.base import UsageError
-from crosscue.replay.safe_text import visible
+from crosscue.replay.base import UsageError, visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

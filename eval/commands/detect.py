@@ -13,11 +13,8 @@ import argparse
 from pathlib import Path
 
 from crosscue.eval.commands.shared.detectors import add_detector_arguments, cache_of, detectors_of
-from crosscue.eval.commands.shared.options import (
-    add_log_arguments,
-    open_part,
-    print_json,
-)
+from crosscue.eval.commands.shared.drive_part import open_part
+from crosscue.eval.commands.shared.options import add_log_arguments, print_json
 from crosscue.eval.commands.shared.progress import DriveLine, is_shown
 from crosscue.eval.interface.runs import detect_drive
 from crosscue.eval.pipeline.outcome import DetectOutcome

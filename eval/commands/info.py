@@ -14,12 +14,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.eval.commands.shared.options import (
-    add_part_arguments,
-    limits_of,
-    open_part,
-    print_json,
-)
+from crosscue.eval.commands.shared.drive_part import open_part
+from crosscue.eval.commands.shared.options import add_part_arguments, limits_of, print_json
 from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.interface.logs import open as open_drive
 from crosscue.replay.vehicle.vehicle import load

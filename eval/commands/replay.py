@@ -31,11 +31,8 @@ from crosscue.eval.batch.jobs import (
 )
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
 from crosscue.eval.commands.shared.detectors import add_detector_arguments, cache_of, detectors_of
-from crosscue.eval.commands.shared.options import (
-    add_part_arguments,
-    open_part,
-    print_json,
-)
+from crosscue.eval.commands.shared.drive_part import open_part
+from crosscue.eval.commands.shared.options import add_part_arguments, print_json
 from crosscue.eval.commands.shared.outcome import as_json, summary
 from crosscue.eval.commands.shared.progress import DriveLine, DrivesLine, is_shown
 from crosscue.eval.interface.runs import replay_drive

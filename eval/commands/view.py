@@ -23,7 +23,7 @@ from crosscue.eval.commands.shared.options import (
     refuse_existing,
 )
 from crosscue.eval.interface.runs import open_run, save_recording
-from crosscue.replay.base import CrosscueError, UsageError
+from crosscue.replay.errors import CrosscueError, UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

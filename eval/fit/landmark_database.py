@@ -14,7 +14,6 @@ import numpy as np
 
 from crosscue.datasets.truth.tum import heading_rad
 from crosscue.detectors.images import Encoded
-from crosscue.eval.pipeline.clocks import probe_clocks
 from crosscue.eval.pipeline.landmarks import UNDECODABLE
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.pose.score import load_truth
@@ -36,7 +35,7 @@ from crosscue.replay.base import (
     VehicleError,
     read_at_most,
 )
-from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan
 from crosscue.replay.signals.plan import camera_of, with_pictures
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -146,8 +145,7 @@ def camera_frames(
     log, topic = logs[camera[0]], camera[1]
     planned = with_pictures(Plan((), {}), camera)
     wanted = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
-    probe = Extractor(planned, vehicle, camera[0], Ledger(""))
-    clocks = probe_clocks(log, probe, wanted)
+    clocks = probe_clocks(log, planned, vehicle, camera[0], wanted)
     found: list[Block] = []
     extractor = Extractor(
         planned, vehicle, camera[0], ledgers[camera[0]], clocks, on_pictures=found.append

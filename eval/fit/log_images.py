@@ -11,7 +11,6 @@ import numpy as np
 
 from crosscue.datasets.truth.annotations import LogPictures
 from crosscue.detectors.images import encoded, size_of
-from crosscue.eval.pipeline.clocks import probe_clocks
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     Block,
@@ -28,7 +27,7 @@ from crosscue.replay.opening import open_log
 from crosscue.replay.readers.images.files import SUFFIXES
 from crosscue.replay.readers.time_file import find_time_file, read_time_file
 from crosscue.replay.readers.timed_files import list_files, pair
-from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.stamp_watch import StampWatch
@@ -49,7 +48,7 @@ def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT_LIMITS) 
         topic = camera[1]
         planned = Plan((Source(0, topic, ()),), {})
         wanted = Selection(frozenset({topic.name}))
-        clocks = probe_clocks(log, Extractor(planned, vehicle, 0, Ledger("")), wanted)
+        clocks = probe_clocks(log, planned, vehicle, 0, wanted)
         times: list[np.typing.NDArray[np.int64]] = []
         sizes: list[tuple[int, int]] = []
 

@@ -8,7 +8,6 @@ from typing import Final
 
 from crosscue.detectors.images import Encoded, encoded
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
-from crosscue.eval.pipeline.clocks import probe_clocks
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     MIB,
@@ -24,7 +23,7 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_log
-from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle, load
@@ -85,7 +84,7 @@ def _camera(log: Log, vehicle: Vehicle) -> Iterator[tuple[int, Encoded]]:
         raise LogError(f"{log.path}: no camera in the log; signs need its pictures")
     planned = Plan((Source(0, camera[1], ()),), {})
     wanted = Selection(frozenset({camera[1].name}))
-    clocks = probe_clocks(log, Extractor(planned, vehicle, 0, Ledger("")), wanted)
+    clocks = probe_clocks(log, planned, vehicle, 0, wanted)
     waiting: list[Block] = []
     extractor = Extractor(
         planned, vehicle, 0, Ledger(str(log.path)), clocks, on_pictures=waiting.append

@@ -15,7 +15,7 @@ from crosscue.eval.interface.runs import (
     score_run,
 )
 from crosscue.eval.interface.simulate import simulate_approach
-from crosscue.replay.base import CrosscueError, UsageError
+from crosscue.replay.errors import CrosscueError, UsageError
 
 REAL: Final = "pandaset_002"
 MODEL: Final = "yolox-nano"

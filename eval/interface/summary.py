@@ -91,8 +91,8 @@ def summary_of(
     """
     if quick:
         return DriveSummary(tuple(map(quick_summary, logs)), None)
-    planned, clocks = plan_for_time(logs, vehicle, selection)
-    watches = [LogWatch(i, planned, vehicle, clocks[i]) for i in range(len(logs))]
+    planned, wheels = plan_for_time(logs, vehicle, selection)
+    watches = [LogWatch(i, planned, vehicle, wheels[i]) for i in range(len(logs))]
     found = tuple(
         summarise(log, _watched(watch, progress), selection)
         for log, watch in zip(logs, watches, strict=True)

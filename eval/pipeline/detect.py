@@ -34,13 +34,13 @@ from crosscue.eval.runs.manifest import (
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.replay.base import Block, Ledger, Log, Selection, VehicleError, versions
-from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle
 
-from .clocks import clock_rows, probe_clocks
+from .clocks import clock_rows
 from .drive_time import camera_timeline, time_segments
 from .empty_result import empty_result, nothing_left
 
@@ -127,8 +127,7 @@ def detect_into(
     ledger = Ledger(log_names(logs)[camera[0]])
     planned = Plan((Source(camera[0], topic, ()),), {})
     narrowed = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
-    probe = Extractor(planned, vehicle, camera[0], Ledger(""))
-    clocks = probe_clocks(log, probe, narrowed)
+    clocks = probe_clocks(log, planned, vehicle, camera[0], narrowed)
     timeline = timeline or camera_timeline(logs, vehicle, selection, camera)
     clock = timeline.clock(camera[0])
     extractor = Extractor(
@@ -198,7 +197,7 @@ def detect_into(
                     )
                     for one, choice in zip(named, choices, strict=True)
                 ),
-                clocks=(clock_rows(extractor),),
+                clocks=(clock_rows(extractor.clocks, extractor.watch.reports()),),
                 account=made,
                 counts=DetectCounts(
                     frames=runner.counts.frames,

@@ -8,16 +8,13 @@ import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import TimeSegments
-from crosscue.replay.base import Ledger, Log, Selection, Topic, UsageError, VehicleError
-from crosscue.replay.clocks.clock import Clock
-from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.base import Log, Selection, Topic, UsageError, VehicleError
+from crosscue.replay.signals.extractor import Extractor, probe_clocks, wheels_only
 from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import plan, with_pictures
 from crosscue.replay.time.scan import scan
 from crosscue.replay.time.segments import Timeline, gaps_text
 from crosscue.replay.vehicle.vehicle import Vehicle
-
-from .clocks import probe_clocks
 
 
 def drive_timeline(
@@ -44,11 +41,11 @@ def drive_timeline(
     if camera is not None:
         planned = with_pictures(planned, camera)
     selections = selections_of(logs, planned, selection)
-    clocks = [
-        probe_clocks(log, Extractor(planned, vehicle, i, Ledger("")), selections[i])
+    wheels = [
+        wheels_only(planned, vehicle, i, probe_clocks(log, planned, vehicle, i, selections[i]))
         for i, log in enumerate(logs)
     ]
-    return scan(logs, planned, vehicle, selections, clocks, known)
+    return scan(logs, planned, vehicle, selections, wheels, known)
 
 
 def camera_timeline(
@@ -64,7 +61,7 @@ def camera_timeline(
     except VehicleError:
         planned = with_pictures(Plan((), {}), camera)
         selections = selections_of(logs, planned, selection)
-        return scan(logs, planned, vehicle, selections, [{} for _ in logs])
+        return scan(logs, planned, vehicle, selections, _no_wheels(planned, vehicle, len(logs)))
 
 
 def refuse_other_segments(run: RunFolder, timeline: Timeline) -> None:
@@ -90,14 +87,14 @@ def refuse_other_segments(run: RunFolder, timeline: Timeline) -> None:
 
 def whole_timeline(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> Timeline:
     """As ``drive_timeline``, over every topic: for who writes all of them."""
-    planned, clocks = plan_for_time(logs, vehicle, selection)
-    return scan(logs, planned, vehicle, [selection] * len(logs), clocks)
+    planned, wheels = plan_for_time(logs, vehicle, selection)
+    return scan(logs, planned, vehicle, [selection] * len(logs), wheels)
 
 
 def plan_for_time(
     logs: Sequence[Log], vehicle: Vehicle, selection: Selection
-) -> tuple[Plan, list[dict[str, Clock]]]:
-    """Where the wheel speeds come from, and the clock of each log's topics.
+) -> tuple[Plan, list[Extractor]]:
+    """Where the wheel speeds come from, and what reads them, for each log.
 
     Without wheel speeds to choose, nothing is planned: set-backs are found all the same.
     """
@@ -105,16 +102,20 @@ def plan_for_time(
     try:
         planned = plan(topics, vehicle)
     except VehicleError:
-        return Plan((), {}), [{} for _ in logs]
+        planned = Plan((), {})
+        return planned, _no_wheels(planned, vehicle, len(logs))
     wheels = planned.source_of(Signal.WHEEL_SPEEDS)
     planned = Plan(() if wheels is None else (wheels,), {})
     selections = selections_of(logs, planned, selection)
-    return planned, [
-        probe_clocks(log, Extractor(planned, vehicle, i, Ledger("")), selections[i])
-        if selections[i].topics
-        else {}
+    clocks = [
+        probe_clocks(log, planned, vehicle, i, selections[i]) if selections[i].topics else {}
         for i, log in enumerate(logs)
     ]
+    return planned, [wheels_only(planned, vehicle, i, used) for i, used in enumerate(clocks)]
+
+
+def _no_wheels(planned: Plan, vehicle: Vehicle, logs: int) -> list[Extractor]:
+    return [wheels_only(planned, vehicle, i, {}) for i in range(logs)]
 
 
 def selections_of(logs: Sequence[Log], planned: Plan, selection: Selection) -> list[Selection]:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from crosscue.eval.pipeline.outcome import (
@@ -49,7 +50,7 @@ from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.eval.runs.tables.table_sink import TableSink
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.base import Ledger, Log, Selection, Topic, sha256_of, versions
-from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import camera_of, plan, with_pictures
 from crosscue.replay.time.segments import (
@@ -63,7 +64,7 @@ from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.windows import windows
 
-from .clocks import clock_changes, clock_rows, probe_clocks
+from .clocks import clock_changes, clock_rows
 from .drive_time import drive_timeline, refuse_other_segments, selections_of, time_segments
 from .empty_result import empty_result, silent_roles
 from .landmarks import looking
@@ -151,7 +152,9 @@ def estimate_into(
         *_of_detecting(found),
         *stage.notices,
         *stage.doubts(),
-        *clock_changes(reading.extractors),
+        *chain.from_iterable(
+            clock_changes(each.clocks, each.watch.reports()) for each in reading.extractors
+        ),
     )
     write_manifest(
         run,
@@ -161,7 +164,9 @@ def estimate_into(
             selection=part_of(selection),
             settings=vehicle,
             sources=_sources(reading.planned, logs),
-            clocks=tuple(clock_rows(extractor) for extractor in reading.extractors),
+            clocks=tuple(
+                clock_rows(each.clocks, each.watch.reports()) for each in reading.extractors
+            ),
             account=made,
             counts=EstimateCounts(**stage.counts()),
             time=time_segments(timeline),
@@ -254,7 +259,7 @@ class _Reading:
             timeline = drive_timeline(logs, vehicle, selection, self.camera, known)
         self.timeline = timeline
         clocks = [
-            probe_clocks(log, Extractor(self.planned, vehicle, i, Ledger("")), self.selections[i])
+            probe_clocks(log, self.planned, vehicle, i, self.selections[i])
             for i, log in enumerate(logs)
         ]
         self.extractors = [

@@ -25,7 +25,7 @@ from crosscue.detectors.base import Detections
 from crosscue.detectors.ranging.object_tracks import Facing, Motion, ObjectTracks, Track
 from crosscue.fusion.approaches import FrameEvidence, RangePosterior
 from crosscue.fusion.intersection_range import Reference
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.cue_table import TRAFFIC_LIGHT
 from crosscue.replay.vehicle.vehicle import Vehicle
 

@@ -28,7 +28,7 @@ from crosscue.localization.pose_track import (
     TrackSettings,
     TrackState,
 )
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from crosscue.replay.signals.kinds import Plan, Samples, Signal
 from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Segment, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle

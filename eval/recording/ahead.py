@@ -15,7 +15,7 @@ import rerun as rr
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
 from crosscue.eval.scoring.truth import TrueRanges
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from crosscue.replay.mobileye.geometry import evaluate
 from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.vehicle.vehicle import Vehicle

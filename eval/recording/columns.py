@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .drive_time import DriveTime
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import rerun as rr
 
-from crosscue.replay.base import Int64s
+from crosscue.replay.columns import Int64s
 
 TIMELINE: Final = "drive"
 """Not ``log_time``: under that name the viewer keeps the wall clock of the logging itself."""

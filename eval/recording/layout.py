@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import rerun.blueprint as rrb
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .ahead import ASIDE_M, BEHIND_M, FAR_M
 from .drive_time import TIMELINE

@@ -26,7 +26,7 @@ from crosscue.detectors.cues.cars import (
 )
 from crosscue.detectors.cues.road import RoadShares, road_shares
 from crosscue.eval.runs.tables.stored_frames import StoredFrame
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .columns import Colour, Shapes, arrows, boxes, labelled_strips, strips

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 from .colours import ELLIPSE, END, ESTIMATE, LANDMARK, START, TRUTH
 from .columns import Shapes, strips_above

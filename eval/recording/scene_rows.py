@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.replay.base import Int64s
+from crosscue.replay.columns import Int64s
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import LABELS
 from crosscue.eval.scoring.truth import TrueRanges
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle import cue_table
 from crosscue.replay.vehicle.fusion import NOT_FEATURES
 from crosscue.replay.vehicle.vehicle import Vehicle

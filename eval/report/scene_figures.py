@@ -16,7 +16,7 @@ from crosscue.eval.scoring.belief import BeliefScore
 from crosscue.eval.scoring.columns import NONE
 from crosscue.eval.scoring.cues import CueFrames
 from crosscue.eval.scoring.ranges import RangeJudged, RangeScore
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.cue_table import CUES
 
 from .svg_plot import Drawing, Panel

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from markupsafe import Markup, escape
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.stored_images import camera_of, picture_at
 from crosscue.eval.scoring.cues import CueFrames
 from crosscue.eval.scoring.runs import RunScored
-from crosscue.replay.base import CrosscueError
+from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Vehicle
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.datasets.truth.truth import Approach
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 from .columns import NONE, BeliefRows, RunTables
 from .intervals import Mean, Proportion, mean, share

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import AMBIGUOUS
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 from .columns import NONE, RunTables
 from .intervals import Mean, Proportion, mean, share

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import AMBIGUOUS
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.cue_spec import Scoring
 from crosscue.replay.vehicle.cue_table import CUES
 

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from crosscue.replay.base import SchemaError
+from crosscue.replay.errors import SchemaError
 
 from . import approaches as score_approaches
 from . import belief as score_belief

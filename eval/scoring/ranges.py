@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import AMBIGUOUS
 from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 from .columns import RunTables
 from .intervals import Mean, mean

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.eval.scoring.intervals import wilson
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 Z_95: Final = 1.959964
 REPLICATES: Final = 400

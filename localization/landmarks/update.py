@@ -28,7 +28,7 @@ from crosscue.localization.angles import wrap
 from crosscue.localization.ekf import PoseBelief, Updated
 from crosscue.localization.pose_filter import HEADING, SPEED
 from crosscue.localization.pose_track import ACCEPTED, REJECTED
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .database import REACH_SIGMAS, LandmarkDatabase, Nearby, Place
 from .features import Features, Match, Matcher

@@ -42,7 +42,7 @@ from crosscue.localization.pose_filter import (
     update,
     update_position,
 )
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from . import settings as settings_of
 from .parameters import Parameters, parameters_of

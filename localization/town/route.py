@@ -6,7 +6,7 @@ import math
 from typing import Final, NamedTuple
 
 from crosscue.localization.pose_filter import arc
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .parameters import Parameters
 from .streets import COSINES, HEADINGS_RAD, SINES, Streets, place_of, step_of

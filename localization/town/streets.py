@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .parameters import Parameters
 from .random_stream import Stream, below, uniform

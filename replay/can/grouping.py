@@ -9,7 +9,7 @@ from typing import Final, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import LENGTH_UNKNOWN, CanFrames
+from crosscue.replay.columns import LENGTH_UNKNOWN, CanFrames
 
 from .extract import Column, Extractor, Words
 from .layout import CanMessage

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from crosscue.replay.base import DATA
+from crosscue.replay.columns import DATA
 
 Loop = TypeVar("Loop", bound=Callable[..., None])
 

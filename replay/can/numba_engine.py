@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import CanFrames
+from crosscue.replay.columns import CanFrames
 
 from . import kernels
 from .extract import Column, Words, flip_and_bias, is_short_integer

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import DATA, LENGTH_UNKNOWN, CanFrames
+from crosscue.replay.columns import DATA, LENGTH_UNKNOWN, CanFrames
 
 from .extract import Words
 from .grouping import STANDARD_IDS, Columns, Grouped, Rules, Strange, Tables, words_of

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, Int64s
+from crosscue.replay.columns import Block, Int64s
 
 LATEST_NS: Final = 1 << 62
 """Stamps from the year 2116 on are nonsense; below it, differences fit into 64 bits."""

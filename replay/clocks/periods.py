@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 BINS_PER_OCTAVE: Final = 32
 _BINS: Final = 2 + 63 * BINS_PER_OCTAVE

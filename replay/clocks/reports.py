@@ -25,7 +25,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, Int64s
+from crosscue.replay.columns import Block, Int64s
 
 from .clock import LATEST_NS, Clock
 from .offset import ClockLine, OffsetWatch

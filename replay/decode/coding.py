@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from crosscue.replay.base import ImageCoding
+from crosscue.replay.columns import ImageCoding
 
 MAGIC_BYTES: Final = 12
 """As many first bytes as ``coding_of`` examines."""

@@ -9,7 +9,7 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Bytes, Int64s
+from crosscue.replay.columns import Bytes, Int64s
 
 from .plan import Plan, Value
 from .walk import Bools, Found, Rows, gather

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from crosscue.replay.base import Topic
+from crosscue.replay.columns import Topic
 
 SERVICE_EVENT: Final = "service event"
 NO_FEEDBACK_DEFINITION: Final = "action feedback without a complete definition"

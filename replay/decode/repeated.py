@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Bytes, Int64s, Messages
+from crosscue.replay.columns import Bytes, Int64s, Messages
 
 from .plan import Items, Plan, Run, Step, Text
 from .walk import Bools

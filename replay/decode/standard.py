@@ -28,6 +28,7 @@ from crosscue.replay.base import (
 
 from .coding import JPEG, MAGIC_BYTES, STREAMS, coding_of
 from .fields import Fields
+from .paths import quat, xyz
 from .plan import Plan
 from .refuse import BIG_ENDIAN, EMPTY_PICTURE, IMAGE_CODING, LONG_LENS, VIDEO_CODING
 from .walk import Bools, gather
@@ -84,16 +85,6 @@ def _table(**sources: str) -> Kind:
         return Table({name: fields.number(path.split(":")[0]) for name, path in sources.items()})
 
     return Kind(tuple(sources.values()), build)
-
-
-def xyz(columns: str, path: str) -> dict[str, str]:
-    """From column to field for the parts of a vector; ``columns`` has {} for the axis."""
-    return {columns.format(axis): f"{path}.{axis}" for axis in "xyz"}
-
-
-def quat(path: str) -> dict[str, str]:
-    """The same for a quaternion."""
-    return {f"quat_{axis}": f"{path}.{axis}" for axis in "xyzw"}
 
 
 _CARRIED: Final = np.where(np.arange(8) < np.arange(9)[:, None], 255, 0).astype(np.uint8)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.replay.base import Block, CanFrames, Images, Ledger, Messages, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.definition import definitions_of
-from crosscue.replay.decode.ros import RosDecoder
 from crosscue.replay.decode.type_names import ros2_spelling
 
 from .can import can_messages
@@ -18,6 +21,17 @@ from .ros1 import ros1_to_cdr
 from .tables import OwnTypes, table_messages
 
 __all__ = ["Encoder", "Encoders", "Outgoing", "Ros2Type"]
+
+
+@runtime_checkable
+class Walking(Protocol):
+    """A decoder that can tell which messages fit their definition."""
+
+    def walked(
+        self, block: Block, messages: Messages, ledger: Ledger
+    ) -> tuple[object, NDArray[np.intp]]:
+        """Fields of the messages that fit, and which of the block they are."""
+        ...
 
 
 @dataclass(slots=True)
@@ -42,7 +56,7 @@ class Encoders:
 
 def _cdr(topic: Topic) -> Encoder | None:
     decoder = decoder_for(topic)
-    if not isinstance(decoder, RosDecoder):
+    if not isinstance(decoder, Walking):
         return None
     name, encoding = ros2_spelling(topic.type_name), topic.schema_encoding
     if not topic.schema.strip() and not encoding:
@@ -63,7 +77,7 @@ class _AsStored:
     """
 
     type: Ros2Type
-    decoder: RosDecoder
+    decoder: Walking
 
     def __call__(self, block: Block, ledger: Ledger) -> list[Outgoing]:
         assert isinstance(block.rows, Messages)

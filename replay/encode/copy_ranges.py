@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Bytes, Int64s
+from crosscue.replay.columns import Bytes, Int64s
 
 FEW_LENGTHS: Final = 32
 """Copies of as many different lengths are made length by length; of more, one by one."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from crosscue.replay.base import SchemaError
 from crosscue.replay.decode.definition import (
     DURATION,
     PRIMITIVES,
@@ -18,6 +17,7 @@ from crosscue.replay.decode.definition import (
     Shape,
     well_known,
 )
+from crosscue.replay.errors import SchemaError
 
 SEPARATOR: Final = "=" * 80 + "\n"
 HEADER: Final = "std_msgs/msg/Header"

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 from crosscue.replay.decode.plan import Items, Plan, Run, Text
 
 ENCAPSULATION: Final = b"\x00\x01\x00\x00"

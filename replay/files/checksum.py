@@ -10,7 +10,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Final, cast
 
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 
 
 def _fastest() -> Callable[[bytes | memoryview | Bytes, int], int]:

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Int64s
+from crosscue.replay.columns import Int64s
 
 from .bits import Words
 

@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Int64s
+from crosscue.replay.columns import Int64s
 
 MS: Final = 1_000_000
 WRAP_NS: Final = 256 * MS

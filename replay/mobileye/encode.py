@@ -12,15 +12,15 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import DATA, Block, CanFrames, Floats, Int64s, Table
+from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table
 from crosscue.replay.mobileye.geometry import AT_REAR_AXLE, Mounting
 
 from .bits import Words, payloads_of
 from .clock import MS
-from .layout import UNKNOWN, VARIANTS, Message, layout
+from .layout import UNKNOWN, VARIANTS, Column, Columns, Message, layout
 from .settings import DEFAULTS, MobileyeSettings
 from .tables import floats, instance_of_lane, table_block, to_device
-from .wire import Column, Columns, Variant, variant_number, words_from
+from .wire import Variant, variant_number, words_from
 
 FRAME_NS: Final = 250_000
 """One frame of 8 bytes takes about this long at 500 kbit/s."""

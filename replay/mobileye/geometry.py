@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,14 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
 from crosscue.replay.base import SchemaError, toml_tree
 
+Column: TypeAlias = NDArray[np.generic]
+Columns: TypeAlias = dict[str, Column]
+"""By name: the columns of a message's fields, or of a table."""
 Kind: TypeAlias = Literal["real", "code", "flag"]
 Beyond: TypeAlias = Literal["refuse", "clip", "drop"]
 
@@ -264,3 +270,8 @@ def _formula(f: Field) -> str:
     raw = "raw" if not f.zero else f"(raw - {f.zero:g})"
     scaled = raw if f.scale == 1.0 else f"{raw} * {f.scale:g}"
     return scaled if f.per == 1.0 else f"{scaled} / {f.per:g}"
+
+
+def unit_of(f: Field) -> str:
+    """Unit of the column where its name does not carry it, as for ``Table.units``."""
+    return f.unit.rstrip("?") + " (unverified)" if f.unit.endswith("?") else ""

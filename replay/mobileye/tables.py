@@ -15,7 +15,7 @@ from typing import Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Block, Floats, Int64s, Table
+from crosscue.replay.columns import Block, Floats, Int64s, Table
 from crosscue.replay.mobileye.geometry import Mounting
 
 from .geometry import (
@@ -27,8 +27,7 @@ from .geometry import (
     turn_slope,
     vehicle_T_device,
 )
-from .layout import layout
-from .wire import Column, Columns, unit_of
+from .layout import Column, Columns, layout, unit_of
 
 LEFT: Final = 1
 RIGHT: Final = -1

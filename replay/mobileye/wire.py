@@ -14,13 +14,11 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 from .bits import Words, extract, place
-from .layout import UNKNOWN, VARIANTS, Field, Message
+from .layout import UNKNOWN, VARIANTS, Column, Columns, Field, Message
 
-Column: TypeAlias = NDArray[np.generic]
-Columns: TypeAlias = dict[str, Column]
 Variant: TypeAlias = NDArray[np.int8]
 """Shape (N,): the variant of each frame as a place in ``VARIANTS``, or ``UNKNOWN``."""
 
@@ -104,11 +102,6 @@ def dtype_of(message: Message, name: str) -> np.dtype[np.generic]:
     if same[0].kind == "code":
         return np.dtype(np.int16)
     return np.dtype(np.int8 if any(f.may_be_missing for f in same) else np.bool_)
-
-
-def unit_of(f: Field) -> str:
-    """Unit of the column where its name does not carry it, as for ``Table.units``."""
-    return f.unit.rstrip("?") + " (unverified)" if f.unit.endswith("?") else ""
 
 
 def _whole(value: Floats, dtype: np.dtype[np.generic]) -> Column:

@@ -20,7 +20,7 @@ from pathlib import Path
 from threading import Lock
 from typing import BinaryIO, Final, TypeVar
 
-from crosscue.replay.base import CrosscueError, LogError, one_line
+from crosscue.replay.errors import CrosscueError, LogError, one_line
 
 PIECE: Final = 4 << 20
 AHEAD: Final = 8 << 10

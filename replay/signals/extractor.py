@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, Images, Int64s, Ledger
+from crosscue.replay.base import Block, Images, Int64s, Ledger, Log, Selection
 from crosscue.replay.clocks.clock import Clock, times_of
 from crosscue.replay.clocks.reports import MAX_OFFSET_NS, ClockWatch
 from crosscue.replay.decode import Decoder, decoder_for
@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     from crosscue.replay.can.decode import BusDecoder
     from crosscue.replay.decode.packets import PacketDecoder
     from crosscue.replay.mobileye.samples import MobileyeStream
+
+
+PROBE_NS: Final = 10_000_000_000
+"""Log time examined before a clock is chosen for each topic."""
 
 
 def _no_pictures(block: Block) -> None:
@@ -196,3 +200,39 @@ class Extractor:
             elsewhere = all_ids(settings) if is_shared else ()
             self._buses[bus] = BusDecoder(database, bus, self.ledger, wanted, elsewhere=elsewhere)
         return self._buses[bus]
+
+
+def probe_clocks(
+    log: Log, planned: Plan, vehicle: Vehicle, number: int, selection: Selection
+) -> dict[str, Clock]:
+    """Which clock to use for each planned topic, judged by the log's first seconds.
+
+    Args:
+        log: Open.
+        planned: Which topics give which signals.
+        vehicle: The vehicle file.
+        number: Of the log in the plan.
+        selection: What will be read of the log.
+    """
+    extractor = Extractor(planned, vehicle, number, Ledger(""))
+    first_ns: int | None = None
+    for block in log.read(extractor.ledger, selection):
+        if not len(block):
+            continue
+        first_ns = int(block.log_ns[0]) if first_ns is None else first_ns
+        for _ in extractor(block):
+            pass
+        if int(block.log_ns[0]) - first_ns > PROBE_NS:
+            break
+    return {name: report.used for name, report in extractor.watch.reports().items()}
+
+
+def wheels_only(
+    planned: Plan, vehicle: Vehicle, number: int, clocks: Mapping[str, Clock]
+) -> Extractor:
+    """What gives the wheel speeds of one log's blocks and decodes nothing else."""
+    can = vehicle.can.model_copy(update={"yaw_rate": None, "steering": None})
+    source = planned.source_of(Signal.WHEEL_SPEEDS)
+    only = () if source is None else (replace(source, signals=(Signal.WHEEL_SPEEDS,)),)
+    lean = vehicle.model_copy(update={"can": can})
+    return Extractor(Plan(only, {}), lean, number, Ledger(""), clocks)

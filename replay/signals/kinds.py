@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Floats, Int64s, Topic
+from crosscue.replay.columns import Floats, Int64s, Topic
 
 
 class Signal(Enum):

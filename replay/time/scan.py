@@ -7,17 +7,15 @@ grow with the log: set-backs, strays, and where wheel speeds were silent.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from operator import attrgetter, itemgetter
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
 from crosscue.replay.base import Block, Ledger, Log, Selection
-from crosscue.replay.clocks.clock import Clock
-from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Samples, Signal, Source
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -26,6 +24,9 @@ from .stamp_watch import StampWatch
 
 SAME_NS: Final = 2_000_000_000
 """Set-backs of two topics or logs that differ by no more are one and the same."""
+
+WheelReader: TypeAlias = Callable[[Block], Iterable[Samples]]
+"""The wheel speeds of a block; ``wheels_only`` of ``replay.signals.extractor`` makes one."""
 
 
 @dataclass(slots=True)
@@ -41,7 +42,7 @@ class _Run:
 class _WheelRuns:
     """Follows the wheel speeds' times."""
 
-    extractor: Extractor
+    read: WheelReader
     max_silence_ns: int
     watch: StampWatch
     runs: list[_Run] = field(default_factory=list)
@@ -89,7 +90,7 @@ class _WheelRuns:
                 if (begin, end) == (first, stop)
                 else block.take(slice(begin - first, end - first))
             )
-            for samples in self.extractor(part):
+            for samples in self.read(part):
                 self._see(samples, era)
 
     def _is_stray(self, row: int) -> bool:
@@ -122,7 +123,7 @@ def scan(
     planned: Plan,
     vehicle: Vehicle,
     selections: Sequence[Selection],
-    clocks: Sequence[Mapping[str, Clock]],
+    wheels: Sequence[WheelReader],
     known: Timeline | None = None,
 ) -> Timeline:
     """Find a drive's time segments.
@@ -132,11 +133,11 @@ def scan(
         planned: Which topics will be used.
         vehicle: Limits stand under ``[time]``.
         selections: What will be read of each log.
-        clocks: Which clock each topic will use, for each log.
+        wheels: For each log, what reads the wheel speeds off its blocks.
         known: An earlier timeline of these logs: its shifts are kept, so that tables of both go
             together.
     """
-    watches = [LogWatch(number, planned, vehicle, clocks[number]) for number in range(len(logs))]
+    watches = [LogWatch(number, planned, vehicle, wheels[number]) for number in range(len(logs))]
     for watch, log, selection in zip(watches, logs, selections, strict=True):
         if selection.topics is None or selection.topics:
             for block in log.read(Ledger(""), selection):
@@ -150,15 +151,13 @@ class LogWatch:
     For who reads the log anyway; ``scan`` reads it for this alone.
     """
 
-    def __init__(
-        self, number: int, planned: Plan, vehicle: Vehicle, clocks: Mapping[str, Clock]
-    ) -> None:
+    def __init__(self, number: int, planned: Plan, vehicle: Vehicle, read: WheelReader) -> None:
         """Watch the log with this number in the plan."""
         wheels = planned.source_of(Signal.WHEEL_SPEEDS)
         self.topics: Final[dict[str, StampWatch]] = {}
         self._wheels: Final = wheels if wheels is not None and wheels.log == number else None
-        self._vehicle: Final = vehicle
-        self._clocks: Final = clocks
+        self._limit_ns: Final = round(vehicle.time.max_silence_s * 1e9)
+        self._read: Final = read
         self._following: _WheelRuns | None = None
 
     def add(self, block: Block) -> None:
@@ -170,9 +169,7 @@ class LogWatch:
         if self._wheels is None or block.topic != self._wheels.topic.name:
             return
         if self._following is None:
-            extractor = _wheels_only(self._wheels, self._vehicle, self._clocks)
-            limit_ns = round(self._vehicle.time.max_silence_s * 1e9)
-            self._following = _WheelRuns(extractor, limit_ns, watch)
+            self._following = _WheelRuns(self._read, self._limit_ns, watch)
         self._following.add(block)
 
     def finish(self) -> list[_Run]:
@@ -195,13 +192,6 @@ def timeline_from(
     aligned = [_Aligned(watch.topics) for watch in watches]
     log_clocks = _clocks(aligned, round(vehicle.time.unknown_gap_s * 1e9), known)
     return Timeline(_segments(aligned, log_clocks, runs, wheels, limit_ns), log_clocks)
-
-
-def _wheels_only(source: Source, vehicle: Vehicle, clocks: Mapping[str, Clock]) -> Extractor:
-    can = vehicle.can.model_copy(update={"yaw_rate": None, "steering": None})
-    only = Plan((replace(source, signals=(Signal.WHEEL_SPEEDS,)),), {})
-    lean = vehicle.model_copy(update={"can": can})
-    return Extractor(only, lean, source.log, Ledger(""), clocks)
 
 
 class _Aligned:

@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Int64s
+from crosscue.replay.columns import Int64s
 
 MIN_SET_BACK_NS: Final = 100_000_000
 STRAY_NS: Final = 1_000_000_000

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Final
 
-from crosscue.replay.base import Topic
+from crosscue.replay.columns import Topic
 from crosscue.replay.decode.type_names import ros2_spelling
 
 

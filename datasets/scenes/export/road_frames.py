@@ -9,7 +9,7 @@ import numpy as np
 
 from crosscue.datasets.scenes.drive import SceneSettings, world_of
 from crosscue.datasets.scenes.rendering.render import Renderer
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ from urllib.error import URLError
 import torch
 from torch import nn
 
-from crosscue.replay.base import VehicleError, one_line
+from crosscue.replay.errors import VehicleError, one_line
 
 from .checkpoint import Checkpoint, Facts
 from .network import Plan, build_network

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crosscue.replay.base import Int64s
+from crosscue.replay.columns import Int64s
 
 Boxes = NDArray[np.float32]
 FEW: Final = 1000

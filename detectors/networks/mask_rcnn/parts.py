@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 
 from .network import MEAN, SPREAD
 from .nms import FEW, likeliest_apart

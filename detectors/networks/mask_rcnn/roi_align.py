@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crosscue.replay.base import Int64s
+from crosscue.replay.columns import Int64s
 
 Grid = NDArray[np.float32]
 _ROUNDING: Final = 1e-6

@@ -18,7 +18,7 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import Found, Frame, RoadMask, View
 from crosscue.detectors.devices import chosen_device
 from crosscue.detectors.settings import Settings, identity_of, settings_of
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 
 from .checkpoint import RoadCheckpoint, load_road
 from .network import embedded_path, logits_of

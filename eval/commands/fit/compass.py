@@ -13,13 +13,13 @@ import argparse
 import math
 from pathlib import Path
 
+from crosscue.eval.commands.shared.drive_part import selection_of
 from crosscue.eval.commands.shared.options import (
     add_log_arguments,
     add_vehicle_output,
     check_vehicle_output,
     limits_of,
     print_json,
-    selection_of,
 )
 from crosscue.eval.fit.compass import fit, section_of, with_section
 from crosscue.localization.compass_fit import CompassFit

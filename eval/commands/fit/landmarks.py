@@ -16,6 +16,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
+from crosscue.eval.commands.shared.drive_part import selection_of
 from crosscue.eval.commands.shared.options import (
     add_part_arguments,
     add_vehicle_output,
@@ -23,7 +24,6 @@ from crosscue.eval.commands.shared.options import (
     limits_of,
     metres,
     print_json,
-    selection_of,
 )
 from crosscue.eval.fit.landmark_database import camera_frames, read_poses
 from crosscue.eval.fit.landmark_pairs import pairs_of_drive, pairs_of_table, with_min_score

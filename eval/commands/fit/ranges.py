@@ -25,7 +25,7 @@ from crosscue.eval.fit.range_pairs import (
     pairs_of_truth,
     together,
 )
-from crosscue.replay.base import OutputError, UsageError
+from crosscue.replay.errors import OutputError, UsageError
 
 PUBLISHED_SD_M = {"stop_sign": 1.7, "traffic_light": 5.9}
 

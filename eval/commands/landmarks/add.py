@@ -15,13 +15,8 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from crosscue.eval.commands.shared.options import (
-    add_part_arguments,
-    limits_of,
-    metres,
-    print_json,
-    selection_of,
-)
+from crosscue.eval.commands.shared.drive_part import selection_of
+from crosscue.eval.commands.shared.options import add_part_arguments, limits_of, metres, print_json
 from crosscue.eval.fit.landmark_database import (
     AddCounts,
     add_from_images,

@@ -17,7 +17,7 @@ from pathlib import Path
 from crosscue.detectors.catalog.fetch import Fetched, fetch
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, ProgressLine, progress_line
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 from crosscue.replay.files.transfer import Progress
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crosscue.eval.commands.shared.options import print_json
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 
 if TYPE_CHECKING:
     from crosscue.localization.town.settings import Drive

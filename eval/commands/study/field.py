@@ -18,7 +18,7 @@ import argparse
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.commands.shared.study import add_study_arguments, study_of, workers_of
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -20,7 +20,7 @@ from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.commands.shared.training import check_place, learnt_layouts_of
-from crosscue.replay.base import OutputError, UsageError
+from crosscue.replay.errors import OutputError, UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_result
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

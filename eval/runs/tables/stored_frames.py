@@ -14,7 +14,7 @@ from crosscue.detectors.cues.frame import Role, Seen, all_labels
 from crosscue.detectors.cues.road import RoadShares
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectorRow
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 NO_BOXES: Final = np.empty((0, 4))
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from crosscue.localization.angles import wrap
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 
 def nees_along_the_arc(row: Floats) -> float:

@@ -20,7 +20,7 @@ from crosscue.localization.town.drive import (
 )
 from crosscue.localization.town.settings import Drive
 from crosscue.localization.town.streets import Streets, has_way, place_of, step_of
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,7 @@ import numpy as np
 from crosscue.eval.studies.intervals import fraction_of, logistic
 from crosscue.eval.studies.pictures import COLOURS, figure, save
 from crosscue.localization.town.drive import Outcome
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .landmark_study import PUBLISHED_POINT, Cell, LandmarkResult
 from .settings import LandmarkStudy

@@ -25,7 +25,7 @@ from crosscue.eval.studies.page import Table
 from crosscue.eval.studies.words import km, percent
 from crosscue.localization.town.drive import Outcome
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .range_study import split
 from .settings import LandmarkStudy

@@ -11,7 +11,7 @@ import numpy as np
 
 from crosscue.eval.studies.pictures import COLOURS, figure, save
 from crosscue.localization.town.drive import Outcome
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .range_study import CompassResult, points
 

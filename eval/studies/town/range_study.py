@@ -19,7 +19,7 @@ from crosscue.eval.studies.intervals import Measured, fraction_of, mean_of, meas
 from crosscue.localization.town.drive import Outcome, Result, drive_many
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 from .settings import UNTIL_LOST, RangeStudy, changed
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from crosscue.replay.base import Int64s, Ledger
 from crosscue.replay.mobileye.bursts import NO_BURST
+from crosscue.replay.mobileye.layout import Columns
 from crosscue.replay.mobileye.settings import MobileyeSettings
-from crosscue.replay.mobileye.wire import Columns
 
 NOT_COME: Final = "obstacle messages announced by a status message that did not come"
 

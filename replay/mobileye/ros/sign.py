@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from crosscue.replay.mobileye.settings import LaneSign
 
 VOTES_WANTED: Final = 50

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from crosscue.replay.base import DATA, ERROR, REMOTE, Bytes, CanFrames, Int64s
+from crosscue.replay.columns import DATA, ERROR, REMOTE, Bytes, CanFrames, Int64s
 from crosscue.replay.readers.can_rows import FD_LENGTHS, IS_FD_LENGTH, FrameRows, joined, widened
 from crosscue.replay.readers.can_text.dialect import NO_ROWS
 

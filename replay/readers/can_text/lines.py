@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Bytes, Int64s
+from crosscue.replay.columns import Bytes, Int64s
 
 from .digits import BACK, FRONT, Words, words_of
 

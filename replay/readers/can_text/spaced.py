@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import DATA, CanFrames, Int64s
+from crosscue.replay.columns import DATA, CanFrames, Int64s
 from crosscue.replay.readers.can_rows import joined
 
 from .dialect import NO_ROWS, Fast, payloads, picked

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 from crosscue.replay.files.checksum import crc32
 from crosscue.replay.remote.ranges import RangedFile
 from crosscue.replay.seal.touched import Touched

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 from crosscue.replay.files.checksum import crc32
 
 from .records import BrokenRecordError, ChunkHead

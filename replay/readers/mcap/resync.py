@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Bytes, Int64s
+from crosscue.replay.columns import Bytes, Int64s
 
 from .bytes import ByteFile
 from .find import MAX_HEAD

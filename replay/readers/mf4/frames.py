@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import DATA, ERROR, REMOTE, Bytes, CanFrames, Int64s
+from crosscue.replay.columns import DATA, ERROR, REMOTE, Bytes, CanFrames, Int64s
 from crosscue.replay.readers.can_rows import FD_LENGTHS, IS_FD_LENGTH, FrameRows
 
 from .blocks import VARIABLE, VARIABLE_COMPACT, Channel, Group

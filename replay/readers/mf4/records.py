@@ -16,7 +16,7 @@ from typing import Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import BLOCK_ROWS, Bytes, Int64s
+from crosscue.replay.columns import BLOCK_ROWS, Bytes, Int64s
 
 from .blocks import VLSD_GROUP, DataGroup, Group
 from .stream import Stream

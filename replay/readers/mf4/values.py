@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 
 from .blocks import VIRTUAL, VIRTUAL_MASTER, Channel, Conversion
 

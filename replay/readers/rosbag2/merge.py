@@ -10,7 +10,7 @@ from typing import Final, cast
 
 import numpy as np
 
-from crosscue.replay.base import BLOCK_BYTES, BLOCK_ROWS, Block, Messages
+from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Block, Messages
 
 HELD_BYTES: Final = 16 * BLOCK_BYTES
 """Payload bytes held back at most; beyond it rows are given before their order is certain."""

@@ -11,7 +11,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import BLOCK_BYTES, BLOCK_ROWS, Int64s
+from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Int64s
 
 from .sqlite import FAULTS, Database
 from .tables import fetched

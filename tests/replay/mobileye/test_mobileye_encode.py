@@ -13,10 +13,9 @@ from crosscue.replay.base import Block, CanFrames, Floats, Ledger, Table
 from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.encode import FRAME_NS, bursts_of, encode_burst, encode_tables
 from crosscue.replay.mobileye.geometry import Mounting
-from crosscue.replay.mobileye.layout import Message, layout
+from crosscue.replay.mobileye.layout import Columns, Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.mobileye.tables import LEFT, RIGHT, table_block
-from crosscue.replay.mobileye.wire import Columns
 from support.mobileye_frames import MS, block_of, random_drive, random_words, values
 
 MOUNTED = MobileyeSettings(mounting=Mounting(1.85, -0.1, 0.02))
