@@ -17,8 +17,9 @@ from typing import Final
 import gtsam
 import numpy as np
 
-from crosscue.fusion.approaches import Approaches, FrameEvidence, SignRange
+from crosscue.fusion.approaches import Approaches
 from crosscue.fusion.belief import begin, multiply, probabilities, source_speaker
+from crosscue.fusion.evidence import FrameEvidence, SignRange
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
 from crosscue.fusion.situation import Situation

@@ -16,8 +16,6 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Final, Literal, TypeVar
 
-from .errors import one_line
-
 Kind = Literal["detector", "cue", "reader", "dataset"]
 T = TypeVar("T")
 
@@ -71,7 +69,7 @@ def load(point: EntryPoint, wanted: type[T]) -> T:
         found = point.load()
     except (Exception, SystemExit) as error:
         # Whatever another package does when imported must not end crosscue.
-        raise ImportError(f"{type(error).__name__}: {one_line(error, 300)}") from None
+        raise ImportError(f"{type(error).__name__}: {_short(error)}") from None
     if not isinstance(found, wanted):
         raise ImportError(
             f"{point.value} is {type(found).__name__}; expected {wanted.__name__}"
@@ -101,6 +99,11 @@ def loaded(kind: Kind, wanted: type[T], taken: Collection[str]) -> Iterator[tupl
             continue
         seen.add(point.name)
         yield point.name, found
+
+
+def _short(error: BaseException) -> str:
+    """On one line, whatever another package says."""
+    return " ".join(str(error).split())[:300]
 
 
 def described(point: EntryPoint, kind: Kind, problem: str) -> Plugin:

@@ -23,7 +23,7 @@ from typing import Final, NamedTuple
 
 from crosscue.detectors.base import Detections
 from crosscue.detectors.ranging.object_tracks import Facing, Motion, ObjectTracks, Track
-from crosscue.fusion.approaches import FrameEvidence, RangePosterior
+from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.cue_table import TRAFFIC_LIGHT

@@ -27,7 +27,8 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
 from crosscue.eval.runs.tables.travelled import Odometer, odometer_of
-from crosscue.fusion.approaches import Approaches, FrameEvidence, PastCues, SignRange, Step
+from crosscue.fusion.approaches import Approaches, PastCues, Step
+from crosscue.fusion.evidence import FrameEvidence, SignRange
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -13,7 +13,7 @@ from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.candidates import BELOW_SCORE, NO_CURVE, Candidates
 from crosscue.detectors.cues.tally import cue_labels, scores_of, threshold_of
 from crosscue.detectors.ranging.height_to_range import range_of
-from crosscue.fusion.approaches import SignRange
+from crosscue.fusion.evidence import SignRange
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.cue_table import STOP_SIGN, TRAFFIC_LIGHT

@@ -23,11 +23,9 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .colours import END, ESTIMATE, FAINT, LANE, QUIET, START, TRUTH, VEHICLE
 from .columns import Shapes, boxes, labelled_strips, points, strips
 from .drive_time import DriveTime
+from .layout import ASIDE_M, BEHIND_M, FAR_M
 from .scene_rows import SceneRows
 
-FAR_M: Final = 110.0
-BEHIND_M: Final = 12.0
-ASIDE_M: Final = 24.0
 HALF_ROAD_M: Final = 9.0
 LANE_POINTS: Final = 13
 FRAMES_HELD: Final = 1024

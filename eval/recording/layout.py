@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import rerun.blueprint as rrb
 
 from crosscue.replay.columns import Floats
 
-from .ahead import ASIDE_M, BEHIND_M, FAR_M
 from .drive_time import TIMELINE
 from .series import BELIEF, CUES, POSE, RANGE
+
+FAR_M: Final = 110.0
+BEHIND_M: Final = 12.0
+ASIDE_M: Final = 24.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,10 +32,10 @@ from .bursts import (
 )
 from .clock import CounterClock
 from .family import FamilyEvidence
-from .layout import UNKNOWN, VARIANTS, Columns, Field, Message, layout
+from .layout import UNKNOWN, VARIANTS, Columns, Field, Message, Variant, layout, variant_number
 from .settings import DEFAULTS, MobileyeSettings, mounting_of
 from .tables import lane_places, table_block, to_vehicle
-from .wire import Variant, columns_of, values_of, variant_number
+from .wire import columns_of, values_of
 
 CUT_AT_END: Final = "obstacle cut by the end of the log"
 NOT_COME: Final = "obstacle frames announced by a status frame that did not come"

@@ -17,10 +17,10 @@ from crosscue.replay.mobileye.geometry import AT_REAR_AXLE, Mounting
 
 from .bits import Words, payloads_of
 from .clock import MS
-from .layout import UNKNOWN, VARIANTS, Column, Columns, Message, layout
+from .layout import UNKNOWN, VARIANTS, Column, Columns, Message, Variant, layout, variant_number
 from .settings import DEFAULTS, MobileyeSettings
 from .tables import floats, instance_of_lane, table_block, to_device
-from .wire import Variant, variant_number, words_from
+from .wire import words_from
 
 FRAME_NS: Final = 250_000
 """One frame of 8 bytes takes about this long at 500 kbit/s."""

@@ -11,9 +11,8 @@ from typing import Final
 import numpy as np
 
 from .bits import Words
-from .layout import UNKNOWN
+from .layout import UNKNOWN, Variant, variant_number
 from .settings import Family
-from .wire import Variant, variant_number
 
 
 def _mask(*bits: int) -> np.uint64:

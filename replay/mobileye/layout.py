@@ -23,6 +23,8 @@ Beyond: TypeAlias = Literal["refuse", "clip", "drop"]
 VARIANTS: Final = ("classic", "2.32", "extended", "tsr", "basic")
 """Layouts that some field is ``only`` in; a frame's is a place in this tuple, or ``UNKNOWN``."""
 UNKNOWN: Final = -1
+Variant: TypeAlias = NDArray[np.int8]
+"""Shape (N,): the variant of each frame as a place in ``VARIANTS``, or ``UNKNOWN``."""
 WORD_BITS: Final = 64
 
 
@@ -275,3 +277,8 @@ def _formula(f: Field) -> str:
 def unit_of(f: Field) -> str:
     """Unit of the column where its name does not carry it, as for ``Table.units``."""
     return f.unit.rstrip("?") + " (unverified)" if f.unit.endswith("?") else ""
+
+
+def variant_number(name: str) -> int:
+    """Place of a variant in ``VARIANTS``, or ``UNKNOWN``."""
+    return VARIANTS.index(name) if name in VARIANTS else UNKNOWN

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import pi
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,7 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import Floats, Int64s
 
 from .bits import Words, extract, place
-from .layout import UNKNOWN, VARIANTS, Column, Columns, Field, Message
-
-Variant: TypeAlias = NDArray[np.int8]
-"""Shape (N,): the variant of each frame as a place in ``VARIANTS``, or ``UNKNOWN``."""
+from .layout import VARIANTS, Column, Columns, Field, Message, Variant
 
 _TO_SI: Final[Mapping[str, float]] = {"deg": pi / 180, "deg/s": pi / 180, "km/h": 1 / 3.6}
 
@@ -174,8 +171,3 @@ def _on_wire(f: Field, column: Column) -> tuple[Floats, NDArray[np.bool_]]:
         return value, value == MISSING_CODE
     value = value / _TO_SI.get(f.unit, 1.0)
     return (-value if f.flip else value), np.isnan(value)
-
-
-def variant_number(name: str) -> int:
-    """Place of a variant in ``VARIANTS``, or ``UNKNOWN``."""
-    return VARIANTS.index(name) if name in VARIANTS else UNKNOWN

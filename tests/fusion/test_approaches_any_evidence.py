@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.fusion.approaches import Approaches, FrameEvidence, SignRange, Step
+from crosscue.fusion.approaches import Approaches, Step
+from crosscue.fusion.evidence import FrameEvidence, SignRange
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.cue_table import CUES

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.fusion.approaches import Approaches, FrameEvidence, RangePosterior, Step
+from crosscue.fusion.approaches import Approaches, Step
+from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.factor_graph import graph_of, log_odds
 from crosscue.fusion.intersection_range import Reference
 from crosscue.fusion.persistence import Persistence, PersistentSpeaker

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from crosscue.fusion.approaches import Approaches, FrameEvidence
+from crosscue.fusion.approaches import Approaches
+from crosscue.fusion.evidence import FrameEvidence
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.replay.base import VehicleError
 from crosscue.replay.vehicle.fusion import Fusion, usual_cues

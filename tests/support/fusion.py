@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from crosscue.fusion.annotated_approach import AnnotatedApproach
-from crosscue.fusion.approaches import FrameEvidence, SignRange
+from crosscue.fusion.evidence import FrameEvidence, SignRange
 from crosscue.fusion.factor_graph import CueNode, Edge, FactorGraph, Feature
 from crosscue.fusion.intersection_range import Reference
 from crosscue.fusion.situation import Situation

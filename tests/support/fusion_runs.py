@@ -12,7 +12,8 @@ from crosscue.eval.pipeline.scene import schemas
 from crosscue.eval.runs.folder import RunFolder, create, write_manifest
 from crosscue.eval.runs.tables import measurements
 from crosscue.eval.runs.tables.table_sink import TableSink
-from crosscue.fusion.approaches import Approaches, FrameEvidence, Step
+from crosscue.fusion.approaches import Approaches, Step
+from crosscue.fusion.evidence import FrameEvidence
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -28,10 +28,10 @@ import numpy as np
 from crosscue.replay.base import Block, Floats, Int64s, Ledger, Table
 from crosscue.replay.mobileye.bursts import NO_BURST
 from crosscue.replay.mobileye.clock import CounterClock
-from crosscue.replay.mobileye.layout import Columns, Message, layout
+from crosscue.replay.mobileye.layout import Columns, Message, layout, variant_number
 from crosscue.replay.mobileye.settings import DEFAULTS, MobileyeSettings, mounting_of
 from crosscue.replay.mobileye.tables import LEFT, RIGHT, table_block, to_vehicle
-from crosscue.replay.mobileye.wire import blank_dependent, columns_of, from_given, variant_number
+from crosscue.replay.mobileye.wire import blank_dependent, columns_of, from_given
 
 from .bursts import Obstacles, RosBursts
 from .sign import LaneSignVotes
