@@ -37,6 +37,7 @@ from .columns import (
 from .errors import (
     AccountError,
     AnnotationError,
+    CanDatabaseError,
     CrosscueError,
     EmptyResultError,
     LogError,
@@ -98,6 +99,7 @@ __all__ = [
     "AnnotationError",
     "Block",
     "Bytes",
+    "CanDatabaseError",
     "CanFrames",
     "Closing",
     "CrosscueError",

@@ -7,6 +7,7 @@
         * LogTooLargeError   a declared or produced size is over the limit
         * UnknownFormatError no reader knows this file or folder
     * SchemaError            a message type, DBC or truth file cannot be understood
+        * CanDatabaseError   a CAN database cannot be read (exit status 4)
         * AnnotationError    a file of annotations cannot be read (exit status 4)
     * VehicleError           the vehicle file is wrong or lacks a role
         * MissingTopicError  a topic that it or a flag names is not in the logs
@@ -56,6 +57,12 @@ class UnknownFormatError(LogError):
 
 class SchemaError(CrosscueError):
     """A message type, DBC or truth file cannot be understood."""
+
+
+class CanDatabaseError(SchemaError):
+    """A CAN database (DBC, KCD, ARXML, SYM) is missing, damaged or something else."""
+
+    exit_status = 4
 
 
 class AnnotationError(SchemaError):

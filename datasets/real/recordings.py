@@ -22,7 +22,7 @@ from crosscue.detectors.catalog.fetch import DATA
 from crosscue.detectors.settings import Settings
 from crosscue.replay.base import (
     MIB,
-    UsageError,
+    LogError,
     VehicleError,
     toml_tree,
 )
@@ -125,7 +125,8 @@ def fetch(
         Its folder, to be opened as a log.
 
     Raises:
-        UsageError: ``given`` holds another recording, or part of it.
+        LogError: ``given`` holds no such recording.
+        UsageError: It holds another recording, or part of it.
         CrosscueError: A file cannot be had, or is not the published one.
         OutputError: The cache cannot be written.
     """
@@ -169,7 +170,7 @@ def _folder_in(known: Recording, given: Path | None) -> Path | None:
         return None
     found = _folder_below(known, given)
     if found is None:
-        raise UsageError(
+        raise LogError(
             f"{given}: expected a folder with {known.files[0].name} of recording {known.name}, "
             f"itself or in {' or '.join(known.folders)}"
         )

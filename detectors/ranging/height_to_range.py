@@ -12,7 +12,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from crosscue.replay.base import Floats, UsageError
+from crosscue.replay.base import EmptyResultError, Floats, UsageError
 from crosscue.replay.vehicle.vehicle import RangeCurve
 
 Family = Literal["pinhole", "pinhole-offset", "power"]
@@ -68,15 +68,17 @@ def fit_range(height_px: Floats, range_m: Floats, family: Family, bin_m: float =
         bin_m: Width of the bins of distance.
 
     Raises:
-        UsageError: Too few pairs, or a number that is not one or not positive.
+        EmptyResultError: Too few pairs.
+        UsageError: A number that is not one or not positive.
     """
     model, start = _CURVES[family]
     bad = ~(np.isfinite(height_px) & np.isfinite(range_m) & (height_px > 0.0) & (range_m > 0.0))
     if bad.any():
         raise UsageError(f"row {int(np.flatnonzero(bad)[0]) + 1}: height and range: want positive")
+    count = 1 if family == "pinhole" else 2
+    if len(np.unique(height_px)) <= count:
+        raise EmptyResultError(f"{family}: want more than {count} different heights to fit it")
     guess = start(height_px, range_m)
-    if len(np.unique(height_px)) <= len(guess):
-        raise UsageError(f"{family}: want more than {len(guess)} different heights to fit it")
     from scipy.optimize import least_squares
 
     scale = np.maximum(np.abs(guess), 1.0)

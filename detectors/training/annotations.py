@@ -88,9 +88,12 @@ def read_coco(path: Path, folder: Path, classes: Sequence[str]) -> LabelledSet:
         classes: Names wanted, in the order that labels number them.
 
     Raises:
-        SchemaError: No COCO file, none of its pictures is there, or nothing is of the classes.
+        AnnotationError: No COCO file, or no such folder.
+        SchemaError: None of its pictures is there, or nothing is of the classes.
     """
     tree = _tree(path)
+    if not folder.is_dir():
+        raise AnnotationError(f"{folder}: no folder; give the one with the images of {path.name}")
     left_out: Counter[str] = Counter()
     names = {row["id"]: row["name"] for row in _rows(tree, "categories", path) if "id" in row}
     if not set(classes) & set(names.values()):

@@ -25,6 +25,7 @@ from crosscue.replay.base import (
     MIB,
     Bytes,
     SchemaError,
+    UsageError,
     json_tree,
     one_line,
     read_at_most,
@@ -140,8 +141,8 @@ class RoadTraining:
         """Go on where ``save`` left off.
 
         Raises:
-            SchemaError: Not such a file, or of another seed.
-            UsageError: Of a training of something else.
+            SchemaError: Not such a file.
+            UsageError: Of a training of something else, or of another seed.
         """
         from safetensors import SafetensorError
         from safetensors.torch import load
@@ -160,7 +161,7 @@ class RoadTraining:
             why = one_line(error, 120)
             raise SchemaError(f"{path}: cannot go on from it ({why}); begin anew") from None
         if seed != self.schedule.seed:
-            raise SchemaError(f"{path}: of seed {seed}, not {self.schedule.seed}; give that --seed")
+            raise UsageError(f"{path}: of seed {seed}, not {self.schedule.seed}; give that --seed")
         self.done = done
 
     def _fill(self, tensors: dict[str, Tensor]) -> None:

@@ -203,7 +203,9 @@ def _in_folder(folder: Path, *, each: bool) -> Iterator[_Found]:
     else:
         found = list(_walk(folder, 1))
         if not found:
-            raise UsageError(f"{folder}: no drive in it; give recordings or folders of them")
+            raise UnknownFormatError(
+                f"{folder}: no drive in it; give recordings or folders of them"
+            )
         yield from found
 
 

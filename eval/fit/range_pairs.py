@@ -10,12 +10,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from crosscue.datasets.truth.truth import FILE, load
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.base import (
     MIB,
+    AnnotationError,
     Floats,
     Int64s,
     SchemaError,
-    UsageError,
     json_tree,
     read_at_most,
 )
@@ -48,21 +49,23 @@ def pairs_of_table(path: Path) -> RangePairs:
     """From a CSV or Parquet file with the columns ``height_px`` and ``range_m``.
 
     Raises:
-        UsageError: Not there, too large, or without these columns.
+        AnnotationError: Not there, too large, or without these columns.
     """
     try:
         columns = _parquet(path) if path.suffix == ".parquet" else _csv(path, RangePairs._fields)
     except OSError as error:
-        raise UsageError(
+        raise AnnotationError(
             f"{path}: {error.strerror or error}; give a table (CSV or Parquet) with height_px and "
             "range_m"
         ) from None
     except UnicodeDecodeError:
-        raise UsageError(
+        raise AnnotationError(
             f"{path}: is no text; give a table (CSV or .parquet) with height_px and range_m"
         ) from None
     except (KeyError, ValueError):
-        raise UsageError(f"{path}: want the columns height_px and range_m, all numbers") from None
+        raise AnnotationError(
+            f"{path}: want the columns height_px and range_m, all numbers"
+        ) from None
     return RangePairs(*columns)
 
 
@@ -89,7 +92,7 @@ def pairs_of_truth(truth: Path, cue: str) -> RangePairs:
             and one.get("in_picture", 1.0) >= 1.0
         ]
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise SchemaError(f"{truth}: objects: no COCO file ({error!r}); mend it") from None
+        raise AnnotationError(f"{truth}: objects: no COCO file ({error!r}); repair it") from None
     return _paired(rows, t_ns, range_m)
 
 
@@ -103,17 +106,11 @@ def pairs_of_run(run: Path, truth: Path, cue: str, score: float) -> RangePairs:
         score: Detections must have more.
 
     Raises:
-        UsageError: The run has no detections.
+        UnreadableRunError: The run has no detections.
         SchemaError: The truth has no ranges.
     """
-    import pyarrow.parquet as pq
-
-    path = run / "detections.parquet"
-    if not path.exists():
-        raise UsageError(f"{path}: not there; run crosscue detect first")
     names = ["t_ns", "label", "score", "height_px"]
-    with opened(path) as file:
-        table = pq.read_table(file, columns=names, page_checksum_verification=True)
+    table = RunFolder(run).table("detections", names)
     t_ns, label, scores, height = (table[name].to_pylist() for name in names)
     rows = [
         (t, float(h))
@@ -145,7 +142,7 @@ def _true_ranges(truth: Path, cue: str) -> tuple[Int64s, Floats]:
     try:
         t_ns, range_m = _csv(path, ("t_ns", REFERENCES[cue]))
     except (OSError, UnicodeDecodeError, KeyError, ValueError) as error:
-        raise SchemaError(f"{path}: no table of true ranges ({error}); mend it") from None
+        raise AnnotationError(f"{path}: no table of true ranges ({error}); repair it") from None
     order = np.argsort(t_ns, kind="stable")
     return t_ns[order].astype(np.int64), range_m[order]
 
@@ -158,10 +155,10 @@ def _objects(truth: Path) -> Any:
     try:
         content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
+            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
         return json_tree(content)
     except (OSError, ValueError) as error:
-        raise SchemaError(f"{path}: not readable as JSON ({error}); mend it") from None
+        raise AnnotationError(f"{path}: not readable as JSON ({error}); repair it") from None
 
 
 def _folder(truth: Path) -> Path:
@@ -171,8 +168,11 @@ def _folder(truth: Path) -> Path:
 def _csv(path: Path, names: tuple[str, ...]) -> tuple[Floats, ...]:
     content = read_at_most(path, MAX_BYTES)
     if content is None:
-        raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; give fewer rows")
-    rows = list(csv.DictReader(content.decode("utf-8").splitlines()))
+        raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; give fewer rows")
+    reader = csv.DictReader(content.decode("utf-8").splitlines())
+    if set(names) - set(reader.fieldnames or ()):
+        raise KeyError(names)
+    rows = list(reader)
     # Nanoseconds since 1970 are kept to 256 ns, which is near enough to find a picture by.
     return tuple(np.array([float(row[name] or "nan") for row in rows]) for name in names)
 

@@ -147,6 +147,7 @@ def convert(
         UsageError: Several logs, another suffix, or the output is the log itself.
         OutputError: The output exists, has a seal, cannot be written, or reads back differently.
         EmptyResultError: No row to write.
+        LogError: Damage has left none.
     """
     path = Path(output)
     with opened(log) as drive:
@@ -158,7 +159,7 @@ def convert(
             _copy(drive, ledger, writer, on_rows)
             # Found = written + skipped, for every topic.
             ledger.check({name: writer.kept[name] for name in ledger.accounts})
-            if not writer.written and _is_whole(ledger):
+            if not writer.written and not _refused(ledger):
                 raise empty_result("no row to write", drive.logs, drive.selection)
         paths = drive.paths
     _read_back(path, writer)
@@ -216,10 +217,13 @@ def _read_back(path: Path, writer: LogWriter) -> None:
 
 
 def _is_whole(ledger: Ledger) -> bool:
-    refused = (
-        reason
+    return ledger.is_whole and not _refused(ledger)
+
+
+def _refused(ledger: Ledger) -> bool:
+    """Were rows skipped that were asked for?"""
+    return any(
+        reason not in NOT_ASKED
         for account in ledger.accounts.values()
         for reason in account.skipped
-        if reason not in NOT_ASKED
     )
-    return ledger.is_whole and not any(refused)

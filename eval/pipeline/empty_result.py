@@ -7,8 +7,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Final
 
-from crosscue.eval.runs.folder import RunFolder, clear
-from crosscue.replay.base import CrosscueError, EmptyResultError, Ledger, Log, LogError, Selection
+from crosscue.eval.runs.folder import MANIFEST, RunFolder, clear
+from crosscue.replay.base import (
+    CrosscueError,
+    EmptyResultError,
+    Ledger,
+    Log,
+    LogError,
+    SchemaError,
+    Selection,
+    VehicleError,
+)
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.signals.kinds import Plan, Signal
 
@@ -80,9 +89,16 @@ def silent_roles(planned: Plan, received: Mapping[Signal, int]) -> dict[Signal, 
 
 @contextmanager
 def nothing_left(run: RunFolder) -> Iterator[None]:
-    """Take a run's files away again when nothing came of it, so that it does not look finished."""
+    """Take a run's files away again when nothing came of it, so that it does not look finished.
+
+    Detections that are whole stay where only the settings of the estimate are refused.
+    """
     try:
         yield
     except (EmptyResultError, LogError):
         clear(run)
+        raise
+    except (VehicleError, SchemaError):
+        if not run.file(MANIFEST).exists():
+            clear(run)
         raise

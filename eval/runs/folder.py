@@ -310,8 +310,10 @@ def open_run(
         limits: What its logs are read with.
 
     Raises:
-        RunError: As ``RunFolder.manifest``.
+        RunError: As ``RunFolder.manifest``; ``logs`` is no folder.
     """
+    if logs is not None and not logs.is_dir():
+        raise UnreadableRunError(f"{logs}: no folder; give the one that the logs have moved to")
     run = RunFolder(path, logs, without_images, limits)
     run.manifest()
     return run

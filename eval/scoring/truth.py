@@ -13,7 +13,7 @@ import numpy as np
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.truth import Approach, CueTruth, Truth
 from crosscue.datasets.truth.tum import read_tum
-from crosscue.replay.base import MIB, Floats, Int64s, SchemaError
+from crosscue.replay.base import MIB, AnnotationError, Floats, Int64s
 
 from .columns import NONE
 
@@ -122,7 +122,7 @@ def load(path: Path, drive: str) -> DriveTruth:
     Ranges come from its CSV file, or where none exists from the way along its track.
 
     Raises:
-        SchemaError: A file does not fit.
+        AnnotationError: A file does not fit.
         LogError: The trajectory cannot be read.
     """
     truth = truth_file.load(path)
@@ -140,15 +140,15 @@ def _read_ranges(path: Path, truth: Truth) -> TrueRanges:
     rows: list[tuple[int, int, float, float]] = []
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise SchemaError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
+            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
         with path.open(encoding="utf-8", newline="") as file:
             reader = csv.DictReader(file)
             if set(COLUMNS) - set(reader.fieldnames or ()):
-                raise SchemaError(f"{path}:1: want the columns {','.join(COLUMNS)}")
+                raise AnnotationError(f"{path}:1: want the columns {','.join(COLUMNS)}")
             for row in reader:
                 rows.append(_range_row(row, known, f"{path}:{reader.line_num}"))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SchemaError(f"{path}: {error}; the truth names it under ranges") from None
+        raise AnnotationError(f"{path}: {error}; the truth names it under ranges") from None
     rows.sort()
     t_ns, approach, start, end = zip(*rows, strict=True) if rows else ((), (), (), ())
     return TrueRanges(
@@ -165,11 +165,11 @@ def _range_row(row: dict[str, str], known: set[int], where: str) -> tuple[int, i
         start_m = float(row["start_m"])
         end_m = float(row["end_m"]) if row["end_m"] else math.nan
     except (TypeError, ValueError):
-        raise SchemaError(f"{where}: want whole t_ns and approach, numbers in metres") from None
+        raise AnnotationError(f"{where}: want whole t_ns and approach, numbers in metres") from None
     if not math.isfinite(start_m) or math.isinf(end_m) or not -(2**62) < t_ns < 2**62:
-        raise SchemaError(f"{where}: want finite numbers")
+        raise AnnotationError(f"{where}: want finite numbers")
     if approach not in known:
-        raise SchemaError(f"{where}: no approach {approach}; there are: {sorted(known)}")
+        raise AnnotationError(f"{where}: no approach {approach}; there are: {sorted(known)}")
     return t_ns, approach, start_m, end_m
 
 

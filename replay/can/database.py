@@ -13,7 +13,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.replay.base import DEFAULT_LIMITS, Limits, LogTooLargeError, SchemaError, one_line
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    CanDatabaseError,
+    Limits,
+    LogTooLargeError,
+    SchemaError,
+    one_line,
+)
 
 from .dbc_text import read_dbc
 from .extract import Extractor
@@ -84,7 +91,8 @@ class CanDatabase:
                 instead of refusing.
 
         Raises:
-            SchemaError: A file is missing, does not parse, or contradicts another.
+            CanDatabaseError: A file is missing or does not parse.
+            SchemaError: It contradicts another.
             LogTooLargeError: A file, or a size that it declares, is over the limit.
         """
         found: list[CanMessage] = []
@@ -194,7 +202,7 @@ def _load_file(path: Path, limits: Limits) -> tuple[list[CanMessage], list[str]]
     form = path.suffix.lower().removeprefix(".")
     if form not in FORMATS:
         known = " ".join(f".{suffix}" for suffix in FORMATS)
-        raise SchemaError(f"{path}: no CAN database; expected a file ending in one of {known}")
+        raise CanDatabaseError(f"{path}: no CAN database; expected a file ending in one of {known}")
     source = read_text(path, limits)
     entry = LayoutEntry(source, form, cache_folder())
     kept = entry.read()
@@ -218,7 +226,7 @@ def _read_layout(source: DatabaseText, form: str) -> tuple[list[CanMessage], lis
         problem = one.problem or _problem(one, marked.get(one.source, []))
         messages.append(replace(one, source=where, problem=problem, topic=one.name))
     if not messages:
-        raise SchemaError(f"{path}: defines no message; check that the file is whole")
+        raise CanDatabaseError(f"{path}: defines no message; check that the file is whole")
     notices = [*source.notices, *doubts(source, form, [m.name for m in messages])]
     for message in messages:
         notices += _doubts_of(message)
@@ -253,7 +261,7 @@ def _parse(source: DatabaseText, form: str) -> InternalDatabase:
     except Exception as error:  # cantools documents none; whatever a damaged file provokes
         words = one_line(error, 300) or type(error).__name__
         line = source.line_of_error(str(error))
-        raise SchemaError(
+        raise CanDatabaseError(
             f"{source.path}:{line}: not a readable {form.upper()} file: {words}; "
             "correct that line or get a whole copy of the file"
         ) from None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import Limits, LogTooLargeError, SchemaError, read_at_most
+from crosscue.replay.base import CanDatabaseError, Limits, LogTooLargeError, read_at_most
 
 _MAX_BITS: Final = 8 * 2048
 """No message is longer: 1785 bytes is the longest multi-packet message there is."""
@@ -85,23 +85,23 @@ def read_text(path: Path, limits: Limits) -> DatabaseText:
     for themselves.
 
     Raises:
-        SchemaError: It cannot be read, is empty or is binary.
+        CanDatabaseError: It cannot be read, is empty or is binary.
         LogTooLargeError: It is larger than ``limits.message_bytes``.
     """
     try:
         if not path.is_file():
-            raise SchemaError(f"{path}: no such file; give a CAN database")
+            raise CanDatabaseError(f"{path}: no such file; give a CAN database")
         stored = read_at_most(path, limits.message_bytes)
     except OSError as error:
-        raise SchemaError(f"{path}: {error.strerror or error}; check the path") from None
+        raise CanDatabaseError(f"{path}: {error.strerror or error}; check the path") from None
     if stored is None:
         raise LogTooLargeError(f"{path}: larger than {limits.message_bytes} bytes; not a database")
     text, notices = _decode(path, stored)
     if not text.strip():
-        raise SchemaError(f"{path}:1: empty; expected a CAN database")
+        raise CanDatabaseError(f"{path}:1: empty; expected a CAN database")
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
-        raise SchemaError(f"{path}:{line}: holds zero bytes, so it is damaged or no text file")
+        raise CanDatabaseError(f"{path}:{line}: holds zero bytes, so it is damaged or no text file")
     return DatabaseText(path, text, notices)
 
 

@@ -2,34 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
 import pytest
 
-from crosscue.datasets.truth.truth import Truth, save
 from crosscue.eval import cli
-from support.gap_drive import BEGIN, SECOND, Clock, replayed, write_drive
-from support.pictures import picture, picture_folder
-from support.rosbag_files import Row, write_folder
+from support.empty_inputs import COMMANDS, empty_inputs
 
-CASES: dict[str, str] = {
-    "truth": "{log} -o {out}",
-    "truth import": "{empty}/coco.json --log {log} -o {out}.json --vehicle {car}",
-    "truth check": "{empty}/truth.json --log {other}",
-    "fit compass": "{log} --vehicle {car}",
-    "fit signs": "{empty}/labels.csv --label stop",
-    "fit messages": "{run} --truth {empty}/truth.json -o {out}.toml",
-    "fit ranges": "--cue stop_sign --truth {empty}/truth.json",
-    "fit landmarks": "--pairs {empty}/pairs.csv",
-    "score": "{run} --truth {empty}/truth.json -o {out}",
-    "train mask-rcnn": "--data {empty}/coco.json --images {empty} -o {out}.safetensors",
-    "train road": "--data {empty} -o {out}.safetensors",
-    "landmarks add": "{out}.db --images {empty} --coordinates {empty}/places.csv",
-    "vehicle init": "{strange} -o {out}.toml",
-    "merge": "{empty} -o {out}",
-}
 ELSEWHERE: dict[str, str] = {
     "replay": "test_empty_result.py", "estimate": "test_empty_result.py",
     "detect": "test_empty_result.py", "decode": "test_empty_result.py",
@@ -50,43 +30,22 @@ ELSEWHERE: dict[str, str] = {
 
 
 def test_every_command_is_in_one_of_the_tables() -> None:
-    assert not CASES.keys() & ELSEWHERE.keys()
-    assert CASES.keys() | ELSEWHERE.keys() == cli.COMMANDS.keys()
+    assert not COMMANDS.keys() & ELSEWHERE.keys()
+    assert COMMANDS.keys() | ELSEWHERE.keys() == cli.COMMANDS.keys()
 
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A drive and its run, and inputs of every kind that are whole and hold nothing."""
-    folder = tmp_path_factory.mktemp("inputs")
-    drive, empty = folder / "drive", folder / "empty"
-    log = write_drive(drive, Clock(), seconds=4)
-    run = replayed(drive, log, "../run")
-    for place in (empty / "images", empty / "masks"):
-        place.mkdir(parents=True)
-    save(Truth(version=1, source="x", start_ns=BEGIN, end_ns=BEGIN + 4 * SECOND), empty)
-    coco: dict[str, list[object]] = {"categories": [], "images": [], "annotations": []}
-    (empty / "coco.json").write_text(json.dumps(coco))
-    (empty / "a.png").write_bytes(picture(1))
-    (empty / "labels.csv").write_text("picture,label,x0,y0,x1,y1\na.png,,,,,\n")
-    (empty / "pairs.csv").write_text("query,known,same\n")
-    (empty / "places.csv").write_text("image,x_m,y_m,sd_m\na.png,0,0,1\n")
-    message = Row("/can", BEGIN, b"\0\1\0\0\2\0\0\0a\0")
-    return {
-        "log": log,
-        "run": run.path,
-        "car": drive / "car.toml",
-        "empty": empty,
-        "other": picture_folder(folder / "front", 3, "rate_hz: 10\n"),
-        "strange": write_folder(folder / "strange", [message]),
-    }
+    return empty_inputs(tmp_path_factory.mktemp("inputs"))
 
 
-@pytest.mark.parametrize("command", CASES)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_nothing_comes_of_it(
     command: str, names: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.rmtree(names["run"] / "score", ignore_errors=True)
-    argv = CASES[command].format(**names, out=tmp_path / "out").split()
+    argv = COMMANDS[command].format(**names, out=tmp_path / "out").split()
 
     status = cli.run([*command.split(), *argv])
 

@@ -25,7 +25,7 @@ from crosscue.eval.fit.range_pairs import (
     pairs_of_truth,
     together,
 )
-from crosscue.replay.errors import OutputError, UsageError
+from crosscue.replay.errors import EmptyResultError, OutputError, UsageError
 
 PUBLISHED_SD_M = {"stop_sign": 1.7, "traffic_light": 5.9}
 
@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
     if args.test:
         others = together(pairs_of_truth(path, args.cue) for path in args.test)
         if not len(others.range_m):
-            raise UsageError(f"--test: no {args.cue} in it; give other drives")
+            raise EmptyResultError(f"--test: no {args.cue} in it; give other drives")
         tested = residuals(*others, best.curve, args.bin_m)
     if args.figure is not None:
         from crosscue.eval.fit.range_figure import draw
@@ -140,7 +140,7 @@ def _pairs(args: argparse.Namespace) -> RangePairs:
     )
     pairs = together(parts)
     if not len(pairs.range_m):
-        raise UsageError(f"--truth: no {args.cue} with a range in it; give other drives")
+        raise EmptyResultError(f"--truth: no {args.cue} with a range in it; give other drives")
     return pairs
 
 

@@ -18,7 +18,7 @@ from crosscue.detectors.catalog.draft import Draft, draft
 from crosscue.detectors.catalog.recognise import closed, guesses, plausible, read_interface
 from crosscue.detectors.decoders.base import Guess, Interface
 from crosscue.detectors.networks.model_detector import build
-from crosscue.eval.commands.model.shared import look
+from crosscue.eval.commands.model.shared import look, pixels_of
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.replay.base import MIB, UsageError, read_at_most, write_text
 
@@ -65,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
         found_kinds = plausible(args.weights, run_once, found_kinds)
     guess = _chosen(args.weights, found_kinds, run_once, args.kind)
     written = draft(args.weights, model, guess, _names(args.class_names), size)
+    if args.picture is not None:
+        pixels_of(args.picture)
     _try(output, written)
     found = None
     if args.picture is not None:
@@ -109,7 +111,10 @@ def _names(path: Path | None) -> tuple[str, ...]:
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise UsageError(f"{path}: {why}; give class names, one a line") from None
-    return tuple(line.strip() for line in lines if line.strip())
+    names = tuple(line.strip() for line in lines if line.strip())
+    if not names:
+        raise UsageError(f"{path}: no name in it; give class names, one a line")
+    return names
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

@@ -155,7 +155,7 @@ def test_a_dbc_that_does_not_parse(
     status = cli.run([*argv, str(tmp_path / "run")])
 
     err = capsys.readouterr().err
-    assert status in (1, 2)
+    assert status in (2, 4)
     assert _one_line(err)
     assert said in err
     assert not (tmp_path / "run" / "manifest.json").exists()

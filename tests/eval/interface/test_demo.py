@@ -148,7 +148,7 @@ def test_a_mirror_is_asked_instead(made_up: StandIn, monkeypatch: pytest.MonkeyP
 def test_a_folder_without_the_recording_or_with_another_is_wrong_usage(
     made_up: StandIn, tmp_path: Path
 ) -> None:
-    with pytest.raises(crosscue.UsageError, match="expected a folder with"):
+    with pytest.raises(crosscue.LogError, match="expected a folder with"):
         crosscue.fetch_drive(tmp_path)
 
     other = made_up.folder / "sequences" / "pandaset_002" / PICTURE.removeprefix("drive/")

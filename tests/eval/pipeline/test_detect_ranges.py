@@ -12,7 +12,7 @@ from crosscue.datasets.truth.truth import Truth, save
 from crosscue.detectors.ranging.height_to_range import FAMILIES, fit_range, range_of
 from crosscue.eval.cli import run
 from crosscue.eval.fit.range_pairs import pairs_of_run, pairs_of_truth
-from crosscue.replay.base import SchemaError, UsageError
+from crosscue.replay.base import CrosscueError, SchemaError, UnreadableRunError
 from crosscue.replay.vehicle.vehicle import RangeCurve, parse
 
 
@@ -42,7 +42,7 @@ def test_the_curve_that_made_the_pairs_comes_back(family: str) -> None:
 def test_pairs_that_cannot_be_fitted_are_refused(
     heights: list[float], ranges: list[float], said: str
 ) -> None:
-    with pytest.raises(UsageError, match=said):
+    with pytest.raises(CrosscueError, match=said):
         fit_range(np.array(heights), np.array(ranges), "pinhole")
 
 
@@ -68,7 +68,7 @@ def test_a_table_without_its_columns_is_reported(
     table = tmp_path / "pairs.csv"
     table.write_text("a,b\n1,2\n")
 
-    assert run(["fit", "ranges", str(table), "--cue", "stop_sign"]) == 2
+    assert run(["fit", "ranges", str(table), "--cue", "stop_sign"]) == 4
 
     assert "want the columns height_px and range_m" in capsys.readouterr().err
 
@@ -80,7 +80,7 @@ def test_a_table_that_is_none_is_reported_with_its_path_once(
 
     for name, said in (("none.csv", "No such file"), ("wild.csv", "is no text")):
         path = tmp_path / name
-        assert run(["fit", "ranges", str(path), "--cue", "stop_sign"]) == 2
+        assert run(["fit", "ranges", str(path), "--cue", "stop_sign"]) == 4
         reported = capsys.readouterr().err
         assert f"{path}: {said}" in reported
         assert reported.count(name) == 1
@@ -197,7 +197,7 @@ def test_truth_without_objects_or_ranges_is_reported(tmp_path: Path) -> None:
     (whole / "objects.json").write_text('{"images": 3}')
     with pytest.raises(SchemaError, match="no COCO file"):
         pairs_of_truth(whole, "stop_sign")
-    with pytest.raises(UsageError, match=r"detections.parquet: not there"):
+    with pytest.raises(UnreadableRunError, match=r"detections.parquet: not there"):
         pairs_of_run(tmp_path, whole, "stop_sign", 0.9)
 
 

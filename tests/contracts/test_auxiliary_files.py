@@ -1,0 +1,295 @@
+"""Every argument and option that names an input file answers alike when there is no such file.
+
+Nor where it is empty, noise, a folder or other text: 4 for input, 2 for settings; one line that
+names it, no result, nothing left.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from crosscue.eval import cli
+from crosscue.localization.landmarks.database import LandmarkWriter
+from support.gap_drive import Clock, replayed, write_drive
+from support.onnx_models import bright_box_model
+from support.pictures import picture
+from support.trees import tree
+
+INPUT: Final = 4
+SETTINGS: Final = 2
+
+CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
+    ("info", "LOG"): ("{gone}", INPUT),
+    ("convert", "LOG"): ("{gone} -o {out}.mcap", INPUT),
+    ("decode", "LOG"): ("{gone} -o {out}", INPUT),
+    ("detect", "LOG"): ("{gone} -o {out} --detectors signs", INPUT),
+    ("replay", "LOG"): ("{gone} -o {out}", INPUT),
+    ("vehicle init", "LOG"): ("{gone} -o {out}.toml", INPUT),
+    ("fit compass", "LOG"): ("{gone} --vehicle {car}", INPUT),
+    ("fit landmarks", "LOG"): ("{gone} --poses {truth} --database {db} --vehicle {car}", INPUT),
+    ("landmarks add", "LOG"): ("{out}.db {gone} --poses {truth} --vehicle {car}", INPUT),
+    ("truth", "LOG"): ("{gone} -o {out}", INPUT),
+    ("estimate", "RUN"): ("{gone}", INPUT),
+    ("score", "RUN"): ("{gone} --truth {truth}", INPUT),
+    ("view", "RUN"): ("{gone} -o {out}.rrd", INPUT),
+    ("compare", "RUN_A"): ("{gone} {run}", INPUT),
+    ("compare", "RUN_B"): ("{run} {gone}", INPUT),
+    ("merge", "RUNS"): ("{gone} -o {out}", INPUT),
+    ("fit messages", "RUN"): ("{gone} --truth {truth} -o {out}.toml", INPUT),
+    ("fit signs", "LABELS"): ("{gone}.csv --label stop", INPUT),
+    ("fit ranges", "TABLE"): ("{gone} --cue stop_sign", INPUT),
+    ("landmarks add", "DB"): ("{gone} --images {pictures} --coordinates {places}", INPUT),
+    ("landmarks list", "DB"): ("{gone}", INPUT),
+    ("landmarks match", "DB"): ("{gone} {picture}", INPUT),
+    ("landmarks match", "IMAGE"): ("{db} {gone}", INPUT),
+    ("truth import", "ANNOTATIONS"): ("{gone}.json --log {log} -o {out}.json", INPUT),
+    ("truth check", "T.json"): ("{gone} --log {log}", INPUT),
+    ("model init", "MODEL"): ("{gone}.onnx", SETTINGS),
+    ("model check", "MODEL"): ("{gone}.toml", SETTINGS),
+    ("model show", "MODEL"): ("{gone}.toml", SETTINGS),
+    ("info", "--vehicle"): ("{log} --vehicle {gone}", SETTINGS),
+    ("decode", "--vehicle"): ("{log} -o {out} --vehicle {gone}", SETTINGS),
+    ("detect", "--vehicle"): ("{log} -o {out} --vehicle {gone}", SETTINGS),
+    ("detect", "--detectors"): ("{log} -o {out} --detectors {gone}.toml", SETTINGS),
+    ("replay", "--vehicle"): ("{log} -o {out} --vehicle {gone}", SETTINGS),
+    ("replay", "--detectors"): ("{log} -o {out} --detectors {gone}.toml", SETTINGS),
+    ("replay", "--landmarks"): ("{log} -o {out} --vehicle {car} --landmarks {gone}", INPUT),
+    ("estimate", "--vehicle"): ("{run} --vehicle {gone}", SETTINGS),
+    ("estimate", "--logs"): ("{run} --logs {gone}", INPUT),
+    ("score", "--truth"): ("{run} --truth {gone}", INPUT),
+    ("score", "--gate"): ("{run} --truth {truth} --gate {gone}", SETTINGS),
+    ("score", "--logs"): ("{run} --truth {truth} --logs {gone}", INPUT),
+    ("view", "--truth"): ("{run} -o {out}.rrd --truth {gone}", INPUT),
+    ("view", "--logs"): ("{run} -o {out}.rrd --logs {gone}", INPUT),
+    ("vehicle init", "--dbc"): ("{log} -o {out}.toml --dbc {gone}.dbc", INPUT),
+    ("fit compass", "--vehicle"): ("{log} --vehicle {gone}", SETTINGS),
+    ("fit signs", "--test"): ("{labels} --label stop --test {gone}.csv", INPUT),
+    ("fit ranges", "--truth"): ("--cue stop_sign --truth {gone}", INPUT),
+    ("fit ranges", "--runs"): ("--cue stop_sign --truth {truth} --runs {gone}", INPUT),
+    ("fit ranges", "--test"): ("{pairs_m} --cue stop_sign --test {gone}", INPUT),
+    ("fit messages", "--truth"): ("{run} --truth {gone} -o {out}.toml", INPUT),
+    ("fit landmarks", "--pairs"): ("--pairs {gone}", INPUT),
+    ("fit landmarks", "--database"): (
+        "{log} --vehicle {car} --poses {truth} --database {gone}",
+        INPUT,
+    ),
+    ("fit landmarks", "--poses"): ("{log} --vehicle {car} --database {db} --poses {gone}", INPUT),
+    ("fit landmarks", "--vehicle"): (
+        "{log} --poses {truth} --database {db} --vehicle {gone}",
+        SETTINGS,
+    ),
+    ("landmarks add", "--poses"): ("{out}.db {log} --vehicle {car} --poses {gone}", INPUT),
+    ("landmarks add", "--vehicle"): ("{out}.db {log} --poses {truth} --vehicle {gone}", SETTINGS),
+    ("landmarks add", "--images"): ("{out}.db --images {gone} --coordinates {places}", INPUT),
+    ("landmarks add", "--coordinates"): (
+        "{out}.db --images {pictures} --coordinates {gone}",
+        INPUT,
+    ),
+    ("landmarks match", "--vehicle"): ("{db} {picture} --vehicle {gone}", SETTINGS),
+    ("truth import", "--log"): ("{coco} --log {gone} -o {out}.json", INPUT),
+    ("truth import", "--vehicle"): ("{coco} --log {log} -o {out}.json --vehicle {gone}", SETTINGS),
+    ("truth check", "--log"): ("{truth} --log {gone}", INPUT),
+    ("truth check", "--vehicle"): ("{truth} --log {log} --vehicle {gone}", SETTINGS),
+    ("model init", "--class-names"): ("{onnx} -o {there}/new.toml --class-names {gone}", SETTINGS),
+    ("model init", "--picture"): ("{onnx} -o {there}/new.toml --picture {gone}", INPUT),
+    ("model check", "--picture"): ("{card} --picture {gone} -o {out}.jpg", INPUT),
+    ("model fetch", "--weights"): ("yolox-nano --weights {gone}", SETTINGS),
+    ("demo", "--data"): ("--real --data {gone} -o {out}", INPUT),
+    ("study intersections", "--vehicle"): ("-o {out} --vehicle {gone}", SETTINGS),
+    ("study range", "--settings"): ("-o {out} --settings {gone}", SETTINGS),
+    ("study landmarks", "--settings"): ("-o {out} --settings {gone}", SETTINGS),
+    ("study field", "--settings"): ("-o {out} --settings {gone}", SETTINGS),
+    ("train road", "--data"): ("--data {gone} -o {out}.safetensors", INPUT),
+    ("train road", "--init"): ("--data {masks} -o {out}.safetensors --init {gone}", SETTINGS),
+    ("train road", "--measure"): ("--data {masks} --measure {gone}", SETTINGS),
+    ("train mask-rcnn", "--data"): (
+        "--data {gone} --images {pictures} -o {out}.safetensors",
+        INPUT,
+    ),
+    ("train mask-rcnn", "--images"): ("--data {coco} --images {gone} -o {out}.safetensors", INPUT),
+    ("train mask-rcnn", "--val-data"): (
+        "--data {coco} --images {pictures} --val-data {gone} --val-images {pictures} "
+        "-o {out}.safetensors",
+        INPUT,
+    ),
+    ("train mask-rcnn", "--val-images"): (
+        "--data {coco} --images {pictures} --val-data {coco} --val-images {gone} "
+        "-o {out}.safetensors",
+        INPUT,
+    ),
+    ("train mask-rcnn", "--init"): (
+        "--data {coco} --images {pictures} -o {out}.safetensors --init {gone}",
+        SETTINGS,
+    ),
+    ("train mask-rcnn", "--measure"): (
+        "--data {coco} --images {pictures} --measure {gone}",
+        SETTINGS,
+    ),
+}
+"""Arguments in which ``{gone}`` is the file, and what it is."""
+NAMED_IN_THE_VEHICLE_FILE: Final[dict[str, str]] = {
+    "decode": "{log} -o {out} --vehicle {strange}",
+    "replay": "{log} -o {out} --vehicle {strange} --no-cache",
+    "estimate": "{run} --vehicle {strange}",
+    "info": "{log} --vehicle {strange}",
+}
+"""Commands that read the DBC files of a vehicle file."""
+WRITTEN: Final = {"--output", "--cache", "--figure", "--sheet"}
+"""Options whose file is made where there is none."""
+ANY_BYTES: Final = {"seal", "model fetch", "completion"}
+"""Their arguments are no files that could be of another kind."""
+MADE: Final = {("landmarks add", "DB")}
+"""Made where it is missing or empty."""
+FOLDERS: Final = {
+    ("estimate", "--logs"), ("score", "--logs"), ("view", "--logs"), ("landmarks add", "--images"),
+    ("train road", "--data"), ("train mask-rcnn", "--images"), ("train mask-rcnn", "--val-images"),
+    ("merge", "RUNS"),
+}  # fmt: skip
+"""An empty folder in their place lacks a file, which is another error."""
+DAMAGE: Final[dict[str, Callable[[Path], object]]] = {
+    "missing": lambda path: None,
+    "empty": lambda path: path.write_bytes(b""),
+    "noise": lambda path: path.write_bytes(bytes(range(256)) * 8),
+    "a folder": lambda path: path.mkdir(),
+    "text": lambda path: path.write_text("nothing of the kind\n"),
+}
+
+
+def _named_files() -> set[tuple[str, str]]:
+    """Arguments, options whose value is a path and that are no output, and networks' names."""
+    found = set()
+    for name in cli.COMMANDS:
+        _, parser = cli.parser_of(name)
+        for action in parser._actions:
+            if action.option_strings and (action.type is Path or action.metavar == "NETWORK"):
+                found.add((name, action.option_strings[-1]))
+            elif not action.option_strings and name not in ANY_BYTES:
+                found.add((name, str(action.metavar)))
+    return {(name, option) for name, option in found if option not in {*WRITTEN, "LAYOUT"}}
+
+
+def test_the_table_is_whole() -> None:
+    detectors = {("detect", "--detectors"), ("replay", "--detectors")}
+    assert CASES.keys() - detectors == _named_files()
+
+
+@pytest.fixture(scope="module")
+def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Sound inputs of every kind."""
+    folder = tmp_path_factory.mktemp("inputs")
+    drive, photos = folder / "drive", folder / "photos"
+    log = write_drive(drive, Clock(), seconds=4)
+    run = replayed(drive, log, "../run")
+    with LandmarkWriter(folder / "known.db", "orb"):
+        pass
+    for place in ("images", "masks"):
+        (photos / place).mkdir(parents=True)
+        for number in range(2):
+            (photos / place / f"{number}.png").write_bytes(picture(number, width=64, height=48))
+    (photos / "coco.json").write_text(_coco())
+    (photos / "labels.csv").write_text("picture,label,x0,y0,x1,y1\nimages/0.png,stop,1,1,9,9\n")
+    (photos / "places.csv").write_text("image,x_m,y_m,sd_m\n0.png,0,0,1\n")
+    (photos / "pairs_m.csv").write_text(
+        "height_px,range_m\n" + "".join(f"{200 / m},{m}\n" for m in range(5, 60))
+    )
+    (photos / "net.onnx").write_bytes(bright_box_model())
+    assert cli.run(["model", "init", str(photos / "net.onnx"), "-q"]) == 0
+    return {
+        "log": log,
+        "run": run.path,
+        "car": drive / "car.toml",
+        "truth": drive / "truth.json",
+        "db": folder / "known.db",
+        "pictures": photos / "images",
+        "picture": photos / "images" / "0.png",
+        "masks": photos,
+        "coco": photos / "coco.json",
+        "labels": photos / "labels.csv",
+        "places": photos / "places.csv",
+        "pairs_m": photos / "pairs_m.csv",
+        "onnx": photos / "net.onnx",
+        "card": photos / "net.toml",
+        "there": photos,
+    }
+
+
+def _coco() -> str:
+    box = {"bbox": [10, 10, 40, 30], "segmentation": [[10, 10, 50, 10, 50, 40, 10, 40]]}
+    return json.dumps(
+        {
+            "categories": [{"id": 1, "name": "stop sign"}],
+            "images": [
+                {"id": k, "file_name": f"{k}.png", "width": 64, "height": 48} for k in range(2)
+            ],
+            "annotations": [{"id": k, "image_id": k, "category_id": 1, **box} for k in range(2)],
+        }
+    )
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("case", CASES, ids=" ".join)
+def test_a_file_that_an_option_names(
+    case: tuple[str, str],
+    damage: str,
+    names: dict[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    command, (line, wanted) = case[0], CASES[case]
+    DAMAGE[damage](tmp_path / ("gone" + line.partition("{gone}")[2].partition(" ")[0]))
+    if damage == "a folder" and case in FOLDERS:
+        pytest.skip("a folder is what is wanted; that it lacks files is another error")
+    if case in MADE and damage in ("missing", "empty"):
+        pytest.skip("made where it is missing")
+    if case == ("model init", "--class-names") and damage == "text":
+        pytest.skip("text is what is wanted")
+    argv = line.format(**names, gone=tmp_path / "gone", out=tmp_path / "out").split()
+
+    _is_refused([*command.split(), *argv], wanted, "gone", names, tmp_path, capsys)
+
+
+def _is_refused(
+    argv: list[str],
+    wanted: int,
+    named: str,
+    names: dict[str, Path],
+    out: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    inputs = names["masks"].parent
+    before, here = tree(inputs), tree(out)
+
+    status = cli.run(argv)
+
+    captured = capsys.readouterr()
+    assert status == wanted, captured.err
+    assert captured.out == ""
+    assert captured.err.startswith("crosscue: ")
+    assert captured.err.count("\n") == 1
+    assert named in captured.err
+    assert "bug" not in captured.err
+    assert tree(inputs) == before
+    assert {name for name in tree(out) if Path(out / name).is_file()} == here.keys()
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("command", NAMED_IN_THE_VEHICLE_FILE)
+def test_a_database_that_the_vehicle_file_names(
+    command: str,
+    damage: str,
+    names: dict[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    DAMAGE[damage](tmp_path / "gone.dbc")
+    strange = tmp_path / "strange.toml"
+    strange.write_text(names["car"].read_text().replace("simulated_car.dbc", "gone.dbc"))
+    line = NAMED_IN_THE_VEHICLE_FILE[command]
+    argv = line.format(**names, strange=strange, out=tmp_path / "out").split()
+
+    _is_refused([command, *argv], INPUT, "gone.dbc", names, tmp_path, capsys)

@@ -1,0 +1,54 @@
+"""Inputs of every kind that are whole and of which nothing comes, and commands that want more."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from crosscue.datasets.truth.truth import Truth, save
+from support.gap_drive import BEGIN, SECOND, Clock, replayed, write_drive
+from support.pictures import picture, picture_folder
+from support.rosbag_files import Row, write_folder
+
+COMMANDS: dict[str, str] = {
+    "truth": "{log} -o {out}",
+    "truth import": "{empty}/coco.json --log {log} -o {out}.json --vehicle {car}",
+    "truth check": "{empty}/truth.json --log {other}",
+    "fit compass": "{log} --vehicle {car}",
+    "fit signs": "{empty}/labels.csv --label stop",
+    "fit messages": "{run} --truth {empty}/truth.json -o {out}.toml",
+    "fit ranges": "--cue stop_sign --truth {empty}/truth.json",
+    "fit landmarks": "--pairs {empty}/pairs.csv",
+    "score": "{run} --truth {empty}/truth.json -o {out}",
+    "train mask-rcnn": "--data {empty}/coco.json --images {empty} -o {out}.safetensors",
+    "train road": "--data {empty} -o {out}.safetensors",
+    "landmarks add": "{out}.db --images {empty} --coordinates {empty}/places.csv",
+    "vehicle init": "{strange} -o {out}.toml",
+    "merge": "{empty} -o {out}",
+}
+"""Commands that such input gives nothing, and their arguments."""
+
+
+def empty_inputs(folder: Path) -> dict[str, Path]:
+    """A drive and its run, and inputs of every kind that are whole and hold nothing."""
+    drive, empty = folder / "drive", folder / "empty"
+    log = write_drive(drive, Clock(), seconds=4)
+    run = replayed(drive, log, "../run")
+    for place in (empty / "images", empty / "masks"):
+        place.mkdir(parents=True)
+    save(Truth(version=1, source="x", start_ns=BEGIN, end_ns=BEGIN + 4 * SECOND), empty)
+    coco: dict[str, list[object]] = {"categories": [], "images": [], "annotations": []}
+    (empty / "coco.json").write_text(json.dumps(coco))
+    (empty / "a.png").write_bytes(picture(1))
+    (empty / "labels.csv").write_text("picture,label,x0,y0,x1,y1\na.png,,,,,\n")
+    (empty / "pairs.csv").write_text("query,known,same\n")
+    (empty / "places.csv").write_text("image,x_m,y_m,sd_m\na.png,0,0,1\n")
+    message = Row("/can", BEGIN, b"\0\1\0\0\2\0\0\0a\0")
+    return {
+        "log": log,
+        "run": run.path,
+        "car": drive / "car.toml",
+        "empty": empty,
+        "other": picture_folder(folder / "front", 3, "rate_hz: 10\n"),
+        "strange": write_folder(folder / "strange", [message]),
+    }
