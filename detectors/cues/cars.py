@@ -53,6 +53,26 @@ class Sides(NamedTuple):
 NONE: Final = Sides(0, 0)
 
 
+class Judged(NamedTuple):
+    """What cars do, where they were followed over several frames and not only in two.
+
+    Attributes:
+        crossing: Cross traffic at the intersection.
+        parked: Parked cars there.
+        crossing_elsewhere: Cross traffic that is not there.
+        parked_elsewhere: Likewise, or nobody knows where the intersection is.
+        seen: Cars that were whole and near enough.
+        followed: Those of them that were seen in frames enough.
+    """
+
+    crossing: Sides
+    parked: Sides
+    crossing_elsewhere: Sides
+    parked_elsewhere: Sides
+    seen: int
+    followed: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
     """Cars of one frame that were found again in the next, as columns of length M.
@@ -62,12 +82,14 @@ class Pairs:
         center_px: Shape (M, 2), float64: where these are in the later frame.
         nose: Shape (M,), int64: as in ``CarShapes``, of the later frame.
         width_px: Of the picture.
+        judged: What they do, where that is known from more than these two frames.
     """
 
     step_px: Floats
     center_px: Floats
     nose: Int64s
     width_px: int
+    judged: Judged | None = None
 
 
 class Tracker(Protocol):
@@ -199,13 +221,16 @@ def parked_cars(pairs: Pairs, settings: Cars) -> Sides:
 
 def count_crossing(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int:
     """Cars that cross towards the side that the cue supports."""
-    return _of_side(cross_traffic(pairs, vehicle.cars), cue)
+    sides = cross_traffic(pairs, vehicle.cars) if pairs.judged is None else pairs.judged.crossing
+    return of_side(sides, cue)
 
 
 def count_parked(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int:
     """Parked cars that face the side that the cue supports."""
-    return _of_side(parked_cars(pairs, vehicle.cars), cue)
+    sides = parked_cars(pairs, vehicle.cars) if pairs.judged is None else pairs.judged.parked
+    return of_side(sides, cue)
 
 
-def _of_side(sides: Sides, cue: CueSpec) -> int:
+def of_side(sides: Sides, cue: CueSpec) -> int:
+    """How many say the side that the cue supports."""
     return sides.left if cue.supports == ("left",) else sides.right

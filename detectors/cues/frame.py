@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Final
+
+import numpy as np
 
 from crosscue.detectors.base import Detections, Found, RoadMask
+from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.vehicle import Vehicle
 
+from .car_tracks import CarTracks, Place, judge
 from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
 from .labelled import count_labels
 from .road import RoadShares, road_shares
@@ -105,26 +111,37 @@ class FrameCues:
 
 @dataclass(slots=True)
 class CuePass:
-    """Gives each frame's cues; keeps the cars of the frame before.
+    """Gives each frame's cues; keeps the cars of earlier frames.
 
     Attributes:
         vehicle: Regions and thresholds.
-        tracker: Pairs cars of two frames.
+        tracker: Pairs cars of two frames, where the vehicle file has ``cars.kind = "pairs"``.
         tally: Counts what became of all candidates, where somebody asks.
+        not_followed: Frames in which cars could not be followed, by reason.
     """
 
     vehicle: Vehicle
     tracker: Tracker = pair_cars
     tally: CueTally | None = None
+    not_followed: Counter[str] = field(default_factory=Counter)
     _before: CarShapes | None = None
+    _tracks: CarTracks | None = None
 
-    def __call__(self, frame: Seen) -> FrameCues:
-        """The cues of the next frame."""
+    def __call__(
+        self, frame: Seen, ego: Motion | None = None, place: Place | None = None
+    ) -> FrameCues:
+        """The cues of the next frame.
+
+        Args:
+            frame: What was found in it.
+            ego: The ego vehicle's motion since the frame before; None where nobody knows.
+            place: Where the intersection is believed to be, if that is known.
+        """
         counts: dict[str, int] = {}
         pairs: Pairs | None = None
         if frame.objects:
             counts |= counts_of("objects", frame.objects, self.vehicle)
-            pairs = self._pairs(frame.objects)
+            pairs = self._cars(frame.objects, ego, place)
             if pairs is not None:
                 counts |= counts_of("car pairs", pairs, self.vehicle)
         if frame.boxes:
@@ -148,19 +165,69 @@ class CuePass:
             self._explain(self.tally, frame, pairs, found)
         return found
 
+    def restart(self) -> None:
+        """Know nothing of the cars before."""
+        self._before = self._tracks = None
+
+    def notes(self) -> Counter[str]:
+        """Frames in which crossing and parked cars could not be computed, by reason."""
+        return Counter(
+            {f"crossing and parked cars: {why}": n for why, n in self.not_followed.items()}
+        )
+
     def _explain(self, tally: CueTally, frame: Seen, pairs: Pairs | None, found: FrameCues) -> None:
         tally.labelled("objects", frame.objects, found.counts)
         tally.labelled("signs", frame.boxes, found.counts)
         tally.own(frame.boxes, found.counts)
         is_any = frame.labels is None or not frame.labels.isdisjoint(self.vehicle.cars.labels)
-        if self._before is not None and frame.objects and is_any:
+        if pairs is not None and pairs.judged is not None and is_any:
+            tally.followed(frame.objects, pairs.judged)
+        elif self._before is not None and frame.objects and is_any:
             again = 0 if pairs is None else len(pairs.nose)
             tally.cars(frame.objects, len(self._before), again, found.counts)
         if found.road is not None:
             tally.road(found.road)
+
+    def _cars(
+        self, boxes: Sequence[Detections], ego: Motion | None, place: Place | None
+    ) -> Pairs | None:
+        """Cars found again; None where they could not be."""
+        cars, camera = self.vehicle.cars, self.vehicle.camera
+        if cars.kind != "tracks":
+            return self._pairs(boxes)
+        why = _why_not_followed(ego, self.vehicle)
+        if ego is None or why is not None:
+            self._tracks = None
+            self.not_followed[why or NO_ODOMETRY] += 1
+            return None
+        self._tracks = self._tracks or CarTracks(camera, cars)
+        found = self._tracks(boxes, ego)
+        judged = judge(found, self._tracks.seen, camera, cars, place)
+        return Pairs(
+            np.array([car.step_px for car in found]).reshape(-1, 2),
+            np.array([car.center_px for car in found]).reshape(-1, 2),
+            np.sign([car.nose for car in found]).astype(np.int64),
+            boxes[0].size_px[0],
+            judged,
+        )
 
     def _pairs(self, boxes: Sequence[Detections]) -> Pairs | None:
         """Cars found again since the frame before; None in the first frame."""
         now = car_shapes(boxes, self.vehicle.cars)
         before, self._before = self._before, now
         return None if before is None else self.tracker(before, now, self.vehicle.cars)
+
+
+NO_ODOMETRY: Final = "no odometry, so the camera's own motion is unknown"
+NO_FOCAL_LENGTH: Final = "camera.focal_px is not given"
+
+
+def _why_not_followed(ego: Motion | None, vehicle: Vehicle) -> str | None:
+    """Why cars cannot be followed into this frame; None where they can."""
+    if vehicle.camera.focal_px is None:
+        return NO_FOCAL_LENGTH
+    if ego is None or ego.way_m is None:
+        return NO_ODOMETRY
+    if ego.seconds > vehicle.cars.most_gap_s:
+        return f"frames further than {vehicle.cars.most_gap_s:g} s apart"
+    return None

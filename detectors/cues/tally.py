@@ -12,14 +12,18 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .candidates import (
     BELOW_SCORE,
+    CUT_OR_FAR,
+    ELSEWHERE,
     NOT_COUNTED,
     NOT_FOUND_BEFORE,
     NOT_FROM_THE_SIDE,
     OTHER_MOTION,
+    TOO_FEW_FRAMES,
     TOO_LITTLE_ROAD,
     Candidates,
     Unit,
 )
+from .cars import Judged, of_side
 from .labelled import labels_of
 from .road import RoadShares
 
@@ -86,6 +90,30 @@ class CueTally:
                     },
                 )
 
+    def followed(self, boxes: Sequence[Detections], judged: Judged) -> None:
+        """Of cues that follow cars over several frames.
+
+        Args:
+            boxes: All detections of the frame.
+            judged: What became of the cars among them.
+        """
+        cars = self.vehicle.cars
+        scores = scores_of(boxes, cars.labels)
+        low = sum(score <= cars.score for score in scores)
+        for cue in CUES.values():
+            if cue.group in ("cross_traffic", "parked"):
+                here, there = _judged(judged, cue)
+                self._of(cue.name, "detections", "[cars] score", cars.score).take(
+                    scores,
+                    {
+                        BELOW_SCORE: low,
+                        CUT_OR_FAR: len(scores) - low - judged.seen,
+                        TOO_FEW_FRAMES: judged.seen - judged.followed,
+                        OTHER_MOTION: judged.followed - here - there,
+                        ELSEWHERE: there,
+                    },
+                )
+
     def road(self, shares: RoadShares) -> None:
         """Of cues that look for road in a region."""
         threshold = self.vehicle.cues.road_share
@@ -116,6 +144,13 @@ class CueTally:
         self, name: str, unit: Unit, setting: str | None, threshold: float | None
     ) -> Candidates:
         return self.by_cue.setdefault(name, Candidates(unit, setting, threshold))
+
+
+def _judged(judged: Judged, cue: CueSpec) -> tuple[int, int]:
+    """Cars that are the cue, and those that would be at another place."""
+    if cue.group == "cross_traffic":
+        return of_side(judged.crossing, cue), of_side(judged.crossing_elsewhere, cue)
+    return of_side(judged.parked, cue), of_side(judged.parked_elsewhere, cue)
 
 
 def scores_of(boxes: Sequence[Detections], labels: Sequence[str]) -> list[float]:

@@ -15,10 +15,15 @@ from crosscue.eval.interface.runs import (
     score_run,
 )
 from crosscue.eval.interface.simulate import simulate_approach
-from crosscue.replay.errors import CrosscueError, UsageError
+from crosscue.replay.base import CrosscueError, UsageError, write_text
 
 REAL: Final = "pandaset_002"
 MODEL: Final = "yolox-nano"
+FOLLOWED: Final = """
+# Cars are followed on the road over several frames, not in pairs of frames as the source has it.
+[cars]
+kind = "tracks"
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,12 +158,16 @@ def simulated(
     width_px: int = 1280,
     overwrite: bool = False,
 ) -> KnownDrive:
-    """A drive as of ``simulate_approach`` in ``folder/drive``, for the embedded networks."""
+    """A drive as of ``simulate_approach`` in ``folder/drive``, for the embedded networks.
+
+    Its vehicle file has cars followed on the road: of the published pairs most are wrong there.
+    """
     from crosscue.detectors.registry import EMBEDDED
 
     files = simulate_approach(
         Path(folder) / "drive", layout, run, seed, width_px=width_px, overwrite=overwrite
     )
+    write_text(files.vehicle, files.vehicle.read_text("utf-8") + FOLLOWED)
     return KnownDrive(files.log, files.vehicle, files.truth, "", tuple(EMBEDDED.split(",")))
 
 

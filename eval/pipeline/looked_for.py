@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 from typing import Final
 
 from crosscue.detectors.cues.frame import Role, all_labels
@@ -20,6 +21,7 @@ def not_looked_for(
     looked: Collection[str],
     detectors: Sequence[DetectorRow],
     cue_labels: Mapping[str, Sequence[str]],
+    not_followed: Mapping[str, int] = MappingProxyType({}),
 ) -> dict[str, str]:
     """From each cue, a user's own among them, that has no row to the reason.
 
@@ -27,6 +29,7 @@ def not_looked_for(
         looked: Cues that have rows.
         detectors: As the manifest has them.
         cue_labels: All cues, with the labels they are made of.
+        not_followed: Frames in which cars could not be followed, by reason.
     """
     roles = {one.role for one in detectors}
     finders = [one for one in detectors if one.role in (Role.OBJECTS, Role.SIGNS)]
@@ -43,6 +46,8 @@ def not_looked_for(
             return NO_LABEL
         can_be_signs = observed_by == "signs" or cue not in CUES
         has_any = bool(finders) if can_be_signs else Role.OBJECTS in roles
+        if has_any and observed_by == "car pairs" and not_followed:
+            return max(not_followed, key=lambda why: not_followed[why])
         return NEVER if has_any else NO_OBJECTS
 
     return {cue: why(cue) for cue in cue_labels if cue not in looked}

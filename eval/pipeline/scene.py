@@ -8,14 +8,16 @@ and each cue left out to see what it was worth.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from crosscue.detectors.cues.car_tracks import Place
 from crosscue.detectors.cues.frame import CuePass, Seen
 from crosscue.detectors.cues.tally import CueTally, cue_labels
+from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.eval.pipeline.outcome import (
     ApproachSummary,
     OnTime,
@@ -27,9 +29,10 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
 from crosscue.eval.runs.tables.travelled import Odometer, odometer_of
-from crosscue.fusion.approaches import Approaches, PastCues, Step
-from crosscue.fusion.evidence import FrameEvidence, SignRange
+from crosscue.fusion.approaches import Approaches, PastCues, RangeRow, Step
+from crosscue.fusion.evidence import FrameEvidence
 from crosscue.fusion.factor_graph import graph_of
+from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -103,11 +106,13 @@ def estimate_scene(
         scene.frames,
         dict(sorted(scene.positive.items())),
         tuple(scene.summaries.values()),
-        scene.approaches.counts + scene.motion.counts,
+        scene.approaches.counts + scene.motion.counts + scene.cues.notes(),
         scene.without_odometry,
         scene.tally.by_cue,
         scene.signs.by_cue,
-        not_looked_for(scene.looked, detected.detectors, cue_labels(vehicle)),
+        not_looked_for(
+            scene.looked, detected.detectors, cue_labels(vehicle), scene.cues.not_followed
+        ),
     )
 
 
@@ -150,6 +155,7 @@ class _Scene:
     summaries: dict[int, ApproachSummary] = field(default_factory=dict)
     _last_ns: int | None = None
     _before: Seen | None = None
+    _ranges: tuple[RangeRow, ...] = ()
 
     def __post_init__(self) -> None:
         self.tally = CueTally(self.vehicle)
@@ -159,15 +165,20 @@ class _Scene:
 
     def step(self, frame: StoredFrame, past: PastCues | None, without: frozenset[str]) -> None:
         seen = frame.seen
-        counts = {cue: count for cue, count in self.cues(seen).counts.items() if cue not in without}
+        gap_ns = 0 if self._last_ns is None else seen.t_ns - self._last_ns
+        seconds = max(gap_ns, 0) * 1e-9
+        evidence = self._motion(seen.t_ns)
+        ego = Motion(
+            evidence.travelled_m, evidence.travelled_var_m2, evidence.turned_rad or 0.0, seconds
+        )
+        found = self.cues(seen, ego, self._place(ego))
+        counts = {cue: count for cue, count in found.counts.items() if cue not in without}
         signs = tuple(
             sign
             for sign in self.signs(seen.objects, frame.heights_px)
             if _MEASURES[sign.reference] not in without
         )
-        gap_ns = 0 if self._last_ns is None else seen.t_ns - self._last_ns
-        evidence = self._evidence(seen.t_ns, counts, signs)
-        seconds = max(gap_ns, 0) * 1e-9
+        evidence = replace(evidence, counts=counts, signs=signs)
         posteriors = self.motion(evidence, seconds, seen.objects, frame.heights_px, without)
         evidence = replace(evidence, posteriors=posteriors, is_new_picture=self._is_new(seen))
         self.rows.add_objects(seen.t_ns, self.motion.objects)
@@ -179,8 +190,15 @@ class _Scene:
         self.frames += 1
         self.looked.update(step.counts)
         self.positive.update(cue for cue, count in step.counts.items() if count)
+        self._ranges = step.ranges
         self.rows.add(step)
         self._sum_up(step)
+
+    def _place(self, ego: Motion) -> Place | None:
+        """Where the intersection is in this frame, from what was believed in the one before."""
+        if ego.way_m is None:
+            return None
+        return place_of(self._ranges, ego.way_m, self.vehicle.fusion.length_m)
 
     def _is_new(self, seen: Seen) -> bool:
         """False where a camera repeats a picture, which shows as detections equal to the last bit.
@@ -196,13 +214,13 @@ class _Scene:
         """Know nothing of what was before ``t_ns``."""
         self.approaches.restart()
         self.odometer.skip_to(t_ns)
-        self.cues = CuePass(self.vehicle, tally=self.tally)
+        self.cues.restart()
         self.motion.restart()
         self._last_ns = self._before = None
+        self._ranges = ()
 
-    def _evidence(
-        self, t_ns: int, counts: Mapping[str, int], signs: tuple[SignRange, ...]
-    ) -> FrameEvidence:
+    def _motion(self, t_ns: int) -> FrameEvidence:
+        """Evidence that holds only how the ego vehicle moved."""
         way = self.odometer.until(t_ns)
         gap_ns = 0 if self._last_ns is None else t_ns - self._last_ns
         is_covered = way.covered_ns >= 0.9 * gap_ns
@@ -212,8 +230,8 @@ class _Scene:
             t_ns=t_ns,
             travelled_m=way.distance_m if is_covered else None,
             travelled_var_m2=way.var_m2,
-            signs=signs,
-            counts=counts,
+            signs=(),
+            counts={},
             turned_rad=way.turn_rad if is_covered else None,
             assumed_m=way.assumed_m,
         )
@@ -231,6 +249,27 @@ class _Scene:
             one.detected_ns = step.t_ns
             one.detected_m = step.ranges[0].range_m
             one.reference = str(step.ranges[0].reference)
+
+
+def place_of(ranges: Sequence[RangeRow], way_m: float, length_m: float) -> Place | None:
+    """Where an intersection is after ``way_m`` more; None without any range.
+
+    Args:
+        ranges: At most one for each reference.
+        way_m: Gone since they held.
+        length_m: From its start to its end, where only one is known.
+    """
+    if not ranges:
+        return None
+    known = {one.reference: one.range_m - way_m for one in ranges}
+    start_m = known.get(Reference.START)
+    end_m = known.get(Reference.END)
+    if start_m is None:
+        assert end_m is not None
+        start_m = end_m - length_m
+    if end_m is None:
+        end_m = start_m + length_m
+    return Place(start_m, end_m, max(one.var_m2 for one in ranges) ** 0.5)
 
 
 def _is_repeated(before: Seen, now: Seen) -> bool:

@@ -207,8 +207,12 @@ class Cues(Section):
 
 
 class Cars(Section):
-    """Crossing and parked cars: shape, association and motion between two frames (eq. 15, 16)."""
+    """Crossing and parked cars: shape, association and motion (eq. 15, 16)."""
 
+    kind: Literal["pairs", "tracks"] | None = None
+    """``pairs``: motion in the picture between two frames, as published. ``tracks``: motion on the
+    road over three frames and more, the ego vehicle's taken out; wants ``camera.focal_px`` and
+    odometry. Left out: ``pairs`` in a simulated car's file, ``tracks`` in every other."""
     labels: tuple[str, ...] = ("car",)
     score: Proportion = 0.95
     length_per_height: Positive = 2.0
@@ -223,6 +227,14 @@ class Cars(Section):
     """Horizontal motion: less than so many pixels down or up for one to the side."""
     most_gap_s: Positive = 0.5
     """Frames further apart are not compared."""
+    least_frames: Annotated[int, Field(ge=3)] = 3
+    """With ``kind = "tracks"`` a car is judged once seen in so many frames."""
+    most_frames: Annotated[int, Field(ge=3, le=100)] = 10
+    """And by the newest so many."""
+    within_m: Positive = 60.0
+    """Cars that are further away by their height are not judged."""
+    crossing_mps: Positive = 2.0
+    """A car that crosses moves sideways by more; a parked one surely moves by less."""
 
 
 class RangeCurve(Section):
@@ -296,7 +308,7 @@ class Vehicle(Section):
     landmarks: Landmarks = Landmarks()
     regions: Regions = Regions()
     cues: Cues = Cues()
-    cars: Cars = Cars()
+    cars: Annotated[Cars, Field(validate_default=True)] = Cars()
     ranges: Ranges = Ranges()
     range_filter: RangeFilter = RangeFilter()
     past: Past = Past()
@@ -304,6 +316,14 @@ class Vehicle(Section):
     detectors: dict[str, DetectorSection] = Field(default_factory=dict)
     lost_above_m: Positive = 100.0
     """The pose counts as lost while the 2-sigma ellipse's full major axis exceeds this."""
+
+    @field_validator("cars")
+    @classmethod
+    def _kind_of_cars(cls, cars: Cars, info: ValidationInfo) -> Cars:
+        if cars.kind is not None:
+            return cars
+        is_simulated = info.data.get("name") == SIMULATED_CAR
+        return cars.model_copy(update={"kind": "pairs" if is_simulated else "tracks"})
 
     @field_validator("fusion")
     @classmethod

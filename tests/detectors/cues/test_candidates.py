@@ -7,18 +7,28 @@ from hypothesis import strategies as st
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.candidates import (
     BELOW_SCORE,
+    CUT_OR_FAR,
     NOT_FOUND_BEFORE,
     NOT_FROM_THE_SIDE,
     OTHER_MOTION,
+    TOO_FEW_FRAMES,
     TOO_LITTLE_ROAD,
 )
 from crosscue.detectors.cues.frame import CuePass, Seen
 from crosscue.detectors.cues.road import RoadShares
 from crosscue.detectors.cues.tally import CueTally
+from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.cue_table import CUES
-from crosscue.replay.vehicle.vehicle import Cues, OwnCue, Vehicle
+from crosscue.replay.vehicle.vehicle import Camera, Cars, Cues, OwnCue, Vehicle
 
-VEHICLE = Vehicle(version=1, cues=Cues(own={"crossing": OwnCue(labels=("zebra",), score=0.3)}))
+VEHICLE = Vehicle(
+    version=1,
+    cues=Cues(own={"crossing": OwnCue(labels=("zebra",), score=0.3)}),
+    cars=Cars(kind="pairs"),
+)
+FOLLOWED = VEHICLE.model_copy(
+    update={"cars": Cars(kind="tracks"), "camera": Camera(focal_px=500.0, center_px=(320.0, 200.0))}
+)
 LABELS = ("traffic light", "stop sign", "car", "zebra", "one way left", "dog")
 BOX = st.tuples(st.sampled_from(LABELS), st.floats(0.0, 1.0), st.floats(5.0, 300.0))
 FRAMES = st.lists(st.lists(BOX, max_size=5), min_size=1, max_size=4)
@@ -32,9 +42,9 @@ def _found(t_ns: int, *things: tuple[str, float, float]) -> Detections:
     return Detections(t_ns, (640, 480), boxes, scores, labels, (b"",) * len(things))
 
 
-def _pass() -> tuple[CuePass, CueTally]:
-    tally = CueTally(VEHICLE)
-    return CuePass(VEHICLE, tally=tally), tally
+def _pass(vehicle: Vehicle = VEHICLE) -> tuple[CuePass, CueTally]:
+    tally = CueTally(vehicle)
+    return CuePass(vehicle, tally=tally), tally
 
 
 def test_lights_below_the_threshold_are_counted_with_the_best_score_of_all() -> None:
@@ -64,6 +74,17 @@ def test_a_car_is_skipped_for_the_first_rule_that_it_does_not_meet() -> None:
     }
 
 
+def test_a_car_that_is_followed_is_skipped_for_its_first_reason_too() -> None:
+    cues, tally = _pass(FOLLOWED)
+    for _ in range(2):
+        things = ("car", 0.99, 100.0), ("car", 0.5, 100.0), ("car", 0.99, 640.0)
+        cues(Seen(0, objects=(_found(0, *things),)), Motion(0.0, 0.0, 0.0, 0.1))
+
+    cars = tally.by_cue["parked_right"]
+    assert (cars.seen, cars.used) == (6, 0)
+    assert cars.skipped == {BELOW_SCORE: 2, CUT_OR_FAR: 2, TOO_FEW_FRAMES: 2}
+
+
 def test_a_region_with_too_little_road_is_counted_and_one_without_is_not() -> None:
     cues, tally = _pass()
     cues(Seen(0, road=RoadShares(left=0.13, straight=0.5, right=0.0)))
@@ -74,16 +95,19 @@ def test_a_region_with_too_little_road_is_counted_and_one_without_is_not() -> No
     assert tally.by_cue["road_right"].seen == 0
 
 
-@given(FRAMES, FRAMES)
-@settings(max_examples=40, deadline=None)
+@given(FRAMES, FRAMES, st.sampled_from([VEHICLE, FOLLOWED]))
+@settings(max_examples=60, deadline=None)
 def test_used_and_skipped_add_up_for_every_cue(
-    objects: list[list[tuple[str, float, float]]], signs: list[list[tuple[str, float, float]]]
+    objects: list[list[tuple[str, float, float]]],
+    signs: list[list[tuple[str, float, float]]],
+    vehicle: Vehicle,
 ) -> None:
-    cues, tally = _pass()
+    cues, tally = _pass(vehicle)
+    ego = Motion(0.5, 0.0, 0.0, 0.1)
     counted: dict[str, int] = {}
     for t, (some, others) in enumerate(zip(objects, signs, strict=False)):
         frame = Seen(t * 10**8, objects=(_found(t, *some),), signs=(_found(t, *others),))
-        for cue, number in cues(frame).counts.items():
+        for cue, number in cues(frame, ego).counts.items():
             counted[cue] = counted.get(cue, 0) + number
 
     for name, one in tally.by_cue.items():

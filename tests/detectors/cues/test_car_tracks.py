@@ -1,0 +1,243 @@
+"""Cars followed on the road: what stands never crosses, whatever the camera does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.car_tracks import (
+    CAR_HEIGHT_M,
+    CarMotion,
+    CarTracks,
+    Place,
+    crossing,
+    judge,
+    parked,
+)
+from crosscue.detectors.cues.cars import Sides
+from crosscue.detectors.cues.frame import CuePass, Seen
+from crosscue.detectors.ranging.object_tracks import Motion
+from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Cars, Vehicle
+
+SIZE = (1280, 720)
+CAMERA = Camera(x_m=1.7, z_m=1.4, focal_px=704.0, center_px=(640.0, 360.0))
+RULES = Cars(kind="tracks", score=0.5)
+VEHICLE = Vehicle(version=1, camera=CAMERA, cars=RULES)
+CAR_LENGTH_M = 4.6
+PERIOD_S = 0.1
+WAY_M = 0.8
+
+
+@dataclass(frozen=True)
+class Car:
+    """A car seen from the side, as a board across the road; it may move."""
+
+    ahead_m: float
+    right_m: float
+    right_mps: float = 0.0
+    ahead_mps: float = 0.0
+    nose: int = 0
+    height_m: float = CAR_HEIGHT_M
+
+
+def drive(
+    cars: Sequence[Car], steps: Sequence[Motion], *, jitter_px: float = 0.0, seed: int = 0
+) -> Iterator[list[CarMotion]]:
+    """What is known of the cars after each frame of a drive."""
+    rng = np.random.default_rng(seed)
+    tracks = CarTracks(CAMERA, RULES)
+    x = y = heading = time_s = 0.0
+    for step in steps:
+        middle = heading + 0.5 * step.turned_rad
+        x += (step.way_m or 0.0) * math.cos(middle)
+        y += (step.way_m or 0.0) * math.sin(middle)
+        heading += step.turned_rad
+        time_s += step.seconds
+        eye = x + CAMERA.x_m * math.cos(heading), y + CAMERA.x_m * math.sin(heading), heading
+        seen = [box for car in cars if (box := board(car, time_s, eye)) is not None]
+        boxes = np.array([box for box, _ in seen]).reshape(-1, 4)
+        boxes += rng.normal(0.0, jitter_px, boxes.shape) if jitter_px else 0.0
+        yield tracks([found(boxes, [nose for _, nose in seen])], step)
+
+
+def board(
+    car: Car, time_s: float, eye: tuple[float, float, float]
+) -> tuple[tuple[float, float, float, float], int] | None:
+    """A car's box in the picture, if it is in front of the camera."""
+    at = car.ahead_m + car.ahead_mps * time_s, -car.right_m - car.right_mps * time_s
+    east, north = at[0] - eye[0], at[1] - eye[1]
+    depth = east * math.cos(eye[2]) + north * math.sin(eye[2])
+    right = east * math.sin(eye[2]) - north * math.cos(eye[2])
+    if depth < 3.0:
+        return None
+    scale = 704.0 / depth
+    middle, bottom = 640.0 + right * scale, 360.0 + 1.4 * scale
+    half, height = 0.5 * CAR_LENGTH_M * scale, car.height_m * scale
+    return (middle - half, bottom - height, middle + half, bottom), car.nose
+
+
+def found(boxes: np.ndarray[tuple[int, int], np.dtype[np.float64]], noses: list[int]) -> Detections:
+    n = len(boxes)
+    masks = tuple(mask(box, nose) for box, nose in zip(boxes, noses, strict=True))
+    return Detections(0, SIZE, boxes, np.full(n, 0.9), ("car",) * n, masks)
+
+
+def mask(box: np.ndarray[tuple[int], np.dtype[np.float64]], nose: int) -> bytes:
+    """A wedge whose lower end is the nose; nothing where it is unknown."""
+    x0, y0, x1, y1 = (round(value) for value in box.tolist())
+    if not nose or min(x0, y0) < 0 or x1 >= SIZE[0] or y1 >= SIZE[1]:
+        return b""
+    tall = np.linspace(1.0, 0.4, x1 - x0)[:: 1 if nose > 0 else -1]
+    rows = np.arange(y1 - y0)[:, None]
+    return rle.encode(rows >= (1.0 - tall) * (y1 - y0), (x0, y0), SIZE)
+
+
+def steady(frames: int, way_m: float = WAY_M, turned_rad: float = 0.0) -> list[Motion]:
+    return [Motion(way_m, 0.0, turned_rad, PERIOD_S)] * frames
+
+
+ego_motions = st.lists(
+    st.builds(
+        Motion,
+        st.floats(-1.0, 3.0),
+        st.just(0.0),
+        st.floats(-0.06, 0.06),
+        st.floats(0.02, 0.5),
+    ),
+    min_size=3,
+    max_size=15,
+)
+standing = st.builds(
+    Car, st.floats(8.0, 60.0), st.floats(-30.0, 30.0), height_m=st.floats(1.3, 1.9)
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(steps=ego_motions, car=standing)
+def test_a_standing_car_never_crosses_whatever_the_ego_vehicle_does(
+    steps: list[Motion], car: Car
+) -> None:
+    for cars in drive([car], steps):
+        assert not crossing(cars, RULES)
+
+
+@settings(max_examples=60, deadline=None)
+@given(steps=ego_motions, car=standing, seed=st.integers(0, 99))
+def test_nor_does_it_when_its_box_trembles(steps: list[Motion], car: Car, seed: int) -> None:
+    one = replace(car, height_m=CAR_HEIGHT_M)
+
+    for cars in drive([one], steps, jitter_px=0.7, seed=seed):
+        assert not crossing(cars, RULES)
+
+
+@pytest.mark.parametrize("way_m", [0.0, 0.5, 1.5])
+@pytest.mark.parametrize("turned_rad", [0.0, 0.01])
+@pytest.mark.parametrize("right_mps", [-9.0, -6.0, 6.0, 9.0])
+def test_a_crossing_car_does_and_to_the_side_it_goes_to(
+    right_mps: float, turned_rad: float, way_m: float
+) -> None:
+    car = Car(38.0, -0.5 * right_mps, right_mps)
+
+    *_, last = drive([car], steady(10, way_m, turned_rad))
+
+    (one,) = crossing(last, RULES)
+    assert one.right_mps == pytest.approx(right_mps, rel=0.2)
+    assert judge(last, 1, CAMERA, RULES, None).crossing == Sides(right_mps < 0, right_mps > 0)
+    assert not parked(last, RULES)
+
+
+def test_the_mirror_image_of_a_drive_has_the_mirror_image_of_its_cars() -> None:
+    steps = steady(8, turned_rad=0.01)
+    mirrored = [one._replace(turned_rad=-one.turned_rad) for one in steps]
+
+    *_, last = drive([Car(35.0, -4.0, 7.0), Car(30.0, 6.0)], steps)
+    *_, other = drive([Car(35.0, 4.0, -7.0), Car(30.0, -6.0)], mirrored)
+
+    assert [one.right_mps for one in other] == pytest.approx([-one.right_mps for one in last])
+
+
+@pytest.mark.parametrize("ahead_mps", [-14.0, 8.0, 14.0])
+def test_oncoming_and_outgoing_cars_do_not_cross(ahead_mps: float) -> None:
+    for cars in drive([Car(45.0, -3.5, ahead_mps=ahead_mps)], steady(12)):
+        assert not crossing(cars, RULES)
+        assert not parked(cars, RULES)
+
+
+def test_a_car_that_comes_out_from_behind_another_does_not_cross() -> None:
+    tracks = CarTracks(CAMERA, RULES)
+    for i in range(10):
+        box = np.array([[600.0, 350.0, 640.0 + 8.0 * i, 380.0]])
+        cars = tracks([found(box, [0])], Motion(0.0, 0.0, 0.0, PERIOD_S))
+        assert not crossing(cars, RULES)
+
+
+def test_fewer_than_three_frames_say_nothing() -> None:
+    first, second, *_ = drive([Car(30.0, 0.0, 8.0), Car(30.0, 9.0, nose=1)], steady(3, 0.0))
+
+    assert not first
+    assert len(second) == 2
+    assert not crossing(second, RULES)
+    assert not parked(second, RULES)
+
+
+@pytest.mark.parametrize("nose", [-1, 1])
+def test_a_parked_car_counts_at_the_intersection_alone(nose: int) -> None:
+    steps = steady(10)
+    *_, last = drive([Car(40.0, 2.0, nose=nose)], steps)
+    ahead_m = 40.0 - 10 * WAY_M
+
+    here = judge(last, 1, CAMERA, RULES, Place(ahead_m - 5.0, ahead_m + 8.0, 1.0))
+    further = judge(last, 1, CAMERA, RULES, Place(ahead_m + 30.0, ahead_m + 45.0, 1.0))
+
+    side = Sides(nose < 0, nose > 0)
+    assert (here.parked, here.parked_elsewhere) == (side, Sides(0, 0))
+    assert (further.parked, further.parked_elsewhere) == (Sides(0, 0), side)
+    assert judge(last, 1, CAMERA, RULES, None).parked == Sides(0, 0)
+    assert here.crossing == further.crossing == Sides(0, 0)
+
+
+@given(bearing=st.floats(-0.9, 0.9))
+def test_a_car_along_the_street_is_not_parked_across_it(bearing: float) -> None:
+    # Its length is foreshortened, its width is not: what its outline is long at this bearing.
+    long = (CAR_LENGTH_M * abs(bearing) + 1.8) / CAR_HEIGHT_M
+    car = CarMotion(10, 30.0, bearing, 0.0, 0.1, 0.0, 0.5, True, long, 1.0)
+
+    assert not parked([car], RULES)
+
+
+def cues(steps: Sequence[Motion | None], vehicle: Vehicle = VEHICLE) -> CuePass:
+    one = CuePass(vehicle)
+    for step in steps:
+        box = np.array([[600.0, 350.0, 680.0, 380.0]])
+        counts = one(Seen(0, (found(box, [0]),)), step).counts
+        if step is None or step.seconds > 0.5:
+            assert "cross_traffic_left" not in counts
+    return one
+
+
+def test_below_two_frames_a_second_the_cue_says_that_it_cannot_be_computed() -> None:
+    slow = [Motion(5.0, 0.0, 0.0, 0.51)] * 4
+
+    assert cues(slow).notes() == {"crossing and parked cars: frames further than 0.5 s apart": 4}
+    assert not cues([Motion(5.0, 0.0, 0.0, 0.5)] * 4).notes()
+
+
+def test_without_odometry_or_focal_length_it_cannot_either() -> None:
+    (why,) = cues([None, None]).not_followed
+    assert why == "no odometry, so the camera's own motion is unknown"
+    (why,) = cues([None], Vehicle(version=1)).not_followed
+    assert why == "camera.focal_px is not given"
+
+
+def test_the_default_is_the_published_pairs_only_for_simulated_cars() -> None:
+    assert Vehicle(version=1, name="Golf").cars.kind == "tracks"
+    assert Vehicle(version=1, name=SIMULATED_CAR).cars.kind == "pairs"
+    assert Vehicle(version=1, name=SIMULATED_CAR, cars=RULES).cars.kind == "tracks"
