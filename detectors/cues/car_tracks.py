@@ -388,13 +388,16 @@ def judge(
     moving_here = [c for c in moving if place is None or is_at(c, camera, place)]
     still_here = [c for c in still if place is not None and is_at(c, camera, place)]
     followed = sum(car.frames >= settings.least_frames for car in cars)
-    sides = _by_motion(moving_here), _by_nose(still_here)
-    everywhere = _by_motion(moving), _by_nose(still)
-    elsewhere = [
-        Sides(all_.left - here.left, all_.right - here.right)
-        for here, all_ in zip(sides, everywhere, strict=True)
-    ]
-    return Judged(*sides, *elsewhere, seen, followed)
+    crossing_here, crossing_all = _by_motion(moving_here), _by_motion(moving)
+    parked_here, parked_all = _by_nose(still_here), _by_nose(still)
+    return Judged(
+        crossing_here,
+        parked_here,
+        _less(crossing_all, crossing_here),
+        _less(parked_all, parked_here),
+        seen,
+        followed,
+    )
 
 
 def is_at(car: CarMotion, camera: Camera, place: Place) -> bool:
@@ -412,3 +415,7 @@ def _by_motion(cars: Sequence[CarMotion]) -> Sides:
 def _by_nose(cars: Sequence[CarMotion]) -> Sides:
     right = sum(car.nose > 0.0 for car in cars)
     return Sides(len(cars) - right, right)
+
+
+def _less(all_of_them: Sides, some: Sides) -> Sides:
+    return Sides(all_of_them.left - some.left, all_of_them.right - some.right)
