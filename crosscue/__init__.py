@@ -111,6 +111,8 @@ _EXPORTS: Final = {
     "import_truth": "eval.fit.truth_check",
     "TruthFit": "eval.fit.truth_check",
     "ImportedTruth": "eval.fit.truth_check",
+    "score_runs": "eval.interface.scores",
+    "ScoredRuns": "eval.interface.scores",
 }
 """From a public name to its module."""
 
@@ -158,6 +160,8 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.runs import run_schema as run_schema
     from crosscue.eval.interface.runs import save_recording as save_recording
     from crosscue.eval.interface.runs import score_run as score_run
+    from crosscue.eval.interface.scores import ScoredRuns as ScoredRuns
+    from crosscue.eval.interface.scores import score_runs as score_runs
     from crosscue.eval.interface.seals import SealCheck as SealCheck
     from crosscue.eval.interface.seals import SealChecks as SealChecks
     from crosscue.eval.interface.seals import Sealed as Sealed

@@ -21,45 +21,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from crosscue.eval.catalog.find_runs import runs_of
-from crosscue.eval.commands.shared.options import (
-    add_logs_arguments,
-    limits_of,
-    metres,
-    print_json,
-)
-from crosscue.eval.commands.shared.progress import Done, with_progress
-from crosscue.eval.report.junit import write_junit
-from crosscue.eval.report.page import REPORT, write_report
-from crosscue.eval.report.score_runs import Failed, Scored, ScoreWork, score_runs
-from crosscue.eval.report.summary import gate_lines, headline, pose_summary, reported_line, summary
-from crosscue.eval.runs.account import account_lines
-from crosscue.eval.runs.folder import locked
-from crosscue.eval.scoring.drives import DEFAULTS, Scores, ScoreSettings
-from crosscue.eval.scoring.gates import Gate, GateResult, check_gates, load_gates
-from crosscue.eval.scoring.metric_values import metric_values
-from crosscue.eval.scoring.pose.smoother import smoother_text
-from crosscue.eval.scoring.runs import (
-    FOLDER,
-    RunScored,
-    account_of_scores,
-    metrics_of,
-    scores_of,
-    write_scores,
-)
-from crosscue.eval.studies.attribution import (
-    Attribution,
-    Drive,
-    attribute,
-    attribution_lines,
-    attribution_tree,
-)
-from crosscue.eval.studies.estimated_again import estimate_of
-from crosscue.replay.base import UsageError, one_line, visible
+import crosscue
+from crosscue.eval.commands.shared.options import add_logs_arguments, limits_of, metres, print_json
+from crosscue.eval.commands.shared.progress import progress_line
+from crosscue.replay.base import CrosscueError, one_line, visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -93,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--threshold",
         type=float,
-        default=DEFAULTS.threshold,
+        default=0.9,
         metavar="P",
         help="probability above which a feature counts as detected (default: 0.9)",
     )
@@ -133,184 +100,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Score every run, then all together; 1 for a failed gate, 3 when anything was dropped."""
-    paths = runs_of(args.runs)
-    if args.gate is not None and len(paths) > 1 and args.output is None:
-        raise UsageError("score: several runs and --gate: say with -o DIR where junit.xml goes")
-    if args.workers < 1:
-        raise UsageError(f"--workers {args.workers}: want 1 or more")
-    try:
-        settings = ScoreSettings(threshold=args.threshold)
-    except ValueError as error:
-        raise UsageError(f"--threshold: {error}") from None
-    gates = () if args.gate is None else load_gates(args.gate)
-    work = ScoreWork(
-        args.truth,
-        settings,
-        tuple(args.rpe),
-        args.smoother is not None,
-        args.any_log,
-        args.logs,
-        limits_of(args),
-        args.has_figures,
-        args.without_images,
-    )
-    scored, failed = _score_all(paths, work, args)
-    if len(paths) == 1:
-        tree = _report_one(scored[0], settings, args)
-    else:
-        tree = _pool(scored, failed, settings, args)
-    results = _gate(gates, tree, args.output or scored[0].one.run.file(FOLDER), paths)
-    if args.json:
-        print_json(
-            {
-                "metrics": tree,
-                "gates": _as_json(results),
-                "runs": {str(one.one.run.path): one.metrics for one in scored},
-            }
+    with progress_line(args, "scoring") as line:
+
+        def on_run(scored: crosscue.ScoredRun) -> None:
+            if not (args.json or args.quiet):
+                line.end()
+                print(scored.headline)
+
+        def on_failed(path: Path, error: CrosscueError) -> None:
+            line.end()
+            text = visible(one_line(error))
+            print(f"crosscue: {text}; this run is left out", file=sys.stderr)
+
+        found = crosscue.score_runs(
+            args.runs,
+            args.truth,
+            args.output,
+            gates=args.gate,
+            threshold=args.threshold,
+            rpe_m=args.rpe,
+            has_attribution=args.attribution,
+            has_smoother=args.smoother is not None,
+            any_log=args.any_log,
+            logs=args.logs,
+            without_images=args.without_images,
+            has_figures=args.has_figures,
+            workers=args.workers,
+            limits=limits_of(args),
+            on_runs=line.counting("runs"),
+            on_run=on_run,
+            on_failed=on_failed,
         )
-    elif results and not args.quiet:
-        print(gate_lines(results))
-    if any(one.failure for one in results):
+    if args.json:
+        print_json(found.as_dict())
+    elif not args.quiet:
+        print(f"\n{found}" if found.is_many else found)
+    if found.has_failed_gate:
         return 1
-    return 3 if failed or not tree["account"]["is_whole"] else 0
-
-
-def _score_all(
-    paths: Sequence[Path], work: ScoreWork, args: argparse.Namespace
-) -> tuple[list[Scored], list[Failed]]:
-    """All that can be scored; if nothing can, the first error ends the command."""
-    scored: list[Scored] = []
-    failed: list[Failed] = []
-
-    def at() -> Done:
-        return Done(len(scored) + len(failed), len(paths), "runs")
-
-    for one in with_progress(score_runs(paths, work, args.workers), at, args, "scoring"):
-        if isinstance(one, Scored):
-            scored.append(one)
-            if len(paths) > 1 and not (args.json or args.quiet):
-                print(headline(str(one.one.run.path), metric_values(one.metrics)))
-            continue
-        failed.append(one)
-        if len(paths) > 1:
-            line = visible(one_line(one.error))
-            print(f"crosscue: {line}; this run is left out", file=sys.stderr)
-    if not scored:
-        raise failed[0].error
-    return scored, failed
-
-
-def _report_one(found: Scored, settings: ScoreSettings, args: argparse.Namespace) -> dict[str, Any]:
-    """Print one run's scores; its metrics come back."""
-    one = found.one
-    scores = scores_of([one], settings)
-    worth = _attribution([found], found.metrics, settings, args)
-    report = found.report
-    if worth:
-        with locked(one.run):
-            _report(one.run.file(FOLDER), [one], scores, found.metrics, args)
-            write_scores(one.run.file(FOLDER), [one], found.metrics)
-    if args.output is not None:
-        report = _report(args.output, [one], scores, found.metrics, args)
-        write_scores(args.output, [one], found.metrics)
-    if args.json or args.quiet:
-        return found.metrics
-    print(f"run        {visible(str(one.run.path))}")
-    print("\n".join(map(visible, account_lines(account_of_scores([one])))) + "\n")
-    _print_scores(scores, one.why_no_pose, worth)
-    if one.pose is not None:
-        print("\n" + pose_summary(one.pose))
-    if found.smoothed is not None:
-        print(smoother_text(found.smoothed))
-    print(f"written to {visible(str(report))}")
-    return found.metrics
-
-
-def _report(
-    folder: Path,
-    scored: Sequence[RunScored],
-    scores: Scores,
-    metrics: dict[str, Any],
-    args: argparse.Namespace,
-) -> Path:
-    return write_report(folder, scored, scores, metrics, has_figures=args.has_figures)
-
-
-def _print_scores(scores: Scores, why_no_pose: str, worth: dict[str, Attribution]) -> None:
-    print(summary(scores, why_no_pose))
-    if worth:
-        print("\n" + "\n".join(attribution_lines(worth)))
-
-
-def _attribution(
-    scored: Sequence[Scored],
-    tree: dict[str, Any],
-    settings: ScoreSettings,
-    args: argparse.Namespace,
-) -> dict[str, Attribution]:
-    """What each cue was worth, also put into the metrics; nothing unless asked for."""
-    if not args.attribution:
-        return {}
-    ones = [found.one for found in scored]
-    drives = [Drive(one.judged, one.truth, estimate_of(one.run)) for one in ones]
-    found = attribute(drives, settings=settings)
-    tree["attribution"] = attribution_tree(found)
-    return found
-
-
-def _pool(
-    scored: Sequence[Scored],
-    failed: Sequence[Failed],
-    settings: ScoreSettings,
-    args: argparse.Namespace,
-) -> dict[str, Any]:
-    """Score all runs together, into the folder asked for."""
-    ones = [found.one for found in scored]
-    scores = scores_of(ones, settings)
-    tree = metrics_of(ones, scores)
-    tree["coverage"]["failed"] = {str(one.path): str(one.error) for one in failed}
-    worth = _attribution(scored, tree, settings, args)
-    if args.output is not None:
-        _report(args.output, ones, scores, tree, args)
-        write_scores(args.output, ones, tree)
-    if args.json or args.quiet:
-        return tree
-    print()
-    if failed:
-        print(f"failed     {len(failed)} of {len(failed) + len(scored)} runs, left out")
-    for first, second in tree["coverage"].get("same_log", ()):
-        names = f"{visible(first)} and {visible(second)}"
-        print(reported_line("twice", f"{names} are runs of one log, which therefore counts twice"))
-    print("\n".join(map(visible, account_lines(account_of_scores(ones)))) + "\n")
-    why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
-    _print_scores(scores, why, worth)
-    if args.output is not None:
-        print(f"written to {visible(str(args.output / REPORT))}")
-    return tree
-
-
-def _gate(
-    gates: Sequence[Gate], tree: dict[str, Any], folder: Path, paths: Sequence[Path]
-) -> tuple[GateResult, ...]:
-    """Hold the gates against the metrics and write ``junit.xml``; nothing without gates."""
-    if not gates:
-        return ()
-    results = check_gates(gates, metric_values(tree), tree["coverage"]["not_scored"])
-    suite = str(paths[0]) if len(paths) == 1 else f"{len(paths)} runs"
-    write_junit(folder / "junit.xml", results, suite)
-    return results
-
-
-def _as_json(results: Sequence[GateResult]) -> list[dict[str, Any]]:
-    return [
-        {
-            "metric": one.gate.metric,
-            "min": one.gate.min,
-            "max": one.gate.max,
-            "use": one.gate.use,
-            "value": one.value,
-            "passed": not one.failure,
-            "failure": one.failure,
-        }
-        for one in results
-    ]
+    return 0 if found.is_whole else 3

@@ -110,6 +110,14 @@ class ScoredRun:
     report: Path
 
     @property
+    def headline(self) -> str:
+        """Its folder and most important numbers in one line."""
+        from crosscue.eval.report.summary import headline
+        from crosscue.eval.scoring.metric_values import metric_values
+
+        return headline(str(self.scored.one.run.path), metric_values(self.metrics))
+
+    @property
     def cues(self) -> pa.Table:
         """Precision and recall of each cue with 95 % intervals, judged as its row says."""
         import pyarrow as pa

@@ -27,11 +27,12 @@ CALLS: Final = {
     "truth check": ("check_truth",),
     "truth schema": ("truth_schema",),
     "run schema": ("run_schema",),
+    "score": ("score_runs",),
 }
 """The public functions that a command is made of."""
 NOT_YET: Final = frozenset(
     {
-        "info", "detect", "estimate", "replay", "score", "view",
+        "info", "detect", "estimate", "replay", "view",
         "model list", "model show", "model fetch", "model init", "model check", "fit compass",
         "fit signs", "fit ranges", "fit messages", "fit landmarks", "landmarks add",
         "landmarks list", "landmarks match",

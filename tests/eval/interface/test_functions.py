@@ -101,3 +101,33 @@ def test_truth_is_carried_by_data_sets_alone(drive: Path, tmp_path: Path) -> Non
         crosscue.write_truth(drive, tmp_path)
     assert crosscue.truth_schema()["title"] == "Truth"
     assert "anyOf" in crosscue.run_schema() or "oneOf" in crosscue.run_schema()
+
+
+def test_runs_are_scored_together_and_one_that_cannot_be_is_named(
+    drive: Path, tmp_path: Path
+) -> None:
+    run = crosscue.replay_drive(drive, tmp_path / "run", drive.parent / "car.toml")
+    gates = tmp_path / "gates.toml"
+    gates.write_text(
+        'version = 1\n[[gate]]\nmetric = "cues.stop_sign.precision"\nmin = 1.1\n', "utf-8"
+    )
+    seen: list[str] = []
+
+    found = crosscue.score_runs(
+        [run, tmp_path / "gone"],
+        drive.parent / "truth.json",
+        tmp_path / "pooled",
+        gates=gates,
+        has_figures=False,
+        on_run=lambda one: seen.append(one.headline),
+        on_failed=lambda path, error: seen.append(f"{path.name}: {error}"),
+    )
+
+    assert seen[0].startswith(str(run.path))
+    assert seen[1].startswith("gone: ")
+    assert [path.name for path in found.failed] == ["gone"]
+    assert found.has_failed_gate
+    assert not found.is_whole
+    assert repr(found).startswith("failed     1 of 2 runs, left out\n")
+    assert "FAILED     cues.stop_sign.precision" in repr(found)
+    assert (tmp_path / "pooled" / "junit.xml").exists()

@@ -1,0 +1,298 @@
+"""Runs scored, each beside its truth and all together, with gates and the worth of each cue."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from crosscue.eval.catalog.find_runs import runs_of
+from crosscue.eval.interface.runs import Run, ScoredRun
+from crosscue.eval.report.junit import write_junit
+from crosscue.eval.report.page import REPORT, write_report
+from crosscue.eval.report.score_runs import Failed, ScoreWork
+from crosscue.eval.report.score_runs import score_runs as score_each
+from crosscue.eval.report.summary import gate_lines, pose_summary, reported_line, summary
+from crosscue.eval.runs.account import account_lines
+from crosscue.eval.runs.folder import locked
+from crosscue.eval.scoring.drives import Scores, ScoreSettings
+from crosscue.eval.scoring.gates import GateResult, check_gates, load_gates
+from crosscue.eval.scoring.metric_values import metric_values
+from crosscue.eval.scoring.pose.smoother import smoother_text
+from crosscue.eval.scoring.runs import (
+    FOLDER,
+    RunScored,
+    account_of_scores,
+    metrics_of,
+    scores_of,
+    write_scores,
+)
+from crosscue.eval.studies.attribution import (
+    Attribution,
+    Drive,
+    attribute,
+    attribution_lines,
+    attribution_tree,
+)
+from crosscue.eval.studies.estimated_again import estimate_of
+from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, UsageError, visible
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class ScoredRuns:
+    """Runs beside their truth; printed as ``crosscue score`` prints them.
+
+    Attributes:
+        runs: Each run that was scored.
+        failed: From the folder of a run that could not be scored to the reason.
+        metrics: Of all runs together, as in ``metrics.json``; of the run where there is one.
+        scores: What the metrics are made of.
+        gates: What became of each gate.
+        attribution: What each cue was worth, where that was asked for.
+        report: The page; None for several runs without ``output``.
+    """
+
+    runs: tuple[ScoredRun, ...]
+    failed: Mapping[Path, CrosscueError]
+    metrics: Mapping[str, Any]
+    scores: Scores
+    gates: tuple[GateResult, ...]
+    attribution: Mapping[str, Attribution]
+    report: Path | None
+
+    @property
+    def is_many(self) -> bool:
+        """Several runs were to be scored."""
+        return len(self.runs) + len(self.failed) > 1
+
+    @property
+    def is_whole(self) -> bool:
+        """Every run was scored, and nothing was dropped in any."""
+        return not self.failed and bool(self.metrics["account"]["is_whole"])
+
+    @property
+    def has_failed_gate(self) -> bool:
+        """A metric violates a bound."""
+        return any(one.failure for one in self.gates)
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue score --json`` prints."""
+        return {
+            "metrics": self.metrics,
+            "gates": [
+                {
+                    "metric": one.gate.metric,
+                    "min": one.gate.min,
+                    "max": one.gate.max,
+                    "use": one.gate.use,
+                    "value": one.value,
+                    "passed": not one.failure,
+                    "failure": one.failure,
+                }
+                for one in self.gates
+            ],
+            "runs": {str(one.scored.one.run.path): one.metrics for one in self.runs},
+        }
+
+    def __repr__(self) -> str:
+        lines = _lines_together(self) if self.is_many else _lines_of_one(self)
+        if self.report is not None:
+            lines.append(f"written to {visible(str(self.report))}")
+        if self.gates:
+            lines.append(gate_lines(self.gates))
+        return "\n".join(lines)
+
+
+def _lines_of_one(found: ScoredRuns) -> list[str]:
+    (run,) = found.runs
+    one = run.scored.one
+    lines = [f"run        {visible(str(one.run.path))}", *_account(found), ""]
+    lines += _scores(found, one.why_no_pose)
+    if one.pose is not None:
+        lines += ["", pose_summary(one.pose)]
+    if run.scored.smoothed is not None:
+        lines.append(smoother_text(run.scored.smoothed))
+    return lines
+
+
+def _lines_together(found: ScoredRuns) -> list[str]:
+    lines = []
+    if found.failed:
+        every = len(found.failed) + len(found.runs)
+        lines.append(f"failed     {len(found.failed)} of {every} runs, left out")
+    for first, second in found.metrics["coverage"].get("same_log", ()):
+        names = f"{visible(first)} and {visible(second)}"
+        text = f"{names} are runs of one log, which therefore counts twice"
+        lines.append(reported_line("twice", text))
+    ones = _ones(found)
+    why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
+    return [*lines, *_account(found), "", *_scores(found, why)]
+
+
+def _account(found: ScoredRuns) -> list[str]:
+    return [visible(line) for line in account_lines(account_of_scores(_ones(found)))]
+
+
+def _scores(found: ScoredRuns, why_no_pose: str) -> list[str]:
+    lines = [summary(found.scores, why_no_pose)]
+    if found.attribution:
+        lines += ["", *attribution_lines(found.attribution)]
+    return lines
+
+
+def _ones(found: ScoredRuns) -> list[RunScored]:
+    return [run.scored.one for run in found.runs]
+
+
+def score_runs(
+    runs: Sequence[Run | Path | str],
+    truth: Path | str | None = None,
+    output: Path | str | None = None,
+    *,
+    gates: Path | str | None = None,
+    threshold: float = 0.9,
+    rpe_m: Sequence[float] = (10.0, 100.0),
+    has_attribution: bool = False,
+    has_smoother: bool = False,
+    any_log: bool = False,
+    logs: Path | str | None = None,
+    without_images: bool = False,
+    has_figures: bool = True,
+    workers: int = 1,
+    limits: Limits = DEFAULT_LIMITS,
+    on_runs: Callable[[int, int], None] = lambda done, of: None,
+    on_run: Callable[[ScoredRun], None] = lambda scored: None,
+    on_failed: Callable[[Path, CrosscueError], None] = lambda path, error: None,
+) -> ScoredRuns:
+    """Score runs against their truth, each alone and all together.
+
+    Every run gets metrics, figures and report in ``RUN/score``. One that cannot be scored does not
+    stop the rest.
+
+    Args:
+        runs: Run folders, folders that hold some, patterns, or ``@list.txt``.
+        truth: Of all runs; None for the ``truth.json`` beside each run's log.
+        output: Folder for metrics and report of all runs together.
+        gates: File of bounds on metrics; ``junit.xml`` goes into ``output``.
+        threshold: A feature is detected above this probability.
+        rpe_m: Distances of the relative pose error.
+        has_attribution: Estimate without each cue as well, and report what it was worth.
+        has_smoother: Run a batch smoother on the same measurements as well (needs gtsam).
+        any_log: Take a truth that names the hash of another file: the same drive, converted.
+        logs: Where the runs' logs have moved to, if they have.
+        without_images: Report without pictures, whose logs may be gone.
+        has_figures: Draw figures, for which matplotlib is imported.
+        workers: How many runs are scored side by side.
+        limits: What the runs' logs are read with.
+        on_runs: Called with the number of runs that are done, and of how many.
+        on_run: Called with each of several runs once it is scored.
+        on_failed: Called with each of several runs that cannot be scored, and why.
+
+    Raises:
+        UsageError: A setting out of range, or a gate file that does not fit.
+        CrosscueError: No run can be scored: what is wrong with the first.
+    """
+    paths = runs_of([str(one.path if isinstance(one, Run) else one) for one in runs])
+    folder = None if output is None else Path(output)
+    if gates is not None and len(paths) > 1 and folder is None:
+        raise UsageError("score: several runs and --gate: say with -o DIR where junit.xml goes")
+    if workers < 1:
+        raise UsageError(f"--workers {workers}: want 1 or more")
+    try:
+        settings = ScoreSettings(threshold=threshold)
+    except ValueError as error:
+        raise UsageError(f"--threshold: {error}") from None
+    bounds = () if gates is None else load_gates(Path(gates))
+    work = ScoreWork(
+        None if truth is None else Path(truth),
+        settings,
+        tuple(rpe_m),
+        has_smoother,
+        any_log,
+        None if logs is None else Path(logs),
+        limits,
+        has_figures,
+        without_images,
+    )
+    scored: list[ScoredRun] = []
+    failed: dict[Path, CrosscueError] = {}
+    is_many = len(paths) > 1
+    for one in score_each(paths, work, workers):
+        if isinstance(one, Failed):
+            failed[one.path] = one.error
+            if is_many:
+                on_failed(one.path, one.error)
+        else:
+            scored.append(ScoredRun(one, one.metrics, one.report))
+            if is_many:
+                on_run(scored[-1])
+        on_runs(len(scored) + len(failed), len(paths))
+    if not scored:
+        raise next(iter(failed.values()))
+    together = _pool if is_many else _one
+    found = together(scored, failed, settings, folder, has_attribution, has_figures)
+    if not bounds:
+        return found
+    tree = found.metrics
+    results = check_gates(bounds, metric_values(tree), tree["coverage"]["not_scored"])
+    suite = f"{len(paths)} runs" if is_many else str(paths[0])
+    place = folder or scored[0].scored.one.run.file(FOLDER)
+    write_junit(place / "junit.xml", results, suite)
+    return replace(found, gates=results)
+
+
+def _one(
+    runs: Sequence[ScoredRun],
+    failed: Mapping[Path, CrosscueError],
+    settings: ScoreSettings,
+    output: Path | None,
+    has_attribution: bool,
+    has_figures: bool,
+) -> ScoredRuns:
+    """One run, whose own files hold what is asked for beyond ``score_run``."""
+    (run,) = runs
+    one, metrics, report = run.scored.one, run.scored.metrics, run.report
+    scores = scores_of([one], settings)
+    worth = _attribution([one], metrics, settings) if has_attribution else {}
+    if worth:
+        with locked(one.run):
+            place = one.run.file(FOLDER)
+            write_report(place, [one], scores, metrics, has_figures=has_figures)
+            write_scores(place, [one], metrics)
+    if output is not None:
+        report = write_report(output, [one], scores, metrics, has_figures=has_figures)
+        write_scores(output, [one], metrics)
+    return ScoredRuns(tuple(runs), failed, metrics, scores, (), worth, report)
+
+
+def _pool(
+    runs: Sequence[ScoredRun],
+    failed: Mapping[Path, CrosscueError],
+    settings: ScoreSettings,
+    output: Path | None,
+    has_attribution: bool,
+    has_figures: bool,
+) -> ScoredRuns:
+    """All runs together, into the folder asked for."""
+    ones = [run.scored.one for run in runs]
+    scores = scores_of(ones, settings)
+    tree = metrics_of(ones, scores)
+    tree["coverage"]["failed"] = {str(path): str(error) for path, error in failed.items()}
+    worth = _attribution(ones, tree, settings) if has_attribution else {}
+    report = None
+    if output is not None:
+        write_report(output, ones, scores, tree, has_figures=has_figures)
+        write_scores(output, ones, tree)
+        report = output / REPORT
+    return ScoredRuns(tuple(runs), failed, tree, scores, (), worth, report)
+
+
+def _attribution(
+    ones: Sequence[RunScored], tree: dict[str, Any], settings: ScoreSettings
+) -> dict[str, Attribution]:
+    """What each cue was worth, also put into the metrics."""
+    drives = [Drive(one.judged, one.truth, estimate_of(one.run)) for one in ones]
+    found = attribute(drives, settings=settings)
+    tree["attribution"] = attribution_tree(found)
+    return found
