@@ -113,12 +113,17 @@ _EXPORTS: Final = {
     "ImportedTruth": "eval.fit.truth_check",
     "score_runs": "eval.interface.scores",
     "ScoredRuns": "eval.interface.scores",
+    "simulate_approaches": "eval.interface.simulate",
+    "SimulatedDrives": "eval.interface.simulate",
+    "draw_contact_sheet": "eval.interface.simulate",
+    "SceneFiles": "datasets.scenes.drive",
 }
 """From a public name to its module."""
 
 __all__ = [*_EXPORTS]
 
 if TYPE_CHECKING:
+    from crosscue.datasets.scenes.drive import SceneFiles as SceneFiles
     from crosscue.detectors.base import Detections as Detections
     from crosscue.detectors.base import Detector as Detector
     from crosscue.detectors.base import Frame as Frame
@@ -168,8 +173,11 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.seals import Seals as Seals
     from crosscue.eval.interface.seals import check_seal as check_seal
     from crosscue.eval.interface.seals import seal as seal
+    from crosscue.eval.interface.simulate import SimulatedDrives as SimulatedDrives
+    from crosscue.eval.interface.simulate import draw_contact_sheet as draw_contact_sheet
     from crosscue.eval.interface.simulate import draw_sign as draw_sign
     from crosscue.eval.interface.simulate import simulate_approach as simulate_approach
+    from crosscue.eval.interface.simulate import simulate_approaches as simulate_approaches
     from crosscue.eval.interface.simulate import simulate_drive as simulate_drive
     from crosscue.eval.interface.studies import StudyResult as StudyResult
     from crosscue.eval.interface.studies import run_study as run_study

@@ -28,6 +28,7 @@ from crosscue.replay.base import (
     Ledger,
     Messages,
     Topic,
+    UsageError,
     json_tree,
     read_at_most,
     sha256_of,
@@ -119,6 +120,17 @@ class SceneFiles:
     truth: Path
     pictures: int
     seconds: float
+
+
+def camera_of_width(width_px: int) -> Camera:
+    """The camera of simulated drives with pictures of another size; they are 9/16 high.
+
+    Raises:
+        UsageError: Not a size that it has.
+    """
+    if not 64 <= width_px <= 3840 or width_px % 16:
+        raise UsageError(f"--width {width_px}: want a multiple of 16 from 64 to 3840")
+    return Camera(width_px=width_px, height_px=width_px * 9 // 16)
 
 
 def world_of(settings: SceneSettings) -> tuple[Layout, Conditions, World]:

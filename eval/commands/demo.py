@@ -16,17 +16,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import crosscue
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.commands.shared.outcome import summary as replay_summary
 from crosscue.eval.commands.shared.progress import (
     Done,
     DriveLine,
     is_shown,
     progress_line,
 )
-from crosscue.eval.interface.demo import KnownDrive, fetch_drive, show_drive, simulated
-from crosscue.eval.pipeline.outcome import Outcome
+from crosscue.eval.interface.demo import show_drive, simulated
 from crosscue.replay.base import UsageError, visible
 
 
@@ -68,30 +67,28 @@ def run(args: argparse.Namespace) -> int:
     drive = _fetched(args) if args.real else _simulated(args, folder)
     with DriveLine("replaying", is_shown=is_shown(args)) as line:
         made = show_drive(drive, folder, args.overwrite, line.at_frame, line.at_time)
-    outcome = made.run.outcome
-    assert isinstance(outcome, Outcome)
     if args.json:
         print_json(made.as_dict())
     elif not args.quiet:
         whose = "our annotations" if args.real else "the truth of the simulation"
-        print(replay_summary(outcome))
+        print(made.run.made)
         print(f"\nagainst {whose}")
         print("\n".join(map(visible, repr(made).splitlines())))
-    return outcome.exit_status
+    return made.run.made.exit_status
 
 
-def _fetched(args: argparse.Namespace) -> KnownDrive:
+def _fetched(args: argparse.Namespace) -> crosscue.KnownDrive:
     for name in ("layout", "run", "seed", "width"):
         if getattr(args, name) is not None:
             raise UsageError(f"--{name}: for a simulated drive; leave it or --real out")
     with progress_line(args, "fetching") as line:
-        return fetch_drive(
+        return crosscue.fetch_drive(
             args.source,
             on_fetch=lambda file, done, of: line.at(Done(done / 1e6, of / 1e6, "MB"), file),
         )
 
 
-def _simulated(args: argparse.Namespace, folder: Path) -> KnownDrive:
+def _simulated(args: argparse.Namespace, folder: Path) -> crosscue.KnownDrive:
     if args.source is not None:
         raise UsageError("--data: for a real drive; add --real")
     width = 1280 if args.width is None else args.width

@@ -11,11 +11,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.eval.commands.shared.options import add_logs_argument, limits_of, print_json
-from crosscue.eval.commands.shared.outcome import as_json, summary
+import crosscue
+from crosscue.eval.commands.shared.options import add_logs_argument, limits_of, print_result
 from crosscue.eval.commands.shared.progress import DriveLine, is_shown
-from crosscue.eval.interface.runs import estimate_run, open_run
-from crosscue.eval.pipeline.outcome import Outcome
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,12 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Estimate; 3 when something was dropped."""
-    run = open_run(args.run, args.logs, limits=limits_of(args))
+    run = crosscue.open_run(args.run, args.logs, limits=limits_of(args))
     with DriveLine("estimating", is_shown=is_shown(args)) as line:
-        outcome = estimate_run(run, args.vehicle, on_time=line.at_time).outcome
-    assert isinstance(outcome, Outcome)
-    if args.json:
-        print_json(as_json(outcome))
-    elif not args.quiet:
-        print(summary(outcome))
-    return outcome.exit_status
+        made = crosscue.estimate_run(run, args.vehicle, on_time=line.at_time).made
+    print_result(made, args)
+    return made.exit_status

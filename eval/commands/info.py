@@ -14,11 +14,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import crosscue
 from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.options import add_part_arguments, limits_of, print_json
+from crosscue.eval.commands.shared.options import (
+    add_part_arguments,
+    limits_of,
+    print_json,
+)
 from crosscue.eval.commands.shared.progress import Done, with_progress
-from crosscue.eval.interface.logs import open as open_drive
-from crosscue.replay.vehicle.vehicle import load
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
     Returns:
         0 when all logs are whole, 3 when something is dropped or there is more than one segment.
     """
-    vehicle = load(args.vehicle) if args.vehicle else None
-    opened = open_drive(*args.logs, limits=limits_of(args)) if args.quick else None
+    vehicle = crosscue.load_vehicle(args.vehicle) if args.vehicle else None
+    opened = crosscue.open(*args.logs, limits=limits_of(args)) if args.quick else None
     with opened or open_part(args, args.logs) as log:
         found = log.summary(
             vehicle,

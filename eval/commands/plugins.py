@@ -12,8 +12,8 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 
+import crosscue
 from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.interface.plugins import plugins
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """List; 1 when one does not load."""
-    found = plugins()
+    found = crosscue.plugins()
     if args.json:
         print_json({"plugins": [asdict(one) for one in found]})
     elif not args.quiet:

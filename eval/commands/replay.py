@@ -32,8 +32,11 @@ from crosscue.eval.batch.jobs import (
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
 from crosscue.eval.commands.shared.detectors import add_detector_arguments, cache_of, detectors_of
 from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.options import add_part_arguments, print_json
-from crosscue.eval.commands.shared.outcome import as_json, summary
+from crosscue.eval.commands.shared.options import (
+    add_part_arguments,
+    print_json,
+    print_result,
+)
 from crosscue.eval.commands.shared.progress import DriveLine, DrivesLine, is_shown
 from crosscue.eval.interface.runs import replay_drive
 from crosscue.eval.pipeline.outcome import Outcome
@@ -101,10 +104,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--workers, --ray: for many drives; this is one (--each makes it many)")
     with DriveLine("replaying", is_shown=is_shown(args)) as line:
         outcome = _replay(drives.drives[0], args.output, args, line)
-    if args.json:
-        print_json(as_json(outcome))
-    elif not args.quiet:
-        print(summary(outcome))
+    print_result(outcome, args)
     return outcome.exit_status
 
 
@@ -227,5 +227,5 @@ def _drive_as_json(one: Done[Outcome]) -> dict[str, object]:
         "earlier": one.is_earlier,
         "attempts": one.attempts,
         "seconds": one.seconds,
-        "result": None if one.result is None else as_json(one.result),
+        "result": None if one.result is None else one.result.as_dict(),
     }

@@ -16,14 +16,14 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+import crosscue
 from crosscue.eval.commands.shared.options import (
     add_logs_arguments,
     limits_of,
     print_json,
     refuse_existing,
 )
-from crosscue.eval.interface.runs import open_run, save_recording
-from crosscue.replay.errors import CrosscueError, UsageError
+from crosscue.replay.base import CrosscueError, UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,8 +52,10 @@ def run(args: argparse.Namespace) -> int:
     if args.output is not None and args.output.suffix != ".rrd":
         raise UsageError(f"{args.output}: want a name that ends in .rrd")
     refuse_existing(args)
-    made = open_run(args.run, args.logs, without_images=args.without_images, limits=limits_of(args))
-    path = save_recording(made, args.output, args.truth)
+    made = crosscue.open_run(
+        args.run, args.logs, without_images=args.without_images, limits=limits_of(args)
+    )
+    path = crosscue.save_recording(made, args.output, args.truth)
     if args.output is not None:
         if args.json:
             print_json({"recording": str(path)})

@@ -48,6 +48,17 @@ class Run:
         return self.folder.path
 
     @property
+    def made(self) -> Outcome | DetectOutcome:
+        """What the replay, detection or estimate that made it counted.
+
+        Raises:
+            UsageError: The run was read from disk.
+        """
+        if self.outcome is None:
+            raise UsageError(f"{self.path}: read from disk; its manifest holds what was counted")
+        return self.outcome
+
+    @property
     def manifest(self) -> Manifest:
         """Its logs, versions and settings, and the account of every row."""
         return self.folder.manifest()
@@ -166,7 +177,7 @@ class ScoredRun:
         one = self.scored.one
         lines = [summary(scores_of([one]), one.why_no_pose)]
         if one.pose is not None:
-            lines.append(pose_summary(one.pose))
+            lines += ["", pose_summary(one.pose)]
         return "\n".join(lines)
 
 

@@ -2,15 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crosscue.replay.base import UsageError
+from crosscue.eval.interface.show import Listing
+from crosscue.replay.base import OutputError, UsageError
 
 if TYPE_CHECKING:
-    from crosscue.datasets.scenes.drive import SceneFiles
+    from crosscue.datasets.scenes.drive import SceneFiles, SceneSettings
     from crosscue.datasets.simulated.log_files import DriveFiles
     from crosscue.replay.base import Bytes
+
+
+class SimulatedDrives(Listing["SceneFiles"]):
+    """Simulated drives, printed as a table."""
+
+    head = ("drive", "log", "images", "seconds")
+
+    def cells(self, row: SceneFiles) -> tuple[object, ...]:
+        """One line."""
+        return (row.log.parent.name, row.log, row.pictures, row.seconds)
+
+    def as_dict(self) -> list[dict[str, object]]:
+        """What ``crosscue simulate --json`` prints."""
+        return [
+            {
+                "name": one.log.parent.name,
+                "log": str(one.log),
+                "vehicle": str(one.vehicle),
+                "truth": str(one.truth),
+                "pictures": one.pictures,
+                "seconds": one.seconds,
+            }
+            for one in self
+        ]
 
 
 def simulate_approach(
@@ -41,17 +68,123 @@ def simulate_approach(
         UsageError: A value out of range.
         OutputError: The folder holds a drive already, or cannot be written.
     """
-    from crosscue.datasets.scenes.drive import SceneSettings, write_scene
-    from crosscue.datasets.scenes.rendering.camera import Camera
+    from crosscue.datasets.scenes.drive import write_scene
 
-    if not 64 <= width_px <= 3840 or width_px % 16:
-        raise UsageError(f"width_px: {width_px}; expected a multiple of 16 from 64 to 3840")
-    camera = Camera(width_px=width_px, height_px=width_px * 9 // 16)
-    try:
-        settings = SceneSettings(layout, run, seed, rate_hz, camera)
-    except ValueError as error:
-        raise UsageError(f"simulate_approach: {error}") from None
+    (settings,) = _scenes((layout,), (run,), seed, width_px, rate_hz)
     return write_scene(Path(folder), settings, overwrite=overwrite)
+
+
+def simulate_approaches(
+    folder: Path | str,
+    layouts: Sequence[str],
+    runs: Sequence[int] = (1,),
+    seed: int = 0,
+    *,
+    width_px: int = 1280,
+    rate_hz: int = 10,
+    workers: int = 1,
+    overwrite: bool = False,
+    on_drive: Callable[[SceneFiles, int, int], None] = lambda files, done, of: None,
+) -> SimulatedDrives:
+    """Simulate every run of every layout; see ``simulate_approach``.
+
+    Args:
+        folder: Gets a folder for each drive.
+        layouts: Which intersections.
+        runs: Which drives up to each of them.
+        seed: Of what differs from run to run.
+        width_px: Of a picture, a multiple of 16; it is 9/16 high.
+        rate_hz: Pictures a second: 10, 20, 25 or 50.
+        workers: How many drives are made side by side.
+        overwrite: Replace drives of the same settings.
+        on_drive: Called with each drive once it is written, how many are done, and of how many.
+
+    Raises:
+        UsageError: A value out of range, a layout named twice, or a folder with another drive.
+        OutputError: A drive is there already, or cannot be written.
+    """
+    from crosscue.datasets.scenes.drive import refuse_other_drive
+    from crosscue.replay.processes import in_processes
+
+    if workers < 1:
+        raise UsageError(f"--workers {workers}: want 1 or more")
+    wanted, place = _scenes(layouts, runs, seed, width_px, rate_hz), Path(folder)
+    for settings in wanted if overwrite else ():
+        refuse_other_drive(place / settings.name, settings)
+    make = partial(_write_scene, output=place, overwrite=overwrite)
+    made: list[SceneFiles] = []
+    for files in in_processes(make, wanted, workers):
+        made.append(files)
+        on_drive(files, len(made), len(wanted))
+    return SimulatedDrives(made)
+
+
+def draw_contact_sheet(
+    path: Path | str,
+    layouts: Sequence[str],
+    runs: Sequence[int] = (1,),
+    seed: int = 0,
+    *,
+    width_px: int = 1280,
+    rate_hz: int = 10,
+    overwrite: bool = False,
+) -> tuple[str, ...]:
+    """Draw one picture of each of many simulated drives onto one sheet, a JPEG file.
+
+    Args:
+        path: The file.
+        layouts: As in ``simulate_approaches``.
+        runs: As in ``simulate_approaches``.
+        seed: As in ``simulate_approaches``.
+        width_px: As in ``simulate_approaches``.
+        rate_hz: As in ``simulate_approaches``.
+        overwrite: Replace a file that is there.
+
+    Returns:
+        Names of the drives.
+
+    Raises:
+        UsageError: A value out of range.
+        OutputError: The file exists, or cannot be written.
+    """
+    from crosscue.datasets.scenes.export.contact_sheet import contact_sheet, sheet_jpeg
+    from crosscue.replay.base import write_bytes
+
+    wanted, sheet = _scenes(layouts, runs, seed, width_px, rate_hz), Path(path)
+    if sheet.exists() and not overwrite:
+        raise OutputError(f"{sheet}: exists; give another name or --overwrite")
+    columns = len({(one.run, one.seed) for one in wanted})
+    write_bytes(sheet, sheet_jpeg(contact_sheet(wanted, columns)))
+    return tuple(one.name for one in wanted)
+
+
+def _write_scene(settings: SceneSettings, output: Path, overwrite: bool) -> SceneFiles:
+    from crosscue.datasets.scenes.drive import write_scene
+
+    return write_scene(output / settings.name, settings, overwrite=overwrite)
+
+
+def _scenes(
+    layouts: Sequence[str], runs: Sequence[int], seed: int, width_px: int, rate_hz: int
+) -> list[SceneSettings]:
+    """Every run of every layout.
+
+    Raises:
+        UsageError: A value out of range, or a layout named twice.
+    """
+    from crosscue.datasets.scenes.drive import SceneSettings, camera_of_width
+
+    if len(set(layouts)) != len(layouts):
+        raise UsageError("simulate: a layout is named twice; name each once")
+    camera = camera_of_width(width_px)
+    try:
+        return [
+            SceneSettings(layout=layout, run=run, seed=seed, rate_hz=rate_hz, camera=camera)
+            for layout in layouts
+            for run in runs
+        ]
+    except ValueError as error:
+        raise UsageError(f"simulate: {error}") from None
 
 
 def simulate_drive(

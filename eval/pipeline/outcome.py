@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 from crosscue.detectors.cues.candidates import Candidates
 from crosscue.detectors.runner import Counts
-from crosscue.eval.runs.account import Account
+from crosscue.eval.runs.account import Account, account_lines, details_of
+from crosscue.eval.runs.candidates import candidate_lines, candidate_rows, not_looked_lines
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.replay.base import Ledger
+from crosscue.replay.base import Ledger, visible
+from crosscue.replay.safe_text import terminal_width, wrapped
 from crosscue.replay.time.segments import ONE_SEGMENT, Segment, Timeline
 
 OnTime = Callable[[float, float], None]
@@ -30,9 +32,9 @@ def report_time(on_time: OnTime, timeline: Timeline, t_ns: int) -> None:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class DetectOutcome:
-    """What a detection run did.
+    """What a detection run did; printed as ``crosscue detect`` prints it.
 
     Attributes:
         run: Its folder.
@@ -60,6 +62,23 @@ class DetectOutcome:
     def exit_status(self) -> int:
         """3 when anything was dropped or the drive has gaps, else 0."""
         return 0 if self.account.is_whole and not self.has_gaps else 3
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue detect --json`` prints."""
+        return {
+            "run": str(self.run.path),
+            "account": self.account.as_json(),
+            "frames": self.counts.frames,
+            "ran": self.counts.ran,
+            "from_cache": self.counts.from_cache,
+            "objects": self.objects,
+            "cues": self.cues,
+            "notices": list(self.notices),
+            "seconds": self.seconds,
+        }
+
+    def __repr__(self) -> str:
+        return _detect_text(self)
 
 
 @dataclass(slots=True)
@@ -110,9 +129,9 @@ class SceneOutcome:
     not_looked_for: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Outcome:
-    """What a replay, or its second stage alone, did.
+    """What a replay, or its second stage alone, did; printed as ``crosscue replay`` prints it.
 
     Attributes:
         run: Its folder.
@@ -148,3 +167,120 @@ class Outcome:
     def exit_status(self) -> int:
         """3 when anything was dropped or the drive has gaps, else 0."""
         return 0 if self.account.is_whole and len(self.segments) == 1 else 3
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue replay --json`` prints."""
+        return {
+            "run": str(self.run.path),
+            "account": self.account.as_json(),
+            "pose": {
+                "rows": self.rows,
+                "travelled_m": self.travelled_m,
+                "major_axis_m": self.major_axis_m,
+            },
+            "landmarks": self.landmark_counts,
+            "detected": None
+            if self.detected is None
+            else {
+                "frames": self.detected.counts.frames,
+                "ran": self.detected.counts.ran,
+                "from_cache": self.detected.counts.from_cache,
+                "objects": self.detected.objects,
+            },
+            "scene": None if self.scene is None else asdict(self.scene),
+            "notices": list(self.notices),
+            "seconds": self.seconds,
+        }
+
+    def __repr__(self) -> str:
+        return _outcome_text(self)
+
+
+def _detect_text(outcome: DetectOutcome) -> str:
+    """What happened, for a person."""
+    counts, ledger = outcome.counts, outcome.ledger
+    lines = [f"run      {outcome.run.path}", f"log      {ledger.log}"]
+    lines.append(f"frames   {counts.frames:,} in {outcome.seconds:.2f} s")
+    for name, ran in counts.ran.items():
+        lines.append(f"  {name}: ran on {ran:,}, {counts.from_cache[name]:,} from the cache")
+    lines += [f"found    {what}: {count:,}" for what, count in sorted(outcome.objects.items())]
+    lines += [f"cue      {cue}: in {count:,} frames" for cue, count in outcome.cues.items()]
+    lines += [*account_lines(outcome.account), *details_of([ledger])]
+    lines += [f"note     {sentence}" for sentence in (*ledger.notices, *outcome.notices)]
+    return "\n".join(visible(line) for line in lines)
+
+
+def _outcome_text(outcome: Outcome) -> str:
+    """What happened, for a person, in 80 columns."""
+    lines = [f"run      {outcome.run.path}"]
+    for log in outcome.account.reading:
+        lines.append(f"log      {log.log}")
+        lines.append(f"         integrity: {log.integrity}")
+        lines += [f"  note   {sentence}" for sentence in log.notices]
+    lines += [*account_lines(outcome.account), *details_of(_ledgers(outcome))]
+    if outcome.rows:
+        lines += [
+            f"pose     {outcome.rows:,} rows over {outcome.travelled_m:.0f} m in "
+            f"{outcome.drive_seconds:.0f} s;",
+            f"         2-sigma ellipse {outcome.major_axis_m:.1f} m long at the end",
+        ]
+    else:
+        lines.append("pose     none")
+    if outcome.detected is not None:
+        lines += _detected(outcome)
+    if outcome.scene is not None:
+        lines += _scene_lines(outcome.scene)
+    if outcome.landmark_counts:
+        lines.append(f"marks    {_landmarks(outcome.landmark_counts)}")
+    lines += [f"  note   {sentence}" for sentence in outcome.notices]
+    speed = outcome.drive_seconds / max(outcome.seconds, 1e-9)
+    digits = 0 if speed >= 10 else 1
+    lines.append(f"took     {outcome.seconds:.2f} s, {speed:.{digits}f} times real time")
+    width = min(terminal_width(), 80)
+    return "\n".join(
+        wrapped(visible(line[9:]), width, lead=line[:9]) if len(line) > width else visible(line)
+        for line in lines
+    )
+
+
+def _ledgers(outcome: Outcome) -> list[Ledger]:
+    detected = () if outcome.detected is None else (outcome.detected.ledger,)
+    return [*detected, *outcome.ledgers]
+
+
+def _detected(outcome: Outcome) -> list[str]:
+    assert outcome.detected is not None
+    counts = outcome.detected.counts
+    lines = [f"frames   {counts.frames:,} looked at"]
+    for name, ran in counts.ran.items():
+        lines.append(f"         {name}: ran on {ran:,}, {counts.from_cache[name]:,} from the cache")
+    return lines
+
+
+def _scene_lines(scene: SceneOutcome) -> list[str]:
+    """Cues and approaches, for a person."""
+    seen = [f"{cue} {count:,}" for cue, count in scene.positive.items()]
+    lines = [f"cues     {', '.join(seen) or 'none'} (frames each, of {scene.frames:,})"]
+    rows = candidate_rows(scene.candidates), candidate_rows(scene.ranged)
+    lines += [f"  skip   {sentence}" for sentence in candidate_lines(*rows)]
+    lines += [f"  skip   {sentence}" for sentence in not_looked_lines(scene.not_looked_for)]
+    lines += [f"  note   {n:,} x {what}" for what, n in scene.counts.items() if n]
+    for one in scene.approaches:
+        lines.append(f"approach {_approach(one)}")
+    return lines
+
+
+def _approach(one: ApproachSummary) -> str:
+    said = ", ".join(f"{feature} {p:.2f}" for feature, p in one.probabilities.items())
+    where = "not detected"
+    if one.detected_m is not None:
+        where = f"detected {one.detected_m:.1f} m before its {one.reference}"
+    return f"{one.number}: {where}; at the end {said}"
+
+
+def _landmarks(counts: dict[str, int]) -> str:
+    looked = counts["frames"] - counts["thinned"] - counts["late"]
+    return (
+        f"{counts['accepted']} landmarks weighed in, {counts['gated']} refused by the gate; "
+        f"{counts['matched']} of {looked} frames looked at matched one"
+    )
