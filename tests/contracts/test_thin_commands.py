@@ -59,7 +59,7 @@ NOT_YET: Final = frozenset(
 """Commands with logic of their own."""
 WITHOUT: Final = {"completion": "it is about the shell"}
 ALLOWED: Final = re.compile(
-    r"crosscue(\.eval\.(commands|interface)(\..+)?|\.replay\.(base|safe_text))?"
+    r"crosscue(\.eval\.(commands|interface)(\..+)?|\.replay\.(base|errors|safe_text))?"
 )
 """What a command may import of ours: the public interface, options, errors, and safe text.
 
