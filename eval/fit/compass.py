@@ -16,8 +16,8 @@ from crosscue.replay.remote.logs import name_of
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.signals.plan import plan
+from crosscue.replay.signals.windows import windows
 from crosscue.replay.vehicle.vehicle import Vehicle
-from crosscue.replay.windows import windows
 
 
 def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassFit:

@@ -53,6 +53,7 @@ from crosscue.replay.base import Ledger, Log, Selection, Topic, sha256_of, versi
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import camera_of, plan, with_pictures
+from crosscue.replay.signals.windows import windows
 from crosscue.replay.time.segments import (
     LogClock,
     TimedLog,
@@ -62,7 +63,6 @@ from crosscue.replay.time.segments import (
 )
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
-from crosscue.replay.windows import windows
 
 from .clocks import clock_changes, clock_rows
 from .drive_time import drive_timeline, refuse_other_segments, selections_of, time_segments

@@ -30,9 +30,9 @@ from crosscue.localization.pose_track import (
 )
 from crosscue.replay.columns import Floats
 from crosscue.replay.signals.kinds import Plan, Samples, Signal
+from crosscue.replay.signals.windows import Window
 from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Segment, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
-from crosscue.replay.windows import Window
 
 from .landmarks import LandmarkStage, NoLandmarks
 

@@ -11,11 +11,11 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import Gap, broken_at
-from crosscue.eval.scoring.approaches import THRESHOLD, ApproachResult, Curve
-from crosscue.eval.scoring.belief import BeliefScore
 from crosscue.eval.scoring.columns import NONE
-from crosscue.eval.scoring.cues import CueFrames
-from crosscue.eval.scoring.ranges import RangeJudged, RangeScore
+from crosscue.eval.scoring.scene.approaches import THRESHOLD, ApproachResult, Curve
+from crosscue.eval.scoring.scene.belief import BeliefScore
+from crosscue.eval.scoring.scene.cues import CueFrames
+from crosscue.eval.scoring.scene.ranges import RangeJudged, RangeScore
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.cue_table import CUES
 

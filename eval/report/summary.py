@@ -6,15 +6,15 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
-from crosscue.eval.scoring.approaches import ApproachScore
-from crosscue.eval.scoring.belief import BeliefScore
-from crosscue.eval.scoring.cues import CueScore
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.gates import GateResult
 from crosscue.eval.scoring.intervals import Mean, Proportion
 from crosscue.eval.scoring.metric_values import MetricValue
 from crosscue.eval.scoring.pose.score import Errors, PoseScore
-from crosscue.eval.scoring.ranges import RangeScore
+from crosscue.eval.scoring.scene.approaches import ApproachScore
+from crosscue.eval.scoring.scene.belief import BeliefScore
+from crosscue.eval.scoring.scene.cues import CueScore
+from crosscue.eval.scoring.scene.ranges import RangeScore
 from crosscue.replay.base import visible
 
 WIDTH: Final = 80

@@ -17,8 +17,8 @@ from crosscue.detectors.overlay import draw
 from crosscue.detectors.runner import FrameResult
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.stored_images import camera_of, picture_at
-from crosscue.eval.scoring.cues import CueFrames
 from crosscue.eval.scoring.runs import RunScored
+from crosscue.eval.scoring.scene.cues import CueFrames
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -12,18 +12,18 @@ from typing import Any, Final
 
 import numpy as np
 
+from crosscue.eval.scoring.scene import approaches as score_approaches
+from crosscue.eval.scoring.scene import belief as score_belief
+from crosscue.eval.scoring.scene.approaches import ApproachesJudged, ApproachScore, judge_approaches
+from crosscue.eval.scoring.scene.belief import BeliefJudged, BeliefScore, judge_belief
+from crosscue.eval.scoring.scene.cues import CueFrames, CueScore, match_cues, score_cues
+from crosscue.eval.scoring.scene.ranges import RangeJudged, RangeScore, judge_range, score_range
 from crosscue.replay.errors import SchemaError
 
-from . import approaches as score_approaches
-from . import belief as score_belief
 from . import intervals
 from . import truth as score_truth
-from .approaches import ApproachesJudged, ApproachScore, judge_approaches
-from .belief import BeliefJudged, BeliefScore, judge_belief
 from .columns import RunTables
-from .cues import CueFrames, CueScore, match_cues, score_cues
 from .pooling import BINS_M
-from .ranges import RangeJudged, RangeScore, judge_range, score_range
 from .truth import DriveTruth
 
 FORMAT: Final = 1

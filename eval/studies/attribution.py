@@ -13,8 +13,6 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
-from crosscue.eval.scoring.approaches import ApproachResult
-from crosscue.eval.scoring.belief import BeliefDifference, compare_belief
 from crosscue.eval.scoring.columns import RunTables
 from crosscue.eval.scoring.drives import (
     DEFAULTS,
@@ -27,6 +25,8 @@ from crosscue.eval.scoring.drives import (
 )
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.metric_values import metric_values
+from crosscue.eval.scoring.scene.approaches import ApproachResult
+from crosscue.eval.scoring.scene.belief import BeliefDifference, compare_belief
 from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.replay.vehicle import cue_table
 

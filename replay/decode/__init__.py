@@ -30,8 +30,8 @@ class Decoder(Protocol):
 
 BY_ENCODING: Final[Mapping[str, str]] = {
     "columns": "crosscue.replay.decode:_as_it_is",
-    "cdr": "crosscue.replay.decode.ros:ros_decoder",
-    "ros1": "crosscue.replay.decode.ros:ros_decoder",
+    "cdr": "crosscue.replay.decode.ros.decoder:ros_decoder",
+    "ros1": "crosscue.replay.decode.ros.decoder:ros_decoder",
     "protobuf": "crosscue.replay.decode.protobuf:protobuf_decoder",
     "json": "crosscue.replay.decode.json_text:json_decoder",
 }

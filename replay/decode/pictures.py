@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.base import Block, Bytes, ImageCoding, Images, Ledger, Messages
+from crosscue.replay.decode.ros.standard import MAX_SIDE_PX
 
 from .coding import STREAMS, coding_of
 from .foxglove import Picture
 from .refuse import EMPTY_PICTURE, IMAGE_CODING, MISFIT, VIDEO_CODING, refuse
-from .standard import MAX_SIDE_PX
 
 _NO_TIME: Final = 0
 

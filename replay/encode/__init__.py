@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from crosscue.replay.base import Block, CanFrames, Images, Ledger, Messages, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
-from crosscue.replay.decode.definition import definitions_of
-from crosscue.replay.decode.type_names import ros2_spelling
+from crosscue.replay.decode.ros.definition import definitions_of
+from crosscue.replay.decode.ros.type_names import ros2_spelling
 
 from .can import can_messages
 from .definitions import completed, standard_text

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from crosscue.replay.decode.definition import (
+from crosscue.replay.decode.ros.definition import (
     DURATION,
     PRIMITIVES,
     TIME,

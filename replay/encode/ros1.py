@@ -1,7 +1,7 @@
 """ROS 1 messages as CDR: the same values in the same order, aligned, strings terminated.
 
-The walk over the messages (``crosscue.replay.decode.walk``) notes what goes where; when the sizes
-of all messages are known, whole columns of values are copied at once.
+The walk over the messages (``crosscue.replay.decode.ros.walk``) notes what goes where; when the
+sizes of all messages are known, whole columns of values are copied at once.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.base import Block, Bytes, Int64s, Ledger, Messages, SchemaError, Topic
-from crosscue.replay.decode.definition import definitions_of
-from crosscue.replay.decode.plan import Items, Plan, Run, Text, jumped, plan_of
 from crosscue.replay.decode.refuse import MISFIT, refuse
-from crosscue.replay.decode.type_names import ros2_spelling
-from crosscue.replay.decode.walk import Bools, Cursor, Found, Rows, Walker
+from crosscue.replay.decode.ros.definition import definitions_of
+from crosscue.replay.decode.ros.plan import Items, Plan, Run, Text, jumped, plan_of
+from crosscue.replay.decode.ros.type_names import ros2_spelling
+from crosscue.replay.decode.ros.walk import Bools, Cursor, Found, Rows, Walker
 
 from .copy_ranges import copy_ranges
 from .definitions import as_ros2, differs_in_ros2, text_of

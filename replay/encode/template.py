@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes
-from crosscue.replay.decode.plan import Items, Plan, Run, Text
+from crosscue.replay.decode.ros.plan import Items, Plan, Run, Text
 
 ENCAPSULATION: Final = b"\x00\x01\x00\x00"
 

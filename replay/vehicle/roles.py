@@ -7,7 +7,7 @@ from enum import Enum
 from typing import Final
 
 from crosscue.replay.columns import Topic
-from crosscue.replay.decode.type_names import ros2_spelling
+from crosscue.replay.decode.ros.type_names import ros2_spelling
 
 
 class Role(Enum):

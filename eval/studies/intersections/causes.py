@@ -17,10 +17,10 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.scoring.approaches import NEAR_M, ApproachResult
-from crosscue.eval.scoring.cues import SEEN, CueFrames
 from crosscue.eval.scoring.drives import DriveJudged
 from crosscue.eval.scoring.intervals import Mean, mean
+from crosscue.eval.scoring.scene.approaches import NEAR_M, ApproachResult
+from crosscue.eval.scoring.scene.cues import SEEN, CueFrames
 from crosscue.replay.vehicle.cue_table import CUES
 
 Failing = Literal["missing", "late", "invented"]

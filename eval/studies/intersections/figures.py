@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
-from crosscue.eval.scoring.approaches import ApproachResult, Curve
-from crosscue.eval.scoring.belief import BeliefScore
+from crosscue.eval.scoring.scene.approaches import ApproachResult, Curve
+from crosscue.eval.scoring.scene.belief import BeliefScore
 from crosscue.replay.base import write_whole
 
 if TYPE_CHECKING:

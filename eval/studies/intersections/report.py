@@ -13,8 +13,8 @@ from crosscue.eval.batch.jobs import Done
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.report.html import render_page
 from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
-from crosscue.eval.scoring.approaches import ApproachScore
 from crosscue.eval.scoring.runs import metrics_of, write_scores
+from crosscue.eval.scoring.scene.approaches import ApproachScore
 from crosscue.eval.studies.intersections.scores import StudyScores
 from crosscue.replay.base import strict_json, versions, write_text
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from crosscue.eval.scoring.belief import BeliefDifference
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.runs import RunScored
+from crosscue.eval.scoring.scene.belief import BeliefDifference
 from crosscue.eval.studies.attribution import Attribution
 
 

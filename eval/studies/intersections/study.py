@@ -24,9 +24,9 @@ from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import create, open_run
-from crosscue.eval.scoring.belief import compare_belief
 from crosscue.eval.scoring.drives import judge, score
 from crosscue.eval.scoring.runs import RunScored, judge_run
+from crosscue.eval.scoring.scene.belief import compare_belief
 from crosscue.eval.studies.attribution import Drive, attribute
 from crosscue.eval.studies.estimated_again import estimate_of
 from crosscue.eval.studies.intersections.scores import StudyScores

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from crosscue.eval.scoring.approaches import ApproachResult
-from crosscue.eval.scoring.cues import CueScore
 from crosscue.eval.scoring.intervals import Mean, Proportion, wilson
+from crosscue.eval.scoring.scene.approaches import ApproachResult
+from crosscue.eval.scoring.scene.cues import CueScore
 from crosscue.eval.studies.intersections.scores import StudyScores
 from crosscue.replay.vehicle.cue_table import groups
 

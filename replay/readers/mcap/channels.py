@@ -13,9 +13,9 @@ from dataclasses import replace
 from typing import Final
 
 from crosscue.replay.base import Limits, Topic
+from crosscue.replay.readers.mcap.chunks.rows import Definition
 
 from .records import CHANNEL, Channel, Schema, read_channel, read_schema
-from .rows import Definition
 
 UNKNOWN: Final = ""
 """The topic of messages whose channel nobody declares."""

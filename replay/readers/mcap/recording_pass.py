@@ -12,15 +12,22 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.base import EVERYTHING, Block, Bytes, Ledger, Limits, Selection
+from crosscue.replay.readers.mcap.chunks.blocks import Giver
+from crosscue.replay.readers.mcap.chunks.load import Load, Loader, Stretch
+from crosscue.replay.readers.mcap.chunks.rows import (
+    NEVER_IN_A_CHUNK,
+    Rows,
+    contradicts,
+    join,
+    rows_by_index,
+    rows_by_scan,
+)
+from crosscue.replay.readers.mcap.damage.resync import Plausible, Resync
 
-from .blocks import Giver
 from .bytes import ByteFile
 from .channels import TopicBook
 from .checks import Checks
-from .load import Load, Loader, Stretch
 from .records import PREFIX, BrokenRecordError
-from .resync import Plausible, Resync
-from .rows import NEVER_IN_A_CHUNK, Rows, contradicts, join, rows_by_index, rows_by_scan
 from .segments import Segment, Summary
 from .walk import (
     STOPS_A_RUN,

@@ -15,12 +15,14 @@ import numpy as np
 
 from crosscue.replay.base import Limits, LogFormatError
 from crosscue.replay.files.checksum import crc32
+from crosscue.replay.readers.mcap.chunks.chunk_table import ChunkTable, run_of, table_of
+from crosscue.replay.readers.mcap.chunks.inflate import inflate, inflate_prefix
+from crosscue.replay.readers.mcap.chunks.rows import NEVER_IN_A_CHUNK, Definition, rows_by_scan
+from crosscue.replay.readers.mcap.damage.find import find_bytes
+from crosscue.replay.readers.mcap.damage.repair import proved_head
 
 from .bytes import PIECE, ByteFile
 from .channels import Declarations, TopicBook
-from .chunk_table import ChunkTable, run_of, table_of
-from .find import find_bytes
-from .inflate import inflate, inflate_prefix
 from .records import (
     CHANNEL,
     CHUNK,
@@ -44,8 +46,6 @@ from .records import (
     read_schema,
     read_statistics,
 )
-from .repair import proved_head
-from .rows import NEVER_IN_A_CHUNK, Definition, rows_by_scan
 from .walk import Chunk, End, How, Run, Walk
 
 MAX_HEADER: Final = 1 << 16

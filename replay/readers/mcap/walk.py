@@ -17,9 +17,12 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from crosscue.replay.base import Bytes, Limits
+from crosscue.replay.readers.mcap.chunks.rows import Rows, opcodes, rows_by_scan
+from crosscue.replay.readers.mcap.damage.find import find_chunk
+from crosscue.replay.readers.mcap.damage.repair import REPAIRED, is_doubtful, proved_head
+from crosscue.replay.readers.mcap.damage.resync import Plausible, Resync, is_exact
 
 from .bytes import ByteFile
-from .find import find_chunk
 from .records import (
     ATTACHMENT,
     CHANNEL,
@@ -48,9 +51,6 @@ from .records import (
     read_chunk_head,
     read_message_index,
 )
-from .repair import REPAIRED, is_doubtful, proved_head
-from .resync import Plausible, Resync, is_exact
-from .rows import Rows, opcodes, rows_by_scan
 
 RUN_BYTES: Final = 4 << 20
 """Most bytes outside chunks taken at once, unless one record is larger."""

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.base import Limits, Selection
+from crosscue.replay.readers.mcap.chunks.chunk_table import ChunkTable
 
 from .bytes import ByteFile
 from .channels import Declarations
-from .chunk_table import ChunkTable
 from .segments import Segment, Summary
 from .walk import End, Item, Walk
 

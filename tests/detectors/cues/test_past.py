@@ -21,9 +21,9 @@ from crosscue.replay.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import MOBILEYE_SIGNALS, Samples, Signal
 from crosscue.replay.signals.plan import plan
+from crosscue.replay.signals.windows import Window, windows
 from crosscue.replay.vehicle.mobileye_cues import Past
 from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
-from crosscue.replay.windows import Window, windows
 from support.memory_log import MemoryLog
 from support.mobileye_frames import random_drive
 from support.mobileye_ros import TOPIC_TYPES, messages_of

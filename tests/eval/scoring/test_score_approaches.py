@@ -7,8 +7,9 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from crosscue.eval.scoring.approaches import associate, judge_approaches, score_approaches
-from crosscue.eval.scoring.belief import (
+from crosscue.eval.scoring.run_tables import run_tables
+from crosscue.eval.scoring.scene.approaches import associate, judge_approaches, score_approaches
+from crosscue.eval.scoring.scene.belief import (
     CLIP,
     brier,
     compare_belief,
@@ -17,8 +18,7 @@ from crosscue.eval.scoring.belief import (
     reliability,
     score_belief,
 )
-from crosscue.eval.scoring.ranges import judge_range, score_range
-from crosscue.eval.scoring.run_tables import run_tables
+from crosscue.eval.scoring.scene.ranges import judge_range, score_range
 from support.scoring import (
     BELIEF,
     approach,

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.eval.scoring.cues import match_cues, score_cues
 from crosscue.eval.scoring.intervals import mean, resampled, share, wilson
+from crosscue.eval.scoring.scene.cues import match_cues, score_cues
 from crosscue.replay.vehicle.cue_table import CUES
 from support.scoring import (
     ENTER,

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from crosscue.eval.scoring.approaches import ApproachResult
-from crosscue.eval.scoring.cues import CueFrames
+from crosscue.eval.scoring.scene.approaches import ApproachResult
+from crosscue.eval.scoring.scene.cues import CueFrames
 from crosscue.eval.studies.intersections.causes import (
     Finding,
     approach_findings,

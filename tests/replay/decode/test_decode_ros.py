@@ -15,10 +15,10 @@ from rosbags.typesys.store import Typestore
 
 from crosscue.replay.base import Block, CanFrames, Images, Ledger, SchemaError, Table, Topic
 from crosscue.replay.decode import decoder_for
-from crosscue.replay.decode.fields import WalkedFields
 from crosscue.replay.decode.refuse import MISFIT, WRONG_CODING
-from crosscue.replay.decode.ros import RosDecoder
-from crosscue.replay.decode.standard import Kind, generic
+from crosscue.replay.decode.ros.decoder import RosDecoder
+from crosscue.replay.decode.ros.fields import WalkedFields
+from crosscue.replay.decode.ros.standard import Kind, generic
 from support.ros_messages import (
     block_of,
     messages_of,

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from crosscue.replay.readers.mcap.scan import scan_of
+from crosscue.replay.readers.mcap.chunks.scan import scan_of
 from support.mcap_files import Message, read_back
 
 MESSAGES = st.lists(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from crosscue.replay.base import Selection
 from crosscue.replay.readers.mcap import recording_pass as mcap_pass
-from crosscue.replay.readers.mcap.chunk_table import run_of, table_of
+from crosscue.replay.readers.mcap.chunks.chunk_table import run_of, table_of
 from crosscue.replay.readers.mcap.records import PREFIX
 from support.mcap_files import (
     ChunkOf,

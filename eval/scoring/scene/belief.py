@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import AMBIGUOUS
+from crosscue.eval.scoring.columns import NONE, RunTables
+from crosscue.eval.scoring.intervals import Mean, Proportion, mean, share
+from crosscue.eval.scoring.pooling import cluster_numbers, first_reasons, summed
+from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
 from crosscue.replay.columns import Floats, Int64s
-
-from .columns import NONE, RunTables
-from .intervals import Mean, Proportion, mean, share
-from .pooling import cluster_numbers, first_reasons, summed
-from .truth import FEATURES, DriveTruth, has_feature
 
 CLIP: Final = 1e-6
 """Log scores are taken of probabilities clipped to this and one minus this."""

@@ -9,13 +9,11 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.base import Block, Ledger, Messages, SchemaError, Topic
-from crosscue.replay.decode.type_names import ros2_spelling
-
-from .definition import Definitions, definitions_of, well_known
-from .fields import Fields, Part, WalkedFields
-from .plan import Plan, plan_of
-from .refuse import MISFIT, WRONG_CODING, refuse
-from .repeated import (
+from crosscue.replay.decode.refuse import MISFIT, WRONG_CODING, refuse
+from crosscue.replay.decode.ros.definition import Definitions, definitions_of, well_known
+from crosscue.replay.decode.ros.fields import Fields, Part, WalkedFields
+from crosscue.replay.decode.ros.plan import Plan, plan_of
+from crosscue.replay.decode.ros.repeated import (
     LAYOUTS_KEPT,
     MAX_BYTES,
     Layout,
@@ -25,8 +23,9 @@ from .repeated import (
     tail_counts,
     tail_of,
 )
-from .standard import Doubt, Kind, header_ns, kind_of
-from .walk import CDR_PADDING, Bools, Rows, gather, walk
+from crosscue.replay.decode.ros.standard import Doubt, Kind, header_ns, kind_of
+from crosscue.replay.decode.ros.type_names import ros2_spelling
+from crosscue.replay.decode.ros.walk import CDR_PADDING, Bools, Rows, gather, walk
 
 CDR_BE: Final = 0x0000
 CDR_LE: Final = 0x0001

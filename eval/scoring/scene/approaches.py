@@ -24,11 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.datasets.truth.truth import Approach
+from crosscue.eval.scoring.columns import NONE, BeliefRows, RunTables
+from crosscue.eval.scoring.intervals import Mean, Proportion, mean, share
+from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
 from crosscue.replay.columns import Floats, Int64s
-
-from .columns import NONE, BeliefRows, RunTables
-from .intervals import Mean, Proportion, mean, share
-from .truth import FEATURES, DriveTruth, has_feature
 
 THRESHOLD: Final = 0.9
 NEAR_M: Final = 8.0

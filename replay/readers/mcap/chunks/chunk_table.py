@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Int64s
-
-from .records import CHUNK_FIXED, PREFIX, BrokenRecordError, ChunkIndex
+from crosscue.replay.readers.mcap.records import CHUNK_FIXED, PREFIX, BrokenRecordError, ChunkIndex
 
 SMALLEST_CHUNK: Final = PREFIX.size + CHUNK_FIXED
 FARTHEST: Final = 1 << 62

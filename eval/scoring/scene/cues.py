@@ -23,14 +23,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import AMBIGUOUS
+from crosscue.eval.scoring.columns import NONE, CueRows, RunTables
+from crosscue.eval.scoring.intervals import Proportion, share
+from crosscue.eval.scoring.pooling import (
+    BINS_M,
+    cluster_numbers,
+    distance_bins,
+    first_reasons,
+    summed,
+)
+from crosscue.eval.scoring.truth import DriveTruth, cue_at, has_feature
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.cue_spec import Scoring
 from crosscue.replay.vehicle.cue_table import CUES
-
-from .columns import NONE, CueRows, RunTables
-from .intervals import Proportion, share
-from .pooling import BINS_M, cluster_numbers, distance_bins, first_reasons, summed
-from .truth import DriveTruth, cue_at, has_feature
 
 Reading = Scoring
 

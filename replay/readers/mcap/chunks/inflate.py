@@ -10,8 +10,7 @@ import numpy as np
 
 from crosscue.replay.columns import Bytes
 from crosscue.replay.files.checksum import crc32
-
-from .records import BrokenRecordError, ChunkHead
+from crosscue.replay.readers.mcap.records import BrokenRecordError, ChunkHead
 
 if TYPE_CHECKING:
     import zstandard

@@ -15,8 +15,15 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from crosscue.replay.base import DEFAULT_LIMITS, Int64s, Limits, SchemaError
-
-from .definition import DURATION, PRIMITIVES, TIME, Definitions, Field, Shape, well_known
+from crosscue.replay.decode.ros.definition import (
+    DURATION,
+    PRIMITIVES,
+    TIME,
+    Definitions,
+    Field,
+    Shape,
+    well_known,
+)
 
 MAX_DEPTH: Final = 32
 MAX_STEPS: Final = 20_000

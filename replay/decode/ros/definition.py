@@ -14,7 +14,7 @@ from functools import cache
 from typing import Final
 
 from crosscue.replay.base import DEFAULT_LIMITS, Limits, SchemaError
-from crosscue.replay.decode.type_names import ros2_spelling
+from crosscue.replay.decode.ros.type_names import ros2_spelling
 
 PRIMITIVES: Final[Mapping[str, str]] = {
     "bool": "u1",

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Int64s
-
-from .records import (
+from crosscue.replay.readers.mcap.chunks.scan import Scan, scan_of
+from crosscue.replay.readers.mcap.records import (
     ATTACHMENT,
     CHANNEL,
     CHUNK,
@@ -35,7 +35,6 @@ from .records import (
     MessageIndex,
     heads_at,
 )
-from .scan import Scan, scan_of
 
 GAPS_WORTH_A_LOOK: Final = 256
 """Stretches between indexed messages beyond which scanning everything is as fast."""

@@ -12,10 +12,10 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.base import Bytes, Limits
-
-from .bytes import PIECE, ByteFile
-from .inflate import inflate
-from .records import (
+from crosscue.replay.readers.mcap.bytes import PIECE, ByteFile
+from crosscue.replay.readers.mcap.chunks.inflate import inflate
+from crosscue.replay.readers.mcap.chunks.rows import NEVER_IN_A_CHUNK, rows_by_scan
+from crosscue.replay.readers.mcap.records import (
     CHUNK,
     CHUNK_FIXED,
     COMPRESSIONS,
@@ -26,7 +26,6 @@ from .records import (
     ChunkHead,
     read_chunk_head,
 )
-from .rows import NEVER_IN_A_CHUNK, rows_by_scan
 
 MAX_HEAD: Final = PREFIX.size + CHUNK_FIXED + 32
 FIRST_PIECE: Final = 4 << 10

@@ -25,13 +25,18 @@ from crosscue.replay.base import (
     SchemaError,
     Table,
 )
-
-from .coding import JPEG, MAGIC_BYTES, STREAMS, coding_of
-from .fields import Fields
-from .paths import quat, xyz
-from .plan import Plan
-from .refuse import BIG_ENDIAN, EMPTY_PICTURE, IMAGE_CODING, LONG_LENS, VIDEO_CODING
-from .walk import Bools, gather
+from crosscue.replay.decode.coding import JPEG, MAGIC_BYTES, STREAMS, coding_of
+from crosscue.replay.decode.refuse import (
+    BIG_ENDIAN,
+    EMPTY_PICTURE,
+    IMAGE_CODING,
+    LONG_LENS,
+    VIDEO_CODING,
+)
+from crosscue.replay.decode.ros.fields import Fields
+from crosscue.replay.decode.ros.paths import quat, xyz
+from crosscue.replay.decode.ros.plan import Plan
+from crosscue.replay.decode.ros.walk import Bools, gather
 
 Decoded: TypeAlias = CanFrames | Table | Images
 Doubt: TypeAlias = tuple[Bools, str]

@@ -20,11 +20,10 @@ from crosscue.replay.base import (
     Messages,
     Selection,
 )
-
-from .channels import UNKNOWN, Declarations
-from .checks import Checks
-from .records import MESSAGE_HEAD, BrokenRecordError, MessageIndex
-from .rows import Rows
+from crosscue.replay.readers.mcap.channels import UNKNOWN, Declarations
+from crosscue.replay.readers.mcap.checks import Checks
+from crosscue.replay.readers.mcap.chunks.rows import Rows
+from crosscue.replay.readers.mcap.records import MESSAGE_HEAD, BrokenRecordError, MessageIndex
 
 UNDECLARED: Final = "message of a channel that the file does not declare"
 TOO_LARGE: Final = "message over the size limit"

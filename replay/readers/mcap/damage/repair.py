@@ -8,10 +8,9 @@ from __future__ import annotations
 from typing import Final
 
 from crosscue.replay.base import Limits
-
-from .bytes import ByteFile
-from .inflate import inflate
-from .records import (
+from crosscue.replay.readers.mcap.bytes import ByteFile
+from crosscue.replay.readers.mcap.chunks.inflate import inflate
+from crosscue.replay.readers.mcap.records import (
     CHUNK_FIXED,
     COMPRESSIONS,
     PREFIX,

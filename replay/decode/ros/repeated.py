@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Int64s, Messages
-
-from .plan import Items, Plan, Run, Step, Text
-from .walk import Bools
+from crosscue.replay.decode.ros.plan import Items, Plan, Run, Step, Text
+from crosscue.replay.decode.ros.walk import Bools
 
 MAX_BYTES: Final = 4096
 """Longer messages are few, and copying them whole would cost more than walking them."""

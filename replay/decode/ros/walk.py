@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Int64s, Messages
-
-from .plan import Items, Plan, Run, Step, Text, jumped
+from crosscue.replay.decode.ros.plan import Items, Plan, Run, Step, Text, jumped
 
 Bools = NDArray[np.bool_]
 Rows = NDArray[np.intp]

@@ -16,12 +16,11 @@ from threading import Event
 from typing import Final, Self
 
 from crosscue.replay.base import Bytes, Limits
-
-from .bytes import ByteFile
-from .inflate import inflate, inflate_prefix
-from .records import BrokenRecordError
-from .segments import Segment
-from .walk import Chunk, Item
+from crosscue.replay.readers.mcap.bytes import ByteFile
+from crosscue.replay.readers.mcap.chunks.inflate import inflate, inflate_prefix
+from crosscue.replay.readers.mcap.records import BrokenRecordError
+from crosscue.replay.readers.mcap.segments import Segment
+from crosscue.replay.readers.mcap.walk import Chunk, Item
 
 WORKERS: Final = 1
 """One hides most of the work; each more costs more in handing over the interpreter."""

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Int64s
-
-from .records import PREFIX
+from crosscue.replay.readers.mcap.records import PREFIX
 
 
 @dataclass(frozen=True, slots=True, eq=False)

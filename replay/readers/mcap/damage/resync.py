@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Int64s
-
-from .bytes import ByteFile
-from .find import MAX_HEAD
-from .records import (
+from crosscue.replay.readers.mcap.bytes import ByteFile
+from crosscue.replay.readers.mcap.chunks.rows import Definition, Rows
+from crosscue.replay.readers.mcap.damage.find import MAX_HEAD
+from crosscue.replay.readers.mcap.records import (
     ATTACHMENT,
     CHANNEL,
     CHUNK,
@@ -39,7 +39,6 @@ from .records import (
     read_chunk_head,
     read_schema,
 )
-from .rows import Definition, Rows
 
 LINKS: Final = 3
 """Plausible records in a row that are believed wherever they end."""

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Int64s
-
-from .plan import Plan, Value
-from .walk import Bools, Found, Rows, gather
+from crosscue.replay.decode.ros.plan import Plan, Value
+from crosscue.replay.decode.ros.walk import Bools, Found, Rows, gather
 
 
 @dataclass(slots=True, eq=False)

@@ -10,13 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import AMBIGUOUS
+from crosscue.eval.scoring.columns import RunTables
+from crosscue.eval.scoring.intervals import Mean, mean
+from crosscue.eval.scoring.pooling import (
+    BINS_M,
+    cluster_numbers,
+    distance_bins,
+    first_reasons,
+    summed,
+)
 from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
+from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.replay.columns import Floats, Int64s
-
-from .columns import RunTables
-from .intervals import Mean, mean
-from .pooling import BINS_M, cluster_numbers, distance_bins, first_reasons, summed
-from .truth import DriveTruth
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,0 +1,1 @@
+"""The chunks of an MCAP file: found, decompressed, and their messages as columns."""

@@ -1,0 +1,1 @@
+"""Where an MCAP file goes on after damage."""
