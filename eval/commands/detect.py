@@ -17,7 +17,7 @@ from crosscue.eval.commands.shared.detectors import add_detector_arguments, cach
 from crosscue.eval.commands.shared.drive_part import open_part
 from crosscue.eval.commands.shared.options import add_log_arguments, print_result
 from crosscue.eval.commands.shared.progress import DriveLine, is_shown
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

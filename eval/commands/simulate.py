@@ -20,7 +20,7 @@ import crosscue
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, progress_line
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 
 PUBLISHED_RUNS = 10
 

@@ -23,7 +23,7 @@ from crosscue.eval.commands.shared.options import (
     print_json,
     refuse_existing,
 )
-from crosscue.replay.base import CrosscueError, UsageError
+from crosscue.replay.errors import CrosscueError, UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -23,9 +23,7 @@ from crosscue.localization.landmarks.features import Matcher
 from crosscue.localization.landmarks.images import grey_of, picture_of, read_picture
 from crosscue.replay.base import (
     AnnotationError,
-    Block,
     Floats,
-    Images,
     Int64s,
     Ledger,
     Log,
@@ -35,9 +33,8 @@ from crosscue.replay.base import (
     VehicleError,
     read_at_most,
 )
-from crosscue.replay.signals.extractor import Extractor, probe_clocks
-from crosscue.replay.signals.kinds import Plan
-from crosscue.replay.signals.plan import camera_of, with_pictures
+from crosscue.replay.signals.extractor import pictures_of
+from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 MIN_POINTS: Final = 20
@@ -143,21 +140,10 @@ def camera_frames(
     if camera is None:
         raise VehicleError("the logs hold no camera; give a log with pictures")
     log, topic = logs[camera[0]], camera[1]
-    planned = with_pictures(Plan((), {}), camera)
-    wanted = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
-    clocks = probe_clocks(log, planned, vehicle, camera[0], wanted)
-    found: list[Block] = []
-    extractor = Extractor(
-        planned, vehicle, camera[0], ledgers[camera[0]], clocks, on_pictures=found.append
-    )
-    for block in log.read(ledgers[camera[0]], wanted):
-        for _ in extractor(block):
-            pass
-        for pictures in found:
-            assert isinstance(pictures.rows, Images)
-            for row, t_ns in enumerate(pictures.log_ns.tolist()):
-                yield Frame(t_ns, topic.name, picture_of(pictures.rows, row))
-        found.clear()
+    ledger = ledgers[camera[0]]
+    for block, pictures in pictures_of(log, camera[0], topic, vehicle, ledger, selection):
+        for row, t_ns in enumerate(block.log_ns.tolist()):
+            yield Frame(t_ns, topic.name, picture_of(pictures, row))
 
 
 def drop_picture(ledgers: Sequence[Ledger], frame: Frame, error: LogError) -> None:

@@ -13,13 +13,14 @@ from crosscue.datasets.truth.annotations import LogPictures
 from crosscue.detectors.images import encoded, size_of
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
+    EVERYTHING,
     Block,
     Images,
+    Int64s,
     Ledger,
     Limits,
     Log,
     LogError,
-    Selection,
     VehicleError,
 )
 from crosscue.replay.losses import warn_of
@@ -27,8 +28,7 @@ from crosscue.replay.opening import open_log
 from crosscue.replay.readers.images.files import SUFFIXES
 from crosscue.replay.readers.time_file import find_time_file, read_time_file
 from crosscue.replay.readers.timed_files import list_files, pair
-from crosscue.replay.signals.extractor import Extractor, probe_clocks
-from crosscue.replay.signals.kinds import Plan, Source
+from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.stamp_watch import StampWatch
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -46,33 +46,23 @@ def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT_LIMITS) 
         if camera is None:
             raise VehicleError(f"{path}: no camera in the log; annotations need its pictures")
         topic = camera[1]
-        planned = Plan((Source(0, topic, ()),), {})
-        wanted = Selection(frozenset({topic.name}))
-        clocks = probe_clocks(log, planned, vehicle, 0, wanted)
-        times: list[np.typing.NDArray[np.int64]] = []
-        sizes: list[tuple[int, int]] = []
-
-        def see(block: Block) -> None:
+        ledger = Ledger(str(path))
+        times: list[Int64s] = []
+        size: tuple[int, int] | None = None
+        for block, pictures in pictures_of(log, 0, topic, vehicle, ledger, EVERYTHING):
             times.append(block.log_ns)
-            if not sizes and isinstance(block.rows, Images):
-                sizes.append(_size_of(block, f"{path}: {topic.name}"))
-
-        extractor = Extractor(planned, vehicle, 0, Ledger(str(path)), clocks, on_pictures=see)
-        for block in log.read(extractor.ledger, wanted):
-            for _ in extractor(block):
-                pass
-        warn_of(extractor.ledger)
-        if not times:
+            size = size or _size_of(block, pictures, f"{path}: {topic.name}")
+        warn_of(ledger)
+        if size is None:
             raise LogError(f"{path}: {topic.name}: not one picture; annotations need them")
         names = _names(log)
-    return LogPictures(str(path), np.unique(np.concatenate(times)), sizes[0], names)
+    return LogPictures(str(path), np.unique(np.concatenate(times)), size, names)
 
 
-def _size_of(block: Block, where: str) -> tuple[int, int]:
+def _size_of(block: Block, pictures: Images, where: str) -> tuple[int, int]:
     """Of the first picture, by which the annotations are checked."""
-    assert isinstance(block.rows, Images)
     try:
-        return size_of(encoded(block.rows, 0))
+        return size_of(encoded(pictures, 0))
     except LogError as error:
         raise type(error)(
             f"{where}: first picture, at {block.log_ns[0]}ns: {error}; annotations need its size"

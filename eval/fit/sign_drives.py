@@ -10,21 +10,18 @@ from crosscue.detectors.images import Encoded, encoded
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
+    EVERYTHING,
     MIB,
     AnnotationError,
-    Block,
-    Images,
     Ledger,
     Limits,
     Log,
     LogError,
-    Selection,
     read_at_most,
 )
 from crosscue.replay.losses import warn_of
 from crosscue.replay.opening import open_log
-from crosscue.replay.signals.extractor import Extractor, probe_clocks
-from crosscue.replay.signals.kinds import Plan, Source
+from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
@@ -82,19 +79,8 @@ def _camera(log: Log, vehicle: Vehicle) -> Iterator[tuple[int, Encoded]]:
     camera = camera_of([(0, topic) for topic in log.topics], vehicle)
     if camera is None:
         raise LogError(f"{log.path}: no camera in the log; signs need its pictures")
-    planned = Plan((Source(0, camera[1], ()),), {})
-    wanted = Selection(frozenset({camera[1].name}))
-    clocks = probe_clocks(log, planned, vehicle, 0, wanted)
-    waiting: list[Block] = []
-    extractor = Extractor(
-        planned, vehicle, 0, Ledger(str(log.path)), clocks, on_pictures=waiting.append
-    )
-    for block in log.read(extractor.ledger, wanted):
-        for _ in extractor(block):
-            pass
-        for pictures in waiting:
-            if isinstance(pictures.rows, Images):
-                for i, t_ns in enumerate(pictures.log_ns.tolist()):
-                    yield t_ns, encoded(pictures.rows, i)
-        waiting.clear()
-    warn_of(extractor.ledger)
+    ledger = Ledger(str(log.path))
+    for block, pictures in pictures_of(log, 0, camera[1], vehicle, ledger, EVERYTHING):
+        for i, t_ns in enumerate(block.log_ns.tolist()):
+            yield t_ns, encoded(pictures, i)
+    warn_of(ledger)

@@ -24,7 +24,7 @@ from crosscue.replay.vehicle.cue_table import CUES
 
 from .html import render_page
 from .pose_figures import draw_all
-from .worst_frames import WorstFrame, worst_frames
+from .scene_figures import WorstFrame
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -87,6 +87,7 @@ def write_report(
     scored: Sequence[RunScored],
     scores: Scores,
     metrics: Mapping[str, Any],
+    worst: Sequence[WorstFrame],
     *,
     has_figures: bool = True,
 ) -> Path:
@@ -97,14 +98,14 @@ def write_report(
         scored: All runs, at least one.
         scores: Of all of them together.
         metrics: From ``metrics_of``, with whatever the command added.
+        worst: From ``worst_frames``, to be shown with their pictures.
         has_figures: Draw, which imports matplotlib? Tables and frames are there without.
 
     Raises:
-        RunError: A run's manifest or tables cannot be read, or the log with the pictures of its
-            worst frames is not found.
+        RunError: A run's manifest or tables cannot be read.
         OutputError: It cannot be written.
     """
-    content = _content(scored, metrics)
+    content = _content(scored, metrics, worst)
     if has_figures and len(scored) == 1 and scored[0].poses is not None:
         draw_all(scored[0].poses, folder)
     content["figures"] = _figures(scored, scores) if has_figures else NO_FIGURES
@@ -118,7 +119,9 @@ def write_report(
     return folder / REPORT
 
 
-def _content(scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> dict[str, Any]:
+def _content(
+    scored: Sequence[RunScored], metrics: Mapping[str, Any], worst: Sequence[WorstFrame]
+) -> dict[str, Any]:
     runs = [_run(one) for one in scored]
     sources = [one.truth.truth.source for one in scored]
     cues = [_cue(name, one) for name, one in metrics["cues"].items()]
@@ -143,7 +146,7 @@ def _content(scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> dict[st
         "range_scores": metrics["range"],
         "attribution": metrics.get("attribution"),
         "has_scene": bool(metrics["approaches"] or metrics["belief"]),
-        "frames": [_frame(one) for one in worst_frames(scored)],
+        "frames": [_frame(one) for one in worst],
         "pose": pose if is_alone else None,
         "poses": None if is_alone else pose,
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -199,6 +200,35 @@ def _lane(
             if across:
                 drawing.rect(min(across) - 1, y + 2, max(across) - min(across) + 3, 10, style)
     drawing.text(panel.left - 6, y + 11, cue.cue.replace("_", " "), "tick", "end")
+
+
+@dataclass(frozen=True, slots=True)
+class WorstFrame:
+    """A cue that was found and is not there.
+
+    Attributes:
+        run: Its drive's name in the scores.
+        t_ns: Log time.
+        cue: Name.
+        count: How many were found.
+        true_count: How many there are, or None where the truth does not say.
+        distance_m: To the intersection ahead, NaN where none is.
+        confidence: Highest score of what stands behind the cue, or None where nothing scores it.
+        frames: Wrong frames of this cue around this one.
+        picture: A JPEG as base64; empty where the log or the picture is gone.
+        size_px: Its width and height.
+    """
+
+    run: str
+    t_ns: int
+    cue: str
+    count: int
+    true_count: int | None
+    distance_m: float
+    confidence: float | None
+    frames: int
+    picture: str = ""
+    size_px: tuple[int, int] = (0, 0)
 
 
 def is_wrong(cue: CueFrames) -> NDArray[np.bool_]:

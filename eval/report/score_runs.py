@@ -26,6 +26,7 @@ from crosscue.replay.processes import in_processes
 
 from .page import write_report
 from .pose_figures import draw_all
+from .worst_frames import worst_frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,8 +101,9 @@ class ScoreWork:
             if smoothed is not None:
                 metrics["smoother"] = asdict(smoothed)
             # First what may lack pictures: then nothing is written.
+            worst = worst_frames([one])
             report = write_report(
-                folder.file(FOLDER), [one], scores, metrics, has_figures=self.has_figures
+                folder.file(FOLDER), [one], scores, metrics, worst, has_figures=self.has_figures
             )
             write_scores(folder.file(FOLDER), [one], metrics)
         return Scored(one, metrics, report, smoothed)

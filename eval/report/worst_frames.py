@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -23,7 +23,7 @@ from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .scene_figures import is_wrong
+from .scene_figures import WorstFrame, is_wrong
 
 MOST: Final = 6
 APART_NS: Final = 2_000_000_000
@@ -41,35 +41,6 @@ FOUND: Final = (
     "picture_width_px",
     "picture_height_px",
 )
-
-
-@dataclass(frozen=True, slots=True)
-class WorstFrame:
-    """A cue that was found and is not there.
-
-    Attributes:
-        run: Its drive's name in the scores.
-        t_ns: Log time.
-        cue: Name.
-        count: How many were found.
-        true_count: How many there are, or None where the truth does not say.
-        distance_m: To the intersection ahead, NaN where none is.
-        confidence: Highest score of what stands behind the cue, or None where nothing scores it.
-        frames: Wrong frames of this cue around this one.
-        picture: A JPEG as base64; empty where the log or the picture is gone.
-        size_px: Its width and height.
-    """
-
-    run: str
-    t_ns: int
-    cue: str
-    count: int
-    true_count: int | None
-    distance_m: float
-    confidence: float | None
-    frames: int
-    picture: str = ""
-    size_px: tuple[int, int] = (0, 0)
 
 
 def worst_frames(scored: Sequence[RunScored], most: int = MOST) -> list[WorstFrame]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, Images, Int64s, Ledger, Log, Selection
+from crosscue.replay.base import Block, Images, Int64s, Ledger, Log, Selection, Topic
 from crosscue.replay.clocks.clock import Clock, times_of
 from crosscue.replay.clocks.reports import MAX_OFFSET_NS, ClockWatch
 from crosscue.replay.decode import Decoder, decoder_for
@@ -236,3 +236,30 @@ def wheels_only(
     only = () if source is None else (replace(source, signals=(Signal.WHEEL_SPEEDS,)),)
     lean = vehicle.model_copy(update={"can": can})
     return Extractor(Plan(only, {}), lean, number, Ledger(""), clocks)
+
+
+def pictures_of(
+    log: Log, number: int, topic: Topic, vehicle: Vehicle, ledger: Ledger, selection: Selection
+) -> Iterator[tuple[Block, Images]]:
+    """A camera's pictures, a block at a time, on the clock that its first seconds show to be best.
+
+    Args:
+        log: Open.
+        number: Of the log in the drive.
+        topic: Of the camera.
+        vehicle: The vehicle file.
+        ledger: Reported of what could not be used.
+        selection: Which part of the log to read; its topics do not count.
+    """
+    planned = Plan((Source(number, topic, ()),), {})
+    wanted = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
+    clocks = probe_clocks(log, planned, vehicle, number, wanted)
+    found: list[Block] = []
+    extractor = Extractor(planned, vehicle, number, ledger, clocks, on_pictures=found.append)
+    for block in log.read(ledger, wanted):
+        for _ in extractor(block):
+            pass
+        for pictures in found:
+            if isinstance(pictures.rows, Images):
+                yield pictures, pictures.rows
+        found.clear()

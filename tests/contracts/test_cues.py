@@ -18,6 +18,7 @@ from crosscue.detectors.cues.rules import rule_of
 from crosscue.eval.recording.series import of_cue
 from crosscue.eval.report.page import write_report
 from crosscue.eval.report.summary import summary
+from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of
 from crosscue.eval.studies.intersections.tables import cue_rows
 from crosscue.replay.vehicle.cue_spec import CueSpec
@@ -134,7 +135,9 @@ def test_a_dummy_cue_is_one_row_and_one_function(
     assert scores.cues["zebra"].reading == "feature"
     assert scores.cues["zebra"].readings["object"].precision.right == 1
     assert "zebra" in summary(scores)
-    page = write_report(run.file(FOLDER), [one], scores, metrics_of([one], scores)).read_text()
+    page = write_report(
+        run.file(FOLDER), [one], scores, metrics_of([one], scores), worst_frames([one])
+    ).read_text()
     assert "<td>zebra</td>" in page
     assert "at least 0.61" in page
     (row,) = [row for row in cue_rows(scores.cues) if row["cue"] == "zebra crossing"]

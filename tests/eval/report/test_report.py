@@ -63,7 +63,9 @@ def _scored(folder: Path, name: str = "A", **more: Any) -> RunScored:
 
 def _written(folder: Path, *scored: RunScored, **more: Any) -> str:
     scores = scores_of(scored)
-    path = write_report(folder, scored, scores, {**metrics_of(scored, scores), **more})
+    path = write_report(
+        folder, scored, scores, {**metrics_of(scored, scores), **more}, worst_frames(scored)
+    )
     return path.read_text(encoding="utf-8")
 
 
@@ -239,7 +241,7 @@ def test_several_drives_make_one_page(tmp_path: Path) -> None:
     metrics = metrics_of(drives, scores)
     metrics["coverage"]["failed"] = failed
 
-    page = write_report(tmp_path, drives, scores, metrics).read_text()
+    page = write_report(tmp_path, drives, scores, metrics, worst_frames(drives)).read_text()
 
     assert "<h1>3 drives</h1>" in page
     assert "<b>150 of 150</b>" in page

@@ -17,6 +17,7 @@ from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.recording import save as save_recording
 from crosscue.eval.report.page import write_report
 from crosscue.eval.report.score_runs import score_pose
+from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
 from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of
@@ -165,7 +166,9 @@ class _Elements(HTMLParser):
 def _reported(run: RunFolder, path: Path) -> Path:
     one = judge_run(run, path)
     scores = scores_of([one])
-    return write_report(run.file(FOLDER), [one], scores, metrics_of([one], scores))
+    return write_report(
+        run.file(FOLDER), [one], scores, metrics_of([one], scores), worst_frames([one])
+    )
 
 
 def test_the_report_needs_no_network_and_hostile_names_stay_text(tmp_path: Path) -> None:
