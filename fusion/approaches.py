@@ -32,7 +32,15 @@ from .evidence import FrameEvidence, RangePosterior, SignRange
 from .factor_graph import FactorGraph
 from .intersection_range import RangeBelief, Reference
 from .persistence import Confirmed, Persistence, PersistentSpeaker
-from .range_track import NOTHING, RangeTrack, Verdict, advance, measure, predict_without_odometry
+from .range_track import (
+    NOTHING,
+    RangeTrack,
+    Verdict,
+    advance,
+    follow,
+    measure,
+    predict_without_odometry,
+)
 from .speakers import speakers_of
 
 TURN_FADES_M: Final = 25.0
@@ -263,7 +271,7 @@ class Approaches:
         past: PastCues,
         moved: _Moved,
     ) -> Step:
-        ranges = self._measured(at_hand, signs, evidence.posteriors)
+        ranges = self._measured(at_hand, signs, evidence.posteriors, moved.way_m)
         best, reference = _best(at_hand, Reference(self._fusion.reference))
         more = past(best, reference)
         counts = {**evidence.counts, **more} if more else evidence.counts
@@ -306,19 +314,19 @@ class Approaches:
         at_hand: _Open,
         signs: Mapping[Reference, tuple[float, float]],
         posteriors: Sequence[RangePosterior],
+        way_m: float,
     ) -> tuple[RangeRow, ...]:
-        """Weigh in the signs and take posteriors over as they are; the rows to write."""
+        """Weigh in the signs and take posteriors up; the rows to write."""
         start_m = end_m = None
         if Reference.START in signs:
             at_hand.start, start_m = self._weigh(at_hand.start, *signs[Reference.START])
         if Reference.END in signs:
             at_hand.end, end_m = self._weigh(at_hand.end, *signs[Reference.END])
         for one in posteriors:
-            track = RangeTrack(RangeBelief(one.range_m, one.var_m2))
             if one.reference is Reference.START:
-                at_hand.start, start_m = track, one.measured_m
+                at_hand.start, start_m = self._follow(at_hand.start, one, way_m), one.measured_m
             else:
-                at_hand.end, end_m = track, one.measured_m
+                at_hand.end, end_m = self._follow(at_hand.end, one, way_m), one.measured_m
         rows = (
             (Reference.START, at_hand.start.belief, start_m),
             (Reference.END, at_hand.end.belief, end_m),
@@ -328,6 +336,12 @@ class Approaches:
             for reference, belief, measured_m in rows
             if belief is not None
         )
+
+    def _follow(self, track: RangeTrack, one: RangePosterior, way_m: float) -> RangeTrack:
+        way_m = max(way_m, track.unseen_m)
+        track, verdict = follow(track, one.range_m, one.var_m2, way_m, self._filter)
+        self.counts["ranges restarted"] += verdict is Verdict.RESTARTED
+        return track
 
     def _weigh(
         self, track: RangeTrack, range_m: float, var_m2: float

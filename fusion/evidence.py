@@ -56,7 +56,7 @@ class FrameEvidence:
         turned_rad: Change of heading since the evidence before, counter-clockwise, where known.
         assumed_m: How much of the way was assumed across a gap in time: on it nobody looked, so no
             approach becomes stale by it.
-        posteriors: Ranges that replace what is believed of their reference.
+        posteriors: Ranges by all observations so far, which the belief takes up along the way.
     """
 
     t_ns: int

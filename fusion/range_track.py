@@ -122,6 +122,38 @@ def measure(
     return RangeTrack(belief, rival, seen, track.unseen_m), Verdict.REFUSED
 
 
+def follow(
+    track: RangeTrack, whole_m: float, var_m2: float, way_m: float, settings: RangeFilter
+) -> tuple[RangeTrack, Verdict]:
+    """Take up a range that somebody else has weighed from all observations so far.
+
+    Its errors are those of the one before, but for what is new, so it is no independent
+    measurement: one after the other would make the belief far too sure. It is one (eq. 10 to 12)
+    whose gain follows the way gone, ``1 - exp(-way / take_up_m)``, so that a correction smaller
+    than ``take_up_m`` never makes the range grow while the car goes on, and nothing changes while
+    it stands. The later of two such ranges is the better one, so their covariance is its variance;
+    with that, the belief's variance is exact.
+
+    Args:
+        track: Advanced to the range's time.
+        whole_m: The range, by all observations so far.
+        var_m2: Its variance.
+        way_m: Gone since the last one that was taken up.
+        settings: ``take_up_m``, and the gate beyond which it replaces the belief.
+    """
+    belief = track.belief
+    if belief is None:
+        return RangeTrack(RangeBelief(whole_m, var_m2)), Verdict.BEGAN
+    if not _inside(belief, whole_m, var_m2, settings.gate_nis):
+        return RangeTrack(RangeBelief(whole_m, var_m2)), Verdict.RESTARTED
+    gain = 1.0 if settings.take_up_m == 0.0 else -math.expm1(-way_m / settings.take_up_m)
+    rest = 1.0 - gain
+    mean_m = belief.mean_m + gain * (whole_m - belief.mean_m)
+    shared_m2 = min(var_m2, belief.var_m2)
+    var_m2 = rest**2 * belief.var_m2 + gain**2 * var_m2 + 2.0 * rest * gain * shared_m2
+    return RangeTrack(RangeBelief(mean_m, var_m2)), Verdict.TAKEN
+
+
 def _inside(
     belief: RangeBelief, measured_m: float, sensor_var_m2: float, gate: float | None
 ) -> bool:

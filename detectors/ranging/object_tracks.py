@@ -20,7 +20,8 @@ import numpy as np
 from crosscue.replay.columns import Floats
 
 from .lens import HUES
-from .range_from_motion import SIZES, MotionRange, SizePrior, range_from_motion
+from .range_from_motion import MotionRange, range_from_motion
+from .standard_sizes import BOX_SPREAD, SizePrior, size_of
 
 NEAR_HEIGHTS: Final = 1.0
 """A box belongs to a track whose predicted box is nearer than so many of its heights: the car's
@@ -44,6 +45,17 @@ small or blurred ones."""
 MIN_DARK: Final = 10
 MAX_LIT_FRACTION: Final = 0.05
 """And does not face it if it was dark in so many frames and lit in at most this fraction."""
+SAME_MAKE: Final = 0.06
+"""Lights at one crossing are mostly of one make: their heights differ by this fraction, boxes drawn
+tight or wide included, much less than the standard sizes do."""
+SAME_ASPECT: Final = 1.2
+"""If their boxes are alike, height by width, within this factor."""
+OTHER_MAKE: Final = 2.0
+"""And if motion does not say otherwise by more than so many standard deviations."""
+MIN_SAID: Final = 0.25
+"""Motion has said something once it is worth this fraction of what the standard sizes say."""
+MIN_SEEN: Final = 5
+"""A light seen less often says nothing of the others' make."""
 STRAIGHT_RAD: Final = 0.15
 """Heights follow the way only while the car goes straight; after such a turn they begin anew."""
 
@@ -93,7 +105,9 @@ class Track:
         number: Of the track, from 1.
         box_px: Where it is now: as seen, or as predicted.
         height_px: Of its box, the same way.
-        estimate: Range and height at the last observation.
+        estimate: Range and height at the last observation, from this object and those alike.
+        alone: The same from this object alone.
+        size: What its shape alone says of its height.
         seen: In how many frames.
         is_seen: In the newest frame.
         since_m: Way gone since the last observation.
@@ -107,6 +121,8 @@ class Track:
     box_px: Floats
     height_px: float
     estimate: MotionRange
+    alone: MotionRange
+    size: SizePrior
     seen: int = 1
     is_seen: bool = True
     since_m: float = 0.0
@@ -116,6 +132,7 @@ class Track:
     dark: int = 0
     _way_m: list[float] = field(default_factory=list)
     _height_px: list[float] = field(default_factory=list)
+    _aspect: list[float] = field(default_factory=list)
     _merged: int = 0
     _at_m: float = 0.0
     _way_var_m2: float = 0.0
@@ -143,11 +160,31 @@ class Track:
     @property
     def var_m2(self) -> float:
         """Its variance, the odometer's error included: a way too long is a range too far."""
-        way_m = abs(self._way_m[-1] - self._way_m[0])
-        if way_m < MERGE_M:
-            return self.estimate.var_m2
-        stretch = self.estimate.by_motion * math.sqrt(self._way_var_m2) / way_m
+        stretch = self.estimate.by_motion * self._stretch()
         return self.estimate.var_m2 + (stretch * self.estimate.mean_m) ** 2
+
+    @property
+    def aspect(self) -> float:
+        """Height by width of its boxes, the median of the newest."""
+        return float(np.median(self._aspect))
+
+    def _stretch(self) -> float:
+        """S.d. of the way as a fraction of it."""
+        way_m = abs(self._way_m[-1] - self._way_m[0])
+        return 0.0 if way_m < MERGE_M else math.sqrt(self._way_var_m2) / way_m
+
+    def size_by_motion(self) -> tuple[float, float] | None:
+        """How much larger it is than its standard size, as mean and variance of the logarithm.
+
+        None where motion has said nothing yet. The standard size, which the estimate holds, too, is
+        taken out, so that several objects may be weighed together with it once.
+        """
+        found, prior = self.alone, self.size
+        precision = 1.0 / found.log_height_var - 1.0 / prior.log_var
+        if precision <= MIN_SAID / prior.log_var:
+            return None
+        mean = (found.log_height - prior.log_mean) / (found.log_height_var * precision)
+        return mean, 1.0 / precision + self._stretch() ** 2
 
     def go_on(self, motion: Motion, lens: Lens) -> None:
         """Carry it to the next frame, where it has not been looked for yet."""
@@ -168,8 +205,12 @@ class Track:
         if motion.way_m is None or abs(self._turned_rad) > STRAIGHT_RAD:
             self._forget()
 
-    def observe(self, box_px: Floats, height_px: float, size: SizePrior, lens: Lens) -> None:
+    def observe(self, box_px: Floats, height_px: float, cue: str, lens: Lens) -> None:
         """Take the box of the newest frame."""
+        width_px = float(box_px[2] - box_px[0])
+        if width_px > 0.0:
+            self._aspect.append(height_px / width_px)
+            del self._aspect[:-MAX_OBSERVATIONS]
         if self._way_m and abs(self._at_m - self._way_m[-1]) < MERGE_M and self._merged:
             self._merged += 1
             self._height_px[-1] += (height_px - self._height_px[-1]) / self._merged
@@ -178,13 +219,21 @@ class Track:
             self._height_px.append(height_px)
             self._merged = 1
             del self._way_m[:-MAX_OBSERVATIONS], self._height_px[:-MAX_OBSERVATIONS]
-        found = range_from_motion(
-            np.array(self._way_m), np.array(self._height_px), lens.focal_px, size
-        )
-        self.estimate, self.since_m = found, self._at_m - self._way_m[-1]
+        self.size = size_of(cue, self.aspect if self._aspect else None)
+        self.alone = self.estimate = self._ranged(self.size, lens)
+        self.since_m = self._at_m - self._way_m[-1]
         self.box_px, self.height_px = box_px.copy(), height_px
         self.seen += 1
         self.is_seen, self.unseen_m, self.unseen_s = True, 0.0, 0.0
+
+    def weigh(self, size: SizePrior, lens: Lens) -> None:
+        """Take into account what objects alike say of its size."""
+        self.estimate = self._ranged(size, lens)
+
+    def _ranged(self, size: SizePrior, lens: Lens) -> MotionRange:
+        return range_from_motion(
+            np.array(self._way_m), np.array(self._height_px), lens.focal_px, size
+        )
 
     def _forget(self) -> None:
         """What heights said so far fits no straight way; the last estimate stands until seen."""
@@ -203,7 +252,7 @@ class ObjectTracks:
     def __init__(self, cue: str, focal_px: float, center_px: tuple[float, float]) -> None:
         self.tracks: list[Track] = []
         self.counts: Counter[str] = Counter()
-        self._size = SIZES[cue]
+        self._cue = cue
         self._lens = Lens(focal_px, center_px)
 
     def __call__(
@@ -237,6 +286,7 @@ class ObjectTracks:
             self._begin(boxes_px[i], float(heights_px[i]), lenses[i])
             taken.append(i)
         self.tracks = [one for one in self.tracks if not _is_over(one)]
+        self._share_sizes()
         return self.tracks
 
     def _assign(self, boxes_px: Floats, heights_px: Floats, lenses: Sequence[str]) -> list[int]:
@@ -251,22 +301,83 @@ class ObjectTracks:
         tracks: set[int] = set()
         for _, i, j in sorted(pairs):
             if i not in boxes and j not in tracks:
-                self.tracks[j].observe(boxes_px[i], float(heights_px[i]), self._size, self._lens)
+                self.tracks[j].observe(boxes_px[i], float(heights_px[i]), self._cue, self._lens)
                 self.tracks[j].look(lenses[i])
                 boxes.append(i)
                 tracks.add(j)
         return boxes
 
+    def _share_sizes(self) -> None:
+        """Weigh each object's size with those of the others alike, each taken by itself."""
+        said = [
+            (one, by_motion)
+            for one in self.tracks
+            if one.seen >= MIN_SEEN and (by_motion := one.size_by_motion()) is not None
+        ]
+        for one in self.tracks:
+            own = one.size_by_motion()
+            others = [
+                by_motion
+                for other, by_motion in said
+                if other is not one
+                and is_alike(one.aspect, other.aspect)
+                and (own is None or may_be_one_make(own, by_motion))
+            ]
+            if others and one.is_seen:
+                one.weigh(shared_size(one.size, others), self._lens)
+
     def _begin(self, box_px: Floats, height_px: float, lens: str) -> None:
         self.counts["objects followed"] += 1
-        first = range_from_motion(
-            np.zeros(1), np.array([height_px]), self._lens.focal_px, self._size
-        )
-        track = Track(self.counts["objects followed"], box_px.copy(), height_px, first)
-        track.observe(box_px, height_px, self._size, self._lens)
+        size = size_of(self._cue)
+        first = range_from_motion(np.zeros(1), np.array([height_px]), self._lens.focal_px, size)
+        number = self.counts["objects followed"]
+        track = Track(number, box_px.copy(), height_px, first, first, size)
+        track.observe(box_px, height_px, self._cue, self._lens)
         track.look(lens)
         track.seen = 1
         self.tracks.append(track)
+
+
+def is_alike(aspect: float, other: float) -> bool:
+    """May two lights be of one make, by the shape of their boxes?"""
+    return abs(math.log(aspect / other)) < math.log(SAME_ASPECT)
+
+
+def may_be_one_make(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Do two sizes by motion agree as well as lights of one make would?"""
+    var = one[1] + other[1] + 2.0 * SAME_MAKE**2
+    return (one[0] - other[0]) ** 2 < OTHER_MAKE**2 * var
+
+
+def difference_var_m2(one: Track, other: Track) -> float:
+    """Variance of the difference of two ranges.
+
+    Of lights of one make, what is common to their sizes does not count: it makes both ranges too
+    long or too short, and the higher box is the nearer light.
+    """
+    apart_m2 = one.var_m2 + other.var_m2
+    if not is_alike(one.aspect, other.aspect):
+        return apart_m2
+    ratio_var = 2.0 * (SAME_MAKE**2 + BOX_SPREAD**2)
+    return min(apart_m2, ratio_var * max(one.range_m, other.range_m) ** 2)
+
+
+def shared_size(size: SizePrior, others: Sequence[tuple[float, float]]) -> SizePrior:
+    """An object's size, given how much larger than standard others of its make are.
+
+    The logarithm of a size is that of the standard size, plus what is common to the make, plus the
+    object's own (``SAME_MAKE``); all are Gaussian.
+
+    Args:
+        size: What its shape alone says.
+        others: Mean and variance of the logarithm by ``Track.size_by_motion``, of each.
+    """
+    own = min(SAME_MAKE**2, 0.5 * size.log_var)
+    common = size.log_var - own
+    precision = 1.0 / common + sum(1.0 / (own + var) for _, var in others)
+    mean = sum(off / (own + var) for off, var in others) / precision
+    var = own + 1.0 / precision
+    return SizePrior(math.exp(size.log_mean + mean + 0.5 * var), math.sqrt(math.expm1(var)))
 
 
 def iou(one: Floats, other: Floats) -> float:

@@ -2,8 +2,8 @@
 
 A pinhole camera of focal length f sees an object of height H at depth R as h = f H / R pixels. Over
 the distance s travelled towards it, 1 / h falls linearly: 1 / h = (R0 - s) / (f H). So the growth
-tells R without knowing H; what is known of H beforehand (``SIZES``) is only the prior. It is all
-there is while the car stands, and is outweighed as the car moves.
+tells R without knowing H; what is known of H beforehand (``standard_sizes``) is only the prior. It
+is all there is while the car stands, and is outweighed as the car moves.
 
 In logarithms, ln h = ln f + ln H - ln R + error, and H is lognormal: given R, everything is
 Gaussian, so H is integrated out exactly and the posterior of R is computed on a grid. Its prior is
@@ -19,7 +19,6 @@ The scale of the errors is estimated with the range, from residuals and a weak p
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -27,38 +26,7 @@ import numpy as np
 
 from crosscue.replay.columns import Floats
 
-
-@dataclass(frozen=True, slots=True)
-class SizePrior:
-    """What is known of an object's height before it is seen: lognormal.
-
-    Attributes:
-        mean_m: Expected height.
-        spread: Standard deviation as a fraction of the mean.
-    """
-
-    mean_m: float
-    spread: float
-
-    @property
-    def log_var(self) -> float:
-        """Variance of the logarithm."""
-        return float(np.log1p(self.spread**2))
-
-    @property
-    def log_mean(self) -> float:
-        """Mean of the logarithm."""
-        return float(np.log(self.mean_m)) - 0.5 * self.log_var
-
-
-SIZES: Final[Mapping[str, SizePrior]] = {
-    "traffic_light": SizePrior(1.2, 0.25),
-    "stop_sign": SizePrior(0.82, 0.15),
-}
-"""Standard sizes by cue. Housings: three lenses of 0.30 m are 1.07 m bare and 1.32 m with a
-backplate, three of 0.20 m are 0.75 m, four of 0.30 m with a backplate 1.68 m. Faces of stop signs:
-0.75 m and 0.90 m across the flats, the small ones 0.60 m. The spread takes in boxes drawn tight or
-wide."""
+from .standard_sizes import SizePrior
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,12 +55,16 @@ class MotionRange:
         var_m2: Its variance.
         height_m: The object's height that goes with ``mean_m``.
         by_motion: How much of the prior variance motion took away, in [0, 1].
+        log_height: Mean of the logarithm of the height.
+        log_height_var: Its variance.
     """
 
     mean_m: float
     var_m2: float
     height_m: float
     by_motion: float
+    log_height: float
+    log_height_var: float
 
 
 NEAREST_M: Final = 0.5
@@ -140,7 +112,9 @@ def range_from_motion(
     unmoved = seen.at_last()
     before = _refined(unmoved, grid_m, unmoved.worth / unmoved.var, size)
     by_motion = float(np.clip(1.0 - post.var_m2 / before.var_m2, 0.0, 1.0))
-    return MotionRange(post.mean_m, post.var_m2, post.height_m, by_motion)
+    return MotionRange(
+        post.mean_m, post.var_m2, post.height_m, by_motion, post.log_height, post.log_height_var
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +149,8 @@ class _Posterior:
     mean_m: float
     var_m2: float
     height_m: float
+    log_height: float
+    log_height_var: float
 
 
 def _checked(
@@ -249,4 +225,7 @@ def _posterior(
     var_m2 = float(density @ (range_m - mean_m) ** 2)
     at_mean = seen.excess(np.array([mean_m]))[0] - size.log_mean
     height_m = float(np.exp(size.log_mean + at_mean @ weights / precision))
-    return _Posterior(mean_m, max(var_m2, 1e-12), height_m)
+    log_heights = size.log_mean + pull / precision
+    log_height = float(density @ log_heights)
+    log_height_var = float(density @ (log_heights - log_height) ** 2) + 1.0 / precision
+    return _Posterior(mean_m, max(var_m2, 1e-12), height_m, log_height, log_height_var)

@@ -5,7 +5,8 @@ Which object reports the range:
 * **Traffic lights** stand on both sides of the crossing. Of those that face the car, one that no
   other is clearly (two standard deviations) further than marks the **end**. One of a nearer group,
   which may well be seen from behind, marks the **start**. A light that is known not to face the car
-  never marks the end. Where only one group was seen, the run says so.
+  never marks the end, and one of which that is unknown never the start. Where only one group was
+  seen, the run says so. Lights stand set back from the crossing (``Ranges.light_setback_m``).
 * **Stop signs** mark the **start**: one that no other is clearly nearer than. They come before
   lights.
 
@@ -22,7 +23,13 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.ranging.object_tracks import Facing, Motion, ObjectTracks, Track
+from crosscue.detectors.ranging.object_tracks import (
+    Facing,
+    Motion,
+    ObjectTracks,
+    Track,
+    difference_var_m2,
+)
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.columns import Floats
@@ -37,6 +44,8 @@ WIDEST_M: Final = 60.0
 """Lights further behind the nearest than this are another intersection's."""
 NARROWEST_M: Final = 8.0
 """Groups nearer to each other than a street of two lanes with its kerbs is wide are one."""
+PERSISTS: Final = 10
+"""An object seen so often competes with any; less often, with those seen up to twice as often."""
 ONE_GROUP: Final = "frames with only one group of lights"
 ONLY_AWAY: Final = "frames with only lights that do not face the ego vehicle"
 
@@ -165,7 +174,7 @@ class _Chain:
                 one.facing,
                 marks.get(one.number),
                 one.range_m + self.vehicle.camera.x_m,
-                _var_m2(one, self.vehicle),
+                one.var_m2,
                 one.estimate.height_m,
                 tuple(one.box_px.tolist()),
             )
@@ -182,14 +191,15 @@ class _Chain:
                 continue
             shift_m, place_var_m2 = camera.x_m, 0.0
             if self.cue == TRAFFIC_LIGHT.name:
-                place_var_m2 = ranges.light_place_sd_m**2
-                shift_m -= ranges.light_beyond_end_m if reference is Reference.END else 0.0
+                place_var_m2 = ranges.light_setback_sd_m**2
+                shift_m -= ranges.light_setback_m if reference is Reference.END else 0.0
+                shift_m += ranges.light_setback_m if one.facing is Facing.AWAY else 0.0
             measured_m = (camera.focal_px or 0.0) * one.estimate.height_m / one.height_px
             found.append(
                 RangePosterior(
                     reference,
                     one.range_m + shift_m,
-                    _var_m2(one, self.vehicle) + place_var_m2,
+                    one.var_m2 + place_var_m2,
                     measured_m + shift_m,
                 )
             )
@@ -203,11 +213,15 @@ def _may_end(tracks: Sequence[Track]) -> list[Track]:
 
 
 def _may_start(tracks: Sequence[Track], end: Track | None) -> list[Track]:
-    """Lights of a group that is clearly nearer than the end; any that do not face the car."""
+    """Lights of a group that is clearly nearer than the end, once it is known where they face."""
     if end is None:
         return [one for one in tracks if one.facing is Facing.AWAY]
     return [
-        one for one in tracks if end.range_m - one.range_m > NARROWEST_M and _is_apart(one, end)
+        one
+        for one in tracks
+        if one.facing is not Facing.UNKNOWN
+        and end.range_m - one.range_m > NARROWEST_M
+        and _is_apart(one, end)
     ]
 
 
@@ -248,7 +262,7 @@ class _Choice:
                 self.chosen is not None
             )
             self.chosen = best.number
-        self._held = _Held(best.range_m, _var_m2(best, self.vehicle), best.seen)
+        self._held = _Held(best.range_m, best.var_m2, best.seen)
         return best
 
     def _best(self, tracks: Sequence[Track]) -> Track | None:
@@ -256,19 +270,20 @@ class _Choice:
         if not able:
             return None
         nearest_m = min(one.range_m for one in able)
-        able = [one for one in able if one.range_m <= nearest_m + WIDEST_M]
+        enough = min(PERSISTS, 0.5 * max(one.seen for one in able))
+        able = [one for one in able if one.range_m <= nearest_m + WIDEST_M and one.seen >= enough]
         sign = 1.0 if self.reference is Reference.END else -1.0
         extreme = max(able, key=lambda one: sign * one.range_m)
         group = [one for one in able if not _is_apart(one, extreme)]
         kept = [one for one in group if one.number == self.chosen]
         if kept:
             return kept[0]
-        enough = 0.5 * max(one.seen for one in group)
-        return max((one for one in group if one.seen >= enough), key=lambda one: sign * one.range_m)
+        often = 0.5 * max(one.seen for one in group)
+        return max((one for one in group if one.seen >= often), key=lambda one: sign * one.range_m)
 
     def _is_able(self, one: Track) -> bool:
         settings = self.vehicle.range_filter
-        sd_m = math.sqrt(_var_m2(one, self.vehicle))
+        sd_m = math.sqrt(one.var_m2)
         if one.seen < settings.begin_after or sd_m > settings.most_sd_m:
             return False
         if one.range_m > settings.most_m or one.number == self.chosen:
@@ -277,13 +292,9 @@ class _Choice:
         if held is None or one.seen >= held.seen:
             return True
         off_m = abs(one.range_m - held.range_m)
-        return off_m <= CLEARLY * math.sqrt(_var_m2(one, self.vehicle) + held.var_m2)
+        return off_m <= CLEARLY * math.sqrt(one.var_m2 + held.var_m2)
 
 
 def _is_apart(one: Track, other: Track) -> bool:
     """Are they clearly at different ranges?"""
-    return abs(one.range_m - other.range_m) > CLEARLY * math.sqrt(one.var_m2 + other.var_m2)
-
-
-def _var_m2(one: Track, vehicle: Vehicle) -> float:
-    return one.var_m2 + (vehicle.range_filter.sd_share * one.range_m) ** 2
+    return abs(one.range_m - other.range_m) > CLEARLY * math.sqrt(difference_var_m2(one, other))

@@ -50,6 +50,10 @@ class RangeFilter(Section):
     counts for less. With 0 every frame is a new look, as in the source; on simulated drives the
     variance
     is then five times too small, with these two about right."""
+    take_up_m: NotNegative = 10.0
+    """A range from motion is taken up over this way: it is an estimate from the same observations
+    as before and some more, no new measurement. Corrections below it never make the range grow.
+    With 0 it is taken up at once."""
     unseen_mps: Positive = 15.0
     """Where odometry is missing, the s.d. grows by this each second; the mean stays."""
     most_sd_m: Positive = 20.0

@@ -254,11 +254,12 @@ class Ranges(Section):
     curve where one is given, else motion where ``camera.focal_px`` is."""
     stop_sign: RangeCurve | None = None
     traffic_light: RangeCurve | None = None
-    light_beyond_end_m: Finite = 3.0
-    """With ``motion``: the far lights stand so far behind the end of the intersection, on poles at
-    the far corners; a fitted curve knows this from its pairs."""
-    light_place_sd_m: NotNegative = 2.0
-    """How much that differs from one intersection to another (the same at its start)."""
+    light_setback_m: Finite = 3.0
+    """With ``motion``: lights that face the ego vehicle from across the crossing stand so far
+    behind its end, on poles at the far corners, and those seen from behind as far before its start;
+    a fitted curve knows this from its pairs."""
+    light_setback_sd_m: NotNegative = 2.0
+    """How much that differs from one intersection to another."""
 
 
 class DetectorSection(Section):

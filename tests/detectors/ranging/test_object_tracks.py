@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crosscue.detectors.ranging.object_tracks import Facing, Motion, ObjectTracks, Track
-from crosscue.detectors.ranging.range_from_motion import SIZES
+from crosscue.detectors.ranging.standard_sizes import light_size
 from crosscue.replay.base import Floats
 
 FOCAL_PX = 1500.0
@@ -47,9 +47,24 @@ def test_several_lights_are_several_tracks_with_a_range_each() -> None:
         now = take(followed, [(NEAR, FAR, BESIDE)[i] for i in order], float(gone_m))
 
     assert [one.seen for one in now] == [40, 40, 40]
-    assert sorted(one.range_m for one in now) == pytest.approx([18.0, 45.0, 45.0], rel=0.04)
+    assert sorted(one.range_m for one in now) == pytest.approx([18.0, 45.0, 45.0], rel=0.06)
     heights = sorted(one.estimate.height_m for one in now)
-    assert heights == pytest.approx([1.0, 1.3, 1.5], rel=0.04)
+    assert heights == pytest.approx([1.0, 1.3, 1.5], rel=0.06)
+
+
+def test_a_near_light_tells_the_size_of_a_far_one_of_its_make() -> None:
+    near: Light = (45.0, -5.0, 5.0, 1.5)
+    far: Light = (140.0, 2.0, 5.0, 1.5)
+    alone, beside = tracks(), tracks()
+    for gone_m in range(25):
+        (one,) = take(alone, [far], float(gone_m))
+        both = take(beside, [near, far], float(gone_m))
+
+    true_m = 140.0 - 24.0
+    shared = max(both, key=lambda track: track.range_m)
+    assert abs(shared.range_m - true_m) < 0.5 * abs(one.range_m - true_m)
+    assert shared.var_m2 < 0.6 * one.var_m2
+    assert shared.alone == one.alone
 
 
 def test_a_light_not_seen_for_some_frames_is_the_same_afterwards() -> None:
@@ -126,10 +141,11 @@ def test_without_odometry_only_the_size_speaks() -> None:
         (track,) = take(followed, [FAR], float(gone_m), Motion(None, 0.0, 0.0, 0.1))
 
     height_px = FOCAL_PX * FAR[3] / (84.0 - 19.0)
-    alone_m = FOCAL_PX * SIZES["traffic_light"].mean_m / height_px
+    size = light_size(2.5)
+    alone_m = FOCAL_PX * size.mean_m / height_px
     assert track.seen == 20
     assert track.range_m == pytest.approx(alone_m, rel=0.1)
-    assert np.sqrt(track.var_m2) == pytest.approx(0.25 * track.range_m, rel=0.2)
+    assert np.sqrt(track.var_m2) == pytest.approx(size.spread * track.range_m, rel=0.2)
 
 
 def test_an_odometer_that_errs_makes_the_range_less_sure() -> None:

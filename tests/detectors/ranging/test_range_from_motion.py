@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 
 from crosscue.detectors.ranging.range_from_motion import (
-    SIZES,
     HeightErrors,
     MotionRange,
-    SizePrior,
     range_from_motion,
 )
+from crosscue.detectors.ranging.standard_sizes import SizePrior
 from crosscue.replay.base import Floats
 
 FOCAL_PX = 1500.0
-LIGHT = SIZES["traffic_light"]
+LIGHT = SizePrior(1.2, 0.25)
 NO_ERRORS = HeightErrors(fraction=1e-5, edges_px=0.0)
 
 
