@@ -32,7 +32,7 @@ from rosbags.typesys.store import Typestore
 
 from crosscue.replay.base import Ledger
 from crosscue.replay.decode import Decoder, decoder_for
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 
 FRAME: Final = """std_msgs/Header header
 uint32 id
@@ -49,7 +49,7 @@ MEASURED: Final = """
 import sys
 from pathlib import Path
 from crosscue.replay.base import Ledger
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 with open_log(sys.argv[1]) as log:
     for block in log.read(Ledger("a")):
         pass

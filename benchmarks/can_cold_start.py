@@ -31,7 +31,7 @@ _OURS: Final = """
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings
 from crosscue.replay.base import Ledger
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 import crosscue.replay.readers.can_text.candump, crosscue.replay.seal.log
 began = time.process_time()
 database = CanDatabase.load([dbc])

@@ -27,7 +27,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from crosscue.eval.cli import run as crosscue
 from crosscue.replay.base import Ledger
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.write.convert import LogWriter
 
 FRAME = """std_msgs/Header header

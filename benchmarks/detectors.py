@@ -28,7 +28,7 @@ from crosscue.detectors.registry import chosen
 from crosscue.eval.pipeline.detect import detect_drive
 from crosscue.eval.runs.folder import create
 from crosscue.replay.base import Selection
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 ROUNDS = 5

@@ -19,14 +19,14 @@ from statistics import median
 import numpy as np
 
 from crosscue.datasets.simulated.drive import DriveSettings, drive, sense, vehicle_text
-from crosscue.datasets.simulated.log_files import BUS, GYRO, MAGNETOMETER, sensor_blocks
+from crosscue.datasets.simulated.sensor_blocks import BUS, GYRO, MAGNETOMETER, sensor_blocks
 from crosscue.detectors import rle
 from crosscue.detectors.base import Choice, Detections, Found, Frame, View
 from crosscue.eval.pipeline.detect import detect_drive
 from crosscue.eval.pipeline.reestimate import estimate_run
 from crosscue.eval.runs.folder import create, open_run
 from crosscue.replay.base import EVERYTHING, Block, Images, Ledger, Messages, Topic
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import parse
 from crosscue.replay.write.convert import LogWriter
 

@@ -323,7 +323,7 @@ PEAK = """
 import sys
 from pathlib import Path
 from crosscue.replay.base import Ledger
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 import crosscue.replay.readers.mcap.reader
 
 def peak():

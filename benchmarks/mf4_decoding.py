@@ -43,7 +43,7 @@ def ours(log: Path, database: Any) -> dict[str, list[Any]]:
     """Blocks of signals by message."""
     from crosscue.replay.base import Ledger
     from crosscue.replay.can.decode import BusDecoder, DecodeSettings
-    from crosscue.replay.opening import open_log
+    from crosscue.replay.logs.opening import open_log
 
     ledger = Ledger(str(log))
     found: dict[str, list[Any]] = {}

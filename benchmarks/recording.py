@@ -38,7 +38,7 @@ from crosscue.eval.runs.folder import RunFolder, create, open_run
 from crosscue.eval.runs.stored_images import camera_of, read_pictures
 from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.replay.base import EVERYTHING, Block, Images
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import parse
 
 ROUNDS = 5

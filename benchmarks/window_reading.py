@@ -29,8 +29,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
-from crosscue.replay.opening import open_log
-from crosscue.replay.topic_part import read_topic
+from crosscue.replay.logs.opening import open_log
+from crosscue.replay.logs.topic_part import read_topic
 
 HEADER_TEXT = """
 ================================================================================

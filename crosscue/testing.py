@@ -31,7 +31,7 @@ from crosscue.replay.base import (
     Table,
 )
 from crosscue.replay.formats import known_formats
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 
 if TYPE_CHECKING:
     from crosscue.detectors.base import Detector, Found, Frame

@@ -17,7 +17,7 @@ from crosscue.datasets.scenes.export.coco import Objects
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.scenes.rendering.render import DEFAULTS, Picture, PictureSettings, Renderer
 from crosscue.datasets.simulated.drive import START_NS, DriveSettings, TrueMotion, dbc_path, sense
-from crosscue.datasets.simulated.log_files import sensor_blocks
+from crosscue.datasets.simulated.sensor_blocks import sensor_blocks
 from crosscue.datasets.truth.truth import Approach, Features, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.replay.base import (

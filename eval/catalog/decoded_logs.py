@@ -31,14 +31,14 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
-from crosscue.replay.log_summary import rows_declared, rows_read
+from crosscue.replay.logs.log_summary import rows_declared, rows_read
+from crosscue.replay.logs.topic_part import columns_of
 from crosscue.replay.mobileye.admit import all_ids
 from crosscue.replay.mobileye.decode import MobileyeDecoder
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.mobileye.samples import settings_of
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text
-from crosscue.replay.topic_part import columns_of
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 

@@ -23,8 +23,8 @@ from crosscue.replay.base import (
     LogError,
     VehicleError,
 )
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.losses import warn_of
-from crosscue.replay.opening import open_log
 from crosscue.replay.readers.images.files import SUFFIXES
 from crosscue.replay.readers.time_file import find_time_file, read_time_file
 from crosscue.replay.readers.timed_files import list_files, pair

@@ -21,9 +21,9 @@ from crosscue.eval.runs.tables.log_time import refuse_set_back
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.eval.scoring.intervals import Interval, resampled, wilson
 from crosscue.eval.scoring.truth import CROSSING_NS
-from crosscue.fusion.annotated_approach import NOT_LOOKED, AnnotatedApproach
 from crosscue.fusion.factor_graph import FactorGraph, graph_of
-from crosscue.fusion.message_fit import MessageFit, RateFit, Side
+from crosscue.fusion.fit.annotated_approach import NOT_LOOKED, AnnotatedApproach
+from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.replay.base import Floats, Int64s, RunError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle
 

@@ -12,7 +12,7 @@ from crosscue.eval.interface.logs import NOT_ASKED, Log, opened
 from crosscue.eval.interface.show import listing
 from crosscue.eval.pipeline.empty_result import empty_result
 from crosscue.replay.base import Ledger, LogError, OutputError, Topic, UsageError, visible
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.seal.seal import seal_path
 from crosscue.replay.write.convert import LogWriter
 from crosscue.replay.write.mcap import Compression

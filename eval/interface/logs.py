@@ -37,19 +37,19 @@ from crosscue.replay.base import Log as OneLog
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.decode.packets import PacketDecoder, is_stream
-from crosscue.replay.log_part import part_of
+from crosscue.replay.logs.log_part import part_of
+from crosscue.replay.logs.opening import open_log as open_one
+from crosscue.replay.logs.opening import unless_damaged
+from crosscue.replay.logs.topic_part import columns_of
 from crosscue.replay.losses import LossWarning, warn_of
-from crosscue.replay.opening import open_log as open_one
-from crosscue.replay.opening import unless_damaged
 from crosscue.replay.remote.logs import name_of
-from crosscue.replay.topic_part import columns_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from crosscue.eval.interface.summary import DriveSummary
     from crosscue.replay.base import Bytes
-    from crosscue.replay.log_summary import Progress
+    from crosscue.replay.logs.log_summary import Progress
     from crosscue.replay.vehicle.vehicle import Vehicle
 
 NOT_ASKED: Final = (NOT_ASKED_TIME, NOT_ASKED_TOPIC)

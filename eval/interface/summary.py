@@ -10,7 +10,7 @@ from typing import Final
 from crosscue.eval.pipeline.drive_time import plan_for_time, time_segments
 from crosscue.replay.base import Block, Log, Selection
 from crosscue.replay.clocks.findings import instant_text
-from crosscue.replay.log_summary import (
+from crosscue.replay.logs.log_summary import (
     LogSummary,
     Progress,
     Together,

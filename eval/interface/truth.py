@@ -7,7 +7,7 @@ from typing import Any
 
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.replay.base import DEFAULT_LIMITS, Limits
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 
 
 def write_truth(log: Path | str, output: Path | str, *, limits: Limits = DEFAULT_LIMITS) -> Path:

@@ -17,7 +17,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import LogRow
 from crosscue.replay.base import CrosscueError, Log, UnreadableRunError, sha256_of
 from crosscue.replay.files.identity import identity_of, identity_of_log
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote.logs import RangedLog, is_remote, origin
 from crosscue.replay.vehicle.roles import Role, role_of
 

@@ -24,8 +24,8 @@ from crosscue.replay.base import (
     UnreadableRunError,
 )
 from crosscue.replay.clocks.clock import Clock
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.losses import warn_of
-from crosscue.replay.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.time.segments import UNSHIFTED, LogClock, TimedLog

@@ -9,7 +9,7 @@ from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval import cli
 from crosscue.replay.base import Ledger, LogError, report_missing
 from crosscue.replay.formats import FORMATS
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from support.accounted import read
 from support.every_format import EVERY_FORMAT
 

@@ -15,7 +15,7 @@ from crosscue.replay.base import (
     Table,
     UnknownFormatError,
 )
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from support.data import shared
 
 SEGMENT = ("comma2k19", "Example_1", "b0c9d2329ad1606b_2018-08-02--08-34-47", "40")

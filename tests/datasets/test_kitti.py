@@ -27,7 +27,7 @@ from crosscue.replay.base import (
     Selection,
     Table,
 )
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.roles import Role, role_of
 from support.data import shared
 from support.kitti_drive import (

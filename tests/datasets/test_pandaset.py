@@ -12,7 +12,7 @@ from crosscue.datasets.adapters.pandaset import read_poses
 from crosscue.datasets.truth.truth import load, write_carried
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.replay.base import Ledger, LogFormatError, Selection
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from support.data import shared
 from support.pandaset_drive import COUNT, SPEED_MPS, START_S, YAW_RATE_RADPS, pandaset_drive
 

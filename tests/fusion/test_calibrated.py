@@ -13,8 +13,8 @@ from crosscue.fusion.approaches import Approaches
 from crosscue.fusion.belief import source_speaker
 from crosscue.fusion.calibrated import CalibratedMessageModel, voices_of
 from crosscue.fusion.factor_graph import graph_of
+from crosscue.fusion.fit.message_fit import fit_messages, log_odds_of
 from crosscue.fusion.independence import effective_sample_fraction
-from crosscue.fusion.message_fit import fit_messages, log_odds_of
 from crosscue.fusion.situation import Situation
 from crosscue.replay.base import VehicleError
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Fusion, RangeFilter, Rates

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.replay import opening
 from crosscue.replay.base import DEFAULT_LIMITS, Limits, Log, LogError
-from crosscue.replay.opening import open_logs
+from crosscue.replay.logs import opening
+from crosscue.replay.logs.opening import open_logs
 from support.memory_log import MemoryLog
 
 

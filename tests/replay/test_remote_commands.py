@@ -16,7 +16,7 @@ from mcap.writer import Writer
 from crosscue.eval.cli import run as crosscue
 from crosscue.replay.base import Block, Images, Ledger, Messages, Selection, Topic
 from crosscue.replay.files.identity import SHARE_BYTES, identity_of
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.write.convert import LogWriter
 from support.can_files import candump, made

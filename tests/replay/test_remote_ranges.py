@@ -12,11 +12,11 @@ from mcap.writer import CompressionType, Writer
 
 from crosscue.eval.cli import run as crosscue
 from crosscue.replay.base import EVERYTHING, Block, Ledger, LogError, Selection
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
+from crosscue.replay.logs.topic_part import read_topic
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.remote import ranges as remote_ranges
 from crosscue.replay.remote.logs import RangedLog, RemoteLog
-from crosscue.replay.topic_part import read_topic
 from support.range_server import Served, serving
 from support.rosbag_files import rows_of, write_bag
 

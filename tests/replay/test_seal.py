@@ -18,8 +18,8 @@ from crosscue.eval.runs.stored_images import StoredCamera, read_pictures
 from crosscue.replay.base import CHANGED, DIFFERS, MIB, Ledger, LogError, Selection
 from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.formats import FORMATS
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.losses import losses_heard
-from crosscue.replay.opening import open_log
 from crosscue.replay.seal import seal as sealing
 from crosscue.replay.seal.seal import digests_of, read_seal, seal_path
 from support.accounted import read

@@ -7,8 +7,8 @@ import pytest
 from mcap.writer import Writer
 
 from crosscue.replay.base import Messages, Table, UsageError
-from crosscue.replay.opening import open_log
-from crosscue.replay.topic_part import read_topic
+from crosscue.replay.logs.opening import open_log
+from crosscue.replay.logs.topic_part import read_topic
 
 
 def stored(path: Path) -> Path:

@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 from crosscue.replay.base import DEFAULT_LIMITS, EVERYTHING, Block, Ledger, Limits, Selection
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 
 
 def read(

@@ -12,7 +12,7 @@ from pathlib import Path
 import can
 
 from crosscue.replay.base import DATA, ERROR, EVERYTHING, REMOTE, CanFrames, Ledger, Selection
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 
 START_NS = 1_436_529_600_000_000_000
 """Noon of 10 July 2015, which days since 1899 spell exactly."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from crosscue.replay.base import CrosscueError
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from support.can_files import START_NS, Sent, asc, blf, by_bus, candump, made, read_back, trc
 
 

@@ -9,9 +9,9 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from crosscue.fusion.annotated_approach import AnnotatedApproach
 from crosscue.fusion.evidence import FrameEvidence, SignRange
 from crosscue.fusion.factor_graph import CueNode, Edge, FactorGraph, Feature
+from crosscue.fusion.fit.annotated_approach import AnnotatedApproach
 from crosscue.fusion.intersection_range import Reference
 from crosscue.fusion.situation import Situation
 from crosscue.replay.base import Floats

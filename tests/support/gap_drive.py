@@ -38,7 +38,7 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 from crosscue.replay.write.convert import LogWriter
 

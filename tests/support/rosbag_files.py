@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from crosscue.replay.base import EVERYTHING, CrosscueError, Ledger, Log, Selection
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 
 START_NS: Final = 1_700_000_000_000_000_000
 

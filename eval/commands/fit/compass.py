@@ -24,7 +24,7 @@ from crosscue.eval.commands.shared.options import (
 from crosscue.eval.fit.compass import fit, section_of, with_section
 from crosscue.localization.compass_fit import CompassFit
 from crosscue.replay.base import write_text
-from crosscue.replay.opening import open_logs
+from crosscue.replay.logs.opening import open_logs
 from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
 
 

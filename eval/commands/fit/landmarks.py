@@ -31,8 +31,8 @@ from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.features import Matcher
 from crosscue.localization.landmarks.fit import LandmarkFit, Rate, ScoredPairs, fit_landmarks
 from crosscue.replay.base import Ledger, SchemaError, UsageError, write_text
+from crosscue.replay.logs.opening import open_logs
 from crosscue.replay.losses import warn_of
-from crosscue.replay.opening import open_logs
 from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
 
 

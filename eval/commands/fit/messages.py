@@ -21,8 +21,8 @@ from crosscue.eval.commands.shared.options import print_json, refuse_existing
 from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, rates_of, section_of
 from crosscue.eval.runs.folder import open_run
-from crosscue.fusion.fade_fit import FadeFit
-from crosscue.fusion.message_fit import MessageFit, RateFit, Side, fit_messages
+from crosscue.fusion.fit.fade_fit import FadeFit
+from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side, fit_messages
 from crosscue.replay.base import EmptyResultError, UsageError, write_text
 from crosscue.replay.vehicle.fusion import Rates
 

@@ -28,8 +28,8 @@ from crosscue.eval.pipeline.landmarks import matcher_for
 from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.localization.landmarks.features import Matcher
 from crosscue.replay.base import EmptyResultError, Ledger, UsageError, visible
+from crosscue.replay.logs.opening import open_logs
 from crosscue.replay.losses import warn_of
-from crosscue.replay.opening import open_logs
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 

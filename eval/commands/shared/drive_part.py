@@ -13,8 +13,8 @@ from pathlib import Path
 from crosscue.eval.interface.logs import Log as DriveLog
 from crosscue.eval.interface.logs import open as open_drive
 from crosscue.replay.base import Log, Selection, UsageError
-from crosscue.replay.log_part import first_ns, named_topics
-from crosscue.replay.opening import unless_damaged
+from crosscue.replay.logs.log_part import first_ns, named_topics
+from crosscue.replay.logs.opening import unless_damaged
 
 from .options import limits_of
 

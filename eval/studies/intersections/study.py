@@ -30,9 +30,9 @@ from crosscue.eval.scoring.scene.belief import compare_belief
 from crosscue.eval.studies.attribution import Drive, attribute
 from crosscue.eval.studies.estimated_again import estimate_of
 from crosscue.eval.studies.intersections.scores import StudyScores
-from crosscue.fusion.message_fit import fit_messages
+from crosscue.fusion.fit.message_fit import fit_messages
 from crosscue.replay.base import EVERYTHING, RunError, UsageError, versions
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.fusion import Calibrated
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 

@@ -14,7 +14,7 @@ from crosscue.eval.scoring.pose.score import PoseScore
 from crosscue.localization.town.drive import Traced, drive_traced
 from crosscue.localization.town.settings import Drive
 from crosscue.replay.base import EVERYTHING
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 
 from .drive_files import StudyDriveFiles, write_drive_files

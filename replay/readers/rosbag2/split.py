@@ -21,7 +21,7 @@ from crosscue.replay.base import (
     report_missing,
 )
 from crosscue.replay.files.partial_file import Scratch
-from crosscue.replay.opening import open_log, open_unsealed
+from crosscue.replay.logs.opening import open_log, open_unsealed
 from crosscue.replay.seal.log import with_seal
 
 from .db3 import Db3Log

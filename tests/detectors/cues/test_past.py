@@ -17,7 +17,7 @@ from crosscue.datasets.truth.truth import load as load_truth
 from crosscue.detectors.cues.far_side import end_of, past_counts, vehicles_past
 from crosscue.detectors.cues.mobileye_state import MobileyeState, state_at
 from crosscue.replay.base import Block, Floats, Ledger, Selection, Topic, VehicleError
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import MOBILEYE_SIGNALS, Samples, Signal
 from crosscue.replay.signals.plan import plan

@@ -28,7 +28,7 @@ from crosscue.replay.base import (
     Topic,
     strict_json,
 )
-from crosscue.replay.log_summary import quick_summary, summarise, together
+from crosscue.replay.logs.log_summary import quick_summary, summarise, together
 from crosscue.replay.safe_text import cells, table, visible, wrapped
 from support.clock_streams import SECOND_NS, START_NS, Stream, table_of
 from support.data import shared

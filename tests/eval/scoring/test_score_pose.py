@@ -31,7 +31,7 @@ from crosscue.replay.base import (
     SchemaError,
     Topic,
 )
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import Camera, Start, Vehicle
 from crosscue.replay.write.convert import LogWriter
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block

@@ -13,7 +13,7 @@ import pytest
 from crosscue.eval.cli import run
 from crosscue.replay.base import Block, Images, Ledger, Topic
 from crosscue.replay.decode.packets import NO_PICTURE, NOT_DECODED
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.base import Selection
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from support.can_files import damaged, read_back
 from support.can_kinds import KINDS, Kind, judge
 

@@ -9,7 +9,7 @@ import can
 import pytest
 
 from crosscue.replay.base import DATA, ERROR, REMOTE, LogFormatError
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from support.can_files import Sent, read_back, same_as_python_can
 from support.data import shared
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.base import ERROR, NOT_ASKED_TIME, Ledger, Limits, LogFormatError, Selection
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from support.can_files import START_NS, Sent, blf, by_bus, made, read_back, same_as_python_can
 from support.data import shared
 

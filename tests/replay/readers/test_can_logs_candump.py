@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.base import DATA, ERROR, REMOTE, LogFormatError, Selection
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.can_text import dialect as can_text
 from crosscue.replay.readers.can_text import digits
 from crosscue.replay.readers.can_text.lines import Lines, Overlong, Tail, lines_of

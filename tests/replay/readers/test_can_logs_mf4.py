@@ -22,7 +22,7 @@ from crosscue.replay.base import (
     Selection,
     Table,
 )
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.mf4.blocks import Blocks
 from support.can_files import Sent, made, read_back, same_as_python_can
 from support.data import shared

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from crosscue.replay.base import CanFrames, Ledger
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from support.can_files import Sent, by_bus, made, read_back
 from support.data import shared
 from support.mf4_files import unsorted

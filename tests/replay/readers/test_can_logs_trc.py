@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.base import DATA, ERROR, REMOTE, LogFormatError
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.can_text.lines import CHUNK_BYTES
 from crosscue.replay.readers.can_text.message_numbers import GO_BACK, MISFIT, MISSING
 from crosscue.replay.readers.can_text.trc import NOT_UNDERSTOOD

@@ -18,7 +18,7 @@ from crosscue.replay.base import (
     LogFormatError,
     Selection,
 )
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from support.accounted import read
 from support.videos import number_of, numbers_at_times, video
 

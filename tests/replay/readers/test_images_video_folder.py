@@ -25,7 +25,7 @@ from crosscue.replay.base import (
     Selection,
     UnknownFormatError,
 )
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from support.accounted import read
 from support.data import shared
 from support.pictures import picture, picture_folder

@@ -22,7 +22,7 @@ from crosscue.replay.base import (
     LogFormatError,
     Selection,
 )
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.rosbag1.reader import open_bag
 from support.data import shared
 from support.rosbag_files import (

@@ -22,7 +22,7 @@ from crosscue.replay.base import (
     LogFormatError,
     Selection,
 )
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.rosbag2.db3 import open_db3
 from crosscue.replay.readers.rosbag2.tables import Tables
 from crosscue.replay.readers.rosbag2.wal import check_wal

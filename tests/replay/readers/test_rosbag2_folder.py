@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rosbags.rosbag2 import Reader
 
 from crosscue.replay.base import NOT_ASKED_TIME, LogError, Selection
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from support.data import shared
 from support.rosbag_files import Row, by_topic, read_rows, rows_of, write_folder
 

@@ -12,7 +12,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from crosscue.eval import cli
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 
 ROWS = 7
 SERVICE = "/add/_service_event"

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from crosscue.eval import cli
-from crosscue.replay.opening import open_log
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.roles import role_of
 from support.data import shared
 from support.every_format import EVERY_FORMAT

@@ -9,9 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.fusion.factor_graph import CueNode
 from crosscue.replay.columns import Floats, Int64s
-
-from .factor_graph import CueNode
 
 NOT_LOOKED: Final = -1
 """Count of a cue that nothing looked for."""

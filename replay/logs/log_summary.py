@@ -39,7 +39,7 @@ from crosscue.replay.seal.log import sealed_sentence
 from crosscue.replay.vehicle.roles import Role, role_of
 
 if TYPE_CHECKING:
-    from .decode import Decoder
+    from crosscue.replay.decode import Decoder
 
 CAN_IDS_SHOWN: Final = 10
 _CAN_IDS_COUNTED: Final = 100_000
@@ -245,9 +245,8 @@ def _decoded(log: Log, blocks: Iterable[Block], ledger: Ledger) -> Iterator[Bloc
 
 def _decoder_of(topic: Topic) -> Decoder:
     """The topic's decoder, or one that skips every row and says why."""
+    from crosscue.replay.decode import decoder_for
     from crosscue.replay.decode.interfaces import why_not_decoded
-
-    from .decode import decoder_for
 
     try:
         decoder = decoder_for(topic)

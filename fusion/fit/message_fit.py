@@ -19,14 +19,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from crosscue.fusion.calibrated import CalibratedMessageModel, voices_of
+from crosscue.fusion.factor_graph import CueNode, FactorGraph, log_odds
+from crosscue.fusion.fit.annotated_approach import NOT_LOOKED, AnnotatedApproach
+from crosscue.fusion.fit.fade_fit import FadeFit, fit_fade
 from crosscue.fusion.situation import Situation
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
-
-from .annotated_approach import NOT_LOOKED, AnnotatedApproach
-from .calibrated import CalibratedMessageModel, voices_of
-from .factor_graph import CueNode, FactorGraph, log_odds
-from .fade_fit import FadeFit, fit_fade
 
 MIN_PLACES: Final = 3
 """With the feature and without, each; fewer fix no rate or exponent. A rate also needs

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import cast
 
 from crosscue.replay.base import DEFAULT_LIMITS, Ledger, Limits, Log, LogError, MissingTopicError
-
-from .formats import FORMATS, format_of, known_formats
+from crosscue.replay.formats import FORMATS, format_of, known_formats
 
 
 def open_log(path: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.base import Block, CanFrames, Ledger, Log, Selection, Table, Topic, UsageError
+from crosscue.replay.decode import decoder_for
 from crosscue.replay.remote.logs import name_of
-
-from .decode import decoder_for
 
 
 @dataclass(frozen=True, slots=True, eq=False)

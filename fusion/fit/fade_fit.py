@@ -14,11 +14,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from crosscue.fusion.factor_graph import USUAL_FADE, CueNode, FactorGraph
+from crosscue.fusion.fit.annotated_approach import AnnotatedApproach, Bools
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.fusion import Fade
-
-from .annotated_approach import AnnotatedApproach, Bools
-from .factor_graph import USUAL_FADE, CueNode, FactorGraph
 
 MIN_POSITIVES: Final = 20
 """Fewer positive observations do not determine a fade."""

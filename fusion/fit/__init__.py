@@ -1,0 +1,1 @@
+"""What annotated approaches teach: how much each message says, and how soon it fades."""

@@ -1,0 +1,1 @@
+"""Logs opened, whatever their format, and parts and summaries of them."""
