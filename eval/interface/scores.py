@@ -14,6 +14,7 @@ from crosscue.eval.report.page import REPORT, write_report
 from crosscue.eval.report.score_runs import Failed, ScoreWork
 from crosscue.eval.report.score_runs import score_runs as score_each
 from crosscue.eval.report.summary import gate_lines, pose_summary, reported_line, summary
+from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.account import account_lines
 from crosscue.eval.runs.folder import locked
 from crosscue.eval.scoring.drives import Scores, ScoreSettings
@@ -258,10 +259,14 @@ def _one(
     if worth:
         with locked(one.run):
             place = one.run.file(FOLDER)
-            write_report(place, [one], scores, metrics, has_figures=has_figures)
+            write_report(
+                place, [one], scores, metrics, worst_frames([one]), has_figures=has_figures
+            )
             write_scores(place, [one], metrics)
     if output is not None:
-        report = write_report(output, [one], scores, metrics, has_figures=has_figures)
+        report = write_report(
+            output, [one], scores, metrics, worst_frames([one]), has_figures=has_figures
+        )
         write_scores(output, [one], metrics)
     return ScoredRuns(tuple(runs), failed, metrics, scores, (), worth, report)
 
@@ -282,7 +287,7 @@ def _pool(
     worth = _attribution(ones, tree, settings) if has_attribution else {}
     report = None
     if output is not None:
-        write_report(output, ones, scores, tree, has_figures=has_figures)
+        write_report(output, ones, scores, tree, worst_frames(ones), has_figures=has_figures)
         write_scores(output, ones, tree)
         report = output / REPORT
     return ScoredRuns(tuple(runs), failed, tree, scores, (), worth, report)
