@@ -73,7 +73,7 @@ def decode_seconds() -> None:
         taken: dict[str, list[float]] = {"ours": [], "full": []}
         for _ in range(ROUNDS * 4):
             began = time.process_time()
-            ours, _ = decode(picture, View(least_width_px=width))
+            ours, _ = decode(picture, View(min_width_px=width))
             taken["ours"].append(time.process_time() - began)
             size = (ours.shape[1], ours.shape[0])
             began = time.process_time()

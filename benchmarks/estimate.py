@@ -50,7 +50,7 @@ residual_sd_m = 5.9
 class Busy:
     """Six objects with masks in every frame; its pictures are not examined."""
 
-    view = View(least_width_px=64)
+    view = View(min_width_px=64)
     identity = "busy 1"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:

@@ -37,7 +37,7 @@ MIN_S = 0.001
 class Bright:
     """One box around the brightest pixel of each frame: quick, and every frame differs."""
 
-    view = View(least_width_px=64)
+    view = View(min_width_px=64)
     identity = "bright 1"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:

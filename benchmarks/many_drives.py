@@ -119,7 +119,7 @@ def engines(folder: Path, rounds: int) -> None:
     began = time.perf_counter()
     run_many(jobs, tiny, in_turn)
     seen = time.perf_counter() - began
-    print(f"\na second start looks at {many} done drives in {seen * 1e3:.0f} ms")
+    print(f"\na second start checks {many} done drives in {seen * 1e3:.0f} ms")
 
 
 def town_drives(folder: Path, count: int, minutes: float) -> float:

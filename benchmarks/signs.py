@@ -86,7 +86,7 @@ class WindowSearch:
         best: tuple[float, str, Floats] = (MIN_SHARE, "", np.zeros(4))
         for size, of_size in self._by_size.items():
             for window in self._windows(grey, size):
-                best = max(best, *self._shares(window, of_size), key=lambda one: one[0])
+                best = max(best, *self._fractions(window, of_size), key=lambda one: one[0])
         return [(best[1], best[2])] if best[1] else []
 
     def seconds(self, grey: Bytes, first: int) -> float:
@@ -98,7 +98,7 @@ class WindowSearch:
                 if number % ONE_IN == first:
                     looked += 1
                     began = time.perf_counter()
-                    self._shares(window, of_size)
+                    self._fractions(window, of_size)
                     taken += time.perf_counter() - began
         return taken / looked * there
 
@@ -112,9 +112,9 @@ class WindowSearch:
                     box = np.array([x, y, x + width, y + height], np.float64) / scale
                     yield Window(small[y : y + height, x : x + width], box)
 
-    def _shares(self, window: Window, drawn: list[Drawn]) -> list[tuple[float, str, Floats]]:
+    def _fractions(self, window: Window, drawn: list[Drawn]) -> list[tuple[float, str, Floats]]:
         points = self._described(window.pixels)
-        if len(points) < RULES.least_votes:
+        if len(points) < RULES.min_votes:
             return [(0.0, "", window.box)]
         found: list[tuple[float, str, Floats]] = []
         for one in drawn:
@@ -122,7 +122,7 @@ class WindowSearch:
             alike = {
                 a.trainIdx
                 for a, b in pairs
-                if a.distance < RULES.ratio * b.distance and a.distance <= RULES.most_bits
+                if a.distance < RULES.ratio * b.distance and a.distance <= RULES.max_bits
             }
             found.append((len(alike) / len(one.described), one.kind, _about(window, one.size_px)))
         return found

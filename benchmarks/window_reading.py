@@ -168,7 +168,7 @@ def measure(path: Path, minutes: int, rounds: int) -> dict[str, list[float]]:
     window = (begin, begin + SPAN_S * SECOND_NS)
     counts = {name: case(path, *window) for name, case in CASES.items()}
     if set(counts.values()) != {SPAN_S * 500}:
-        raise SystemExit(f"want {SPAN_S * 500} vectors: {counts}")
+        raise SystemExit(f"expected {SPAN_S * 500} vectors: {counts}")
     print(f"vectors found: {counts}")
     taken: dict[str, list[float]] = {name: [] for name in CASES}
     for _ in range(rounds):

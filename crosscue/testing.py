@@ -65,7 +65,7 @@ def check_reader(
         AssertionError: The contract is broken; the message says where.
     """
     whole, ledger = _read(log)
-    _expect(sum(map(len, whole.values())) > 2, f"{log}: want three rows or more, for a test")
+    _expect(sum(map(len, whole.values())) > 2, f"{log}: expected three rows or more, for a test")
     _expect(ledger.is_whole, f"{log}: a whole log has drops: {[*ledger.drops()]}")
     _expect(_read(log)[0] == whole, f"{log}: read again, its rows differ")
     _check_topics(log, whole, ledger)
@@ -100,7 +100,7 @@ def check_detector(build: Callable[[], Detector], *, tolerance: float = 1e-3) ->
     from crosscue.detectors.base import reportable
 
     detect = build()
-    _expect(isinstance(detect.identity, str) and bool(detect.identity), "identity: want a text")
+    _expect(isinstance(detect.identity, str) and bool(detect.identity), "identity: expected a text")
     _expect(build().identity == detect.identity, "identity: differs when it is built again")
     labels = reportable(detect)
     frames = _frames(detect.view.is_grey)
@@ -114,7 +114,7 @@ def check_detector(build: Callable[[], Detector], *, tolerance: float = 1e-3) ->
         _check_labels(found, labels)
         (alone,) = detect([frame])
         _expect(_is_same(alone, found, tolerance), f"frame {frame.t_ns}: alone it gives another")
-    _expect(len(detect([])) == 0, "no frames: want no results")
+    _expect(len(detect([])) == 0, "no frames: expected no results")
 
 
 def check_cue(cue: CueSpec) -> None:
@@ -129,8 +129,8 @@ def check_cue(cue: CueSpec) -> None:
     from crosscue.detectors.cues.rules import rule_of
     from crosscue.replay.vehicle.vehicle import Vehicle
 
-    _expect(cue.name.isidentifier() and cue.name.islower(), f"{cue.name!r}: want a_lower_name")
-    _expect(0.5 < cue.precision < 1.0, f"{cue.name}: precision {cue.precision}: want 0.5 to 1")
+    _expect(cue.name.isidentifier() and cue.name.islower(), f"{cue.name!r}: expected a_lower_name")
+    _expect(0.5 < cue.precision < 1.0, f"{cue.name}: precision {cue.precision}: expected 0.5 to 1")
     _expect(bool(cue.supports or cue.excludes), f"{cue.name}: supports and excludes nothing")
     both = {*cue.supports} & {*cue.excludes}
     _expect(not both, f"{cue.name}: supports and excludes {sorted(both)}")
@@ -144,7 +144,7 @@ def check_cue(cue: CueSpec) -> None:
         count = rule(observed, settings, cue)
         _expect(
             count is None or (isinstance(count, int) and count >= 0),
-            f"{cue.name}: {what}: got {count!r}, want a count or None",
+            f"{cue.name}: {what}: got {count!r}, expected a count or None",
         )
         _expect(rule(observed, settings, cue) == count, f"{cue.name}: {what}: another answer")
         _expect(not (what == "nothing" and count), f"{cue.name}: counts {count} where nothing is")
@@ -221,7 +221,7 @@ def _columns(block: Block) -> list[Sequence[Any]]:
 def _check_topics(log: Path, whole: Rows, ledger: Ledger) -> None:
     with open_log(log) as opened:
         known = known_formats()
-        _expect(opened.format in known, f"format {opened.format!r}: want one of {[*known]}")
+        _expect(opened.format in known, f"format {opened.format!r}: expected one of {[*known]}")
         for topic in opened.topics:
             count = len(whole.get(topic.name, ()))
             refused = ledger.topic(topic.name).skipped.total()
@@ -240,7 +240,7 @@ def _check_spans(log: Path, whole: Rows) -> None:
         want = {name: [row for row in rows if low <= row[0] < high] for name, rows in whole.items()}
         _expect(
             part == {name: rows for name, rows in want.items() if rows},
-            f"{start} to {end} ns: {_counts(part)} rows, want {_counts(want)}",
+            f"{start} to {end} ns: {_counts(part)} rows, expected {_counts(want)}",
         )
         _check_skips(ledger, NOT_ASKED_TIME)
 
@@ -252,7 +252,7 @@ def _check_skips(ledger: Ledger, reason: str) -> None:
         _expect(
             declared is None or account.in_file == declared,
             f"{name}: {declared} rows declared, {account.used} used, {dict(account.skipped)} "
-            f"skipped; want the rest skipped as {reason!r}",
+            f"skipped; expected the rest skipped as {reason!r}",
         )
 
 
@@ -268,7 +268,7 @@ def _check_one_lost(log: Path, whole: Rows, left_out: int) -> None:
     missing = (before - after).total()
     _expect(missing == 1, f"one row damaged: {missing} rows are missing")
     lost = _left_out(ledger) - left_out
-    _expect(lost == 1, f"one row damaged: {lost} rows are told as dropped or skipped")
+    _expect(lost == 1, f"one row damaged: {lost} rows are reported as dropped or skipped")
     unknown = [why for one in ledger.accounts.values() for why in one.dropped_unknown]
     _expect(not unknown, f"one row damaged: an unknown number is lost, too: {unknown}")
 
@@ -305,8 +305,8 @@ def _check_found(frame: Frame, found: Found) -> None:
     low, high = found.boxes_px[:, :2], found.boxes_px[:, 2:]
     is_inside = (low >= 0).all() and (low <= high).all() and (high <= (width, height)).all()
     _expect(bool(is_inside), f"{where}: boxes outside the picture: {found.boxes_px.tolist()}")
-    is_share = ((found.scores >= 0) & (found.scores <= 1)).all()
-    _expect(bool(is_share), f"{where}: scores outside 0 to 1: {found.scores.tolist()}")
+    is_fraction = ((found.scores >= 0) & (found.scores <= 1)).all()
+    _expect(bool(is_fraction), f"{where}: scores outside 0 to 1: {found.scores.tolist()}")
     _expect(all(found.labels), f"{where}: an empty label")
     for mask in filter(None, found.masks):
         decode(mask, frame.size_px)

@@ -66,7 +66,7 @@ def ecef_to_geodetic(xyz_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
     """
     xyz = np.atleast_2d(np.asarray(xyz_m, dtype=np.float64))
     if xyz.ndim != 2 or xyz.shape[1] != 3:
-        raise ValueError(f"xyz_m: want (N, 3), got {np.shape(xyz_m)}")
+        raise ValueError(f"xyz_m: expected (N, 3), got {np.shape(xyz_m)}")
     x, y, z = xyz.T
     across_m = np.hypot(x, y)
     # Sine and cosine instead of a tangent: the tangent is infinite at the poles.

@@ -16,11 +16,11 @@ class View:
     """The pixels a detector asks for; a frame is decoded no finer than that.
 
     Attributes:
-        least_width_px: Any picture at least this wide will do; None for the full size.
+        min_width_px: Any picture at least this wide will do; None for the full size.
         is_grey: One channel instead of three.
     """
 
-    least_width_px: int | None = None
+    min_width_px: int | None = None
     is_grey: bool = False
 
 
@@ -45,7 +45,7 @@ class Frame:
         """Refuse pixels of another shape."""
         shape = self.pixels.shape
         if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] != 3):
-            raise ValueError(f"pixels: want (H, W) or (H, W, 3), got {shape}")
+            raise ValueError(f"pixels: expected (H, W) or (H, W, 3), got {shape}")
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -86,15 +86,15 @@ class Detections:
         """
         n = len(self.labels)
         if self.boxes_px.shape != (n, 4):
-            raise ValueError(f"boxes_px: want ({n}, 4), got {self.boxes_px.shape}")
+            raise ValueError(f"boxes_px: expected ({n}, 4), got {self.boxes_px.shape}")
         if self.scores.shape != (n,):
-            raise ValueError(f"scores: want ({n},), got {self.scores.shape}")
+            raise ValueError(f"scores: expected ({n},), got {self.scores.shape}")
         if len(self.masks) != n:
-            raise ValueError(f"masks: want {n}, got {len(self.masks)}")
+            raise ValueError(f"masks: expected {n}, got {len(self.masks)}")
         if len(self.lenses) not in (0, n):
-            raise ValueError(f"lenses: want {n} or none, got {len(self.lenses)}")
+            raise ValueError(f"lenses: expected {n} or none, got {len(self.lenses)}")
         if not (np.isfinite(self.boxes_px).all() and np.isfinite(self.scores).all()):
-            raise ValueError("boxes_px, scores: want finite numbers")
+            raise ValueError("boxes_px, scores: expected finite numbers")
 
     def __len__(self) -> int:
         return len(self.labels)

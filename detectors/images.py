@@ -57,7 +57,7 @@ def encoded(images: Images, row: int) -> Encoded:
     return Encoded(coding, content, (width, height, step, images.pixel_format[row]))
 
 
-def read_file(path: Path, most_bytes: int = DEFAULT_LIMITS.message_bytes) -> Encoded:
+def read_file(path: Path, max_bytes: int = DEFAULT_LIMITS.message_bytes) -> Encoded:
     """A picture file's bytes; their format is known from the first of them, not from the name.
 
     Raises:
@@ -65,10 +65,10 @@ def read_file(path: Path, most_bytes: int = DEFAULT_LIMITS.message_bytes) -> Enc
         LogFormatError: No picture that is known here.
         LogTooLargeError: Larger than one encoded picture may be.
     """
-    content = read_at_most(path, most_bytes)
+    content = read_at_most(path, max_bytes)
     if content is None:
         raise LogTooLargeError(
-            f"picture of {path.stat().st_size} bytes: more than {most_bytes} are not read"
+            f"picture of {path.stat().st_size} bytes: more than {max_bytes} are not read"
         )
     coding = coding_of(content[:MAGIC_BYTES], "")
     if coding is None:
@@ -90,7 +90,7 @@ def size_of(picture: Encoded) -> tuple[int, int]:
     if size is None:
         raise LogFormatError(f"{picture.coding} picture without a size, or not decoded here")
     if min(size) < 1:
-        raise LogFormatError(f"picture of {size[0]} x {size[1]} pixels: want at least one")
+        raise LogFormatError(f"picture of {size[0]} x {size[1]} pixels: expected at least one")
     if size[0] * size[1] > MAX_PIXELS:
         raise LogTooLargeError(
             f"picture of {size[0]} x {size[1]} pixels: more than {MAX_PIXELS:,} are not decoded"
@@ -123,9 +123,9 @@ def decode(picture: Encoded, view: View, depth_bits: int = 16) -> tuple[Bytes, t
 
 def reduction(width_px: int, view: View) -> int:
     """The largest of 8, 4, 2, 1 that leaves the view's width."""
-    if view.least_width_px is None:
+    if view.min_width_px is None:
         return 1
-    return next((by for by in _REDUCTIONS if width_px // by >= view.least_width_px), 1)
+    return next((by for by in _REDUCTIONS if width_px // by >= view.min_width_px), 1)
 
 
 def _compressed(

@@ -146,7 +146,7 @@ def _checked(text: bytes, size_px: tuple[int, int]) -> Int64s:
 
 def _check_pixels(reported: int, size_px: tuple[int, int]) -> None:
     if reported != size_px[0] * size_px[1]:
-        raise ValueError(f"mask of {reported} pixels: want {size_px[0]} x {size_px[1]}")
+        raise ValueError(f"mask of {reported} pixels: expected {size_px[0]} x {size_px[1]}")
 
 
 def _to_text(lengths: Int64s) -> bytes:

@@ -160,12 +160,12 @@ class Runner:
             why = f"{type(error).__name__}: {one_line(error, 200)}"
             raise CrosscueError(
                 f"detector {named.name}: failed at {frames[0].t_ns} ns: {why}; leave it out of "
-                "--detectors, or mend it"
+                "--detectors, or correct it"
             ) from error
         if len(found) != len(frames):
             raise UsageError(
-                f"detector {named.name}: gave {len(found)} results for {len(frames)} frames; "
-                "want one for each"
+                f"detector {named.name}: returned {len(found)} results for {len(frames)} frames; "
+                "expected one for each"
             )
         return [
             with_lenses(one, frame, self.light_labels) if isinstance(one, Detections) else one

@@ -56,7 +56,9 @@ def _explained(error: ValidationError, kind: type[BaseModel], where: str) -> str
         return f"{where}: {name}: no such setting; {hint}{more}"
     if first["type"] == "missing":
         return f"{where}: {name}: missing; add it{more}"
-    return f"{where}: {name}: {first['msg'].lower()}, got {first['input']!r}; mend the value{more}"
+    return (
+        f"{where}: {name}: {first['msg'].lower()}, got {first['input']!r}; correct the value{more}"
+    )
 
 
 def identity_of(name: str, *parts: object) -> str:

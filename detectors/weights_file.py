@@ -79,7 +79,7 @@ def unpacked(content: bytes, key: str, path: Path) -> tuple[str | None, dict[str
     description: str | None = header.get(key)
     if SUM in header and header[SUM] != _sum(description or "", content):
         raise VehicleError(
-            f"{path}: damaged: its weights are not those it was written with; copy it anew, or "
+            f"{path}: damaged: its weights are not those it was written with; copy it again, or "
             "train it again"
         )
     wanted = EMBEDDED.get(path.name)
@@ -87,7 +87,7 @@ def unpacked(content: bytes, key: str, path: Path) -> tuple[str | None, dict[str
         found = hashlib.sha256(content).hexdigest()
         if found != wanted:
             raise VehicleError(
-                f"{path}: damaged: want sha256 {wanted[:12]}..., got {found[:12]}...; install "
+                f"{path}: damaged: expected sha256 {wanted[:12]}..., got {found[:12]}...; install "
                 "crosscue anew"
             )
     return description, tensors

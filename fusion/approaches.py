@@ -199,7 +199,7 @@ class Approaches:
         at_hand.end = self._carried(at_hand.end, evidence, moved_m)
         has = (at_hand.start.belief is not None) + (at_hand.end.belief is not None)
         if has < had:
-            self.counts["ranges dropped: too unsure"] += had - has
+            self.counts["ranges dropped: too uncertain"] += had - has
         at_hand.way_m += moved_m
         at_hand.since_evidence_m += max(moved_m - evidence.assumed_m, 0.0)
         at_hand.since_dissent_m += moved_m
@@ -220,7 +220,7 @@ class Approaches:
         fusion, end_m = self._fusion, _end_m(at_hand, self._fusion.length_m)
         if end_m is not None and end_m < -fusion.closes_behind_m:
             return "passed"
-        if end_m is not None and end_m > self._filter.most_m + fusion.length_m:
+        if end_m is not None and end_m > self._filter.max_m + fusion.length_m:
             return "out of reach"
         is_at_it = end_m is None or end_m <= fusion.length_m
         if is_at_it and abs(at_hand.turned_rad) >= fusion.turned_rad:
@@ -249,7 +249,7 @@ class Approaches:
         found: dict[Reference, list[SignRange]] = {}
         for sign in signs:
             # Less sure than the furthest range is long: no measurement, and its square overflows.
-            max_m = self._filter.most_m
+            max_m = self._filter.max_m
             is_sane = 0.0 < sign.range_m <= max_m and 0.0 < sign.var_m2 <= max_m * max_m
             if is_sane:
                 found.setdefault(sign.reference, []).append(sign)
@@ -260,7 +260,7 @@ class Approaches:
     def _mean(self, signs: Sequence[SignRange]) -> tuple[float, float]:
         range_m = sum(one.range_m for one in signs) / len(signs)
         var_m2 = sum(one.var_m2 for one in signs) / len(signs)
-        return range_m, var_m2 + (self._filter.sd_share * range_m) ** 2
+        return range_m, var_m2 + (self._filter.sd_fraction * range_m) ** 2
 
     def _step(
         self,
@@ -349,7 +349,7 @@ class Approaches:
         near_m = self._fusion.dissent_within_m
         track, verdict = measure(track, range_m, var_m2, self._filter, near_m)
         if verdict is Verdict.WAITS:
-            self.counts["ranges waiting for another look"] += 1
+            self.counts["ranges waiting for a second observation"] += 1
             return track, None
         if verdict is Verdict.REFUSED:
             self.counts["ranges refused: outside the gate"] += 1

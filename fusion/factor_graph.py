@@ -26,7 +26,7 @@ def log_odds(probability: float) -> float:
         ValueError: Not strictly between 0 and 1.
     """
     if not 0.0 < probability < 1.0:
-        raise ValueError(f"probability: want inside (0, 1), got {probability}")
+        raise ValueError(f"probability: expected inside (0, 1), got {probability}")
     return math.log(probability) - math.log1p(-probability)
 
 

@@ -41,7 +41,7 @@ def initialise(measured_m: float, sensor_var_m2: float) -> RangeBelief:
         ValueError: ``sensor_var_m2`` is not positive.
     """
     if not sensor_var_m2 > 0.0:
-        raise ValueError(f"sensor_var_m2: want > 0, got {sensor_var_m2}")
+        raise ValueError(f"sensor_var_m2: expected > 0, got {sensor_var_m2}")
     return RangeBelief(measured_m, sensor_var_m2)
 
 
@@ -52,7 +52,7 @@ def predict(belief: RangeBelief, travelled_m: float, odometry_var_m2: float) -> 
         ValueError: ``odometry_var_m2`` is negative.
     """
     if not odometry_var_m2 >= 0.0:
-        raise ValueError(f"odometry_var_m2: want >= 0, got {odometry_var_m2}")
+        raise ValueError(f"odometry_var_m2: expected >= 0, got {odometry_var_m2}")
     from filterpy.kalman import predict as kalman_predict
 
     mean_m, var_m2 = kalman_predict(
@@ -73,7 +73,7 @@ def update(belief: RangeBelief, measured_m: float, sensor_var_m2: float) -> Rang
         ValueError: ``sensor_var_m2`` is not positive.
     """
     if not sensor_var_m2 > 0.0:
-        raise ValueError(f"sensor_var_m2: want > 0, got {sensor_var_m2}")
+        raise ValueError(f"sensor_var_m2: expected > 0, got {sensor_var_m2}")
     from filterpy.kalman import update as kalman_update
 
     # filterpy reads the number of dimensions off the mean, which a plain float does not have.

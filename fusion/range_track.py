@@ -55,7 +55,7 @@ def advance(
 ) -> RangeTrack:
     """The track after the car went on.
 
-    A belief that has become less sure than ``most_sd_m`` is dropped, and first observations that
+    A belief that has become less sure than ``max_sd_m`` is dropped, and first observations that
     nothing has confirmed within ``begin_within_m`` are forgotten.
     """
     if track.belief is None and track.rival is None:
@@ -66,7 +66,7 @@ def advance(
         is_stale = unseen_m > settings.begin_within_m
         return NOTHING if is_stale else RangeTrack(None, rival, track.rival_seen, unseen_m)
     belief = predict(track.belief, travelled_m, var_m2)
-    if belief.var_m2 > settings.most_sd_m * settings.most_sd_m:
+    if belief.var_m2 > settings.max_sd_m * settings.max_sd_m:
         return NOTHING
     return RangeTrack(belief, rival, track.rival_seen, unseen_m)
 

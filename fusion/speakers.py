@@ -24,6 +24,6 @@ def speakers_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], Speaker]:
         speaker = source_speaker(graph, fusion.dissent)
         return lambda: speaker
     if fusion.calibrated is None:
-        raise ValueError("fusion.calibrated: want what crosscue fit messages wrote, got None")
+        raise ValueError("fusion.calibrated: expected what crosscue fit messages wrote, got None")
     voices, size = voices_of(graph, fusion.calibrated), len(graph.features)
     return lambda: CalibratedMessageModel(size, voices)

@@ -60,7 +60,7 @@ def circular_mean(angles_rad: Floats) -> float:
         ValueError: No angles, or they cancel out.
     """
     if len(angles_rad) == 0:
-        raise ValueError("circular_mean: want at least one angle, got none")
+        raise ValueError("circular_mean: expected at least one angle, got none")
     east, north = float(np.mean(np.cos(angles_rad))), float(np.mean(np.sin(angles_rad)))
     if math.hypot(east, north) < 1e-9:
         raise ValueError("circular_mean: the angles cancel out, there is no mean direction")

@@ -51,17 +51,19 @@ class CompassSettings:
         """
         for f in fields(self):
             if not np.isfinite(np.array(getattr(self, f.name))).all():
-                raise ValueError(f"{f.name}: want finite numbers, got {getattr(self, f.name)}")
+                raise ValueError(f"{f.name}: expected finite numbers, got {getattr(self, f.name)}")
         turn = np.array(self.mounting_rotation)
         if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6):
-            raise ValueError(f"mounting_rotation: want a rotation, got {self.mounting_rotation}")
+            raise ValueError(
+                f"mounting_rotation: expected a rotation, got {self.mounting_rotation}"
+            )
         if np.linalg.det(turn) < 0.0:
             raise ValueError(
-                "mounting_rotation: want a rotation, got a mirror; turn one axis round"
+                "mounting_rotation: expected a rotation, got a mirror; turn one axis round"
             )
         soft = np.array(self.soft_iron)
         if soft.shape != (3, 3) or not np.linalg.det(soft) > 0.0:
-            raise ValueError(f"soft_iron: want determinant > 0, got {self.soft_iron}")
+            raise ValueError(f"soft_iron: expected determinant > 0, got {self.soft_iron}")
 
 
 def heading(
@@ -103,10 +105,10 @@ def level_field(
     """
     n = len(field_t)
     if field_t.shape != (n, 3):
-        raise ValueError(f"field_t: want ({n}, 3), got {field_t.shape}")
+        raise ValueError(f"field_t: expected ({n}, 3), got {field_t.shape}")
     for name, angle in (("roll_rad", roll_rad), ("pitch_rad", pitch_rad)):
         if angle is not None and angle.shape != (n,):
-            raise ValueError(f"{name}: want ({n},), got {angle.shape}")
+            raise ValueError(f"{name}: expected ({n},), got {angle.shape}")
     to_car = np.array(settings.mounting_rotation) @ np.array(settings.soft_iron)
     body: Floats = (field_t - np.array(settings.hard_iron_t)) @ to_car.T
     if roll_rad is None and pitch_rad is None:

@@ -124,9 +124,9 @@ def fit_compass(
     """
     settings = settings or FitSettings()
     if field_t.shape != (len(t_ns), 3):
-        raise ValueError(f"field_t: want ({len(t_ns)}, 3), got {field_t.shape}")
+        raise ValueError(f"field_t: expected ({len(t_ns)}, 3), got {field_t.shape}")
     if reference_rad is not None and reference_rad.shape != t_ns.shape:
-        raise ValueError(f"reference_rad: want {t_ns.shape}, got {reference_rad.shape}")
+        raise ValueError(f"reference_rad: expected {t_ns.shape}, got {reference_rad.shape}")
     usable = np.isfinite(field_t).all(axis=1) & (field_t != 0.0).any(axis=1)
     if reference_rad is not None:
         usable &= np.isfinite(reference_rad)

@@ -55,11 +55,13 @@ class PoseBelief:
             ValueError: Wrong shape, a value that is not finite, or a negative variance.
         """
         if self.mean.shape != (4,) or self.cov.shape != (4, 4):
-            raise ValueError(f"want mean (4,), cov (4, 4); got {self.mean.shape}, {self.cov.shape}")
+            raise ValueError(
+                f"expected mean (4,), cov (4, 4); got {self.mean.shape}, {self.cov.shape}"
+            )
         if not (np.isfinite(self.mean).all() and np.isfinite(self.cov).all()):
-            raise ValueError(f"belief at {self.t_ns} ns: want finite numbers, got {self.mean}")
+            raise ValueError(f"belief at {self.t_ns} ns: expected finite numbers, got {self.mean}")
         if (np.diagonal(self.cov) < -_ROUNDING).any():
-            raise ValueError(f"cov: want variances >= 0, got {np.diagonal(self.cov)}")
+            raise ValueError(f"cov: expected variances >= 0, got {np.diagonal(self.cov)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +89,10 @@ class MotionNoise:
             ValueError: Wheelbase not positive or a negative standard deviation.
         """
         if not self.wheelbase_m > 0.0:
-            raise ValueError(f"wheelbase_m: want > 0, got {self.wheelbase_m}")
+            raise ValueError(f"wheelbase_m: expected > 0, got {self.wheelbase_m}")
         for name in ("accel_mps2", "steering_rad", "yaw_rate_radps", "slip_per_sqrt_m"):
             if not getattr(self, name) >= 0.0:
-                raise ValueError(f"{name}: want >= 0, got {getattr(self, name)}")
+                raise ValueError(f"{name}: expected >= 0, got {getattr(self, name)}")
 
 
 class Motion(NamedTuple):
@@ -196,7 +198,7 @@ def predict_odometry(
     """
     _check_inputs(dt_s, distance_m=distance_m, turn_rad=turn_rad)
     if not (distance_var_m2 >= 0.0 and turn_var_rad2 >= 0.0 and accel_var_m2ps3 >= 0.0):
-        raise ValueError(f"variances: want >= 0, got {distance_var_m2}, {turn_var_rad2}")
+        raise ValueError(f"variances: expected >= 0, got {distance_var_m2}, {turn_var_rad2}")
     after = pose_filter.predict(
         packed(belief), distance_m, turn_rad, distance_var_m2, turn_var_rad2, accel_var_m2ps3 * dt_s
     )
@@ -216,7 +218,7 @@ def coast(
     """
     _check_inputs(dt_s, accel_var_m2ps3=accel_var_m2ps3, turn_var_rad2ps=turn_var_rad2ps)
     if accel_var_m2ps3 < 0.0 or turn_var_rad2ps < 0.0:
-        raise ValueError(f"variances: want >= 0, got {accel_var_m2ps3}, {turn_var_rad2ps}")
+        raise ValueError(f"variances: expected >= 0, got {accel_var_m2ps3}, {turn_var_rad2ps}")
     motion = turning(belief.mean, 0.0, 0.0, dt_s)
     heading, distance_m = belief.mean[HEADING], belief.mean[SPEED] * dt_s
     along = np.array([math.cos(heading), math.sin(heading), 0.0, 0.0])
@@ -273,7 +275,7 @@ def update_position(
         ValueError: Wrong shape, not finite, or ``cov_m2`` not positive definite.
     """
     if xy_m.shape != (2,):
-        raise ValueError(f"xy_m: want (2,), got {xy_m.shape}")
+        raise ValueError(f"xy_m: expected (2,), got {xy_m.shape}")
     innovation = xy_m - belief.mean[:2]
     _check_measurement(innovation, cov_m2)
     (var_x, cov_xy), (_, var_y) = cov_m2.tolist()
@@ -376,20 +378,20 @@ def _wrapped(angle_rad: float) -> float:
 
 def _check_inputs(dt_s: float, **inputs: float) -> None:
     if not (math.isfinite(dt_s) and dt_s >= 0.0):
-        raise ValueError(f"dt_s: want finite and >= 0, got {dt_s}")
+        raise ValueError(f"dt_s: expected finite and >= 0, got {dt_s}")
     for name, value in inputs.items():
         if not math.isfinite(value):
-            raise ValueError(f"{name}: want a finite number, got {value}")
+            raise ValueError(f"{name}: expected a finite number, got {value}")
 
 
 def _check_measurement(innovation: Floats, cov: Floats) -> None:
     m = len(innovation)
     if cov.shape != (m, m):
-        raise ValueError(f"measurement covariance: want ({m}, {m}), got {cov.shape}")
+        raise ValueError(f"measurement covariance: expected ({m}, {m}), got {cov.shape}")
     if not (np.isfinite(innovation).all() and np.isfinite(cov).all()):
-        raise ValueError("measurement: want finite numbers, got NaN or infinity")
+        raise ValueError("measurement: expected finite numbers, got NaN or infinity")
     if (np.linalg.eigvalsh(cov) <= 0.0).any() or not np.allclose(cov, cov.T):
-        raise ValueError(f"measurement covariance: want positive definite, got {cov.tolist()}")
+        raise ValueError(f"measurement covariance: expected positive definite, got {cov.tolist()}")
 
 
 def packed(belief: PoseBelief) -> State:

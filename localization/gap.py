@@ -73,7 +73,7 @@ def cross_gap(
     """
     dt_s = (until_ns - belief.t_ns) * 1e-9
     if dt_s < 0.0:
-        raise ValueError(f"until_ns: want >= {belief.t_ns}, got {until_ns}")
+        raise ValueError(f"until_ns: expected >= {belief.t_ns}, got {until_ns}")
     speed_mps = abs(float(belief.mean[SPEED]))
     faster_m = 0.5 * settings.max_accel_mps2 * dt_s * dt_s
     reach_m = min(speed_mps * dt_s + faster_m, max(settings.max_speed_mps, speed_mps) * dt_s)

@@ -95,14 +95,16 @@ class OdometrySettings:
         for name in _POSITIVE:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}: want > 0, got {value}")
+                raise ValueError(f"{name}: expected > 0, got {value}")
         if not math.isfinite(self.steering_ratio) or self.steering_ratio == 0.0:
-            raise ValueError(f"steering_ratio: want finite and not 0, got {self.steering_ratio}")
+            raise ValueError(
+                f"steering_ratio: expected finite and not 0, got {self.steering_ratio}"
+            )
         noises = [f.name for f in fields(self) if "_per_" in f.name or f.name.startswith("gap_")]
         for name in (*noises, "wheel_step_mps", "steering_noise_rad_sqrt_m"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name}: want >= 0, got {value}")
+                raise ValueError(f"{name}: expected >= 0, got {value}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,9 +130,11 @@ class WheelSpeeds:
         """
         n = len(self.t_ns)
         if self.wheels_mps.shape not in ((n, 2), (n, 4)):
-            raise ValueError(f"wheels_mps: want ({n}, 2) or ({n}, 4), got {self.wheels_mps.shape}")
+            raise ValueError(
+                f"wheels_mps: expected ({n}, 2) or ({n}, 4), got {self.wheels_mps.shape}"
+            )
         if self.is_reverse is not None and self.is_reverse.shape != (n,):
-            raise ValueError(f"is_reverse: want ({n},), got {self.is_reverse.shape}")
+            raise ValueError(f"is_reverse: expected ({n},), got {self.is_reverse.shape}")
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -163,7 +167,7 @@ class TurnSignal:
             ValueError: Naming the shape wanted and the shape given.
         """
         if self.values.shape != self.t_ns.shape or self.t_ns.ndim != 1:
-            raise ValueError(f"values: want {self.t_ns.shape}, got {self.values.shape}")
+            raise ValueError(f"values: expected {self.t_ns.shape}, got {self.values.shape}")
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -319,7 +323,7 @@ def integrate(
 def _check_geometry(settings: OdometrySettings, turn: TurnSignal | None) -> None:
     needs_base = settings.use_front_wheels or (turn is not None and turn.kind == "steering")
     if needs_base and settings.wheelbase_m is None:
-        raise ValueError("wheelbase_m: wanted for steering and for front wheels, got None")
+        raise ValueError("wheelbase_m: needed for steering and for front wheels, got None")
 
 
 def _at_rear_axle(wheels: WheelSpeeds, settings: OdometrySettings) -> tuple[Floats, Floats]:

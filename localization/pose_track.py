@@ -67,7 +67,7 @@ class TrackSettings:
         for f in fields(self):
             value = getattr(self, f.name)
             if value is not None and not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{f.name}: want >= 0, got {value}")
+                raise ValueError(f"{f.name}: expected >= 0, got {value}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +92,9 @@ class Headings:
         """
         for name in ("heading_rad", "var_rad2"):
             if getattr(self, name).shape != self.t_ns.shape:
-                raise ValueError(f"{name}: want {self.t_ns.shape}, got {getattr(self, name).shape}")
+                raise ValueError(
+                    f"{name}: expected {self.t_ns.shape}, got {getattr(self, name).shape}"
+                )
 
     def __len__(self) -> int:
         return len(self.t_ns)

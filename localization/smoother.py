@@ -58,7 +58,7 @@ class Fixes:
         n = len(self.t_ns)
         if self.xy_m.shape != (n, 2) or self.cov_m2.shape != (n, 2, 2):
             raise ValueError(
-                f"want xy_m ({n}, 2), cov_m2 ({n}, 2, 2); got {self.xy_m.shape}, "
+                f"expected xy_m ({n}, 2), cov_m2 ({n}, 2, 2); got {self.xy_m.shape}, "
                 f"{self.cov_m2.shape}"
             )
 
@@ -134,11 +134,11 @@ def _need_gtsam() -> None:
 
 def _check(start: PoseBelief, increments: Increments) -> None:
     if not len(increments) or increments.stop_ns[-1] <= start.t_ns:
-        raise ValueError(f"increments: want odometry after {start.t_ns} ns, got none")
+        raise ValueError(f"increments: expected odometry after {start.t_ns} ns, got none")
     holes = np.flatnonzero(increments.start_ns[1:] != increments.stop_ns[:-1])
     if len(holes) or increments.start_ns[0] > start.t_ns:
         where = increments.stop_ns[holes[0]] if len(holes) else start.t_ns
-        raise ValueError(f"increments: want no holes, got one at {where} ns")
+        raise ValueError(f"increments: expected no holes, got one at {where} ns")
 
 
 def _times(

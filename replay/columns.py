@@ -82,7 +82,7 @@ class Messages:
         """Refuse ranges that do not line up."""
         if self.start.shape != self.stop.shape or self.start.ndim != 1:
             raise ValueError(
-                f"start {self.start.shape} and stop {self.stop.shape}: want equal (N,)"
+                f"start {self.start.shape} and stop {self.stop.shape}: expected equal (N,)"
             )
 
     def __len__(self) -> int:
@@ -127,11 +127,11 @@ class CanFrames:
         for name in ("is_extended", "kind", "length", "is_fd"):
             shape = getattr(self, name).shape
             if shape != (n,):
-                raise ValueError(f"{name}: want ({n},), got {shape}")
+                raise ValueError(f"{name}: expected ({n},), got {shape}")
         if self.is_tx is not None and self.is_tx.shape != (n,):
-            raise ValueError(f"is_tx: want ({n},), got {self.is_tx.shape}")
+            raise ValueError(f"is_tx: expected ({n},), got {self.is_tx.shape}")
         if self.data.ndim != 2 or self.data.shape[0] != n or self.data.shape[1] not in (8, 64):
-            raise ValueError(f"data: want ({n}, 8) or ({n}, 64), got {self.data.shape}")
+            raise ValueError(f"data: expected ({n}, 8) or ({n}, 64), got {self.data.shape}")
 
     def __len__(self) -> int:
         return len(self.arbitration_id)
@@ -218,7 +218,7 @@ class Images:
     def __post_init__(self) -> None:
         """Refuse columns that do not line up."""
         if len(self.coding) != len(self.bytes_):
-            raise ValueError(f"coding: want {len(self.bytes_)} entries, got {len(self.coding)}")
+            raise ValueError(f"coding: expected {len(self.bytes_)} entries, got {len(self.coding)}")
 
     def __len__(self) -> int:
         return len(self.bytes_)
@@ -270,9 +270,11 @@ class Block:
             if column is None:
                 continue
             if column.shape != (n,) or column.dtype != np.int64:
-                raise ValueError(f"{name}: want int64 ({n},), got {column.dtype} {column.shape}")
+                raise ValueError(
+                    f"{name}: expected int64 ({n},), got {column.dtype} {column.shape}"
+                )
         if self.sequence is not None and self.sequence.shape != (n,):
-            raise ValueError(f"sequence: want ({n},), got {self.sequence.shape}")
+            raise ValueError(f"sequence: expected ({n},), got {self.sequence.shape}")
 
     def __len__(self) -> int:
         return len(self.log_ns)

@@ -129,7 +129,7 @@ def format_of(path: Path) -> str:
 
     Raises:
         UnknownFormatError: No format fits; the message lists those there are.
-        LogError: It is not there, or is no file or folder.
+        LogError: It is not there, or is not a file or folder.
     """
     try:
         is_folder, is_file = path.is_dir(), path.is_file()

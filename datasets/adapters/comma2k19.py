@@ -240,7 +240,7 @@ class Segment(Closing):
         n = min(len(column.rows) for column in files)
         lost = max(column.declared for column in files) - n
         if payload.rows.dtype.kind != "S" or payload.rows.dtype.itemsize > 8:
-            self._unreadable.append(f"{payload.path}: want |S8, got {payload.rows.dtype}")
+            self._unreadable.append(f"{payload.path}: expected |S8, got {payload.rows.dtype}")
             return
         buses = np.asarray(bus.rows[:n])
         t_ns = _to_ns(times.rows[:n])
@@ -299,7 +299,7 @@ def _block(source: _Source, part: slice, ledger: Ledger, selection: Selection) -
 
 
 def _to_ns(seconds: Values) -> Int64s:
-    """Nanoseconds, ``NO_TIME`` where damage has made a number that is no time."""
+    """Nanoseconds, ``NO_TIME`` where damage has made a number that is not a time."""
     with np.errstate(invalid="ignore", over="ignore"):
         t_ns = np.rint(np.asarray(seconds, np.float64) * 1e9)
         is_time = np.abs(t_ns) < LATEST_NS

@@ -270,7 +270,7 @@ def _open_tracking(path: Path, limits: Limits) -> Drive:
     singles = sorted((path / "oxts").glob("*.txt"))
     if len(singles) != 1:
         raise LogFormatError(
-            f"{path}/oxts: {len(singles)} sequences; want a folder with one of them, "
+            f"{path}/oxts: {len(singles)} sequences; expected a folder with one of them, "
             "or a raw drive with oxts/timestamps.txt"
         )
     name = singles[0].stem
@@ -306,7 +306,7 @@ def _driven_period_s(oxts: Oxts) -> float | None:
 
 
 def _frame_ns(stem: str) -> int:
-    """Time of a numbered frame, or -1 for a name that is no number."""
+    """Time of a numbered frame, or -1 for a name that is not a number."""
     is_number = stem.isascii() and stem.isdecimal() and len(stem) <= 9
     return int(stem) * TRACKING_PERIOD_NS if is_number else -1
 

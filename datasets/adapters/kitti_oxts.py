@@ -98,7 +98,7 @@ def parse(line: str | bytes) -> tuple[float, ...] | str:
     """The thirty numbers of one line, or why it is no packet."""
     parts: Sequence[str | bytes] = line[:LINE_BYTES].split()
     if len(parts) != len(COLUMNS):
-        return f"{len(parts)} numbers; want {len(COLUMNS)}"
+        return f"{len(parts)} numbers; expected {len(COLUMNS)}"
     try:
         numbers = tuple(float(part) for part in parts)
     except ValueError:

@@ -52,7 +52,7 @@ def read_column(path: Path) -> Column:
     except (ValueError, UnicodeDecodeError, SyntaxError, TypeError, EOFError) as error:
         raise LogFormatError(f"{path}: not a NumPy array file ({error}); copy it again") from None
     if dtype.hasobject or not shape or dtype.itemsize == 0 or any(side < 0 for side in shape):
-        raise LogFormatError(f"{path}: want an array of plain numbers, got {dtype} {shape}")
+        raise LogFormatError(f"{path}: expected an array of plain numbers, got {dtype} {shape}")
     width = int(np.prod(shape[1:], dtype=np.int64))
     cells = max(0, path.stat().st_size - offset) // dtype.itemsize
     present = min(shape[0], cells // width if width else 0)

@@ -304,7 +304,7 @@ def _times_ns(path: Path) -> Int64s:
     except (TypeError, ValueError):
         raise LogFormatError(f"{path}: expected a list of seconds") from None
     if not np.isfinite(seconds).all() or (np.abs(seconds) > 9e9).any():
-        raise LogFormatError(f"{path}: a time is no number of seconds since 1970")
+        raise LogFormatError(f"{path}: a time is not a number of seconds since 1970")
     # Whole microseconds, as published: more digits are only those of a floating-point number.
     return np.rint(seconds * 1e6).astype(np.int64) * 1000
 

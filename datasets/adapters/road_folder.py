@@ -33,7 +33,7 @@ def load_folder(folder: Path, size_px: tuple[int, int]) -> RoadFrames:
     if not images:
         if not folder.joinpath("images").is_dir():
             raise LogError(f"{folder / 'images'}: no such folder; give one with images and masks")
-        raise EmptyResultError(f"{folder / 'images'}: no pictures; want {', '.join(SUFFIXES)}")
+        raise EmptyResultError(f"{folder / 'images'}: no pictures; expected {', '.join(SUFFIXES)}")
     pixels, road = [], []
     for path in images:
         picture = _decoded(path, View())

@@ -62,7 +62,7 @@ def conditions_of(layout: Layout, run: int, seed: int = 0) -> Conditions:
         ValueError: ``run`` below 1.
     """
     if run < 1:
-        raise ValueError(f"run: want 1 or more, got {run}")
+        raise ValueError(f"run: expected 1 or more, got {run}")
     rng = np.random.default_rng([seed, layout.seed, run, 0x2B])
     place = run - 1 if run <= 10 else int(rng.integers(10))
     light = LIGHTS[place]

@@ -38,13 +38,13 @@ def present(layout: Layout, picture: Picture) -> dict[str, Presence]:
     return {name: SIMULATED[name](layout, picture) for name in CUES if name in SIMULATED}
 
 
-def _things(shows: Shows, most_m: float = math.inf) -> Simulated:
+def _things(shows: Shows, max_m: float = math.inf) -> Simulated:
     """The things in a picture, large enough to be labelled, that show a cue."""
 
     def simulated(layout: Layout, picture: Picture) -> Presence:
         found = ABSENT
         for seen in picture.seen:
-            if seen.distance_m > most_m or not shows(layout, seen.thing, picture.t_s):
+            if seen.distance_m > max_m or not shows(layout, seen.thing, picture.t_s):
                 continue
             if seen.mask.sum() >= MIN_PIXELS:
                 found = Presence(found.things + 1, max(found.visible, seen.visible))

@@ -93,9 +93,9 @@ class SceneSettings:
         """
         layout_named(self.layout)
         if self.run < 1 or self.seed < 0:
-            raise ValueError(f"run {self.run}, seed {self.seed}: want 1 or more, 0 or more")
+            raise ValueError(f"run {self.run}, seed {self.seed}: expected 1 or more, 0 or more")
         if self.rate_hz not in (10, 20, 25, 50):
-            raise ValueError(f"rate_hz: want 10, 20, 25 or 50, got {self.rate_hz}")
+            raise ValueError(f"rate_hz: expected 10, 20, 25 or 50, got {self.rate_hz}")
 
     @property
     def name(self) -> str:
@@ -129,7 +129,7 @@ def camera_of_width(width_px: int) -> Camera:
         UsageError: Not a size that it has.
     """
     if not 64 <= width_px <= 3840 or width_px % 16:
-        raise UsageError(f"--width {width_px}: want a multiple of 16 from 64 to 3840")
+        raise UsageError(f"--width {width_px}: expected a multiple of 16 from 64 to 3840")
     return Camera(width_px=width_px, height_px=width_px * 9 // 16)
 
 

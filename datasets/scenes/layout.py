@@ -155,4 +155,4 @@ def layout_named(name: str) -> Layout:
         return TABLE_6[name]
     if name[:1] == "L" and name[1:].isdecimal() and len(name) < 11:
         return any_layout(int(name[1:]))
-    raise ValueError(f"{name!r} is no layout; there are: A to H, and L0, L1, ... from seeds")
+    raise ValueError(f"{name!r} is not a layout; there are: A to H, and L0, L1, ... from seeds")

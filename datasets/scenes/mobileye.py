@@ -37,21 +37,21 @@ class Faults:
     Attributes:
         half_view_rad: Half its field of view.
         reach_m: Farthest vehicle.
-        least_visible: Fraction of a vehicle that must show.
+        min_visible: Fraction of a vehicle that must show.
         hit: Chance that a vehicle on our road is reported; states last about a second.
         hit_crossing: The same for one that shows its side.
         hit_off_road: The same for one in a lot or driveway.
-        place_share: Relative error of distance.
+        place_fraction: Relative error of distance.
         side_m: Error aside.
     """
 
     half_view_rad: float = 0.33
     reach_m: float = 95.0
-    least_visible: float = 0.35
+    min_visible: float = 0.35
     hit: float = 0.9
     hit_crossing: float = 0.12
     hit_off_road: float = 0.18
-    place_share: float = 0.03
+    place_fraction: float = 0.03
     side_m: float = 0.15
 
 
@@ -102,7 +102,7 @@ class Device:
     def _is_reported(self, seen: Seen, ahead: float, left: float) -> bool:
         faults, number = self._faults, seen.thing.number
         front = ahead - FRONT_M
-        if front < 1.0 or front > faults.reach_m or seen.visible < faults.least_visible:
+        if front < 1.0 or front > faults.reach_m or seen.visible < faults.min_visible:
             return False
         if abs(np.arctan2(left, front)) > faults.half_view_rad:
             return False
@@ -123,7 +123,7 @@ class Device:
         thing, faults = seen.thing, self._faults
         number = thing.number
         if number not in self._scale:
-            self._scale[number] = float(self._rng.normal(1.0, faults.place_share))
+            self._scale[number] = float(self._rng.normal(1.0, faults.place_fraction))
         self._age[number] = min(self._age.get(number, 0) + 1, 254)
         heading = picture.view.rear_axle[2]
         vx = thing.velocity[0] * np.cos(heading) + thing.velocity[1] * np.sin(heading)

@@ -35,9 +35,9 @@ def _batches(block: Block) -> list[Block]:
     ]
 
 
-def _late(t_ns: Int64s, rng: np.random.Generator, least_ms: float, mean_ms: float) -> Int64s:
+def _late(t_ns: Int64s, rng: np.random.Generator, min_ms: float, mean_ms: float) -> Int64s:
     """When the recorder stored what was measured at ``t_ns``; the order is kept."""
-    delay = least_ms + rng.exponential(mean_ms, len(t_ns))
+    delay = min_ms + rng.exponential(mean_ms, len(t_ns))
     late: Int64s = np.maximum.accumulate(t_ns + np.rint(delay * 1e6).astype(np.int64))
     return late
 

@@ -203,7 +203,7 @@ def _by_number(annotations: Annotations, log: LogPictures) -> Placed:
             digits = re.search(r"([0-9]{1,9})\.[A-Za-z]+$", picture.name)
             if digits is None:
                 raise SchemaError(
-                    f"{annotations.where}: {picture.name}: tells neither a time nor a frame; give "
+                    f"{annotations.where}: {picture.name}: has neither a time nor a frame; give "
                     "pictures a t_ns, or names that end in the frame's number, from 0"
                 )
             number = int(digits[1])
@@ -285,11 +285,11 @@ def check_boxes(annotations: Annotations) -> None:
             x0, y0, x1, y1 = thing.box_px
             where = f"{annotations.where}: {thing.place or picture.name} ({thing.label})"
             if not (x0 < x1 and y0 < y1):
-                raise SchemaError(f"{where}: box {_box(thing.box_px)} has no area; mend it")
+                raise SchemaError(f"{where}: box {_box(thing.box_px)} has no area; correct it")
             if x0 < -SLACK_PX or y0 < -SLACK_PX or x1 > width + SLACK_PX or y1 > height + SLACK_PX:
                 raise SchemaError(
                     f"{where}: box {_box(thing.box_px)} lies outside the picture of "
-                    f"{_size(picture.size_px)} pixels; mend it"
+                    f"{_size(picture.size_px)} pixels; correct it"
                 )
 
 

@@ -29,7 +29,7 @@ def read_coco(path: Path) -> Annotations:
     except (OSError, ValueError) as error:
         raise AnnotationError(f"{path}: not readable as JSON ({error}); give a COCO file") from None
     if not isinstance(tree, dict):
-        raise AnnotationError(f"{path}: want an object with images, annotations and categories")
+        raise AnnotationError(f"{path}: expected an object with images, annotations and categories")
     labels = _labels(tree, path)
     pictures = _pictures(tree, path)
     things: dict[int, list[Thing]] = {number: [] for number in pictures}
@@ -38,7 +38,7 @@ def read_coco(path: Path) -> Annotations:
         image, label = _key(row.get("image_id")), labels.get(_key(row.get("category_id")))
         if image not in things:
             raise AnnotationError(
-                f"{path}: {where}: image_id {row.get('image_id')!r}: no such image; mend it"
+                f"{path}: {where}: image_id {row.get('image_id')!r}: no such image; correct it"
             )
         if label is None:
             raise AnnotationError(
@@ -59,7 +59,7 @@ def read_coco(path: Path) -> Annotations:
 def _rows(tree: Mapping[str, Any], name: str, path: Path) -> list[Mapping[str, Any]]:
     rows = tree.get(name)
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise AnnotationError(f"{path}: {name}: want a list of objects; give a COCO file")
+        raise AnnotationError(f"{path}: {name}: expected a list of objects; give a COCO file")
     return rows
 
 
@@ -74,7 +74,7 @@ def _labels(tree: Mapping[str, Any], path: Path) -> dict[int, str]:
         number, name = _key(row.get("id")), row.get("name")
         if number < 0 or number in labels or not isinstance(name, str) or name in labels.values():
             raise AnnotationError(
-                f"{path}: categories.{place}: want an id and a name, neither twice; mend it"
+                f"{path}: categories.{place}: expected an id and a name, neither twice; correct it"
             )
         labels[number] = name
     return labels
@@ -87,13 +87,15 @@ def _pictures(tree: Mapping[str, Any], path: Path) -> dict[int, Picture]:
         number, name, t_ns = _key(row.get("id")), row.get("file_name"), row.get("t_ns")
         if number < 0 or number in pictures or not isinstance(name, str):
             raise AnnotationError(
-                f"{where}: want an id that no other has, and a file_name; mend it"
+                f"{where}: expected an id that no other has, and a file_name; correct it"
             )
         size = (_key(row.get("width")), _key(row.get("height")))
         if not (0 < size[0] <= MAX_SIDE and 0 < size[1] <= MAX_SIDE):
-            raise AnnotationError(f"{where}: width and height: want whole pixels, 1 to {MAX_SIDE}")
+            raise AnnotationError(
+                f"{where}: width and height: expected whole pixels, 1 to {MAX_SIDE}"
+            )
         if t_ns is not None and not (_key(t_ns) == t_ns and 0 <= t_ns < 2**62):
-            raise AnnotationError(f"{where}: t_ns {t_ns!r}: want whole nanoseconds; mend it")
+            raise AnnotationError(f"{where}: t_ns {t_ns!r}: expected whole nanoseconds; correct it")
         pictures[number] = Picture(name, size, t_ns)
     return pictures
 
@@ -102,12 +104,12 @@ def _thing(row: Mapping[str, Any], label: str, where: str, path: Path) -> Thing:
     box = row.get("bbox")
     if not (isinstance(box, list) and len(box) == 4 and all(_is_number(value) for value in box)):
         raise AnnotationError(
-            f"{path}: {where}: bbox {box!r}: want four numbers x, y, w, h; mend it"
+            f"{path}: {where}: bbox {box!r}: expected four numbers x, y, w, h; correct it"
         )
     x, y, w, h = (float(value) for value in box)
     visible, track = row.get("visible"), row.get("track_id")
     if visible is not None and not (_is_number(visible) and 0.0 <= visible <= 1.0):
-        raise AnnotationError(f"{path}: {where}: visible {visible!r}: want 0 to 1; mend it")
+        raise AnnotationError(f"{path}: {where}: visible {visible!r}: expected 0 to 1; correct it")
     return Thing(
         label=label,
         box_px=(x, y, x + w, y + h),

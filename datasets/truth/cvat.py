@@ -78,7 +78,9 @@ class _Reader:
 
     def start(self, tag: str, found: Mapping[str, str]) -> None:
         if not self._path and tag != "annotations":
-            raise AnnotationError(f"{self.where}: <{tag}>: want <annotations>; give CVAT's XML 1.1")
+            raise AnnotationError(
+                f"{self.where}: <{tag}>: expected <annotations>; give CVAT's XML 1.1"
+            )
         if len(self._path) >= MAX_DEPTH:
             raise AnnotationError(
                 f"{self.where}: elements over {MAX_DEPTH} deep; this is not CVAT's"
@@ -125,7 +127,9 @@ class _Reader:
 
     def _check_size(self, size: tuple[int, int]) -> None:
         if not (0 < size[0] <= MAX_SIDE and 0 < size[1] <= MAX_SIDE):
-            raise AnnotationError(f"{self.where}: pictures of {size[0]} x {size[1]}: want pixels")
+            raise AnnotationError(
+                f"{self.where}: pictures of {size[0]} x {size[1]}: expected pixels"
+            )
 
     def _shape(self, tag: str, found: Mapping[str, str]) -> None:
         if self._path[-2] == "track":
@@ -167,7 +171,9 @@ class _Reader:
         except ValueError:
             points = np.empty((0, 0))
         if points.ndim != 2 or points.shape[1:] != (2,) or not np.isfinite(points).all():
-            raise AnnotationError(f"{self.where}: points {text[:40]!r}: want x,y;x,y;...; mend it")
+            raise AnnotationError(
+                f"{self.where}: points {text[:40]!r}: expected x,y;x,y;...; correct it"
+            )
         return points
 
     def _text(self, found: Mapping[str, str], name: str) -> str:
@@ -181,7 +187,7 @@ class _Reader:
         text = self._text(found, name)
         if not re.fullmatch(r"[0-9]{1,9}", text):
             raise AnnotationError(
-                f"{self.where}: <{self._path[-1]}> {name} {text[:40]!r}: want a whole number"
+                f"{self.where}: <{self._path[-1]}> {name} {text[:40]!r}: expected a whole number"
             )
         return int(text)
 
@@ -193,7 +199,7 @@ class _Reader:
             value = math.nan
         if not math.isfinite(value):
             raise AnnotationError(
-                f"{self.where}: <{self._path[-1]}> {name} {text[:40]!r}: want a number"
+                f"{self.where}: <{self._path[-1]}> {name} {text[:40]!r}: expected a number"
             )
         return value
 
@@ -235,5 +241,7 @@ class _Reader:
         if re.fullmatch(r"[0-9]{1,9}", text):
             return int(text)
         if otherwise is None or text:
-            raise AnnotationError(f"{self.where}: meta: {name} {text[:40]!r}: want a whole number")
+            raise AnnotationError(
+                f"{self.where}: meta: {name} {text[:40]!r}: expected a whole number"
+            )
         return otherwise

@@ -184,7 +184,7 @@ def load(path: Path) -> Truth:
             f"{path}: no such truth file; for a data set make it with: crosscue truth LOG -o DIR"
         ) from None
     except (OSError, ValueError) as error:
-        raise AnnotationError(f"{path}: not readable as JSON ({error}); mend it") from None
+        raise AnnotationError(f"{path}: not readable as JSON ({error}); correct it") from None
     if truth.end_ns <= truth.start_ns:
         raise AnnotationError(
             f"{path}: end_ns {truth.end_ns} is not after start_ns {truth.start_ns}"
@@ -199,15 +199,18 @@ def _check_approaches(truth: Truth, path: Path) -> None:
     for one in sorted(truth.approaches, key=lambda one: one.start_ns):
         if not truth.start_ns <= one.start_ns < one.enter_ns <= truth.end_ns:
             raise AnnotationError(
-                f"{path}: approach {one.id}: start_ns {one.start_ns}, enter_ns {one.enter_ns}: want"
-                f" start before enter, both from {truth.start_ns} to {truth.end_ns}; mend it"
+                f"{path}: approach {one.id}: start_ns {one.start_ns}, enter_ns {one.enter_ns}: "
+                f"expected start before enter, both from {truth.start_ns} to {truth.end_ns}; "
+                "correct it"
             )
         if before is not None and one.start_ns < before.enter_ns:
-            raise AnnotationError(f"{path}: approaches {before.id} and {one.id} overlap; mend them")
+            raise AnnotationError(
+                f"{path}: approaches {before.id} and {one.id} overlap; correct them"
+            )
         before = one
     numbers = [one.id for one in truth.approaches]
     if len(set(numbers)) != len(numbers):
-        raise AnnotationError(f"{path}: approaches: an id stands twice in {numbers}; mend it")
+        raise AnnotationError(f"{path}: approaches: an id stands twice in {numbers}; correct it")
 
 
 def _check_cues(truth: Truth, path: Path) -> None:
@@ -223,14 +226,17 @@ def _check_cues(truth: Truth, path: Path) -> None:
             )
         spans = one.start_ns is not None and one.end_ns is not None
         if spans == (one.t_ns is not None) or (one.start_ns is None) != (one.end_ns is None):
-            raise AnnotationError(f"{where}: want either t_ns, or start_ns and end_ns; mend it")
+            raise AnnotationError(
+                f"{where}: expected either t_ns, or start_ns and end_ns; correct it"
+            )
         first = one.t_ns if one.start_ns is None else one.start_ns
         last = first + 1 if one.end_ns is None and first is not None else one.end_ns
         assert first is not None
         assert last is not None
         if not truth.start_ns <= first < last <= truth.end_ns:
             raise AnnotationError(
-                f"{where}: {first} to {last}: want times from {truth.start_ns} to {truth.end_ns}"
+                f"{where}: {first} to {last}: expected times from {truth.start_ns} to "
+                f"{truth.end_ns}"
             )
         if one.approach is not None and one.approach not in numbers:
             raise AnnotationError(

@@ -54,15 +54,15 @@ class Trajectory:
         """
         n = len(self.t_ns)
         if self.xyz_m.shape != (n, 3):
-            raise ValueError(f"xyz_m: want ({n}, 3), got {self.xyz_m.shape}")
+            raise ValueError(f"xyz_m: expected ({n}, 3), got {self.xyz_m.shape}")
         if self.quat_wxyz.shape != (n, 4):
-            raise ValueError(f"quat_wxyz: want ({n}, 4), got {self.quat_wxyz.shape}")
+            raise ValueError(f"quat_wxyz: expected ({n}, 4), got {self.quat_wxyz.shape}")
         if (np.diff(self.t_ns) <= 0).any():
-            raise ValueError("t_ns: want increasing times")
+            raise ValueError("t_ns: expected increasing times")
         if not (np.isfinite(self.xyz_m).all() and np.isfinite(self.quat_wxyz).all()):
-            raise ValueError("poses: want finite numbers, got NaN or infinity")
+            raise ValueError("poses: expected finite numbers, got NaN or infinity")
         if (np.abs(np.linalg.norm(self.quat_wxyz, axis=1) - 1.0) > 1e-6).any():
-            raise ValueError("quat_wxyz: want unit quaternions")
+            raise ValueError("quat_wxyz: expected unit quaternions")
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -144,10 +144,10 @@ def nanoseconds(text: str) -> int:
     try:
         seconds = Decimal(text)
     except InvalidOperation:
-        raise ValueError(f"{text!r} is no number of seconds") from None
+        raise ValueError(f"{text!r} is not a number of seconds") from None
     # The exponent first: arithmetic on 1e999999999 overflows.
     if not seconds.is_finite() or seconds.adjusted() > 9 or abs(seconds) > _LATEST_S:
-        raise ValueError(f"{text!r} is no time that 64 bits of nanoseconds hold")
+        raise ValueError(f"{text!r} is not a time that 64 bits of nanoseconds hold")
     return int((seconds * 1_000_000_000).quantize(Decimal(1), rounding=ROUND_HALF_EVEN))
 
 
@@ -167,7 +167,7 @@ def _read(path: Path, lines: TextIO) -> Trajectory:
                 raise ValueError(f"time {line.split()[0]} is not after the line before")
         except ValueError as error:
             raise LogFormatError(
-                f"{path}, line {number}: {error}; want timestamp x y z qx qy qz qw"
+                f"{path}, line {number}: {error}; expected timestamp x y z qx qy qz qw"
             ) from None
         times.append(t_ns)
         rows.append(row)

@@ -177,7 +177,7 @@ def read_card(path: Path) -> ModelCard:
     except ValidationError as error:
         raise VehicleError(explain(error, text, str(path), ModelCard)) from None
     except ValueError as error:
-        raise VehicleError(f"{path}: not TOML: {error}; mend that line") from None
+        raise VehicleError(f"{path}: not TOML: {error}; correct that line") from None
 
 
 def read_weights(card: ModelCard, folder: Path) -> Weights:

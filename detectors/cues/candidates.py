@@ -1,6 +1,6 @@
 """What became of everything that a cue or a range could have come from: used, or skipped and why.
 
-A cue that is never positive looks the same whether there was nothing to see or a threshold was too
+A cue that stays negative reads the same whether there was nothing to see or a threshold was too
 high. So candidates are counted, and with them the highest score that was met.
 """
 

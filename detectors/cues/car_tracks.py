@@ -173,7 +173,7 @@ class CarTracks:
         self._t_s += ego.seconds
         cars = self._observed(found)
         again = self._assign(cars)
-        newest = self._t_s - self._settings.most_gap_s
+        newest = self._t_s - self._settings.max_gap_s
         self._tracks = [one for one in self._tracks if one.seen[-1].t_s >= newest]
         self.seen = len(cars)
         return [_motion(track) for track in again]
@@ -227,7 +227,7 @@ class CarTracks:
             track.step_px = 0.5 * (cars[i][0] - track.box_px).reshape(2, 2).sum(axis=0)
             track.box_px = cars[i][0]
             track.seen.append(cars[i][1])
-            del track.seen[: -self._settings.most_frames]
+            del track.seen[: -self._settings.max_frames]
             again.append(track)
         self._tracks += [
             _Track(box, np.zeros(2), [one]) for i, (box, one) in enumerate(cars) if i not in used
@@ -348,7 +348,7 @@ def crossing(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
     return [
         car
         for car in cars
-        if car.frames >= settings.least_frames
+        if car.frames >= settings.min_frames
         and car.is_steady
         and car.long > settings.length_per_height
         and abs(car.right_mps) > max(settings.crossing_mps, SIGMAS * car.right_sd_mps)
@@ -361,7 +361,7 @@ def parked(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
     return [
         car
         for car in cars
-        if car.frames >= settings.least_frames
+        if car.frames >= settings.min_frames
         and car.is_steady
         and abs(car.bearing) <= MAX_BEARING
         and car.long > settings.length_per_height * (1.0 + abs(car.bearing))
@@ -387,7 +387,7 @@ def judge(
     moving, still = crossing(cars, settings), parked(cars, settings)
     moving_here = [c for c in moving if place is None or is_at(c, camera, place)]
     still_here = [c for c in still if place is not None and is_at(c, camera, place)]
-    followed = sum(car.frames >= settings.least_frames for car in cars)
+    followed = sum(car.frames >= settings.min_frames for car in cars)
     crossing_here, crossing_all = _by_motion(moving_here), _by_motion(moving)
     parked_here, parked_all = _by_nose(still_here), _by_nose(still)
     return Judged(

@@ -111,7 +111,7 @@ def car_shapes(found: Sequence[Detections], settings: Cars) -> CarShapes:
         ValueError: No result at all, or a mask that is not one.
     """
     if not found:
-        raise ValueError("found: want at least one detector's result")
+        raise ValueError("found: expected at least one detector's result")
     t_ns, size = found[0].t_ns, found[0].size_px
     rows = [
         (box, mask)
@@ -166,7 +166,7 @@ def pair_cars(before: CarShapes, now: CarShapes, settings: Cars) -> Pairs:
     """
     gap_s = (now.t_ns - before.t_ns) * 1e-9
     width = now.size_px[0]
-    is_apart = not 0.0 < gap_s <= settings.most_gap_s or before.size_px != now.size_px
+    is_apart = not 0.0 < gap_s <= settings.max_gap_s or before.size_px != now.size_px
     if is_apart or not len(before) or not len(now):
         return no_pairs(width)
     steps = now.center_px[None, :, :] - before.center_px[:, None, :]

@@ -17,7 +17,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .car_tracks import CarTracks, Place, judge
 from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
 from .labelled import count_labels
-from .road import RoadShares, road_shares
+from .road import RoadShares, road_fractions
 from .rules import counts_of
 from .tally import CueTally, cue_labels
 
@@ -157,7 +157,7 @@ class CuePass:
             }
         road = frame.road
         if isinstance(road, RoadMask):
-            road = road_shares(road, self.vehicle.regions)
+            road = road_fractions(road, self.vehicle.regions)
         if road is not None:
             counts |= counts_of("road", road, self.vehicle)
         found = FrameCues(counts, road)
@@ -228,6 +228,6 @@ def _why_not_followed(ego: Motion | None, vehicle: Vehicle) -> str | None:
         return NO_FOCAL_LENGTH
     if ego is None or ego.way_m is None:
         return NO_ODOMETRY
-    if ego.seconds > vehicle.cars.most_gap_s:
-        return f"frames further than {vehicle.cars.most_gap_s:g} s apart"
+    if ego.seconds > vehicle.cars.max_gap_s:
+        return f"frames further than {vehicle.cars.max_gap_s:g} s apart"
     return None

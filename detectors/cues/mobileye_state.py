@@ -40,7 +40,7 @@ def state_at(
         past: How long a burst takes, and when it is too old.
     """
     newest = t_ns - round(past.settles_s * 1e9)
-    oldest = t_ns - round(past.most_age_s * 1e9)
+    oldest = t_ns - round(past.max_age_s * 1e9)
     return MobileyeState(
         _last_burst(_between(obstacles, oldest, newest), past),
         _last_lanes(_between(lanes, oldest, newest)),

@@ -28,14 +28,14 @@ class RoadShares:
     straight: float
     right: float
 
-    def positive(self, least_share: float) -> tuple[bool, bool, bool]:
-        """Left, straight and right road: more than ``least_share`` of the region (eq. 14)."""
-        return self.left > least_share, self.straight > least_share, self.right > least_share
+    def positive(self, min_fraction: float) -> tuple[bool, bool, bool]:
+        """Left, straight and right road: more than ``min_fraction`` of the region (eq. 14)."""
+        return self.left > min_fraction, self.straight > min_fraction, self.right > min_fraction
 
 
 def is_road(shares: RoadShares, vehicle: Vehicle, cue: CueSpec) -> int:
     """1 where more than the vehicle file's fraction of the cue's region is road (eq. 14)."""
-    positive = shares.positive(vehicle.cues.road_share)
+    positive = shares.positive(vehicle.cues.road_fraction)
     return int(positive[("left", "straight", "right").index(cue.supports[0])])
 
 
@@ -54,7 +54,7 @@ def region_mask(polygon: Polygon, shape: tuple[int, int]) -> NDArray[np.bool_]:
     return inside
 
 
-def road_shares(road: RoadMask, regions: Regions) -> RoadShares:
+def road_fractions(road: RoadMask, regions: Regions) -> RoadShares:
     """Road pixels over all pixels of each region (eq. 13); regions are scaled with the mask.
 
     Raises:

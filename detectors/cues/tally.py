@@ -116,7 +116,7 @@ class CueTally:
 
     def road(self, shares: RoadShares) -> None:
         """Of cues that look for road in a region."""
-        threshold = self.vehicle.cues.road_share
+        threshold = self.vehicle.cues.road_fraction
         for cue in CUES.values():
             side = cue.supports[0] if cue.supports else ""
             if cue.observed_by != "road" or side not in RoadShares.__slots__:
@@ -124,7 +124,7 @@ class CueTally:
             share: float = getattr(shares, side)
             found = [share] if share > 0.0 else []
             low = sum(one <= threshold for one in found)
-            counted = self._of(cue.name, "frames", "[cues] road_share", threshold)
+            counted = self._of(cue.name, "frames", "[cues] road_fraction", threshold)
             counted.take(found, {TOO_LITTLE_ROAD: low})
 
     def _count(

@@ -74,7 +74,9 @@ def load_network(
     suffix = PurePath(weights.name).suffix.lower()
     able = BACKENDS.get(suffix)
     if able is None:
-        raise VehicleError(f"{weights.name}: weights of a kind not known; want {sorted(BACKENDS)}")
+        raise VehicleError(
+            f"{weights.name}: weights of a kind not known; expected {sorted(BACKENDS)}"
+        )
     if suffix == ".onnx" and _EXTERNAL in weights.content:
         raise VehicleError(
             f"{weights.name}: keeps tensors in other files, which no hash covers; save it whole"

@@ -69,7 +69,7 @@ class BoxModel:
         """No finer than the network's input; the full size for tiles."""
         if self.card.tiles is not None:
             return View()
-        return View(least_width_px=self.card.input.width_px)
+        return View(min_width_px=self.card.input.width_px)
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         """Detect."""
@@ -100,10 +100,10 @@ class BoxModel:
         outputs = self.network(batch[0] if is_bare else batch)
         for i, (part, (_, placement)) in enumerate(zip(parts, given, strict=True)):
             try:
-                mine = outputs if len(parts) == 1 else _share(outputs, i, len(parts))
+                mine = outputs if len(parts) == 1 else _fraction(outputs, i, len(parts))
                 yield self._kept(mine, part, placement, frames[part.frame])
             except ValueError as error:
-                raise VehicleError(f"{self.where}: output: {error}; mend the card") from None
+                raise VehicleError(f"{self.where}: output: {error}; correct the card") from None
 
     def _kept(
         self, outputs: Mapping[str, Array], part: _Part, placement: Placement, frame: Frame
@@ -177,7 +177,7 @@ class BoxModel:
         )
 
 
-def _share(outputs: Mapping[str, Array], number: int, count: int) -> dict[str, Array]:
+def _fraction(outputs: Mapping[str, Array], number: int, count: int) -> dict[str, Array]:
     """One picture's part of a batch's outputs.
 
     Raises:

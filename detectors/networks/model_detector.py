@@ -78,7 +78,7 @@ def _tried(detector: Detector, card: ModelCard, path: Path) -> Detector:
         why = one_line(error, 200)
         raise VehicleError(
             f"{path}: the network does not run on input {size[0]} x {size[1]}, "
-            f"{card.input.layout}, {card.input.dtype}: {why}; mend [input]"
+            f"{card.input.layout}, {card.input.dtype}: {why}; correct [input]"
         ) from None
     return detector
 
@@ -101,7 +101,7 @@ class RoadModel:
     @property
     def view(self) -> View:
         """No finer than the network's input."""
-        return View(least_width_px=self.card.input.width_px)
+        return View(min_width_px=self.card.input.width_px)
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         """Segment."""
@@ -120,7 +120,7 @@ class RoadModel:
             raw = named(self.network(given), self.output.name)
             classes = class_map(raw, len(self.output.classes))
         except ValueError as error:
-            raise VehicleError(f"{self.where}: output: {error}; mend the card") from None
+            raise VehicleError(f"{self.where}: output: {error}; correct the card") from None
         names = [i for i, name in enumerate(self.output.classes) if name in self.output.road]
         if not names:
             raise VehicleError(
@@ -153,7 +153,7 @@ def class_map(raw: Array, classes: int) -> Array:
         return np.asarray(raw[0].argmax(axis=0))
     squeezed = raw.reshape([side for side in raw.shape if side != 1])
     if squeezed.ndim != 2:
-        raise ValueError(f"want (1, {classes}, h, w) or (1, h, w), got {raw.shape}")
+        raise ValueError(f"expected (1, {classes}, h, w) or (1, h, w), got {raw.shape}")
     numbers = np.asarray(squeezed, np.int64)
     if numbers.min() < 0 or numbers.max() >= classes:
         raise ValueError(f"class number {numbers.max()}, but {classes} classes are listed")

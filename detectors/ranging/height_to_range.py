@@ -74,10 +74,12 @@ def fit_range(height_px: Floats, range_m: Floats, family: Family, bin_m: float =
     model, start = _CURVES[family]
     bad = ~(np.isfinite(height_px) & np.isfinite(range_m) & (height_px > 0.0) & (range_m > 0.0))
     if bad.any():
-        raise UsageError(f"row {int(np.flatnonzero(bad)[0]) + 1}: height and range: want positive")
+        raise UsageError(
+            f"row {int(np.flatnonzero(bad)[0]) + 1}: height and range: expected positive"
+        )
     count = 1 if family == "pinhole" else 2
     if len(np.unique(height_px)) <= count:
-        raise EmptyResultError(f"{family}: want more than {count} different heights to fit it")
+        raise EmptyResultError(f"{family}: expected more than {count} different heights to fit it")
     guess = start(height_px, range_m)
     from scipy.optimize import least_squares
 

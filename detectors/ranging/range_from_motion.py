@@ -158,12 +158,12 @@ def _checked(
 ) -> _Observations:
     if travelled_m.ndim != 1 or travelled_m.shape != height_px.shape or not len(travelled_m):
         raise ValueError(
-            f"travelled_m, height_px: want (N,), got {travelled_m.shape}, {height_px.shape}"
+            f"travelled_m, height_px: expected (N,), got {travelled_m.shape}, {height_px.shape}"
         )
     if not (np.isfinite(travelled_m).all() and np.isfinite(height_px).all()):
-        raise ValueError("travelled_m, height_px: want finite numbers")
+        raise ValueError("travelled_m, height_px: expected finite numbers")
     if not ((height_px > 0.0).all() and 0.0 < focal_px < np.inf):
-        raise ValueError("height_px, focal_px: want positive numbers")
+        raise ValueError("height_px, focal_px: expected positive numbers")
     step_m = np.abs(np.diff(travelled_m))
     # Resembling the one before by exp(-step / length), each is worth tanh(step / length / 2).
     worth = np.concatenate(([1.0], np.tanh(0.5 * step_m / errors.resemble_m)))

@@ -34,7 +34,7 @@ _SAME_SIGN: Final = 0.5
 
 
 class SignSettings(Settings):
-    """Numbers of the search; ``crosscue fit signs`` chooses ``least_score``."""
+    """Numbers of the search; ``crosscue fit signs`` chooses ``min_score``."""
 
     kinds: tuple[Kind, ...] = AMERICAN
     """The international disc has few corners and needs a threshold of its own: search it alone."""
@@ -58,13 +58,13 @@ class SignSettings(Settings):
     """Fraction of the picture without signs above."""
     crop_bottom: Proportion = 0.25
     """And below."""
-    most_bits: Annotated[int, Field(ge=1, le=256)] = 64
+    max_bits: Annotated[int, Field(ge=1, le=256)] = 64
     """Two points are alike only if their descriptors differ in fewer bits of 256."""
-    least_votes: Annotated[int, Field(ge=2)] = 4
+    min_votes: Annotated[int, Field(ge=2)] = 4
     """Different points that must agree."""
-    least_share: Proportion = 0.25
+    min_fraction: Proportion = 0.25
     """And the fraction of the drawing's points that they must be."""
-    least_score: Proportion = 0.065
+    min_score: Proportion = 0.065
     """For precision 0.95 on simulated layouts L800 to L838; one's own camera wants its own."""
     overlap: Proportion = 0.2
     """Of two signs that overlap more, the better stays."""
@@ -180,7 +180,7 @@ class SignDetector:
             scale = self.settings.enlarge / self.settings.factor**level
             candidates += self._level(grey, scale)
         best = _apart(candidates, self.settings.overlap)
-        kept = [one for one in best if one[0] >= self.settings.least_score]
+        kept = [one for one in best if one[0] >= self.settings.min_score]
         stretch = np.tile(np.array(frame.scale), 2)
         boxes = np.array([box for _, _, box in kept], np.float64).reshape(-1, 4)
         boxes = (boxes + np.array([0, top, 0, top])) * stretch
@@ -203,7 +203,7 @@ class SignDetector:
             self.gallery.points.words,
             self.gallery.first,
             self.settings.ratio,
-            self.settings.most_bits,
+            self.settings.max_bits,
         )
         found: list[tuple[float, Kind, Floats]] = []
         for k, drawing in enumerate(self.gallery.drawn):
@@ -230,7 +230,7 @@ class SignDetector:
         rows, columns = shape[0] // _CELL_PX + 1, shape[1] // _CELL_PX + 1
         cells = np.floor(votes / _CELL_PX).astype(np.int64)
         counts = window_counts(cells, at, rows, columns, reach)
-        least = max(self.settings.least_share * points_drawn, self.settings.least_votes)
+        least = max(self.settings.min_fraction * points_drawn, self.settings.min_votes)
         if counts.max(initial=0) < least:
             return []
         half = np.array(drawing.size_px) / 2.0

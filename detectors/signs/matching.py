@@ -44,7 +44,7 @@ def _keys(point: Words, a: Words, b: Words, c: Words, d: Words, keys: Words) -> 
 
 
 @njit(cache=True)
-def _least_above(keys: Words, floor: np.uint64) -> np.uint64:
+def _min_above(keys: Words, floor: np.uint64) -> np.uint64:
     least = _NONE
     for j in range(keys.size):
         least = min(least, keys[j] if keys[j] > floor else _NONE)
@@ -84,7 +84,7 @@ def nearest(points: Words, drawn: Words, first: Int64s, ratio: float, most: int)
             best = _least(of_drawing)
             bits = np.int64(best >> _BITS_AT)
             if bits <= most:
-                second = np.int64(_least_above(of_drawing, best) >> _BITS_AT)
+                second = np.int64(_min_above(of_drawing, best) >> _BITS_AT)
                 if bits < ratio * second:
                     found[k, i] = np.int64(best & _PLACE)
     return found

@@ -55,7 +55,7 @@ def draw(kind: Kind, height_px: int) -> Drawing:
         ValueError: Too small to show anything, or larger than the largest file.
     """
     if not 16 <= height_px <= FILES_PX[-1]:
-        raise ValueError(f"height_px: want 16 to {FILES_PX[-1]}, got {height_px}")
+        raise ValueError(f"height_px: expected 16 to {FILES_PX[-1]}, got {height_px}")
     import cv2
 
     size = size_of(kind, height_px)

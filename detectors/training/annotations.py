@@ -132,18 +132,18 @@ def _tree(path: Path) -> Mapping[str, Any]:
             raise AnnotationError(f"{path}: more than {MAX_BYTES:,} bytes of annotations; split it")
         tree = json_tree(content)
     except OSError as error:
-        raise AnnotationError(f"{path}: {error.strerror}; want a COCO file") from None
+        raise AnnotationError(f"{path}: {error.strerror}; expected a COCO file") from None
     except ValueError as error:
-        raise AnnotationError(f"{path}: no JSON ({error}); want a COCO file") from None
+        raise AnnotationError(f"{path}: no JSON ({error}); expected a COCO file") from None
     if not isinstance(tree, dict):
-        raise AnnotationError(f"{path}: want a COCO file: images, annotations and categories")
+        raise AnnotationError(f"{path}: expected a COCO file: images, annotations and categories")
     return tree
 
 
 def _rows(tree: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
     rows = tree.get(key)
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise AnnotationError(f"{path}: {key}: want a list of objects, as COCO files have")
+        raise AnnotationError(f"{path}: {key}: expected a list of objects, as COCO files have")
     return rows
 
 

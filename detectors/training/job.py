@@ -148,7 +148,7 @@ def _check_place(job: Job, overwrite: bool) -> None:
     for path in (job.state_path, job.output):
         if path.exists() and not overwrite:
             how = "--resume goes on with it, " if path == job.state_path else ""
-            raise OutputError(f"{path}: exists; {how}--overwrite begins anew")
+            raise OutputError(f"{path}: exists; {how}--overwrite starts over")
     job.state_path.unlink(missing_ok=True)
 
 

@@ -145,7 +145,7 @@ class Training:
         if self._bad >= BAD_STEPS:
             raise CrosscueError(
                 f"step {self.done}: {BAD_STEPS} losses in a row are not finite; "
-                "lower --learning-rate and begin anew"
+                "lower --learning-rate and start over"
             )
 
     @torch.no_grad()
@@ -227,7 +227,7 @@ class Training:
             self._optimizer.load_state_dict({**whole, "state": state})
         except (RuntimeError, ValueError, KeyError) as error:
             why = one_line(error, 120)
-            raise SchemaError(f"{path}: does not fit this network ({why}); begin anew") from None
+            raise SchemaError(f"{path}: does not fit this network ({why}); start over") from None
 
 
 def _groups(network: Any, decay: float) -> list[dict[str, Any]]:

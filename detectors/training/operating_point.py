@@ -55,8 +55,8 @@ def judge(
     boxes_px: Floats,
     scores: Floats,
     truth_px: Floats,
-    least_overlap: float,
-    least_height_px: float = 0.0,
+    min_overlap: float,
+    min_height_px: float = 0.0,
 ) -> Judged:
     """Which detections of one frame are right: each true sign counts once, the best first.
 
@@ -64,8 +64,8 @@ def judge(
         boxes_px: Shape (N, 4).
         scores: Shape (N,).
         truth_px: Shape (M, 4): boxes of the true signs.
-        least_overlap: Intersection over union that makes a detection right.
-        least_height_px: True signs that are lower do not count, whether they are found or not.
+        min_overlap: Intersection over union that makes a detection right.
+        min_height_px: True signs that are lower do not count, whether they are found or not.
     """
     heights = truth_px[:, 3] - truth_px[:, 1]
     order = np.argsort(-scores, kind="stable")
@@ -73,13 +73,13 @@ def judge(
     left = set(range(len(truth_px)))
     for i in order.tolist():
         shares = overlaps(boxes_px[i], truth_px) if len(truth_px) else np.empty(0)
-        fits = [k for k in left if shares[k] >= least_overlap]
+        fits = [k for k in left if shares[k] >= min_overlap]
         if fits:
             taken = max(fits, key=lambda k: float(shares[k]))
             left.remove(taken)
             is_right[i] = True
-            counts[i] = heights[taken] >= least_height_px
-    return Judged(scores[counts], is_right[counts], int((heights >= least_height_px).sum()))
+            counts[i] = heights[taken] >= min_height_px
+    return Judged(scores[counts], is_right[counts], int((heights >= min_height_px).sum()))
 
 
 def together(parts: list[Judged]) -> Judged:

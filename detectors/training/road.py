@@ -34,7 +34,7 @@ from crosscue.replay.base import (
 from crosscue.replay.files.made_of import NOTHING, refuse_another
 
 STATE_KEY: Final = "crosscue_road_training"
-MOST_BYTES: Final = 1024 * MIB
+MAX_BYTES: Final = 1024 * MIB
 """Of a state; the network and its moments take a few."""
 EDGE_WEIGHT: Final = 6.0
 EDGE_PX: Final = 9
@@ -148,9 +148,9 @@ class RoadTraining:
         from safetensors.torch import load
 
         try:
-            content = read_at_most(path, MOST_BYTES)
+            content = read_at_most(path, MAX_BYTES)
             if content is None:
-                raise ValueError(f"over {MOST_BYTES} bytes")
+                raise ValueError(f"over {MAX_BYTES} bytes")
             tensors = load(content)
             size = int.from_bytes(content[:8], "little")
             state = json_tree(json_tree(content[8 : 8 + size])["__metadata__"][STATE_KEY])
@@ -159,7 +159,7 @@ class RoadTraining:
             self._fill(tensors)
         except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
             why = one_line(error, 120)
-            raise SchemaError(f"{path}: cannot go on from it ({why}); begin anew") from None
+            raise SchemaError(f"{path}: cannot go on from it ({why}); start over") from None
         if seed != self.schedule.seed:
             raise UsageError(f"{path}: of seed {seed}, not {self.schedule.seed}; give that --seed")
         self.done = done

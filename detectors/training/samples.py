@@ -83,8 +83,9 @@ def read_picture(picture: LabelledPicture) -> Bytes:
     if size != picture.size_px:
         width, height = picture.size_px
         raise SchemaError(
-            f"{picture.path}: want a picture of {width} x {height}, as its annotations say, got "
-            f"{size[0]} x {size[1]}; mend the file or leave it out of the annotations"
+            f"{picture.path}: expected a picture of {width} x {height}, as its "
+            f"annotations say, got {size[0]} x {size[1]}; repair the file or leave it out of the "
+            "annotations"
         )
     return pixels
 

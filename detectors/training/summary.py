@@ -47,11 +47,11 @@ def _key(kind: str, name: str, column: str) -> str:
 
 
 def _rates_line(name: str, score: float, at: Rates) -> str:
-    precision, recall = _share(at.right, at.found), _share(at.right, at.signs)
+    precision, recall = _fraction(at.right, at.found), _fraction(at.right, at.signs)
     return f"{name:14} score from {score:<4}  precision {precision}  recall {recall}"
 
 
-def _share(right: int, of: int) -> str:
+def _fraction(right: int, of: int) -> str:
     return f"{100.0 * right / of:5.1f} % ({right} of {of})" if of else "none (0 of 0)"
 
 

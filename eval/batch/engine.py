@@ -14,7 +14,7 @@ def engine_of(workers: int | None, ray: str | None) -> Engine:
         UsageError: Too few workers.
     """
     if workers is not None and workers < 1:
-        raise UsageError(f"--workers {workers}: want 1 or more")
+        raise UsageError(f"--workers {workers}: expected 1 or more")
     if ray is not None:
         from crosscue.eval.batch.ray_jobs import OnRay
 

@@ -60,7 +60,7 @@ class Processes:
             ValueError: Naming the count.
         """
         if min(self.workers, self.attempts, self.threads or 1) < 1:
-            raise ValueError(f"want counts of 1 or more, got {self}")
+            raise ValueError(f"expected counts of 1 or more, got {self}")
 
     def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
         """Work; see ``many_drives.Engine``."""

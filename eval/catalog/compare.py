@@ -68,11 +68,11 @@ class Tolerance(NamedTuple):
 
     pattern: str
     by: float
-    is_share: bool
+    is_fraction: bool
 
     def allowed(self, before: float) -> float:
         """In the metric's own unit."""
-        return self.by * abs(before) if self.is_share else self.by
+        return self.by * abs(before) if self.is_fraction else self.by
 
 
 NONE: Final = Tolerance("*", 0.0, False)
@@ -187,16 +187,17 @@ def read_tolerance(text: str) -> Tolerance:
         UsageError: Neither.
     """
     pattern, _, number = text.rpartition("=")
-    is_share = number.endswith("%")
+    is_fraction = number.endswith("%")
     try:
-        by = float(number.removesuffix("%")) / (100.0 if is_share else 1.0)
+        by = float(number.removesuffix("%")) / (100.0 if is_fraction else 1.0)
     except ValueError:
         by = math.nan
     if not (math.isfinite(by) and by >= 0.0):
         raise UsageError(
-            f"--tolerance {text}: want 0.01, 2% or PATTERN=0.01, such as 'cues.*.precision=0.02'"
+            f"--tolerance {text}: expected 0.01, 2% or PATTERN=0.01, such as "
+            "'cues.*.precision=0.02'"
         )
-    return Tolerance(pattern or "*", by, is_share)
+    return Tolerance(pattern or "*", by, is_fraction)
 
 
 def compare_runs(
@@ -295,7 +296,7 @@ def _tree_of(path: Path) -> dict[str, Any]:
             f"{path}: unreadable ({error}); run crosscue score again"
         ) from None
     if not isinstance(tree, dict):
-        raise UnreadableRunError(f"{path}: want an object; run crosscue score again")
+        raise UnreadableRunError(f"{path}: expected an object; run crosscue score again")
     return tree
 
 

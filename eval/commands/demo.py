@@ -93,7 +93,7 @@ def _simulated(args: argparse.Namespace, folder: Path) -> crosscue.KnownDrive:
         raise UsageError("--data: for a real drive; add --real")
     width = 1280 if args.width is None else args.width
     if not 64 <= width <= 3840 or width % 16:
-        raise UsageError(f"--width {width}: want a multiple of 16 from 64 to 3840")
+        raise UsageError(f"--width {width}: expected a multiple of 16 from 64 to 3840")
     talk = not (args.quiet or args.json)
     layout = args.layout or "C"
     if talk:

@@ -96,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Replay; 3 when something was dropped."""
     if args.draw < 0:
-        raise UsageError(f"--draw {args.draw}: want 0 or more")
+        raise UsageError(f"--draw {args.draw}: expected 0 or more")
     drives = drives_of(args.logs, each=args.each)
     if drives.is_many:
         return _run_many(args, drives)

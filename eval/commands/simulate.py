@@ -126,6 +126,6 @@ def _wanted(args: argparse.Namespace) -> tuple[Sequence[str], Sequence[int]]:
         raise UsageError("--run: not together with --runs or --all; give one of them")
     last = args.runs if args.runs is not None else PUBLISHED_RUNS if args.all else 1
     if last < 1:
-        raise UsageError(f"--runs {last}: want 1 or more")
+        raise UsageError(f"--runs {last}: expected 1 or more")
     runs = [args.run] if args.run is not None else list(range(1, last + 1))
     return list(SCORED) if args.all else args.layouts, runs

@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write drive.rrd into the run, or where asked, and open it; 3 when the run has drops."""
     if args.output is not None and args.output.suffix != ".rrd":
-        raise UsageError(f"{args.output}: want a name that ends in .rrd")
+        raise UsageError(f"{args.output}: expected a name that ends in .rrd")
     refuse_existing(args)
     made = crosscue.open_run(
         args.run, args.logs, without_images=args.without_images, limits=limits_of(args)

@@ -271,8 +271,9 @@ def read_coordinates(path: Path, source: str) -> Iterator[tuple[str, Place]]:
             missing = _PLACE_COLUMNS - known
             if missing or not ("sd_m" in known or known.issuperset(_COV_COLUMNS)):
                 raise AnnotationError(
-                    f"{path}:1: want columns image,x_m,y_m,sd_m (or {','.join(_COV_COLUMNS)} for "
-                    f"sd_m), got {','.join(rows.fieldnames or ())}; mend the header"
+                    f"{path}:1: expected columns image,x_m,y_m,sd_m (or "
+                    f"{','.join(_COV_COLUMNS)} for sd_m), "
+                    f"got {','.join(rows.fieldnames or ())}; correct the header"
                 )
             for row in rows:
                 yield str(row["image"]), _place_of(row, f"{path}:{rows.line_num}", source)
@@ -289,14 +290,16 @@ def _place_of(row: dict[str, str], where: str, source: str) -> Place:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise AnnotationError(f"{where}: {column}: want a finite number, got {text!r}; mend it")
+            raise AnnotationError(
+                f"{where}: {column}: expected a finite number, got {text!r}; correct it"
+            )
         return value
 
     xy_m = np.array([number("x_m"), number("y_m")])
     if row.get("sd_m"):
         sd_m = number("sd_m")
         if not sd_m > 0.0:
-            raise AnnotationError(f"{where}: sd_m: want > 0, got {sd_m}; mend it")
+            raise AnnotationError(f"{where}: sd_m: expected > 0, got {sd_m}; correct it")
         cov = sd_m**2 * np.eye(2)
     else:
         xx, xy, yy = (number(column) for column in _COV_COLUMNS)
@@ -305,7 +308,7 @@ def _place_of(row: dict[str, str], where: str, source: str) -> Place:
     try:
         return Place(f"{source}/{row['image']}", xy_m, cov, heading, source)
     except ValueError as error:
-        raise AnnotationError(f"{where}: {error}; mend it") from None
+        raise AnnotationError(f"{where}: {error}; correct it") from None
 
 
 def near_of(text: str | None) -> tuple[Floats, float] | None:
@@ -321,5 +324,7 @@ def near_of(text: str | None) -> tuple[Floats, float] | None:
     except ValueError:
         x = y = radius = math.nan
     if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(radius) and radius >= 0.0):
-        raise UsageError(f"--near {text}: want x,y,radius in metres, such as --near=-12.5,80,50")
+        raise UsageError(
+            f"--near {text}: expected x,y,radius in metres, such as --near=-12.5,80,50"
+        )
     return np.array([x, y]), radius

@@ -60,13 +60,15 @@ def _labelled(path: Path) -> Iterator[tuple[str, str, bool]]:
         with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
             table = csv.DictReader(file)
             if not {"query", "known", "same"} <= set(table.fieldnames or ()):
-                raise AnnotationError(f"{path}:1: want columns query,known,same; mend the header")
+                raise AnnotationError(
+                    f"{path}:1: expected columns query,known,same; correct the header"
+                )
             for row in table:
                 label = _LABELS.get(str(row["same"]).strip().lower())
                 if label is None or table.line_num > MAX_PAIRS:
                     raise AnnotationError(
-                        f"{path}:{table.line_num}: same: want 1 or 0 (and at most {MAX_PAIRS:,} "
-                        f"lines), got {row['same']!r}; mend it"
+                        f"{path}:{table.line_num}: same: expected 1 or 0 (and at most "
+                        f"{MAX_PAIRS:,} lines), got {row['same']!r}; correct it"
                     )
                 yield str(row["query"]), str(row["known"]), label
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -82,7 +84,7 @@ def pairs_of_drive(
     every_m: float,
     near_m: float,
     far_m: float,
-    most_per_frame: int,
+    max_per_frame: int,
     ledgers: Sequence[Ledger],
 ) -> ScoredPairs:
     """Frames with known poses against landmarks: near ones show the same place, far ones do not.
@@ -95,7 +97,7 @@ def pairs_of_drive(
         every_m: Distance between frames that are taken.
         near_m: Same place below, and looking the same way.
         far_m: Another place above; what lies between is not judged.
-        most_per_frame: Landmarks compared with one frame: all near ones first, then far ones drawn
+        max_per_frame: Landmarks compared with one frame: all near ones first, then far ones drawn
             with a fixed seed.
         ledgers: Of all logs; pictures that do not decode are dropped in the camera's.
     """
@@ -120,7 +122,7 @@ def pairs_of_drive(
             if metres <= near_m and _looks_along(marks[i], place.heading_rad)
         ]
         other = [i for i, metres in enumerate(apart) if metres >= far_m]
-        drawn = rng.permutation(other)[: max(most_per_frame - len(same), 0)].tolist()
+        drawn = rng.permutation(other)[: max(max_per_frame - len(same), 0)].tolist()
         for i in (*same, *drawn):
             match = matcher.match(seen, database.features(marks[i].key))
             rows.append((match.score, i in same, number))

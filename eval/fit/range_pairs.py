@@ -60,11 +60,11 @@ def pairs_of_table(path: Path) -> RangePairs:
         ) from None
     except UnicodeDecodeError:
         raise AnnotationError(
-            f"{path}: is no text; give a table (CSV or .parquet) with height_px and range_m"
+            f"{path}: is not text; give a table (CSV or .parquet) with height_px and range_m"
         ) from None
     except (KeyError, ValueError):
         raise AnnotationError(
-            f"{path}: want the columns height_px and range_m, all numbers"
+            f"{path}: expected the columns height_px and range_m, all numbers"
         ) from None
     return RangePairs(*columns)
 

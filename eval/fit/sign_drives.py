@@ -56,7 +56,7 @@ def _boxes(path: Path) -> dict[int, Boxes]:
         ) from None
     except UnicodeDecodeError:
         raise AnnotationError(
-            f"{path}: is no text; labels of a drive's signs stand there"
+            f"{path}: is not text; labels of a drive's signs stand there"
         ) from None
     found: dict[int, Boxes] = {}
     for image, boxes in coco_boxes(text, path):

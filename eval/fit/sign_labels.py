@@ -53,7 +53,7 @@ def _text(path: Path) -> str:
     except OSError as error:
         raise AnnotationError(f"{path}: {error.strerror}; {_WANTED}") from None
     except UnicodeDecodeError:
-        raise AnnotationError(f"{path}: is no text; {_WANTED}") from None
+        raise AnnotationError(f"{path}: is not text; {_WANTED}") from None
 
 
 def _of_coco(text: str, path: Path) -> list[Labelled]:
@@ -64,7 +64,7 @@ def _of_coco(text: str, path: Path) -> list[Labelled]:
             place = path.parent / image["file_name"]
             place = place if place.exists() else path.parent / "images" / image["file_name"]
         except (KeyError, TypeError) as error:
-            raise AnnotationError(f"{path}: no COCO file ({error!r}); mend it") from None
+            raise AnnotationError(f"{path}: no COCO file ({error!r}); correct it") from None
         found.append(Labelled(str(place), place, boxes))
     return found
 
@@ -85,10 +85,12 @@ def coco_boxes(text: str, path: Path) -> list[tuple[dict[str, Any], Boxes]]:
             x, y, wide, high = (float(number) for number in one["bbox"])
             box = (x, y, x + wide, y + high)
             if not all(map(math.isfinite, box)) or wide <= 0.0 or high <= 0.0:
-                raise AnnotationError(f"{path}: annotation {one['id']}: box {box}: want a real one")
+                raise AnnotationError(
+                    f"{path}: annotation {one['id']}: box {box}: expected a real one"
+                )
             found[one["image_id"]][1].setdefault(names[one["category_id"]], []).append(box)
     except (ValueError, KeyError, TypeError) as error:
-        raise AnnotationError(f"{path}: no COCO file ({error!r}); mend it") from None
+        raise AnnotationError(f"{path}: no COCO file ({error!r}); correct it") from None
     if not found:
         raise EmptyResultError(f"{path}: no picture in it; add some")
     return [found[number] for number in sorted(found)]
@@ -97,7 +99,7 @@ def coco_boxes(text: str, path: Path) -> list[tuple[dict[str, Any], Boxes]]:
 def _of_csv(text: str, path: Path) -> list[Labelled]:
     reader = csv.DictReader(text.splitlines())
     if reader.fieldnames is None or set(COLUMNS) - set(reader.fieldnames):
-        raise AnnotationError(f"{path}:1: want the columns {','.join(COLUMNS)}")
+        raise AnnotationError(f"{path}:1: expected the columns {','.join(COLUMNS)}")
     found: dict[str, Labelled] = {}
     for row in reader:
         where = f"{path}:{reader.line_num}"
@@ -115,7 +117,7 @@ def _box(row: dict[str, str], where: str) -> tuple[float, float, float, float]:
     try:
         x0, y0, x1, y1 = (float(row[name]) for name in COLUMNS[2:])
     except (TypeError, ValueError):
-        raise AnnotationError(f"{where}: want four numbers x0,y0,x1,y1") from None
+        raise AnnotationError(f"{where}: expected four numbers x0,y0,x1,y1") from None
     if not all(map(math.isfinite, (x0, y0, x1, y1))) or x0 >= x1 or y0 >= y1:
-        raise AnnotationError(f"{where}: box {x0}, {y0}, {x1}, {y1}: want x0 < x1 and y0 < y1")
+        raise AnnotationError(f"{where}: box {x0}, {y0}, {x1}, {y1}: expected x0 < x1 and y0 < y1")
     return x0, y0, x1, y1

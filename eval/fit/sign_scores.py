@@ -24,18 +24,18 @@ class Rules:
 
     Attributes:
         labels: The signs to find.
-        least_overlap: With the true box (intersection over union).
-        least_height_px: True signs that are lower do not count.
+        min_overlap: With the true box (intersection over union).
+        min_height_px: True signs that are lower do not count.
     """
 
     labels: Sequence[str]
-    least_overlap: float
-    least_height_px: float = 0.0
+    min_overlap: float
+    min_height_px: float = 0.0
 
     @property
     def of_judge(self) -> tuple[float, float]:
         """As ``judge`` takes them."""
-        return self.least_overlap, self.least_height_px
+        return self.min_overlap, self.min_height_px
 
 
 def judged_pictures(
@@ -79,7 +79,9 @@ def _judged(one: Labelled, detector: Detector, rules: Rules) -> Judged:
     for label in rules.labels:
         truth: Floats = np.array(one.boxes.get(label, []), np.float64).reshape(-1, 4)
         if len(truth) and (truth.min() < -1 or (truth[:, 2:] > (width + 1, height + 1)).any()):
-            raise UsageError(f"{one.name}: a box lies outside its {width} x {height} px; mend it")
+            raise UsageError(
+                f"{one.name}: a box lies outside its {width} x {height} px; correct it"
+            )
         which = np.array([name == label for name in found.labels], np.bool_)
         parts.append(judge(found.boxes_px[which], found.scores[which], truth, *rules.of_judge))
     return together(parts)

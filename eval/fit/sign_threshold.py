@@ -38,7 +38,7 @@ class SignFit:
     """A threshold, and what pictures say of any.
 
     Attributes:
-        threshold: For ``least_score``; None where none is precise enough.
+        threshold: For ``min_score``; None where none is precise enough.
         chosen_on: What the pictures say that chose it, a part for each file or drive.
         others: The same of the pictures that measure it.
     """
@@ -52,15 +52,15 @@ class SignFit:
         parts = self.others if on_others else self.chosen_on
         counts = [rates_at(part, threshold) for part in parts]
         return SignRates(
-            _share([(one.right, one.found) for one in counts]),
-            _share([(one.right, one.signs) for one in counts]),
+            _fraction([(one.right, one.found) for one in counts]),
+            _fraction([(one.right, one.signs) for one in counts]),
         )
 
     def __repr__(self) -> str:
         if self.threshold is None:
             signs = sum(part.signs for part in self.chosen_on)
             return f"no threshold is precise enough on {signs} signs"
-        lines = [f"least_score = {self.threshold:g}"]
+        lines = [f"min_score = {self.threshold:g}"]
         for name, on_others in (("chosen on", False), ("other frames", True)):
             rates = self.rates(self.threshold, on_others=on_others)
             lines.append(f"{name:13} {_proportion_text('precision', rates.precision)}")
@@ -116,7 +116,7 @@ def fit_signs(
     _check(precision, overlap, test_every, threshold, kinds)
     detector = build(
         kinds=tuple(kinds),
-        least_score=LOWEST,
+        min_score=LOWEST,
         crop_top=crop_top,
         crop_bottom=crop_bottom,
         enlarge=enlarge,
@@ -147,11 +147,11 @@ def _check(
 ) -> None:
     for name, value in (("precision", precision), ("overlap", overlap)):
         if not 0.0 < value <= 1.0:
-            raise UsageError(f"--{name} {value}: want above 0, at most 1")
+            raise UsageError(f"--{name} {value}: expected above 0, at most 1")
     if every < 1:
-        raise UsageError(f"--test-every {every}: want 1 or more")
+        raise UsageError(f"--test-every {every}: expected 1 or more")
     if threshold is not None and not LOWEST <= threshold <= 1.0:
-        raise UsageError(f"--threshold {threshold}: want {LOWEST} to 1")
+        raise UsageError(f"--threshold {threshold}: expected {LOWEST} to 1")
     for kind in kinds:
         if kind not in KINDS:
             raise UsageError(f"--kinds {kind}: no such drawing; there are: {', '.join(KINDS)}")
@@ -162,7 +162,7 @@ def _shown(score: float | None) -> float | None:
     return None if score is None else math.floor(score * 1e6) / 1e6
 
 
-def _share(counts: Sequence[tuple[int, int]]) -> Proportion:
+def _fraction(counts: Sequence[tuple[int, int]]) -> Proportion:
     is_right = [np.arange(of) < right for right, of in counts]
     which = np.repeat(np.arange(len(counts)), [of for _, of in counts])
     return share(np.concatenate(is_right), which)

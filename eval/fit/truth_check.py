@@ -233,7 +233,7 @@ def _parts(truth: Truth) -> Iterator[tuple[str, int, int]]:
 def _check_overlap(what: str, t_ns: np.typing.NDArray[np.int64], truth: Truth, path: Path) -> None:
     if not ((t_ns >= truth.start_ns - SLACK_NS) & (t_ns < truth.end_ns + SLACK_NS)).any():
         raise SchemaError(
-            f"{what} from {t_ns.min()} to {t_ns.max()} ns, but {path} speaks of {truth.start_ns} "
+            f"{what} from {t_ns.min()} to {t_ns.max()} ns, but {path} covers {truth.start_ns} "
             f"to {truth.end_ns} ns; it belongs to another log"
         )
 
@@ -258,7 +258,7 @@ def read_annotations(path: Path) -> Annotations:
         return read_coco(path)
     if suffix == ".xml":
         return read_cvat(path)
-    raise UsageError(f"{path}: want a COCO .json or a CVAT .xml file")
+    raise UsageError(f"{path}: expected a COCO .json or a CVAT .xml file")
 
 
 def import_truth(

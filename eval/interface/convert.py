@@ -169,7 +169,7 @@ def convert(
 
 def _check_output(output: Path, log: str) -> None:
     if output.suffix.lower() != ".mcap":
-        raise UsageError(f"{output}: want a name that ends in .mcap")
+        raise UsageError(f"{output}: expected a name that ends in .mcap")
     if output.exists() and Path(log).exists() and output.samefile(log):
         raise UsageError(f"{output}: is the log itself; give another name")
     if seal_path(output).exists():

@@ -423,7 +423,7 @@ def save_recording(
     folder = _run(run).folder
     path = folder.file("drive.rrd") if output is None else Path(output)
     if path.suffix != ".rrd":
-        raise UsageError(f"{path}: want a name that ends in .rrd")
+        raise UsageError(f"{path}: expected a name that ends in .rrd")
     track = ranges = None
     if truth is not None:
         known = load_truth(Path(truth), str(folder.path))
@@ -467,7 +467,7 @@ def _copied(folder: RunFolder, output: Path) -> RunFolder:
     """The run in a new place, for other estimates beside it."""
     if output.resolve().parent != folder.path.resolve().parent:
         # Its manifest holds where its logs are, as seen from the folder.
-        raise UsageError(f"{output}: want a folder beside the run, {folder.path}")
+        raise UsageError(f"{output}: expected a folder beside the run, {folder.path}")
     if output.exists():
         raise OutputError(f"{output}: exists; give another folder")
     shutil.copytree(folder.path, output, ignore=shutil.ignore_patterns("score", ".*"))

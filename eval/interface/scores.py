@@ -199,7 +199,7 @@ def score_runs(
     if gates is not None and len(paths) > 1 and folder is None:
         raise UsageError("score: several runs and --gate: say with -o DIR where junit.xml goes")
     if workers < 1:
-        raise UsageError(f"--workers {workers}: want 1 or more")
+        raise UsageError(f"--workers {workers}: expected 1 or more")
     try:
         settings = ScoreSettings(threshold=threshold)
     except ValueError as error:

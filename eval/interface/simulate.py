@@ -107,7 +107,7 @@ def simulate_approaches(
     from crosscue.replay.processes import in_processes
 
     if workers < 1:
-        raise UsageError(f"--workers {workers}: want 1 or more")
+        raise UsageError(f"--workers {workers}: expected 1 or more")
     wanted, place = _scenes(layouts, runs, seed, width_px, rate_hz), Path(folder)
     for settings in wanted if overwrite else ():
         refuse_other_drive(place / settings.name, settings)

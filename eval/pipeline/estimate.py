@@ -396,4 +396,4 @@ def _no_scene(found: DetectManifest | None, reading: _Reading) -> list[str]:
         return []
     if not reading.has_camera:
         return ["no camera in the logs, so no cue and no belief"]
-    return ["no detector has looked at the camera, so no cue and no belief; name some"]
+    return ["no detector ran on the camera, so no cue and no belief; name some"]

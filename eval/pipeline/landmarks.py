@@ -28,7 +28,7 @@ def landmark_settings(vehicle: Vehicle) -> LandmarkSettings:
     return LandmarkSettings(
         min_score=section.min_score,
         sigmas=section.sigmas,
-        most_candidates=section.most_candidates,
+        max_candidates=section.max_candidates,
         gate_nis=section.gate_nis,
         interval_m=section.interval_m,
         revisit_m=section.revisit_m,

@@ -284,10 +284,10 @@ class _Choice:
     def _is_able(self, one: Track) -> bool:
         settings = self.vehicle.range_filter
         sd_m = math.sqrt(one.var_m2)
-        if one.seen < settings.begin_after or sd_m > settings.most_sd_m:
+        if one.seen < settings.begin_after or sd_m > settings.max_sd_m:
             return False
-        if one.range_m > settings.most_m or one.number == self.chosen:
-            return one.range_m <= settings.most_m
+        if one.range_m > settings.max_m or one.number == self.chosen:
+            return one.range_m <= settings.max_m
         held = self._held
         if held is None or one.seen >= held.seen:
             return True

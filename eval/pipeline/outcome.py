@@ -251,7 +251,7 @@ def _ledgers(outcome: Outcome) -> list[Ledger]:
 def _detected(outcome: Outcome) -> list[str]:
     assert outcome.detected is not None
     counts = outcome.detected.counts
-    lines = [f"frames   {counts.frames:,} looked at"]
+    lines = [f"frames   {counts.frames:,} examined"]
     for name, ran in counts.ran.items():
         lines.append(f"         {name}: ran on {ran:,}, {counts.from_cache[name]:,} from the cache")
     return lines
@@ -281,6 +281,6 @@ def _approach(one: ApproachSummary) -> str:
 def _landmarks(counts: dict[str, int]) -> str:
     looked = counts["frames"] - counts["thinned"] - counts["late"]
     return (
-        f"{counts['accepted']} landmarks weighed in, {counts['gated']} refused by the gate; "
-        f"{counts['matched']} of {looked} frames looked at matched one"
+        f"{counts['accepted']} landmarks used, {counts['gated']} rejected by the gate; "
+        f"{counts['matched']} of {looked} frames examined matched one"
     )

@@ -176,7 +176,7 @@ class PoseStage:
         if not judged or counts.headings_rejected <= REJECTED_SHARE * judged:
             return []
         return [
-            f"{counts.headings_rejected} of {judged} compass readings were refused by the gate: "
+            f"{counts.headings_rejected} of {judged} compass readings were rejected by the gate: "
             "compass or odometry err more than the vehicle file says; fit the compass, or raise "
             "heading_sd_rad and the odometry's noise"
         ]
@@ -350,7 +350,7 @@ def estimating_of(stage: PoseStage, frames: tuple[int, int] | None) -> dict[str,
             track.headings_accepted + stage.started_with,
             {
                 "too soon after the last one used": track.headings_thinned,
-                "refused by the gate": track.headings_rejected,
+                "rejected by the gate": track.headings_rejected,
                 "earlier than the estimate": track.headings_late,
                 "not finite": track.headings_bad,
                 "after the last wheel speeds": stage.waiting,

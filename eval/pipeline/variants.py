@@ -34,7 +34,7 @@ def scene_tables(
     manifest = run.drive_manifest()
     detected = manifest.detected
     if detected is None:
-        raise RunError(f"{run.path}: no detector has looked at its camera; replay with detectors")
+        raise RunError(f"{run.path}: no detector ran on its camera; replay with detectors")
     settings = manifest.settings if vehicle is None else vehicle
     wanted = schemas(features_of(settings), gives_reasons=gives_reasons(settings))
     parts: dict[str, list[pa.Table]] = {

@@ -24,7 +24,7 @@ from crosscue.detectors.cues.cars import (
     pair_cars,
     parked_cars,
 )
-from crosscue.detectors.cues.road import RoadShares, road_shares
+from crosscue.detectors.cues.road import RoadShares, road_fractions
 from crosscue.eval.runs.tables.stored_frames import StoredFrame
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -122,8 +122,8 @@ class Marks:
         """Polygons, green where there is road; none where no detector looks for road."""
         if road is None:
             return
-        shares = road_shares(road, self.vehicle.regions) if isinstance(road, RoadMask) else road
-        positive = shares.positive(self.vehicle.cues.road_share)
+        shares = road_fractions(road, self.vehicle.regions) if isinstance(road, RoadMask) else road
+        positive = shares.positive(self.vehicle.cues.road_fraction)
         for side, is_road in zip(SIDES, positive, strict=True):
             corners = np.array(getattr(self.vehicle.regions, side)) * size_px
             colour = REGION_WITH_ROAD if is_road else REGION

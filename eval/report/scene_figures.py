@@ -258,7 +258,7 @@ def draw_range(
     far = max(10.0, max(float(one.true_m.max()) for one in rows))
     near = min(0.0, min(float(one.true_m.min()) for one in rows))
     above = Panel(40, 46, WIDTH - 50, 130, (far, near), (-most, most))
-    below = Panel(40, above.bottom + 62, WIDTH - 50, 80, (far, near), (0.0, _most_nees(scores)))
+    below = Panel(40, above.bottom + 62, WIDTH - 50, 80, (far, near), (0.0, _max_nees(scores)))
     drawing = Drawing(
         WIDTH,
         below.bottom + 38,
@@ -329,7 +329,7 @@ def _middle(name: str) -> float | None:
     return (float(low) + float(high)) / 2.0 if dash else None
 
 
-def _most_nees(scores: Mapping[str, RangeScore]) -> float:
+def _max_nees(scores: Mapping[str, RangeScore]) -> float:
     found = [one.nees for score in scores.values() for one in score.by_distance.values()]
     return max(2.0, min(10.0, max(found, default=2.0)) * 1.1)
 
@@ -341,10 +341,10 @@ def draw_reliability(belief: Mapping[str, BeliefScore]) -> Markup:
         panel.right + 20,
         panel.bottom + 38,
         "Reliability",
-        "Share of steps in which a feature was there, for ten bins of its stated probability; "
+        "Fraction of steps in which a feature was there, for ten bins of its stated probability; "
         "points on the diagonal are honest.",
     )
-    drawing.axes(panel, "stated probability", "share that is so")
+    drawing.axes(panel, "stated probability", "observed fraction")
     drawing.rule(panel.x(0), panel.y(0), panel.x(1), panel.y(1), "line dash")
     most = max((one.steps for score in belief.values() for one in score.reliability), default=1)
     for place, (name, score) in enumerate(belief.items()):

@@ -77,7 +77,7 @@ def _coverage(scores: Scores) -> list[str]:
     n = len(scores.drives)
     twice = sum(one.frames_ambiguous for one in scores.drives)
     lines = [
-        _line("drives", f"{n}: of {frames} frames the truth speaks of {reported}"),
+        _line("drives", f"{n}: of {frames} frames the truth covers {reported}"),
         _line("truth", f"{truth_s:.1f} s, of which the runs cover {covered_s:.1f} s"),
     ]
     if twice:
@@ -91,10 +91,10 @@ def _cues(cues: Mapping[str, CueScore]) -> list[str]:
     lines = ["cue                  scored  found  precision (95 %)      recall (95 %)"]
     for name, one in shown.items():
         star = " " if one.is_sources_reading else "*"
-        recall = "-" if one.recall is None else _share(one.recall)
+        recall = "-" if one.recall is None else _fraction(one.recall)
         lines.append(
             f"{visible(name):19}{star} {one.scored:6} {one.positives:6}  "
-            f"{_share(one.precision):20}  {recall}".rstrip()
+            f"{_fraction(one.precision):20}  {recall}".rstrip()
         )
     if any(not one.is_sources_reading for one in shown.values()):
         lines.append("* judged by the feature or thing that the source does not judge it by")
@@ -118,7 +118,7 @@ def _left_out(cues: Mapping[str, CueScore]) -> list[str]:
     return lines
 
 
-def _share(one: Proportion) -> str:
+def _fraction(one: Proportion) -> str:
     if not one.of:
         return "-"
     low, high = _ends(one)
@@ -136,7 +136,7 @@ def _approaches(one: ApproachScore) -> list[str]:
     lines = [
         _line(
             "approaches",
-            f"{one.approaches} true, the runs know {one.matched}; extra "
+            f"{one.approaches} true, the runs have {one.matched}; extra "
             f"{one.extra} ({one.extra_detected} believed), in pieces {one.splits}",
         ),
         _line("detected", _distance(one.detected, one.detected_m)),
@@ -175,8 +175,8 @@ def _belief(belief: Mapping[str, BeliefScore]) -> list[str]:
     lines = ["belief         scored of steps   there   Brier  of base rate  log score"]
     for name, one in belief.items():
         lines.append(
-            f"{visible(name):14} {one.scored:6} {one.steps:8}  {_number(one.share_there):>6}  "
-            f"{_number(one.brier.value):>6}  {_number(one.brier_of_share):>12}  "
+            f"{visible(name):14} {one.scored:6} {one.steps:8}  {_number(one.fraction_there):>6}  "
+            f"{_number(one.brier.value):>6}  {_number(one.brier_of_base_rate):>12}  "
             f"{_number(one.log_score.value):>9}"
         )
     return lines
@@ -185,7 +185,7 @@ def _belief(belief: Mapping[str, BeliefScore]) -> list[str]:
 def _range(ranges: Mapping[str, RangeScore]) -> list[str]:
     lines = ["range to       scored  of rows    bias    rmse  mean NEES  inside 95 %"]
     for name, one in ranges.items():
-        inside = 100.0 * one.nees.share_inside_95
+        inside = 100.0 * one.nees.fraction_inside_95
         lines.append(
             f"{name:14} {one.scored:6} {one.rows:8} {_number(one.bias_m.value, 2):>6}m "
             f"{_number(one.rmse_m, 2):>6}m  {_number(one.nees.mean, 2):>9}  "
@@ -195,7 +195,7 @@ def _range(ranges: Mapping[str, RangeScore]) -> list[str]:
             lines.append(
                 f"  {control.replace('_', ' '):12} {part.rows:6} {'':8} "
                 f"{_number(part.bias_m, 2):>6}m {_number(part.rmse_m, 2):>6}m  "
-                f"{_number(part.nees, 2):>9}  {_number(100.0 * part.share_inside_95, 0):>9} %"
+                f"{_number(part.nees, 2):>9}  {_number(100.0 * part.fraction_inside_95, 0):>9} %"
             )
     return lines
 
@@ -258,6 +258,6 @@ def _nees_lines(result: PoseScore) -> list[str]:
             continue
         lines.append(
             f"NEES of {name}: mean {n.mean:.2f} (honest for one drive: {n.band_low:.2f} to "
-            f"{n.band_high:.2f}), {100 * n.share_inside_95:.0f} % inside 95 %"
+            f"{n.band_high:.2f}), {100 * n.fraction_inside_95:.0f} % inside 95 %"
         )
     return lines

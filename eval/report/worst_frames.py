@@ -132,7 +132,7 @@ def _drawn(picture: Encoded, one: WorstFrame, rows: Sequence[Mapping[str, Any]])
     """With the picture, small, and the boxes of what stands behind the cue."""
     import cv2
 
-    pixels, whole = decode(picture, View(least_width_px=WIDTH_PX))
+    pixels, whole = decode(picture, View(min_width_px=WIDTH_PX))
     size = (WIDTH_PX, round(whole[1] * WIDTH_PX / whole[0]))
     if pixels.shape[1] > WIDTH_PX:
         pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)

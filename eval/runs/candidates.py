@@ -1,4 +1,4 @@
-"""What became of the candidates of cues and ranges, as the manifest and a person are told."""
+"""What became of the candidates of cues and ranges, as the manifest and the summary report it."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def candidate_lines(
     A road cue gets one only where it never was: a region that is not road is nothing that was
     skipped.
     """
-    told: dict[str, list[str]] = {}
+    reported: dict[str, list[str]] = {}
     for cue, one in cues.items():
         if one.skipped and (one.unit == "detections" or not one.used):
-            told.setdefault(_told(one), []).append(cue)
-    lines = [f"{', '.join(names)}: {text}" for text, names in told.items()]
-    return lines + [text for cue, one in ranged.items() for text in _range_told(cue, one)]
+            reported.setdefault(_text_of(one), []).append(cue)
+    lines = [f"{', '.join(names)}: {text}" for text, names in reported.items()]
+    return lines + [text for cue, one in ranged.items() for text in _range_text(cue, one)]
 
 
 def not_looked_lines(cues: Mapping[str, str]) -> list[str]:
@@ -67,7 +67,7 @@ def not_looked_lines(cues: Mapping[str, str]) -> list[str]:
     return [f"not looked for, {why}: {', '.join(names)}" for why, names in same.items()]
 
 
-def _told(one: CandidateRow) -> str:
+def _text_of(one: CandidateRow) -> str:
     threshold = "" if one.threshold is None else f"{one.threshold:.2f}"
     low = one.skipped.get(BELOW_SCORE, 0) + one.skipped.get(TOO_LITTLE_ROAD, 0)
     if low == one.seen and one.max_score is not None:
@@ -83,8 +83,8 @@ def _told(one: CandidateRow) -> str:
     return f"{one.seen:,} {one.unit}, {one.used:,} used; {reasons}"
 
 
-def _range_told(cue: str, one: CandidateRow) -> list[str]:
-    """Scores are the cue's own affair and told there."""
+def _range_text(cue: str, one: CandidateRow) -> list[str]:
+    """Scores are the cue's own affair and reported there."""
     skipped = {why: number for why, number in one.skipped.items() if why != BELOW_SCORE}
     things = f"{cue.replace('_', ' ')}s"
     lines = []

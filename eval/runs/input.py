@@ -76,7 +76,7 @@ def refuse_another(run: RunFolder, mine: Mapping[str, Any]) -> None:
             run.manifest()
         if any(entry.name != LOCK for entry in run.path.iterdir()):
             raise UsageError(
-                f"{run.path}: holds a run of which no {INPUT} tells what it is made of; --resume "
+                f"{run.path}: holds a run without {INPUT}, so its input is unknown; --resume "
                 "would destroy it: give another folder or --overwrite"
             )
         return

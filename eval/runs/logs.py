@@ -90,7 +90,7 @@ def place_of(run: RunFolder, said: LogRow) -> Path | str:
         try:
             found = identity_of(place)
         except CrosscueError as error:
-            raise UnreadableRunError(f"{run.path}: its log cannot be looked at: {error}") from None
+            raise UnreadableRunError(f"{run.path}: its log cannot be examined: {error}") from None
         if found.digest == wanted.digest:
             return place if isinstance(place, str) else Path(os.path.normpath(place))
         others.append((place, found))

@@ -12,9 +12,9 @@ def quantile(probability: float, dimensions: int) -> float:
     from scipy.special import chdtri
 
     if not 0.0 < probability < 1.0:
-        raise ValueError(f"probability: want in (0, 1), got {probability}")
+        raise ValueError(f"probability: expected in (0, 1), got {probability}")
     if dimensions < 1:
-        raise ValueError(f"dimensions: want >= 1, got {dimensions}")
+        raise ValueError(f"dimensions: expected >= 1, got {dimensions}")
     return float(chdtri(dimensions, 1.0 - probability))
 
 

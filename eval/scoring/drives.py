@@ -51,9 +51,9 @@ class ScoreSettings:
             ValueError: Naming what was wanted.
         """
         if not 0.0 < self.threshold < 1.0:
-            raise ValueError(f"threshold: want in (0, 1), got {self.threshold}")
+            raise ValueError(f"threshold: expected in (0, 1), got {self.threshold}")
         if len(self.bins_m) < 2 or (np.diff(self.bins_m) <= 0.0).any():
-            raise ValueError(f"bins_m: want two or more growing borders, got {self.bins_m}")
+            raise ValueError(f"bins_m: expected two or more growing borders, got {self.bins_m}")
 
 
 DEFAULTS: Final = ScoreSettings()
@@ -160,7 +160,7 @@ def _check_fits(tables: RunTables, truth: DriveTruth) -> float:
         return 0.0
     if span[1] < reported.start_ns or span[0] >= reported.end_ns:
         raise SchemaError(
-            f"{truth.drive}: its truth speaks of {reported.start_ns} to {reported.end_ns} ns, "
+            f"{truth.drive}: its truth covers {reported.start_ns} to {reported.end_ns} ns, "
             f"the run of {span[0]} to {span[1]} ns; it belongs to "
             "another log or clock: give the right one"
         )
@@ -173,7 +173,7 @@ def _not_scored(tables: RunTables, truth: DriveTruth) -> dict[str, str]:
     if tables.cues is None:
         found["cues"] = "the run has no cues"
     elif not reported.cues and not reported.approaches:
-        found["cues"] = "the truth tells neither cues nor approaches"
+        found["cues"] = "the truth has neither cues nor approaches"
     for section, table in (
         ("approaches", tables.belief),
         ("belief", tables.belief),
@@ -183,9 +183,9 @@ def _not_scored(tables: RunTables, truth: DriveTruth) -> dict[str, str]:
             what = "range" if section == "range" else "belief"
             found[section] = f"the run has no {what}"
         elif not reported.approaches:
-            found[section] = "the truth tells no approaches"
+            found[section] = "the truth has no approaches"
     if "range" not in found and truth.ranges is None:
-        found["range"] = "the truth tells neither ranges nor a track"
+        found["range"] = "the truth has neither ranges nor a track"
     return found
 
 
@@ -197,7 +197,7 @@ def score(drives: Sequence[DriveJudged], settings: ScoreSettings = DEFAULTS) -> 
     """
     names = [one.coverage.drive for one in drives]
     if not names or len(set(names)) != len(names):
-        raise ValueError(f"drives: want one or more with different names, got {names}")
+        raise ValueError(f"drives: expected one or more with different names, got {names}")
     bins_m, seed = settings.bins_m, settings.seed
     return Scores(
         settings=settings,

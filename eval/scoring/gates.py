@@ -47,7 +47,7 @@ class Gate(BaseModel):
     @model_validator(mode="after")
     def _has_bounds(self) -> Self:
         if self.min is None and self.max is None:
-            raise ValueError("want min, max or both")
+            raise ValueError("expected min, max or both")
         if self.min is not None and self.max is not None and self.min > self.max:
             raise ValueError(f"min {self.min:g} is above max {self.max:g}")
         return self
@@ -97,7 +97,7 @@ def load_gates(path: Path) -> tuple[Gate, ...]:
         text = content.decode("utf-8")
         tree = toml_tree(text)
     except (OSError, ValueError) as error:
-        raise UsageError(f"{path}: not readable as TOML ({error}); mend it") from None
+        raise UsageError(f"{path}: not readable as TOML ({error}); correct it") from None
     try:
         return GateFile.model_validate(tree).gate
     except ValidationError as error:
@@ -148,7 +148,7 @@ def _failure(gate: Gate, found: MetricValue, value: float) -> str:
     if math.isnan(value):
         return f"its interval has no {gate.use} end: too few drives"
     if found.of is not None and found.of < gate.least:
-        return f"stands on {found.of} rows, want {gate.least} or more"
+        return f"stands on {found.of} rows, expected {gate.least} or more"
     if gate.min is not None and value < gate.min:
         return f"{value:.6g} is below {gate.min:g}"
     if gate.max is not None and value > gate.max:

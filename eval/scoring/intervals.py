@@ -88,9 +88,9 @@ def wilson(right: int, of: int, confidence: float = CONFIDENCE) -> Interval:
     from scipy.special import ndtri
 
     if not 0 <= right <= of:
-        raise ValueError(f"right: want 0 to {of}, got {right}")
+        raise ValueError(f"right: expected 0 to {of}, got {right}")
     if not 0.0 < confidence < 1.0:
-        raise ValueError(f"confidence: want in (0, 1), got {confidence}")
+        raise ValueError(f"confidence: expected in (0, 1), got {confidence}")
     if of == 0:
         return UNKNOWN
     z = float(ndtri(0.5 + 0.5 * confidence))

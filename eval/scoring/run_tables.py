@@ -81,7 +81,7 @@ def _cues(table: pa.Table, where: str) -> CueRows:
     count = _whole(table, "count", where)
     if len(count) and count.min() < 0:
         raise UnreadableRunError(
-            f"{where}: count {count.min()}: want 0 or more; run crosscue replay again"
+            f"{where}: count {count.min()}: expected 0 or more; run crosscue replay again"
         )
     return CueRows(
         _whole(table, "t_ns", where), _approach(table, where), _texts(table, "cue", where), count
@@ -93,7 +93,7 @@ def _ranges(table: pa.Table, where: str) -> RangeRows:
     strange = sorted(set(reference.tolist()) - {"start", "end"})
     if strange:
         raise UnreadableRunError(
-            f"{where}: reference {strange[0]!r}: want start or end; replay again"
+            f"{where}: reference {strange[0]!r}: expected start or end; replay again"
         )
     return RangeRows(
         _whole(table, "t_ns", where),
@@ -135,7 +135,9 @@ def _whole(table: pa.Table, name: str, where: str) -> Int64s:
 
     column = _column(table, name, where)
     if column.null_count or not pa.types.is_integer(column.type):
-        raise UnreadableRunError(f"{where}: {name}: want whole numbers in every row; replay again")
+        raise UnreadableRunError(
+            f"{where}: {name}: expected whole numbers in every row; replay again"
+        )
     return np.asarray(column.cast(pa.int64()).to_numpy(), np.int64)
 
 
@@ -145,7 +147,9 @@ def _approach(table: pa.Table, where: str) -> Int64s:
 
     column = _column(table, "approach", where)
     if not (pa.types.is_integer(column.type) or pa.types.is_null(column.type)):
-        raise UnreadableRunError(f"{where}: approach: want whole numbers or nulls; replay again")
+        raise UnreadableRunError(
+            f"{where}: approach: expected whole numbers or nulls; replay again"
+        )
     filled = pc.fill_null(column.cast(pa.int64()), NONE)
     return np.asarray(filled.to_numpy(), np.int64)
 
@@ -155,7 +159,9 @@ def _numbers(table: pa.Table, name: str, where: str) -> Floats:
 
     column = _column(table, name, where)
     if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
-        raise UnreadableRunError(f"{where}: {name}: want numbers, got {column.type}; replay again")
+        raise UnreadableRunError(
+            f"{where}: {name}: expected numbers, got {column.type}; replay again"
+        )
     return np.asarray(column.cast(pa.float64()).to_numpy(), np.float64)
 
 
@@ -163,5 +169,5 @@ def _texts(table: pa.Table, name: str, where: str) -> NDArray[np.str_]:
     column = _column(table, name, where)
     values = column.to_pylist()
     if not all(isinstance(value, str) for value in values):
-        raise UnreadableRunError(f"{where}: {name}: want text in every row; replay again")
+        raise UnreadableRunError(f"{where}: {name}: expected text in every row; replay again")
     return np.array(values, np.str_)

@@ -187,13 +187,13 @@ def _check_times(run: RunFolder, truth: Truth, tables: RunTables, path: Path) ->
         if one.start_ns > span[1] + SLACK_NS or one.enter_ns < span[0] - SLACK_NS:
             raise SchemaError(
                 f"{path}: approach {one.id} from {one.start_ns} to {one.enter_ns} ns lies outside "
-                f"the log, of which {run.path} has {span[0]} to {span[1]} ns; mend the truth"
+                f"the log, of which {run.path} has {span[0]} to {span[1]} ns; correct the truth"
             )
 
 
 def _why_no_pose(run: RunFolder, truth: Truth) -> str:
     if truth.pose is None:
-        return "the truth tells no track (pose: missing)"
+        return "the truth has no track (pose: missing)"
     if not run.file("pose.parquet").exists():
         return "the run has no pose"
     return "" if run.table("pose", ["t_ns"]).num_rows else "the run's pose has no row"

@@ -144,7 +144,7 @@ def _read_ranges(path: Path, truth: Truth) -> TrueRanges:
         with path.open(encoding="utf-8", newline="") as file:
             reader = csv.DictReader(file)
             if set(COLUMNS) - set(reader.fieldnames or ()):
-                raise AnnotationError(f"{path}:1: want the columns {','.join(COLUMNS)}")
+                raise AnnotationError(f"{path}:1: expected the columns {','.join(COLUMNS)}")
             for row in reader:
                 rows.append(_range_row(row, known, f"{path}:{reader.line_num}"))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -165,9 +165,11 @@ def _range_row(row: dict[str, str], known: set[int], where: str) -> tuple[int, i
         start_m = float(row["start_m"])
         end_m = float(row["end_m"]) if row["end_m"] else math.nan
     except (TypeError, ValueError):
-        raise AnnotationError(f"{where}: want whole t_ns and approach, numbers in metres") from None
+        raise AnnotationError(
+            f"{where}: expected whole t_ns and approach, numbers in metres"
+        ) from None
     if not math.isfinite(start_m) or math.isinf(end_m) or not -(2**62) < t_ns < 2**62:
-        raise AnnotationError(f"{where}: want finite numbers")
+        raise AnnotationError(f"{where}: expected finite numbers")
     if approach not in known:
         raise AnnotationError(f"{where}: no approach {approach}; there are: {sorted(known)}")
     return t_ns, approach, start_m, end_m

@@ -78,21 +78,23 @@ class Place:
                 or a covariance that is not positive definite.
         """
         if not 0 < len(self.name) <= MAX_TEXT or len(self.source) > MAX_TEXT:
-            raise ValueError(f"name, source: want up to {MAX_TEXT} letters, got {self.name!r}")
+            raise ValueError(f"name, source: expected up to {MAX_TEXT} letters, got {self.name!r}")
         if not _is_unicode(self.name + self.source):
-            raise ValueError(f"name, source: want Unicode, got {self.name!r}, {self.source!r}")
+            raise ValueError(f"name, source: expected Unicode, got {self.name!r}, {self.source!r}")
         if self.xy_m.shape != (2,) or self.cov_m2.shape != (2, 2):
             shapes = f"{self.xy_m.shape}, {self.cov_m2.shape}"
-            raise ValueError(f"landmark {self.name}: want xy_m (2,), cov_m2 (2, 2), got {shapes}")
+            raise ValueError(
+                f"landmark {self.name}: expected xy_m (2,), cov_m2 (2, 2), got {shapes}"
+            )
         numbers = (*self.xy_m, *self.cov_m2.ravel(), self.heading_rad or 0.0)
         if not np.isfinite(numbers).all():
             raise ValueError(
-                f"landmark {self.name}: want finite numbers, got {self.xy_m.tolist()}, "
+                f"landmark {self.name}: expected finite numbers, got {self.xy_m.tolist()}, "
                 f"{self.cov_m2.tolist()}, heading {self.heading_rad}"
             )
         if not is_positive(self.cov_m2):
             raise ValueError(
-                f"landmark {self.name}: covariance: want symmetric and positive definite, "
+                f"landmark {self.name}: covariance: expected symmetric and positive definite, "
                 f"got {self.cov_m2.tolist()}"
             )
 
@@ -176,9 +178,9 @@ class LandmarkDatabase:
             LogFormatError: The file is damaged.
         """
         if not 0.0 < sigmas <= REACH_SIGMAS:
-            raise ValueError(f"sigmas: want 0 to {REACH_SIGMAS}, got {sigmas}")
+            raise ValueError(f"sigmas: expected 0 to {REACH_SIGMAS}, got {sigmas}")
         if not (np.isfinite(xy_m).all() and np.isfinite(cov_m2).all()):
-            raise ValueError(f"near: want finite numbers, got {xy_m}, {cov_m2}")
+            raise ValueError(f"near: expected finite numbers, got {xy_m}, {cov_m2}")
         # An R*Tree keeps 32-bit floats, rounded outwards for what is stored: round the question
         # outwards as well.
         reach = sigmas * np.sqrt(np.maximum(np.diagonal(cov_m2), 0.0))
@@ -305,7 +307,7 @@ class LandmarkWriter:
             OutputError: The disk is full.
         """
         if len(features) > MAX_POINTS:
-            raise ValueError(f"features: want up to {MAX_POINTS} points, got {len(features)}")
+            raise ValueError(f"features: expected up to {MAX_POINTS} points, got {len(features)}")
         (xx, xy), (_, yy) = place.cov_m2.tolist()
         x, y = place.xy_m.tolist()
         points_px = features.points_px.astype("<f4").tobytes()

@@ -47,11 +47,11 @@ class Features:
         """
         n = len(self.descriptors)
         if self.descriptors.ndim != 2 or self.descriptors.dtype != np.uint8:
-            raise ValueError(f"descriptors: want uint8 (N, B), got {self.descriptors.shape}")
+            raise ValueError(f"descriptors: expected uint8 (N, B), got {self.descriptors.shape}")
         if self.points_px.shape != (n, 2):
-            raise ValueError(f"points_px: want ({n}, 2), got {self.points_px.shape}")
+            raise ValueError(f"points_px: expected ({n}, 2), got {self.points_px.shape}")
         if not np.isfinite(self.points_px).all():
-            raise ValueError("points_px: want finite numbers")
+            raise ValueError("points_px: expected finite numbers")
 
     def __len__(self) -> int:
         return len(self.descriptors)
@@ -124,6 +124,6 @@ def make_matcher(name: str, camera: CameraGeometry = CameraGeometry()) -> Matche
     lacks = [part for part in ("kind", "describe", "match") if not hasattr(made, part)]
     if lacks:
         raise UsageError(
-            f"matcher {name!r}: what the factory gives has no {lacks[0]}; want a Matcher"
+            f"matcher {name!r}: what the factory gives has no {lacks[0]}; expected a Matcher"
         )
     return made

@@ -116,7 +116,7 @@ def check_ours(sql: sqlite3.Connection, path: Path) -> None:
     if version != VERSION:
         raise LogFormatError(
             f"{path}: landmark database of version {version}, this crosscue reads {VERSION}; "
-            "build it anew with: crosscue landmarks add"
+            "build it again with: crosscue landmarks add"
         )
     found = sql.execute(
         "SELECT sql FROM sqlite_schema WHERE sql IS NOT NULL AND name NOT GLOB 'place_*'"
@@ -136,7 +136,7 @@ def kind_of(sql: sqlite3.Connection, path: Path) -> str:
 def damaged(path: Path, why: str) -> LogFormatError:
     """The error to raise where the file contradicts itself."""
     return LogFormatError(
-        f"{path}: damaged: {why}; copy it again, or build it anew with: crosscue landmarks add"
+        f"{path}: damaged: {why}; copy it again, or build it again with: crosscue landmarks add"
     )
 
 

@@ -44,7 +44,7 @@ class ScoredPairs:
         for name in ("is_same", "query"):
             if getattr(self, name).shape != self.score.shape:
                 raise ValueError(
-                    f"{name}: want {self.score.shape}, got {getattr(self, name).shape}"
+                    f"{name}: expected {self.score.shape}, got {getattr(self, name).shape}"
                 )
 
     def __len__(self) -> int:
@@ -106,14 +106,15 @@ def fit_landmarks(pairs: ScoredPairs, wanted_rate: float, seed: int = 0) -> Land
         ValueError: A rate out of range, or a half without two-place pairs.
     """
     if not 0.0 <= wanted_rate < 1.0:
-        raise ValueError(f"wanted_rate: want 0 to 1, got {wanted_rate}")
+        raise ValueError(f"wanted_rate: expected 0 to 1, got {wanted_rate}")
     queries = np.unique(pairs.query)
     chosen = np.random.default_rng(seed).permutation(queries)[: len(queries) // 2]
     is_fit = np.isin(pairs.query, chosen)
     for name, half in (("first", is_fit), ("second", ~is_fit)):
         if not (half & ~pairs.is_same).any():
             raise ValueError(
-                f"pairs: want two-place pairs of at least two queries, got none in the {name} half"
+                f"pairs: expected two-place pairs of at least two queries, got none in "
+                f"the {name} half"
             )
     min_score = _threshold(pairs.score, is_fit & ~pairs.is_same, wanted_rate)
     return LandmarkFit(

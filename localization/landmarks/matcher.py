@@ -53,10 +53,10 @@ class OrbSettings:
             ValueError: Naming the field and the value.
         """
         if not 0.0 < self.ratio <= 1.0:
-            raise ValueError(f"ratio: want 0 to 1, got {self.ratio}")
+            raise ValueError(f"ratio: expected 0 to 1, got {self.ratio}")
         for name in ("features", "side_px", "tolerance_px"):
             if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: want > 0, got {getattr(self, name)}")
+                raise ValueError(f"{name}: expected > 0, got {getattr(self, name)}")
 
 
 class OrbMatcher:

@@ -44,7 +44,7 @@ class LandmarkSettings:
     Attributes:
         min_score: Matches with a lower score are none; ``crosscue fit landmarks`` chooses it.
         sigmas: Size of the search ellipse.
-        most_candidates: Compare with no more landmarks than these, the nearest.
+        max_candidates: Compare with no more landmarks than these, the nearest.
         gate_nis: Refuse a match whose normalised innovation squared is larger; None accepts all.
         interval_m: Look again once the car has gone this far.
         revisit_m: A landmark counts again once the car has gone this far since it counted.
@@ -53,7 +53,7 @@ class LandmarkSettings:
 
     min_score: float = 20.0
     sigmas: float = 2.0
-    most_candidates: int = 50
+    max_candidates: int = 50
     gate_nis: float | None = 13.8
     interval_m: float = 1.0
     revisit_m: float = 100.0
@@ -66,11 +66,11 @@ class LandmarkSettings:
             ValueError: Naming the field and the value.
         """
         if not 0.0 < self.sigmas <= REACH_SIGMAS:
-            raise ValueError(f"sigmas: want 0 to {REACH_SIGMAS}, got {self.sigmas}")
-        for name in ("min_score", "most_candidates", "interval_m", "revisit_m"):
+            raise ValueError(f"sigmas: expected 0 to {REACH_SIGMAS}, got {self.sigmas}")
+        for name in ("min_score", "max_candidates", "interval_m", "revisit_m"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name}: want >= 0, got {value}")
+                raise ValueError(f"{name}: expected >= 0, got {value}")
 
 
 @dataclass(slots=True)
@@ -155,11 +155,11 @@ def update_camera_position(
         ValueError: Wrong shape, not finite, or ``cov_m2`` not positive definite.
     """
     if xy_m.shape != (2,) or not np.isfinite(xy_m).all():
-        raise ValueError(f"xy_m: want two finite numbers, got {xy_m}")
+        raise ValueError(f"xy_m: expected two finite numbers, got {xy_m}")
     if cov_m2.shape != (2, 2) or not np.isfinite(cov_m2).all():
-        raise ValueError(f"cov_m2: want finite (2, 2), got {cov_m2.tolist()}")
+        raise ValueError(f"cov_m2: expected finite (2, 2), got {cov_m2.tolist()}")
     if (np.linalg.eigvalsh(cov_m2) <= 0.0).any() or not np.allclose(cov_m2, cov_m2.T):
-        raise ValueError(f"cov_m2: want positive definite, got {cov_m2.tolist()}")
+        raise ValueError(f"cov_m2: expected positive definite, got {cov_m2.tolist()}")
     expected, observe = _observed(belief, lever_m)
     innovation = xy_m - expected
     spread = observe @ belief.cov @ observe.T + cov_m2
@@ -266,7 +266,7 @@ class LandmarkSearch:
         self, camera_m: Floats, cov_m2: Floats, describe: Callable[[], Features | None]
     ) -> Best | None:
         settings = self.settings
-        candidates = self.database.near(camera_m, cov_m2, settings.sigmas, settings.most_candidates)
+        candidates = self.database.near(camera_m, cov_m2, settings.sigmas, settings.max_candidates)
         if not candidates:
             self.counts.without_candidate += 1
             return None

@@ -23,9 +23,9 @@ class City(Section):
     largest_km2: Annotated[float, Field(ge=0.25, le=400.0)] = 100.0
     shortest_block_m: Annotated[float, Field(ge=50.0, le=1000.0)] = 50.0
     longest_block_m: Annotated[float, Field(ge=50.0, le=1000.0)] = 300.0
-    dead_end_share: Annotated[float, Field(ge=0.0, le=0.2)] = 0.03
+    dead_end_fraction: Annotated[float, Field(ge=0.0, le=0.2)] = 0.03
     """Of the intersections, before the streets that lead there are cut."""
-    one_way_share: Annotated[float, Field(ge=0.0, le=0.8)] = 0.15
+    one_way_fraction: Annotated[float, Field(ge=0.0, le=0.8)] = 0.15
     """Of the blocks."""
     goal_at_least_m: Annotated[float, Field(ge=0.0, le=250.0)] = 200.0
     """A goal is not drawn nearer to the car than this, as the crow flies."""

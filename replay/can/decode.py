@@ -160,7 +160,7 @@ class BusDecoder:
         """
         frames = block.rows
         if not isinstance(frames, CanFrames):
-            raise ValueError(f"{block.topic}: want CanFrames, got {type(frames).__name__}")
+            raise ValueError(f"{block.topic}: expected CanFrames, got {type(frames).__name__}")
         self._choose_engine(len(frames))
         grouped = self._engine.group(frames)
         if len(grouped.order) < len(frames):

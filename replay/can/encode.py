@@ -63,7 +63,7 @@ def _checked_length(message: CanMessage, columns: Mapping[str, Column]) -> int:
     lengths = {name: np.shape(column) for name, column in columns.items()}
     shapes = set(lengths.values())
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
-        raise ValueError(f"{message.name}: want columns of one length (N,), got {lengths}")
+        raise ValueError(f"{message.name}: expected columns of one length (N,), got {lengths}")
     return int(next(iter(shapes))[0])
 
 
@@ -72,7 +72,7 @@ def _column(message: CanMessage, columns: Mapping[str, Column], signal: CanSigna
         raise ValueError(f"{message.name}: no column for signal {signal.name}")
     column = np.asarray(columns[signal.name])
     if column.dtype.kind not in "biuf":
-        raise ValueError(f"{message.name}.{signal.name}: want numbers, got {column.dtype}")
+        raise ValueError(f"{message.name}.{signal.name}: expected numbers, got {column.dtype}")
     return column
 
 

@@ -211,7 +211,7 @@ def _multiplexing_problem(message: CanMessage) -> str:
         above = signal.multiplexer
         while above is not None:
             if above not in by_name or not by_name[above].is_multiplexer:
-                return f"signal {signal.name} hangs on {above}, which is no multiplexer"
+                return f"signal {signal.name} hangs on {above}, which is not a multiplexer"
             if above in seen:
                 return f"multiplexers depend on each other in a ring: {above}"
             seen.add(above)

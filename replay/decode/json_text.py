@@ -51,7 +51,9 @@ def json_decoder(topic: Topic) -> Callable[[Block, Ledger], Block]:
         try:
             _object(topic.schema)
         except _BAD as error:
-            raise SchemaError(f"{topic.name}: its JSON schema is no JSON object: {error}") from None
+            raise SchemaError(
+                f"{topic.name}: its JSON schema is not a JSON object: {error}"
+            ) from None
     if topic.type_name in PICTURES:
         return _PictureDecoder(PICTURES[topic.type_name])
     return _TableDecoder(topic.type_name)
@@ -60,7 +62,7 @@ def json_decoder(topic: Topic) -> Callable[[Block, Ledger], Block]:
 def _object(text: bytes) -> dict[str, Any]:
     value = json_tree(text.decode("utf-8"), parse_constant=_refuse, object_pairs_hook=_once)
     if not isinstance(value, dict):
-        raise ValueError(f"want an object, got {type(value).__name__}")
+        raise ValueError(f"expected an object, got {type(value).__name__}")
     return value
 
 
@@ -83,7 +85,7 @@ def _nanoseconds(value: Any) -> int | None:
     if type(seconds) is not int or type(rest) is not int:
         return None
     if abs(seconds) > MAX_SECONDS or not 0 <= rest < 1_000_000_000:
-        raise ValueError(f"timestamp {seconds} s + {rest} ns is no time")
+        raise ValueError(f"timestamp {seconds} s + {rest} ns is not a time")
     return seconds * 1_000_000_000 + rest
 
 
@@ -149,11 +151,11 @@ def _at(value: Any, source: Source) -> Any:
         value = value[step]
     if source.count == 0:
         if not isinstance(value, int | float):
-            raise ValueError(f"{source.path} is no number")
+            raise ValueError(f"{source.path} is not a number")
         return value
     numbers = [float(each) for each in value]
     if source.count > 0 and len(numbers) != source.count:
-        raise ValueError(f"{source.path}: want {source.count} values, got {len(numbers)}")
+        raise ValueError(f"{source.path}: expected {source.count} values, got {len(numbers)}")
     return numbers
 
 
@@ -193,7 +195,7 @@ def _picture(value: dict[str, Any], pixels: bytearray) -> PictureRow:
     pixels += encoded
     label = value.get("format", value.get("encoding", ""))
     if not isinstance(label, str):
-        raise ValueError("format is no text")
+        raise ValueError("format is not text")
     return PictureRow(
         stamp_ns=_nanoseconds(value.get("timestamp")),
         start=start,
@@ -209,5 +211,5 @@ def _picture(value: dict[str, Any], pixels: bytearray) -> PictureRow:
 def _count(value: dict[str, Any], key: str) -> int:
     number = value.get(key, 0)
     if type(number) is not int or not 0 <= number < 1 << 31:
-        raise ValueError(f"{key} is no count")
+        raise ValueError(f"{key} is not a count")
     return number

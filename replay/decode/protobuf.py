@@ -224,11 +224,11 @@ def _value(message: Message, leaf: _Leaf) -> Any:
         return len(at)
     if leaf.dtype == "time":
         if abs(at.seconds) > MAX_SECONDS:
-            raise ValueError(f"{leaf.column}: {at.seconds} s is no time")
+            raise ValueError(f"{leaf.column}: {at.seconds} s is not a time")
         return at.seconds * 1_000_000_000 + at.nanos
     if leaf.count > 0:
         if len(at) not in (0, leaf.count):
-            raise ValueError(f"{leaf.column}: want {leaf.count} values, got {len(at)}")
+            raise ValueError(f"{leaf.column}: expected {leaf.count} values, got {len(at)}")
         return list(at) or [np.nan] * leaf.count
     return list(at) if leaf.count else at
 
@@ -301,7 +301,7 @@ def _stamp(payload: memoryview, place: tuple[int, int] | None) -> int | None:
         elif number == 2 and plain is not None:
             nanos = plain
     if abs(seconds) > MAX_SECONDS or not 0 <= nanos < 1_000_000_000:
-        raise ValueError(f"timestamp {seconds} s + {nanos} ns is no time")
+        raise ValueError(f"timestamp {seconds} s + {nanos} ns is not a time")
     return seconds * 1_000_000_000 + nanos
 
 

@@ -11,15 +11,15 @@ from crosscue.replay.limits import MIB
 PIECE_BYTES: Final = MIB
 
 
-def read_at_most(path: Path, most_bytes: int) -> bytes | None:
-    """What a file holds, or None when that is more than ``most_bytes``.
+def read_at_most(path: Path, max_bytes: int) -> bytes | None:
+    """What a file holds, or None when that is more than ``max_bytes``.
 
     Its size is not believed: that of a device or a pipe is 0.
 
     Raises:
         OSError: It cannot be read.
     """
-    pieces, room = [], most_bytes
+    pieces, room = [], max_bytes
     with path.open("rb") as file:
         # A file with an honest size comes in one piece, which is then not copied.
         step = max(PIECE_BYTES, os.fstat(file.fileno()).st_size)

@@ -59,7 +59,7 @@ def identity_of(place: Path | str) -> Identity:
     try:
         path.stat()
         files = list(_files(path))
-        share = _share(len(files))
+        share = _fraction(len(files))
         for name, file in files:
             with file.open("rb", buffering=0) as stream:
                 opened = _Local(stream.fileno())
@@ -96,7 +96,7 @@ def _identity_of_parts(url: str) -> Identity | None:
     remote = RemoteFiles(url)
     name = url.rstrip("/").rpartition("/")[2]
     names = sorted(_names_of(name, remote.sizes).items(), key=lambda one: os.fsencode(one[0]))
-    share = _share(len(names))
+    share = _fraction(len(names))
     sizes = [remote.sizes[at] for _, at in names]
     total = sum(sizes)
     if not names or remote.is_at_hand or total < 2 * sum(min(size, share) for size in sizes):
@@ -123,7 +123,7 @@ def _names_of(name: str, sizes: Mapping[str, int]) -> dict[str, str]:
     return {name: name} | {f"beside/{other}": other for other in beside}
 
 
-def _share(files: int) -> int:
+def _fraction(files: int) -> int:
     """Bytes of each file that are hashed."""
     return max(SHARE_BYTES // max(files, 1), MIN_BYTES)
 

@@ -285,7 +285,7 @@ def _summary(
         format=log.format,
         is_quick=is_quick,
         is_whole=ledger.is_whole,
-        integrity="not looked at" if is_quick else ledger.integrity,
+        integrity="not examined" if is_quick else ledger.integrity,
         seal=sealed_sentence(log),
         start_ns=min((c.min_ns for c in log_clocks if c.min_ns is not None), default=None),
         end_ns=max((c.max_ns for c in log_clocks if c.max_ns is not None), default=None),

@@ -6,7 +6,7 @@ how far apart images are, modulo 256 ms; the log says roughly when each frame ar
     log time = image time + latency,    image time = counter + 256 ms * k + (device - log offset).
 
 **What this can and cannot tell.** The device's clock has no known relation to the log's, so the
-latency is known only up to a constant: the fastest frame is given ``least_latency_ns`` (0 unless
+latency is known only up to a constant: the fastest frame is given ``min_latency_ns`` (0 unless
 you know better), and the others what they took more. And it is known only modulo 256 ms: a frame
 that the host held back for 240 ms or more longer than the fastest is placed 256 ms late. Where that
 shows (the next image would come first), or a counter starts anew, a notice says so.
@@ -39,11 +39,11 @@ WATCHED: Final = 32
 STEP_NS: Final = 12 * MS
 """If none of ``WATCHED`` frames is this near the fastest, the counter or a clock was set."""
 
-WENT_BACK: Final = "the log's clock went back, image times start anew"
-LONG_GAP: Final = "a gap too long to follow the clocks' drift, image times start anew"
-SET_ANEW: Final = "the millisecond counter was set anew, or every frame takes longer than before"
+WENT_BACK: Final = "the log's clock went back, image times restart"
+LONG_GAP: Final = "a gap too long to follow the clocks' drift, image times restart"
+SET_ANEW: Final = "the millisecond counter was reset, or every frame takes longer than before"
 OUT_OF_ORDER: Final = (
-    "an image would come before the one before it: a frame 240 ms late, or a counter set anew"
+    "an image would come before the one before it: a frame 240 ms late, or a counter reset"
 )
 
 
@@ -60,15 +60,15 @@ class Unwrapped(NamedTuple):
     notices: tuple[str, ...]
 
 
-def unwrap(counter_ms: NDArray[np.integer], log_ns: Int64s, least_latency_ns: int = 0) -> Unwrapped:
+def unwrap(counter_ms: NDArray[np.integer], log_ns: Int64s, min_latency_ns: int = 0) -> Unwrapped:
     """When the image of each status frame was grabbed, on the log's clock.
 
     Args:
         counter_ms: Shape (N,), 0 to 255.
         log_ns: Shape (N,).
-        least_latency_ns: What the fastest frame took.
+        min_latency_ns: What the fastest frame took.
     """
-    clock = CounterClock(least_latency_ns)
+    clock = CounterClock(min_latency_ns)
     image_ns = clock.feed(counter_ms, log_ns)
     return Unwrapped(image_ns, clock.notices)
 
@@ -76,8 +76,8 @@ def unwrap(counter_ms: NDArray[np.integer], log_ns: Int64s, least_latency_ns: in
 class CounterClock:
     """``unwrap`` for a stream: the same answers however it is cut into pieces."""
 
-    def __init__(self, least_latency_ns: int = 0) -> None:
-        self._least_ns = least_latency_ns
+    def __init__(self, min_latency_ns: int = 0) -> None:
+        self._min_ns = min_latency_ns
         self._offset_ns = 0
         self._frames = 0
         self._log_ns = 0
@@ -89,7 +89,7 @@ class CounterClock:
     def feed(self, counter_ms: NDArray[np.integer], log_ns: Int64s) -> Int64s:
         """Image times of the next frames, shape (N,)."""
         pairs = zip(counter_ms.tolist(), log_ns.tolist(), strict=True)
-        return np.array([self._next(c * MS, t) for c, t in pairs], dtype=np.int64) - self._least_ns
+        return np.array([self._next(c * MS, t) for c, t in pairs], dtype=np.int64) - self._min_ns
 
     @property
     def notices(self) -> tuple[str, ...]:

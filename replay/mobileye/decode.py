@@ -166,7 +166,7 @@ class MobileyeDecoder:
         self._ledger = ledger
         self._settings = settings
         self._admit = Admission(bus, ledger, settings)
-        self._clock = CounterClock(settings.least_latency_ns)
+        self._clock = CounterClock(settings.min_latency_ns)
         self._family = FamilyEvidence(bus, settings.family)
         self._statuses = Statuses(bus, ledger, settings, self._clock)
         self._open = no_parts()
@@ -185,7 +185,7 @@ class MobileyeDecoder:
             ValueError: The rows are no ``CanFrames``.
         """
         if not isinstance(block.rows, CanFrames):
-            raise ValueError(f"{block.topic}: want CanFrames, got {type(block.rows).__name__}")
+            raise ValueError(f"{block.topic}: expected CanFrames, got {type(block.rows).__name__}")
         frames = self._admit(block.rows, block.log_ns)
         before = self._statuses.last
         opened, status_block, burst_at = self._statuses(frames)

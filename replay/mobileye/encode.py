@@ -121,11 +121,11 @@ def bursts_of(
         ValueError: An object of no image, or image times that do not rise.
     """
     if np.any(np.diff(image_ns) <= 0):
-        raise ValueError("image_ns: want rising times")
+        raise ValueError("image_ns: expected rising times")
     t_ns = objects["t_ns"].astype(np.int64)
     burst = np.searchsorted(image_ns, t_ns)
     if np.any(burst == len(image_ns)) or np.any(image_ns[burst] != t_ns):
-        raise ValueError("objects t_ns: want times out of image_ns")
+        raise ValueError("objects t_ns: expected times out of image_ns")
     mounting = settings.mounting or AT_REAR_AXLE
     ahead_m, seen = _seen(objects, mounting)
     order = np.lexsort((ahead_m[seen], burst[seen]))
@@ -156,7 +156,7 @@ def _check_bursts(named: Iterable[tuple[str, Block]]) -> None:
             bursts[name] |= set(block.rows["burst"].tolist())
     alone = bursts["obstacles"] - bursts["status"]
     if alone:
-        raise ValueError(f"obstacles of burst {min(alone)}: want a status row of that burst")
+        raise ValueError(f"obstacles of burst {min(alone)}: expected a status row of that burst")
 
 
 def _seen(objects: Table, mounting: Mounting) -> tuple[Floats, NDArray[np.bool_]]:
@@ -173,7 +173,7 @@ def _seen(objects: Table, mounting: Mounting) -> tuple[Floats, NDArray[np.bool_]
 def _sent(name: str, block: Block, settings: MobileyeSettings) -> list[_Sent]:
     rows = block.rows
     if not isinstance(rows, Table):
-        raise ValueError(f"{block.topic}: want a Table, got {type(rows).__name__}")
+        raise ValueError(f"{block.topic}: expected a Table, got {type(rows).__name__}")
     columns = to_device(name, dict(rows.columns), settings.mounting or AT_REAR_AXLE)
     if name == "obstacles":
         return _obstacles(block, columns)
@@ -216,7 +216,7 @@ def _message(
 ) -> _Sent:
     variant = _variant(message, columns, len(log_ns), settings)
     if np.any((instance < 0) | (instance >= len(message.ids))):
-        raise ValueError(f"{topic}: want places 0 to {len(message.ids) - 1}, got {instance}")
+        raise ValueError(f"{topic}: expected places 0 to {len(message.ids) - 1}, got {instance}")
     words = words_from(message, columns, variant, topic)
     length_of = [message.length_of(name) for name in (*VARIANTS, "")]  # the last for UNKNOWN
     return _Sent(

@@ -30,7 +30,7 @@ class MobileyeSettings:
             its first half the second half of a lane. Below the shortest time between two images.
         repeat_within_ns: A status frame equal to the one before and this close after it is a
             repetition, not a new image.
-        least_latency_ns: What the fastest frame took from image to log; the log alone cannot tell.
+        min_latency_ns: What the fastest frame took from image to log; the log alone cannot tell.
         is_shared_bus: Another decoder reads the same bus and accounts for what is not the device's.
         ros_lane_sign: Which way lanes in ROS messages are positive; ``auto`` examines which side
             the left and right lane lie.
@@ -42,7 +42,7 @@ class MobileyeSettings:
     mounting: Mounting | None = None
     within_ns: int = 50_000_000
     repeat_within_ns: int = 20_000_000
-    least_latency_ns: int = 0
+    min_latency_ns: int = 0
     is_shared_bus: bool = False
     ros_lane_sign: LaneSign = "auto"
 
@@ -54,9 +54,9 @@ class MobileyeSettings:
         """
         for name in ("within_ns", "repeat_within_ns"):
             if getattr(self, name) <= 0:
-                raise ValueError(f"{name}: want > 0, got {getattr(self, name)}")
+                raise ValueError(f"{name}: expected > 0, got {getattr(self, name)}")
         if self.slots not in (10, 13):
-            raise ValueError(f"slots: want 10 or 13, got {self.slots}")
+            raise ValueError(f"slots: expected 10 or 13, got {self.slots}")
 
 
 DEFAULTS: Final = MobileyeSettings()

@@ -146,7 +146,7 @@ def _raw_from(f: Field, column: Column | None, here: NDArray[np.bool_], topic: s
         low, high = sorted(float(from_raw(f, np.array([r]))[0]) for r in (lowest, highest))
         raise ValueError(
             f"{topic} {f.name}, row {row}: cannot send {column[row]}; "
-            f"want {low:g} to {high:g} {f.unit} on the wire"
+            f"expected {low:g} to {high:g} {f.unit} on the wire"
         )
     nearest = np.clip(np.rint(steps), lowest, highest)
     nearest = _beside_missing(f, nearest)

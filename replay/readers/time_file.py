@@ -133,8 +133,8 @@ def read_time_file(path: Path, limits: Limits) -> TimeFile:
             columns = tuple(parts)
             if not any(_names_a_time(column) for column in columns):
                 raise LogFormatError(
-                    f"{where}: {line[:80]!r}: want a time (seconds with a decimal point, integer "
-                    "nanoseconds or a date-time), alone or with a file name"
+                    f"{where}: {line[:80]!r}: expected a time (seconds with a decimal "
+                    "point, integer nanoseconds or a date-time), alone or with a file name"
                 )
             continue
         may_be_cut = number == lines[-1][0] and not has_end and len(times) > 1
@@ -154,7 +154,7 @@ def read_time_file(path: Path, limits: Limits) -> TimeFile:
         if (one.name is None) != (times[0].name is None):
             raise LogFormatError(f"{where}: {line[:80]!r}: names a file or not, unlike line above")
     if not times:
-        raise LogFormatError(f"{path}: no time in it; want one line for each picture")
+        raise LogFormatError(f"{path}: no time in it; expected one line for each picture")
     t_ns = np.array([one.t_ns for one in times], dtype=np.int64)
     names = tuple(one.name for one in times if one.name is not None)
     _check_period(path, t_ns, integers=all(one.is_bare for one in times))
@@ -179,7 +179,7 @@ def _lines(path: Path, limits: Limits) -> tuple[list[tuple[int, str]], bool]:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         bad = raw[: error.start].count(b"\n") + 1
-        raise LogFormatError(f"{path}: line {bad}: not UTF-8 text; want a text file") from None
+        raise LogFormatError(f"{path}: line {bad}: not UTF-8 text; expected a text file") from None
     stripped = ((n, line.strip()) for n, line in enumerate(text.split("\n"), start=1))
     said = [(n, line) for n, line in stripped if line and not line.startswith("#")]
     return said, not text or text.endswith("\n")
@@ -200,12 +200,12 @@ def _one_line(parts: list[str], columns: tuple[str, ...], where: str) -> _Line:
     at = [i for i, column in enumerate(columns) if _names_a_time(column)]
     if columns:
         if len(parts) != len(columns):
-            raise LogFormatError(f"{where}: {len(parts)} cells; want {len(columns)}")
+            raise LogFormatError(f"{where}: {len(parts)} cells; expected {len(columns)}")
     else:
         at = [i for i, part in enumerate(parts) if _is_time(part)]
     if len(at) != 1 or (not columns and len(parts) > 2):
         raise LogFormatError(
-            f"{where}: {' '.join(parts)[:80]!r}: want one time, alone or with a file name; "
+            f"{where}: {' '.join(parts)[:80]!r}: expected one time, alone or with a file name; "
             "name the columns in a first line (name,time) where there are more"
         )
     named = _UNIT.search(columns[at[0]].lower()) if columns else None
@@ -236,11 +236,11 @@ def _time_ns(text: str, unit_ns: int | None, where: str) -> int:
                 unit_ns = 1 if re.fullmatch(r"[+-]?\d+", text) else SECOND_NS
             t_ns = int((Decimal(text) * unit_ns).to_integral_value())
         else:
-            raise LogFormatError(f"{where}: {text[:80]!r} is no time")
+            raise LogFormatError(f"{where}: {text[:80]!r} is not a time")
     except (ValueError, InvalidOperation) as error:
-        raise LogFormatError(f"{where}: {text[:80]!r} is no time: {error}") from None
+        raise LogFormatError(f"{where}: {text[:80]!r} is not a time: {error}") from None
     if not 0 <= t_ns < _LATEST_NS:
-        raise LogFormatError(f"{where}: {text[:80]!r}: want a time from 0 on and before 2116")
+        raise LogFormatError(f"{where}: {text[:80]!r}: expected a time from 0 on and before 2116")
     return t_ns
 
 
@@ -255,7 +255,9 @@ def _date_ns(date: re.Match[str]) -> int:
 def _period(path: Path, line: int, text: str) -> Fraction:
     rate = Fraction(text) if _NUMBER.fullmatch(text) else Fraction(0)
     if not 0 < rate <= 100_000:
-        raise LogFormatError(f"{path}: line {line}: rate_hz {text[:40]!r}; want a rate like 29.97")
+        raise LogFormatError(
+            f"{path}: line {line}: rate_hz {text[:40]!r}; expected a rate like 29.97"
+        )
     return SECOND_NS / rate
 
 
@@ -277,6 +279,6 @@ def _check_twins(path: Path, names: Sequence[str]) -> None:
     for name in names:
         if name in seen:
             raise LogFormatError(
-                f"{path}: {name[:80]!r} stands twice; want one time for each picture"
+                f"{path}: {name[:80]!r} stands twice; expected one time for each picture"
             )
         seen.add(name)

@@ -63,7 +63,7 @@ def pair(paths: Sequence[Path], times: TimeFile) -> TimedFiles:
     is_timed = index >= 0
     if not is_timed.any():
         raise LogFormatError(
-            f"{times.path}: no line names a file of {paths[0].parent}; want names like "
+            f"{times.path}: no line names a file of {paths[0].parent}; expected names like "
             f"{paths[0].name!r}"
         )
     t_ns = np.full(len(paths), -1, dtype=np.int64)

@@ -118,7 +118,7 @@ def default_store() -> Store:
     except (ValueError, OverflowError):
         limit = 0
     if limit <= 0:
-        raise UsageError(f"{LIMIT_VARIABLE}={text}: want a number of GiB above 0")
+        raise UsageError(f"{LIMIT_VARIABLE}={text}: expected a number of GiB above 0")
     return Store(Path(folder), limit)
 
 

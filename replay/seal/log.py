@@ -48,7 +48,7 @@ def with_seal(path: Path, opened: Callable[[], Log], *, is_part: bool = False) -
     Args:
         path: The log.
         opened: Opens it without looking at a seal.
-        is_part: It is read as a part of a folder, whose seal is looked at for all of it.
+        is_part: It is read as a part of a folder, whose seal covers all of it.
 
     Raises:
         LogError: The seal is damaged, or the log cannot be opened: then its seal says where it is

@@ -33,7 +33,7 @@ class RangeFilter(Section):
 
     gate_nis: Positive | None = 16.0
     """Measurements whose normalised innovation squared is larger are refused and counted."""
-    most_m: Positive = 150.0
+    max_m: Positive = 150.0
     """A sign measured further away than this is refused and counted."""
     begin_after: Annotated[int, Field(ge=1)] = 2
     """So many measurements that agree begin a range; the source has 1. On simulated layouts that
@@ -43,7 +43,7 @@ class RangeFilter(Section):
     """A first observation that none has confirmed within this way is forgotten."""
     restart_after: Annotated[int, Field(ge=1)] = 5
     """So many refused measurements in a row that agree among themselves replace the belief."""
-    sd_share: NotNegative = 0.05
+    sd_fraction: NotNegative = 0.05
     """This fraction of a sign's range is added to its curve's s.d. in squares (source: 0)."""
     fade_m: NotNegative = 1.0
     """A sign's errors resemble each other over this way, so that an observation soon after another
@@ -56,7 +56,7 @@ class RangeFilter(Section):
     With 0 it is taken up at once."""
     unseen_mps: Positive = 15.0
     """Where odometry is missing, the s.d. grows by this each second; the mean stays."""
-    most_sd_m: Positive = 20.0
+    max_sd_m: Positive = 20.0
     """A belief less sure than this is dropped."""
 
 
@@ -78,7 +78,7 @@ class Fade(Section):
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
         if (self.way_m is None) == (self.time_s is None):
-            raise _refused("want either way_m or time_s")
+            raise _refused("expected either way_m or time_s")
         return self
 
 
@@ -112,7 +112,7 @@ class CueEntry(Section):
     def _can_be_seen(self) -> Self:
         if self.seen_frames > self.of_frames:
             raise _refused(
-                f"seen_frames {self.seen_frames} of of_frames {self.of_frames}: never; want no more"
+                f"seen_frames {self.seen_frames} of of_frames {self.of_frames}; expected no more"
             )
         return self
 

@@ -26,7 +26,7 @@ class Past(Section):
     """Cars, trucks, motorcycles, standing or moving; without 3 and 4, pedestrians and bicycles."""
     vehicle_age_frames: NotNegative = 2.0
     """A vehicle must have been seen in so many pictures of the device."""
-    most_age_s: Positive = 0.5
+    max_age_s: Positive = 0.5
     """What the device said longer ago is forgotten; the cues are then neutral."""
     settles_s: NotNegative = 0.03
     """An image's burst on the bus is whole so long after its first frame."""

@@ -39,7 +39,7 @@ def explain(error: ValidationError, text: str | None, where: str, root: type[Bas
     given = repr(first["input"])
     if len(given) > GIVEN_CHARACTERS:
         given = f"{given[:GIVEN_CHARACTERS]}..."
-    return f"{place}: {first['msg'].lower()}, got {given}; mend the value{more}"
+    return f"{place}: {first['msg'].lower()}, got {given}; correct the value{more}"
 
 
 def _suggestion(keys: list[str], root: type[BaseModel]) -> str:

@@ -192,7 +192,7 @@ class Cues(Section):
     stop_sign_score: Proportion = 0.9
     traffic_light_labels: tuple[str, ...] = ("traffic light",)
     traffic_light_score: Proportion = 0.9
-    road_share: Proportion = 0.2
+    road_fraction: Proportion = 0.2
     """More road than this in a region is a cue (eq. 14)."""
     own: dict[Name, OwnCue] = Field(default_factory=dict)
     """By name; what each says of an intersection stands under [fusion.cues]."""
@@ -225,11 +225,11 @@ class Cars(Section):
     """A car that moved by less than this fraction of the width, both ways, stood."""
     slope: NotNegative = 0.25
     """Horizontal motion: less than so many pixels down or up for one to the side."""
-    most_gap_s: Positive = 0.5
+    max_gap_s: Positive = 0.5
     """Frames further apart are not compared."""
-    least_frames: Annotated[int, Field(ge=3)] = 3
+    min_frames: Annotated[int, Field(ge=3)] = 3
     """With ``kind = "tracks"`` a car is judged once seen in so many frames."""
-    most_frames: Annotated[int, Field(ge=3, le=100)] = 10
+    max_frames: Annotated[int, Field(ge=3, le=100)] = 10
     """And by the newest so many."""
     within_m: Positive = 60.0
     """Cars that are further away by their height are not judged."""
@@ -250,7 +250,7 @@ class Ranges(Section):
 
     kind: Literal["curve", "motion"] | None = None
     """``curve``: the curves below, and no range without one. ``motion``: range and true height
-    together, from how an object grows as the car moves; wants ``camera.focal_px``. Left out: a
+    together, from how an object grows as the car moves; needs ``camera.focal_px``. Left out: a
     curve where one is given, else motion where ``camera.focal_px`` is."""
     stop_sign: RangeCurve | None = None
     traffic_light: RangeCurve | None = None
@@ -282,7 +282,7 @@ class Landmarks(Section):
     """Matches with a lower score are none."""
     sigmas: Annotated[float, Field(gt=0.0, le=4.0)] = 2.0
     """Compare with landmarks inside the ellipse of so many."""
-    most_candidates: Annotated[int, Field(ge=1)] = 50
+    max_candidates: Annotated[int, Field(ge=1)] = 50
     gate_nis: Positive | None = 13.8
     """Refuse matches whose normalised innovation squared is larger (one good one in a thousand)."""
     interval_m: NotNegative = 1.0
@@ -339,7 +339,7 @@ class Vehicle(Section):
     def _focal_length(cls, ranges: Ranges, info: ValidationInfo) -> Ranges:
         camera = info.data.get("camera")
         if ranges.kind == "motion" and camera is not None and camera.focal_px is None:
-            raise PydanticCustomError("ranges", 'kind = "motion" wants camera.focal_px')
+            raise PydanticCustomError("ranges", 'kind = "motion" needs camera.focal_px')
         return ranges
 
 
@@ -386,7 +386,7 @@ def parse(text: str, where: str) -> Vehicle:
     try:
         tree = toml_tree(text)
     except ValueError as error:
-        raise VehicleError(f"{where}: not TOML: {error}; mend that line") from None
+        raise VehicleError(f"{where}: not TOML: {error}; correct that line") from None
     try:
         return Vehicle.model_validate(tuples(tree))
     except ValidationError as error:

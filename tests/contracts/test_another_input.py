@@ -140,7 +140,7 @@ def test_a_finished_training_is_not_begun_anew_by_resume(
     argv = ["train", "mask-rcnn", "--data", str(folder / "coco.json"), "--images"]
 
     assert cli.run([*argv, str(folder / "images"), "-o", str(out), "--resume"]) == 1
-    assert "--overwrite begins anew" in capsys.readouterr().err
+    assert "--overwrite starts over" in capsys.readouterr().err
     assert out.read_bytes() == b"weights"
 
 

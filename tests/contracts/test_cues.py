@@ -74,13 +74,13 @@ def test_every_cue_keeps_the_contract(cue: CueSpec) -> None:
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"name": "Zebra"}, "want a_lower_name"),
+        ({"name": "Zebra"}, "expected a_lower_name"),
         ({"precision": 1.0}, "precision"),
         ({"supports": ()}, "supports and excludes nothing"),
         ({"excludes": ("straight",)}, "supports and excludes"),
         ({"rule": "crosscue.detectors.cues.labelled:nothing"}, "rule"),
         ({"rule": f"{__name__}:always"}, "counts 1 where nothing is"),
-        ({"rule": f"{__name__}:a_share"}, "want a count"),
+        ({"rule": f"{__name__}:a_fraction"}, "expected a count"),
     ],
 )
 def test_a_cue_that_breaks_the_contract_is_reported(changes: dict[str, Any], match: str) -> None:
@@ -93,7 +93,7 @@ def always(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
     return 1
 
 
-def a_share(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> float:
+def a_fraction(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> float:
     """A rule that counts no whole number."""
     return 0.5
 

@@ -13,7 +13,7 @@ from support.every_format import EVERY_FORMAT
 from support.one_row import ONE_ROW
 
 WITHOUT_ROWS_OF_THEIR_OWN: Final = {
-    "mf4": "records have a fixed size and no mark or checksum: a damaged one cannot be told",
+    "mf4": "records have a fixed size and no mark or checksum: a damaged one cannot be reported",
     "comma2k19": "an .npy array has neither: a damaged number is another number",
     "kitti-raw": "a row is a line in each of several files",
     "video": "a damaged packet is found when it is decoded, and may take others with it",

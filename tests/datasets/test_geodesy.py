@@ -79,5 +79,5 @@ def test_one_second_of_arc_is_about_thirty_one_metres_north_and_less_east() -> N
 
 
 def test_another_shape_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"want \(N, 3\), got \(2,\)"):
+    with pytest.raises(ValueError, match=r"expected \(N, 3\), got \(2,\)"):
         ecef_to_geodetic([1.0, 2.0])

@@ -182,8 +182,8 @@ def test_only_the_part_asked_for_is_given(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("", "0 numbers; want 30"),
-        (" ".join(packet_lines(1)[0].split()[:29]), "29 numbers; want 30"),
+        ("", "0 numbers; expected 30"),
+        (" ".join(packet_lines(1)[0].split()[:29]), "29 numbers; expected 30"),
         (packet_lines(1)[0].replace("9.81", "much", 1), "not all of it are numbers"),
         (packet_lines(1)[0].replace("9.81", "nan", 1), "a number is not finite"),
         (packet_lines(1)[0].replace("49", "149", 1), "not on the earth"),
@@ -261,7 +261,7 @@ def test_several_sequences_in_one_folder_are_refused(tmp_path: Path) -> None:
     drive = tracking_drive(tmp_path / "drive", 2)
     (drive / "oxts" / "0004.txt").write_text("")
 
-    with pytest.raises(LogFormatError, match="2 sequences; want a folder with one"):
+    with pytest.raises(LogFormatError, match="2 sequences; expected a folder with one"):
         open_log(drive)
 
 

@@ -116,11 +116,11 @@ def test_adding_keeps_approaches_and_replaces_cues(tmp_path: Path, log: Path) ->
 
 
 DAMAGED = {
-    "want whole nanoseconds",
+    "expected whole nanoseconds",
     "no such image",
     "no such category",
     "four numbers",
-    "want a list",
+    "expected a list",
     "neither twice",
 }
 """What is wrong with the file whatever its log is: it cannot be read, exit status 4."""
@@ -175,7 +175,7 @@ DAMAGED = {
                 ],
                 "annotations": [],
             },
-            "want whole nanoseconds",
+            "expected whole nanoseconds",
         ),
         ({"images": []}, "no such image"),
         ({"images": [], "annotations": []}, "no picture in it"),
@@ -196,7 +196,7 @@ DAMAGED = {
             {"annotations": [{"image_id": 1, "category_id": 3, "bbox": [1, 1, None, 1]}]},
             "four numbers",
         ),
-        ({"annotations": {}}, "want a list"),
+        ({"annotations": {}}, "expected a list"),
         ({"categories": [{"id": 3, "name": "a"}, {"id": 3, "name": "b"}]}, "neither twice"),
         (
             {"categories": [{"id": 13, "name": "stop sing"}, {"id": 3, "name": "car"}]},
@@ -225,7 +225,7 @@ def test_nan_in_a_box_is_refused(tmp_path: Path) -> None:
     text = json.dumps(coco()).replace("30.5", "NaN")
     (tmp_path / "coco.json").write_text(text)
 
-    with pytest.raises(SchemaError, match="want four numbers"):
+    with pytest.raises(SchemaError, match="expected four numbers"):
         read_coco(tmp_path / "coco.json")
 
 
@@ -241,7 +241,7 @@ def test_labels_mean_what_the_user_says(
     for own, said in (
         ("cat=stop_sign", "no such label"),
         ("dog=sing", "no such cue"),
-        ("dog", "want LABEL=CUE"),
+        ("dog", "expected LABEL=CUE"),
     ):
         assert _import(source, log, tmp_path / "u.json", "--map", own) == 2
         assert said in _refused(capsys)
@@ -346,13 +346,13 @@ def test_cvat_for_video_counts_every_frame_of_its_task(tmp_path: Path, log: Path
     [
         ("", "not readable as XML"),
         ("<annotations>", "not readable as XML"),
-        ("<svg></svg>", "want <annotations>"),
+        ("<svg></svg>", "expected <annotations>"),
         ("<annotations>" + "<a>" * 70 + "</a>" * 70 + "</annotations>", "over 64 deep"),
-        (IMAGES_XML.replace('xtl="5.00"', 'xtl="nan"'), "want a number"),
-        (IMAGES_XML.replace('width="64"', 'width="x"'), "want a whole number"),
-        (IMAGES_XML.replace('width="64"', 'width="0"'), "want pixels"),
+        (IMAGES_XML.replace('xtl="5.00"', 'xtl="nan"'), "expected a number"),
+        (IMAGES_XML.replace('width="64"', 'width="x"'), "expected a whole number"),
+        (IMAGES_XML.replace('width="64"', 'width="0"'), "expected pixels"),
         (IMAGES_XML.replace('label="car"', ""), "has no label"),
-        (IMAGES_XML.replace("20,5;", "20;"), "want x,y"),
+        (IMAGES_XML.replace("20,5;", "20;"), "expected x,y"),
         (_video(_track_box(2)), "frame 2: the task has 1 to 5 by 2"),
         (_video(_track_box(1)).replace("original_size", "o"), "original_size/width"),
         (_video(_track_box(1), "<stop_frame>999999999</stop_frame>"), "over 10000000"),

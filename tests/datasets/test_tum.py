@@ -79,12 +79,12 @@ def test_comments_blank_lines_commas_and_a_byte_order_mark_are_fine(tmp_path: Pa
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("1.6 1 2 3 0 0 0", "line 3: 7 numbers instead of 8; want timestamp"),
+        ("1.6 1 2 3 0 0 0", "line 3: 7 numbers instead of 8; expected timestamp"),
         ("1.6 1 2 3 0 0 0 1 9", "line 3: 9 numbers"),
-        ("now 1 2 3 0 0 0 1", "line 3: 'now' is no number of seconds"),
-        ("nan 1 2 3 0 0 0 1", "line 3: 'nan' is no time"),
-        ("1e30 1 2 3 0 0 0 1", "line 3: '1e30' is no time"),
-        ("1e999999999 1 2 3 0 0 0 1", "line 3: '1e999999999' is no time"),
+        ("now 1 2 3 0 0 0 1", "line 3: 'now' is not a number of seconds"),
+        ("nan 1 2 3 0 0 0 1", "line 3: 'nan' is not a time"),
+        ("1e30 1 2 3 0 0 0 1", "line 3: '1e30' is not a time"),
+        ("1e999999999 1 2 3 0 0 0 1", "line 3: '1e999999999' is not a time"),
         ("1.6 1 two 3 0 0 0 1", "line 3: could not convert"),
         ("1.6 1 inf 3 0 0 0 1", "line 3: a number that is not finite"),
         ("1.6 1 2 3 0 0 0 0", "line 3: a quaternion of length 0"),
@@ -135,11 +135,11 @@ def test_a_planar_pose_keeps_its_heading(heading: float) -> None:
 @pytest.mark.parametrize(
     ("t_ns", "xyz", "quat", "says"),
     [
-        ([1, 2], np.zeros((1, 3)), np.eye(4)[[0, 0]], r"xyz_m: want \(2, 3\), got \(1, 3\)"),
-        ([1, 2], np.zeros((2, 3)), np.eye(4)[[0]], r"quat_wxyz: want \(2, 4\), got \(1, 4\)"),
-        ([2, 2], np.zeros((2, 3)), np.eye(4)[[0, 0]], "want increasing times"),
-        ([1, 2], np.full((2, 3), np.nan), np.eye(4)[[0, 0]], "want finite"),
-        ([1, 2], np.zeros((2, 3)), np.ones((2, 4)), "want unit quaternions"),
+        ([1, 2], np.zeros((1, 3)), np.eye(4)[[0, 0]], r"xyz_m: expected \(2, 3\), got \(1, 3\)"),
+        ([1, 2], np.zeros((2, 3)), np.eye(4)[[0]], r"quat_wxyz: expected \(2, 4\), got \(1, 4\)"),
+        ([2, 2], np.zeros((2, 3)), np.eye(4)[[0, 0]], "expected increasing times"),
+        ([1, 2], np.full((2, 3), np.nan), np.eye(4)[[0, 0]], "expected finite"),
+        ([1, 2], np.zeros((2, 3)), np.ones((2, 4)), "expected unit quaternions"),
     ],
 )
 def test_columns_that_are_no_poses_are_refused(

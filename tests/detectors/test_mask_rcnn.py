@@ -328,7 +328,7 @@ def _json(**changes: Any) -> str:
 def test_a_checkpoint_with_other_classes_than_its_weights_is_refused(tmp_path: Path) -> None:
     path = _file(tmp_path, _json(classes=("car", "boat")))
 
-    with pytest.raises(VehicleError, match=r"roi_heads.*want shape \(12,.*got \(16,"):
+    with pytest.raises(VehicleError, match=r"roi_heads.*expected shape \(12,.*got \(16,"):
         build(network=str(path))
 
 
@@ -345,7 +345,7 @@ def test_weights_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
     }
     tensors["rpn.head.cls_logits.bias"][0] = float("nan")
 
-    with pytest.raises(VehicleError, match=r"cls_logits\.bias: holds numbers that are none"):
+    with pytest.raises(VehicleError, match=r"cls_logits\.bias: holds values that are not finite"):
         load_checkpoint(_file(tmp_path, _json(), tensors))
 
 
@@ -388,7 +388,7 @@ def test_a_hostile_pickle_is_refused_and_never_run(tmp_path: Path, suffix: str) 
     path = tmp_path / f"weights{suffix}"
     path.write_bytes(content)
 
-    with pytest.raises(VehicleError, match=r"want \.safetensors|no safetensors file"):
+    with pytest.raises(VehicleError, match=r"expected \.safetensors|no safetensors file"):
         build(network=str(path))
 
     assert not trap.exists()
@@ -427,7 +427,7 @@ def test_the_embedded_networks_are_those_that_were_measured(
     (tmp_path / "checkpoints" / embedded_path().name).write_bytes(content)
     monkeypatch.setattr(weights_file, "__file__", str(tmp_path / "weights_file.py"))
 
-    with pytest.raises(VehicleError, match="damaged: want sha256 270a84"):
+    with pytest.raises(VehicleError, match="damaged: expected sha256 270a84"):
         build(network="embedded")
 
 
@@ -439,12 +439,14 @@ def test_coco_weights_that_were_damaged_on_the_disk_are_not_loaded(
     folder.mkdir(parents=True)
     (folder / "maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth").write_bytes(b"half of it")
 
-    with pytest.raises(VehicleError, match=r"damaged: sha256 .*, want bf2d0c1e.*delete it"):
+    with pytest.raises(VehicleError, match=r"damaged: sha256 .*, expected bf2d0c1e.*delete it"):
         build(network="resnet50")
 
 
 def test_a_wrong_name_or_setting_says_what_there_is(tmp_path: Path) -> None:
-    with pytest.raises(VehicleError, match="'resnet' is none of embedded, resnet50, resnet50-v2"):
+    with pytest.raises(
+        VehicleError, match="'resnet' is not one of embedded, resnet50, resnet50-v2"
+    ):
         build(network="resnet")
     with pytest.raises(VehicleError, match="No such file"):
         build(network=str(tmp_path / "none.safetensors"))

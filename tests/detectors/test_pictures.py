@@ -39,7 +39,7 @@ def test_every_coding_gives_the_size_and_channels_asked_for(suffix: str, view: V
 
 @pytest.mark.parametrize(("least", "by"), [(None, 1), (64, 1), (33, 1), (32, 2), (10, 4), (8, 8)])
 def test_a_jpeg_is_decoded_at_the_smallest_scale_that_serves(least: int | None, by: int) -> None:
-    view = View(least_width_px=least)
+    view = View(min_width_px=least)
 
     pixels, size = decode(_encode(_ramp(), ".jpg"), view)
 

@@ -13,7 +13,7 @@ import torch
 from crosscue.datasets.adapters.road_folder import load_folder
 from crosscue.detectors import rle
 from crosscue.detectors.base import Frame, RoadMask
-from crosscue.detectors.cues.road import road_shares
+from crosscue.detectors.cues.road import road_fractions
 from crosscue.detectors.networks.road.checkpoint import RoadFacts, load_road, save_road
 from crosscue.detectors.networks.road.detector import build
 from crosscue.detectors.networks.road.network import RoadNetwork, embedded_path
@@ -119,7 +119,7 @@ def test_files_that_are_no_road_networks_are_refused(tmp_path: Path) -> None:
         load_road(flipped)
     with pytest.raises(VehicleError, match=r"other.safetensors: not what crosscue train road"):
         load_road(other)
-    with pytest.raises(VehicleError, match=r"r.pth: want .safetensors"):
+    with pytest.raises(VehicleError, match=r"r.pth: expected .safetensors"):
         load_road(tmp_path / "r.pth")
     with pytest.raises(VehicleError, match=r"none.safetensors: No such file"):
         build(checkpoint=str(tmp_path / "none.safetensors"))
@@ -145,7 +145,7 @@ def test_any_picture_gives_a_mask_of_the_networks_size() -> None:
     for mask, frame in zip(masks(frames), frames, strict=True):
         assert (mask.t_ns, mask.size_px) == (frame.t_ns, frame.size_px)
         assert rle.decode(mask.mask, mask.mask_size_px).shape == mask.mask_size_px[::-1]
-        shares = road_shares(mask, Regions())
+        shares = road_fractions(mask, Regions())
         assert min(shares.left, shares.straight, shares.right) >= 0.0
 
 
@@ -218,12 +218,12 @@ def test_a_picture_without_its_mask_or_of_another_size_is_reported(tmp_path: Pat
     [
         (["--layouts", "A"], "only for scoring"),
         (["--layouts", "L1", "--val-layouts", "L1"], "also trained on"),
-        (["--layouts", "Q"], "is no layout"),
-        (["--layouts", "L2-L1"], "want the lower one first"),
-        (["--layouts", "L1", "--test-layouts", "Z"], "is no layout"),
+        (["--layouts", "Q"], "is not a layout"),
+        (["--layouts", "L2-L1"], "expected the lower one first"),
+        (["--layouts", "L1", "--test-layouts", "Z"], "is not a layout"),
         (["--layouts", "L1", "L0-L3"], "L1: named twice"),
-        (["--layouts", "L1", "--seed", "-1"], "want 0 or more"),
-        (["--layouts", "L1", "--threads", "-1"], "want 0 or more"),
+        (["--layouts", "L1", "--seed", "-1"], "expected 0 or more"),
+        (["--layouts", "L1", "--threads", "-1"], "expected 0 or more"),
         (["--measure", "embedded", "--test-layouts", "A"], "not with -o"),
         ([], "give --layouts"),
     ],

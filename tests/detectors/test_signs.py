@@ -161,7 +161,7 @@ def test_fit_signs_chooses_on_some_frames_and_measures_on_others(
     assert run(["fit", "signs", str(labels), "--label", "one way left"]) == 0
 
     reported = capsys.readouterr().out
-    assert "least_score = " in reported
+    assert "min_score = " in reported
     assert "precision 1.00 (4 of 4; 95 % interval 0.51 to 1.00)" in reported
     printed = reported.split()[2]
     assert (
@@ -280,7 +280,7 @@ def test_a_given_threshold_is_measured_not_chosen(
     assert run(["fit", "signs", fitted, "--label", "one way left", "--threshold", "0.99"]) == 0
 
     reported = capsys.readouterr().out
-    assert "least_score = 0.99\n" in reported
+    assert "min_score = 0.99\n" in reported
     assert "recall    0.00 (0 of 2; " in reported
 
 
@@ -309,8 +309,8 @@ def test_a_file_that_is_no_coco_is_reported(
 @pytest.mark.parametrize(
     ("row", "said"),
     [
-        ("a.png,stop,1,2,x,4", "labels.csv:2: want four numbers"),
-        ("a.png,stop,9,2,3,4", "want x0 < x1"),
+        ("a.png,stop,1,2,x,4", "labels.csv:2: expected four numbers"),
+        ("a.png,stop,9,2,3,4", "expected x0 < x1"),
         ("a.png,stop,1,2,3,4", "check the picture column"),
         ("labels.csv,stop,1,2,3,4", "not a JPEG, PNG or WebP picture"),
     ],
@@ -337,7 +337,8 @@ def test_a_picture_cut_short_is_named(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize(
-    ("name", "said"), [("none.csv", "none.csv: No such file"), ("wild.csv", "wild.csv: is no text")]
+    ("name", "said"),
+    [("none.csv", "none.csv: No such file"), ("wild.csv", "wild.csv: is not text")],
 )
 def test_a_file_of_labels_that_is_none_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, said: str

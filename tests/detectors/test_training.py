@@ -101,8 +101,8 @@ def test_a_box_that_sticks_out_is_cut_off_at_the_edge(tmp_path: Path) -> None:
         ({"annotations": []}, "no usable annotation of car"),
         ({"images": []}, "none of its pictures"),
         ({"categories": []}, "no class of car; it has: none"),
-        ({"annotations": {}}, "annotations: want a list"),
-        ({"images": [7]}, "images: want a list"),
+        ({"annotations": {}}, "annotations: expected a list"),
+        ({"images": [7]}, "images: expected a list"),
     ],
 )
 def test_a_set_without_anything_to_learn_from_is_refused(
@@ -117,7 +117,7 @@ def test_a_file_that_is_no_coco_file_is_refused(tmp_path: Path, content: bytes) 
     path = tmp_path / "coco.json"
     path.write_bytes(content)
 
-    with pytest.raises(SchemaError, match="want a COCO file"):
+    with pytest.raises(SchemaError, match="expected a COCO file"):
         read_coco(path, tmp_path, CARS)
 
 
@@ -143,7 +143,7 @@ def test_a_picture_of_another_size_than_annotated_is_refused(tmp_path: Path) -> 
     labelled = _changed(tmp_path, images=_with({"width": 130, "height": 97}))
     sampler = Sampler(labelled, plan_of(), WINDOW, 0)
 
-    with pytest.raises(SchemaError, match=r"0\.png: want a picture of 130 x 97"):
+    with pytest.raises(SchemaError, match=r"0\.png: expected a picture of 130 x 97"):
         [sampler(number) for number in range(20)]
 
 
@@ -366,7 +366,7 @@ def test_from_simulated_pictures_to_a_checkpoint_by_commands_alone(
     assert cv2.imread(str(out.with_suffix(".curve.png"))) is not None
     assert not out.with_suffix(".state.safetensors").exists()
     assert run(learn) == 1
-    assert "--overwrite begins anew" in capsys.readouterr().err
+    assert "--overwrite starts over" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("layout", ["A", "H", "A-C", "L", "L9-L3", "L1-A", "L-1", "L0-L999999999"])
@@ -382,7 +382,7 @@ def test_nothing_is_rendered_for_training_of_what_is_scored(
     ("flags", "why"),
     [
         (["-o", "x.pth"], "ends in .safetensors"),
-        (["--steps", "0"], "--steps: want 1 or more"),
+        (["--steps", "0"], "--steps: expected 1 or more"),
         (["--learning-rate", "nan"], "--learning-rate"),
         (["--window", "100", "64"], "multiples of 32"),
         (["--window", "64", "1000000000"], "multiples of 32 from 64 to 4096"),
@@ -462,10 +462,10 @@ def test_a_network_is_measured_without_training(
 @pytest.mark.parametrize(
     ("flags", "why"),
     [
-        (["--subset", "9"], "want A:B:N"),
-        (["--subset", "::0"], "want A:B:N"),
+        (["--subset", "9"], "expected A:B:N"),
+        (["--subset", "::0"], "expected A:B:N"),
         (["--subset", "90:"], "none of 4 pictures"),
-        (["--proposals", "0"], "want 1 to 2000"),
+        (["--proposals", "0"], "expected 1 to 2000"),
     ],
 )
 def test_a_measurement_of_nothing_is_refused(

@@ -17,7 +17,7 @@ from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
 from support.fusion import NONE_SEEN, SECOND_NS, drive, light, sign
 
 FRAME_NS = SECOND_NS // 10
-PLAIN = RangeFilter(sd_share=0.0, fade_m=0.0, begin_after=1)
+PLAIN = RangeFilter(sd_fraction=0.0, fade_m=0.0, begin_after=1)
 """As in the source, so that ranges can be worked out by hand."""
 
 
@@ -65,7 +65,7 @@ def test_a_sign_seen_once_opens_an_approach_but_reports_no_range() -> None:
 
     assert taken[1].approach == 1
     assert not any(step.ranges for step in taken)
-    assert loop.counts["ranges waiting for another look"] == 1
+    assert loop.counts["ranges waiting for a second observation"] == 1
 
 
 def test_approaches_of_a_drive_are_numbered_and_begin_anew() -> None:
@@ -308,7 +308,7 @@ def test_several_signs_of_one_kind_count_as_their_mean() -> None:
 
 
 def test_a_signs_sd_may_grow_with_its_range() -> None:
-    loop = approaches(range_filter=RangeFilter(sd_share=0.1, fade_m=0.0, begin_after=1))
+    loop = approaches(range_filter=RangeFilter(sd_fraction=0.1, fade_m=0.0, begin_after=1))
 
     (step,) = steps([replace(frame(0), signs=(sign(30.0, 4.0),))], loop)
 
@@ -387,7 +387,7 @@ def test_odometry_missing_for_long_drops_the_range_and_then_the_approach() -> No
     assert taken[0].ranges
     assert not any(one.ranges for one in taken[14:])
     assert taken[14].approach == 1
-    assert loop.counts["ranges dropped: too unsure"] == 1
+    assert loop.counts["ranges dropped: too uncertain"] == 1
     assert taken[-1].approach is None
 
 

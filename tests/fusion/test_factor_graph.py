@@ -161,7 +161,7 @@ def test_log_odds_and_probability_are_each_others_inverse(p: float) -> None:
 
 @pytest.mark.parametrize("bad", [0.0, 1.0, -0.1, math.nan])
 def test_certainty_has_no_log_odds(bad: float) -> None:
-    with pytest.raises(ValueError, match="want inside"):
+    with pytest.raises(ValueError, match="expected inside"):
         log_odds(bad)
 
 

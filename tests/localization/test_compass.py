@@ -304,13 +304,13 @@ def test_nonsense_is_refused_by_name() -> None:
     stretch: Matrix = ((2.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     with pytest.raises(ValueError, match="got a mirror"):
         CompassSettings(mounting_rotation=mirror)
-    with pytest.raises(ValueError, match="mounting_rotation: want a rotation"):
+    with pytest.raises(ValueError, match="mounting_rotation: expected a rotation"):
         CompassSettings(mounting_rotation=stretch)
-    with pytest.raises(ValueError, match="soft_iron: want determinant > 0"):
+    with pytest.raises(ValueError, match="soft_iron: expected determinant > 0"):
         CompassSettings(soft_iron=mirror)
-    with pytest.raises(ValueError, match="declination_rad: want finite"):
+    with pytest.raises(ValueError, match="declination_rad: expected finite"):
         CompassSettings(declination_rad=math.nan)
-    with pytest.raises(ValueError, match=r"field_t: want \(4, 3\), got \(4, 2\)"):
+    with pytest.raises(ValueError, match=r"field_t: expected \(4, 3\), got \(4, 2\)"):
         heading(np.zeros((4, 2)), CompassSettings())
-    with pytest.raises(ValueError, match=r"roll_rad: want \(4,\), got \(3,\)"):
+    with pytest.raises(ValueError, match=r"roll_rad: expected \(4,\), got \(3,\)"):
         heading(np.zeros((4, 3)), CompassSettings(), roll_rad=np.zeros(3))

@@ -322,19 +322,21 @@ def test_waiting_rows_stay_few() -> None:
 
 
 def test_nonsense_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"wheels_mps: want \(3, 2\) or \(3, 4\), got \(3, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"wheels_mps: expected \(3, 2\) or \(3, 4\), got \(3, 3\)"
+    ):
         WheelSpeeds(times(3), np.zeros((3, 3)))
-    with pytest.raises(ValueError, match=r"is_reverse: want \(3,\), got \(2,\)"):
+    with pytest.raises(ValueError, match=r"is_reverse: expected \(3,\), got \(2,\)"):
         WheelSpeeds(times(3), np.zeros((3, 2)), np.zeros(2, np.bool_))
-    with pytest.raises(ValueError, match=r"values: want \(3,\), got \(2,\)"):
+    with pytest.raises(ValueError, match=r"values: expected \(3,\), got \(2,\)"):
         TurnSignal(times(3), np.zeros(2), "steering")
-    with pytest.raises(ValueError, match="track_width_m: want > 0, got 0"):
+    with pytest.raises(ValueError, match="track_width_m: expected > 0, got 0"):
         OdometrySettings(track_width_m=0.0)
-    with pytest.raises(ValueError, match="slip_per_sqrt_m: want >= 0, got -1"):
+    with pytest.raises(ValueError, match="slip_per_sqrt_m: expected >= 0, got -1"):
         OdometrySettings(track_width_m=1.6, slip_per_sqrt_m=-1.0)
-    with pytest.raises(ValueError, match="steering_ratio: want finite and not 0"):
+    with pytest.raises(ValueError, match="steering_ratio: expected finite and not 0"):
         OdometrySettings(track_width_m=1.6, steering_ratio=0.0)
-    with pytest.raises(ValueError, match="wheelbase_m: wanted for steering"):
+    with pytest.raises(ValueError, match="wheelbase_m: needed for steering"):
         integrate(
             both_wheels(1.0),
             OdometrySettings(track_width_m=1.6),

@@ -319,7 +319,7 @@ def test_rows_come_at_the_times_asked_for() -> None:
 
 
 def test_wrong_shapes_and_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"var_rad2: want \(2,\), got \(1,\)"):
+    with pytest.raises(ValueError, match=r"var_rad2: expected \(2,\), got \(1,\)"):
         Headings(np.zeros(2, np.int64), np.zeros(2), np.zeros(1))
-    with pytest.raises(ValueError, match="heading_interval_m: want >= 0, got -1"):
+    with pytest.raises(ValueError, match="heading_interval_m: expected >= 0, got -1"):
         TrackSettings(heading_interval_m=-1.0)

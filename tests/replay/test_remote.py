@@ -221,5 +221,5 @@ def test_only_texts_are_urls(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not is_remote("folder/a.mcap")
     assert not is_remote(Path("s3://bucket/a.mcap"))
     monkeypatch.setenv(remote.LIMIT_VARIABLE, "-1")
-    with pytest.raises(UsageError, match="want a number of GiB above 0"):
+    with pytest.raises(UsageError, match="expected a number of GiB above 0"):
         remote.default_store()

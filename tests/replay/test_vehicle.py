@@ -21,7 +21,7 @@ def test_an_empty_file_of_version_1_is_all_defaults() -> None:
         ("version = 1\n[odometry]\nwheelbase_m = '2.7'", r":3: .*valid number, got '2.7'"),
         ("version = 1\n[odometry]\nwheelbase_m = -2.7", r":3: .*greater than 0"),
         ("version = 1\n[odometry]\nwheelbase_m = nan", r":3: odometry.wheelbase_m"),
-        ("version = 1\n[ranges]\nkind = 'motion'", r":2: ranges: .*wants camera.focal_px"),
+        ("version = 1\n[ranges]\nkind = 'motion'", r":2: ranges: .*needs camera.focal_px"),
         ("version = 2", r":1: version: .*1, got 2"),
         ("version = 1\n[can.yaw_rate]\nsignal = 'YAW'", r":3: can.yaw_rate.signal"),
         ("version = 1\nversion = 1", r"not TOML: .*"),

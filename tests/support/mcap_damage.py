@@ -76,9 +76,9 @@ class Kind(Enum):
     """What became of one damaged copy."""
 
     REFUSED = "refused with one line"
-    SAME = "everything given, nothing to tell"
-    TOLD = "loss told"
-    NOTICED = "everything given, with a notice"
+    SAME = "everything read, nothing to report"
+    TOLD = "loss reported"
+    NOTICED = "everything read, with a notice"
     SILENT = "SILENT LOSS"
     CHANGED = "a message changed where no checksum can say which"
     WRONG = "WRONG MESSAGE"

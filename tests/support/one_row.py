@@ -23,7 +23,7 @@ def _garbled_line(path: Path) -> None:
 
 
 def _no_hexadecimal_digit(path: Path) -> None:
-    """A line of a candump log with an identifier that is no number."""
+    """A line of a candump log with an identifier that is not a number."""
     lines = path.read_bytes().splitlines(keepends=True)
     stamp, bus, frame = lines[len(lines) // 2].split(b" ", 2)
     lines[len(lines) // 2] = b" ".join([stamp, bus, b"Z" + frame[1:]])

@@ -30,7 +30,7 @@ class Oracle:
     @property
     def view(self) -> View:
         """Hardly any pixels: it does not look at them."""
-        return View(least_width_px=64)
+        return View(min_width_px=64)
 
     @property
     def identity(self) -> str:

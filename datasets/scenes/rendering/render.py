@@ -259,11 +259,11 @@ class Renderer:
             thing = self.world.things[int(number)]
             corners = view.project(_corners(thing, t_s))
             mask, box = _cut_out(owner, int(number), corners)
-            visible, inside = self._shares(thing, t_s, view, int(counts[number]), corners)
+            visible, inside = self._fractions(thing, t_s, view, int(counts[number]), corners)
             seen.append(Seen(thing, mask, box, visible, inside, distance_m(thing, t_s, view)))
         return tuple(seen)
 
-    def _shares(
+    def _fractions(
         self, thing: Thing, t_s: float, view: View, pixels: int, corners: Floats
     ) -> tuple[float, float]:
         """Visible fraction of what is in the picture, and the fraction that is in the picture."""

@@ -119,7 +119,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
 def _content(path: Path) -> bytes:
     if path.suffix.lower() in _PICKLES:
         raise VehicleError(
-            f"{path}: weights of this kind can run programs when read; want .safetensors "
+            f"{path}: weights of this kind can run programs when read; expected .safetensors "
             "(convert with safetensors.torch.save_file where you trust the file)"
         )
     try:
@@ -127,15 +127,15 @@ def _content(path: Path) -> bytes:
     except OSError as error:
         raise VehicleError(f"{path}: {error.strerror}; check the network's file name") from None
     if content is None:
-        raise VehicleError(f"{path}: more than {MAX_BYTES:,} bytes; want a checkpoint")
+        raise VehicleError(f"{path}: more than {MAX_BYTES:,} bytes; expected a checkpoint")
     return content
 
 
 def _facts(description: str | None, path: Path) -> Facts:
     if description is None:
         raise VehicleError(
-            f"{path}: says nothing of its classes and size; want one that crosscue train mask-rcnn "
-            "wrote"
+            f"{path}: says nothing of its classes and size; expected one that "
+            "crosscue train mask-rcnn wrote"
         )
     try:
         return Facts.model_validate_json(description)
@@ -162,9 +162,9 @@ def fill(network: Any, tensors: Mapping[str, Tensor], path: Path) -> None:
     for name, value in sorted(tensors.items()):
         if value.shape != wanted[name].shape:
             raise VehicleError(
-                f"{path}: {name}: want shape {tuple(wanted[name].shape)} for its classes, "
+                f"{path}: {name}: expected shape {tuple(wanted[name].shape)} for its classes, "
                 f"got {tuple(value.shape)}; take the file it was trained as"
             )
         if value.is_floating_point() and not bool(value.isfinite().all()):
-            raise VehicleError(f"{path}: {name}: holds numbers that are none; train it again")
+            raise VehicleError(f"{path}: {name}: holds values that are not finite; train it again")
     network.load_state_dict({name: tensors[name].to(wanted[name].dtype) for name in wanted})

@@ -69,7 +69,7 @@ def _check_whole(path: Path) -> None:
     with path.open("rb") as file:
         found = hashlib.file_digest(file, "sha256").hexdigest()
     if not found.startswith(wanted):
-        raise ValueError(f"damaged: sha256 {found[:8]}, want {wanted}")
+        raise ValueError(f"damaged: sha256 {found[:8]}, expected {wanted}")
 
 
 def coco_checkpoint(name: str, weights: Any, tensors: Mapping[str, Any]) -> Checkpoint:

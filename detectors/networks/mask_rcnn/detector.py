@@ -93,7 +93,8 @@ def checkpoint_named(name: str) -> Checkpoint:
     if "." not in Path(name).name:
         names = ", ".join((EMBEDDED, *COCO_NETWORKS))
         raise VehicleError(
-            f"detector mask-rcnn: network: {name!r} is none of {names}; or give a .safetensors file"
+            f"detector mask-rcnn: network: {name!r} is not one of {names}; or give "
+            "a .safetensors file"
         )
     return load_checkpoint(Path(name))
 
@@ -161,7 +162,7 @@ class MaskRcnnDetector:
     @property
     def view(self) -> View:
         """No finer than the network's input."""
-        return View(least_width_px=self.checkpoint.facts.plan.width_px)
+        return View(min_width_px=self.checkpoint.facts.plan.width_px)
 
     @property
     def identity(self) -> str:

@@ -67,11 +67,11 @@ def load_road(path: Path) -> RoadCheckpoint:
         VehicleError: Not there, no safetensors, damaged, or not of a road network.
     """
     if path.suffix != ".safetensors":
-        raise VehicleError(f"{path}: want .safetensors; other files can run programs when read")
+        raise VehicleError(f"{path}: expected .safetensors; other files can run programs when read")
     try:
         content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise VehicleError(f"{path}: more than {MAX_BYTES:,} bytes; want a road network")
+            raise VehicleError(f"{path}: more than {MAX_BYTES:,} bytes; expected a road network")
     except OSError as error:
         raise VehicleError(f"{path}: {error.strerror}; check the file name") from None
     description, tensors = unpacked(content, KEY, path)
@@ -86,7 +86,7 @@ def load_road(path: Path) -> RoadCheckpoint:
         ) from None
     network = RoadNetwork()
     if not all(bool(value.isfinite().all()) for value in tensors.values()):
-        raise VehicleError(f"{path}: holds numbers that are none; train it again")
+        raise VehicleError(f"{path}: holds values that are not finite; train it again")
     try:
         network.load_state_dict(tensors)
     except RuntimeError as error:

@@ -67,7 +67,7 @@ class RoadNetworkDetector:
     @property
     def view(self) -> View:
         """No finer than the network's input."""
-        return View(least_width_px=self.checkpoint.facts.width_px)
+        return View(min_width_px=self.checkpoint.facts.width_px)
 
     @property
     def identity(self) -> str:

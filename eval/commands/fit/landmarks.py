@@ -94,10 +94,10 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("fit landmarks: give --pairs, or LOG... with --database and --poses")
     check_vehicle_output(args)
     if args.max_landmarks < 1:
-        raise UsageError(f"--max-landmarks {args.max_landmarks}: want 1 or more")
+        raise UsageError(f"--max-landmarks {args.max_landmarks}: expected 1 or more")
     if args.same_within >= args.different_beyond:
         raise UsageError(
-            f"--same-within {args.same_within:g}: want less than --different-beyond "
+            f"--same-within {args.same_within:g}: expected less than --different-beyond "
             f"{args.different_beyond:g}"
         )
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)

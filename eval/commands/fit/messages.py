@@ -92,11 +92,11 @@ def run(args: argparse.Namespace) -> int:
 def _report_text(fitted: MessageFit, used: Counter[str], runs: int) -> str:
     lines = [f"{runs} runs, {fitted.approaches} approaches to learn from"]
     lines += [f"  {count:5} {what}" for what, count in sorted(used.items())]
-    lines += ["", "shares of positive looks, feature there and not there (95 % intervals)"]
+    lines += ["", "fractions of positive frames, feature there and not there (95 % intervals)"]
     lines += [_rate_text(one, one.rates) for one in fitted.rates if one.rates is not None]
     lines += ["", "too little seen, so the published message stands"]
     lines += [_unlearned_text(one) for one in fitted.rates if one.rates is None]
-    lines += ["", "looks become independent over"]
+    lines += ["", "frames become independent over"]
     lines += [_fade_text(one) for one in fitted.fades]
     scales = ", ".join(f"{name} {value:.2f}" for name, value in fitted.calibrated.exponents.items())
     lines += ["", f"exponents: {scales or 'none: no feature was both there and not there'}", ""]

@@ -94,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fit and report."""
     if not args.bin_m > 0.0:
-        raise UsageError(f"--bin-m {args.bin_m}: want more than 0")
+        raise UsageError(f"--bin-m {args.bin_m}: expected more than 0")
     if args.figure is not None and args.figure.exists() and not args.overwrite:
         raise OutputError(f"{args.figure}: exists; give another name or --overwrite")
     pairs = _pairs(args)

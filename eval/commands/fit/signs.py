@@ -144,7 +144,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _as_json(fitted: SignFit) -> dict[str, object]:
-    out: dict[str, object] = {"least_score": fitted.threshold}
+    out: dict[str, object] = {"min_score": fitted.threshold}
     for name, on_others in (("chosen_on", False), ("other_frames", True)):
         of = fitted.threshold
         out[name] = None if of is None else _tree(fitted.rates(of, on_others=on_others))

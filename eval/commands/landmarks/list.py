@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     """List."""
     near = near_of(args.near)
     if args.limit < 0:
-        raise UsageError(f"--limit {args.limit}: want 0 or more")
+        raise UsageError(f"--limit {args.limit}: expected 0 or more")
     with LandmarkDatabase(args.database) as database:
         total = len(database)
         found = iter(database) if near is None else database.within(*near)

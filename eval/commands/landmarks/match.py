@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Match."""
     near = near_of(args.near)
     if args.best < 1:
-        raise UsageError(f"--best {args.best}: want 1 or more")
+        raise UsageError(f"--best {args.best}: expected 1 or more")
     vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
     matcher = matcher_for(vehicle, args.matcher)
     seen = matcher.describe(grey_of(read_picture(args.image)))

@@ -166,4 +166,4 @@ def _report(args: argparse.Namespace, output: Path, written: Draft, boxes: int |
         print(f"assumed    {line}")
     if args.picture is not None:
         what = "road" if boxes is None else f"{boxes} boxes"
-        print(f"picture    {what}, drawn in {_drawing(args.picture)}: please look")
+        print(f"picture    {what}, drawn in {_drawing(args.picture)}: please check it")

@@ -53,6 +53,6 @@ def _time_ns(flag: str, text: str | None, logs: Sequence[Log]) -> int | None:
         seconds = math.nan
     if not math.isfinite(seconds):
         raise UsageError(
-            f"{flag} {text}: want seconds after the start (12.5) or absolute time (17...ns)"
+            f"{flag} {text}: expected seconds after the start (12.5) or absolute time (17...ns)"
         )
     return first_ns(logs) + round(seconds * 1e9)

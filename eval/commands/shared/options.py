@@ -64,7 +64,7 @@ def _mebibytes(text: str) -> int:
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and 0.0 < value <= 1 << 20):
-        raise argparse.ArgumentTypeError(f"{text!r}: want MiB, above 0 and up to {1 << 20}")
+        raise argparse.ArgumentTypeError(f"{text!r}: expected MiB, above 0 and up to {1 << 20}")
     return max(int(value * (1 << 20)), 1)
 
 
@@ -138,7 +138,7 @@ def metres(text: str) -> float:
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text!r}: want metres, above 0")
+        raise argparse.ArgumentTypeError(f"{text!r}: expected metres, above 0")
     return value
 
 

@@ -88,7 +88,7 @@ def workers_of(args: argparse.Namespace) -> int:
     if args.workers is None:
         return default_workers()
     if args.workers < 1:
-        raise UsageError(f"--workers {args.workers}: want 1 or more")
+        raise UsageError(f"--workers {args.workers}: expected 1 or more")
     return int(args.workers)
 
 

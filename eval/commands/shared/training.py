@@ -29,7 +29,7 @@ def layouts_of(texts: Sequence[str], who: str) -> list[str]:
     for text in texts:
         names += _span(text, who)
         if len(names) > MOST:
-            raise UsageError(f"{who}: {text}: want at most {MOST:,} layouts; give fewer")
+            raise UsageError(f"{who}: {text}: expected at most {MOST:,} layouts; give fewer")
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise UsageError(f"{who}: {twice}: named twice; name each layout once")
@@ -57,9 +57,9 @@ def _span(text: str, who: str) -> Sequence[str]:
     elif letters is not None:
         names = SCORED[SCORED.index(letters[1]) : SCORED.index(letters[2] or letters[1]) + 1]
     else:
-        raise UsageError(f"{who}: {text!r} is no layout; want L0, L0-L99, A or A-H")
+        raise UsageError(f"{who}: {text!r} is not a layout; expected L0, L0-L99, A or A-H")
     if not names:
-        raise UsageError(f"{who}: {text}: want the lower one first")
+        raise UsageError(f"{who}: {text}: expected the lower one first")
     return names
 
 

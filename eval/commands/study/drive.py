@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     from crosscue.eval.studies.town.replayed import through_log
 
     if not 0 <= args.seed < 1 << 64:
-        raise UsageError(f"--seed {args.seed}: want 0 or more, below 2^64")
+        raise UsageError(f"--seed {args.seed}: expected 0 or more, below 2^64")
     settings = _settings(args)
     done = through_log(args.output, settings, args.seed, overwrite=args.overwrite)
     picture = drive_figure.draw(settings, done.traced, args.seed, args.output)
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         result = done.traced.result
         print(
             f"simulated  {result.travelled_m:.0f} m in {result.seconds:.0f} s, "
-            f"{result.decisions} decisions, {result.detected} landmarks weighed in"
+            f"{result.decisions} decisions, {result.detected} landmarks used"
         )
         print("\nthe replay of its log against the truth")
         print(pose_summary(done.score))

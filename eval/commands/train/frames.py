@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Render and write."""
     if args.per_layout < 1 or args.workers < 1 or args.seed < 0:
-        raise UsageError("--per-layout, --workers: want 1 or more; --seed: want 0 or more")
+        raise UsageError("--per-layout, --workers: expected 1 or more; --seed: expected 0 or more")
     wanted = [_settings(name, args) for name in learnt_layouts_of(args.layouts, "train frames")]
     target = args.output / "coco.json"
     if target.exists():
@@ -93,6 +93,6 @@ def _settings(layout: str, args: argparse.Namespace) -> SceneSettings:
     # Conditions come in ten kinds; layout and run count up together, so each kind comes as often.
     run = int(layout[1:]) % 10 + 1
     if not 64 <= args.width <= 3840 or args.width % 16:
-        raise UsageError(f"--width {args.width}: want a multiple of 16 from 64 to 3840")
+        raise UsageError(f"--width {args.width}: expected a multiple of 16 from 64 to 3840")
     camera = Camera(width_px=args.width, height_px=args.width * 9 // 16)
     return SceneSettings(layout=layout, run=run, seed=args.seed, camera=camera)

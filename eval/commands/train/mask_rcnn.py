@@ -203,24 +203,24 @@ def _check(args: argparse.Namespace) -> None:
         if args.output is not None or args.val_data is not None:
             raise UsageError("--measure: trains nothing, so not with -o or --val-data; leave those")
         if not all(1 <= count <= 2000 for count in args.proposals):
-            raise UsageError("--proposals: want 1 to 2000")
+            raise UsageError("--proposals: expected 1 to 2000")
         return
     if args.output is None:
         raise UsageError("train mask-rcnn: give -o OUT.safetensors, or --measure")
     if args.output.suffix != ".safetensors":
-        raise UsageError(f"-o {args.output}: want a name that ends in .safetensors")
+        raise UsageError(f"-o {args.output}: expected a name that ends in .safetensors")
     for name in ("steps", "batch", "check_every", "check_images", "threads"):
         if getattr(args, name) < 1:
-            raise UsageError(f"--{name.replace('_', '-')}: want 1 or more")
+            raise UsageError(f"--{name.replace('_', '-')}: expected 1 or more")
     if not 0.0 < args.learning_rate < 1.0 or args.seed < 0:
         raise UsageError(
-            "--learning-rate, --seed: want a rate between 0 and 1, and a seed of 0 or more"
+            "--learning-rate, --seed: expected a rate between 0 and 1, and a seed of 0 or more"
         )
     if not 0.0 <= args.balance <= 1.0:
-        raise UsageError(f"--balance {args.balance}: want 0 to 1")
+        raise UsageError(f"--balance {args.balance}: expected 0 to 1")
     if any(side % 32 or not 64 <= side <= MAX_WINDOW_PX for side in args.window):
         raise UsageError(
-            f"--window {args.window[0]} {args.window[1]}: want multiples of 32 from 64 to "
+            f"--window {args.window[0]} {args.window[1]}: expected multiples of 32 from 64 to "
             f"{MAX_WINDOW_PX}"
         )
     if not all(args.classes) or len(set(args.classes)) != len(args.classes):
@@ -269,7 +269,7 @@ def _slice(text: str | None) -> slice:
     """
     match = re.fullmatch(r"(\d{0,9}):(\d{0,9})(?::([1-9]\d{0,8})?)?", text or ":")
     if match is None:
-        raise UsageError(f"--subset {text}: want A:B:N, as 300: or 300:600 or ::4")
+        raise UsageError(f"--subset {text}: expected A:B:N, as 300: or 300:600 or ::4")
     return slice(*(int(part) if part else None for part in match.groups()))
 
 

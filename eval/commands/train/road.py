@@ -156,11 +156,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     if args.width % 16 or not 128 <= args.width <= 1024:
-        raise UsageError(f"--width {args.width}: want a multiple of 16 from 128 to 1024")
+        raise UsageError(f"--width {args.width}: expected a multiple of 16 from 128 to 1024")
     if min(args.per_layout, args.steps, args.batch, args.stop_at or 1) < 1:
-        raise UsageError("--per-layout, --steps, --stop-at, --batch: want 1 or more")
+        raise UsageError("--per-layout, --steps, --stop-at, --batch: expected 1 or more")
     if min(args.seed, args.threads) < 0:
-        raise UsageError("--seed, --threads: want 0 or more")
+        raise UsageError("--seed, --threads: expected 0 or more")
     layouts_of(args.test_layouts, "--test-layouts")
     if args.measure is not None:
         if args.output is not None or args.layouts is not None:
@@ -171,7 +171,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.output is None:
         raise UsageError("train road: give -o OUT.safetensors, or --measure")
     if args.output.suffix != ".safetensors":
-        raise UsageError(f"-o {args.output}: want a name that ends in .safetensors")
+        raise UsageError(f"-o {args.output}: expected a name that ends in .safetensors")
     if args.output.exists() and not args.overwrite:
         raise OutputError(f"{args.output}: exists; give another name or --overwrite")
     if (args.data is None) == (args.layouts is None):

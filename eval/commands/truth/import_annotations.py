@@ -78,5 +78,5 @@ def run(args: argparse.Namespace) -> int:
 def _meaning(text: str) -> tuple[str, str]:
     label, equals, cue = text.rpartition("=")
     if not equals or not label:
-        raise UsageError(f"--map {text}: want LABEL=CUE")
+        raise UsageError(f"--map {text}: expected LABEL=CUE")
     return label, cue

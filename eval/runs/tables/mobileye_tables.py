@@ -89,7 +89,7 @@ class StoredMobileye:
 
     def at(self, t_ns: int) -> MobileyeState:
         """What was known at ``t_ns``; call it with times that do not go back."""
-        keep_ns = round((self._past.most_age_s + 1.0) * 1e9)
+        keep_ns = round((self._past.max_age_s + 1.0) * 1e9)
         obstacles, lanes = (
             self._readers[signal].around(t_ns, keep_ns) for signal in MOBILEYE_SIGNALS
         )

@@ -67,7 +67,7 @@ class _Rows:
 
 
 FOUND: Final = ("detector", "label", "score", "x0", "y0", "x1", "y1", "mask", "height_px", "lens")
-SHARES: Final = ("share_left", "share_straight", "share_right")
+SHARES: Final = ("fraction_left", "fraction_straight", "fraction_right")
 MASK: Final = ("mask", "mask_width_px", "mask_height_px")
 
 

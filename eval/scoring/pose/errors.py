@@ -104,7 +104,7 @@ class NeesSummary:
         mean: NEES on average.
         band_low: The mean lies above this with 97.5 %, ...
         band_high: ... and below this with 97.5 %, if the claims are right.
-        share_inside_95: Of rows inside their own 95 % region; should be 0.95.
+        fraction_inside_95: Of rows inside their own 95 % region; should be 0.95.
     """
 
     dimensions: int
@@ -113,7 +113,7 @@ class NeesSummary:
     mean: float
     band_low: float
     band_high: float
-    share_inside_95: float
+    fraction_inside_95: float
 
 
 class RpeDelta(NamedTuple):
@@ -154,7 +154,7 @@ def pair(
         UsageError: No true pose has an estimate.
     """
     if cov_xyh is not None and cov_xyh.shape != (len(estimate), 6):
-        raise ValueError(f"cov_xyh: want ({len(estimate)}, 6), got {cov_xyh.shape}")
+        raise ValueError(f"cov_xyh: expected ({len(estimate)}, 6), got {cov_xyh.shape}")
     if len(truth) == 0 or len(estimate) == 0:
         raise UsageError(f"{len(truth)} true and {len(estimate)} estimated poses: nothing to score")
     after = np.clip(np.searchsorted(estimate.t_ns, truth.t_ns), 0, len(estimate) - 1)
@@ -238,12 +238,12 @@ def rpe_pairs(xyz_m: Floats, delta: RpeDelta) -> tuple[Indices, Indices]:
         ValueError: A size that is not positive, or a broken number of frames.
     """
     if not (math.isfinite(delta.size) and delta.size > 0.0):
-        raise ValueError(f"size: want > 0, got {delta.size}")
+        raise ValueError(f"size: expected > 0, got {delta.size}")
     if delta.unit == "metres":
         return _metre_pairs(xyz_m, delta)
     frames = int(delta.size)
     if frames != delta.size:
-        raise ValueError(f"size: want a whole number of frames, got {delta.size}")
+        raise ValueError(f"size: expected a whole number of frames, got {delta.size}")
     first = np.arange(0, max(len(xyz_m) - frames, 0), 1 if delta.all_pairs else frames)
     return first, first + frames
 
@@ -274,7 +274,7 @@ def nees(paired: Paired, dimensions: Literal[2, 3]) -> Floats:
         ValueError: The estimate has no covariance.
     """
     if paired.cov_xyh is None:
-        raise ValueError("cov_xyh: wanted for NEES, got None")
+        raise ValueError("cov_xyh: needed for NEES, got None")
     turn = wrap_all(heading_rad(paired.estimate) - heading_rad(paired.truth))
     error = np.column_stack([(paired.estimate.xyz_m - paired.truth.xyz_m)[:, :2], turn])
     upper = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
@@ -312,7 +312,7 @@ def summarise_nees(values: Floats, dimensions: int, independent: int = 1) -> Nee
         mean=float(kept.mean()) if some else math.nan,
         band_low=low,
         band_high=high,
-        share_inside_95=float((kept <= limit).mean()) if some else math.nan,
+        fraction_inside_95=float((kept <= limit).mean()) if some else math.nan,
     )
 
 

@@ -229,7 +229,7 @@ def _inside(track: Trajectory, table: pa.Table, path: Path) -> NDArray[np.bool_]
     inside = (track.t_ns >= first_ns) & (track.t_ns <= last_ns)
     if not inside.any():
         raise SchemaError(
-            f"{path}: truth speaks of {track.t_ns[0]} to {track.t_ns[-1]} ns, the run of "
+            f"{path}: truth covers {track.t_ns[0]} to {track.t_ns[-1]} ns, the run of "
             f"{first_ns} to {last_ns} ns; it belongs to another log or clock"
         )
     return np.asarray(inside)

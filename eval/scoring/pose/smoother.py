@@ -67,7 +67,7 @@ def score_smoother(run: RunFolder, truth_path: Path) -> SmootherScore:
     wanted = _thinned(track.t_ns[(track.t_ns > first_ns) & (track.t_ns <= last_ns)])
     if not len(wanted):
         raise SchemaError(
-            f"{truth_path}: truth speaks of other times than the run; it belongs to another log"
+            f"{truth_path}: its times are not those of the run; it belongs to another log"
         )
     lever_m = (vehicle.camera.x_m, vehicle.camera.y_m)
     found = smooth(

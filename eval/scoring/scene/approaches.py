@@ -364,14 +364,14 @@ def score_approaches(judged: Sequence[ApproachesJudged], seed: int = 0) -> Appro
         without_range=sum(
             _is_unknown(one.detected_m) or _is_unknown(one.full_m) for one in results
         ),
-        detected=_share([one.detected_m is not None for one in results]),
-        full=_share([one.full_m is not None for one in results]),
-        full_from_8_m=_share(
+        detected=_fraction([one.detected_m is not None for one in results]),
+        full=_fraction([one.full_m is not None for one in results]),
+        full_from_8_m=_fraction(
             [(one.full_m or 0.0) >= NEAR_M for one in results if not _is_unknown(one.full_m)]
         ),
         detected_m=_mean([one.detected_m for one in results], seed),
         full_m=_mean([one.full_m for one in results], seed),
-        false_features=_share([bool(one.false_features) for one in results]),
+        false_features=_fraction([bool(one.false_features) for one in results]),
         false_by_feature=_counts([name for one in results for name in one.false_features]),
         extra=sum(one.extra for one in judged),
         extra_detected=sum(one.extra_detected for one in judged),
@@ -400,7 +400,7 @@ def _is_unknown(distance_m: float | None) -> bool:
     return distance_m is not None and math.isnan(distance_m)
 
 
-def _share(values: Sequence[bool]) -> Proportion:
+def _fraction(values: Sequence[bool]) -> Proportion:
     # Approaches are the clusters, so Wilson's interval is the one that counts.
     return share(np.array(values, np.bool_), np.arange(len(values)))
 

@@ -78,9 +78,9 @@ class BeliefScore:
         steps: All, and frames ahead of a true intersection for which none exists.
         scored: With truth.
         left_out: Reason to steps.
-        share_there: How often the feature is there.
+        fraction_there: How often the feature is there.
         brier: Mean squared error; smaller is better, 0.25 for always saying one half.
-        brier_of_share: What always saying ``share_there`` would get.
+        brier_of_base_rate: What always saying ``fraction_there`` would get.
         log_score: Mean of -ln(probability of what is so), clipped; 0.693 for one half.
         clip: Probabilities are clipped to this and one minus this for the log score.
         clipped: Steps to which that happened.
@@ -90,9 +90,9 @@ class BeliefScore:
     steps: int
     scored: int
     left_out: dict[str, int]
-    share_there: float
+    fraction_there: float
     brier: Mean
-    brier_of_share: float
+    brier_of_base_rate: float
     log_score: Mean
     clip: float
     clipped: int
@@ -141,7 +141,7 @@ def judge_belief(tables: RunTables, truth: DriveTruth) -> list[BeliefJudged]:
             "outside the truth's time": ~reported,
             "in the intersection": crossing,
             "no intersection ahead": (at == NONE) & (label == NONE),
-            "the truth does not know this feature": label == NONE,
+            "the truth does not annotate this feature": label == NONE,
         }
         left, left_out = first_reasons(np.ones(len(values), np.bool_), reasons)
         if silent:
@@ -186,9 +186,9 @@ def _score(rows: Sequence[BeliefJudged], seed: int) -> BeliefScore:
         steps=len(probability) + sum(left_out.values()),
         scored=len(probability),
         left_out=left_out,
-        share_there=base,
+        fraction_there=base,
         brier=mean(brier(probability, is_there), clusters, seed),
-        brier_of_share=base * (1.0 - base),
+        brier_of_base_rate=base * (1.0 - base),
         log_score=mean(log_score(probability, is_there), clusters, seed),
         clip=CLIP,
         clipped=int(((probability < CLIP) | (probability > 1.0 - CLIP)).sum()),

@@ -59,7 +59,7 @@ class RangeBin:
     bias_m: float
     rmse_m: float
     nees: float
-    share_inside_95: float
+    fraction_inside_95: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,5 +180,5 @@ def _bin(error: Floats, nees: NDArray[np.float64]) -> RangeBin:
         bias_m=float(error.mean()),
         rmse_m=_rms(error),
         nees=float(nees.mean()),
-        share_inside_95=summarise_nees(nees, 1).share_inside_95,
+        fraction_inside_95=summarise_nees(nees, 1).fraction_inside_95,
     )

@@ -259,12 +259,12 @@ def _cause(
         return "denied", f"{_names(against)} in {denied} frames against {found}"
     found_seen = sum(one.found_seen for one in for_it)
     if found_seen < MOSTLY * seen:
-        return "not found", f"found in {found_seen} of {seen} looks: {_shares(for_it)}"
+        return "not found", f"found in {found_seen} of {seen} frames: {_fractions(for_it)}"
     presence_m = result.features_m.get("intersection")
     if feature != "intersection" and (presence_m is None or presence_m < NEAR_M):
         when = "never" if presence_m is None else f"only at {presence_m:.0f} m"
-        return "waited for presence", f"found in {found} looks; the intersection {when}"
-    return "too little", f"found in {found} looks of {seen}: {_shares(for_it)}"
+        return "waited for presence", f"found in {found} frames; the intersection {when}"
+    return "too little", f"found in {found} frames of {seen}: {_fractions(for_it)}"
 
 
 def _invented(result: ApproachResult, feature: str, cues: Mapping[str, CueEvidence]) -> Finding:
@@ -288,7 +288,7 @@ def _bad(result: ApproachResult) -> tuple[str, ...]:
     return tuple(tag for tag in result.conditions if tag not in GOOD)
 
 
-def _shares(cues: Sequence[CueEvidence]) -> str:
+def _fractions(cues: Sequence[CueEvidence]) -> str:
     return ", ".join(f"{_name(one.cue)} {one.found_seen}/{one.seen}" for one in cues if one.seen)
 
 

@@ -123,7 +123,7 @@ def draw_reliability(
         axes.set_title(name, fontsize=9)
         axes.set_xlabel("held probable", fontsize=8)
         axes.tick_params(labelsize=7)
-    grid[0, 0].set_ylabel("share that is so", fontsize=8)
+    grid[0, 0].set_ylabel("observed fraction", fontsize=8)
     grid[0, 0].legend(fontsize=7)
     _save(figure, path)
 

@@ -69,12 +69,14 @@ class StudySettings:
             UsageError: Naming what was wanted.
         """
         if self.runs < 1 or self.seed < 0:
-            raise UsageError(f"runs {self.runs}, seed {self.seed}: want 1 or more, 0 or more")
+            raise UsageError(f"runs {self.runs}, seed {self.seed}: expected 1 or more, 0 or more")
         if not 64 <= self.width_px <= 3840 or self.width_px % 16:
-            raise UsageError(f"width {self.width_px}: want a multiple of 16 from 64 to 3840")
+            raise UsageError(f"width {self.width_px}: expected a multiple of 16 from 64 to 3840")
         unknown = [name for name in self.layouts if name not in SCORED]
         if unknown or len(set(self.layouts)) != len(self.layouts) or not self.layouts:
-            raise UsageError(f"layouts {', '.join(self.layouts)}: want some of A to H, each once")
+            raise UsageError(
+                f"layouts {', '.join(self.layouts)}: expected some of A to H, each once"
+            )
 
     def scenes(self) -> tuple[SceneSettings, ...]:
         """Every drive, in the order in which they are done."""

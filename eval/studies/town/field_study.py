@@ -40,7 +40,7 @@ NOTES: Final = (
     "and turns many, so that a heading's error, which persists for a while, is spread over both "
     "axes and partly undone. Towns of 25 km2, or wheels that forget a heading sooner, give 13 to "
     "14 km (docs/studies.md). Streets in which the compass is worse, the source's explanation, "
-    "shorten a run only where the filter is told of them: the ellipse knows no true errors.",
+    "shorten a run only where the filter models them: the ellipse does not see true errors.",
 )
 
 

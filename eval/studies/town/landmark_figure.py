@@ -130,7 +130,7 @@ def _successes(
         axes.set_title(strategy, fontsize=10)
         axes.set_ylim(0.0, 1.03)
         axes.set_xlabel("start to goal, as the crow flies (km)")
-    panels[0].set_ylabel("share of drives that reach the goal")
+    panels[0].set_ylabel("fraction of drives that reach the goal")
     panels[0].legend(frameon=False, fontsize=8, title="landmarks per km²", title_fontsize=8)
     made.suptitle(
         f"Success against distance at a detection rate of {100 * rate:.0f} %, simulated; "

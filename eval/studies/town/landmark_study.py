@@ -44,12 +44,12 @@ NOTES: Final = (
     "Range: the distance from start to goal, as the crow flies, at which a logistic curve through "
     "all drives of a cell has fallen to 80 % success; 'beyond': not within the farthest goal that "
     "cities of at most 100 km2 gave. Intervals: 95 %, bootstrap over drives.",
-    "Extra distance: ratio of the ways driven by the same seeds where both strategies reached "
+    "Extra distance: ratio of the distances driven by the same seeds where both strategies reached "
     "the goal. The source does not say over which drives it averages; 'each its own' compares the "
     "mean ways of all drives that reached the goal, which counts that a strategy reaches farther "
     "goals as well, and 'all drives' counts lost ones as far as they came.",
-    "Gains are told only for cells where both ranges are within the farthest goal, which leaves "
-    "out those in which looking for landmarks helps most.",
+    "Gains are reported only for cells where both ranges are within the "
+    "farthest goal, which leaves out those in which looking for landmarks helps most.",
     "The source says nothing of the landmarks' own uncertainty, nor where in a city they stand "
     "(here: at intersections, 5 m s.d.), nor when a landmark is given up as a target.",
 )

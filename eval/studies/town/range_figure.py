@@ -47,7 +47,7 @@ def draw(
     survival.set_xlim(0.0, 60.0)
     survival.set_ylim(0.0, 1.02)
     survival.set_xlabel("distance driven along streets, goal after goal (km)")
-    survival.set_ylabel("share of drives not lost yet")
+    survival.set_ylabel("fraction of drives not lost yet")
     survival.set_title("Crosses: mean distance at loss; dotted: published", fontsize=9)
     made.suptitle("Range without landmarks, simulated", fontsize=11)
     return save(made, folder, NAME)

@@ -70,7 +70,7 @@ class CompassResult:
         lost_after_m: Mean distance at loss of those lost.
         shortest_m: The soonest loss; NaN without.
         longest_m: The latest.
-        share_lost: Of all drives.
+        fraction_lost: Of all drives.
         law_m: Straight driving: 25^2 / (r ds); NaN without compass.
         growth: Curve through the points of the published kind of figure.
         nees_mean: Of x, y, heading at the end; 3 where the filter is honest.
@@ -87,7 +87,7 @@ class CompassResult:
     lost_after_m: Measured
     shortest_m: float
     longest_m: float
-    share_lost: Measured
+    fraction_lost: Measured
     law_m: float
     growth: Growth
     nees_mean: float
@@ -181,7 +181,7 @@ def _of_case(settings: Drive, rows: dict[str, Floats]) -> CompassResult:
         lost_after_m=mean_of(lost_m),
         shortest_m=float(lost_m.min()) if len(lost_m) else math.nan,
         longest_m=float(lost_m.max()) if len(lost_m) else math.nan,
-        share_lost=fraction_of(int(is_lost.sum()), n),
+        fraction_lost=fraction_of(int(is_lost.sum()), n),
         law_m=law_m(settings),
         growth=fit_growth(
             *points(rows), 4.0 * sensors.start_position_sd_m, settings.navigation.lost_above_m

@@ -231,10 +231,10 @@ def load_study(path: Path, kind: type[Study]) -> Study:
     except UnicodeDecodeError:
         raise StudyFileError(f"{path}: not UTF-8 text; give a study file") from None
     except ValueError as error:
-        raise StudyFileError(f"{path}: not TOML: {error}; mend that line") from None
+        raise StudyFileError(f"{path}: not TOML: {error}; correct that line") from None
     wanted = kind.model_fields["kind"].default
     if tree.get("kind") != wanted:
-        raise StudyFileError(f'{path}: kind: want "{wanted}" here, got {tree.get("kind")!r}')
+        raise StudyFileError(f'{path}: kind: expected "{wanted}" here, got {tree.get("kind")!r}')
     if "version" not in tree:
         raise StudyFileError(f"{path}:1: version: missing; add version = {VERSION}")
     try:

@@ -137,7 +137,7 @@ def range_tables(results: Sequence[range_study.CompassResult]) -> tuple[Table, .
                 (
                     range_figure.name_of(r),
                     str(r.drives),
-                    percent(r.share_lost),
+                    percent(r.fraction_lost),
                     km(r.lost_after_m) if r.lost else "never lost",
                     _published(r),
                     f"{r.shortest_m / 1e3:.2f}..{r.longest_m / 1e3:.2f}" if r.lost else "",

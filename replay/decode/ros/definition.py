@@ -108,7 +108,7 @@ def definitions_of(
         return _from_msg(ros2_spelling(type_name), text)
     if schema_encoding in ("ros2idl", "omgidl"):
         return _from_idl(type_name, text)
-    raise SchemaError(f"{type_name}: want ros1msg, ros2msg or ros2idl, got {schema_encoding!r}")
+    raise SchemaError(f"{type_name}: expected ros1msg, ros2msg or ros2idl, got {schema_encoding!r}")
 
 
 def _from_msg(type_name: str, text: str) -> Definitions:
@@ -119,7 +119,9 @@ def _from_msg(type_name: str, text: str) -> Definitions:
         if i:
             head, _, body = section.lstrip().partition("\n")
             if not head.startswith("MSG:"):
-                raise SchemaError(f"{type_name}: want 'MSG: name' after ====, got {head[:60]!r}")
+                raise SchemaError(
+                    f"{type_name}: expected 'MSG: name' after ====, got {head[:60]!r}"
+                )
             name = ros2_spelling(head[4:].strip())
         fields = tuple(_fields_of(name, body))
         if raw.setdefault(name, fields) != fields:

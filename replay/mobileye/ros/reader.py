@@ -95,7 +95,7 @@ class RosMobileye:
         topics = {name: topic for topic, name in self._types.items()}
         self._bursts = RosBursts(topics.get("ObstacleData", ""), ledger, settings)
         self._bursts.has_status = "ObstacleStatus" in topics
-        self._clock = CounterClock(settings.least_latency_ns)
+        self._clock = CounterClock(settings.min_latency_ns)
         self._votes = {name: LaneSignVotes(says, settings.ros_lane_sign) for name, says in _SIDED}
         self._waiting: dict[str, list[Block]] = {name: [] for name, _ in _SIDED}
         self._mounting = mounting_of(settings, bus, ledger)

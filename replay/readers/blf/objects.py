@@ -261,7 +261,7 @@ def rows_of(stream: Bytes, start: Int64s, start_ns: int, tally: Tally, place: st
             tally.damage("object of impossible type", f"{place}, type {kind}")
             tally.counted -= int(count)
         elif kind != RESTORE_POINT:
-            tally.others[f"object of type {kind} is no CAN frame"] += int(count)
+            tally.others[f"object of type {kind} is not a CAN frame"] += int(count)
     return rows
 
 

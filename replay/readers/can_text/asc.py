@@ -248,7 +248,7 @@ class Asc(Dialect):
         if self._is_relative and t_ns > _STEP_MAX_NS:
             return Damage("time out of range")
         if _EVENT.fullmatch(rest):
-            return Other("event that is no CAN frame", t_ns)
+            return Other("event that is not a CAN frame", t_ns)
         if not rest.isascii():
             return Damage(NOT_UNDERSTOOD)
         if found := _FD_ERROR.fullmatch(rest) or _ERROR.fullmatch(rest):

@@ -307,7 +307,7 @@ def _lengths(
     """Payload bytes from the length or else the length code."""
     word = count or code
     if word is None:
-        raise ValueError("columns: want L or l, got neither")
+        raise ValueError("columns: expected L or l, got neither")
     value, ok = decimal(lines.words, word.stop, word.size)
     if count is None:
         ok &= value <= 15

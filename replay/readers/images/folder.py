@@ -68,7 +68,7 @@ def open_images(path: Path, limits: Limits) -> ImageFolder:
     """
     paths = list_files(path, SUFFIXES)
     if not paths:
-        raise LogFormatError(f"{path}: no picture in it; want .png, .jpg or .webp files")
+        raise LogFormatError(f"{path}: no picture in it; expected .png, .jpg or .webp files")
     time_file = find_time_file(path)
     if time_file is None:
         raise LogFormatError(

@@ -337,7 +337,7 @@ def open_video(path: Path, limits: Limits) -> Video:
         )
     if times is not None and times.names is not None:
         raise LogFormatError(
-            f"{times.path}: names files; want one time for each picture of {path.name}"
+            f"{times.path}: names files; expected one time for each picture of {path.name}"
         )
     file = path.open("rb")
     try:

@@ -186,9 +186,7 @@ class SegmentPass:
         rest = window.rest(self._summary, held)
         if doubt or rest is None:
             doubt = doubt or "it does not add up with the statistics"
-            self._notice(
-                f"the index was not trusted after all ({doubt}); every chunk was looked at"
-            )
+            self._notice(f"the index was not trusted after all ({doubt}); every chunk was examined")
             yield from self._walked(window.others(self._file, self._limits))
             return
         self._checks.chunks += window.left

@@ -636,7 +636,7 @@ def _refusal(group: Group, master: Channel | None, can: CanLayout | None) -> str
     if master is None:
         return "group without a time channel"
     if master.type == MASTER and not is_numeric(master, group.value_bytes):
-        return "time channel is no number"
+        return "time channel is not a number"
     if can is None:
         names = {channel.name for channel in group.channels}
         if any(name.startswith(("LIN_", "ETH_", "FLX_", "MOST_", "K_LINE_")) for name in names):

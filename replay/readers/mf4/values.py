@@ -164,7 +164,7 @@ def times_ns(channel: Channel, values: NDArray[np.generic]) -> NDArray[np.int64]
     """Master values as nanoseconds since the start, exact where stored as whole steps of them.
 
     Returns:
-        Shape (N,); None when one of them is no time (not finite, or over 200 years).
+        Shape (N,); None when one of them is not a time (not finite, or over 200 years).
     """
     conversion = channel.conversion
     offset, factor = 0.0, 1.0
@@ -186,7 +186,7 @@ def times_ns(channel: Channel, values: NDArray[np.generic]) -> NDArray[np.int64]
         seconds = values.astype(np.float64, copy=False)
         # One product where it can be exact: counts of nanoseconds stored as floating point.
         nanos = np.rint(seconds * step if offset == 0.0 else (seconds * factor + offset) * 1e9)
-        # Comparisons with what is no number are false.
+        # Comparisons with what is not a number are false.
         if len(nanos) and not (nanos.max() < float(1 << 62) and nanos.min() > -float(1 << 62)):
             return None
     return nanos.astype(np.int64)

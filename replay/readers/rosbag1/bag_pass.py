@@ -257,7 +257,7 @@ class Pass:
         self._inside = None
         if self._doubt:
             self._ledger.notice(
-                f"the index was not trusted after all ({self._doubt}); every chunk was looked at"
+                f"the index was not trusted after all ({self._doubt}); every chunk was examined"
             )
             others = window.units(self._file, self._limits, connections, is_read=False)
             yield from self._taken(others, index_at)

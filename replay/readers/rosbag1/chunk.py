@@ -210,7 +210,7 @@ def _u32(heads: Bytes, at: int) -> Int64s:
 
 
 def read_chunk(
-    inflated: Inflated, entries: Entries | None, largest: int, most_records: int
+    inflated: Inflated, entries: Entries | None, largest: int, max_records: int
 ) -> ChunkRows:
     """The messages of an inflated chunk.
 
@@ -218,13 +218,13 @@ def read_chunk(
         inflated: Its records.
         entries: What the index records behind it say, or None where none exists.
         largest: Most bytes of a message definition.
-        most_records: Most records to take from one chunk.
+        max_records: Most records to take from one chunk.
     """
     if entries is not None and len(entries) and not inflated.fault:
         rows = _by_index(inflated.raw, entries, largest)
-        if rows is not None and len(rows.conn) <= most_records:
+        if rows is not None and len(rows.conn) <= max_records:
             return rows
-    return _by_steps(inflated, entries, largest, most_records)
+    return _by_steps(inflated, entries, largest, max_records)
 
 
 def _by_index(raw: bytes, entries: Entries, largest: int) -> ChunkRows | None:
@@ -293,7 +293,7 @@ class _Steps:
 
 
 def _by_steps(
-    inflated: Inflated, entries: Entries | None, largest: int, most_records: int
+    inflated: Inflated, entries: Entries | None, largest: int, max_records: int
 ) -> ChunkRows:
     """Rows found by stepping from record to record, over damage with the index's help."""
     raw = inflated.raw
@@ -301,7 +301,7 @@ def _by_steps(
     at, records, run = 0, 0, _FIRST_RUN
     fault, fault_at = inflated.fault, -1
     while at < len(raw):
-        if records > most_records:
+        if records > max_records:
             fault, fault_at = TOO_MANY, at
             break
         taken, at = _run_of_messages(raw, at, steps, run)

@@ -135,7 +135,7 @@ class BagLog(Closing):
         start = self._file.bytes_at(0, len(MAGIC))
         if start != MAGIC:
             raise LogFormatError(
-                f"{self._path}: begins with {start!r}, want {MAGIC!r} (ROS 1 bag format 2.0); "
+                f"{self._path}: begins with {start!r}, expected {MAGIC!r} (ROS 1 bag format 2.0); "
                 "migrate older bags with 'rosbag fix', or check the file"
             )
         record = self._file.whole_record(len(MAGIC))
@@ -163,7 +163,7 @@ class BagLog(Closing):
         self._say_why_walked(header, contents)
         if not contents.connections and header is None:
             raise LogFormatError(
-                f"{self._path}: no readable record in {self._file.size} bytes; want a ROS 1 bag"
+                f"{self._path}: no readable record in {self._file.size} bytes; expected a ROS 1 bag"
             )
         return contents
 

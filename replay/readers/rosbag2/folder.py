@@ -62,8 +62,8 @@ class FolderLog(Closing):
         if not any(not split.fault for split in self._splits):
             why = "; ".join(split.fault for split in self._splits)
             raise LogError(
-                f"{path}: {why or 'no .db3 or .mcap file in it'}; want at least one storage file "
-                "that opens"
+                f"{path}: {why or 'no .db3 or .mcap file in it'}; expected at least one "
+                "storage file that opens"
             )
         self._topics = _union(self._splits)
 

@@ -83,7 +83,7 @@ def open_database(path: Path, limits: Limits) -> Database:
         head = file.read(100)
     if head[:16] != SQLITE_MAGIC:
         raise LogFormatError(
-            f"{path}: begins with {head[:16]!r}, want {SQLITE_MAGIC!r} (a SQLite file); "
+            f"{path}: begins with {head[:16]!r}, expected {SQLITE_MAGIC!r} (a SQLite file); "
             "check the file"
         )
     try:

@@ -117,7 +117,7 @@ def _require(database: Database, kinds: dict[str, str], path: Path) -> None:
         if kinds.get(table) != "table" or not columns <= _columns(database, table):
             held = ", ".join(sorted(kinds)) or "nothing"
             raise LogFormatError(
-                f"{path}: no ROS 2 bag: want a table {table!r} with columns "
+                f"{path}: no ROS 2 bag: expected a table {table!r} with columns "
                 f"{', '.join(sorted(columns))}; it holds {held}"
             )
 

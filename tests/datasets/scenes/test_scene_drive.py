@@ -221,7 +221,7 @@ def test_a_drive_is_not_overwritten_unasked(files: SceneFiles) -> None:
         (["simulate", "A", "--run", "0", "-o", "x"], "run 0"),
         (["simulate", "A", "--run", "1", "--runs", "2", "-o", "x"], "--run"),
         (["simulate", "A", "B", "A", "-o", "x"], "named twice"),
-        (["simulate", "A", "--fps", "7", "-o", "x"], "want 10, 20, 25 or 50"),
+        (["simulate", "A", "--fps", "7", "-o", "x"], "expected 10, 20, 25 or 50"),
         (["simulate", "A", "--width", "99", "-o", "x"], "multiple of 16"),
         (["simulate", "A", "--seed", "-1", "-o", "x"], "seed -1"),
     ],

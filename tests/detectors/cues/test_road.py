@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
-from crosscue.detectors.cues.road import RoadShares, region_mask, road_shares
+from crosscue.detectors.cues.road import RoadShares, region_mask, road_fractions
 from crosscue.replay.base import VehicleError
 from crosscue.replay.vehicle.vehicle import Regions, parse
 
@@ -19,10 +19,10 @@ def _mask(road: NDArray[np.bool_]) -> RoadMask:
 
 
 def test_a_picture_full_of_road_is_all_road_and_an_empty_one_none() -> None:
-    full = road_shares(_mask(np.ones((90, 160), np.bool_)), Regions())
+    full = road_fractions(_mask(np.ones((90, 160), np.bool_)), Regions())
 
     assert full == RoadShares(1.0, 1.0, 1.0)
-    assert road_shares(_mask(np.zeros((90, 160), np.bool_)), Regions()) == RoadShares(0, 0, 0)
+    assert road_fractions(_mask(np.zeros((90, 160), np.bool_)), Regions()) == RoadShares(0, 0, 0)
 
 
 @settings(deadline=None, max_examples=20)
@@ -30,20 +30,20 @@ def test_a_picture_full_of_road_is_all_road_and_an_empty_one_none() -> None:
 def test_the_mirror_image_swaps_left_and_right(seed: int) -> None:
     road = np.random.default_rng(seed).random((90, 160)) < 0.3
 
-    seen = road_shares(_mask(road), Regions())
-    mirrored = road_shares(_mask(road[:, ::-1]), Regions())
+    seen = road_fractions(_mask(road), Regions())
+    mirrored = road_fractions(_mask(road[:, ::-1]), Regions())
 
     assert (mirrored.left, mirrored.right) == pytest.approx((seen.right, seen.left))
     assert mirrored.straight == pytest.approx(seen.straight)
 
 
 @pytest.mark.parametrize("factor", [2, 3, 5])
-def test_a_finer_picture_of_the_same_road_gives_the_same_shares(factor: int) -> None:
+def test_a_finer_picture_of_the_same_road_gives_the_same_fractions(factor: int) -> None:
     road = np.zeros((100, 200), np.bool_)
     road[55:70, 10:30] = True
     finer = np.kron(road, np.ones((factor, factor), np.bool_)).astype(np.bool_)
 
-    coarse, fine = (road_shares(_mask(one), Regions()) for one in (road, finer))
+    coarse, fine = (road_fractions(_mask(one), Regions()) for one in (road, finer))
 
     assert fine.left == pytest.approx(coarse.left, abs=0.02)
     assert coarse.left == pytest.approx(0.5, abs=0.02)

@@ -76,7 +76,7 @@ def test_only_lights_are_looked_at_in_the_pixels_that_there_are_and_the_cache_ke
         kept = cache.get(b"picture", "detector", 9)
     assert isinstance(kept, Detections)
     assert kept.lenses == seen.lenses
-    with pytest.raises(ValueError, match="lenses: want 2 or none, got 1"):
+    with pytest.raises(ValueError, match="lenses: expected 2 or none, got 1"):
         replace(found, lenses=("red",))
 
 

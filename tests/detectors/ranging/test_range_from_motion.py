@@ -130,5 +130,5 @@ def test_reverse_makes_it_further_away() -> None:
 def test_looks_that_cannot_be_are_refused(
     travelled_m: list[float], height_px: list[float], focal_px: float
 ) -> None:
-    with pytest.raises(ValueError, match="want"):
+    with pytest.raises(ValueError, match="expected"):
         range_from_motion(np.array(travelled_m), np.array(height_px), focal_px, LIGHT)

@@ -93,7 +93,7 @@ def test_tolerances_allow_a_loss_up_to_their_size_and_the_last_that_fits_counts(
 
 @pytest.mark.parametrize("text", ["", "a", "-1", "nan", "1e999", "x=%", "5%%"])
 def test_a_tolerance_that_is_none_is_refused(text: str) -> None:
-    with pytest.raises(UsageError, match=r"want 0\.01"):
+    with pytest.raises(UsageError, match=r"expected 0\.01"):
         read_tolerance(text)
 
 
@@ -120,7 +120,7 @@ def test_losing_a_score_is_worse_and_gaining_one_is_not() -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.floats(0, 1), st.floats(0, 1), st.sampled_from(["precision", "brier", "share_there"]))
+@given(st.floats(0, 1), st.floats(0, 1), st.sampled_from(["precision", "brier", "fraction_there"]))
 def test_at_most_one_direction_is_worse(old: float, new: float, name: str) -> None:
     one, other = {name: MetricValue(old)}, {name: MetricValue(new)}
     worse = [
@@ -129,7 +129,7 @@ def test_at_most_one_direction_is_worse(old: float, new: float, name: str) -> No
     ]
 
     apart = abs(old - new) > 1e-12 * max(old, new)
-    assert sum(worse) == (name != "share_there" and apart)
+    assert sum(worse) == (name != "fraction_there" and apart)
 
 
 def test_tables_that_cannot_be_compared_row_by_row_say_why(tmp_path: Path) -> None:

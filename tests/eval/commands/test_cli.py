@@ -95,7 +95,7 @@ def test_a_length_is_above_nothing(
     flag: str, length: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(f"{flag}={length}".split()) == 2
-    assert f"'{length}': want metres, above 0" in capsys.readouterr().err
+    assert f"'{length}': expected metres, above 0" in capsys.readouterr().err
 
 
 def test_a_slip_of_the_pen_gets_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,8 +16,8 @@ def _run_with_sealed_log(folder: Path) -> tuple[Path, Path]:
     run = pictured.scene_run(folder).path
     # A car that is said to cross and does not: the page shows the picture of it.
     wrong = span("cross_traffic_right", 0, 40, present=False, count=0)
-    told = truth([*good_truth().truth.cues, wrong], approaches=[approach(intersection="A")])
-    truth_folder(folder, told)
+    reported = truth([*good_truth().truth.cues, wrong], approaches=[approach(intersection="A")])
+    truth_folder(folder, reported)
     log = folder / "drive.mcap"
     assert cli.run(["seal", str(log)]) == 0
     return run, log

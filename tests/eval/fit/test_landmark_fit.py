@@ -78,9 +78,9 @@ def test_too_few_pairs_and_odd_rates_are_refused() -> None:
     one = ScoredPairs(np.array([1.0]), np.array([False]), np.array([0]))
     with pytest.raises(ValueError, match="two-place pairs of at least two queries"):
         fit_landmarks(one, 0.01)
-    with pytest.raises(ValueError, match=r"wanted_rate: want 0 to 1, got 1\.5"):
+    with pytest.raises(ValueError, match=r"wanted_rate: expected 0 to 1, got 1\.5"):
         fit_landmarks(made(1), 1.5)
-    with pytest.raises(ValueError, match=r"is_same: want \(2,\), got \(1,\)"):
+    with pytest.raises(ValueError, match=r"is_same: expected \(2,\), got \(1,\)"):
         ScoredPairs(np.zeros(2), np.zeros(1, np.bool_), np.zeros(2, np.int64))
 
 
@@ -138,8 +138,8 @@ def test_pairs_from_a_table_fit_a_threshold_and_write_it(
 @pytest.mark.parametrize(
     ("table", "why"),
     [
-        ("a,b\n", "want columns query,known,same"),
-        ("query,known,same\nx.png,y.png,maybe\n", "pairs.csv:2: same: want 1 or 0"),
+        ("a,b\n", "expected columns query,known,same"),
+        ("query,known,same\nx.png,y.png,maybe\n", "pairs.csv:2: same: expected 1 or 0"),
         ("query,known,same\nx.png,y.png,1\n", "x.png: No such file"),
         ("query,known,same\n", "give more labelled pictures"),
     ],
@@ -157,7 +157,7 @@ def test_bad_tables_are_refused(
     ("flags", "why"),
     [
         (["--max-landmarks", "0"], "--max-landmarks 0"),
-        (["--same-within", "60"], "--same-within 60: want less"),
+        (["--same-within", "60"], "--same-within 60: expected less"),
     ],
 )
 def test_flags_that_leave_no_pairs_are_refused(

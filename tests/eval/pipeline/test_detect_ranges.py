@@ -70,7 +70,7 @@ def test_a_table_without_its_columns_is_reported(
 
     assert run(["fit", "ranges", str(table), "--cue", "stop_sign"]) == 4
 
-    assert "want the columns height_px and range_m" in capsys.readouterr().err
+    assert "expected the columns height_px and range_m" in capsys.readouterr().err
 
 
 def test_a_table_that_is_none_is_reported_with_its_path_once(
@@ -78,7 +78,7 @@ def test_a_table_that_is_none_is_reported_with_its_path_once(
 ) -> None:
     (tmp_path / "wild.csv").write_bytes(b"\xff\xd8\xff")
 
-    for name, said in (("none.csv", "No such file"), ("wild.csv", "is no text")):
+    for name, said in (("none.csv", "No such file"), ("wild.csv", "is not text")):
         path = tmp_path / name
         assert run(["fit", "ranges", str(path), "--cue", "stop_sign"]) == 4
         reported = capsys.readouterr().err

@@ -163,7 +163,7 @@ def test_only_a_changed_detector_runs_again(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = (drive / "vehicle.toml").read_text()
-    slower = 'kind = "signs"\n[detectors.signs.settings]\nleast_votes = 9'
+    slower = 'kind = "signs"\n[detectors.signs.settings]\nmin_votes = 9'
     (tmp_path / "v.toml").write_text(text.replace('kind = "signs"', slower))
     shutil.copy(drive / "simulated_car.dbc", tmp_path)
 
@@ -233,7 +233,7 @@ def test_a_car_without_a_camera_goes_on_and_says_so(
     out = str(tmp_path / "run")
     assert run(["replay", log, "--vehicle", vehicle, "--detectors", "none", "-o", out]) == 0
 
-    assert "no detector has looked at the camera" in capsys.readouterr().out
+    assert "no detector ran on the camera" in capsys.readouterr().out
     assert not RunFolder(tmp_path / "run").file("belief.parquet").exists()
 
 

@@ -168,7 +168,7 @@ def test_zero_landmarks_leave_the_pose_as_it_was(
 
     np.testing.assert_allclose(with_none["x_m"], without.table("pose")["x_m"], rtol=0, atol=1e-6)
     assert with_none["landmark"].null_count == len(with_none)
-    assert "0 landmarks weighed in, 0 refused by the gate" in capsys.readouterr().out
+    assert "0 landmarks used, 0 rejected by the gate" in capsys.readouterr().out
 
 
 def test_a_log_without_a_camera_says_so(town: Town, tmp_path: Path) -> None:
@@ -234,7 +234,7 @@ def test_a_near_that_is_none_is_refused(town: Town, capsys: pytest.CaptureFixtur
     capsys.readouterr()
     for text in ("1,2", "1,2,-3", "nan,0,1", "a,b,c"):
         status, err = refused(capsys, "landmarks", "list", str(town.database), f"--near={text}")
-        assert (status, "want x,y,radius in metres" in err) == (2, True)
+        assert (status, "expected x,y,radius in metres" in err) == (2, True)
 
 
 def test_fewer_than_none_cannot_be_shown(town: Town, capsys: pytest.CaptureFixture[str]) -> None:
@@ -243,7 +243,7 @@ def test_fewer_than_none_cannot_be_shown(town: Town, capsys: pytest.CaptureFixtu
 
     for command in (("list", database, "--limit=-1"), ("match", database, "x.png", "--best=0")):
         status, err = refused(capsys, "landmarks", *command)
-        assert (status, "want" in err) == (2, True)
+        assert (status, "expected" in err) == (2, True)
 
 
 def photos(folder: Path, table: str) -> tuple[Path, Path]:
@@ -277,11 +277,11 @@ def test_pictures_with_coordinates_become_landmarks(
 @pytest.mark.parametrize(
     ("table", "status", "why"),
     [
-        ("image,x_m,y_m\n0.png,1,2\n", 4, "at.csv:1: want columns image,x_m,y_m,sd_m"),
-        ("image,x_m,y_m,sd_m\n0.png,nan,2,1\n", 4, "at.csv:2: x_m: want a finite number"),
+        ("image,x_m,y_m\n0.png,1,2\n", 4, "at.csv:1: expected columns image,x_m,y_m,sd_m"),
+        ("image,x_m,y_m,sd_m\n0.png,nan,2,1\n", 4, "at.csv:2: x_m: expected a finite number"),
         ("image,x_m,y_m,sd_m\n0.png,1,2,1\n1.png,1,inf,1\n", 4, "at.csv:3: y_m"),
-        ("image,x_m,y_m,sd_m\n0.png,1,2,-1\n", 4, "at.csv:2: sd_m: want > 0, got -1"),
-        ("image,x_m,y_m,sd_m\n0.png,1\n", 4, "at.csv:2: y_m: want a finite number, got None"),
+        ("image,x_m,y_m,sd_m\n0.png,1,2,-1\n", 4, "at.csv:2: sd_m: expected > 0, got -1"),
+        ("image,x_m,y_m,sd_m\n0.png,1\n", 4, "at.csv:2: y_m: expected a finite number, got None"),
         ("image,x_m,y_m,var_x_m2,cov_xy_m2,var_y_m2\n0.png,1,2,1,2,1\n", 4, "positive definite"),
         ("image,x_m,y_m,sd_m\nbad.png,1,2,1\n", 4, "bad.png: not a JPEG, PNG or WebP picture"),
         ("image,x_m,y_m,sd_m\nmissing.png,1,2,1\n", 4, "missing.png: No such file"),

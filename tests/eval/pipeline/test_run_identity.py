@@ -68,7 +68,7 @@ def test_resume_of_another_log_or_setting_is_refused_and_touches_nothing(
     assert tree(keep) == tree(keep)
     (keep / "input.json").unlink()
     assert _replay(drives / "D-1", keep, "--resume") == 2
-    assert "no input.json tells" in capsys.readouterr().err
+    assert "without input.json" in capsys.readouterr().err
 
 
 def test_a_run_cut_short_is_known_by_its_input(

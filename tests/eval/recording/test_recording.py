@@ -160,7 +160,7 @@ def test_a_recording_never_replaces_what_is_no_recording(
 
     assert cli.run(["view", str(tmp_path), "-o", str(letter)]) == 2
 
-    assert "letter.md: want a name that ends in .rrd" in capsys.readouterr().err
+    assert "letter.md: expected a name that ends in .rrd" in capsys.readouterr().err
     assert letter.read_text() == "keep me"
 
 

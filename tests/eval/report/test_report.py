@@ -93,7 +93,7 @@ def test_coverage_comes_first_and_losses_are_reported(tmp_path: Path) -> None:
     assert "<b>50 of 50</b>" in page
     assert "rows were dropped." in page
     assert "1 &lt;b&gt;not decoded&lt;/b&gt;" in page
-    assert "Not scored:</b> pose (the truth tells no track (pose: missing))" in page
+    assert "Not scored:</b> pose (the truth has no track (pose: missing))" in page
 
 
 def test_tables_report_the_metrics_and_what_was_published(tmp_path: Path) -> None:

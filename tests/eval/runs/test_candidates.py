@@ -50,12 +50,12 @@ def test_a_range_without_a_curve_says_so() -> None:
 
 
 def test_road_is_told_only_where_it_never_was() -> None:
-    road = {"unit": "frames", "setting": "[cues] road_share", "threshold": 0.2}
+    road = {"unit": "frames", "setting": "[cues] road_fraction", "threshold": 0.2}
     never = _row(8, {"too little road": 8}, **{**road, "max_score": 0.13})
     lines = candidate_lines(
         {"road_left": never, "road_right": _row(8, {"too little road": 3}, **road)}, {}
     )
 
     assert lines == [
-        "road_left: 8 frames with road, none above 0.20 (highest 0.13); lower [cues] road_share"
+        "road_left: 8 frames with road, none above 0.20 (highest 0.13); lower [cues] road_fraction"
     ]

@@ -141,7 +141,7 @@ def _made() -> Account:
     return account(
         [log_account("a", "/t", used=7, skipped={"dull": 2}, dropped={"cut": 1})],
         {"/cam": line(5, 4, {}, {"not decoded": 1})},
-        {"headings": line(9, 6, {"refused by the gate": 3})},
+        {"headings": line(9, 6, {"rejected by the gate": 3})},
     )
 
 
@@ -166,7 +166,7 @@ def test_runs_add_up_and_stay_damaged() -> None:
     assert both.reading["/t"].entered == 20
     assert both.reading["/t"].dropped == {"cut": 2}
     assert both.detecting["/cam"].runs == 2
-    assert both.estimating["headings"].skipped == {"refused by the gate": 6}
+    assert both.estimating["headings"].skipped == {"rejected by the gate": 6}
     assert not both.is_whole
 
 
@@ -178,7 +178,7 @@ def test_a_person_reads_every_stage_and_every_reason_once() -> None:
         "5 frames: 4 used, 0 skipped, 1 dropped",
         "9 readings: 6 used, 3 skipped, 0 dropped",
         "dropped 1 of reading /t: cut",
-        "skipped 3 of estimating headings: refused by the gate",
+        "skipped 3 of estimating headings: rejected by the gate",
     ):
         assert text.count(words) == 1
     assert np.all([len(part) <= 100 for part in text.splitlines()])

@@ -310,7 +310,7 @@ def test_nees_of_drawn_errors_lies_in_its_band() -> None:
         values = nees(pairs_with(error, upper), 2 if dimensions == 2 else 3)
         summary = summarise_nees(values, dimensions, independent=2000)
         assert summary.band_low < summary.mean < summary.band_high
-        assert summary.share_inside_95 == pytest.approx(0.95, abs=0.02)
+        assert summary.fraction_inside_95 == pytest.approx(0.95, abs=0.02)
         overconfident = summarise_nees(4.0 * values, dimensions, independent=2000)
         assert overconfident.mean > overconfident.band_high
 
@@ -357,9 +357,9 @@ def test_the_mean_band_holds_its_share_of_simulated_means() -> None:
 
 
 def test_chi_square_refuses_what_means_nothing() -> None:
-    with pytest.raises(ValueError, match="dimensions: want >= 1, got 0"):
+    with pytest.raises(ValueError, match="dimensions: expected >= 1, got 0"):
         chi_square.quantile(0.5, 0)
-    with pytest.raises(ValueError, match=r"probability: want in \(0, 1\), got 1.0"):
+    with pytest.raises(ValueError, match=r"probability: expected in \(0, 1\), got 1.0"):
         chi_square.quantile(1.0, 2)
 
 
@@ -383,15 +383,15 @@ def straight() -> Trajectory:
         (lambda: align(straight(), straight(), "se3"), UsageError, "align by yaw or origin"),
         (lambda: rpe(straight(), straight(), RpeDelta(9, "frames")), UsageError, "no two of 5"),
         (lambda: rpe(straight(), straight(), RpeDelta(9.0, "metres")), UsageError, "9 metres"),
-        (lambda: rpe_pairs(np.zeros((5, 3)), RpeDelta(0, "frames")), ValueError, "want > 0"),
+        (lambda: rpe_pairs(np.zeros((5, 3)), RpeDelta(0, "frames")), ValueError, "expected > 0"),
         (lambda: rpe_pairs(np.zeros((5, 3)), RpeDelta(1.5, "frames")), ValueError, "whole number"),
         (lambda: pair(later(), standing(), 1), UsageError, "no true pose has an estimate"),
         (lambda: pair(walk(1, 0), standing(), 1), UsageError, "0 true and 5 estimated"),
-        (lambda: pair(walk(1), walk(2), 1, np.zeros((3, 6))), ValueError, r"want \(60, 6\)"),
+        (lambda: pair(walk(1), walk(2), 1, np.zeros((3, 6))), ValueError, r"expected \(60, 6\)"),
         (
             lambda: nees(Paired(walk(1), walk(1), None, Coverage(0, 0, 0, 0, 0)), 2),
             ValueError,
-            "cov_xyh: wanted for NEES",
+            "cov_xyh: needed for NEES",
         ),
     ],
 )

@@ -200,7 +200,7 @@ def test_belief_is_judged_until_the_car_enters_and_the_rest_is_reported() -> Non
     one = scores["intersection"]
     assert (one.steps, one.scored, one.left_out) == (50, 40, {"in the intersection": 10})
     assert one.brier.value == pytest.approx((10 * 0.25 + 30 * 0.05**2) / 40)
-    assert scores["straight"].share_there == 0.0
+    assert scores["straight"].fraction_there == 0.0
     assert scores["straight"].brier.value == pytest.approx((30 * 0.25 + 10 * 0.04) / 40)
 
 
@@ -217,7 +217,7 @@ def test_where_no_intersection_is_ahead_only_its_absence_is_judged() -> None:
     far = approach(start_ns=at(20), enter_ns=at(40))
     scores = score_belief(judge_belief(good_tables(), truth([], [far])))
 
-    assert scores["intersection"].share_there == 0.5
+    assert scores["intersection"].fraction_there == 0.5
     assert scores["left"].left_out == {"in the intersection": 10, "no intersection ahead": 20}
 
 
@@ -226,7 +226,7 @@ def test_a_feature_of_the_users_own_is_not_judged_and_reported() -> None:
     score = score_belief(judge_belief(run, truth()))["roundabout"]
 
     assert score.scored == 0
-    assert score.left_out["the truth does not know this feature"] == 40
+    assert score.left_out["the truth does not annotate this feature"] == 40
     assert math.isnan(score.brier.value)
 
 
@@ -274,7 +274,7 @@ def test_range_errors_by_reference_and_what_the_filter_claims() -> None:
     assert scores["start"].nees.mean == pytest.approx(1.0)
     assert scores["end"].bias_m.value == pytest.approx(-2.0)
     assert scores["end"].left_out == {"in the intersection": 5}
-    assert scores["end"].nees.share_inside_95 == 0.0
+    assert scores["end"].nees.fraction_inside_95 == 0.0
     assert scores["start"].by_distance["0-10"].rows == 9
 
 

@@ -35,7 +35,7 @@ def test_wilson_is_scipys(right: int, more: int, confidence: float) -> None:
 
 def test_wilson_of_nothing_is_unknown_and_of_impossible_counts_refused() -> None:
     assert np.isnan(wilson(0, 0)).all()
-    with pytest.raises(ValueError, match="want 0 to 3, got 4"):
+    with pytest.raises(ValueError, match="expected 0 to 3, got 4"):
         wilson(4, 3)
 
 

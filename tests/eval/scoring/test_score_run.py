@@ -83,7 +83,7 @@ def test_the_summary_reports_coverage_first_and_fits_a_terminal(
     assert cli.run(["score", *runs]) == 0
     text = capsys.readouterr().out
     assert max(map(len, text.splitlines()[2:])) <= 80
-    assert text.index("the truth speaks of") < text.index("precision") < text.index("approaches")
+    assert text.index("the truth covers") < text.index("precision") < text.index("approaches")
     assert "20 in the intersection" in text
     assert "2 of 2, 15.0 m away on average" in text
 
@@ -132,7 +132,7 @@ def test_gates_decide_the_exit_status_and_leave_a_junit_file(tmp_path: Path) -> 
     ("gate", "said"),
     [
         ('metric = "cues.stop_sing.precision"\nmin = 0.9', "close ones: cues.stop_sign.precision"),
-        ('metric = "cues.stop_sign.precision"', "want min, max or both"),
+        ('metric = "cues.stop_sign.precision"', "expected min, max or both"),
         ('metric = "cues.stop_sign.precision"\nmin = nan', "finite number"),
         ('metric = "a"\nmin = 2\nmax = 1', "min 2 is above max 1"),
         (
@@ -271,7 +271,10 @@ def test_an_approach_outside_the_log_is_refused_unless_only_a_part_was_replayed(
     [
         ({"approaches": "twice"}, "overlap"),
         ({"cues": [{"cue": "stop_sing", "present": True, "t_ns": at(3)}]}, "meant: stop_sign"),
-        ({"cues": [{"cue": "stop_sign", "present": True, "t_ns": at(3000)}]}, "want times from"),
+        (
+            {"cues": [{"cue": "stop_sign", "present": True, "t_ns": at(3000)}]},
+            "expected times from",
+        ),
         ({"ranges": "missing.csv"}, "missing.csv"),
         ({"ranges": "../run/manifest.json"}, "manifest.json"),
     ],
@@ -337,8 +340,8 @@ def test_tables_of_another_version_are_refused_by_column(
     broken = {
         "no column count": {"cues": cue_table(CUES).drop_columns(["count"])},
         "outside 0 to 1": {"belief": belief_table({"left": {3: 1.5}})},
-        "want start or end": {"range": range_table(3, 9, reference="middle")},
-        "want whole numbers": {"belief": belief.set_column(0, "t_ns", belief["intersection"])},
+        "expected start or end": {"range": range_table(3, 9, reference="middle")},
+        "expected whole numbers": {"belief": belief.set_column(0, "t_ns", belief["intersection"])},
         "count -1": {"cues": cue_table({"stop_sign": {3: -1}})},
     }
     for i, (said, tables) in enumerate(broken.items()):

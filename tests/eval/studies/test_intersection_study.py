@@ -103,11 +103,11 @@ def test_every_published_cue_has_a_row_even_without_a_single_detection() -> None
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--layouts", "A,Z"], "want some of A to H, each once"),
+        (["--layouts", "A,Z"], "expected some of A to H, each once"),
         (["--layouts", "A,A"], "each once"),
-        (["--runs", "0"], "want 1 or more"),
+        (["--runs", "0"], "expected 1 or more"),
         (["--width", "100"], "multiple of 16"),
-        (["--workers", "0"], "want 1 or more"),
+        (["--workers", "0"], "expected 1 or more"),
     ],
 )
 def test_wrong_settings_are_refused_in_one_line(

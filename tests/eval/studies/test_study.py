@@ -215,7 +215,7 @@ def test_ray_gives_the_same_bytes_and_reports_of_dead_workers(
             'version = 1\nkind = "range"\ndrivs = 3\n',
             r":3: drivs: no such key; did you mean drives",
         ),
-        ('version = 1\nkind = "landmarks"\n', "want \"range\" here, got 'landmarks'"),
+        ('version = 1\nkind = "landmarks"\n', "expected \"range\" here, got 'landmarks'"),
         ('kind = "range"\n', "version: missing"),
         ('version = 2\nkind = "range"\n', "version"),
         ('version = 1\nkind = "range"\ndrives = 0\n', ":3: drives"),

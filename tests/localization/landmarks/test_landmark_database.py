@@ -126,7 +126,7 @@ def test_every_real_covariance_is_taken(sd_x: float, sd_y: float, correlation: f
 
 
 def test_coordinates_that_are_no_numbers_are_refused() -> None:
-    with pytest.raises(ValueError, match="landmark x: want finite numbers"):
+    with pytest.raises(ValueError, match="landmark x: expected finite numbers"):
         Place("x", np.array([np.nan, 0.0]), np.eye(2))
     with pytest.raises(ValueError, match="heading inf"):
         Place("x", np.zeros(2), np.eye(2), np.inf)
@@ -135,15 +135,15 @@ def test_coordinates_that_are_no_numbers_are_refused() -> None:
 def test_a_nameless_landmark_and_odd_features_are_refused() -> None:
     with pytest.raises(ValueError, match="name"):
         Place("", np.zeros(2), np.eye(2))
-    with pytest.raises(ValueError, match="want Unicode"):
+    with pytest.raises(ValueError, match="expected Unicode"):
         Place("\udcff", np.zeros(2), np.eye(2))
-    with pytest.raises(ValueError, match=r"points_px: want \(3, 2\)"):
+    with pytest.raises(ValueError, match=r"points_px: expected \(3, 2\)"):
         Features(1, 1, np.zeros((2, 2), np.float32), np.zeros((3, 32), np.uint8))
 
 
 def test_a_search_wider_than_the_boxes_is_refused(grid: Path) -> None:
     with LandmarkDatabase(grid) as database:
-        with pytest.raises(ValueError, match=r"sigmas: want 0 to 4\.0, got 5"):
+        with pytest.raises(ValueError, match=r"sigmas: expected 0 to 4\.0, got 5"):
             database.near(np.zeros(2), np.eye(2), sigmas=5.0)
         with pytest.raises(ValueError, match="finite"):
             database.near(np.array([np.nan, 0.0]), np.eye(2))
@@ -155,7 +155,7 @@ def test_a_file_cut_short_is_refused(grid: Path, tmp_path: Path, share: float) -
     cut = tmp_path / "cut.sqlite"
     cut.write_bytes(whole[: int(share * len(whole))])
 
-    with pytest.raises(LogFormatError, match=r"cut\.sqlite: cut short: .* build it anew"):
+    with pytest.raises(LogFormatError, match=r"cut\.sqlite: cut short: .* build it again"):
         LandmarkDatabase(cut)
     with pytest.raises(LogFormatError, match="cut short"):
         LandmarkWriter(cut, "orb")
@@ -263,9 +263,9 @@ def test_adding_goes_on_where_it_ended(tmp_path: Path) -> None:
         assert [one.place.name for one in database] == ["0", "1", "2", "more"]
 
 
-def _add(path: Path, names: list[str], most_pages: int = 1_000_000) -> None:
+def _add(path: Path, names: list[str], max_pages: int = 1_000_000) -> None:
     with LandmarkWriter(path, "orb") as writer:
-        writer._sql.execute(f"PRAGMA max_page_count = {most_pages}")
+        writer._sql.execute(f"PRAGMA max_page_count = {max_pages}")
         for name in names:
             writer.add(place_at(1.0, 1.0, name), some_features(9, 200))
 
@@ -337,12 +337,12 @@ with LandmarkWriter(Path(sys.argv[1]), "orb") as writer:
 
 
 def _in_child(
-    path: Path, count: int, *more: str, most_bytes: int | None = None
+    path: Path, count: int, *more: str, max_bytes: int | None = None
 ) -> subprocess.CompletedProcess[str]:
     def limit() -> None:
-        if most_bytes is not None:
+        if max_bytes is not None:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-            resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+            resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, max_bytes))
 
     return subprocess.run(
         [sys.executable, "-c", WRITE_MANY, str(path), str(count), *more],
@@ -373,14 +373,14 @@ def test_a_disk_that_fills_up_is_reported_and_leaves_what_was_there(tmp_path: Pa
     """The kernel refuses to let the file grow, as a full disk would."""
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
 
-    done = _in_child(path, 200, most_bytes=200_000)
+    done = _in_child(path, 200, max_bytes=200_000)
 
     assert done.returncode == 1
     assert "OutputError" in done.stderr
     with LandmarkDatabase(path) as database:
         assert [len(database.features(one.key)) for one in database] == [20, 20, 20]
     fresh = tmp_path / "fresh.sqlite"
-    assert "OutputError" in _in_child(fresh, 200, most_bytes=200_000).stderr
+    assert "OutputError" in _in_child(fresh, 200, max_bytes=200_000).stderr
     assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]
 
 
@@ -388,7 +388,7 @@ def test_a_database_that_may_not_grow_says_the_disk_is_full(tmp_path: Path) -> N
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
 
     with pytest.raises(OutputError, match=r"lm\.sqlite: the disk is full"):
-        _add(path, [f"new {i}" for i in range(200)], most_pages=1)
+        _add(path, [f"new {i}" for i in range(200)], max_pages=1)
     with LandmarkDatabase(path) as database:
         assert len(database) == 3
 

@@ -117,9 +117,9 @@ def test_a_matcher_of_ones_own_is_named_by_module_and_factory() -> None:
 
 
 def test_settings_that_mean_nothing_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"ratio: want 0 to 1, got 1\.5"):
+    with pytest.raises(ValueError, match=r"ratio: expected 0 to 1, got 1\.5"):
         OrbSettings(ratio=1.5)
-    with pytest.raises(ValueError, match="features: want > 0, got 0"):
+    with pytest.raises(ValueError, match="features: expected > 0, got 0"):
         OrbSettings(features=0)
 
 

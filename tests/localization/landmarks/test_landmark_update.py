@@ -122,9 +122,9 @@ def test_no_number_and_no_covariance_is_let_in(xy: list[float], cov: list[list[f
 
 
 def test_settings_that_mean_nothing_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"sigmas: want 0 to 4\.0, got 9"):
+    with pytest.raises(ValueError, match=r"sigmas: expected 0 to 4\.0, got 9"):
         LandmarkSettings(sigmas=9.0)
-    with pytest.raises(ValueError, match="revisit_m: want >= 0, got nan"):
+    with pytest.raises(ValueError, match="revisit_m: expected >= 0, got nan"):
         LandmarkSettings(revisit_m=math.nan)
 
 

@@ -28,7 +28,7 @@ from crosscue.localization.town.streets import (
     step_of,
 )
 
-SMALL = Drive(city=City(largest_km2=3.0, one_way_share=0.5, dead_end_share=0.1))
+SMALL = Drive(city=City(largest_km2=3.0, one_way_fraction=0.5, dead_end_fraction=0.1))
 
 
 def stream(seed: int, purpose: int = 7) -> Stream:

@@ -34,7 +34,7 @@ from crosscue.replay.base import Floats
 
 FIELD = {name: i for i, name in enumerate(Result._fields)}
 TOWN = City(largest_km2=3.0)
-TANGLED = City(largest_km2=4.0, dead_end_share=0.15, one_way_share=0.6)
+TANGLED = City(largest_km2=4.0, dead_end_fraction=0.15, one_way_fraction=0.6)
 KINDS = {
     "town": Drive(city=TOWN),
     "no compass": Drive(sensors=Sensors(compass_2sigma_deg=None)),
@@ -59,7 +59,7 @@ KINDS = {
         navigation=Navigation(strategy="landmark to landmark"),
     ),
     "maze": Drive(
-        city=City(dead_end_share=0.2, one_way_share=0.8, smallest_km2=2.0, largest_km2=3.0),
+        city=City(dead_end_fraction=0.2, one_way_fraction=0.8, smallest_km2=2.0, largest_km2=3.0),
         landmarks_per_km2=5.0,
         longest_m=600.0,
     ),
@@ -200,8 +200,8 @@ def test_simulated_cars_in_one_long_street_are_lost_where_the_law_says() -> None
     city = City(
         smallest_km2=400.0,
         largest_km2=400.0,
-        dead_end_share=0.0,
-        one_way_share=0.0,
+        dead_end_fraction=0.0,
+        one_way_fraction=0.0,
         shortest_block_m=1000.0,
         longest_block_m=1000.0,
         goal_at_least_m=250.0,
@@ -243,7 +243,7 @@ def test_a_city_without_intersections_is_refused() -> None:
         (Sensors, "detection_rate", 1.1),
         (Sensors, "landmark_sd_m", 0.0),
         (Sensors, "compass_2sigma_deg", float("nan")),
-        (City, "one_way_share", 0.9),
+        (City, "one_way_fraction", 0.9),
         (City, "shortest_block_m", 10.0),
     ],
 )

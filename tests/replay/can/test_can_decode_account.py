@@ -322,5 +322,5 @@ def test_rows_that_are_no_frames_are_refused() -> None:
     decode, _ = decoder()
     table = Block("can0", np.zeros(1, np.int64), Table({"a": np.zeros(1)}))
 
-    with pytest.raises(ValueError, match="can0: want CanFrames, got Table"):
+    with pytest.raises(ValueError, match="can0: expected CanFrames, got Table"):
         decode(table)

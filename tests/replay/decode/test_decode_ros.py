@@ -490,7 +490,7 @@ def test_columns_pass_as_they_are() -> None:
         ("@a(" * 100_000 + "\n", "cannot read the line"),
         ("string<=x y\n", "cannot read the line"),
         ("Header h some value\n", "cannot read the line"),
-        ("int32 x\n" + "=" * 80 + "\nint32 y\n", "want 'MSG: name'"),
+        ("int32 x\n" + "=" * 80 + "\nint32 y\n", "expected 'MSG: name'"),
         (("=" * 80 + "\n").join(["", "MSG: a/B\nint8 x\n", "MSG: a/B\nint9 x\n"]), "two different"),
     ],
 )

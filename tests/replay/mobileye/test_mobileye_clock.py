@@ -165,6 +165,6 @@ def test_a_stall_longer_than_a_wrap_is_reported_not_hidden() -> None:
 def test_a_known_latency_moves_all_images_by_it() -> None:
     image_ns, counter_ms = camera(20)
     log_ns = image_ns + 80 * MS
-    known = unwrap(counter_ms, log_ns, least_latency_ns=80 * MS)
+    known = unwrap(counter_ms, log_ns, min_latency_ns=80 * MS)
 
     np.testing.assert_allclose(known.image_ns, image_ns, atol=MS)

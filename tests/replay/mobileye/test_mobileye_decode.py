@@ -228,7 +228,7 @@ def test_on_a_shared_bus_foreign_frames_are_another_decoders_business() -> None:
 
 def test_a_table_is_no_bus() -> None:
     decoder = MobileyeDecoder("can1", Ledger("log"))
-    with pytest.raises(ValueError, match="can1: want CanFrames, got Table"):
+    with pytest.raises(ValueError, match="can1: expected CanFrames, got Table"):
         decoder(Block("can1", np.zeros(0, dtype=np.int64), Table({})))
 
 

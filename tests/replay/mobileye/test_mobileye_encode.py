@@ -255,9 +255,9 @@ def test_a_side_without_a_marking_is_sent_as_such() -> None:
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
-        ("width_m", np.nan, r"obstacles width_m, row 0: cannot send nan; want 0 to 12.5 m"),
-        ("type", 9, r"obstacles type, row 0: cannot send 9; want 0 to 7"),
-        ("obstacle_id", -1, r"obstacles obstacle_id, row 0: cannot send -1; want 0 to 255"),
+        ("width_m", np.nan, r"obstacles width_m, row 0: cannot send nan; expected 0 to 12.5 m"),
+        ("type", 9, r"obstacles type, row 0: cannot send 9; expected 0 to 7"),
+        ("obstacle_id", -1, r"obstacles obstacle_id, row 0: cannot send -1; expected 0 to 255"),
         ("radar_x_m", 400.0, r"obstacles radar_x_m, row 0: cannot send"),
     ],
 )
@@ -278,9 +278,9 @@ def test_tables_and_bursts_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="no such table: lidar; there are: status"):
         encode_tables([Block("can1/lidar", times, Table({"t_ns": times}))])
     lonely: Columns = {"burst": times + 4, "slot": times, "x_m": times + 9.0, "y_m": times + 0.0}
-    with pytest.raises(ValueError, match="obstacles of burst 4: want a status row"):
+    with pytest.raises(ValueError, match="obstacles of burst 4: expected a status row"):
         encode_tables([table_block("can1", "obstacles", times, lonely)])
-    with pytest.raises(ValueError, match="want rising times"):
+    with pytest.raises(ValueError, match="expected rising times"):
         bursts_of(np.array([1, 1]), Table({"t_ns": times, "x_m": times, "y_m": times}))
-    with pytest.raises(ValueError, match="want times out of image_ns"):
+    with pytest.raises(ValueError, match="expected times out of image_ns"):
         bursts_of(np.array([1, 2]), Table({"t_ns": times, "x_m": times, "y_m": times}))

@@ -94,7 +94,7 @@ def test_relative_times_add_up_over_all_lines(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, text))
 
     assert [f.t_ns - NOON_NS for f in found["can/1"]] == [100_000_000, 300_000_000]
-    assert ledger.topic("").skipped == {"event that is no CAN frame": 1}
+    assert ledger.topic("").skipped == {"event that is not a CAN frame": 1}
 
 
 def test_relative_times_say_so_when_a_line_is_missing(tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def test_other_objects_are_counted_as_no_frames(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, header + _container(bytes(objects))))
 
     assert sum(map(len, found.values())) == 2
-    assert ledger.topic("").skipped == {"object of type 96 is no CAN frame": 1}
+    assert ledger.topic("").skipped == {"object of type 96 is not a CAN frame": 1}
     assert ledger.is_whole
 
 

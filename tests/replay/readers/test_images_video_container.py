@@ -200,7 +200,7 @@ def test_a_time_file_that_names_pictures_is_refused(tmp_path: Path) -> None:
     path = video(tmp_path / "a.mp4", 3)
     path.with_suffix(".txt").write_text("a.png,0.5")
 
-    with pytest.raises(LogFormatError, match="names files; want one time for each picture"):
+    with pytest.raises(LogFormatError, match="names files; expected one time for each picture"):
         open_log(path)
 
 

@@ -131,7 +131,7 @@ def test_an_index_that_contradicts_a_chunk_is_given_up(tmp_path: Path) -> None:
     reading = read_back(path, Selection(None, 400, 405))
 
     assert len(reading.messages["/t0"]) == 5
-    assert any("every chunk was looked at" in notice for notice in reading.ledger.notices)
+    assert any("every chunk was examined" in notice for notice in reading.ledger.notices)
     assert reading.ledger.accounts == walked(path, Selection(None, 400, 405)).ledger.accounts
 
 

@@ -118,5 +118,5 @@ def test_a_wrong_time_in_the_index_is_found_out(tmp_path: Path) -> None:
     reading = read_rows(path, Selection(start_ns=last.log_ns))
 
     assert by_topic(reading.rows) == by_topic(rows[middle + 1 :])
-    assert any("every chunk was looked at" in said for said in reading.ledger.notices)
+    assert any("every chunk was examined" in said for said in reading.ledger.notices)
     assert reading.ledger.is_whole

@@ -318,7 +318,7 @@ def test_a_database_without_the_tables_says_what_it_holds(tmp_path: Path, tables
     db.executescript(tables)
     db.close()
 
-    with pytest.raises(LogFormatError, match=r"want a table '(messages|topics)'.*it holds"):
+    with pytest.raises(LogFormatError, match=r"expected a table '(messages|topics)'.*it holds"):
         open_log(path)
 
 

@@ -118,4 +118,4 @@ def test_a_chunk_over_max_chunk_is_refused_with_both_numbers(
 
 def test_max_chunk_wants_a_size(capsys: pytest.CaptureFixture[str]) -> None:
     assert crosscue(["info", "x.mcap", "--max-chunk", "-1"]) == 2
-    assert "want MiB" in capsys.readouterr().err
+    assert "expected MiB" in capsys.readouterr().err
