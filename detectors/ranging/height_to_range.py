@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.replay.base import EmptyResultError, Floats, UsageError
 from crosscue.replay.vehicle.vehicle import RangeCurve
@@ -46,11 +47,25 @@ class RangeFit:
         curve: As the vehicle file keeps it.
         pairs: How many were used.
         bins: Residuals by distance.
+        outliers: How many more were left out, being of another object or a wrong mask.
     """
 
     curve: RangeCurve
     pairs: int
     bins: tuple[Bin, ...]
+    outliers: int = 0
+
+
+OUTLIER_SIGMAS: Final = 5.0
+"""A pair further from the curve is left out, if it is so both in metres and by range: nobody knows
+whether errors grow with the range. Scales are median absolute deviations, which a tenth of bad
+pairs hardly moves."""
+MIN_OUTLIER: Final = 0.02
+"""But never one nearer than this fraction of its range: pairs without errors have no scale."""
+SOFT_FRACTION: Final = 0.05
+"""Of the range: residuals beyond it count less and less in the first fit."""
+ROUNDS: Final = 10
+"""Of fitting and leaving out; two or three settle it."""
 
 
 def range_of(height_px: Floats, curve: RangeCurve) -> Floats:
@@ -59,7 +74,10 @@ def range_of(height_px: Floats, curve: RangeCurve) -> Floats:
 
 
 def fit_range(height_px: Floats, range_m: Floats, family: Family, bin_m: float = 10.0) -> RangeFit:
-    """Fit one family by least squares of the range.
+    """Fit one family by least squares of the range, without outliers.
+
+    A fit that outliers sway little comes first (``soft_l1`` of residuals by range); pairs more than
+    ``OUTLIER_SIGMAS`` off it are left out and counted, and the rest is fitted.
 
     Args:
         height_px: Shape (N,), positive.
@@ -84,13 +102,42 @@ def fit_range(height_px: Floats, range_m: Floats, family: Family, bin_m: float =
     from scipy.optimize import least_squares
 
     scale = np.maximum(np.abs(guess), 1.0)
-    fitted = least_squares(lambda p: model(height_px, p * scale) - range_m, guess / scale)
-    parameters = np.asarray(fitted.x, np.float64) * scale
-    residual = model(height_px, parameters) - range_m
-    freedom = len(range_m) - len(guess)
+
+    def relative(p: Floats) -> Floats:
+        return np.asarray(model(height_px, p * scale) / range_m - 1.0, np.float64)
+
+    robust = least_squares(relative, guess / scale, loss="soft_l1", f_scale=SOFT_FRACTION)
+    parameters = np.asarray(robust.x, np.float64) * scale
+    keep = np.ones(len(range_m), np.bool_)
+    for _ in range(ROUNDS):
+        off_m = model(height_px, parameters) - range_m
+        is_near = np.abs(off_m) <= MIN_OUTLIER * range_m
+        before, keep = keep, _inliers(off_m) | _inliers(off_m / range_m) | is_near
+        if len(np.unique(height_px[keep])) <= len(guess):
+            raise UsageError(f"{family}: too few of {len(range_m)} pairs lie on one curve")
+        near_px, near_m = height_px[keep], range_m[keep]
+        fitted = least_squares(_residual_of(model, near_px, near_m, scale), parameters / scale)
+        parameters = np.asarray(fitted.x, np.float64) * scale
+        if np.array_equal(before, keep):
+            break
+    residual = model(near_px, parameters) - near_m
+    freedom = len(near_m) - len(guess)
     sd = max(float(np.sqrt(np.sum(residual**2) / freedom)), 1e-6)
     curve = RangeCurve(family=family, parameters=tuple(parameters.tolist()), residual_sd_m=sd)
-    return RangeFit(curve, len(range_m), _bins(range_m, residual, bin_m))
+    bins = _bins(near_m, residual, bin_m)
+    return RangeFit(curve, len(near_m), bins, len(range_m) - len(near_m))
+
+
+def _residual_of(
+    model: Callable[[Floats, Floats], Floats], height_px: Floats, range_m: Floats, scale: Floats
+) -> Callable[[Floats], Floats]:
+    return lambda p: model(height_px, p * scale) - range_m
+
+
+def _inliers(off: Floats) -> NDArray[np.bool_]:
+    """Which residuals are no outliers, by the scale of the typical one."""
+    away = np.abs(off - np.median(off))
+    return np.asarray(away <= OUTLIER_SIGMAS * 1.4826 * np.median(away), np.bool_)
 
 
 def residuals(

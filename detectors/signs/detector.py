@@ -40,7 +40,9 @@ class SignSettings(Settings):
     """The international disc has few corners and needs a threshold of its own: search it alone."""
     heights_px: tuple[Annotated[int, Field(ge=16, le=256)], ...] = (48, 64)
     """Sizes of the drawings, in pixels of a pyramid level."""
-    levels: Annotated[int, Field(ge=1, le=16)] = 9
+    levels: Annotated[int, Field(ge=1, le=16)] = 14
+    """Up to 460 pixels high: a sign of 0.75 m so high is 3 m away where the focal length is 1970
+    pixels. Nine found none above 190."""
     factor: Annotated[float, Field(gt=1.0, le=2.0)] = 1.25
     """From one level of the pyramid to the next."""
     enlarge: Annotated[float, Field(ge=1.0, le=4.0)] = 2.5

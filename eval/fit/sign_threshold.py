@@ -82,7 +82,7 @@ def fit_signs(
     crop_top: float = 0.0,
     crop_bottom: float = 0.25,
     enlarge: float = 2.5,
-    levels: int = 9,
+    levels: int = 14,
     points: int = 4000,
     limits: Limits = DEFAULT_LIMITS,
     progress: Progress = lambda parts, done: parts,

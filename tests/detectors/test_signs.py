@@ -13,7 +13,7 @@ from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.signs.detector import build, orb_points
 from crosscue.detectors.signs.matching import nearest, window_counts
-from crosscue.detectors.signs.templates import AMERICAN, Kind
+from crosscue.detectors.signs.templates import AMERICAN, Kind, draw
 from crosscue.detectors.training.operating_point import Judged, judge, rates_at, threshold_for
 from crosscue.eval.cli import run
 from crosscue.replay.base import Block, Bytes, Images, Ledger, Messages, Topic, VehicleError
@@ -53,6 +53,20 @@ def test_a_left_arrow_is_never_a_right_one(kind: Kind, other: Kind) -> None:
         found = _signs(grey)
         for label, candidate in zip(found.labels, found.boxes_px, strict=True):
             assert not (label == other and overlaps(box, candidate[None])[0] > 0.4)
+
+
+@pytest.mark.parametrize("height_px", [40, 150, 220, 320])
+def test_a_sign_is_found_however_near_it_is(height_px: int) -> None:
+    drawing = draw("do not enter", height_px).grey
+    grey = clutter(7, (1280, 720))
+    h, w = drawing.shape
+    grey[60 : 60 + h, 300 : 300 + w] = drawing
+    box = np.array([300.0, 60.0, 300.0 + w, 60.0 + h])
+
+    found = _signs(np.asarray(cv2.GaussianBlur(grey, (0, 0), 0.7), np.uint8))
+
+    assert "do not enter" in found.labels
+    assert overlaps(box, found.boxes_px).max() > 0.5
 
 
 def test_clutter_without_signs_has_no_arrows() -> None:

@@ -147,7 +147,7 @@ def _pairs(args: argparse.Namespace) -> RangePairs:
 def _report_text(cue: str, fits: list[RangeFit], best: RangeFit, tested: RangeFit | None) -> str:
     lines = [f"{fit.curve.family:15} residual s.d. {fit.curve.residual_sd_m:.2f} m" for fit in fits]
     lines += [f"{'published':15} residual s.d. {PUBLISHED_SD_M[cue]:.1f} m, on real images"]
-    lines += ["", f"{best.curve.family} by distance, {best.pairs} pairs:", *_bins(best.bins)]
+    lines += ["", f"{best.curve.family} by distance, {_pairs_text(best)}:", *_bins(best.bins)]
     if tested is not None:
         sd = tested.curve.residual_sd_m
         lines += ["", f"on other drives, {tested.pairs} pairs, r.m.s. {sd:.2f} m:"]
@@ -161,6 +161,11 @@ def _report_text(cue: str, fits: list[RangeFit], best: RangeFit, tested: RangeFi
         f"residual_sd_m = {best.curve.residual_sd_m:.3f}",
     ]
     return "\n".join(lines)
+
+
+def _pairs_text(fit: RangeFit) -> str:
+    left_out = f" ({fit.outliers} outliers left out)" if fit.outliers else ""
+    return f"{fit.pairs} pairs{left_out}"
 
 
 def _bins(bins: tuple[Bin, ...]) -> list[str]:
@@ -177,6 +182,7 @@ def _as_json(fit: RangeFit) -> dict[str, object]:
         "parameters": list(fit.curve.parameters),
         "residual_sd_m": fit.curve.residual_sd_m,
         "pairs": fit.pairs,
+        "outliers": fit.outliers,
         "bins": [
             {
                 "from_m": b.from_m,

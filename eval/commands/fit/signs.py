@@ -76,9 +76,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--levels",
         type=int,
-        default=9,
+        default=14,
         metavar="N",
-        help="pyramid levels, each smaller by 1.25 (default: 9)",
+        help="pyramid levels, each smaller by 1.25 (default: 14)",
     )
     parser.add_argument(
         "--points", type=int, default=4000, metavar="N", help="keypoints per level (default: 4000)"
