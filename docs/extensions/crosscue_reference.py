@@ -139,7 +139,8 @@ class Tables(SphinxDirective):
 
 
 def _schemas() -> dict[str, pa.Schema]:
-    from crosscue.eval.pipeline import detect, scene
+    from crosscue.eval.pipeline import detect
+    from crosscue.eval.pipeline.scene.stage import stage as scene
     from crosscue.eval.runs.tables import measurements, pose_tables, skipped
 
     return {

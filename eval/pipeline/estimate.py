@@ -21,6 +21,7 @@ from crosscue.eval.pipeline.outcome import (
     report_time,
     unwatched_time,
 )
+from crosscue.eval.pipeline.scene.stage import estimate_scene, features_of, gives_reasons, schemas
 from crosscue.eval.runs.account import (
     UNATTRIBUTED,
     account,
@@ -69,7 +70,6 @@ from .drive_time import drive_timeline, refuse_other_segments, selections_of, ti
 from .empty_result import empty_result, silent_roles
 from .landmarks import looking
 from .pose import PoseStage, estimating_of, turn_signal_of
-from .scene import estimate_scene, features_of, gives_reasons, schemas
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from crosscue.eval.pipeline.variants import scene_tables
+from crosscue.eval.pipeline.scene.variants import scene_tables
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.columns import RunTables
 from crosscue.eval.scoring.run_tables import in_log_time

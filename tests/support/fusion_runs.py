@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from crosscue.datasets.truth.truth import Approach, Features, Truth, save
-from crosscue.eval.pipeline.scene import schemas
+from crosscue.eval.pipeline.scene.stage import schemas
 from crosscue.eval.runs.folder import RunFolder, create, write_manifest
 from crosscue.eval.runs.tables import measurements
 from crosscue.eval.runs.tables.table_sink import TableSink

@@ -9,7 +9,7 @@ from crosscue.detectors.base import Choice, Detections, reportable
 from crosscue.detectors.cues.frame import CuePass, Seen, all_labels
 from crosscue.detectors.cues.tally import cue_labels
 from crosscue.detectors.registry import make
-from crosscue.eval.pipeline.looked_for import (
+from crosscue.eval.pipeline.scene.looked_for import (
     NEVER,
     NO_LABEL,
     NO_MOBILEYE,

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from crosscue.eval.pipeline.scene.stage import estimate_scene, features_of, gives_reasons, schemas
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.labelled import with_labels
 from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
 from crosscue.replay.errors import RunError
 from crosscue.replay.vehicle.vehicle import Vehicle
-
-from .scene import estimate_scene, features_of, gives_reasons, schemas
 
 if TYPE_CHECKING:
     import pyarrow as pa

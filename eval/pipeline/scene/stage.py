@@ -25,6 +25,9 @@ from crosscue.eval.pipeline.outcome import (
     report_time,
     unwatched_time,
 )
+from crosscue.eval.pipeline.scene.looked_for import not_looked_for
+from crosscue.eval.pipeline.scene.motion_ranges import MotionRanges, RangedObject
+from crosscue.eval.pipeline.scene.sign_ranges import MEASURED, SignRanges
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
@@ -35,10 +38,6 @@ from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
-
-from .looked_for import not_looked_for
-from .motion_ranges import MotionRanges, RangedObject
-from .sign_ranges import MEASURED, SignRanges
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -1,0 +1,1 @@
+"""The stage that makes ranges, beliefs and cues of what was detected."""
