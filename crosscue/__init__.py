@@ -117,6 +117,21 @@ _EXPORTS: Final = {
     "SimulatedDrives": "eval.interface.simulate",
     "draw_contact_sheet": "eval.interface.simulate",
     "SceneFiles": "datasets.scenes.drive",
+    "add_landmarks": "eval.interface.landmarks",
+    "add_landmark_images": "eval.interface.landmarks",
+    "AddedLandmarks": "eval.interface.landmarks",
+    "list_landmarks": "eval.interface.landmarks",
+    "LandmarkList": "eval.interface.landmarks",
+    "match_landmarks": "eval.interface.landmarks",
+    "LandmarkMatches": "eval.interface.landmarks",
+    "fit_compass": "eval.interface.fits.compass",
+    "FittedCompass": "eval.interface.fits.compass",
+    "fit_landmarks": "eval.interface.fits.landmarks",
+    "FittedLandmarks": "eval.interface.fits.landmarks",
+    "fit_messages": "eval.interface.fits.messages",
+    "FittedMessages": "eval.interface.fits.messages",
+    "fit_ranges": "eval.interface.fits.ranges",
+    "FittedRanges": "eval.interface.fits.ranges",
 }
 """From a public name to its module."""
 
@@ -147,6 +162,21 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.demo import KnownDrive as KnownDrive
     from crosscue.eval.interface.demo import demo as demo
     from crosscue.eval.interface.demo import fetch_drive as fetch_drive
+    from crosscue.eval.interface.fits.compass import FittedCompass as FittedCompass
+    from crosscue.eval.interface.fits.compass import fit_compass as fit_compass
+    from crosscue.eval.interface.fits.landmarks import FittedLandmarks as FittedLandmarks
+    from crosscue.eval.interface.fits.landmarks import fit_landmarks as fit_landmarks
+    from crosscue.eval.interface.fits.messages import FittedMessages as FittedMessages
+    from crosscue.eval.interface.fits.messages import fit_messages as fit_messages
+    from crosscue.eval.interface.fits.ranges import FittedRanges as FittedRanges
+    from crosscue.eval.interface.fits.ranges import fit_ranges as fit_ranges
+    from crosscue.eval.interface.landmarks import AddedLandmarks as AddedLandmarks
+    from crosscue.eval.interface.landmarks import LandmarkList as LandmarkList
+    from crosscue.eval.interface.landmarks import LandmarkMatches as LandmarkMatches
+    from crosscue.eval.interface.landmarks import add_landmark_images as add_landmark_images
+    from crosscue.eval.interface.landmarks import add_landmarks as add_landmarks
+    from crosscue.eval.interface.landmarks import list_landmarks as list_landmarks
+    from crosscue.eval.interface.landmarks import match_landmarks as match_landmarks
     from crosscue.eval.interface.logs import CameraFrame as CameraFrame
     from crosscue.eval.interface.logs import Log as Log
     from crosscue.eval.interface.logs import LogTopic as LogTopic

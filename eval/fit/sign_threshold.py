@@ -56,6 +56,14 @@ class SignFit:
             _fraction([(one.right, one.signs) for one in counts]),
         )
 
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue fit signs --json`` prints."""
+        tree: dict[str, object] = {"min_score": self.threshold}
+        of = self.threshold
+        for name, on_others in (("chosen_on", False), ("other_frames", True)):
+            tree[name] = None if of is None else _tree(self.rates(of, on_others=on_others))
+        return tree
+
     def __repr__(self) -> str:
         if self.threshold is None:
             signs = sum(part.signs for part in self.chosen_on)
@@ -175,3 +183,16 @@ def _proportion_text(name: str, part: Proportion) -> str:
     if not math.isnan(part.clusters_low):
         interval += f", by drive {part.clusters_low:.2f} to {part.clusters_high:.2f}"
     return f"{name:9} {part.value:.2f} ({part.right} of {part.of}; {interval})"
+
+
+def _tree(rates: SignRates) -> dict[str, object]:
+    found: dict[str, object] = {
+        "found": rates.precision.of,
+        "right": rates.recall.right,
+        "signs": rates.recall.of,
+    }
+    for name, part in (("precision", rates.precision), ("recall", rates.recall)):
+        found[name] = part.value
+        found[f"{name}_interval"] = (part.low, part.high)
+        found[f"{name}_interval_by_drive"] = (part.clusters_low, part.clusters_high)
+    return found

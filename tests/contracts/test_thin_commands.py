@@ -44,14 +44,22 @@ CALLS: Final = {
     ),
     "plugins": ("plugins",),
     "info": ("open",),
+    "landmarks add": (
+        "add_landmarks",
+        "add_landmark_images",
+    ),
+    "landmarks list": ("list_landmarks",),
+    "landmarks match": ("match_landmarks",),
+    "fit compass": ("fit_compass",),
+    "fit landmarks": ("fit_landmarks",),
+    "fit messages": ("fit_messages",),
+    "fit ranges": ("fit_ranges",),
+    "fit signs": ("fit_signs",),
 }
 """The public functions that a command is made of."""
 NOT_YET: Final = frozenset(
     {
         "replay", "model list", "model show", "model fetch", "model init", "model check",
-        "fit compass",
-        "fit signs", "fit ranges", "fit messages", "fit landmarks", "landmarks add",
-        "landmarks list", "landmarks match",
         "train frames", "train mask-rcnn", "train road",
         "study intersections", "study range", "study landmarks", "study field", "study drive",
         }

@@ -13,27 +13,17 @@ example:
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+from contextlib import nullcontext
 from pathlib import Path
 
-from crosscue.eval.commands.shared.drive_part import selection_of
+import crosscue
+from crosscue.eval.commands.shared.drive_part import open_part
 from crosscue.eval.commands.shared.options import (
     add_part_arguments,
     add_vehicle_output,
-    check_vehicle_output,
-    limits_of,
     metres,
-    print_json,
+    print_result,
 )
-from crosscue.eval.fit.landmark_database import camera_frames, read_poses
-from crosscue.eval.fit.landmark_pairs import pairs_of_drive, pairs_of_table, with_min_score
-from crosscue.eval.pipeline.landmarks import matcher_for, open_for
-from crosscue.localization.landmarks.features import Matcher
-from crosscue.localization.landmarks.fit import LandmarkFit, Rate, ScoredPairs, fit_landmarks
-from crosscue.replay.base import Ledger, SchemaError, UsageError, write_text
-from crosscue.replay.logs.opening import open_logs
-from crosscue.replay.losses import warn_of
-from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -89,84 +79,21 @@ def _fraction(text: str) -> float:
 
 def run(args: argparse.Namespace) -> int:
     """Fit, report, and write where asked."""
-    given = (bool(args.pairs), bool(args.logs), bool(args.database), bool(args.poses))
-    if given not in ((True, False, False, False), (False, True, True, True)):
-        raise UsageError("fit landmarks: give --pairs, or LOG... with --database and --poses")
-    check_vehicle_output(args)
-    if args.max_landmarks < 1:
-        raise UsageError(f"--max-landmarks {args.max_landmarks}: expected 1 or more")
-    if args.same_within >= args.different_beyond:
-        raise UsageError(
-            f"--same-within {args.same_within:g}: expected less than --different-beyond "
-            f"{args.different_beyond:g}"
+    with open_part(args, args.logs) if args.logs else nullcontext() as log:
+        found = crosscue.fit_landmarks(
+            args.pairs,
+            log,
+            args.database,
+            args.poses,
+            args.vehicle,
+            args.output,
+            false_match_rate=args.false_match_rate,
+            every_m=args.every,
+            same_within_m=args.same_within,
+            different_beyond_m=args.different_beyond,
+            max_landmarks=args.max_landmarks,
+            matcher=args.matcher,
+            overwrite=args.overwrite,
         )
-    vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
-    matcher = matcher_for(vehicle, args.matcher)
-    if args.pairs:
-        pairs = pairs_of_table(args.pairs, matcher)
-    else:
-        pairs = _pairs_of_logs(args, vehicle, matcher)
-    try:
-        fitted = fit_landmarks(pairs, args.false_match_rate)
-    except ValueError as error:
-        raise SchemaError(f"fit landmarks: {error}; give more labelled pictures") from None
-    if args.output is not None:
-        text = with_min_score(args.vehicle.read_text(encoding="utf-8"), fitted.min_score)
-        parse(text, str(args.vehicle))
-        write_text(args.output, text)
-    if args.json:
-        print_json({**asdict(fitted), "is_shown": fitted.is_shown, "matcher": matcher.kind})
-    elif not args.quiet:
-        print(_report_text(fitted))
-        if args.output is not None:
-            print(f"written to {args.output}")
+    print_result(found, args)
     return 0
-
-
-def _pairs_of_logs(args: argparse.Namespace, vehicle: Vehicle, matcher: Matcher) -> ScoredPairs:
-    poses = read_poses(args.poses, vehicle)
-    with (
-        open_for(args.database, matcher) as database,
-        open_logs(args.logs, limits_of(args)) as logs,
-    ):
-        ledgers = [Ledger(str(log.path)) for log in logs]
-        frames = camera_frames(logs, vehicle, selection_of(args, logs), ledgers)
-        pairs = pairs_of_drive(
-            frames,
-            poses,
-            database,
-            matcher,
-            args.every,
-            args.same_within,
-            args.different_beyond,
-            args.max_landmarks,
-            ledgers,
-        )
-    for ledger in ledgers:
-        warn_of(ledger)
-    return pairs
-
-
-def _report_text(fitted: LandmarkFit) -> str:
-    lines = [
-        f"threshold   min_score = {fitted.min_score:g} for a false-match rate of "
-        f"{fitted.wanted_rate:g}",
-        "",
-        "                       fitted                        held out",
-    ]
-    for name, fit, held in (
-        ("false matches", fitted.fitted_false, fitted.held_out_false),
-        ("places found", fitted.fitted_found, fitted.held_out_found),
-    ):
-        lines.append(f"{name:14} {_rate(fit):>29} {_rate(held):>31}")
-    if not fitted.is_shown:
-        lines += [
-            "",
-            f"the {fitted.held_out_false.of} held-out pairs cannot show a rate of "
-            f"{fitted.wanted_rate:g}: it may be up to {fitted.held_out_false.high:.2g}",
-        ]
-    return "\n".join(lines)
-
-
-def _rate(rate: Rate) -> str:
-    return f"{rate.hits} of {rate.of} ({rate.low:.2g} to {rate.high:.2g})"

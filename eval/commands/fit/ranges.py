@@ -16,18 +16,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.detectors.ranging.height_to_range import FAMILIES, Bin, RangeFit, fit_range, residuals
-from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.fit.range_pairs import (
-    RangePairs,
-    pairs_of_run,
-    pairs_of_table,
-    pairs_of_truth,
-    together,
-)
-from crosscue.replay.errors import EmptyResultError, OutputError, UsageError
-
-PUBLISHED_SD_M = {"stop_sign": 1.7, "traffic_light": 5.9}
+import crosscue
+from crosscue.detectors.ranging.height_to_range import FAMILIES
+from crosscue.eval.commands.shared.options import print_result
+from crosscue.eval.interface.fits.ranges import PUBLISHED_SD_M
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -93,104 +85,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fit and report."""
-    if not args.bin_m > 0.0:
-        raise UsageError(f"--bin-m {args.bin_m}: expected more than 0")
-    if args.figure is not None and args.figure.exists() and not args.overwrite:
-        raise OutputError(f"{args.figure}: exists; give another name or --overwrite")
-    pairs = _pairs(args)
-    names = (args.family,) if args.family else FAMILIES
-    fits = [fit_range(*pairs, name, args.bin_m) for name in names]
-    best = min(fits, key=lambda fit: fit.curve.residual_sd_m)
-    tested = None
-    if args.test:
-        others = together(pairs_of_truth(path, args.cue) for path in args.test)
-        if not len(others.range_m):
-            raise EmptyResultError(f"--test: no {args.cue} in it; give other drives")
-        tested = residuals(*others, best.curve, args.bin_m)
-    if args.figure is not None:
-        from crosscue.eval.fit.range_figure import draw
-
-        draw(args.figure, args.cue, pairs, fits, tested)
-    if args.json:
-        tree: dict[str, object] = {
-            "cue": args.cue,
-            "best": best.curve.family,
-            "fits": [_as_json(f) for f in fits],
-        }
-        print_json(tree if tested is None else {**tree, "tested": _as_json(tested)})
-    elif not args.quiet:
-        print(_report_text(args.cue, fits, best, tested))
-    return 0
-
-
-def _pairs(args: argparse.Namespace) -> RangePairs:
-    if (args.table is None) == (not args.truth):
-        raise UsageError("fit ranges: give a TABLE, or --truth with drives")
-    if args.table is not None:
-        return pairs_of_table(args.table)
-    if args.runs and len(args.runs) != len(args.truth):
-        raise UsageError(f"--runs: {len(args.runs)} runs for {len(args.truth)} drives; pair them")
-    parts = (
-        [
-            pairs_of_run(r, t, args.cue, args.min_score)
-            for r, t in zip(args.runs, args.truth, strict=True)
-        ]
-        if args.runs
-        else [pairs_of_truth(path, args.cue) for path in args.truth]
+    found = crosscue.fit_ranges(
+        args.cue,
+        args.table,
+        args.truth,
+        args.runs,
+        test=args.test,
+        min_score=args.min_score,
+        family=args.family,
+        bin_m=args.bin_m,
+        figure=args.figure,
+        overwrite=args.overwrite,
     )
-    pairs = together(parts)
-    if not len(pairs.range_m):
-        raise EmptyResultError(f"--truth: no {args.cue} with a range in it; give other drives")
-    return pairs
-
-
-def _report_text(cue: str, fits: list[RangeFit], best: RangeFit, tested: RangeFit | None) -> str:
-    lines = [f"{fit.curve.family:15} residual s.d. {fit.curve.residual_sd_m:.2f} m" for fit in fits]
-    lines += [f"{'published':15} residual s.d. {PUBLISHED_SD_M[cue]:.1f} m, on real images"]
-    lines += ["", f"{best.curve.family} by distance, {_pairs_text(best)}:", *_bins(best.bins)]
-    if tested is not None:
-        sd = tested.curve.residual_sd_m
-        lines += ["", f"on other drives, {tested.pairs} pairs, r.m.s. {sd:.2f} m:"]
-        lines += _bins(tested.bins)
-    parameters = ", ".join(f"{p:.6g}" for p in best.curve.parameters)
-    lines += [
-        "",
-        f"[ranges.{cue}]",
-        f'family = "{best.curve.family}"',
-        f"parameters = [{parameters}]",
-        f"residual_sd_m = {best.curve.residual_sd_m:.3f}",
-    ]
-    return "\n".join(lines)
-
-
-def _pairs_text(fit: RangeFit) -> str:
-    left_out = f" ({fit.outliers} outliers left out)" if fit.outliers else ""
-    return f"{fit.pairs} pairs{left_out}"
-
-
-def _bins(bins: tuple[Bin, ...]) -> list[str]:
-    return [
-        f"  {b.from_m:5.0f} to {b.to_m:5.0f} m  {b.pairs:6} pairs  mean {b.mean_m:+6.2f} m  "
-        f"r.m.s. {b.sd_m:5.2f} m"
-        for b in bins
-    ]
-
-
-def _as_json(fit: RangeFit) -> dict[str, object]:
-    return {
-        "family": fit.curve.family,
-        "parameters": list(fit.curve.parameters),
-        "residual_sd_m": fit.curve.residual_sd_m,
-        "pairs": fit.pairs,
-        "outliers": fit.outliers,
-        "bins": [
-            {
-                "from_m": b.from_m,
-                "to_m": b.to_m,
-                "pairs": b.pairs,
-                "mean_m": b.mean_m,
-                "rms_m": b.sd_m,
-            }
-            for b in fit.bins
-        ],
-    }
+    print_result(found, args)
+    return 0

@@ -15,10 +15,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import crosscue
 from crosscue.detectors.signs.templates import AMERICAN, KINDS
-from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
+from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_result
 from crosscue.eval.commands.shared.progress import Done, with_progress
-from crosscue.eval.fit.sign_threshold import SignFit, SignRates, fit_signs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -116,7 +116,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Choose and report; 1 when no threshold is precise enough."""
-    fitted = fit_signs(
+    fitted = crosscue.fit_signs(
         args.labels,
         args.label,
         test=args.test,
@@ -136,29 +136,5 @@ def run(args: argparse.Namespace) -> int:
             parts, lambda: Done(*done(), "sets"), args, "looking"
         ),
     )
-    if args.json:
-        print_json(_as_json(fitted))
-    elif not args.quiet:
-        print(fitted)
+    print_result(fitted, args)
     return 0 if fitted.threshold is not None else 1
-
-
-def _as_json(fitted: SignFit) -> dict[str, object]:
-    out: dict[str, object] = {"min_score": fitted.threshold}
-    for name, on_others in (("chosen_on", False), ("other_frames", True)):
-        of = fitted.threshold
-        out[name] = None if of is None else _tree(fitted.rates(of, on_others=on_others))
-    return out
-
-
-def _tree(rates: SignRates) -> dict[str, object]:
-    found: dict[str, object] = {
-        "found": rates.precision.of,
-        "right": rates.recall.right,
-        "signs": rates.recall.of,
-    }
-    for name, part in (("precision", rates.precision), ("recall", rates.recall)):
-        found[name] = part.value
-        found[f"{name}_interval"] = (part.low, part.high)
-        found[f"{name}_interval_by_drive"] = (part.clusters_low, part.clusters_high)
-    return found

@@ -12,25 +12,12 @@ example:
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
 
-from crosscue.eval.commands.shared.drive_part import selection_of
-from crosscue.eval.commands.shared.options import add_part_arguments, limits_of, metres, print_json
-from crosscue.eval.fit.landmark_database import (
-    AddCounts,
-    add_from_images,
-    add_from_log,
-    camera_frames,
-    read_poses,
-)
-from crosscue.eval.pipeline.landmarks import matcher_for
-from crosscue.localization.landmarks.database import LandmarkWriter
-from crosscue.localization.landmarks.features import Matcher
-from crosscue.replay.base import EmptyResultError, Ledger, UsageError, visible
-from crosscue.replay.logs.opening import open_logs
-from crosscue.replay.losses import warn_of
-from crosscue.replay.vehicle.vehicle import Vehicle, load
+import crosscue
+from crosscue.eval.commands.shared.drive_part import open_part
+from crosscue.eval.commands.shared.options import add_part_arguments, metres, print_result
+from crosscue.replay.base import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,64 +64,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Add; 3 when a log was damaged."""
-    _check(args)
-    vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
-    matcher = matcher_for(vehicle, args.matcher)
-    is_whole = True
-    if args.images:
-        source = visible(args.source or args.images.resolve().name)
-        with LandmarkWriter(args.database, matcher.kind) as writer:
-            counts = add_from_images(writer, matcher, args.images, args.coordinates, source)
-            _refuse_none(args.database, counts)
-    else:
-        counts, is_whole = _add_logs(args, vehicle, matcher)
-    if args.json:
-        print_json({"database": str(args.database), **asdict(counts)})
-    elif not args.quiet:
-        print(_report_text(args.database, counts))
-    return 0 if is_whole else 3
-
-
-def _check(args: argparse.Namespace) -> None:
     given = (bool(args.logs), bool(args.poses), bool(args.images), bool(args.coordinates))
-    if given not in ((True, True, False, False), (False, False, True, True)):
-        raise UsageError("landmarks add: give LOG... with --poses, or --images with --coordinates")
-
-
-def _add_logs(
-    args: argparse.Namespace, vehicle: Vehicle, matcher: Matcher
-) -> tuple[AddCounts, bool]:
-    poses = read_poses(args.poses, vehicle)
-    with open_logs(args.logs, limits_of(args)) as logs:
-        ledgers = [Ledger(str(log.path)) for log in logs]
-        frames = camera_frames(logs, vehicle, selection_of(args, logs), ledgers)
-        source = visible(args.source or args.logs[0].resolve().stem)
-        with LandmarkWriter(args.database, matcher.kind) as writer:
-            counts = add_from_log(
-                writer, matcher, frames, poses, args.every, args.sd, source, ledgers
+    if given == (True, True, False, False):
+        with open_part(args, args.logs) as log:
+            found = crosscue.add_landmarks(
+                args.database,
+                log,
+                args.poses,
+                args.vehicle,
+                every_m=args.every,
+                sd_m=args.sd,
+                source=args.source,
+                matcher=args.matcher,
             )
-            for ledger in ledgers:
-                warn_of(ledger)
-            _refuse_none(args.database, counts)
-    return counts, all(ledger.is_whole for ledger in ledgers)
-
-
-def _refuse_none(database: Path, counts: AddCounts) -> None:
-    """Leave the database as it was; within the writer's block, which then takes all back."""
-    if not counts.added:
-        raise EmptyResultError(f"{_report_text(database, counts)}; give other pictures or poses")
-
-
-def _report_text(database: Path, counts: AddCounts) -> str:
-    left_out = [
-        f"{count} {why}"
-        for count, why in (
-            (counts.too_near, "too near the last"),
-            (counts.without_pose, "without a pose at their time"),
-            (counts.undecodable, "do not decode"),
-            (counts.blank, "show too little"),
+    elif given == (False, False, True, True):
+        found = crosscue.add_landmark_images(
+            args.database,
+            args.images,
+            args.coordinates,
+            args.vehicle,
+            source=args.source,
+            matcher=args.matcher,
         )
-        if count
-    ]
-    rest = f"; not: {', '.join(left_out)}" if left_out else ""
-    return f"{database}: {counts.added} landmarks added of {counts.pictures} pictures{rest}"
+    else:
+        raise UsageError("landmarks add: give LOG... with --poses, or --images with --coordinates")
+    print_result(found, args)
+    return 0 if found.is_whole else 3

@@ -7,16 +7,10 @@ example:
 from __future__ import annotations
 
 import argparse
-import heapq
 from pathlib import Path
 
-from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.fit.landmark_database import near_of
-from crosscue.eval.pipeline.landmarks import matcher_for, open_for
-from crosscue.localization.landmarks.features import Match
-from crosscue.localization.landmarks.images import grey_of, read_picture
-from crosscue.replay.base import UsageError, visible
-from crosscue.replay.vehicle.vehicle import Vehicle, load
+import crosscue
+from crosscue.eval.commands.shared.options import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,39 +34,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Match."""
-    near = near_of(args.near)
-    if args.best < 1:
-        raise UsageError(f"--best {args.best}: expected 1 or more")
-    vehicle = load(args.vehicle) if args.vehicle else Vehicle(version=1)
-    matcher = matcher_for(vehicle, args.matcher)
-    seen = matcher.describe(grey_of(read_picture(args.image)))
-    compared = 0
-    best: list[tuple[float, int, Match, str]] = []
-    with open_for(args.database, matcher) as database:
-        for one in iter(database) if near is None else database.within(*near):
-            match = matcher.match(seen, database.features(one.key))
-            compared += 1
-            # Of equal scores the first added comes first.
-            best.append((match.score, -one.key, match, one.place.name))
-            if len(best) > 2 * args.best:
-                best = heapq.nlargest(args.best, best, key=lambda found: found[:2])
-    best = heapq.nlargest(args.best, best, key=lambda found: found[:2])
-    needed = vehicle.landmarks.min_score
-    if args.json:
-        rows = [
-            {
-                "name": name,
-                "score": m.score,
-                "pairs": m.pairs,
-                "agreeing": m.agreeing,
-                "is_match": m.score >= needed,
-            }
-            for _, _, m, name in best
-        ]
-        print_json({"points": len(seen), "compared": compared, "min_score": needed, "best": rows})
-    elif not args.quiet:
-        print(f"{len(seen)} points; {compared} landmarks compared; a match from {needed:g} on")
-        for _, _, m, name in best:
-            word = "match" if m.score >= needed else "no"
-            print(f"{m.score:8.1f}  {word:5}  {m.agreeing:4} of {m.pairs:4} agree  {visible(name)}")
+    found = crosscue.match_landmarks(
+        args.database,
+        args.image,
+        args.vehicle,
+        near=args.near,
+        best=args.best,
+        matcher=args.matcher,
+    )
+    print_result(found, args)
     return 0

@@ -12,7 +12,6 @@ from crosscue.replay.base import (
     DEFAULT_LIMITS,
     Limits,
     OutputError,
-    UsageError,
     strict_json,
     write_text,
 )
@@ -99,22 +98,6 @@ def add_vehicle_output(parser: argparse.ArgumentParser) -> None:
         help="vehicle file to write: --vehicle with the fit; may be the same file",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace another existing file")
-
-
-def check_vehicle_output(args: argparse.Namespace) -> None:
-    """Refuse, before any work, an output that cannot be written as asked.
-
-    Raises:
-        UsageError: There is no vehicle file to put the fit into.
-        OutputError: The output is another file that exists.
-    """
-    if args.output is None:
-        return
-    if args.vehicle is None:
-        raise UsageError("-o: needs the vehicle file that gets the fit; give it as --vehicle")
-    if not args.output.exists() or args.output.samefile(args.vehicle):
-        return
-    refuse_existing(args)
 
 
 def refuse_existing(args: argparse.Namespace) -> None:

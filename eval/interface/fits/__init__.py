@@ -1,0 +1,1 @@
+"""Fits of a vehicle file's values to drives."""

@@ -1,0 +1,188 @@
+"""The reliability of each cue, learned from annotated drives."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from crosscue.fusion.fade_fit import FadeFit
+from crosscue.fusion.message_fit import MessageFit, RateFit, Side
+from crosscue.fusion.message_fit import fit_messages as fit_approaches
+
+from crosscue.datasets.truth.truth import load
+from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, rates_of, section_of
+from crosscue.eval.interface.runs import Run
+from crosscue.eval.runs.folder import open_run
+from crosscue.replay.base import EmptyResultError, OutputError, UsageError, write_text
+from crosscue.replay.vehicle.fusion import Rates
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FittedMessages:
+    """How far each cue is to be believed; printed with its counts.
+
+    Attributes:
+        fitted: Rates, fades and exponents.
+        used: Approaches of the runs, by what they were.
+        runs: How many runs were read.
+        path: Where the section was written to; None where it was not.
+    """
+
+    fitted: MessageFit
+    used: Counter[str]
+    runs: int
+    path: Path | None
+
+    @property
+    def section(self) -> str:
+        """The vehicle file's section ``[fusion.calibrated]``."""
+        return section_of(self.fitted)
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue fit messages --json`` prints."""
+        return {
+            "approaches": self.fitted.approaches,
+            "used": dict(self.used),
+            "calibrated": self.fitted.calibrated.model_dump(mode="json"),
+            "rates": [
+                {
+                    "cue": one.cue,
+                    "feature": one.feature,
+                    "near": one.near,
+                    "learned": one.rates is not None,
+                    "there": _side_json(one.there),
+                    "missing": _side_json(one.missing),
+                }
+                for one in self.fitted.rates
+            ],
+            "fades": [
+                {
+                    "cue": one.cue,
+                    "positives": one.positives,
+                    "frames": one.looks,
+                    "learned": one.is_learned,
+                    **one.fade.model_dump(),
+                }
+                for one in self.fitted.fades
+            ],
+        }
+
+    def __repr__(self) -> str:
+        end = self.section if self.path is None else f"written to {self.path}"
+        return f"{_report_text(self.fitted, self.used, self.runs)}\n{end}"
+
+
+def _report_text(fitted: MessageFit, used: Counter[str], runs: int) -> str:
+    lines = [f"{runs} runs, {fitted.approaches} approaches to learn from"]
+    lines += [f"  {count:5} {what}" for what, count in sorted(used.items())]
+    lines += ["", "fractions of positive frames, feature there and not there (95 % intervals)"]
+    lines += [_rate_text(one, one.rates) for one in fitted.rates if one.rates is not None]
+    lines += ["", "too little seen, so the published message stands"]
+    lines += [_unlearned_text(one) for one in fitted.rates if one.rates is None]
+    lines += ["", "frames become independent over"]
+    lines += [_fade_text(one) for one in fitted.fades]
+    scales = ", ".join(f"{name} {value:.2f}" for name, value in fitted.calibrated.exponents.items())
+    lines += ["", f"exponents: {scales or 'none: no feature was both there and not there'}", ""]
+    return "\n".join(lines)
+
+
+def _name_of(one: RateFit) -> str:
+    return f"  {one.cue} -> {one.feature}, {'near' if one.near else 'far'}"
+
+
+def _rate_text(one: RateFit, rates: Rates) -> str:
+    says = math.log(rates.if_there / rates.if_not)
+    silence = math.log((1.0 - rates.if_there) / (1.0 - rates.if_not))
+    return (
+        f"{_name_of(one)}\n    there     {_side_text(one.there)}\n"
+        f"    not there {_side_text(one.missing)}\n"
+        f"    log odds of a detection {says:+.2f}, of none {silence:+.2f}"
+    )
+
+
+def _unlearned_text(one: RateFit) -> str:
+    positive = sum(rate > 0.0 for rate in (*one.there.rates, *one.missing.rates))
+    return (
+        f"{_name_of(one)}: {one.there.places} places with it, {one.missing.places} without, "
+        f"{positive} positive"
+    )
+
+
+def _side_text(side: Side) -> str:
+    reported = rates_of(side)
+    return (
+        f"{reported.rate:.2f} ({reported.wilson.low:.2f} to {reported.wilson.high:.2f} by "
+        f"{side.looks:.0f} looks in {side.frames} frames; {reported.places.low:.2f} to "
+        f"{reported.places.high:.2f} by {side.places} places)"
+    )
+
+
+def _fade_text(one: FadeFit) -> str:
+    fade = one.fade
+    scale = f"{fade.way_m:.1f} m" if fade.way_m is not None else f"{fade.time_s:.2f} s"
+    why = "" if one.is_learned else ", not learned: too few positive, or always so"
+    return f"  {one.cue:20} {scale:>8}  {one.positives} positive of {one.looks} frames{why}"
+
+
+def _side_json(side: Side) -> dict[str, object]:
+    reported = rates_of(side)
+    return {
+        **side._asdict(),
+        "rate": reported.rate,
+        "wilson": list(reported.wilson),
+        "by_places": list(reported.places),
+    }
+
+
+def fit_messages(
+    runs: Sequence[Run | Path | str],
+    truth: Sequence[Path | str],
+    output: Path | str | None = None,
+    *,
+    overwrite: bool = False,
+    on_runs: Callable[[int, int], None] = lambda done, of: None,
+) -> FittedMessages:
+    """Learn how far each cue is to be believed, for ``fusion.kind = "calibrated"``.
+
+    Args:
+        runs: Finished runs.
+        truth: The truth of each, in the same order.
+        output: TOML file for the section; it is only returned, if left out.
+        overwrite: Replace a file that is there.
+        on_runs: Called with the number of runs that are read, and of how many.
+
+    Raises:
+        UsageError: Not a truth for each run, or runs of different cues.
+        EmptyResultError: Nothing can be learned.
+        OutputError: The file exists, or cannot be written.
+    """
+    if len(runs) != len(truth):
+        raise UsageError(
+            f"fit messages: {len(runs)} runs, {len(truth)} truth files; give one "
+            "for each, in the same order"
+        )
+    path = None if output is None else Path(output)
+    if path is not None and path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists; give another name or --overwrite")
+    folders = [one.folder if isinstance(one, Run) else open_run(Path(one)) for one in runs]
+    graph, vehicle = graph_of_runs(folders)
+    found = Annotated([], Counter())
+    for done, (folder, known) in enumerate(zip(folders, truth, strict=True), 1):
+        annotate(folder, load(Path(known)), vehicle, found)
+        on_runs(done, len(folders))
+    if not found.approaches:
+        raise EmptyResultError(
+            "fit messages: no approach of any run lies in an annotated one; give more"
+        )
+    fitted = fit_approaches(found.approaches, graph)
+    if all(one.rates is None for one in fitted.rates):
+        raise EmptyResultError(
+            f"fit messages: nothing can be learned of {len(found.approaches)} approaches, so every "
+            "published message stands; give more drives and their truth"
+        )
+    if path is not None:
+        write_text(path, section_of(fitted))
+    return FittedMessages(fitted, found.used, len(folders), path)
