@@ -25,7 +25,6 @@ from crosscue.eval.commands.shared.progress import (
     is_shown,
     progress_line,
 )
-from crosscue.eval.interface.demo import show_drive, simulated
 from crosscue.replay.base import UsageError, visible
 
 
@@ -63,10 +62,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fetch or simulate, replay, score, show."""
-    folder = args.output or Path("demo-real" if args.real else "demo")
-    drive = _fetched(args) if args.real else _simulated(args, folder)
-    with DriveLine("replaying", is_shown=is_shown(args)) as line:
-        made = show_drive(drive, folder, args.overwrite, line.at_frame, line.at_time)
+    _check(args)
+    talk = not (args.quiet or args.json)
+    layout = args.layout or "C"
+    if talk and not args.real:
+        print(f"simulating a drive up to intersection {layout} ...", flush=True)
+    with (
+        progress_line(args, "fetching") as fetching,
+        DriveLine("replaying", is_shown=is_shown(args)) as line,
+    ):
+
+        def on_drive(drive: crosscue.KnownDrive) -> None:
+            fetching.end()
+            if talk and not args.real:
+                print(f"  {drive.log}\n", flush=True)
+
+        made = crosscue.demo(
+            args.output,
+            real=args.real,
+            source=args.source,
+            layout=layout,
+            run=1 if args.run is None else args.run,
+            seed=0 if args.seed is None else args.seed,
+            width_px=1280 if args.width is None else args.width,
+            overwrite=args.overwrite,
+            on_fetch=lambda file, done, of: fetching.at(Done(done / 1e6, of / 1e6, "MB"), file),
+            on_drive=on_drive,
+            on_frames=line.at_frame,
+            on_time=line.at_time,
+        )
     if args.json:
         print_json(made.as_dict())
     elif not args.quiet:
@@ -77,35 +101,9 @@ def run(args: argparse.Namespace) -> int:
     return made.run.made.exit_status
 
 
-def _fetched(args: argparse.Namespace) -> crosscue.KnownDrive:
-    for name in ("layout", "run", "seed", "width"):
+def _check(args: argparse.Namespace) -> None:
+    if not args.real and args.source is not None:
+        raise UsageError("--data: for a real drive; add --real")
+    for name in ("layout", "run", "seed", "width") if args.real else ():
         if getattr(args, name) is not None:
             raise UsageError(f"--{name}: for a simulated drive; leave it or --real out")
-    with progress_line(args, "fetching") as line:
-        return crosscue.fetch_drive(
-            args.source,
-            on_fetch=lambda file, done, of: line.at(Done(done / 1e6, of / 1e6, "MB"), file),
-        )
-
-
-def _simulated(args: argparse.Namespace, folder: Path) -> crosscue.KnownDrive:
-    if args.source is not None:
-        raise UsageError("--data: for a real drive; add --real")
-    width = 1280 if args.width is None else args.width
-    if not 64 <= width <= 3840 or width % 16:
-        raise UsageError(f"--width {width}: expected a multiple of 16 from 64 to 3840")
-    talk = not (args.quiet or args.json)
-    layout = args.layout or "C"
-    if talk:
-        print(f"simulating a drive up to intersection {layout} ...", flush=True)
-    drive = simulated(
-        folder,
-        layout,
-        1 if args.run is None else args.run,
-        0 if args.seed is None else args.seed,
-        width_px=width,
-        overwrite=args.overwrite,
-    )
-    if talk:
-        print(f"  {drive.log}\n", flush=True)
-    return drive

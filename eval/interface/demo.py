@@ -127,7 +127,15 @@ def demo(
     *,
     real: bool = False,
     source: Path | str | None = None,
+    layout: str = "C",
+    run: int = 1,
+    seed: int = 0,
+    width_px: int = 1280,
     overwrite: bool = False,
+    on_fetch: Callable[[str, int, int], None] = lambda file, done, of: None,
+    on_drive: Callable[[KnownDrive], None] = lambda drive: None,
+    on_frames: Callable[[int, int | None], None] = lambda done, of: None,
+    on_time: Callable[[float, float], None] = lambda done_s, of_s: None,
 ) -> Demo:
     """Replay a drive up to an intersection, score it, and write report and recording.
 
@@ -135,28 +143,34 @@ def demo(
         folder: Gets the run, and a simulated drive; ``demo``, or ``demo-real``, if left out.
         real: Take the drive of ``fetch_drive``; else one that is simulated on this machine.
         source: As of ``fetch_drive``.
+        layout: Of a simulated drive, as of ``simulate_approach``.
+        run: Likewise.
+        seed: Likewise.
+        width_px: Likewise.
         overwrite: Replace an earlier demonstration.
+        on_fetch: As of ``fetch_drive``.
+        on_drive: Called with the drive before it is replayed.
+        on_frames: As of ``replay_drive``.
+        on_time: As of ``replay_drive``.
 
     Raises:
         CrosscueError: Recording or weights are missing and cannot be fetched.
         UsageError: ``source`` without ``real``.
         RunError: The folder holds something else.
     """
+    place = Path(folder or ("demo-real" if real else "demo"))
     if real:
-        return show_drive(fetch_drive(source), folder or "demo-real", overwrite=overwrite)
-    if source is not None:
+        drive = fetch_drive(source, on_fetch=on_fetch)
+    elif source is None:
+        drive = _simulated(place, layout, run, seed, width_px, overwrite)
+    else:
         raise UsageError("demo: source is for the real drive; add real=True")
-    return show_drive(simulated(folder or "demo", overwrite=overwrite), folder or "demo", overwrite)
+    on_drive(drive)
+    return _shown(drive, place, overwrite, on_frames, on_time)
 
 
-def simulated(
-    folder: Path | str,
-    layout: str = "C",
-    run: int = 1,
-    seed: int = 0,
-    *,
-    width_px: int = 1280,
-    overwrite: bool = False,
+def _simulated(
+    folder: Path, layout: str, run: int, seed: int, width_px: int, overwrite: bool
 ) -> KnownDrive:
     """A drive as of ``simulate_approach`` in ``folder/drive``, for the embedded networks.
 
@@ -165,23 +179,23 @@ def simulated(
     from crosscue.detectors.registry import EMBEDDED
 
     files = simulate_approach(
-        Path(folder) / "drive", layout, run, seed, width_px=width_px, overwrite=overwrite
+        folder / "drive", layout, run, seed, width_px=width_px, overwrite=overwrite
     )
     write_text(files.vehicle, files.vehicle.read_text("utf-8") + FOLLOWED)
     return KnownDrive(files.log, files.vehicle, files.truth, "", tuple(EMBEDDED.split(",")))
 
 
-def show_drive(
+def _shown(
     drive: KnownDrive,
-    folder: Path | str,
-    overwrite: bool = False,
-    on_frames: Callable[[int, int | None], None] = lambda done, of: None,
-    on_time: Callable[[float, float], None] = lambda done_s, of_s: None,
+    folder: Path,
+    overwrite: bool,
+    on_frames: Callable[[int, int | None], None],
+    on_time: Callable[[float, float], None],
 ) -> Demo:
     """Replay and score a drive in ``folder/run``; arguments as of ``replay_drive``."""
     run = replay_drive(
         drive.log,
-        Path(folder) / "run",
+        folder / "run",
         drive.vehicle,
         drive.detectors,
         overwrite=overwrite,

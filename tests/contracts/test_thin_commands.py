@@ -32,7 +32,7 @@ CALLS: Final = {
         "simulate_approaches",
         "draw_contact_sheet",
     ),
-    "demo": ("fetch_drive",),
+    "demo": ("demo",),
     "detect": ("detect_drive",),
     "estimate": (
         "open_run",
@@ -66,9 +66,7 @@ NOT_YET: Final = frozenset(
 )  # fmt: skip
 """Commands with logic of their own."""
 WITHOUT: Final = {"completion": "it is about the shell"}
-ALLOWED: Final = re.compile(
-    r"crosscue(\.eval\.(commands|interface)(\..+)?|\.replay\.(base|errors|safe_text))?"
-)
+ALLOWED: Final = re.compile(r"crosscue(\.eval\.commands(\..+)?|\.replay\.(base|errors|safe_text))?")
 """What a command may import of ours: the public interface, options, errors, and safe text.
 
 Constants, too, for the help."""

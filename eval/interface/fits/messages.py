@@ -8,14 +8,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from crosscue.fusion.fade_fit import FadeFit
-from crosscue.fusion.message_fit import MessageFit, RateFit, Side
-from crosscue.fusion.message_fit import fit_messages as fit_approaches
-
 from crosscue.datasets.truth.truth import load
 from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, rates_of, section_of
 from crosscue.eval.interface.runs import Run
 from crosscue.eval.runs.folder import open_run
+from crosscue.fusion.fit.fade_fit import FadeFit
+from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
+from crosscue.fusion.fit.message_fit import fit_messages as fit_approaches
 from crosscue.replay.base import EmptyResultError, OutputError, UsageError, write_text
 from crosscue.replay.vehicle.fusion import Rates
 
