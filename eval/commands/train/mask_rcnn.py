@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from crosscue.detectors.training.summary import measured_text, measured_tree
 from crosscue.eval.commands.shared.options import print_json
@@ -179,9 +180,8 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         for name, one in (("training", train), ("held out", held_out)):
             left = ", ".join(f"{count} {why}" for why, count in sorted(one.left_out.items()))
-            print(
-                f"{name}: {len(one.pictures)} pictures" + (f"; {left}" if left else ""), flush=True
-            )
+            said = f"{name}: {len(one.pictures)} pictures" + (f"; {left}" if left else "")
+            print(said, file=_talk(args), flush=True)
 
     def tell(point: Point) -> None:
         if not args.quiet:
@@ -189,6 +189,7 @@ def run(args: argparse.Namespace) -> int:
                 f"step {point.step} of {args.steps}: loss {point.loss:.3f}, "
                 f"box AP {point.ap.get('box')}, mask AP {point.ap.get('mask')}, "
                 f"{point.seconds:.0f} s",
+                file=_talk(args),
                 flush=True,
             )
 
@@ -227,6 +228,11 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("--classes: one is empty or named twice; name each once")
     if (args.val_data is None) != (args.val_images is None):
         raise UsageError("--val-data, --val-images: give both or none")
+
+
+def _talk(args: argparse.Namespace) -> TextIO:
+    """Where progress is printed: JSON is alone on standard output."""
+    return sys.stderr if args.json else sys.stdout
 
 
 def _measure(args: argparse.Namespace) -> int:
