@@ -49,7 +49,7 @@ Values = NDArray[np.generic]
 
 def _imu_axes(prefix: str, unit: str, scale: float = 1.0) -> Callable[[Values], Table]:
     def table(values: Values) -> Table:
-        xyz = np.asarray(values, np.float64) * (FLIP * scale)
+        xyz = np.asarray(values[:, :3], np.float64) * (FLIP * scale)
         return Table({f"{prefix}_{axis}_{unit}": xyz[:, i] for i, axis in enumerate("xyz")})
 
     return table
@@ -83,6 +83,8 @@ class _Stream:
     type_name: str
     folder: str
     to_table: Callable[[Values], Table]
+    width: int
+    """Columns that it needs."""
 
 
 _RAW_GNSS = _named(
@@ -91,33 +93,35 @@ _RAW_GNSS = _named(
 )  # fmt: skip
 
 STREAMS: Final[dict[str, _Stream]] = {
-    "imu/gyro": _Stream("sensor_msgs/msg/Imu", "IMU/gyro", _imu_axes("gyro", "radps")),
+    "imu/gyro": _Stream("sensor_msgs/msg/Imu", "IMU/gyro", _imu_axes("gyro", "radps"), 3),
     "imu/accelerometer": _Stream(
-        "crosscue/Table", "IMU/accelerometer", _imu_axes("accel", "mps2")
+        "crosscue/Table", "IMU/accelerometer", _imu_axes("accel", "mps2"), 3
     ),
-    "imu/gyro_bias": _Stream("crosscue/Table", "IMU/gyro_bias", _imu_axes("gyro_bias", "radps")),
+    "imu/gyro_bias": _Stream("crosscue/Table", "IMU/gyro_bias", _imu_axes("gyro_bias", "radps"), 3),
     "imu/gyro_uncalibrated": _Stream(
-        "crosscue/Table", "IMU/gyro_uncalibrated", _imu_axes("gyro", "radps")
+        "crosscue/Table", "IMU/gyro_uncalibrated", _imu_axes("gyro", "radps"), 3
     ),
     "imu/magnetometer": _Stream(
-        "sensor_msgs/msg/MagneticField", "IMU/magnetometer", _imu_axes("mag", "t", MICROTESLA)
+        "sensor_msgs/msg/MagneticField", "IMU/magnetometer", _imu_axes("mag", "t", MICROTESLA), 3
     ),
     "imu/magnetometer_uncalibrated": _Stream(
-        "crosscue/Table", "IMU/magnetometer_uncalibrated", _imu_axes("mag", "t", MICROTESLA)
+        "crosscue/Table", "IMU/magnetometer_uncalibrated", _imu_axes("mag", "t", MICROTESLA), 3
     ),
-    "gnss/ublox": _Stream("sensor_msgs/msg/NavSatFix", "GNSS/live_gnss_ublox", _fix),
-    "gnss/qcom": _Stream("crosscue/Table", "GNSS/live_gnss_qcom", _fix),
-    "gnss/raw_ublox": _Stream("crosscue/Table", "GNSS/raw_gnss_ublox", _RAW_GNSS),
-    "gnss/raw_qcom": _Stream("crosscue/Table", "GNSS/raw_gnss_qcom", _RAW_GNSS),
+    "gnss/ublox": _Stream("sensor_msgs/msg/NavSatFix", "GNSS/live_gnss_ublox", _fix, 6),
+    "gnss/qcom": _Stream("crosscue/Table", "GNSS/live_gnss_qcom", _fix, 6),
+    "gnss/raw_ublox": _Stream("crosscue/Table", "GNSS/raw_gnss_ublox", _RAW_GNSS, 8),
+    "gnss/raw_qcom": _Stream("crosscue/Table", "GNSS/raw_gnss_qcom", _RAW_GNSS, 8),
     "car/wheel_speed": _Stream(
         "crosscue/WheelSpeeds", "CAN/wheel_speed",
-        _named("front_left_mps", "front_right_mps", "rear_left_mps", "rear_right_mps"),
+        _named("front_left_mps", "front_right_mps", "rear_left_mps", "rear_right_mps"), 4,
     ),
-    "car/speed": _Stream("crosscue/Table", "CAN/speed", _named("speed_mps")),
-    "car/steering_angle": _Stream("crosscue/Table", "CAN/steering_angle", _named("steering_deg")),
+    "car/speed": _Stream("crosscue/Table", "CAN/speed", _named("speed_mps"), 1),
+    "car/steering_angle": _Stream(
+        "crosscue/Table", "CAN/steering_angle", _named("steering_deg"), 1
+    ),
     "car/radar": _Stream(
         "crosscue/Table", "CAN/radar",
-        _named("x_m", "right_m", "relative_speed_mps", "unused_a", "unused_b", "address", "new"),
+        _named("x_m", "right_m", "relative_speed_mps", "unused_a", "unused_b", "address", "new"), 7,
     ),
 }  # fmt: skip
 
@@ -214,11 +218,25 @@ class Segment(Closing):
             self._unreadable.append(str(error))
             return None
 
+    def _has(self, column: Column, kinds: str, width: int = 0) -> bool:
+        """Whether rows are numbers of these kinds, in so many columns; 0 for plain numbers."""
+        rows, sides = column.rows, column.rows.shape[1:]
+        has_columns = len(sides) == 1 and sides[0] >= width > 0
+        if rows.dtype.kind in kinds and (has_columns or (not sides and width < 2)):
+            return True
+        self._unreadable.append(
+            f"{column.path}: expected numbers in {max(width, 1)} columns, found {rows.dtype} in "
+            f"{'x'.join(map(str, sides or (1,)))}; copy it again"
+        )
+        return False
+
     def _streams(self) -> Iterator[_Source]:
         for name, stream in STREAMS.items():
             times = self._column(f"{stream.folder}/t")
             values = self._column(f"{stream.folder}/value")
             if times is None or values is None:
+                continue
+            if not (self._has(times, "iuf") and self._has(values, "iuf", stream.width)):
                 continue
             n = min(len(times.rows), len(values.rows))
             declared = max(times.declared, values.declared)
@@ -237,10 +255,13 @@ class Segment(Closing):
         if times is None or bus is None or address is None or payload is None:
             return
         files = (times, bus, address, payload)
+        if not (self._has(times, "iuf") and self._has(bus, "iu") and self._has(address, "iu")):
+            return
         n = min(len(column.rows) for column in files)
         lost = max(column.declared for column in files) - n
-        if payload.rows.dtype.kind != "S" or payload.rows.dtype.itemsize > 8:
-            self._unreadable.append(f"{payload.path}: expected |S8, got {payload.rows.dtype}")
+        kind = payload.rows.dtype
+        if kind.kind != "S" or kind.itemsize > 8 or payload.rows.ndim > 1:
+            self._unreadable.append(f"{payload.path}: expected |S8, got {kind}")
             return
         buses = np.asarray(bus.rows[:n])
         t_ns = _to_ns(times.rows[:n])

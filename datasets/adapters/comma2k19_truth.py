@@ -10,11 +10,14 @@ import numpy as np
 from crosscue.datasets.geodesy import ecef_to_enu_matrix, ecef_to_geodetic
 from crosscue.datasets.truth.truth import Origin, Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
-from crosscue.replay.errors import LogFormatError
+from crosscue.replay.base import Floats, LogFormatError
 
 from .npy import read_column
 
 POSE_FILE: Final = "pose.tum"
+
+LATEST_S: Final = 9e9
+"""Later than any recording, in seconds since 1970 or since the start."""
 
 
 def write(path: Path, folder: Path) -> Path:
@@ -27,21 +30,29 @@ def write(path: Path, folder: Path) -> Path:
     from scipy.spatial.transform import Rotation
 
     times, position, quat = (
-        read_column(path / "global_pose" / name).rows
-        for name in ("frame_times", "frame_positions", "frame_orientations")
+        _numbers(path / "global_pose" / name, shape)
+        for name, shape in (
+            ("frame_times", ()),
+            ("frame_positions", (3,)),
+            ("frame_orientations", (4,)),
+        )
     )
     n = min(len(times), len(position), len(quat))
     if n < 2:
         raise LogFormatError(f"{path}/global_pose: {n} poses; the segment carries no usable truth")
-    t_ns = np.rint(np.asarray(times[:n], np.float64) * 1e9).astype(np.int64)
-    xyz = np.asarray(position[:n], np.float64)
+    if not (np.diff(times[:n]) > 0.0).all() or np.abs(times).max() > LATEST_S:
+        raise LogFormatError(f"{path}/global_pose/frame_times: no rising times; copy it again")
+    if not np.linalg.norm(quat[:n], axis=1).all():
+        raise LogFormatError(f"{path}/global_pose/frame_orientations: zeros; copy it again")
+    t_ns = np.rint(times[:n] * 1e9).astype(np.int64)
+    xyz = position[:n]
     latitude, longitude, altitude = (float(part[0]) for part in ecef_to_geodetic(xyz[:1]))
     enu_r_ecef = ecef_to_enu_matrix(np.deg2rad(latitude), np.deg2rad(longitude))
     east_north_up = (xyz - xyz[0]) @ enu_r_ecef.T
     # The quaternions (w first) turn the camera's forward, right and down axes into earth-fixed
     # ones. The set's own text names the inverse, but only so does forward agree with the recorded
     # velocity (to 0.998).
-    ecef_r_camera = Rotation.from_quat(np.roll(np.asarray(quat[:n], np.float64), -1, axis=1))
+    ecef_r_camera = Rotation.from_quat(np.roll(quat[:n], -1, axis=1))
     camera_r_car = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
     enu_r_car = Rotation.from_matrix(enu_r_ecef) * ecef_r_camera * camera_r_car
     quat_wxyz = np.roll(enu_r_car.as_quat(canonical=True), 1, axis=1)
@@ -62,3 +73,18 @@ def write(path: Path, folder: Path) -> Path:
         ),
         folder,
     )
+
+
+def _numbers(path: Path, shape: tuple[int, ...]) -> Floats:
+    """Rows of one shape, all finite.
+
+    Raises:
+        LogFormatError: They are something else.
+    """
+    rows = read_column(path).rows
+    if rows.dtype.kind not in "iuf" or rows.shape[1:] != shape or not np.isfinite(rows).all():
+        raise LogFormatError(
+            f"{path}: expected finite numbers in rows of {shape or 1}, found {rows.dtype} in rows "
+            f"of {rows.shape[1:] or 1}; copy it again"
+        )
+    return np.asarray(rows, np.float64)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -43,6 +43,7 @@ from crosscue.replay.base import (
 from crosscue.replay.readers.images.files import SUFFIXES, PictureFiles
 from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files, pair
+from crosscue.replay.seal.touched import Touched, open_noted
 
 from .kitti_oxts import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse
 
@@ -70,10 +71,12 @@ class Oxts:
     Attributes:
         files: One file a packet, and times; for a single file, times of its lines.
         single: The one file, or None.
+        touched: Takes note of what is read, for a seal.
     """
 
     files: TimedFiles
     single: Path | None = None
+    touched: Touched = field(default_factory=Touched, kw_only=True)
 
     def lines(self) -> Iterator[Line]:
         """Every packet in stored order."""
@@ -82,14 +85,14 @@ class Oxts:
             return
         for path, t_ns in zip(self.files.paths, self.files.t_ns.tolist(), strict=True):
             try:
-                with path.open("rb") as file:
+                with open_noted(path, self.touched) as file:
                     raw: bytes | str = file.read(LINE_BYTES)
             except OSError as error:
                 raw = error.strerror or str(error)
             yield path.name, t_ns, raw
 
     def _lines_of(self, single: Path) -> Iterator[Line]:
-        with single.open("rb") as file:
+        with open_noted(single, self.touched) as file:
             number = 0
             while raw := file.readline(LINE_BYTES):
                 rest = raw
@@ -112,9 +115,11 @@ class Drive(Closing):
         unreadable: Sequence[Unreadable],
         notices: Sequence[str],
         limits: Limits,
+        touched: Touched,
     ) -> None:
         """Put a drive together; ``unreadable`` holds arguments for ``Ledger.drop``."""
         self.path: Final = path
+        self.touched: Final = touched
         self._cameras: Final = tuple(cameras)
         self._oxts: Final = oxts
         self._unreadable: Final = tuple(unreadable)
@@ -221,13 +226,14 @@ def write_truth(path: Path, folder: Path) -> Path:
 def _open_raw(path: Path, limits: Limits) -> Drive:
     cameras: list[PictureFiles] = []
     unreadable: list[Unreadable] = []
+    touched = Touched()
     for folder in sorted(path.glob("image_[0-9][0-9]")):
-        files = _timed(folder, SUFFIXES, folder.name, unreadable, limits)
+        files = _timed(folder, SUFFIXES, folder.name, unreadable, limits, touched)
         if files is not None:
             topic = Topic(folder.name, "crosscue/Images", "columns", declared=files.declared)
-            cameras.append(PictureFiles(topic, files))
+            cameras.append(PictureFiles(topic, files, touched))
     lost: list[Unreadable] = []
-    packets = _timed(path / "oxts", (".txt",), "oxts", lost, limits)
+    packets = _timed(path / "oxts", (".txt",), "oxts", lost, limits, touched)
     unreadable += [(name, *loss[1:]) for loss in lost for name in TOPICS]
     if not cameras and packets is None:
         why = unreadable[0][3] if unreadable else "no image_0x and no oxts with files in data/"
@@ -236,15 +242,21 @@ def _open_raw(path: Path, limits: Limits) -> Drive:
     return Drive(
         path,
         cameras,
-        None if packets is None else Oxts(packets),
+        None if packets is None else Oxts(packets, touched=touched),
         unreadable,
         notices if (path / "velodyne_points").is_dir() else [],
         limits,
+        touched,
     )
 
 
 def _timed(
-    folder: Path, suffixes: Sequence[str], topic: str, unreadable: list[Unreadable], limits: Limits
+    folder: Path,
+    suffixes: Sequence[str],
+    topic: str,
+    unreadable: list[Unreadable],
+    limits: Limits,
+    touched: Touched,
 ) -> TimedFiles | None:
     """The files of one stream with times; else None, and why is added to ``unreadable``."""
     time_file = folder / "timestamps.txt"
@@ -255,6 +267,7 @@ def _timed(
             unreadable.append((topic, "rows without times", len(paths), why))
         return None
     try:
+        touched.add(time_file, 0, time_file.stat().st_size)
         times = read_time_file(time_file, limits)
         if paths:
             return pair(paths, times)
@@ -274,22 +287,22 @@ def _open_tracking(path: Path, limits: Limits) -> Drive:
             "or a raw drive with oxts/timestamps.txt"
         )
     name = singles[0].stem
-    cameras = []
+    cameras, touched = [], Touched()
     for folder in sorted(path.glob(f"image_[0-9][0-9]/{name}")):
         paths = list_files(folder, SUFFIXES)
         if paths:
             topic = Topic(folder.parent.name, "crosscue/Images", "columns")
             t_ns = np.array([_frame_ns(path.stem) for path in paths], dtype=np.int64)
             files = TimedFiles(tuple(paths), t_ns, _no_times(), None, ())
-            cameras.append(PictureFiles(topic, files))
-    oxts = Oxts(TimedFiles((), _no_times(), _no_times(), None, ()), singles[0])
+            cameras.append(PictureFiles(topic, files, touched))
+    oxts = Oxts(TimedFiles((), _no_times(), _no_times(), None, ()), singles[0], touched=touched)
     notice = (
         f"{name}: the tracking set keeps no times; they are made from frame numbers at "
         f"{1e9 / TRACKING_PERIOD_NS:g} Hz, starting at 0"
     )
     if (period_s := _driven_period_s(oxts)) is not None:
         notice += f" (distance over speed says {period_s * 1e3:.1f} ms a frame)"
-    return Drive(path, cameras, oxts, [], [notice], limits)
+    return Drive(path, cameras, oxts, [], [notice], limits, touched)
 
 
 def _driven_period_s(oxts: Oxts) -> float | None:

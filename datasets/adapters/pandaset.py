@@ -43,6 +43,7 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.readers.images.files import SUFFIXES, PictureFiles
 from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files
+from crosscue.replay.seal.touched import Touched
 
 POSE_FILE: Final = "pose.tum"
 MAX_FILE_BYTES: Final = 64 * MIB
@@ -130,9 +131,11 @@ class Drive(Closing):
         rows: Sequence[_Rows],
         unreadable: Sequence[tuple[str, str, int | None, str]],
         limits: Limits,
+        touched: Touched,
     ) -> None:
         """Put a sequence together; ``unreadable`` holds arguments for ``Ledger.drop``."""
         self.path: Final = path
+        self.touched: Final = touched
         self._cameras: Final = tuple(cameras)
         self._rows: Final = tuple(rows)
         self._unreadable: Final = tuple(unreadable)
@@ -170,6 +173,14 @@ class Drive(Closing):
         """Nothing is held open."""
 
 
+READ_ON_OPENING: Final = (
+    "camera/*/timestamps.json",
+    f"camera/{FRONT}/poses.json",
+    "meta/gps.json",
+    "meta/timestamps.json",
+)
+
+
 def open_sequence(path: Path, limits: Limits) -> Drive:
     """Open a sequence's folder; see ``crosscue.replay.formats.FORMATS``.
 
@@ -177,7 +188,9 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
         LogFormatError: No camera with times, and no poses.
     """
     unreadable: list[tuple[str, str, int | None, str]] = []
-    cameras = []
+    cameras, touched = [], Touched()
+    for file in (one for pattern in READ_ON_OPENING for one in path.glob(pattern)):
+        touched.add(file, 0, file.stat().st_size)
     for folder in sorted((path / "camera").iterdir()):
         paths = list_files(folder, SUFFIXES) if folder.is_dir() else []
         if not paths:
@@ -188,7 +201,7 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
             unreadable.append((folder.name, "times cannot be read", len(paths), str(error)))
             continue
         topic = Topic(folder.name, "crosscue/Images", "columns", declared=files.declared)
-        cameras.append(PictureFiles(topic, files))
+        cameras.append(PictureFiles(topic, files, touched))
     rows = []
     for name, read in (("odometry", _odometry), ("gnss", _gnss)):
         try:
@@ -201,7 +214,7 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
     if not cameras and not rows:
         why = unreadable[0][3] if unreadable else "no camera with pictures and timestamps.json"
         raise LogFormatError(f"{path}: no stream of a PandaSet sequence can be read: {why}")
-    return Drive(path, cameras, rows, unreadable, limits)
+    return Drive(path, cameras, rows, unreadable, limits, touched)
 
 
 def read_poses(path: Path, camera: str = FRONT) -> Poses:

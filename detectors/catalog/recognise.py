@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,6 +23,8 @@ from .card import MAX_BYTES, Input, Weights
 _MAX_NAMES_CHARACTERS: Final = 100_000
 DEFAULT_SIDE_PX: Final = 640
 """Of a network that takes pictures of any size and names none."""
+MAX_INPUT_VALUES: Final = 3 * 8192 * 8192
+"""Of one input that a file declares: the largest picture that a card may name."""
 SENSIBLE_FRACTION: Final = 0.99
 """Of boxes that a network gives for noise, where their layout is read rightly."""
 _REFUSED: Final = {
@@ -130,7 +133,7 @@ def closed(path: Path, model: Interface, size_px: tuple[int, int] | None) -> Int
         size_px: Width and height to run at, where the file leaves them open.
 
     Raises:
-        VehicleError: The network does not run at that size.
+        UsageError: The network does not run at that size, or the size is no sensible one.
     """
     if all(isinstance(side, int) for out in model.outputs for side in out.shape):
         return model
@@ -144,6 +147,11 @@ def closed(path: Path, model: Interface, size_px: tuple[int, int] | None) -> Int
         side if isinstance(side, int) else want
         for side, want in zip(given.shape, wanted, strict=True)
     )
+    if math.prod(shape) > MAX_INPUT_VALUES:
+        raise UsageError(
+            f"{path}: input {'x'.join(map(str, shape))} is {math.prod(shape):,} numbers, the limit "
+            f"is {MAX_INPUT_VALUES:,}; give another --size"
+        )
     network = load_network(_weights(path))
     noise = np.random.default_rng(0).random(shape, np.float32)
     try:

@@ -20,8 +20,10 @@ from crosscue.detectors.images import MAX_PIXELS
 from crosscue.eval import cli
 from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.replay.base import MIB, Floats
+from support.every_format import EVERY_FORMAT
 from support.gap_drive import BEGIN, SIZE, Clock, replayed, write_drive
 from support.mcap_files import MAGIC, record, text
+from support.onnx_models import bright_box_model, open_model
 from support.pictures import picture
 from support.rosbag_files import START_NS, Row, write_bag, write_folder
 
@@ -238,6 +240,8 @@ READS_FILES: dict[str, str] = {
     "landmarks add": "{db} --images {folder} --coordinates {folder}/places.csv",
     "fit landmarks": "--pairs {folder}/pairs.csv",
     "fit signs": "{folder}/labels.csv --label stop_sign",
+    "model check": "{folder}/net.toml --picture {picture} -o {out}.jpg",
+    "model init": "{folder}/net.onnx -o {folder}/new.toml --picture {picture}",
     "train road": "--data {folder} -o {out}.safetensors",
     "train mask-rcnn": "--data {folder}/coco.json --images {folder}/images -o {out}.safetensors "
     "--steps 1 --batch 1 --check-every 1 --device cpu",
@@ -245,11 +249,11 @@ READS_FILES: dict[str, str] = {
 """What decodes picture files."""
 
 
+@pytest.mark.parametrize("coded", CODED)
 @pytest.mark.parametrize("command", READS_FILES)
 def test_a_picture_file_that_declares_too_much_is_unreadable(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, coded: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    coded = [*CODED][[*READS_FILES].index(command) % len(CODED)]
     folder = tmp_path / "photos"
     for place in (folder, folder / "images", folder / "masks"):
         place.mkdir()
@@ -259,6 +263,9 @@ def test_a_picture_file_that_declares_too_much_is_unreadable(
     (folder / "pairs.csv").write_text(f"query,known,same\na.{coded},b.png,1\n")
     (folder / "labels.csv").write_text(f"picture,label,x0,y0,x1,y1\na.{coded},stop sign,1,1,9,9\n")
     (folder / "coco.json").write_text(_coco([(f"a.{coded}", 0), ("b.png", 1)], (24, 16)))
+    (folder / "net.onnx").write_bytes(bright_box_model())
+    if command == "model check":
+        assert cli.run(["model", "init", str(folder / "net.onnx"), "-q"]) == 0
     with LandmarkWriter(tmp_path / "known.db", "orb"):
         pass
     names = {
@@ -272,6 +279,52 @@ def test_a_picture_file_that_declares_too_much_is_unreadable(
 
     assert status == 4
     _names_both(status, capsys)
+    assert not (folder / "new.toml").exists()
+
+
+SIZES: dict[str, tuple[tuple[int | str, ...], dict[str, str], str]] = {
+    "a picture as large as its metadata says": (
+        (1, 3, "h", "w"),
+        {"imgsz": "[200000, 200000]"},
+        "120,000,000,000 numbers, the limit is 201,326,592",
+    ),
+    "a batch": ((100_000, 3, 640, 640), {}, "122,880,000,000 numbers, the limit is 201,326,592"),
+    "a side": ((1, 3, 200_000, 200_000), {}, "120,000,000,000 numbers, the limit is 201,326,592"),
+}
+"""Declared input, metadata, and what is said of it."""
+
+
+@pytest.mark.parametrize("case", SIZES)
+def test_a_network_that_declares_too_large_an_input_is_not_run(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shape, metadata, said = SIZES[case]
+    (tmp_path / "net.onnx").write_bytes(open_model(shape, metadata))
+
+    status = cli.run(["model", "init", str(tmp_path / "net.onnx")])
+
+    assert status == 2
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.toml"))
+
+
+@pytest.mark.parametrize("shape", [(1 << 40,), (1 << 31, 1 << 31), (1 << 62, 4)])
+def test_an_array_is_as_long_as_its_file_whatever_it_declares(
+    shape: tuple[int, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = EVERY_FORMAT["comma2k19"](tmp_path)
+    place = log / "processed_log" / "IMU" / "gyro" / "value"
+    assert place.is_file()
+    with place.open("wb") as file:
+        head = {"descr": "<f8", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, head)
+        file.write(bytes(64))
+
+    status = cli.run(["info", str(log)])
+
+    printed = capsys.readouterr()
+    assert status == (4 if len(shape) == 1 else 3), printed.err
+    assert ("copy it again" in printed.err) if status == 4 else ("losses" in printed.out)
 
 
 def _coco(images: list[tuple[str, int]], size: tuple[int, int]) -> str:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from crosscue.datasets.adapters.comma2k19 import STREAMS
+from crosscue.datasets.adapters.comma2k19_truth import write
 from crosscue.datasets.adapters.npy import read_column
 from crosscue.replay.base import (
     CanFrames,
@@ -16,6 +18,7 @@ from crosscue.replay.base import (
     UnknownFormatError,
 )
 from crosscue.replay.logs.opening import open_log
+from support.accounted import read
 from support.data import shared
 
 SEGMENT = ("comma2k19", "Example_1", "b0c9d2329ad1606b_2018-08-02--08-34-47", "40")
@@ -146,3 +149,53 @@ def test_a_time_that_damage_made_impossible_or_far_costs_its_row_alone(
     assert rows == ledger.accounts["imu/gyro"].used == (50 if is_time else 49)
     dropped = ledger.accounts["imu/gyro"].dropped
     assert dropped == ({} if is_time else {"a row without a possible time": 1})
+
+
+OTHERS: dict[str, NDArray[np.generic]] = {
+    "no columns": np.zeros(40),
+    "two columns": np.zeros((40, 2)),
+    "a third dimension": np.zeros((40, 3, 2)),
+    "text": np.full(40, b"abc"),
+    "complex": np.zeros((40, 3), np.complex128),
+    "no row": np.zeros((0, 3)),
+}
+"""Arrays that another stream, or another writer, might have put in a file's place."""
+
+
+def _segment(folder: Path) -> Path:
+    """Every array that a segment may have, of 40 rows."""
+    for stream in STREAMS.values():
+        place = folder / "processed_log" / stream.folder
+        _save(place / "t", np.arange(40) * 0.1)
+        _save(place / "value", np.ones((40, stream.width)))
+    can = folder / "processed_log" / "CAN" / "raw_can"
+    for name in ("src", "address"):
+        _save(can / name, np.ones(40, np.int64))
+    _save(can / "t", np.arange(40) * 0.1)
+    _save(can / "data", np.full(40, b"12345678"))
+    pose = folder / "global_pose"
+    _save(pose / "frame_times", np.arange(40) * 0.1)
+    _save(pose / "frame_positions", np.full((40, 3), 4e6))
+    _save(pose / "frame_orientations", np.tile([1.0, 0.0, 0.0, 0.0], (40, 1)))
+    return folder
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_an_array_of_another_kind_is_reported_whichever_it_replaces(
+    kind: str, tmp_path: Path
+) -> None:
+    log = _segment(tmp_path / "segment")
+    rows, _ = read(log)
+    for file in [one for one in sorted(log.rglob("*")) if one.is_file()]:
+        whole = file.read_bytes()
+        _save(file, OTHERS[kind])
+
+        blocks, ledger = read(log)
+
+        if "processed_log" in file.parts and sum(map(len, blocks)) < sum(map(len, rows)):
+            assert not ledger.is_whole, file
+        assert all(block.log_ns.ndim == 1 for block in blocks)
+        if "global_pose" in file.parts:
+            with pytest.raises(LogFormatError, match="global_pose"):
+                write(log, tmp_path / "truth")
+        file.write_bytes(whole)

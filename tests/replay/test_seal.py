@@ -418,12 +418,24 @@ def test_a_window_of_an_indexed_log_checks_its_own_blocks_alone(tmp_path: Path, 
     assert losses(early) == [f"{log.name}: bytes 0 to {MIB}"]
 
 
+_PICTURES = {"kitti-raw": "image_02/data", "pandaset": "camera/front_camera"}
+"""Where pictures lie."""
+
+
 def _in_window(kind: str, folder: Path) -> tuple[Path, Selection, dict[str, bool]]:
     """A log, a window at its beginning, and files or parts of it: are they read for the window?"""
     if kind == "images":
         times = "".join(f"{0.5 * i:.1f}\n" for i in range(12))
         log = picture_folder(folder / "front", 12, times)
         return log, Selection(end_ns=1_000_000_000), {"frame_0.png": True, "frame_9.png": False}
+    if kind in ("kitti-raw", "pandaset"):
+        log = EVERY_FORMAT[kind](folder)
+        place = _PICTURES[kind]
+        first = min(int(block.log_ns[0]) for block in read(log)[0])
+        pictures = sorted(log.glob(f"{place}/*.*g"))
+        early, late = (str(one.relative_to(log)) for one in (pictures[0], pictures[-1]))
+        window = Selection(end_ns=first + 300_000_000)
+        return log, window, {early: True, late: False}
     if kind == "blf":
         log = folder / "can.blf"
         frames = made(60_000, step_ns=1_000_000)
@@ -440,7 +452,7 @@ def _in_window(kind: str, folder: Path) -> tuple[Path, Selection, dict[str, bool
     return log, Selection(end_ns=begin + 500_000_000), {}
 
 
-@pytest.mark.parametrize("kind", ["blf", "mf4", "images"])
+@pytest.mark.parametrize("kind", ["blf", "mf4", "images", "kitti-raw", "pandaset"])
 def test_a_window_checks_only_what_it_reads(tmp_path: Path, kind: str) -> None:
     log, window, files = _in_window(kind, tmp_path)
     assert run(["seal", str(log)]) == 0

@@ -29,6 +29,15 @@ def constant_model(shape: tuple[int, ...], outputs: Mapping[str, Array]) -> byte
     return _file(helper.make_graph(nodes, "constant", [given], declared))
 
 
+def open_model(shape: tuple[int | str, ...], metadata: Mapping[str, str]) -> bytes:
+    """A network with input ``shape``, whose output is as long as running it says."""
+    value = numpy_helper.from_array(np.zeros((1, 84, 100), np.float32))
+    node = helper.make_node("Constant", [], ["output0"], value=value)
+    given = helper.make_tensor_value_info("images", TensorProto.FLOAT, shape)
+    found = helper.make_tensor_value_info("output0", TensorProto.FLOAT, (1, 84, "boxes"))
+    return _file(helper.make_graph([node], "open", [given], [found]), metadata)
+
+
 def bright_box_model() -> bytes:
     """One box (N, 1, 6) around all pixels above 127, with score 1 if there are any, class 0.
 
@@ -78,8 +87,9 @@ def _scalar(value: float) -> TensorProto:
     return numpy_helper.from_array(np.array(value, np.float32))
 
 
-def _file(graph: onnx.GraphProto) -> bytes:
+def _file(graph: onnx.GraphProto, metadata: Mapping[str, str] | None = None) -> bytes:
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=8)
+    helper.set_model_props(model, dict(metadata or {}))
     onnx.checker.check_model(model)
     content: bytes = model.SerializeToString()
     return content
