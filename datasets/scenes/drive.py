@@ -37,7 +37,7 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.encode.outgoing import standard_type
 from crosscue.replay.encode.template import filled, template_of
-from crosscue.replay.files.made_of import made_of, refuse_another
+from crosscue.replay.files.made_of import SIMULATED, made_of, refuse_another
 from crosscue.replay.write.convert import LogWriter
 
 from .car_file import vehicle_text
@@ -47,7 +47,7 @@ from .layout import Layout, layout_named
 from .mobileye import Device
 from .world import World, build
 
-MADE_OF: Final = "simulated.json"
+MADE_OF: Final = SIMULATED
 """Says which drive a folder holds."""
 CAR_BUS: Final = "/can/car"
 MOBILEYE_BUS: Final = "/can/mobileye"

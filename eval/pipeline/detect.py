@@ -23,7 +23,7 @@ from crosscue.eval.pipeline.outcome import DetectOutcome
 from crosscue.eval.runs.account import account, detecting_of, reading_of
 from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
 from crosscue.eval.runs.input import input_of
-from crosscue.eval.runs.logs import log_names, log_rows
+from crosscue.eval.runs.logs import is_simulated, log_names, log_rows
 from crosscue.eval.runs.manifest import (
     DetectCounts,
     DetectManifest,
@@ -34,11 +34,12 @@ from crosscue.eval.runs.manifest import (
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.replay.base import Block, Ledger, Log, Selection, VehicleError, versions
+from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
-from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .clocks import clock_rows
 from .drive_time import camera_timeline, time_segments
@@ -173,7 +174,7 @@ def detect_into(
         seconds = time.monotonic() - began
         notices = (
             *gaps_text(timeline.segments),
-            *_simulated_only(choices, vehicle),
+            *_simulated_only(choices, logs),
             *tables.notices,
         )
         write_manifest(
@@ -224,14 +225,14 @@ def detect_into(
     )
 
 
-def _simulated_only(choices: Sequence[Choice], vehicle: Vehicle) -> list[str]:
-    """Embedded networks on a log that no vehicle file of ``simulate`` came with."""
-    if vehicle.name == SIMULATED_CAR:
+def _simulated_only(choices: Sequence[Choice], logs: Sequence[Log]) -> list[str]:
+    """Embedded networks on a log that ``simulate`` has not made."""
+    if all(map(is_simulated, logs)):
         return []
     return [
         f"warning: {choice.name}: the embedded network knows simulated scenes only, and this log "
-        f'is not simulated (the vehicle file is not named "{SIMULATED_CAR}"); its results mean '
-        "nothing here; choose a model with crosscue model list"
+        f"is not simulated (no {SIMULATED} beside it); its results mean nothing here; "
+        "choose a model with crosscue model list"
         for choice in choices
         if knows_simulated_only(choice)
     ]

@@ -119,6 +119,12 @@ def write_report(
     return folder / REPORT
 
 
+def _is_simulated(one: RunScored) -> bool:
+    """By the run's record of its logs, or where only the truth says so."""
+    logs = one.run.drive_manifest().logs
+    return all(log.is_simulated for log in logs) or "simulated" in one.truth.truth.source.lower()
+
+
 def _content(
     scored: Sequence[RunScored], metrics: Mapping[str, Any], worst: Sequence[WorstFrame]
 ) -> dict[str, Any]:
@@ -132,7 +138,7 @@ def _content(
         "title": runs[0].name if is_alone else f"{len(runs)} drives",
         "runs": runs,
         "sources": sorted(set(sources)),
-        "simulated": sum("simulated" in source.lower() for source in sources),
+        "simulated": sum(map(_is_simulated, scored)),
         "failed": metrics["coverage"].get("failed", {}),
         "same_log": metrics["coverage"].get("same_log", ()),
         "dropped": sum(not account.is_whole for account in accounts),

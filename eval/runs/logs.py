@@ -17,6 +17,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import LogRow
 from crosscue.replay.base import CrosscueError, Log, UnreadableRunError, sha256_of
 from crosscue.replay.files.identity import identity_of, identity_of_log
+from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote.logs import RangedLog, is_remote, origin
 from crosscue.replay.vehicle.roles import Role, role_of
@@ -55,9 +56,16 @@ def log_rows(logs: Sequence[Log], run: RunFolder) -> tuple[LogRow, ...]:
             identity=identity_of_log(log),
             cameras=tuple(sorted(o.name for o in log.topics if role_of(o) is Role.CAMERA)),
             sha256={} if isinstance(log, RangedLog) else sha256_of(log.path),
+            is_simulated=is_simulated(log),
         )
         for name, log in zip(log_names(logs), logs, strict=True)
     )
+
+
+def is_simulated(log: Log) -> bool:
+    """Whether ``simulate`` made a log, by the file that it writes beside one."""
+    place = origin(log)
+    return isinstance(place, Path) and (place.resolve().parent / SIMULATED).is_file()
 
 
 def relative(place: Path, run: RunFolder) -> str:

@@ -60,6 +60,8 @@ class LogRow(Record):
     """Topics with pictures."""
     sha256: dict[str, str]
     """By file; empty for a log that was read by ranges."""
+    is_simulated: bool = False
+    """Whether ``simulated.json`` lay beside it."""
 
 
 class Part(Record):

@@ -16,6 +16,8 @@ from crosscue.replay.files.log_identity import as_row, of_row
 
 from .identity import identity_of, identity_of_all
 
+SIMULATED: Final = "simulated.json"
+"""What `simulate` writes beside its log: the mark of a simulated log, and what it is made of."""
 NOTHING: Final[Mapping[str, Any]] = {}
 """Of a result that need not be told from others."""
 

@@ -182,7 +182,9 @@ class OwnCue(Section):
 
 
 SIMULATED_CAR: Final = "crosscue simulated car"
-"""Name in the vehicle files that ``simulate`` writes: the one mark of a log that is simulated."""
+"""Name in the vehicle files that ``simulate`` writes; with it the published belief is the default.
+
+That a log is simulated is known from the file beside it, see ``crosscue.replay.files.made_of``."""
 
 
 class Cues(Section):

@@ -9,6 +9,7 @@ import pytest
 
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import open_run
+from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR
 from support.data import shared
 from support.detecting import yolox_card
@@ -284,11 +285,15 @@ def test_each_real_segmentation_sees_the_road_ahead_and_none_in_the_sky(
 def test_networks_of_simulated_scenes_warn_on_any_other_log(tmp_path: Path) -> None:
     log, vehicle = _folder(tmp_path), tmp_path / "car.toml"
     arguments = ["detect", str(log), "--detectors", "road", "--no-cache", "-q"]
+    vehicle.write_text(f'version = 1\nname = "{SIMULATED_CAR}"\n')
 
-    for name in ("my car", SIMULATED_CAR):
-        vehicle.write_text(f'version = 1\nname = "{name}"\n')
-        assert run([*arguments, "-o", str(tmp_path / name), "--vehicle", str(vehicle)]) == 0
+    # A vehicle file may be copied or left out; the file beside the log is of the log.
+    assert run([*arguments, "-o", str(tmp_path / "real"), "--vehicle", str(vehicle)]) == 0
+    (tmp_path / SIMULATED).write_text("{}")
+    assert run([*arguments, "-o", str(tmp_path / "simulated")]) == 0
 
-    (notice,) = open_run(tmp_path / "my car").drive_manifest().notices
+    real, simulated = (open_run(tmp_path / name).drive_manifest() for name in ("real", "simulated"))
+    (notice,) = real.notices
     assert notice.startswith("warning: road: the embedded network knows simulated scenes only")
-    assert open_run(tmp_path / SIMULATED_CAR).drive_manifest().notices == ()
+    assert simulated.notices == ()
+    assert [one.logs[0].is_simulated for one in (real, simulated)] == [False, True]
