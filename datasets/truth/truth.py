@@ -56,11 +56,11 @@ Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
 
 class Features(Section):
-    """Where one may drive on from an intersection."""
+    """Where one may drive on from an intersection; null where nobody knows, which is not scored."""
 
-    left: bool
-    right: bool
-    straight: bool
+    left: bool | None
+    right: bool | None
+    straight: bool | None
 
 
 class Approach(Section):

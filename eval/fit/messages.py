@@ -111,6 +111,8 @@ def _meant(
         one = truth.approaches[int(np.argmax(shared))]
         features = {"intersection": True, **one.features.model_dump()}
         before = (t_ns >= one.start_ns) & (t_ns < one.enter_ns)
+        if None in features.values():
+            return before, None, "", "to an intersection with unknown roads, left out"
         return before, features, one.intersection, "to an intersection"
     inside = (t_ns >= truth.start_ns) & (t_ns < truth.end_ns)
     for a in truth.approaches:

@@ -91,7 +91,7 @@ def _write_steps(run: RunFolder, steps: list[Step]) -> None:
                 sink.write(dict(zip(schema.names, zip(*rows, strict=True), strict=True)))
 
 
-def write_truth(folder: Path, *, left: bool, enter_ns: int = 59 * FRAME_NS) -> Path:
+def write_truth(folder: Path, *, left: bool | None, enter_ns: int = 59 * FRAME_NS) -> Path:
     """The truth of one drive: one approach over all of it."""
     folder.mkdir()
     one = Approach(

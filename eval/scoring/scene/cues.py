@@ -231,7 +231,8 @@ def _feature_at(cue: str, t_ns: Int64s, truth: DriveTruth) -> NDArray[np.int8]:
     at = truth.approach_at(t_ns)
     feature, is_there = CUES[cue].claim
     for one in truth.truth.approaches:
-        found[at == one.id] = int(has_feature(one, feature) == is_there)
+        there = has_feature(one, feature)
+        found[at == one.id] = NONE if there is None else int(there == is_there)
     return found
 
 

@@ -86,6 +86,17 @@ def test_an_approach_that_begins_in_an_intersection_is_left_out(tmp_path: Path) 
     assert found.used == {"in an intersection, left out": 1}
 
 
+def test_an_approach_with_a_road_that_nobody_knows_is_left_out(tmp_path: Path) -> None:
+    run = write_run(
+        tmp_path / "run", made_up_drive(np.random.default_rng(0), left=True, signed=True)
+    )
+
+    found = annotated(run, write_truth(tmp_path / "truth", left=None))
+
+    assert not found.approaches
+    assert found.used == {"to an intersection with unknown roads, left out": 1}
+
+
 def test_another_drives_truth_is_refused(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     late = [one for one in made_up_drive(rng, left=True, signed=True) if one.t_ns >= 3_000_000_000]

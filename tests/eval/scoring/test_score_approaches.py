@@ -300,3 +300,16 @@ def test_true_ranges_hold_between_rows_but_not_far_from_any() -> None:
     assert start[:2] == pytest.approx([29.5, 0.5])
     assert end[0] == pytest.approx(39.5)
     assert math.isnan(start[2])
+
+
+def test_a_road_that_nobody_knows_is_neither_believed_rightly_nor_falsely() -> None:
+    known = truth(approaches=[approach(features={"left": None, "right": True, "straight": False})])
+
+    judged = judge_approaches(good_tables(), known)
+    belief = score_belief(judge_belief(good_tables(), known))
+
+    assert judged is not None
+    assert judged.results[0].present == ("intersection", "right")
+    assert judged.results[0].false_features == ()
+    assert belief["left"].scored == 0
+    assert belief["right"].scored > 0

@@ -231,3 +231,14 @@ def test_parts_by_distance_sum_up_and_tags_belong_to_their_approach() -> None:
         tag: (part.frames, part.precision.value) for tag, part in score.by_condition.items()
     } == {"rain": (20, 1.0), "dusk": (20, 1.0), "no tag": (20, 0.0)}
     assert set(score.by_distance) == {"0-10", "10-20", "20-30"}
+
+
+def test_a_road_that_nobody_knows_is_not_scored() -> None:
+    unknown = approach(features={"left": True, "right": True, "straight": None})
+    found = {"vehicles_past": dict.fromkeys(range(10), 1)}
+
+    score = score_cues(match_cues(tables(found, frames=10), truth(approaches=[unknown])))
+
+    reading = score["vehicles_past"].readings["feature"]
+    assert reading.scored == 0
+    assert reading.left_out["no truth at this time"] == 10

@@ -1,0 +1,75 @@
+"""The real drives of the documentation: their vehicle files and annotations fit their logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from crosscue.datasets.real.recordings import FOLDER
+from crosscue.datasets.truth.truth import load as load_truth
+from crosscue.detectors.catalog import entries
+from crosscue.detectors.catalog import fetch as weights
+from crosscue.eval.cli import run
+from crosscue.replay.vehicle.vehicle import load as load_vehicle
+from support.data import shared
+
+DRIVES = ("comma2k19", "pandaset_002", "us_dashcam")
+
+
+def test_the_list_of_this_test_is_whole() -> None:
+    assert sorted(path.parent.name for path in FOLDER.glob("*/vehicle.toml")) == sorted(DRIVES)
+
+
+@pytest.mark.parametrize("name", DRIVES)
+def test_settings_and_annotations_can_be_read_and_say_where_they_are_from(name: str) -> None:
+    vehicle = load_vehicle(FOLDER / name / "vehicle.toml")
+    truth = load_truth(FOLDER / name)
+
+    assert vehicle.name != "unnamed"
+    assert vehicle.detectors
+    assert "annotated for crosscue" in truth.source
+    present = {one.cue: one.present for one in truth.cues}
+    assert present["traffic_light"]
+    assert not present["stop_sign"]
+
+
+def test_the_dashcam_s_truth_fits_its_frames(tmp_path: Path) -> None:
+    frames = shared("sequences", "us_signalized_intersection_dashcam")
+    folder = tmp_path / "dashcam"
+    folder.mkdir()
+    for path in frames.glob("*.jpg"):
+        (folder / path.name).symlink_to(path)
+    (folder / "timestamps.txt").write_text("rate_hz: 15\n")
+
+    assert run(["truth", "check", str(FOLDER / "us_dashcam"), "--log", str(folder)]) == 0
+
+
+def test_a_minute_and_its_one_picture_are_one_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The commands of the documentation, up to the traffic light in the picture."""
+    (segment,) = shared("comma2k19", "Example_1").glob("*/40")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(entries.VARIABLE, str(tmp_path / "models"))
+    monkeypatch.setenv(weights.DATA, str(shared("weights").parent))
+    weights.fetch("yolox-nano")
+    front = tmp_path / "front"
+    front.mkdir()
+    (front / "00.png").symlink_to(segment / "preview.png")
+    (front / "timestamps.txt").write_text("46408.547498\n")
+    (tmp_path / "toyota_2017.dbc").symlink_to(shared("comma2k19", "toyota_2017.dbc"))
+    settings = tmp_path / "vehicle.toml"
+    settings.write_text((FOLDER / "comma2k19" / "vehicle.toml").read_text())
+    line = f"replay {segment} front --vehicle {settings} -o run --no-cache -q"
+
+    assert run(line.split()) == 3
+    assert run(["truth", str(segment), "-o", "truth", "-q"]) in (0, 3)
+    (tmp_path / "truth" / "truth.json").write_bytes(
+        (FOLDER / "comma2k19" / "truth.json").read_bytes()
+    )
+    assert run(["score", "run", "--truth", "truth", "-q"]) == 3
+
+    cues = pq.read_table("run/cues.parquet", filters=[("cue", "=", "traffic_light")])
+    assert [count > 0 for count in cues["count"].to_pylist()] == [True]
