@@ -15,7 +15,7 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import Choice, Detections, RoadMask, reportable
 from crosscue.detectors.cues.frame import CuePass, FrameCues, Role, all_labels, role_of, seen
 from crosscue.detectors.overlay import Drawer
-from crosscue.detectors.ranging.height_to_range import range_of
+from crosscue.detectors.ranging.detection_range import detection_range
 from crosscue.detectors.registry import knows_simulated_only, make
 from crosscue.detectors.result_cache import ResultCache
 from crosscue.detectors.runner import FrameResult, Named, Runner
@@ -357,6 +357,7 @@ class _Tables:
             key = f"{name}: {label}"
             self.objects[key] = self.objects.get(key, 0) + 1
             height = _height_px(found, i)
+            ranged = detection_range(self.vehicle, label, found.boxes_px[i], height, found.size_px)
             rows.append(
                 {
                     "frame": self._frame,
@@ -372,20 +373,13 @@ class _Tables:
                     "mask": found.masks[i] or None,
                     "height_px": height,
                     "lens": (found.lenses[i] or None) if found.lenses else None,
-                    "range_m": self._range_m(label, height),
+                    "range_m": None if ranged is None else ranged.mean_m,
+                    "range_sd_m": None if ranged is None else ranged.sd_m,
                     "picture_width_px": found.size_px[0],
                     "picture_height_px": found.size_px[1],
                 }
             )
         return rows
-
-    def _range_m(self, label: str, height_px: float) -> float | None:
-        cues, ranges = self.vehicle.cues, self.vehicle.ranges
-        curve = ranges.stop_sign if label in cues.stop_sign_labels else None
-        curve = ranges.traffic_light if label in cues.traffic_light_labels else curve
-        if curve is None or height_px <= 0.0:
-            return None
-        return float(range_of(np.array([height_px]), curve)[0])
 
     def _write(self, name: str) -> None:
         rows, self._held[name] = self._held[name], []
@@ -432,6 +426,7 @@ def schemas() -> dict[str, pa.Schema]:
                 ("height_px", number),
                 ("lens", text),
                 ("range_m", number),
+                ("range_sd_m", number),
                 ("picture_width_px", pa.int32()),
                 ("picture_height_px", pa.int32()),
             ]

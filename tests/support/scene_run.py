@@ -77,6 +77,7 @@ def detections(frames: int = FRAMES) -> pa.Table:
                     "height_px": 12.0,
                     "lens": None,
                     "range_m": None,
+                    "range_sd_m": None,
                     "picture_width_px": SIZE[0],
                     "picture_height_px": SIZE[1],
                 }

@@ -1,0 +1,79 @@
+"""Range of one detection by itself: by a fitted curve, or by standard sizes and the ground.
+
+Curves are those of the vehicle file. Without any, and with ``camera.focal_px``, lights, signs and
+vehicles have the default R = f H / h of their standard size, vehicles also the ground's; the
+standard deviation holds the spread of sizes. ``ranges.kind = "curve"`` leaves the defaults out.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Floats
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .height_to_range import range_of
+from .standard_sizes import VEHICLES, size_of
+from .vehicle_range import GroundCamera, OneRange, size_range, vehicle_range
+
+BORDER_PX: Final = 2.0
+"""A box that reaches the picture's edge is cut, so its height and edges say nothing."""
+
+
+def detection_range(
+    vehicle: Vehicle, label: str, box_px: Floats, height_px: float, size_px: tuple[int, int]
+) -> OneRange | None:
+    """From the rear axle; None where there is no curve and no default.
+
+    Args:
+        vehicle: Curves, camera and labels.
+        label: Of the detection.
+        box_px: x0, y0, x1, y1.
+        height_px: Rows that its mask spans, or the box's.
+        size_px: Width and height of the picture.
+    """
+    cues, ranges = vehicle.cues, vehicle.ranges
+    if height_px <= 0.0:
+        return None
+    curve = ranges.stop_sign if label in cues.stop_sign_labels else None
+    curve = ranges.traffic_light if label in cues.traffic_light_labels else curve
+    if curve is not None:
+        return OneRange(float(range_of(np.array([height_px]), curve)[0]), curve.residual_sd_m)
+    if not _has_defaults(vehicle) or _is_cut(box_px, size_px):
+        return None
+    found = _by_size(vehicle, label, box_px, height_px, size_px)
+    return None if found is None else OneRange(found.mean_m + vehicle.camera.x_m, found.sd_m)
+
+
+def _has_defaults(vehicle: Vehicle) -> bool:
+    ranges = vehicle.ranges
+    is_fitted = ranges.stop_sign is not None or ranges.traffic_light is not None
+    may = ranges.kind == "motion" or (ranges.kind is None and not is_fitted)
+    return may and vehicle.camera.focal_px is not None
+
+
+def _by_size(
+    vehicle: Vehicle, label: str, box_px: Floats, height_px: float, size_px: tuple[int, int]
+) -> OneRange | None:
+    """Depth from the camera."""
+    cues, camera = vehicle.cues, vehicle.camera
+    focal_px = camera.focal_px or 0.0
+    x0, _, x1, y1 = box_px.tolist()
+    if label in cues.traffic_light_labels:
+        aspect = height_px / (x1 - x0) if x1 > x0 else None
+        return size_range(height_px, focal_px, size_of("traffic_light", aspect))
+    if label in cues.stop_sign_labels:
+        return size_range(height_px, focal_px, size_of("stop_sign"))
+    if label not in VEHICLES:
+        return None
+    center_px = camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1])
+    over_ground = GroundCamera(focal_px, center_px[1], camera.z_m)
+    return vehicle_range(y1, height_px, over_ground, VEHICLES[label])
+
+
+def _is_cut(box_px: Floats, size_px: tuple[int, int]) -> bool:
+    x0, y0, x1, y1 = box_px.tolist()
+    right, bottom = size_px[0] - BORDER_PX, size_px[1] - BORDER_PX
+    return bool(min(x0, y0) < BORDER_PX or x1 > right or y1 > bottom)

@@ -1,0 +1,131 @@
+"""Ranges of one detection: exact on level ground, as unsure as they say, checked on real boxes."""
+
+import math
+
+import numpy as np
+import pytest
+
+from crosscue.detectors.ranging.detection_range import detection_range
+from crosscue.detectors.ranging.standard_sizes import VEHICLES, SizePrior
+from crosscue.detectors.ranging.vehicle_range import (
+    CAMERA_HEIGHT_SD,
+    EDGE_FRACTION,
+    EDGE_PX,
+    OVERHANG_M,
+    GroundCamera,
+    ground_range,
+    size_range,
+    vehicle_range,
+)
+from crosscue.replay.vehicle.vehicle import Vehicle, parse
+
+CAMERA = GroundCamera(focal_px=1500.0, center_y_px=540.0, height_m=1.5)
+CAR = VEHICLES["car"]
+SIZE = (1920, 1080)
+
+
+def edge_px(range_m: float, camera: GroundCamera = CAMERA, pitch_rad: float = 0.0) -> float:
+    """Row where a point of level ground appears."""
+    angle = math.atan(camera.height_m / range_m) - pitch_rad
+    return camera.center_y_px + camera.focal_px * math.tan(angle)
+
+
+@pytest.mark.parametrize("pitch_rad", [-0.03, 0.0, 0.08])
+@pytest.mark.parametrize("range_m", [4.0, 17.0, 40.0])
+def test_a_point_of_level_ground_has_its_range_exactly(range_m: float, pitch_rad: float) -> None:
+    tilted = GroundCamera(1500.0, 540.0, 1.5, pitch_rad)
+
+    found = ground_range(edge_px(range_m, pitch_rad=pitch_rad), 60.0, tilted)
+
+    assert found is not None
+    assert found.mean_m == pytest.approx(range_m, rel=1e-9)
+
+
+def test_an_edge_at_the_horizon_says_nothing_and_size_alone_speaks() -> None:
+    for bottom_px in (500.0, 540.0, 545.0):
+        assert ground_range(bottom_px, 20.0, CAMERA) is None
+        assert vehicle_range(bottom_px, 20.0, CAMERA, CAR) == size_range(20.0, 1500.0, CAR)
+
+
+def test_near_the_ground_decides_and_far_away_the_size() -> None:
+    tall = SizePrior(1.65, 0.15)
+    for range_m, nearer in ((8.0, "ground"), (60.0, "size")):
+        height_px = 1500.0 * 2.0 / range_m
+        both = vehicle_range(edge_px(range_m), height_px, CAMERA, tall)
+        by_size = size_range(height_px, 1500.0, tall)
+        by_ground = ground_range(edge_px(range_m), height_px, CAMERA)
+        assert by_ground is not None
+        to_ground = abs(math.log(both.mean_m / by_ground.mean_m))
+        to_size = abs(math.log(both.mean_m / by_size.mean_m))
+        assert (to_ground < to_size) == (nearer == "ground")
+        assert both.sd_m < min(by_size.sd_m, by_ground.sd_m)
+
+
+@pytest.mark.parametrize("range_m", [10.0, 20.0, 35.0])
+def test_the_interval_holds_the_truth_as_often_as_it_says(range_m: float) -> None:
+    rng = np.random.default_rng(3)
+    inside = 0
+    for _ in range(2000):
+        height_m = math.exp(CAR.log_mean + math.sqrt(CAR.log_var) * rng.normal())
+        true_px = 1500.0 * height_m / range_m
+        edge_sd = math.hypot(EDGE_PX, EDGE_FRACTION * true_px)
+        tilt, raised = 0.005 * rng.normal(), 1.0 + CAMERA_HEIGHT_SD * rng.normal()
+        stands_m = range_m + OVERHANG_M * rng.normal()
+        camera = GroundCamera(1500.0, 540.0, 1.5 * raised)
+        bottom_px = edge_px(stands_m, camera, tilt) + edge_sd * rng.normal()
+        found = vehicle_range(bottom_px, true_px + edge_sd * rng.normal(), CAMERA, CAR)
+        inside += abs(found.mean_m - range_m) < 1.96 * found.sd_m
+
+    assert 0.92 <= inside / 2000 <= 0.985
+
+
+def vehicle(text: str) -> Vehicle:
+    return parse("version = 1\n" + text, "v.toml")
+
+
+FOCAL = "[camera]\nfocal_px = 1500.0\nx_m = 1.5\nz_m = 1.5\n"
+CURVE = "[ranges.traffic_light]\nparameters = [1800.0]\nresidual_sd_m = 4.0\n"
+BOX = np.array([900.0, 300.0, 914.0, 330.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "range_m", "sd_m"),
+    [
+        (FOCAL + CURVE, 60.0, 4.0),
+        (FOCAL, 1500.0 * 1.26 / 30.0 + 1.5, 0.15 * 63.0),
+    ],
+)
+def test_a_default_is_used_where_no_curve_is_fitted(text: str, range_m: float, sd_m: float) -> None:
+    found = detection_range(vehicle(text), "traffic light", BOX, 30.0, SIZE)
+
+    assert found is not None
+    assert found.mean_m == pytest.approx(range_m, rel=0.02)
+    assert found.sd_m == pytest.approx(sd_m, rel=0.2)
+
+
+@pytest.mark.parametrize("text", ["", FOCAL + "[ranges]\nkind = 'curve'\n"])
+def test_without_a_camera_or_by_choice_there_is_no_default(text: str) -> None:
+    assert detection_range(vehicle(text), "traffic light", BOX, 30.0, SIZE) is None
+
+
+def test_a_fitted_curve_leaves_all_else_as_it_was() -> None:
+    box = np.array([900.0, 500.0, 980.0, edge_px(30.0)])
+
+    assert detection_range(vehicle(FOCAL + CURVE), "car", box, 80.0, SIZE) is None
+    found = detection_range(vehicle(FOCAL), "car", box, 80.0, SIZE)
+    assert found is not None
+    assert found.mean_m == pytest.approx(31.5, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("label", "box"),
+    [
+        ("person", (900.0, 500.0, 930.0, 600.0)),
+        ("car", (0.0, 500.0, 80.0, 600.0)),
+        ("bus", (900.0, 500.0, 1300.0, 1080.0)),
+    ],
+)
+def test_what_has_no_size_or_is_cut_has_no_range(
+    label: str, box: tuple[float, float, float, float]
+) -> None:
+    assert detection_range(vehicle(FOCAL), label, np.array(box), 100.0, SIZE) is None
