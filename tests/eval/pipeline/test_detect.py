@@ -175,7 +175,7 @@ def test_a_camera_that_changes_size_is_followed_and_reported(tmp_path: Path) -> 
         ("nonsense", "detector 'nonsense': no such name"),
         ("no.such.module:make", "detector no.such.module:make: No module named"),
         ("support.detecting:nothing", "has no attribute 'nothing'"),
-        ("support.detecting:too_few", "gave 0 results for"),
+        ("support.detecting:too_few", "returned 0 results for"),
         (f"{BRIGHT},{BRIGHT}", "one is named twice"),
         ("", "none named; there are:"),
     ],
