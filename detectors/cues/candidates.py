@@ -12,6 +12,7 @@ from typing import Final, Literal
 
 BELOW_SCORE: Final = "below score"
 TOO_LITTLE_ROAD: Final = "too little road"
+REGION_NOT_SEEN: Final = "region not seen: its place unknown, or too far to be resolved"
 NOT_FROM_THE_SIDE: Final = "not seen from the side"
 NOT_FOUND_BEFORE: Final = "not found in the frame before"
 OTHER_MOTION: Final = "moves or faces otherwise"

@@ -37,6 +37,7 @@ from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
 from .cars import Judged, Sides, nose_of
+from .place import Place
 
 CAR_HEIGHT_M: Final = 1.55
 """Of a usual car; between 1.4 (sports car) and 1.8 (van), so 15 % either way."""
@@ -114,20 +115,6 @@ class CarMotion(NamedTuple):
     nose: float
     center_px: tuple[float, float] = (0.0, 0.0)
     step_px: tuple[float, float] = (0.0, 0.0)
-
-
-class Place(NamedTuple):
-    """Where the intersection is believed to be, from the rear axle.
-
-    Attributes:
-        start_m: Its start.
-        end_m: Its end.
-        sd_m: Standard deviation of either.
-    """
-
-    start_m: float
-    end_m: float
-    sd_m: float
 
 
 @dataclass(slots=True)

@@ -14,10 +14,12 @@ from crosscue.detectors.base import Detections, Found, RoadMask
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .car_tracks import CarTracks, Place, judge
+from .car_tracks import CarTracks, judge
 from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
 from .labelled import count_labels
+from .place import Place
 from .road import RoadShares, road_fractions
+from .road_ground import ground_shares
 from .rules import counts_of
 from .tally import CueTally, cue_labels
 
@@ -157,7 +159,12 @@ class CuePass:
             }
         road = frame.road
         if isinstance(road, RoadMask):
-            road = road_fractions(road, self.vehicle.regions)
+            regions = self.vehicle.regions
+            road = (
+                ground_shares(road, self.vehicle.camera, regions, place)
+                if regions.kind == "ground"
+                else road_fractions(road, regions)
+            )
         if road is not None:
             counts |= counts_of("road", road, self.vehicle)
         found = FrameCues(counts, road)

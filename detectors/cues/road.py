@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,7 @@ class RoadShares:
     """How much of each region of interest is road (eq. 13).
 
     Attributes:
-        left: Fraction of the left region's pixels, 0 to 1.
+        left: Fraction of the left region's pixels, 0 to 1; NaN where the region is not seen.
         straight: Of the straight one.
         right: Of the right one.
     """
@@ -33,10 +35,18 @@ class RoadShares:
         return self.left > min_fraction, self.straight > min_fraction, self.right > min_fraction
 
 
-def is_road(shares: RoadShares, vehicle: Vehicle, cue: CueSpec) -> int:
-    """1 where more than the vehicle file's fraction of the cue's region is road (eq. 14)."""
-    positive = shares.positive(vehicle.cues.road_fraction)
-    return int(positive[("left", "straight", "right").index(cue.supports[0])])
+NOT_SEEN: Final = RoadShares(math.nan, math.nan, math.nan)
+
+
+def is_road(shares: RoadShares, vehicle: Vehicle, cue: CueSpec) -> int | None:
+    """1 where more than the vehicle file's fraction of the cue's region is road (eq. 14).
+
+    None where the region is not seen.
+    """
+    side = ("left", "straight", "right").index(cue.supports[0])
+    if math.isnan((shares.left, shares.straight, shares.right)[side]):
+        return None
+    return int(shares.positive(vehicle.cues.road_fraction)[side])
 
 
 @lru_cache(maxsize=64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -18,6 +19,7 @@ from .candidates import (
     NOT_FOUND_BEFORE,
     NOT_FROM_THE_SIDE,
     OTHER_MOTION,
+    REGION_NOT_SEEN,
     TOO_FEW_FRAMES,
     TOO_LITTLE_ROAD,
     Candidates,
@@ -122,6 +124,10 @@ class CueTally:
             if cue.observed_by != "road" or side not in RoadShares.__slots__:
                 continue
             share: float = getattr(shares, side)
+            if math.isnan(share):
+                unseen = self._of(cue.name, "frames", "[cues] road_share", threshold)
+                unseen.take([0.0], {REGION_NOT_SEEN: 1})
+                continue
             found = [share] if share > 0.0 else []
             low = sum(one <= threshold for one in found)
             counted = self._of(cue.name, "frames", "[cues] road_fraction", threshold)

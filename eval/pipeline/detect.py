@@ -14,6 +14,7 @@ import numpy as np
 from crosscue.detectors import rle
 from crosscue.detectors.base import Choice, Detections, RoadMask, reportable
 from crosscue.detectors.cues.frame import CuePass, FrameCues, Role, all_labels, role_of, seen
+from crosscue.detectors.cues.road import road_fractions
 from crosscue.detectors.overlay import Drawer
 from crosscue.detectors.ranging.detection_range import detection_range
 from crosscue.detectors.registry import knows_simulated_only, make
@@ -319,15 +320,19 @@ class _Tables:
             if isinstance(found, Detections):
                 self._held["detections"] += self._detection_rows(named.name, found)
         road = sorted_by_role.road
-        if cues.road is not None and isinstance(road, RoadMask):
+        if isinstance(road, RoadMask):
+            shares = cues.road
+            if shares is None or self.vehicle.regions.kind == "ground":
+                # Where the intersection is becomes known later; the mask is kept for that.
+                shares = road_fractions(road, self.vehicle.regions)
             self._held["road"].append(
                 {
                     "frame": self._frame,
                     "t_ns": result.t_ns,
                     "camera": self.camera,
-                    "fraction_left": cues.road.left,
-                    "fraction_straight": cues.road.straight,
-                    "fraction_right": cues.road.right,
+                    "fraction_left": shares.left,
+                    "fraction_straight": shares.straight,
+                    "fraction_right": shares.right,
                     "mask": road.mask,
                     "mask_width_px": road.mask_size_px[0],
                     "mask_height_px": road.mask_size_px[1],

@@ -83,8 +83,10 @@ class Marks:
         if isinstance(seen.road, RoadMask):
             for line in road_lines(seen.road):
                 self.road.add(line, ROAD)
-        self._regions(seen.road, frame.size_px)
-        if seen.objects:
+        # What is anchored to the road or followed over frames is not where these rules would be.
+        if self.vehicle.regions.kind != "ground":
+            self._regions(seen.road, frame.size_px)
+        if seen.objects and self.vehicle.cars.kind != "tracks":
             self._cars(seen.objects)
 
     def all(self) -> Iterator[Shapes]:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, ValidationError, ValidationInfo, field_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from crosscue.replay.base import MIB, VehicleError, read_at_most, toml_tree
@@ -162,16 +162,42 @@ class Camera(Section):
     z_m: Finite = 1.2
     focal_px: Positive | None = None
     center_px: tuple[Finite, Finite] | None = None
+    pitch_rad: Finite = 0.0
+    """How far its axis points below the horizon."""
+    pitch_sd_rad: NotNegative = 0.005
+    """How far that is off in a frame: a car pitches by some 0.3 degrees as it brakes."""
     depth_bits: Annotated[int, Field(ge=8, le=16)] = 16
     """How many bits of a 16-bit picture are in use; 12 for many cameras."""
 
 
 class Regions(Section):
-    """Where to look for road: polygons of (x, y) in fractions of the picture's width and height."""
+    """Where to look for road (eq. 13): in the picture, as published, or on the ground."""
 
+    kind: Literal["picture", "ground"] | None = None
+    """``picture``: the polygons below. ``ground``: rectangles on the road, anchored to the believed
+    intersection; wants ``camera.focal_px``, ``z_m`` and a range. Left out: ``ground``, but
+    ``picture`` in a simulated car's file and where a polygon is given."""
     left: Polygon = ((0.0, 0.55), (0.2, 0.55), (0.2, 0.7), (0.0, 0.7))
+    """Polygons of (x, y) in fractions of the picture's width and height."""
     straight: Polygon = ((0.44, 0.52), (0.56, 0.52), (0.6, 0.62), (0.4, 0.62))
     right: Polygon = ((0.8, 0.55), (1.0, 0.55), (1.0, 0.7), (0.8, 0.7))
+    aside_m: tuple[Positive, Positive] = (12.0, 25.0)
+    """On the ground the side roads are looked for so far to the side: beyond three lanes beside
+    the ego vehicle's, and as far as a leg is open."""
+    beyond_m: tuple[NotNegative, Positive] = (2.0, 17.0)
+    """The road straight ahead, so far beyond the intersection's end."""
+    half_width_m: Positive = 2.0
+    """And so far to either side of the ego vehicle's way."""
+    min_rows: Positive = 3.0
+    """A region that spans fewer rows of the segmentation is not seen."""
+
+    @model_validator(mode="after")
+    def _near_before_far(self) -> Self:
+        for name in ("aside_m", "beyond_m"):
+            near_m, far_m = getattr(self, name)
+            if near_m >= far_m:
+                raise PydanticCustomError("regions", f"{name}: want the nearer end first")
+        return self
 
 
 class OwnCue(Section):
@@ -309,7 +335,7 @@ class Vehicle(Section):
     start: Start = Start()
     camera: Camera = Camera()
     landmarks: Landmarks = Landmarks()
-    regions: Regions = Regions()
+    regions: Annotated[Regions, Field(validate_default=True)] = Regions()
     cues: Cues = Cues()
     cars: Annotated[Cars, Field(validate_default=True)] = Cars()
     ranges: Ranges = Ranges()
@@ -319,6 +345,16 @@ class Vehicle(Section):
     detectors: dict[str, DetectorSection] = Field(default_factory=dict)
     lost_above_m: Positive = 100.0
     """The pose counts as lost while the 2-sigma ellipse's full major axis exceeds this."""
+
+    @field_validator("regions")
+    @classmethod
+    def _kind_of_regions(cls, regions: Regions, info: ValidationInfo) -> Regions:
+        if regions.kind is not None:
+            return regions
+        is_drawn = not regions.model_fields_set.isdisjoint(("left", "straight", "right"))
+        is_simulated = info.data.get("name") == SIMULATED_CAR
+        kind = "picture" if is_drawn or is_simulated else "ground"
+        return regions.model_copy(update={"kind": kind})
 
     @field_validator("cars")
     @classmethod

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crosscue.detectors.cues.car_tracks import Place
 from crosscue.detectors.cues.frame import CuePass, Seen
+from crosscue.detectors.cues.place import Place
 from crosscue.detectors.cues.tally import CueTally, cue_labels
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.eval.pipeline.outcome import (
@@ -91,7 +91,8 @@ def estimate_scene(
         _Rows(sink, features_of(vehicle), gives_reasons(vehicle)),
     )
     restarts = _Restarts(vehicle, timeline)
-    fresh_regions = detected.settings.regions != vehicle.regions
+    regions = vehicle.regions
+    fresh_regions = regions.kind == "ground" or detected.settings.regions != regions
     for frame in stored_frames(run, detected.detectors, with_road_masks=fresh_regions):
         fresh_ns = restarts.before(frame.seen.t_ns)
         if fresh_ns is not None:

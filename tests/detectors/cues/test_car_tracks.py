@@ -17,13 +17,13 @@ from crosscue.detectors.cues.car_tracks import (
     CAR_HEIGHT_M,
     CarMotion,
     CarTracks,
-    Place,
     crossing,
     judge,
     parked,
 )
 from crosscue.detectors.cues.cars import Sides
 from crosscue.detectors.cues.frame import CuePass, Seen
+from crosscue.detectors.cues.place import Place
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Cars, Vehicle
 

@@ -1,0 +1,136 @@
+"""Road to the left, ahead and to the right of an intersection, looked for where that is in metres.
+
+The source's regions are fixed in the picture (eq. 13), so a wide road of the ego vehicle's own, or
+its own lanes far ahead, lie in the region for "right". Here a region is a rectangle on the ground,
+anchored to the intersection as believed: aside the middle half between its start and its end,
+further off than the ego vehicle's own road is wide; straight, the lane beyond its end. It
+is projected with the camera's height, pitch and intrinsics; the ground is level.
+
+A region is **not seen**, which says nothing for or against a road,
+
+* where no range is known, or the region lies at or behind the camera;
+* where its place on the ground is unsure by more than the margin to the intersection's ends, a
+  quarter of its depth: the range's standard deviation and what the camera's pitch does to a
+  distance ``D``, ``D**2 * pitch_sd_rad / z_m``;
+* where it spans fewer than ``min_rows`` rows of the segmentation, or lies half outside the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import RoadMask
+from crosscue.replay.base import Floats
+from crosscue.replay.vehicle.vehicle import Camera, Regions
+
+from .place import Place
+from .road import NOT_SEEN, RoadShares
+
+MARGIN: Final = 0.25
+"""Of the intersection's depth, left out at either end."""
+MIN_IN_PICTURE: Final = 0.5
+NEAREST_M: Final = 1.0
+"""Ahead of the camera; what is nearer is not projected."""
+
+Rectangle: TypeAlias = tuple[float, float, float, float]
+"""Nearest and furthest ahead of the rear axle, rightmost and leftmost to its left, metres."""
+
+
+def ground_shares(
+    road: RoadMask, camera: Camera, regions: Regions, place: Place | None
+) -> RoadShares:
+    """Fractions of road in regions on the ground; NaN where one is not seen.
+
+    Raises:
+        ValueError: The mask is not one.
+    """
+    if place is None or camera.focal_px is None:
+        return NOT_SEEN
+    is_road = rle.decode(road.mask, road.mask_size_px)
+    shares = [
+        _share(is_road, road, camera, regions, one, depth_m, place.sd_m)
+        for one, depth_m in rectangles(regions, place)
+    ]
+    return RoadShares(*shares)
+
+
+def rectangles(regions: Regions, place: Place) -> tuple[tuple[Rectangle, float], ...]:
+    """Left, straight and right, each with the depth of what it must lie in."""
+    depth_m = place.end_m - place.start_m
+    first, last = place.start_m + MARGIN * depth_m, place.end_m - MARGIN * depth_m
+    near_m, far_m = regions.aside_m
+    begin_m, stop_m = (place.end_m + beyond for beyond in regions.beyond_m)
+    half_m = regions.half_width_m
+    return (
+        ((first, last, near_m, far_m), depth_m),
+        ((begin_m, stop_m, -half_m, half_m), stop_m - begin_m),
+        ((first, last, -far_m, -near_m), depth_m),
+    )
+
+
+def project(points_m: Floats, camera: Camera, size_px: tuple[int, int]) -> Floats:
+    """Points on level ground in the picture.
+
+    Args:
+        points_m: Shape (N, 2): ahead of the rear axle and to the left; ahead of the camera.
+        camera: Its place, height, pitch and intrinsics.
+        size_px: Width and height of the picture.
+
+    Returns:
+        Shape (N, 2): x and y, pixels.
+    """
+    focal_px = camera.focal_px or math.nan
+    center_x, center_y = camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1])
+    ahead, left = points_m[:, 0] - camera.x_m, points_m[:, 1] - camera.y_m
+    cos, sin = math.cos(camera.pitch_rad), math.sin(camera.pitch_rad)
+    depth = ahead * cos + camera.z_m * sin
+    below = camera.z_m * cos - ahead * sin
+    return np.stack([center_x - focal_px * left / depth, center_y + focal_px * below / depth], 1)
+
+
+def _share(
+    is_road: NDArray[np.bool_],
+    road: RoadMask,
+    camera: Camera,
+    regions: Regions,
+    one: Rectangle,
+    depth_m: float,
+    place_sd_m: float,
+) -> float:
+    """Fraction of road pixels in one rectangle; NaN where it is not seen."""
+    first, last, rightmost, leftmost = one
+    away_m = 0.5 * (first + last) - camera.x_m
+    if first - camera.x_m < NEAREST_M or camera.z_m <= 0.0:
+        return math.nan
+    doubt_m = math.hypot(place_sd_m, away_m**2 * camera.pitch_sd_rad / camera.z_m)
+    if doubt_m > MARGIN * depth_m:
+        return math.nan
+    corners = np.array([(first, rightmost), (first, leftmost), (last, leftmost), (last, rightmost)])
+    scale = np.array(road.mask_size_px) / np.array(road.size_px)
+    polygon = project(corners, camera, road.size_px) * scale
+    if polygon[:2, 1].mean() - polygon[2:, 1].mean() < regions.min_rows:
+        return math.nan
+    inside = _inside(polygon, is_road.shape)
+    count = int(np.count_nonzero(inside))
+    if count < max(MIN_IN_PICTURE * _area(polygon), 1.0):
+        return math.nan
+    return float(np.count_nonzero(is_road & inside) / count)
+
+
+def _inside(polygon: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """The pixels whose centres lie in a convex polygon, shape (h, w)."""
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5
+    signs = []
+    for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        signs.append((x1 - x0) * (y - y0) - (y1 - y0) * (x - x0))
+    return np.logical_or(np.min(signs, axis=0) >= 0.0, np.max(signs, axis=0) <= 0.0)
+
+
+def _area(polygon: Floats) -> float:
+    x, y = polygon.T
+    return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
