@@ -34,6 +34,7 @@ def vehicle_text(
         mobileye_x_m=MOUNTING.x_m,
         camera_x_m=camera.x_m,
         camera_z_m=camera.z_m,
+        pitch_rad=camera.pitch_rad,
         focal_px=camera.focal,
         center_px=list(camera.centre_px),
         stop_sign=[round(stop[0] * camera.focal, 3), stop[1]],
@@ -81,6 +82,7 @@ heading_sd_rad = 0.05
 [camera]
 x_m = {camera_x_m}
 z_m = {camera_z_m}
+pitch_rad = {pitch_rad}
 focal_px = {focal_px}
 center_px = {center_px}
 

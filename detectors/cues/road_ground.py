@@ -9,10 +9,11 @@ is projected with the camera's height, pitch and intrinsics; the ground is level
 A region is **not seen**, which says nothing for or against a road,
 
 * where no range is known, or the region lies at or behind the camera;
-* where its place on the ground is unsure by more than the margin to the intersection's ends, a
-  quarter of its depth: the range's standard deviation and what the camera's pitch does to a
-  distance ``D``, ``D**2 * pitch_sd_rad / z_m``;
-* where it spans fewer than ``min_rows`` rows of the segmentation, or lies half outside the picture.
+* where its place on the ground is unsure by more than the margin to the intersection's ends: the
+  range's standard deviation and what the camera's pitch does to a distance ``D``,
+  ``D**2 * pitch_sd_rad / z_m``;
+* where it spans fewer than ``min_rows`` rows of the segmentation, or three quarters of it lie
+  outside the picture.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from .road import NOT_SEEN, RoadShares
 
 MARGIN: Final = 0.25
 """Of the intersection's depth, left out at either end."""
-MIN_IN_PICTURE: Final = 0.5
+MIN_IN_PICTURE: Final = 0.25
 NEAREST_M: Final = 1.0
 """Ahead of the camera; what is nearer is not projected."""
 
@@ -53,23 +54,23 @@ def ground_shares(
         return NOT_SEEN
     is_road = rle.decode(road.mask, road.mask_size_px)
     shares = [
-        _share(is_road, road, camera, regions, one, depth_m, place.sd_m)
-        for one, depth_m in rectangles(regions, place)
+        _share(is_road, road, camera, regions, one, margin_m, place.sd_m)
+        for one, margin_m in rectangles(regions, place)
     ]
     return RoadShares(*shares)
 
 
 def rectangles(regions: Regions, place: Place) -> tuple[tuple[Rectangle, float], ...]:
-    """Left, straight and right, each with the depth of what it must lie in."""
-    depth_m = place.end_m - place.start_m
-    first, last = place.start_m + MARGIN * depth_m, place.end_m - MARGIN * depth_m
+    """Left, straight and right, each with its margin to the intersection's ends."""
+    margin_m = MARGIN * (place.end_m - place.start_m)
+    first, last = place.start_m + margin_m, place.end_m - margin_m
     near_m, far_m = regions.aside_m
     begin_m, stop_m = (place.end_m + beyond for beyond in regions.beyond_m)
     half_m = regions.half_width_m
     return (
-        ((first, last, near_m, far_m), depth_m),
-        ((begin_m, stop_m, -half_m, half_m), stop_m - begin_m),
-        ((first, last, -far_m, -near_m), depth_m),
+        ((first, last, near_m, far_m), margin_m),
+        ((begin_m, stop_m, -half_m, half_m), regions.beyond_m[0]),
+        ((first, last, -far_m, -near_m), margin_m),
     )
 
 
@@ -99,16 +100,16 @@ def _share(
     camera: Camera,
     regions: Regions,
     one: Rectangle,
-    depth_m: float,
+    margin_m: float,
     place_sd_m: float,
 ) -> float:
     """Fraction of road pixels in one rectangle; NaN where it is not seen."""
     first, last, rightmost, leftmost = one
-    away_m = 0.5 * (first + last) - camera.x_m
-    if first - camera.x_m < NEAREST_M or camera.z_m <= 0.0:
+    away_m = first - camera.x_m
+    if away_m < NEAREST_M or camera.z_m <= 0.0:
         return math.nan
     doubt_m = math.hypot(place_sd_m, away_m**2 * camera.pitch_sd_rad / camera.z_m)
-    if doubt_m > MARGIN * depth_m:
+    if doubt_m > margin_m:
         return math.nan
     corners = np.array([(first, rightmost), (first, leftmost), (last, leftmost), (last, rightmost)])
     scale = np.array(road.mask_size_px) / np.array(road.size_px)

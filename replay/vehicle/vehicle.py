@@ -181,10 +181,10 @@ class Regions(Section):
     """Polygons of (x, y) in fractions of the picture's width and height."""
     straight: Polygon = ((0.44, 0.52), (0.56, 0.52), (0.6, 0.62), (0.4, 0.62))
     right: Polygon = ((0.8, 0.55), (1.0, 0.55), (1.0, 0.7), (0.8, 0.7))
-    aside_m: tuple[Positive, Positive] = (12.0, 25.0)
+    aside_m: tuple[Positive, Positive] = (12.0, 20.0)
     """On the ground the side roads are looked for so far to the side: beyond three lanes beside
-    the ego vehicle's, and as far as a leg is open."""
-    beyond_m: tuple[NotNegative, Positive] = (2.0, 17.0)
+    the ego vehicle's, and no further than a camera sees near by."""
+    beyond_m: tuple[Positive, Positive] = (6.0, 26.0)
     """The road straight ahead, so far beyond the intersection's end."""
     half_width_m: Positive = 2.0
     """And so far to either side of the ego vehicle's way."""

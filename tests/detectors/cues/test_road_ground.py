@@ -1,0 +1,173 @@
+"""Regions on the ground: a wide road of one's own is no side road; what is too far is not seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import RoadMask
+from crosscue.detectors.cues.candidates import REGION_NOT_SEEN
+from crosscue.detectors.cues.frame import CuePass, Seen
+from crosscue.detectors.cues.place import Place
+from crosscue.detectors.cues.road import RoadShares
+from crosscue.detectors.cues.road_ground import ground_shares, project
+from crosscue.detectors.cues.tally import CueTally
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Regions, Vehicle, parse
+
+SIZE = (1280, 720)
+MASK = (640, 360)
+CAMERA = Camera(x_m=1.7, z_m=1.5, focal_px=900.0, center_px=(640.0, 340.0), pitch_rad=0.01)
+GROUND = Regions(kind="ground")
+DEPTH_M = 16.0
+
+
+def pictured(
+    right_m: float, left_m: float, place: Place | None = None, *, legs: str = "", ahead: bool = True
+) -> RoadMask:
+    """A level road from so far right to so far left of the ego vehicle, and legs at a place."""
+    width, height = MASK
+    y, x = np.mgrid[0:height, 0:width] + 0.5
+    scale = SIZE[0] / width
+    across = (x * scale - CAMERA.center_px[0]) / CAMERA.focal_px  # type: ignore[index, operator]
+    below = (y * scale - CAMERA.center_px[1]) / CAMERA.focal_px  # type: ignore[index, operator]
+    angle = np.arctan(below) + CAMERA.pitch_rad
+    is_ground = angle > 1e-4
+    depth = CAMERA.z_m / np.tan(np.where(is_ground, angle, 1.0))
+    slant = depth * math.cos(CAMERA.pitch_rad) + CAMERA.z_m * math.sin(CAMERA.pitch_rad)
+    left = -across * slant
+    from_axle = depth + CAMERA.x_m
+    is_road = (left >= -right_m) & (left <= left_m)
+    if place is not None:
+        is_there = (from_axle >= place.start_m) & (from_axle <= place.end_m)
+        is_road &= ahead | (from_axle <= place.end_m)
+        is_road |= is_there & (left > 0.0) & ("left" in legs)
+        is_road |= is_there & (left < 0.0) & ("right" in legs)
+    mask = rle.encode(is_road & is_ground, (0, 0), MASK)
+    return RoadMask(0, SIZE, mask, MASK)
+
+
+def at(start_m: float, sd_m: float = 1.0) -> Place:
+    return Place(start_m, start_m + DEPTH_M, sd_m)
+
+
+@given(ahead_m=st.floats(3.0, 80.0), left_m=st.floats(-30.0, 30.0))
+def test_a_point_on_the_ground_is_projected_where_the_camera_sees_it(
+    ahead_m: float, left_m: float
+) -> None:
+    level = CAMERA.model_copy(update={"pitch_rad": 0.0})
+
+    ((x, y),) = project(np.array([[ahead_m + level.x_m, left_m]]), level, SIZE).tolist()
+
+    assert x == pytest.approx(640.0 - 900.0 * left_m / ahead_m)
+    assert y == pytest.approx(340.0 + 900.0 * 1.5 / ahead_m)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    start_m=st.floats(3.0, 60.0),
+    right_m=st.floats(1.5, 11.0),
+    left_m=st.floats(1.5, 11.0),
+    off_m=st.floats(-3.0, 3.0),
+)
+def test_a_wide_road_of_ones_own_never_votes_for_a_side(
+    start_m: float, right_m: float, left_m: float, off_m: float
+) -> None:
+    believed = at(start_m + off_m)
+
+    shares = ground_shares(pictured(right_m, left_m), CAMERA, GROUND, believed)
+
+    for share in (shares.left, shares.right):
+        assert math.isnan(share) or share < 0.05
+
+
+@pytest.mark.parametrize("start_m", [10.0, 16.0, 24.0])
+@pytest.mark.parametrize("legs", ["", "left", "right", "left right"])
+@pytest.mark.parametrize("off_m", [-2.0, 0.0, 2.0])
+def test_a_leg_votes_for_its_side_and_for_no_other(legs: str, start_m: float, off_m: float) -> None:
+    place = at(start_m)
+    believed = at(start_m + off_m)
+
+    shares = ground_shares(pictured(3.0, 6.0, place, legs=legs), CAMERA, GROUND, believed)
+
+    for side in ("left", "right"):
+        share = getattr(shares, side)
+        if not math.isnan(share):
+            assert share > 0.9 if side in legs else share < 0.05
+    seen = ground_shares(pictured(3.0, 6.0), CAMERA, GROUND, at(16.0))
+    assert not math.isnan(seen.left + seen.right + seen.straight)
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_straight_is_the_lane_beyond_the_intersection(ahead: bool) -> None:
+    place = at(12.0)
+
+    shares = ground_shares(pictured(3.0, 6.0, place, ahead=ahead), CAMERA, GROUND, place)
+
+    assert shares.straight == pytest.approx(float(ahead), abs=0.1)
+
+
+def test_the_mirror_image_has_mirrored_shares() -> None:
+    place = at(16.0)
+    one = ground_shares(pictured(3.0, 6.0, place, legs="left"), CAMERA, GROUND, place)
+    other = ground_shares(pictured(6.0, 3.0, place, legs="right"), CAMERA, GROUND, place)
+
+    assert (one.left, one.right) == pytest.approx((other.right, other.left), abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [None, at(-8.0), at(80.0), at(16.0, sd_m=8.0)],
+    ids=["no range", "behind", "too far", "place unsure"],
+)
+def test_what_is_not_resolved_is_not_seen(place: Place | None) -> None:
+    shares = ground_shares(pictured(3.0, 6.0), CAMERA, GROUND, place)
+
+    assert math.isnan(shares.left)
+    assert math.isnan(shares.right)
+
+
+def test_a_coarse_segmentation_sees_less_far() -> None:
+    fine = pictured(30.0, 30.0)
+    coarse = replace(fine, mask=rle.encode(np.ones((9, 16), np.bool_), (0, 0), (16, 9)),
+                     mask_size_px=(16, 9))  # fmt: skip
+
+    assert ground_shares(fine, CAMERA, GROUND, at(16.0)).left > 0.9
+    assert math.isnan(ground_shares(coarse, CAMERA, GROUND, at(16.0)).left)
+
+
+def test_a_region_that_is_not_seen_says_nothing_and_is_counted() -> None:
+    vehicle = Vehicle(version=1, camera=CAMERA)
+    tally = CueTally(vehicle)
+    cues = CuePass(vehicle, tally=tally)
+
+    unseen = cues(Seen(0, road=pictured(3.0, 6.0)))
+    seen = cues(Seen(1, road=pictured(3.0, 6.0)), None, at(16.0))
+
+    assert not any(cue.startswith("road") for cue in unseen.counts)
+    assert {cue: n for cue, n in seen.counts.items() if cue.startswith("road")} == {
+        "road_left": 0,
+        "road_straight": 1,
+        "road_right": 0,
+    }
+    assert tally.by_cue["road_left"].skipped[REGION_NOT_SEEN] == 1
+    assert isinstance(seen.road, RoadShares)
+
+
+def test_the_default_is_the_ground_unless_a_region_is_drawn_or_the_car_is_simulated() -> None:
+    drawn = "[regions]\nleft = [[0.0, 0.5], [0.2, 0.5], [0.2, 0.6]]\n"
+
+    assert parse("version = 1", "a.toml").regions.kind == "ground"
+    assert parse("version = 1\n" + drawn, "a.toml").regions.kind == "picture"
+    assert Vehicle(version=1, name=SIMULATED_CAR).regions.kind == "picture"
+
+
+def test_a_region_whose_far_end_is_nearer_is_refused() -> None:
+    with pytest.raises(VehicleError, match="aside_m: want the nearer end first"):
+        parse("version = 1\n[regions]\naside_m = [25.0, 12.0]\n", "a.toml")
