@@ -19,7 +19,7 @@ from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
 from .labelled import count_labels
 from .place import Place
 from .road import RoadShares, road_fractions
-from .road_ground import ground_shares
+from .road_ground import ground_fractions
 from .rules import counts_of
 from .tally import CueTally, cue_labels
 
@@ -161,7 +161,7 @@ class CuePass:
         if isinstance(road, RoadMask):
             regions = self.vehicle.regions
             road = (
-                ground_shares(road, self.vehicle.camera, regions, place)
+                ground_fractions(road, self.vehicle.camera, regions, place)
                 if regions.kind == "ground"
                 else road_fractions(road, regions)
             )

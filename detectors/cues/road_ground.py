@@ -42,7 +42,7 @@ Rectangle: TypeAlias = tuple[float, float, float, float]
 """Nearest and furthest ahead of the rear axle, rightmost and leftmost to its left, metres."""
 
 
-def ground_shares(
+def ground_fractions(
     road: RoadMask, camera: Camera, regions: Regions, place: Place | None
 ) -> RoadShares:
     """Fractions of road in regions on the ground; NaN where one is not seen.
@@ -126,10 +126,11 @@ def _share(
 def _inside(polygon: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """The pixels whose centres lie in a convex polygon, shape (h, w)."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5
-    signs = []
+    signs: list[Floats] = []
     for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         signs.append((x1 - x0) * (y - y0) - (y1 - y0) * (x - x0))
-    return np.logical_or(np.min(signs, axis=0) >= 0.0, np.max(signs, axis=0) <= 0.0)
+    inside: NDArray[np.bool_] = (np.min(signs, axis=0) >= 0.0) | (np.max(signs, axis=0) <= 0.0)
+    return inside
 
 
 def _area(polygon: Floats) -> float:

@@ -125,7 +125,7 @@ class CueTally:
                 continue
             share: float = getattr(shares, side)
             if math.isnan(share):
-                unseen = self._of(cue.name, "frames", "[cues] road_share", threshold)
+                unseen = self._of(cue.name, "frames", "[cues] road_fraction", threshold)
                 unseen.take([0.0], {REGION_NOT_SEEN: 1})
                 continue
             found = [share] if share > 0.0 else []

@@ -16,7 +16,7 @@ from crosscue.detectors.cues.candidates import REGION_NOT_SEEN
 from crosscue.detectors.cues.frame import CuePass, Seen
 from crosscue.detectors.cues.place import Place
 from crosscue.detectors.cues.road import RoadShares
-from crosscue.detectors.cues.road_ground import ground_shares, project
+from crosscue.detectors.cues.road_ground import ground_fractions, project
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Regions, Vehicle, parse
@@ -35,8 +35,8 @@ def pictured(
     width, height = MASK
     y, x = np.mgrid[0:height, 0:width] + 0.5
     scale = SIZE[0] / width
-    across = (x * scale - CAMERA.center_px[0]) / CAMERA.focal_px  # type: ignore[index, operator]
-    below = (y * scale - CAMERA.center_px[1]) / CAMERA.focal_px  # type: ignore[index, operator]
+    across = (x * scale - CAMERA.center_px[0]) / CAMERA.focal_px  # type: ignore[index]
+    below = (y * scale - CAMERA.center_px[1]) / CAMERA.focal_px  # type: ignore[index]
     angle = np.arctan(below) + CAMERA.pitch_rad
     is_ground = angle > 1e-4
     depth = CAMERA.z_m / np.tan(np.where(is_ground, angle, 1.0))
@@ -81,7 +81,7 @@ def test_a_wide_road_of_ones_own_never_votes_for_a_side(
 ) -> None:
     believed = at(start_m + off_m)
 
-    shares = ground_shares(pictured(right_m, left_m), CAMERA, GROUND, believed)
+    shares = ground_fractions(pictured(right_m, left_m), CAMERA, GROUND, believed)
 
     for share in (shares.left, shares.right):
         assert math.isnan(share) or share < 0.05
@@ -94,13 +94,13 @@ def test_a_leg_votes_for_its_side_and_for_no_other(legs: str, start_m: float, of
     place = at(start_m)
     believed = at(start_m + off_m)
 
-    shares = ground_shares(pictured(3.0, 6.0, place, legs=legs), CAMERA, GROUND, believed)
+    shares = ground_fractions(pictured(3.0, 6.0, place, legs=legs), CAMERA, GROUND, believed)
 
     for side in ("left", "right"):
         share = getattr(shares, side)
         if not math.isnan(share):
             assert share > 0.9 if side in legs else share < 0.05
-    seen = ground_shares(pictured(3.0, 6.0), CAMERA, GROUND, at(16.0))
+    seen = ground_fractions(pictured(3.0, 6.0), CAMERA, GROUND, at(16.0))
     assert not math.isnan(seen.left + seen.right + seen.straight)
 
 
@@ -108,15 +108,15 @@ def test_a_leg_votes_for_its_side_and_for_no_other(legs: str, start_m: float, of
 def test_straight_is_the_lane_beyond_the_intersection(ahead: bool) -> None:
     place = at(12.0)
 
-    shares = ground_shares(pictured(3.0, 6.0, place, ahead=ahead), CAMERA, GROUND, place)
+    shares = ground_fractions(pictured(3.0, 6.0, place, ahead=ahead), CAMERA, GROUND, place)
 
     assert shares.straight == pytest.approx(float(ahead), abs=0.1)
 
 
 def test_the_mirror_image_has_mirrored_shares() -> None:
     place = at(16.0)
-    one = ground_shares(pictured(3.0, 6.0, place, legs="left"), CAMERA, GROUND, place)
-    other = ground_shares(pictured(6.0, 3.0, place, legs="right"), CAMERA, GROUND, place)
+    one = ground_fractions(pictured(3.0, 6.0, place, legs="left"), CAMERA, GROUND, place)
+    other = ground_fractions(pictured(6.0, 3.0, place, legs="right"), CAMERA, GROUND, place)
 
     assert (one.left, one.right) == pytest.approx((other.right, other.left), abs=0.02)
 
@@ -127,7 +127,7 @@ def test_the_mirror_image_has_mirrored_shares() -> None:
     ids=["no range", "behind", "too far", "place unsure"],
 )
 def test_what_is_not_resolved_is_not_seen(place: Place | None) -> None:
-    shares = ground_shares(pictured(3.0, 6.0), CAMERA, GROUND, place)
+    shares = ground_fractions(pictured(3.0, 6.0), CAMERA, GROUND, place)
 
     assert math.isnan(shares.left)
     assert math.isnan(shares.right)
@@ -138,8 +138,8 @@ def test_a_coarse_segmentation_sees_less_far() -> None:
     coarse = replace(fine, mask=rle.encode(np.ones((9, 16), np.bool_), (0, 0), (16, 9)),
                      mask_size_px=(16, 9))  # fmt: skip
 
-    assert ground_shares(fine, CAMERA, GROUND, at(16.0)).left > 0.9
-    assert math.isnan(ground_shares(coarse, CAMERA, GROUND, at(16.0)).left)
+    assert ground_fractions(fine, CAMERA, GROUND, at(16.0)).left > 0.9
+    assert math.isnan(ground_fractions(coarse, CAMERA, GROUND, at(16.0)).left)
 
 
 def test_a_region_that_is_not_seen_says_nothing_and_is_counted() -> None:
