@@ -57,7 +57,7 @@ BORDER_PX: Final = 2.0
 MAX_BEARING: Final = 0.6
 """Further off the axis a car along the street is as long as one across it."""
 SIGMAS: Final = 3.0
-LEAST_NOSE: Final = 0.5
+MIN_NOSE: Final = 0.5
 """Three of four frames agree on the nose."""
 MAX_MISFIT: Final = 4.0
 """Of residuals, squared, per degree of freedom: beyond it the motion is not steady."""
@@ -354,7 +354,7 @@ def parked(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
         and car.long > settings.length_per_height * (1.0 + abs(car.bearing))
         and abs(car.right_mps) + 2.0 * car.right_sd_mps <= settings.crossing_mps
         and abs(car.ahead_mps) <= settings.crossing_mps + 2.0 * car.ahead_sd_mps
-        and abs(car.nose) >= LEAST_NOSE
+        and abs(car.nose) >= MIN_NOSE
     ]
 
 

@@ -53,11 +53,11 @@ def ground_fractions(
     if place is None or camera.focal_px is None:
         return NOT_SEEN
     is_road = rle.decode(road.mask, road.mask_size_px)
-    shares = [
-        _share(is_road, road, camera, regions, one, margin_m, place.sd_m)
+    fractions = [
+        _fraction(is_road, road, camera, regions, one, margin_m, place.sd_m)
         for one, margin_m in rectangles(regions, place)
     ]
-    return RoadShares(*shares)
+    return RoadShares(*fractions)
 
 
 def rectangles(regions: Regions, place: Place) -> tuple[tuple[Rectangle, float], ...]:
@@ -94,7 +94,7 @@ def project(points_m: Floats, camera: Camera, size_px: tuple[int, int]) -> Float
     return np.stack([center_x - focal_px * left / depth, center_y + focal_px * below / depth], 1)
 
 
-def _share(
+def _fraction(
     is_road: NDArray[np.bool_],
     road: RoadMask,
     camera: Camera,

@@ -164,8 +164,8 @@ class Camera(Section):
     center_px: tuple[Finite, Finite] | None = None
     pitch_rad: Finite = 0.0
     """How far its axis points below the horizon."""
-    pitch_sd_rad: NotNegative = 0.005
-    """How far that is off in a frame: a car pitches by some 0.3 degrees as it brakes."""
+    pitch_sd_rad: NotNegative = 0.01
+    """How far that is off in a frame: a car pitches by some half a degree as it brakes."""
     depth_bits: Annotated[int, Field(ge=8, le=16)] = 16
     """How many bits of a 16-bit picture are in use; 12 for many cameras."""
 
@@ -175,7 +175,7 @@ class Regions(Section):
 
     kind: Literal["picture", "ground"] | None = None
     """``picture``: the polygons below. ``ground``: rectangles on the road, anchored to the believed
-    intersection; wants ``camera.focal_px``, ``z_m`` and a range. Left out: ``ground``, but
+    intersection; needs ``camera.focal_px``, ``z_m`` and a range. Left out: ``ground``, but
     ``picture`` in a simulated car's file and where a polygon is given."""
     left: Polygon = ((0.0, 0.55), (0.2, 0.55), (0.2, 0.7), (0.0, 0.7))
     """Polygons of (x, y) in fractions of the picture's width and height."""
@@ -196,7 +196,7 @@ class Regions(Section):
         for name in ("aside_m", "beyond_m"):
             near_m, far_m = getattr(self, name)
             if near_m >= far_m:
-                raise PydanticCustomError("regions", f"{name}: want the nearer end first")
+                raise PydanticCustomError("regions", f"{name}: expected the nearer end first")
         return self
 
 
@@ -239,7 +239,7 @@ class Cars(Section):
 
     kind: Literal["pairs", "tracks"] | None = None
     """``pairs``: motion in the picture between two frames, as published. ``tracks``: motion on the
-    road over three frames and more, the ego vehicle's taken out; wants ``camera.focal_px`` and
+    road over three frames and more, the ego vehicle's taken out; needs ``camera.focal_px`` and
     odometry. Left out: ``pairs`` in a simulated car's file, ``tracks`` in every other."""
     labels: tuple[str, ...] = ("car",)
     score: Proportion = 0.95

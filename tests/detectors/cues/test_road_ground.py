@@ -23,7 +23,14 @@ from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Regions, Vehi
 
 SIZE = (1280, 720)
 MASK = (640, 360)
-CAMERA = Camera(x_m=1.7, z_m=1.5, focal_px=900.0, center_px=(640.0, 340.0), pitch_rad=0.01)
+CAMERA = Camera(
+    x_m=1.7,
+    z_m=1.5,
+    focal_px=900.0,
+    center_px=(640.0, 340.0),
+    pitch_rad=0.01,
+    pitch_sd_rad=0.005,
+)
 GROUND = Regions(kind="ground")
 DEPTH_M = 16.0
 
@@ -113,7 +120,7 @@ def test_straight_is_the_lane_beyond_the_intersection(ahead: bool) -> None:
     assert shares.straight == pytest.approx(float(ahead), abs=0.1)
 
 
-def test_the_mirror_image_has_mirrored_shares() -> None:
+def test_the_mirror_image_has_mirrored_fractions() -> None:
     place = at(16.0)
     one = ground_fractions(pictured(3.0, 6.0, place, legs="left"), CAMERA, GROUND, place)
     other = ground_fractions(pictured(6.0, 3.0, place, legs="right"), CAMERA, GROUND, place)
@@ -169,5 +176,5 @@ def test_the_default_is_the_ground_unless_a_region_is_drawn_or_the_car_is_simula
 
 
 def test_a_region_whose_far_end_is_nearer_is_refused() -> None:
-    with pytest.raises(VehicleError, match="aside_m: want the nearer end first"):
+    with pytest.raises(VehicleError, match="aside_m: expected the nearer end first"):
         parse("version = 1\n[regions]\naside_m = [25.0, 12.0]\n", "a.toml")
