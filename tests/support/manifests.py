@@ -19,7 +19,7 @@ from crosscue.eval.runs.manifest import (
     TimeSegments,
 )
 from crosscue.replay.time.segments import ONE_SEGMENT
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import Cars, Regions, Vehicle
 
 WHOLE_LOG = Part(start_ns=None, end_ns=None, topics=None)
 NOTHING = account([])
@@ -30,7 +30,7 @@ def _drive() -> dict[str, Any]:
         "versions": {"crosscue": "0"},
         "logs": (),
         "selection": WHOLE_LOG,
-        "settings": Vehicle(version=1),
+        "settings": Vehicle(version=1, cars=Cars(kind="pairs"), regions=Regions(kind="picture")),
         "clocks": (),
         "time": TimeSegments(segments=ONE_SEGMENT.segments, clocks=(), notices=()),
         "account": NOTHING,
