@@ -240,6 +240,10 @@ def is_wrong(cue: CueFrames) -> NDArray[np.bool_]:
     return np.asarray((cue.count > 0) & (leading == 0))
 
 
+WIDEST_BIN_M: Final = 20.0
+"""Of the usual bins of distance: the middle of the nearest one is no further off its rows."""
+
+
 def draw_range(
     judged: Sequence[RangeJudged],
     scores: Mapping[str, RangeScore],
@@ -256,7 +260,12 @@ def draw_range(
     errors = np.concatenate([np.abs(one.error_m) for one in rows])
     most = max(1.0, float(np.percentile(errors, 99.0)) * 1.15)
     far = max(10.0, max(float(one.true_m.max()) for one in rows))
-    near = min(0.0, min(float(one.true_m.min()) for one in rows))
+    nearest = min(float(one.true_m.min()) for one in rows)
+    near = min(0.0, nearest) if nearest < WIDEST_BIN_M else nearest - WIDEST_BIN_M / 2.0
+    if few:
+        # A band that fills the panel says nothing of how wide it is.
+        two_sd = np.concatenate([2.0 * np.sqrt(one.var_m2) for one in rows])
+        most = max(most, float(np.percentile(two_sd, 90.0)) * 1.15)
     above = Panel(40, 46, WIDTH - 50, 130, (far, near), (-most, most))
     below = Panel(40, above.bottom + 62, WIDTH - 50, 80, (far, near), (0.0, _max_nees(scores)))
     drawing = Drawing(

@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -288,6 +289,17 @@ def test_charts_say_in_words_what_they_show(tmp_path: Path) -> None:
         assert re.search(r"<title>.+?</title><desc>.+?</desc>", chart)
     assert "intersection exceeds 0.9 from 30 m on; left exceeds 0.9 from 20 m on" in charts[1]
     assert "bias 0.50 m, rms error 0.50 m" in charts[2]
+
+
+def test_the_claimed_interval_fits_into_the_chart_of_ranges(tmp_path: Path) -> None:
+    one = _scored(tmp_path / "drive")
+    scores = scores_of([one])
+    unsure = [replace(part, var_m2=np.full_like(part.var_m2, 100.0)) for part in one.judged.ranges]
+
+    chart = draw_range(unsure, scores.range)
+
+    assert re.search(r">-20<", chart)
+    assert not re.search(r">-20<", draw_range(one.judged.ranges, scores.range))
 
 
 @settings(max_examples=60, deadline=None)
