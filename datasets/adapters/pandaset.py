@@ -2,9 +2,9 @@
 
 ``camera/NAME/`` holds ``NN.jpg``, ``timestamps.json`` (seconds since 1970), ``poses.json``
 (position and orientation of the camera in a local frame; its axes are right, down, forward);
-``meta/gps.json`` with ``meta/timestamps.json`` one GNSS/INS row for each sweep of the lidar. Lidar,
-intrinsics and annotations are not read: as published, annotations are pickles, and a pickle runs
-code when it is read.
+``meta/gps.json`` with ``meta/timestamps.json`` one GNSS/INS row for each sweep of the lidar. Lidar
+and annotations are not read: as published, annotations are pickles, and a pickle runs code when it
+is read. Intrinsics go into ``crosscue vehicle init``.
 
 Topics: one per camera; ``odometry`` (forward speed and yaw rate of the car, from the front camera's
 poses, so it is no wheel speed and as good as the poses are); ``gnss``.
@@ -158,6 +158,24 @@ class Drive(Closing):
         streams = [camera.read(ledger, selection, self._limits) for camera in self._cameras]
         streams += [rows.read(ledger, selection) for rows in self._rows]
         yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
+
+    def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
+        """Focal length and optical center of a camera, px; None where they are not published.
+
+        Raises:
+            LogFormatError: The file is damaged.
+        """
+        file = self.path / "camera" / camera / "intrinsics.json"
+        if not file.is_file():
+            return None
+        found = _json(file)
+        try:
+            focal, x, y = (float(found[name]) for name in ("fx", "cx", "cy"))
+        except (TypeError, KeyError, ValueError):
+            raise LogFormatError(f"{file}: expected fx, cx and cy in pixels") from None
+        if not (0.0 < focal < np.inf and np.isfinite([x, y]).all()):
+            raise LogFormatError(f"{file}: fx {focal}, cx {x}, cy {y}: expected numbers of pixels")
+        return focal, x, y
 
     def report_missing(self, ledger: Ledger) -> None:
         """Pictures and rows without a time, times without them; see ``KnowsItsEnd``."""

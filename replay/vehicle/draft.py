@@ -17,12 +17,17 @@ from crosscue.replay.losses import warn_of
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.signals.converters import ANGLE_UNITS, SPEED_UNITS
 
+from .draft_camera import AFTER_CAMERA, camera_lines
 from .roles import Role, role_of
 
 if TYPE_CHECKING:
     from crosscue.replay.can.database import CanDatabase
     from crosscue.replay.can.layout import CanMessage, CanSignal
 
+REQUESTS: Final = frozenset(
+    {"REQ", "REQUEST", "REQUESTED", "CMD", "COMMAND", "TARGET", "DES", "DESIRED", "SETPOINT", "SP"}
+)
+"""Words in the name of a signal that asks for something and measures nothing."""
 FRAMES_LOOKED_AT: Final = 50_000
 WHEELS: Final = {
     "front_left": ("FL", "LF", "FRONTLEFT", "LEFTFRONT"),
@@ -94,8 +99,10 @@ def draft(logs: Sequence[Log], dbc: Sequence[Path], folder: Path) -> str:
         "# track_width_m = 1.55",
         "",
         "# [compass] is written by: crosscue fit compass LOG --vehicle THIS_FILE",
+        "",
+        *camera_lines(logs),
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines).rstrip("\n") + "\n\n" + AFTER_CAMERA
 
 
 def _topic_lines(logs: Sequence[Log]) -> Iterator[str]:
@@ -180,6 +187,7 @@ def _signal_lines(messages: Sequence[CanMessage]) -> Iterator[str]:
             for message in messages
             for signal in message.signals
             if all(word in signal.name.upper() for word in words)
+            and not _is_request(message, signal)
             and signal.unit.strip().lower() in ANGLE_UNITS
         ]
         if names:
@@ -193,10 +201,16 @@ def _wheel_candidates(messages: Sequence[CanMessage], tokens: Sequence[str]) -> 
         (("WHEEL" not in message.name.upper() and "WH" not in signal.name.upper()), message, signal)
         for message in messages
         for signal in message.signals
-        if _is_speed(signal) and _has_token(signal.name, tokens)
+        if _is_speed(signal)
+        and _has_token(signal.name, tokens)
+        and not _is_request(message, signal)
     ]
     found.sort(key=lambda item: item[0])
     return [f"{message.name}.{signal.name}" for _, message, signal in found]
+
+
+def _is_request(message: CanMessage, signal: CanSignal) -> bool:
+    return any(not REQUESTS.isdisjoint(_words(name)) for name in (message.name, signal.name))
 
 
 def _is_speed(signal: CanSignal) -> bool:
@@ -205,10 +219,14 @@ def _is_speed(signal: CanSignal) -> bool:
 
 
 def _has_token(name: str, tokens: Sequence[str]) -> bool:
-    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)
-    upper = [word.upper() for word in words]
+    upper = _words(name)
     pairs = [a + b for a, b in pairwise(upper)]
     return any(token in upper or token in pairs for token in tokens)
+
+
+def _words(name: str) -> list[str]:
+    """Of a name in capitals, in camel case or with underscores."""
+    return [word.upper() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
 
 
 def _quoted(text: str) -> str:

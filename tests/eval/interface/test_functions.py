@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 import crosscue
+from crosscue.replay.vehicle.vehicle import parse
 from support.gap_drive import Clock, write_drive
+from support.pandaset_drive import pandaset_drive
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +90,47 @@ def test_a_vehicle_file_is_drafted_and_reads_back(drive: Path, tmp_path: Path) -
     assert (tmp_path / "car.toml").read_text(encoding="utf-8") == written.text
     with pytest.raises(crosscue.OutputError, match="exists"):
         crosscue.draft_vehicle(drive, output=tmp_path / "car.toml")
+
+
+def test_a_draft_has_the_published_intrinsics_and_what_no_log_shows_as_comments(
+    tmp_path: Path,
+) -> None:
+    text = crosscue.draft_vehicle(pandaset_drive(tmp_path / "002", 4)).text
+
+    assert "focal_px = 1970  # published with the data set\ncenter_px = [970.5, 483]" in text
+    for section in ("mobileye", "regions", "ranges", "detectors.yolox-nano", "cues", "cars"):
+        assert f"# [{section}]" in text
+    # Every commented line is one of a vehicle file, once a person takes the sign away.
+    lines = [line.removeprefix("# ") for line in text.splitlines()]
+    kept = [line for line in lines if re.match(r"\[[\w.-]+\]( +#|$)|\w+ = ", line)]
+    parse("\n".join(line for line in kept if 'kind = "curve"' not in line), "uncommented")
+
+
+def test_damaged_intrinsics_are_one_line(tmp_path: Path) -> None:
+    drive = pandaset_drive(tmp_path / "002", 4)
+    (drive / "camera" / "front_camera" / "intrinsics.json").write_text('{"fx": 0, "cx": 1}')
+
+    with pytest.raises(crosscue.LogFormatError, match="expected fx, cx and cy"):
+        crosscue.draft_vehicle(drive)
+
+
+def test_a_draft_takes_intrinsics_from_a_calibration_message(tmp_path: Path) -> None:
+    files = crosscue.simulate_approach(tmp_path, "L0", width_px=64)
+    known = crosscue.load_vehicle(files.vehicle).camera
+
+    drafted = crosscue.draft_vehicle(files.log).vehicle.camera
+
+    assert drafted.focal_px == pytest.approx(known.focal_px)
+    assert drafted.center_px == pytest.approx(known.center_px)
+
+
+def test_a_draft_never_names_a_request(drive: Path, tmp_path: Path) -> None:
+    dbc = tmp_path / "car.dbc"
+    text = (drive.parent / "simulated_car.dbc").read_text()
+    dbc.write_text(text.replace("SG_ REAR_LEFT ", "SG_ REAR_LEFT_CMD "))
+
+    assert "_CMD" in dbc.read_text()
+    assert "_CMD" not in crosscue.draft_vehicle(drive, [dbc]).text
 
 
 def test_truth_is_held_against_its_log(drive: Path) -> None:

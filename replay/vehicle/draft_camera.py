@@ -1,0 +1,107 @@
+"""What a first vehicle file says of the camera, and of all that no log can show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
+
+from crosscue.replay.base import Ledger, Log, Selection, Table
+from crosscue.replay.decode import decoder_for
+from crosscue.replay.losses import warn_of
+from crosscue.replay.remote.logs import name_of
+
+from .roles import Role, role_of
+
+
+class Intrinsics(NamedTuple):
+    """Of a camera, in pixels, and where they are from."""
+
+    focal_px: float
+    center_px: tuple[float, float]
+    source: str
+
+
+@runtime_checkable
+class KnowsItsCameras(Protocol):
+    """A log whose data set publishes intrinsics beside its streams."""
+
+    def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
+        """Focal length and optical center of a camera; None where they are not published.
+
+        Raises:
+            LogFormatError: They are published and cannot be read.
+        """
+        ...
+
+
+AFTER_CAMERA: Final = """\
+# [mobileye]  # read only where its bus is named
+# bus = ""  # the topic of its CAN bus, if there is one
+# x_m = 0.0  # ahead of the rear axle: measure it
+
+# [regions]  # where the road cues look: polygons in fractions of width and height; the defaults
+# are those of the simulated camera. Draw your own on a picture of: crosscue detect LOG --draw 1
+# left = [[0.0, 0.55], [0.2, 0.55], [0.2, 0.7], [0.0, 0.7]]
+
+# [ranges]  # left out: from motion, where camera.focal_px and odometry are known
+# kind = "curve"  # after: crosscue fit ranges RUN... --truth TRUTH...
+
+# [detectors.yolox-nano]  # after: crosscue model fetch yolox-nano; others: crosscue model list
+# kind = "yolox-nano"  # a network of your own: crosscue model init NET.onnx, then card = "NET.toml"
+
+# [cues]  # thresholds of the published network; scores of another network mean something else
+# stop_sign_score = 0.9
+# traffic_light_score = 0.9
+# [cars]
+# score = 0.95
+"""
+
+
+def camera_lines(logs: Sequence[Log]) -> Iterator[str]:
+    """The section ``[camera]``; nothing for logs without one."""
+    cameras = [
+        (log, topic.name) for log in logs for topic in log.topics if role_of(topic) is Role.CAMERA
+    ]
+    if not cameras:
+        return
+    found = _intrinsics(logs, *cameras[0])
+    yield "[camera]"
+    if found is None:
+        yield "# No calibration in the log; without it there are no ranges from motion."
+        yield "# focal_px = 1000.0"
+        yield "# center_px = [640.0, 360.0]"
+    else:
+        yield f"focal_px = {found.focal_px:.10g}  # {found.source}"
+        yield f"center_px = [{found.center_px[0]:.10g}, {found.center_px[1]:.10g}]"
+    yield "# Measure these on the car: ahead of the rear axle, left of it, above the road."
+    yield from ("# x_m = 0.0", "# y_m = 0.0", "# z_m = 1.2", "")
+
+
+def _intrinsics(logs: Sequence[Log], log: Log, camera: str) -> Intrinsics | None:
+    """As the data set publishes them, or of the first calibration message."""
+    if isinstance(log, KnowsItsCameras) and (published := log.intrinsics(camera)) is not None:
+        focal, x, y = published
+        return Intrinsics(focal, (x, y), "published with the data set")
+    for other in logs:
+        for topic in other.topics:
+            if role_of(topic) is Role.CAMERA_INFO:
+                found = _of_message(other, topic.name)
+                if found is not None:
+                    return found
+    return None
+
+
+def _of_message(log: Log, name: str) -> Intrinsics | None:
+    """Of the first message of a topic; None where it is not calibrated."""
+    topic = next(topic for topic in log.topics if topic.name == name)
+    ledger = Ledger(name_of(log))
+    decode = decoder_for(topic) if topic.encoding != "columns" else None
+    for block in log.read(ledger, Selection(frozenset({name}))):
+        rows: Any = (decode(block, ledger) if decode else block).rows
+        if isinstance(rows, Table) and len(rows) and "k" in rows.columns:
+            k = [float(value) for value in rows["k"][0]]
+            warn_of(ledger)
+            is_calibrated = len(k) == 9 and all(map(math.isfinite, k)) and k[0] > 0.0
+            return Intrinsics(k[0], (k[2], k[5]), f"from {name}") if is_calibrated else None
+    return None
