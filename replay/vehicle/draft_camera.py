@@ -40,9 +40,9 @@ AFTER_CAMERA: Final = """\
 # bus = ""  # the topic of its CAN bus, if there is one
 # x_m = 0.0  # ahead of the rear axle: measure it
 
-# [regions]  # where the road cues look: polygons in fractions of width and height; the defaults
-# are those of the simulated camera. Draw your own on a picture of: crosscue detect LOG --draw 1
-# left = [[0.0, 0.55], [0.2, 0.55], [0.2, 0.7], [0.0, 0.7]]
+# [regions]  # where road is looked for: on the ground, which needs camera.focal_px, z_m and a range
+# kind = "ground"  # or "picture", with a polygon for each side drawn on a picture of:
+# crosscue detect LOG --draw 1
 
 # [ranges]  # left out: from motion, where camera.focal_px and odometry are known
 # kind = "curve"  # after: crosscue fit ranges RUN... --truth TRUTH...
@@ -74,8 +74,8 @@ def camera_lines(logs: Sequence[Log]) -> Iterator[str]:
     else:
         yield f"focal_px = {found.focal_px:.10g}  # {found.source}"
         yield f"center_px = [{found.center_px[0]:.10g}, {found.center_px[1]:.10g}]"
-    yield "# Measure these on the car: ahead of the rear axle, left of it, above the road."
-    yield from ("# x_m = 0.0", "# y_m = 0.0", "# z_m = 1.2", "")
+    yield "# Measure these on the car: ahead of the rear axle, left of it, above the road; pitch."
+    yield from ("# x_m = 0.0", "# y_m = 0.0", "# z_m = 1.2", "# pitch_rad = 0.0", "")
 
 
 def _intrinsics(logs: Sequence[Log], log: Log, camera: str) -> Intrinsics | None:
