@@ -132,6 +132,10 @@ _EXPORTS: Final = {
     "FittedMessages": "eval.interface.fits.messages",
     "fit_ranges": "eval.interface.fits.ranges",
     "FittedRanges": "eval.interface.fits.ranges",
+    "run_field_study": "eval.interface.studies",
+    "FieldResult": "eval.interface.studies",
+    "calibrate_study": "eval.interface.studies",
+    "FieldStudy": "eval.studies.town.settings",
 }
 """From a public name to its module."""
 
@@ -209,7 +213,10 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.simulate import simulate_approach as simulate_approach
     from crosscue.eval.interface.simulate import simulate_approaches as simulate_approaches
     from crosscue.eval.interface.simulate import simulate_drive as simulate_drive
+    from crosscue.eval.interface.studies import FieldResult as FieldResult
     from crosscue.eval.interface.studies import StudyResult as StudyResult
+    from crosscue.eval.interface.studies import calibrate_study as calibrate_study
+    from crosscue.eval.interface.studies import run_field_study as run_field_study
     from crosscue.eval.interface.studies import run_study as run_study
     from crosscue.eval.interface.summary import DriveSummary as DriveSummary
     from crosscue.eval.interface.tables import MergedRuns as MergedRuns
@@ -219,6 +226,7 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.truth import write_truth as write_truth
     from crosscue.eval.interface.vehicles import VehicleDraft as VehicleDraft
     from crosscue.eval.interface.vehicles import draft_vehicle as draft_vehicle
+    from crosscue.eval.studies.town.settings import FieldStudy as FieldStudy
     from crosscue.eval.studies.town.settings import LandmarkStudy as LandmarkStudy
     from crosscue.eval.studies.town.settings import RangeStudy as RangeStudy
     from crosscue.replay.errors import AccountError as AccountError

@@ -105,7 +105,7 @@ class SceneSettings:
 
 @dataclass(frozen=True, slots=True)
 class SceneFiles:
-    """What was written.
+    """The files of one simulated drive.
 
     Attributes:
         log: ``drive.mcap``.

@@ -1,13 +1,15 @@
-"""Reference pages made from the code itself: commands, settings, tables.
+"""Reference pages made from the code itself: public names, commands, settings, tables.
 
-``{crosscue-commands}`` prints the help of every command, ``{crosscue-settings} MODULE:CLASS`` every
-field of a settings file with its type, default and meaning, ``{crosscue-tables}`` every column of
-the tables in a run folder. Nothing on these pages is written by hand, so none of it can be stale.
+``{crosscue-names}`` prints every public name in a line, ``{crosscue-commands}`` the help of every
+command, ``{crosscue-settings} MODULE:CLASS`` every field of a settings file with its type, default
+and meaning, ``{crosscue-tables}`` every column of the tables in a run folder. Nothing on these
+pages is written by hand, so none of it can be stale.
 """
 
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
 import types
 import typing
@@ -50,6 +52,37 @@ def _help(command: str) -> str:
     if status:
         raise RuntimeError(f"crosscue {command} --help exits with {status}")
     return out.getvalue()
+
+
+class Names(SphinxDirective):
+    """``{crosscue-names}``: every public name with the first line of its docstring."""
+
+    def run(self) -> list[nodes.Node]:
+        """Functions, then records, then errors and warnings."""
+        import crosscue
+
+        found = {name: getattr(crosscue, name) for name in sorted(crosscue.__all__)}
+        errors = {
+            name
+            for name, one in found.items()
+            if isinstance(one, type) and issubclass(one, BaseException)
+        }
+        records = {name for name, one in found.items() if isinstance(one, type)} - errors
+        blocks: list[nodes.Node] = []
+        for title, names in (
+            ("functions", found.keys() - records - errors),
+            ("records", records),
+            ("errors", errors),
+        ):
+            rows = [(f"crosscue.{name}", first_line(found[name])) for name in sorted(names)]
+            blocks.append(_table((title, ""), rows))
+        return blocks
+
+
+def first_line(documented: object) -> str:
+    """What a public name is, without the marks of its docstring."""
+    text = (inspect.getdoc(documented) or "").partition("\n\n")[0]
+    return " ".join(text.replace("``", "").split())
 
 
 class SettingsFile(SphinxDirective):
@@ -140,7 +173,7 @@ class Tables(SphinxDirective):
 
 def _schemas() -> dict[str, pa.Schema]:
     from crosscue.eval.pipeline import detect
-    from crosscue.eval.pipeline.scene.stage import stage as scene
+    from crosscue.eval.pipeline.scene import stage as scene
     from crosscue.eval.runs.tables import measurements, pose_tables, skipped
 
     return {
@@ -171,6 +204,7 @@ def _row(cells: tuple[str, ...], *, is_head: bool = False) -> nodes.row:
 def setup(app: Sphinx) -> dict[str, object]:
     """Register the directives."""
     app.add_directive("crosscue-commands", Commands)
+    app.add_directive("crosscue-names", Names)
     app.add_directive("crosscue-settings", SettingsFile)
     app.add_directive("crosscue-tables", Tables)
     return {"parallel_read_safe": True}

@@ -224,7 +224,7 @@ def add_landmark_images(
         matcher: ``orb``, or ``module:factory``; the vehicle file's, if left out.
 
     Raises:
-        AnnotationError: The coordinates cannot be understood; with the line.
+        SchemaError: The coordinates cannot be understood; with the line.
         EmptyResultError: No picture became a landmark; the database is as it was.
     """
     describing, folder = matcher_for(vehicle_given(vehicle), matcher), Path(images)

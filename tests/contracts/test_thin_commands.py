@@ -55,13 +55,19 @@ CALLS: Final = {
     "fit messages": ("fit_messages",),
     "fit ranges": ("fit_ranges",),
     "fit signs": ("fit_signs",),
+    "study range": (
+        "run_study",
+        "calibrate_study",
+    ),
+    "study landmarks": ("run_study",),
+    "study field": ("run_field_study",),
 }
 """The public functions that a command is made of."""
 NOT_YET: Final = frozenset(
     {
         "replay", "model list", "model show", "model fetch", "model init", "model check",
         "train frames", "train mask-rcnn", "train road",
-        "study intersections", "study range", "study landmarks", "study field", "study drive",
+        "study intersections", "study drive",
         }
 )  # fmt: skip
 """Commands with logic of their own."""

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from crosscue.replay.base import UsageError, json_tree
+from crosscue.replay.base import UsageError
 
 from .options import print_json
-from .progress import Done, with_progress
 
 if TYPE_CHECKING:
+    from crosscue.eval.interface.studies import StudyResult
     from crosscue.eval.studies.town.settings import FieldStudy, LandmarkStudy, RangeStudy
-    from crosscue.eval.studies.town.whole import Made
 
 FLAGS: Final = ("drives", "seed", "range_runs", "landmark_runs", "minutes")
 
-S = TypeVar("S", "RangeStudy", "LandmarkStudy")
 AnyStudy = TypeVar("AnyStudy", "RangeStudy", "LandmarkStudy", "FieldStudy")
 
 
@@ -92,21 +89,10 @@ def workers_of(args: argparse.Namespace) -> int:
     return int(args.workers)
 
 
-def run_study(
-    args: argparse.Namespace, study: S, finish: Callable[[S, Path], Made], what: str
-) -> int:
-    """Simulate the drives, summarise and print."""
-    from crosscue.eval.studies.town.whole import PAGE, SUMMARY, drive_study
-
-    done = [0.0]
-    shares = drive_study(study, args.output, workers_of(args), args.ray, overwrite=args.overwrite)
-    for share in with_progress(shares, lambda: Done(100.0 * done[0], 100.0, "percent"), args, what):
-        done[0] = share
-    made = finish(study, args.output)
+def print_study(found: StudyResult, args: argparse.Namespace) -> None:
+    """Its tables, and where page and drives are; or its summary as JSON."""
     if args.json:
-        print_json(json_tree((args.output / SUMMARY).read_text(encoding="utf-8")))
+        print_json(found.as_dict())
     elif not args.quiet:
-        print("\n\n".join(table.as_text() for table in made.tables))
-        print("\n" + "\n".join(made.notes))
-        print(f"\npage       {args.output / PAGE}\ndrives     {args.output / 'drives.parquet'}")
-    return 0
+        print(found)
+        print(f"\npage       {found.page}\ndrives     {args.output / 'drives.parquet'}")

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import argparse
 
+import crosscue
 from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.commands.shared.progress import Done, with_progress
+from crosscue.eval.commands.shared.progress import progress_line
 from crosscue.eval.commands.shared.study import add_study_arguments, study_of, workers_of
-from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,28 +33,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Drive, replay, score, report."""
-    from crosscue.eval.studies.town.field_study import NOTES, PAGE, drive_field, finish_field
-    from crosscue.eval.studies.town.settings import FieldStudy
-
-    study = study_of(args, FieldStudy)
-    if not study.range_runs + study.landmark_runs:
-        raise UsageError("study field: no runs; give --range-runs or --landmark-runs")
-    done, runs = [0.0], []
-    shares = drive_field(study, args.output, workers_of(args), overwrite=args.overwrite)
-
-    def at() -> Done:
-        return Done(100.0 * done[0], 100.0, "percent")
-
-    for share, one in with_progress(shares, at, args, "driving and replaying"):
-        done[0] = share
-        runs.append(one)
-    tables = finish_field(study, runs, args.output)
+    study = study_of(args, crosscue.FieldStudy)
+    with progress_line(args, "driving and replaying") as line:
+        found = crosscue.run_field_study(
+            study,
+            args.output,
+            workers_of(args),
+            overwrite=args.overwrite,
+            on_percent=line.counting("percent"),
+        )
     if args.json:
-        from dataclasses import asdict
-
-        print_json([asdict(one) for one in runs])
+        print_json(found.as_dict())
     elif not args.quiet:
-        print("\n\n".join(table.as_text() for table in tables))
-        print("\n" + "\n".join(NOTES))
-        print(f"\npage       {args.output / PAGE}")
-    return 0 if all(one.is_whole for one in runs) else 3
+        print(f"{found}\n\npage       {found.page}")
+    return 0 if found.is_whole else 3

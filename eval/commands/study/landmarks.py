@@ -14,11 +14,14 @@ from __future__ import annotations
 
 import argparse
 
+import crosscue
+from crosscue.eval.commands.shared.progress import progress_line
 from crosscue.eval.commands.shared.study import (
     add_cluster_arguments,
     add_study_arguments,
-    run_study,
+    print_study,
     study_of,
+    workers_of,
 )
 
 
@@ -30,7 +33,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Drive."""
-    from crosscue.eval.studies.town.settings import LandmarkStudy
-    from crosscue.eval.studies.town.whole import finish_landmarks
-
-    return run_study(args, study_of(args, LandmarkStudy), finish_landmarks, "driving")
+    study = study_of(args, crosscue.LandmarkStudy)
+    with progress_line(args, "driving") as line:
+        found = crosscue.run_study(
+            study,
+            args.output,
+            workers_of(args),
+            ray=args.ray,
+            overwrite=args.overwrite,
+            on_percent=line.counting("percent"),
+        )
+    print_study(found, args)
+    return 0

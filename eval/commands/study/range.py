@@ -15,11 +15,13 @@ from __future__ import annotations
 
 import argparse
 
+import crosscue
 from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.progress import progress_line
 from crosscue.eval.commands.shared.study import (
     add_cluster_arguments,
     add_study_arguments,
-    run_study,
+    print_study,
     study_of,
     workers_of,
 )
@@ -39,17 +41,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Drive, or calibrate."""
-    from crosscue.eval.studies.town.settings import RangeStudy
-    from crosscue.eval.studies.town.whole import finish_range
-
-    study = study_of(args, RangeStudy)
+    study = study_of(args, crosscue.RangeStudy)
     if args.calibrate:
-        from crosscue.eval.studies.town.range_study import calibrate
-
-        interval_m = calibrate(study.drive, workers_of(args))
+        interval_m = crosscue.calibrate_study(study, workers_of(args))
         if args.json:
             print_json({"compass_interval_m": interval_m})
         else:
             print(f"[drive.sensors]\ncompass_interval_m = {interval_m:.4f}")
         return 0
-    return run_study(args, study, finish_range, "driving")
+    with progress_line(args, "driving") as line:
+        found = crosscue.run_study(
+            study,
+            args.output,
+            workers_of(args),
+            ray=args.ray,
+            overwrite=args.overwrite,
+            on_percent=line.counting("percent"),
+        )
+    print_study(found, args)
+    return 0
