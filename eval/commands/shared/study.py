@@ -6,12 +6,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
+import crosscue
 from crosscue.replay.base import UsageError
 
 from .options import print_json
 
 if TYPE_CHECKING:
-    from crosscue.eval.interface.studies import StudyResult
     from crosscue.eval.studies.town.settings import FieldStudy, LandmarkStudy, RangeStudy
 
 FLAGS: Final = ("drives", "seed", "range_runs", "landmark_runs", "minutes")
@@ -89,7 +89,7 @@ def workers_of(args: argparse.Namespace) -> int:
     return int(args.workers)
 
 
-def print_study(found: StudyResult, args: argparse.Namespace) -> None:
+def print_study(found: crosscue.StudyResult, args: argparse.Namespace) -> None:
     """Its tables, and where page and drives are; or its summary as JSON."""
     if args.json:
         print_json(found.as_dict())
