@@ -159,7 +159,8 @@ def convert(
             _copy(drive, ledger, writer, on_rows)
             # Found = written + skipped, for every topic.
             ledger.check({name: writer.kept[name] for name in ledger.accounts})
-            if not writer.written and not _refused(ledger):
+            is_read = any(account.handed_on for account in ledger.accounts.values())
+            if not writer.written and (_is_whole(ledger) or not (is_read or _refused(ledger))):
                 raise empty_result("no row to write", drive.logs, drive.selection)
         paths = drive.paths
     _read_back(path, writer)

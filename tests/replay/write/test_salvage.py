@@ -112,7 +112,8 @@ def test_a_chunk_over_max_chunk_is_refused_with_both_numbers(
 
     said = capsys.readouterr()
     text = " ".join((said.out + said.err).split())
-    assert status == 3
+    # Of a log without one chunk below the limit there is nothing to convert.
+    assert status == (3 if command == "info" else 4)
     assert "the limit is 1048" in text
 
 
