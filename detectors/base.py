@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, Self, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Floats
 
@@ -101,7 +102,11 @@ class Detections:
 
     def above(self, score: float) -> Self:
         """The detections with a score of at least ``score``, in the same order."""
-        keep = np.flatnonzero(self.scores >= score)
+        return self.taken(self.scores >= score)
+
+    def taken(self, is_taken: NDArray[np.bool_]) -> Self:
+        """The detections that shape (N,) marks, in the same order."""
+        keep = np.flatnonzero(is_taken)
         return type(self)(
             self.t_ns,
             self.size_px,
@@ -158,6 +163,11 @@ class Detector(Protocol):
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         """One result for each frame, in order; an empty one is valid."""
         ...
+
+
+def is_calibrated(detector: Detector) -> bool:
+    """Whether a detector says that its scores are probabilities (``is_calibrated = True``)."""
+    return bool(getattr(detector, "is_calibrated", False))
 
 
 def reportable(detector: Detector) -> tuple[str, ...] | None:

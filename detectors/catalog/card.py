@@ -119,6 +119,9 @@ class ModelCard(Settings):
     labels: dict[str, str] = Field(default_factory=dict)
     """What a class means to crosscue, where its own name says something else: the cues count
     "stop sign", "traffic light", "car", "truck", "bus", "one way left" and so on."""
+    is_calibrated: bool = False
+    """Its scores are probabilities: so often a detection is right. Of an object that two detectors
+    found, a calibrated score is kept before one that is not."""
     tiles: Tiles | None = None
     """Left out: the whole picture only."""
     files: tuple[WeightFile, ...] = ()

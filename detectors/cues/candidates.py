@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
+SAME_OBJECT: Final = "found by another detector with a better score"
 BELOW_SCORE: Final = "below score"
 TOO_LITTLE_ROAD: Final = "too little road"
 REGION_NOT_SEEN: Final = "region not seen: its place unknown, or too far to be resolved"

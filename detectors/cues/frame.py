@@ -42,6 +42,8 @@ class Seen:
         signs: Of detectors of one-way and do-not-enter signs; empty where none ran.
         road: Road pixels, or their shares where these are known already.
         labels: What the detectors of objects and signs can report; None for anything.
+        doubles: What was left out of ``objects`` and ``signs``, since another detector found it
+            with a better score.
     """
 
     t_ns: int
@@ -49,6 +51,7 @@ class Seen:
     signs: tuple[Detections, ...] = ()
     road: RoadMask | RoadShares | None = None
     labels: frozenset[str] | None = None
+    doubles: tuple[Detections, ...] = ()
 
     @property
     def boxes(self) -> tuple[Detections, ...]:
@@ -192,6 +195,8 @@ class CuePass:
         elif self._before is not None and frame.objects and is_any:
             again = 0 if pairs is None else len(pairs.nose)
             tally.cars(frame.objects, len(self._before), again, found.counts)
+        if frame.doubles:
+            tally.doubles(frame.doubles, found.counts)
         if found.road is not None:
             tally.road(found.road)
 

@@ -20,6 +20,7 @@ from .candidates import (
     NOT_FROM_THE_SIDE,
     OTHER_MOTION,
     REGION_NOT_SEEN,
+    SAME_OBJECT,
     TOO_FEW_FRAMES,
     TOO_LITTLE_ROAD,
     Candidates,
@@ -115,6 +116,18 @@ class CueTally:
                         ELSEWHERE: there,
                     },
                 )
+
+    def doubles(self, boxes: Sequence[Detections], counts: Mapping[str, int]) -> None:
+        """Of every cue, what another detector found with a better score.
+
+        Args:
+            boxes: What was left out.
+            counts: What came out, of all cues.
+        """
+        for name, labels in cue_labels(self.vehicle).items():
+            scores = scores_of(boxes, labels) if name in counts else []
+            if scores and name in self.by_cue:
+                self.by_cue[name].take(scores, {SAME_OBJECT: len(scores)})
 
     def road(self, shares: RoadShares) -> None:
         """Of cues that look for road in a region."""

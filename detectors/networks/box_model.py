@@ -65,6 +65,11 @@ class BoxModel:
         return tuple(map(self.card.meaning, range(len(self.output.classes))))
 
     @property
+    def is_calibrated(self) -> bool:
+        """Whether the card says that scores are probabilities."""
+        return self.card.is_calibrated
+
+    @property
     def view(self) -> View:
         """No finer than the network's input; the full size for tiles."""
         if self.card.tiles is not None:

@@ -12,9 +12,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crosscue.detectors import rle
-from crosscue.detectors.base import Choice, Detections, RoadMask, reportable
+from crosscue.detectors.base import (
+    Choice,
+    Detections,
+    Found,
+    RoadMask,
+    is_calibrated,
+    reportable,
+)
 from crosscue.detectors.cues.frame import CuePass, FrameCues, Role, all_labels, role_of, seen
 from crosscue.detectors.cues.road import road_fractions
+from crosscue.detectors.cues.same_object import KEPT, meanings, same_objects
 from crosscue.detectors.overlay import Drawer
 from crosscue.detectors.ranging.detection_range import detection_range
 from crosscue.detectors.registry import knows_simulated_only, make
@@ -34,7 +42,7 @@ from crosscue.eval.runs.manifest import (
 )
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.skipped import write_skipped
-from crosscue.replay.base import Block, Ledger, Log, Selection, VehicleError, versions
+from crosscue.replay.base import Block, Int64s, Ledger, Log, Selection, VehicleError, versions
 from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Source
@@ -267,6 +275,7 @@ class _Tables:
     _held: dict[str, list[dict[str, object]]] = field(default_factory=dict)
     _size: tuple[int, int] | None = None
     _frame: int = -1
+    _meanings: dict[str, str] = field(default_factory=dict)
     _labels: frozenset[str] | None = None
     """What the detectors that give boxes can report; known from the first frame on."""
 
@@ -297,12 +306,14 @@ class _Tables:
         self._size = result.size_px
         self._frame += 1
         if self._frame == 0:
+            self._meanings = meanings(self.vehicle)
             self._labels = all_labels(
                 reportable(named.detector)
                 for named, found in zip(self.detectors, result.found, strict=True)
                 if isinstance(found, Detections)
             )
-        sorted_by_role = seen(result.t_ns, result.found, self.is_for_signs, self._labels)
+        once, again = self._once(result.found)
+        sorted_by_role = seen(result.t_ns, once, self.is_for_signs, self._labels)
         cues = self.cues(sorted_by_role)
         self._held["frames"].append(
             {
@@ -313,12 +324,12 @@ class _Tables:
                 "height_px": result.size_px[1],
             }
         )
-        for named, found, for_signs in zip(
-            self.detectors, result.found, self.is_for_signs, strict=True
+        for number, (named, found, for_signs) in enumerate(
+            zip(self.detectors, result.found, self.is_for_signs, strict=True)
         ):
             self.roles[named.name] = role_of(found, for_signs)
             if isinstance(found, Detections):
-                self._held["detections"] += self._detection_rows(named.name, found)
+                self._held["detections"] += self._detection_rows(named.name, found, again[number])
         road = sorted_by_role.road
         if isinstance(road, RoadMask):
             shares = cues.road
@@ -355,7 +366,23 @@ class _Tables:
             self._held["cues"].append(row)
             self.cue_frames[cue] = self.cue_frames.get(cue, 0) + (count > 0)
 
-    def _detection_rows(self, name: str, found: Detections) -> list[dict[str, object]]:
+    def _once(self, found: Sequence[Found]) -> tuple[list[Found], dict[int, Int64s]]:
+        """Results without another detector's objects; and whose they are, by detector."""
+        numbers = [k for k, one in enumerate(found) if isinstance(one, Detections)]
+        boxes = [one for one in found if isinstance(one, Detections)]
+        calibrated = [is_calibrated(self.detectors[k].detector) for k in numbers]
+        same = same_objects(boxes, self._meanings, calibrated)
+        again = dict(zip(numbers, same, strict=True))
+        once = [
+            one.taken(again[k] == KEPT) if isinstance(one, Detections) else one
+            for k, one in enumerate(found)
+        ]
+        names = {k: np.where(one == KEPT, KEPT, np.take(numbers, one)) for k, one in again.items()}
+        return once, names
+
+    def _detection_rows(
+        self, name: str, found: Detections, again: Int64s
+    ) -> list[dict[str, object]]:
         rows: list[dict[str, object]] = []
         for i, label in enumerate(found.labels):
             x0, y0, x1, y1 = found.boxes_px[i].tolist()
@@ -378,6 +405,7 @@ class _Tables:
                     "mask": found.masks[i] or None,
                     "height_px": height,
                     "lens": (found.lenses[i] or None) if found.lenses else None,
+                    "same_as": None if again[i] == KEPT else self.detectors[again[i]].name,
                     "range_m": None if ranged is None else ranged.mean_m,
                     "range_sd_m": None if ranged is None else ranged.sd_m,
                     "picture_width_px": found.size_px[0],
@@ -430,6 +458,7 @@ def schemas() -> dict[str, pa.Schema]:
                 ("mask", pa.binary()),
                 ("height_px", number),
                 ("lens", text),
+                ("same_as", text),
                 ("range_m", number),
                 ("range_sd_m", number),
                 ("picture_width_px", pa.int32()),

@@ -66,7 +66,19 @@ class _Rows:
         return True
 
 
-FOUND: Final = ("detector", "label", "score", "x0", "y0", "x1", "y1", "mask", "height_px", "lens")
+FOUND: Final = (
+    "detector",
+    "label",
+    "score",
+    "x0",
+    "y0",
+    "x1",
+    "y1",
+    "mask",
+    "height_px",
+    "lens",
+    "same_as",
+)
 SHARES: Final = ("fraction_left", "fraction_straight", "fraction_right")
 MASK: Final = ("mask", "mask_width_px", "mask_height_px")
 
@@ -75,6 +87,8 @@ def stored_frames(
     run: RunFolder, detectors: Sequence[DetectorRow], *, with_road_masks: bool = False
 ) -> Iterator[StoredFrame]:
     """All frames of a run in the order they were examined; memory holds one batch of rows.
+
+    What another detector found with a better score is in ``seen.doubles``.
 
     Args:
         run: With the tables of the detect stage.
@@ -97,8 +111,9 @@ def stored_frames(
         ):
             size = (width, height)
             by_name: dict[str, list[tuple[Any, ...]]] = {}
+            again: dict[str, list[tuple[Any, ...]]] = {}
             for row in found.of(frame):
-                by_name.setdefault(row[0], []).append(row)
+                (by_name if row[10] is None else again).setdefault(row[0], []).append(row)
             shares = road.of(frame) if has_road else []
             some = tuple(_detections(t_ns, size, by_name.get(name, [])) for name in objects)
             yield StoredFrame(
@@ -108,6 +123,7 @@ def stored_frames(
                     tuple(_detections(t_ns, size, by_name.get(name, [])) for name in signs),
                     _road(t_ns, size, shares[0], with_road_masks) if shares else None,
                     labels,
+                    tuple(_detections(t_ns, size, rows) for rows in again.values()),
                 ),
                 size,
                 tuple(

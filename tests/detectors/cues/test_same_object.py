@@ -1,0 +1,111 @@
+"""An object that several detectors find counts once, with the better score."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.candidates import SAME_OBJECT
+from crosscue.detectors.cues.frame import CuePass, Seen
+from crosscue.detectors.cues.same_object import KEPT, MIN_IOU, meanings, same_objects
+from crosscue.detectors.cues.tally import CueTally
+from crosscue.detectors.ranging.object_tracks import iou
+from crosscue.replay.vehicle.vehicle import Cars, Vehicle
+
+VEHICLE = Vehicle(version=1, cars=Cars(labels=("car", "truck")))
+MEANING = meanings(VEHICLE)
+Thing = tuple[str, float, float]
+THINGS = st.lists(
+    st.tuples(
+        st.sampled_from(("car", "truck", "stop sign", "no entry", "do not enter", "dog")),
+        st.floats(0.0, 1.0),
+        st.floats(0.0, 60.0),
+    ),
+    max_size=5,
+)
+
+
+def found(*things: Thing) -> Detections:
+    """Boxes of 20 x 10 px, each with a label, a score and a left edge."""
+    boxes = np.array([(x, 5.0, x + 20.0, 15.0) for _, _, x in things]).reshape(-1, 4)
+    scores = np.array([score for _, score, _ in things], np.float64)
+    labels = tuple(label for label, _, _ in things)
+    return Detections(0, (640, 480), boxes, scores, labels, (b"",) * len(things))
+
+
+def again(*results: Detections, calibrated: tuple[bool, ...] | None = None) -> list[list[int]]:
+    flags = calibrated or (False,) * len(results)
+    return [one.tolist() for one in same_objects(results, MEANING, flags)]
+
+
+def test_the_higher_score_is_kept() -> None:
+    low, high = found(("car", 0.6, 10.0)), found(("car", 0.8, 11.0))
+
+    assert again(low, high) == [[1], [KEPT]]
+    assert again(high, low) == [[KEPT], [0]]
+
+
+def test_a_calibrated_score_is_kept_before_a_higher_one() -> None:
+    low, high = found(("car", 0.6, 10.0)), found(("car", 0.8, 11.0))
+
+    assert again(low, high, calibrated=(True, False)) == [[KEPT], [0]]
+    assert again(low, high, calibrated=(True, True)) == [[1], [KEPT]]
+
+
+def test_labels_that_one_cue_counts_mean_the_same_and_others_do_not() -> None:
+    assert again(found(("truck", 0.6, 10.0)), found(("car", 0.8, 10.0))) == [[1], [KEPT]]
+    assert again(found(("no entry", 0.6, 0.0)), found(("do not enter", 0.8, 0.0))) == [[1], [KEPT]]
+    assert again(found(("dog", 0.6, 10.0)), found(("car", 0.8, 10.0))) == [[KEPT], [KEPT]]
+    assert meanings(Vehicle(version=1)).get("truck") is None
+
+
+def test_one_detection_stands_for_one_of_each_detector() -> None:
+    pair = found(("car", 0.7, 10.0), ("car", 0.6, 14.0))
+
+    assert again(pair) == [[KEPT, KEPT]]
+    assert again(found(("car", 0.9, 12.0)), pair) == [[KEPT], [0, KEPT]]
+    assert again(found(("car", 0.9, 10.0), ("car", 0.8, 14.0)), pair) == [[KEPT, KEPT], [0, 0]]
+
+
+@given(st.lists(THINGS, min_size=1, max_size=3))
+def test_what_is_left_out_overlaps_with_what_its_detector_keeps(results: list[list[Thing]]) -> None:
+    boxes = [found(*things) for things in results]
+    same = same_objects(boxes, MEANING, (False,) * len(boxes))
+
+    for k, (one, whose) in enumerate(zip(boxes, same, strict=True)):
+        for i, other in enumerate(whose.tolist()):
+            if other == KEPT:
+                continue
+            assert other != k
+            kept = [
+                j
+                for j in range(len(boxes[other]))
+                if same[other][j] == KEPT
+                and iou(one.boxes_px[i], boxes[other].boxes_px[j]) > MIN_IOU
+                and boxes[other].scores[j] >= one.scores[i]
+            ]
+            assert kept
+
+
+@given(THINGS)
+def test_a_second_detector_that_finds_the_same_changes_nothing(things: list[Thing]) -> None:
+    one = found(*things)
+
+    first, second = same_objects((one, one), MEANING, (False, False))
+
+    assert (first == KEPT).all()
+    assert (second == 0).all()
+
+
+def test_what_is_left_out_is_counted_with_its_reason() -> None:
+    tally = CueTally(VEHICLE)
+    cues = CuePass(VEHICLE, tally=tally)
+    light, weaker = found(("traffic light", 0.95, 10.0)), found(("traffic light", 0.7, 10.0))
+
+    counts = cues(Seen(0, objects=(light, found()), doubles=(weaker,))).counts
+
+    lights = tally.by_cue["traffic_light"]
+    assert counts["traffic_light"] == lights.used == 1
+    assert (lights.seen, lights.skipped) == (2, {SAME_OBJECT: 1})
