@@ -142,8 +142,9 @@ def test_what_is_not_resolved_is_not_seen(place: Place | None) -> None:
 
 def test_a_coarse_segmentation_sees_less_far() -> None:
     fine = pictured(30.0, 30.0)
-    coarse = replace(fine, mask=rle.encode(np.ones((9, 16), np.bool_), (0, 0), (16, 9)),
-                     mask_size_px=(16, 9))  # fmt: skip
+    coarse = replace(
+        fine, mask=rle.encode(np.ones((9, 16), np.bool_), (0, 0), (16, 9)), mask_size_px=(16, 9)
+    )
 
     assert ground_fractions(fine, CAMERA, GROUND, at(16.0)).left > 0.9
     assert math.isnan(ground_fractions(coarse, CAMERA, GROUND, at(16.0)).left)
