@@ -69,7 +69,9 @@ def _by_size(
     if label not in VEHICLES:
         return None
     center_px = camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1])
-    over_ground = GroundCamera(focal_px, center_px[1], camera.z_m)
+    over_ground = GroundCamera(
+        focal_px, center_px[1], camera.z_m, camera.pitch_rad, camera.pitch_sd_rad
+    )
     return vehicle_range(y1, height_px, over_ground, VEHICLES[label])
 
 

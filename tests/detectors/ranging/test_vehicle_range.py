@@ -117,6 +117,23 @@ def test_a_fitted_curve_leaves_all_else_as_it_was() -> None:
     assert found.mean_m == pytest.approx(31.5, rel=0.05)
 
 
+def test_the_camera_s_own_pitch_is_taken_into_account() -> None:
+    level = np.array([900.0, 500.0, 980.0, edge_px(12.0)])
+    tilted = np.array([900.0, 300.0, 980.0, edge_px(12.0, pitch_rad=0.1)])
+
+    found = [
+        detection_range(vehicle(FOCAL + pitch), "bus", box, 200.0, SIZE)
+        for pitch, box in (("", level), ("pitch_rad = 0.1\n", tilted))
+    ]
+    loose = detection_range(vehicle(FOCAL + "pitch_sd_rad = 0.02\n"), "bus", level, 200.0, SIZE)
+
+    assert found[0] is not None
+    assert found[1] is not None
+    assert loose is not None
+    assert found[1].mean_m == pytest.approx(found[0].mean_m)
+    assert loose.sd_m > found[0].sd_m
+
+
 @pytest.mark.parametrize(
     ("label", "box"),
     [
