@@ -136,6 +136,8 @@ _EXPORTS: Final = {
     "FieldResult": "eval.interface.studies",
     "calibrate_study": "eval.interface.studies",
     "FieldStudy": "eval.studies.town.settings",
+    "run_study_drive": "eval.interface.study_drive",
+    "StudyDrive": "eval.interface.study_drive",
 }
 """From a public name to its module."""
 
@@ -218,6 +220,8 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.studies import calibrate_study as calibrate_study
     from crosscue.eval.interface.studies import run_field_study as run_field_study
     from crosscue.eval.interface.studies import run_study as run_study
+    from crosscue.eval.interface.study_drive import StudyDrive as StudyDrive
+    from crosscue.eval.interface.study_drive import run_study_drive as run_study_drive
     from crosscue.eval.interface.summary import DriveSummary as DriveSummary
     from crosscue.eval.interface.tables import MergedRuns as MergedRuns
     from crosscue.eval.interface.tables import decode as decode

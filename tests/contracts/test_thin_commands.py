@@ -61,16 +61,22 @@ CALLS: Final = {
     ),
     "study landmarks": ("run_study",),
     "study field": ("run_field_study",),
+    "study drive": ("run_study_drive",),
 }
 """The public functions that a command is made of."""
-NOT_YET: Final = frozenset(
-    {
-        "replay", "model list", "model show", "model fetch", "model init", "model check",
-        "train frames", "train mask-rcnn", "train road",
-        "study intersections", "study drive",
-        }
-)  # fmt: skip
-"""Commands with logic of their own."""
+NOT_YET: Final = {
+    "replay": "one drive is replay_drive; the batch over many is the command's",
+    **dict.fromkeys(
+        ("model list", "model show", "model fetch", "model init", "model check"),
+        "they call detectors.catalog, which is not public",
+    ),
+    **dict.fromkeys(
+        ("train frames", "train mask-rcnn", "train road"),
+        "they call detectors.training, which is not public",
+    ),
+    "study intersections": "it calls eval.studies.intersections, which is not public",
+}
+"""Commands with logic of their own, and where it is; no new one belongs here."""
 WITHOUT: Final = {"completion": "it is about the shell"}
 ALLOWED: Final = re.compile(r"crosscue(\.eval\.commands(\..+)?|\.replay\.(base|errors|safe_text))?")
 """What a command may import of ours: the public interface, options, errors, and safe text.
@@ -85,8 +91,9 @@ def tree_of(command: str) -> ast.Module:
 
 
 def test_every_command_is_in_one_of_the_tables() -> None:
-    assert not CALLS.keys() & (NOT_YET | WITHOUT.keys())
-    assert CALLS.keys() | NOT_YET | WITHOUT.keys() == cli.COMMANDS.keys()
+    assert len(NOT_YET) <= 10
+    assert not CALLS.keys() & (NOT_YET.keys() | WITHOUT.keys())
+    assert CALLS.keys() | NOT_YET.keys() | WITHOUT.keys() == cli.COMMANDS.keys()
 
 
 @pytest.mark.parametrize("command", CALLS)

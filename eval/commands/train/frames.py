@@ -13,10 +13,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.datasets.scenes.drive import SOURCE, SceneSettings
+from crosscue.datasets.scenes.drive import SOURCE, SceneSettings, camera_of_width
 from crosscue.datasets.scenes.export.coco import Objects
 from crosscue.datasets.scenes.export.training_frames import frames, joined
-from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, with_progress
 from crosscue.eval.commands.shared.training import check_place, learnt_layouts_of
@@ -92,7 +91,5 @@ def run(args: argparse.Namespace) -> int:
 def _settings(layout: str, args: argparse.Namespace) -> SceneSettings:
     # Conditions come in ten kinds; layout and run count up together, so each kind comes as often.
     run = int(layout[1:]) % 10 + 1
-    if not 64 <= args.width <= 3840 or args.width % 16:
-        raise UsageError(f"--width {args.width}: expected a multiple of 16 from 64 to 3840")
-    camera = Camera(width_px=args.width, height_px=args.width * 9 // 16)
+    camera = camera_of_width(args.width)
     return SceneSettings(layout=layout, run=run, seed=args.seed, camera=camera)
