@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 Int64s: TypeAlias = NDArray[np.int64]
 Bytes: TypeAlias = NDArray[np.uint8]
 Floats: TypeAlias = NDArray[np.float64]
+Flag = TypeVar("Flag", np.bool_, np.uint8)
 
 BLOCK_ROWS: Final = 65_536
 """Most rows a reader puts into one block; with ``BLOCK_BYTES`` this bounds memory."""
@@ -97,6 +98,11 @@ class Messages:
         return self.buffer.data[int(self.start[i]) : int(self.stop[i])]
 
 
+def _picked(flags: NDArray[Flag], index: NDArray[np.intp]) -> NDArray[Flag]:
+    """Flags by their index; where none is set, as is usual, they need not be looked up."""
+    return flags.take(index) if flags.any() else np.zeros(len(index), flags.dtype)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CanFrames:
     """N CAN or CAN FD frames of one bus.
@@ -144,12 +150,12 @@ class CanFrames:
             # Faster than an index: for rows of a payload fifteen times.
             return CanFrames(
                 self.arbitration_id.take(index),
-                self.is_extended.take(index),
-                self.kind.take(index),
+                _picked(self.is_extended, index),
+                _picked(self.kind, index),
                 self.length.take(index),
                 self.data.take(index, axis=0),
-                self.is_fd.take(index),
-                None if self.is_tx is None else self.is_tx.take(index),
+                _picked(self.is_fd, index),
+                None if self.is_tx is None else _picked(self.is_tx, index),
             )
         return CanFrames(
             self.arbitration_id[index],

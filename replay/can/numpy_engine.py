@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,10 @@ from crosscue.replay.columns import DATA, LENGTH_UNKNOWN, CanFrames
 
 from .extract import Words
 from .grouping import STANDARD_IDS, Columns, Grouped, Rules, Strange, Tables, words_of
+
+FEW: Final = 16
+"""Up to so many kinds of frames, finding each is quicker than sorting all: 0.11 against 0.21 ms for
+10 kinds among 58,000 frames."""
 
 
 class NumpyEngine:
@@ -48,6 +53,9 @@ class NumpyEngine:
 
     def _sort(self, number: NDArray[np.uint16]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """All frames in order of ``number``, and where each number ends."""
+        if len(self._numbers) <= FEW:
+            each = [np.flatnonzero(number == one) for one in self._numbers]
+            return np.concatenate(each), np.cumsum([len(rows) for rows in each])
         order = np.argsort(number, kind="stable")  # a radix sort on 16 bits
         return order, np.searchsorted(number.take(order), self._numbers, side="right")
 

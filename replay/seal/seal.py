@@ -94,8 +94,8 @@ class Span:
 
 def seal_path(log: Path) -> Path:
     """Where the seal of a log lies, or would lie."""
-    place = Path(os.path.abspath(log))  # noqa: PTH100  # "." has no name, and links must stay
-    return place.parent / (place.name + SUFFIX)
+    # "." has no name, and links must stay.
+    return Path(os.path.abspath(log) + SUFFIX)  # noqa: PTH100
 
 
 def files_of(log: Path) -> dict[str, Path]:
@@ -335,16 +335,18 @@ def seal_over(log: Path) -> tuple[Path, Seal] | None:
     Raises:
         LogError: The seal is damaged.
     """
-    own = seal_path(log)
-    if _is_there(own):
+    # Asked of every log that is opened: names are joined as text, which is ten times as quick.
+    place = os.path.abspath(log)  # noqa: PTH100
+    if os.path.exists(place + SUFFIX):  # noqa: PTH110
+        own = Path(place + SUFFIX)
         return own, read_seal(own)
-    place = Path(os.path.abspath(log))  # noqa: PTH100  # as in seal_path
-    for folder in place.parents[:-1]:
-        path = seal_path(folder)
-        if _is_there(path):
-            seal = read_seal(path)
-            part = _part_of(seal, log, place.relative_to(folder).as_posix())
-            return None if part is None else (path, part)
+    folder = os.path.dirname(place)  # noqa: PTH120
+    while (above := os.path.dirname(folder)) != folder:  # noqa: PTH120
+        if os.path.exists(folder + SUFFIX):  # noqa: PTH110
+            seal = read_seal(Path(folder + SUFFIX))
+            part = _part_of(seal, log, Path(place).relative_to(folder).as_posix())
+            return None if part is None else (Path(folder + SUFFIX), part)
+        folder = above
     return None
 
 
@@ -369,14 +371,6 @@ def _part_of(seal: Seal, log: Path, name: str) -> Seal | None:
     else:
         files = []
     return Seal(seal.sealed_at, {file.name: file for file in files}) if files else None
-
-
-def _is_there(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError:
-        # A log's name may be too long to have a seal.
-        return False
 
 
 class Check:
