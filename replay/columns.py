@@ -98,7 +98,7 @@ class Messages:
         return self.buffer.data[int(self.start[i]) : int(self.stop[i])]
 
 
-def _picked(flags: NDArray[Flag], index: NDArray[np.intp]) -> NDArray[Flag]:
+def _picked(flags: NDArray[Flag], index: NDArray[np.intp] | NDArray[np.bool_]) -> NDArray[Flag]:
     """Flags by their index; where none is set, as is usual, they need not be looked up."""
     return flags.take(index) if flags.any() else np.zeros(len(index), flags.dtype)
 
