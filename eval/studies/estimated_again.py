@@ -23,7 +23,8 @@ def estimate_of(run: RunFolder, vehicle: Vehicle | None = None) -> EstimateWitho
 
     def estimate(cues: frozenset[str], /) -> RunTables:
         timeline = run.drive_manifest().timeline
-        tables = scene_tables(run, vehicle, cues)
+        again = scene_tables(run, vehicle, cues)
+        tables = {name: again[name] for name in ("cues", "range", "belief")}
         frames = run.table("frames", ["t_ns", "segment", "log_t_ns"])
         return in_log_time(str(run.path), {"frames": frames, **tables}, timeline)
 
