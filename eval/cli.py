@@ -20,8 +20,10 @@ from types import FrameType
 from typing import TYPE_CHECKING, Final, NoReturn, Protocol, cast
 
 # Not from crosscue.replay.base, which needs numpy: the list of commands is printed without it.
-from crosscue.replay.base import CrosscueError, installed, one_line, visible
+from crosscue.replay.errors import CrosscueError, one_line
 from crosscue.replay.losses import losses_heard
+from crosscue.replay.safe_text import visible
+from crosscue.replay.versions import installed
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer

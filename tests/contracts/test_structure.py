@@ -57,10 +57,12 @@ def test_one_line_imports_the_ground(imports: Graph) -> None:
     """``replay.base`` hands on what all need; who needs a part alone imports that part instead."""
     base = "crosscue.replay.base"
     ground = {base, *imports[base]} - {"crosscue.replay.safe_text"}
+    # It prints the list of commands without NumPy, which base needs.
+    without = {"crosscue.eval.cli"}
     several = {
         name: sorted(found)
         for name, of in imports.items()
-        if name not in ground and len(found := of & ground) > 1
+        if name not in ground | without and len(found := of & ground) > 1
     }
 
     assert not several
