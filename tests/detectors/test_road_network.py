@@ -19,7 +19,7 @@ from crosscue.detectors.networks.road.detector import build
 from crosscue.detectors.networks.road.network import RoadNetwork, embedded_path
 from crosscue.detectors.training.road import RoadSchedule, RoadTraining, road_score
 from crosscue.eval.cli import run
-from crosscue.replay.base import Bytes, UsageError, VehicleError
+from crosscue.replay.base import Bytes, SchemaError, UsageError, VehicleError
 from crosscue.replay.vehicle.vehicle import Regions
 
 CPU = torch.device("cpu")
@@ -77,7 +77,7 @@ def test_going_on_after_an_interruption_is_as_if_there_was_none(tmp_path: Path) 
 def test_a_file_that_is_no_state_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "state").write_bytes(content)
 
-    with pytest.raises(UsageError, match="state: cannot go on"):
+    with pytest.raises(SchemaError, match="state: cannot go on"):
         RoadTraining(RoadSchedule(), CPU).resume(tmp_path / "state")
 
 
