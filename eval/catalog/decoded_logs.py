@@ -292,7 +292,7 @@ def _labelled(
     """
     import numpy as np
 
-    t_ns = np.asarray(columns["log_ns"], np.int64)
+    t_ns = np.asarray(columns["log_t_ns"], np.int64)
     log_t_ns = clock.log_times(t_ns)
     found: dict[str, NDArray[np.generic]] = {
         "t_ns": t_ns,
@@ -300,11 +300,11 @@ def _labelled(
         "log_t_ns": log_t_ns,
     }
     for name, values in columns.items():
-        if name == "log_ns":
+        if name == "log_t_ns":
             continue
         if name == "publish_ns":
             values = np.asarray(values, np.int64) - (t_ns - log_t_ns)
-        found[f"{name}_" if name in ("segment", "log_t_ns") else name] = values
+        found[f"{name}_" if name == "segment" else name] = values
     return found
 
 

@@ -271,7 +271,7 @@ class LogTopic:
     def table(self, start_s: float | None = None, end_s: float | None = None) -> pa.Table:
         """Its rows as a table, a column for each field; all of it is held in memory.
 
-        Columns ``log_ns``, ``publish_ns`` and ``header_ns`` are nanoseconds, the latter two where
+        Columns ``log_t_ns``, ``publish_ns`` and ``header_ns`` are nanoseconds, the latter two where
         every row has them. What became of every row stands in the table's metadata
         (``table.schema.metadata[b"crosscue"]``, JSON); rows that are dropped or cannot be decoded
         are warned of, too.
@@ -476,7 +476,7 @@ def _table_of(blocks: Sequence[Block], reported: Mapping[str, object]) -> pa.Tab
     import pyarrow as pa
 
     if not blocks:
-        return pa.table({"log_ns": pa.array([], pa.int64())}, metadata=_metadata(reported))
+        return pa.table({"log_t_ns": pa.array([], pa.int64())}, metadata=_metadata(reported))
     units = blocks[0].rows.units if isinstance(blocks[0].rows, Table) else {}
     arrays = {name: pa.array(values) for name, values in columns_of(blocks).items()}
     if isinstance(blocks[0].rows, CanFrames):

@@ -63,13 +63,16 @@ def read_topic(
 def columns_of(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:
     """The rows of one topic as flat columns of equal length: its times, then what it holds.
 
-    A column of vectors becomes one for each component: ``gyro.0``, ``gyro.1``.
+    A column of vectors becomes one for each component: ``gyro.0``, ``gyro.1``. A field of its own
+    called ``log_t_ns`` gets an underscore behind.
 
     Args:
         blocks: Of ``Table`` or ``CanFrames``, at least one, all with the same columns; payloads of
             CAN frames are left out.
     """
-    columns: dict[str, NDArray[np.generic]] = {"log_ns": np.concatenate([b.log_ns for b in blocks])}
+    columns: dict[str, NDArray[np.generic]] = {
+        "log_t_ns": np.concatenate([b.log_ns for b in blocks])
+    }
     for name in ("publish_ns", "header_ns"):
         parts = [part for block in blocks if (part := getattr(block, name)) is not None]
         if len(parts) == len(blocks):
@@ -78,7 +81,7 @@ def columns_of(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:
     for name in rows[0]:
         joined = np.concatenate([one[name] for one in rows])
         if joined.ndim == 1:
-            columns[name] = joined
+            columns[f"{name}_" if name == "log_t_ns" else name] = joined
             continue
         flat = joined.reshape(len(joined), -1)
         columns |= {f"{name}.{i}": flat[:, i] for i in range(flat.shape[1])}

@@ -26,7 +26,9 @@ class Stopping:
         return f"stopping by {self.number.name}"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """Stop."""
+        """Stop. A shell that started the tests in its background had the interrupt ignored."""
+        if self.number == signal.SIGINT:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.raise_signal(self.number)
         return [nothing_found(frame) for frame in frames]
 

@@ -50,7 +50,7 @@ def test_every_format_gives_tables_and_frames(name: str, tmp_path: Path) -> None
             table = topic.table()
             (reported,) = json.loads(table.schema.metadata[b"crosscue"]).values()
             assert len(table) == reported["used"] == sum(map(len, topic.batches()))
-            assert table.column_names[0] == "log_ns"
+            assert table.column_names[0] == "log_t_ns"
             rows += len(table)
     assert rows or heard
 
@@ -67,18 +67,17 @@ def test_a_table_equals_what_decode_writes(drive: DriveFiles, tmp_path: Path) ->
     assert isinstance(manifest, DecodeManifest)
     written = decoded.table(manifest.tables[name].removesuffix(".parquet"))
     # decode has the drive's time and segment in front.
-    names = ["log_ns" if one == "log_t_ns" else one for one in written.column_names[2:]]
-    written = written.drop_columns(["t_ns", "segment"]).rename_columns(names)
+    written = written.drop_columns(["t_ns", "segment"])
     assert table.replace_schema_metadata() == written.replace_schema_metadata()
 
 
 def test_a_span_is_half_open_and_parts_intersect(drive: DriveFiles) -> None:
     with crosscue.open(drive.log) as log:
         name = next(n for n in log.topics if n != "/can")
-        whole = log[name].table()["log_ns"].to_numpy()
-        zero = min(log[one].table()["log_ns"].to_numpy().min() for one in log.topics)
-        some = log[name].table(start_s=1, end_s=2)["log_ns"].to_numpy()
-        parts = log.part(end_s=2)[name].table(start_s=1)["log_ns"].to_numpy()
+        whole = log[name].table()["log_t_ns"].to_numpy()
+        zero = min(log[one].table()["log_t_ns"].to_numpy().min() for one in log.topics)
+        some = log[name].table(start_s=1, end_s=2)["log_t_ns"].to_numpy()
+        parts = log.part(end_s=2)[name].table(start_s=1)["log_t_ns"].to_numpy()
 
         inside = (whole >= zero + 1_000_000_000) & (whole < zero + 2_000_000_000)
         np.testing.assert_array_equal(some, whole[inside])
