@@ -138,6 +138,16 @@ _EXPORTS: Final = {
     "FieldStudy": "eval.studies.town.settings",
     "run_study_drive": "eval.interface.study_drive",
     "StudyDrive": "eval.interface.study_drive",
+    "models": "eval.interface.models",
+    "Models": "eval.interface.models",
+    "model": "eval.interface.models",
+    "Model": "eval.interface.models",
+    "fetch_model": "eval.interface.models",
+    "FetchedModel": "eval.interface.models",
+    "draft_card": "eval.interface.cards",
+    "CardDraft": "eval.interface.cards",
+    "check_card": "eval.interface.cards",
+    "CardCheck": "eval.interface.cards",
 }
 """From a public name to its module."""
 
@@ -162,6 +172,10 @@ if TYPE_CHECKING:
     from crosscue.eval.fit.truth_check import TruthFit as TruthFit
     from crosscue.eval.fit.truth_check import check_truth as check_truth
     from crosscue.eval.fit.truth_check import import_truth as import_truth
+    from crosscue.eval.interface.cards import CardCheck as CardCheck
+    from crosscue.eval.interface.cards import CardDraft as CardDraft
+    from crosscue.eval.interface.cards import check_card as check_card
+    from crosscue.eval.interface.cards import draft_card as draft_card
     from crosscue.eval.interface.convert import Converted as Converted
     from crosscue.eval.interface.convert import convert as convert
     from crosscue.eval.interface.demo import Demo as Demo
@@ -189,6 +203,12 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.logs import Signals as Signals
     from crosscue.eval.interface.logs import Topics as Topics
     from crosscue.eval.interface.logs import open as open  # noqa: A004
+    from crosscue.eval.interface.models import FetchedModel as FetchedModel
+    from crosscue.eval.interface.models import Model as Model
+    from crosscue.eval.interface.models import Models as Models
+    from crosscue.eval.interface.models import fetch_model as fetch_model
+    from crosscue.eval.interface.models import model as model
+    from crosscue.eval.interface.models import models as models
     from crosscue.eval.interface.plugins import plugins as plugins
     from crosscue.eval.interface.runs import Run as Run
     from crosscue.eval.interface.runs import ScoredRun as ScoredRun

@@ -71,6 +71,15 @@ def card_path(name: str) -> Path:
     return FOLDER / f"{name}.toml"
 
 
+def card_named(name: str) -> Path:
+    """A card's file, from its name, which ends in ``.toml``, or from the catalog's.
+
+    Raises:
+        UsageError: The catalog has no such model; the nearest is named.
+    """
+    return Path(name) if name.endswith(".toml") else card_path(name)
+
+
 def entry(name: str) -> ModelCard:
     """A model's card.
 

@@ -7,12 +7,10 @@ example:
 from __future__ import annotations
 
 import argparse
-from collections import Counter
 from pathlib import Path
 
-from crosscue.detectors.networks.model_detector import build
-from crosscue.eval.commands.model.shared import card_of, look
-from crosscue.eval.commands.shared.options import print_json
+import crosscue
+from crosscue.eval.commands.shared.options import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,24 +29,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check."""
-    card = card_of(args.model)
-    detector = build(card=str(card))
-    result: dict[str, object] = {"card": str(card), "identity": detector.identity}
-    if args.picture is not None:
-        output = args.output or args.picture.with_suffix(".found.jpg")
-        found = look(detector, args.picture, output)
-        result["picture"] = str(output)
-        result["found"] = None if found is None else dict(Counter(found.labels))
-    if args.json:
-        print_json(result)
-    elif not args.quiet:
-        print(f"{card}: fits its network")
-        if args.picture is not None:
-            counts = result["found"]
-            text = (
-                ", ".join(f"{n} {label}" for label, n in counts.items())
-                if isinstance(counts, dict)
-                else "road"
-            )
-            print(f"found      {text or 'nothing'}; drawn in {result['picture']}")
+    print_result(crosscue.check_card(args.model, args.picture, args.output), args)
     return 0

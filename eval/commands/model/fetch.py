@@ -12,13 +12,13 @@ example:
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
-from crosscue.detectors.catalog.fetch import Fetched, fetch
+import crosscue
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, ProgressLine, progress_line
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.transfer import Progress
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,19 +38,19 @@ def run(args: argparse.Namespace) -> int:
     """Fetch."""
     if args.given is not None and len(args.models) > 1:
         raise UsageError("--weights: one model at a time")
-    found: dict[str, list[Fetched]] = {}
+    found: dict[str, object] = {}
     for name in args.models:
         with progress_line(args, "fetching") as line:
-            found[name] = fetch(name, args.given, _megabytes(line))
+            fetched = crosscue.fetch_model(name, args.given, on_bytes=_megabytes(line))
+        found |= fetched.as_dict()
         if not args.quiet and not args.json:
-            for file in found[name]:
-                print(f"{name}: {file.path} (from {file.came_from})")
+            print(fetched)
     if args.json:
-        print_json({name: [str(file.path) for file in files] for name, files in found.items()})
+        print_json(found)
     return 0
 
 
-def _megabytes(line: ProgressLine) -> Progress:
+def _megabytes(line: ProgressLine) -> Callable[[str, int, int], None]:
     def show(file: str, done: int, of: int) -> None:
         line.at(Done(done / 1e6, of / 1e6, "MB"), file)
 

@@ -1,0 +1,272 @@
+"""Model cards of one's own networks: drafted from a model file, and checked by running it."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from crosscue.detectors.base import Detections, Detector, Frame, View
+from crosscue.detectors.catalog.draft import Draft, draft
+from crosscue.detectors.catalog.entries import card_named
+from crosscue.detectors.catalog.recognise import closed, guesses, plausible, read_interface
+from crosscue.detectors.decoders.base import Guess, Interface
+from crosscue.detectors.images import decode, read_file
+from crosscue.detectors.networks.model_detector import build
+from crosscue.detectors.overlay import picture_of
+from crosscue.replay.base import (
+    MIB,
+    Bytes,
+    LogError,
+    UsageError,
+    read_at_most,
+    write_bytes,
+    write_text,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class CardDraft:
+    """A card for a network of one's own, and what a person should look at; printed as text.
+
+    Attributes:
+        path: The card.
+        draft: Its text, the kind of its output, what is certain and what was assumed.
+        picture: The picture with what the network found in it; None without one.
+        boxes: How many it found; None without a picture, and where it finds road.
+    """
+
+    path: Path
+    draft: Draft
+    picture: Path | None = None
+    boxes: int | None = None
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue model init --json`` prints."""
+        return {
+            "card": str(self.path),
+            "kind": self.draft.kind,
+            "certain": list(self.draft.certain),
+            "assumed": list(self.draft.assumed),
+            "picture": None if self.picture is None else str(self.picture),
+        }
+
+    def __repr__(self) -> str:
+        lines = [f"{self.path}: {self.draft.kind}; the network runs with it"]
+        lines += [f"certain    {line}" for line in self.draft.certain]
+        lines += [f"assumed    {line}" for line in self.draft.assumed]
+        if self.picture is not None:
+            what = "road" if self.boxes is None else f"{self.boxes} boxes"
+            lines.append(f"picture    {what}, drawn in {self.picture}: please check it")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class CardCheck:
+    """A card that fits its network; printed as text.
+
+    Attributes:
+        path: The card.
+        identity: Of the detector: other cards, weights or versions have another.
+        picture: The picture with what the network found in it; None without one.
+        found: How many objects of each label; None without a picture, and where it finds road.
+    """
+
+    path: Path
+    identity: str
+    picture: Path | None = None
+    found: Mapping[str, int] | None = None
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue model check --json`` prints."""
+        result: dict[str, object] = {"card": str(self.path), "identity": self.identity}
+        if self.picture is not None:
+            result["picture"] = str(self.picture)
+            result["found"] = None if self.found is None else dict(self.found)
+        return result
+
+    def __repr__(self) -> str:
+        fits = f"{self.path}: fits its network"
+        if self.picture is None:
+            return fits
+        counts = self.found
+        text = "road" if counts is None else ", ".join(f"{n} {name}" for name, n in counts.items())
+        return f"{fits}\nfound      {text or 'nothing'}; drawn in {self.picture}"
+
+
+def draft_card(
+    weights: Path | str,
+    output: Path | str | None = None,
+    *,
+    kind: str | None = None,
+    class_names: Sequence[str] | Path | str | None = None,
+    size_px: tuple[int, int] | str | None = None,
+    picture: Path | str | None = None,
+    overwrite: bool = False,
+) -> CardDraft:
+    """Write a model card for a file, from what the file says of itself, and run it with the card.
+
+    Args:
+        weights: An ONNX file, or an OpenVINO ``.xml``.
+        output: The card, in the folder of the weights; their name, ``.toml``, if left out.
+        kind: Layout of its outputs, where several fit.
+        class_names: In the order of its outputs, or a file with one a line, where it has none.
+        size_px: Width and height of its input, or as text, ``1280x736``, where it allows any.
+        picture: What the network finds in it is drawn beside it, as ``.found.jpg``.
+        overwrite: Replace a card that is there.
+
+    Raises:
+        UsageError: The card exists, the file is of another kind or damaged, no layout or several
+            fit, or class names are missing.
+        VehicleError: The network does not run with the card; no card is left.
+        LogError: The picture cannot be read or decoded.
+    """
+    path = Path(weights)
+    place = path.with_suffix(".toml") if output is None else Path(output)
+    if place.exists() and not overwrite:
+        raise UsageError(f"{place}: exists; give another name or --overwrite")
+    if place.resolve().parent != path.resolve().parent:
+        raise UsageError(f"{place}: a card lies beside its weights, in {path.parent}")
+    size = _size(size_px) if isinstance(size_px, str) else size_px
+    model = read_interface(path)
+    guess = _guess(path, closed(path, model, size), kind)
+    written = draft(path, model, guess, _names(class_names), size)
+    if picture is None:
+        _try(place, written)
+        return CardDraft(place, written)
+    seen = Path(picture)
+    # What is wrong with the picture is reported before a card is written.
+    _pixels_of(seen)
+    _try(place, written)
+    found = _look(build(card=str(place)), seen, drawing := _drawing(seen))
+    return CardDraft(place, written, drawing, None if found is None else len(found))
+
+
+def check_card(
+    model: Path | str, picture: Path | str | None = None, output: Path | str | None = None
+) -> CardCheck:
+    """Check that a model card fits its network, by running it.
+
+    Args:
+        model: A name in the catalog, or a card's file name, which ends in ``.toml``.
+        picture: Run it on this JPEG, PNG or WebP file, and draw what it finds.
+        output: The drawing; beside the picture, as ``.found.jpg``, if left out.
+
+    Raises:
+        UsageError: The catalog has no such model.
+        VehicleError: Card, weights or back end do not fit one another.
+        LogError: The picture cannot be read or decoded.
+        OutputError: The drawing cannot be written.
+    """
+    card = card_named(str(model))
+    detector = build(card=str(card))
+    if picture is None:
+        return CardCheck(card, detector.identity)
+    seen = Path(picture)
+    drawing = _drawing(seen) if output is None else Path(output)
+    found = _look(detector, seen, drawing)
+    counts = None if found is None else dict(Counter(found.labels))
+    return CardCheck(card, detector.identity, drawing, counts)
+
+
+def _guess(path: Path, model: Interface, kind: str | None) -> Guess:
+    """The only layout, or the one asked for.
+
+    Raises:
+        UsageError: None or several; with what the file declares.
+    """
+    found = guesses(model)
+    if kind is not None:
+        found = [guess for guess in found if guess.settings["kind"] == kind]
+    elif len(found) > 1:
+        found = plausible(path, model, found)
+    if len(found) == 1:
+        return found[0]
+    if not found:
+        outputs = ", ".join(f"{out.name} {_shape(out.shape)}" for out in model.outputs)
+        asked = "" if kind is None else f" as {kind}"
+        raise UsageError(
+            f"{path}: outputs {outputs}: not known here{asked}; write a card by hand, "
+            "or a detector (docs: Write a detector)"
+        )
+    listed = "; ".join(f"{g.settings['kind']} ({', '.join(g.reasons)})" for g in found)
+    raise UsageError(f"{path}: may be {listed}; choose one with --kind")
+
+
+def _shape(shape: tuple[int | str | None, ...]) -> str:
+    return "x".join("?" if side is None else str(side) for side in shape)
+
+
+def _names(given: Sequence[str] | Path | str | None) -> Sequence[str]:
+    if given is None:
+        return ()
+    if not isinstance(given, Path | str):
+        return given
+    path = Path(given)
+    try:
+        content = read_at_most(path, MIB)
+        if content is None:
+            raise UsageError(f"{path}: over 1 MiB; give class names, one a line")
+        lines = content.decode("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise UsageError(f"{path}: {why}; give class names, one a line") from None
+    names = tuple(line.strip() for line in lines if line.strip())
+    if not names:
+        raise UsageError(f"{path}: no name in it; give class names, one a line")
+    return names
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+    if found is None:
+        raise UsageError(f"--size {text}: expected WxH, such as 1280x736")
+    return int(found[1]), int(found[2])
+
+
+def _drawing(picture: Path) -> Path:
+    return picture.with_suffix(".found.jpg")
+
+
+def _try(place: Path, written: Draft) -> None:
+    """Write the card once the network has run with it.
+
+    Raises:
+        VehicleError: It does not run; no card is left.
+    """
+    trial = place.with_name(f".{place.stem}.trial.toml")
+    write_text(trial, written.text)
+    try:
+        build(card=str(trial))
+        trial.replace(place)
+    finally:
+        trial.unlink(missing_ok=True)
+
+
+def _pixels_of(picture: Path) -> tuple[Bytes, tuple[int, int]]:
+    """A picture file's pixels, (H, W, 3) blue green red, and its width and height.
+
+    Raises:
+        LogError: It cannot be read or decoded.
+    """
+    try:
+        return decode(read_file(picture), View())
+    except OSError as error:
+        raise LogError(f"{picture}: {error.strerror}; give a JPEG, PNG or WebP file") from None
+    except LogError as error:
+        raise type(error)(f"{picture}: {error}") from None
+
+
+def _look(detector: Detector, picture: Path, output: Path) -> Detections | None:
+    """Run a detector over one picture and draw what it finds; None where it finds road.
+
+    Raises:
+        LogError: It cannot be read or decoded.
+        OutputError: The drawing cannot be written.
+    """
+    pixels, size = _pixels_of(picture)
+    (found,) = detector([Frame(0, "", pixels, size)])
+    write_bytes(output, picture_of(pixels, found))
+    return found if isinstance(found, Detections) else None

@@ -1,0 +1,162 @@
+"""Networks: the catalog, a model's card, and its weights brought to this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from crosscue.detectors.catalog.card import ModelCard, read_card
+from crosscue.detectors.catalog.class_names import CUE_LABELS
+from crosscue.detectors.catalog.entries import card_named, entry, names, place_of
+from crosscue.detectors.catalog.fetch import Fetched, fetch
+from crosscue.eval.interface.show import Listing
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Model:
+    """A network that a card describes; printed as ``crosscue model show`` prints it.
+
+    Attributes:
+        name: In the catalog, or the card's file name.
+        card: What it needs as input, what its output means, and what was measured.
+    """
+
+    name: str
+    card: ModelCard
+
+    @property
+    def size_mb(self) -> float:
+        """Of the weights that the publisher offers, in 10^6 bytes."""
+        return sum(file.size_bytes for file in self.card.files) / 1e6
+
+    @property
+    def is_fetched(self) -> bool:
+        """All weights that the publisher offers are on this machine."""
+        return all(place_of(self.card, file).exists() for file in self.card.files)
+
+    @property
+    def cue_labels(self) -> list[str]:
+        """Labels of its classes that a default cue counts, sorted."""
+        card = self.card
+        meant = {card.meaning(i) for i in range(len(card.output.classes))}
+        return sorted(meant & {*CUE_LABELS})
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue model show --json`` prints."""
+        return self.card.model_dump(mode="json")
+
+    def __repr__(self) -> str:
+        card, given = self.card, self.card.input
+        resizable = ", resizable" if given.is_resizable else ""
+        cues = ", ".join(self.cue_labels) or "none of its classes is counted by a default cue"
+        lines = [
+            f"{self.name}: {card.about or 'no description'}",
+            f"licence    {card.licence or 'not named'}",
+            f"source     {card.source or 'not named'}",
+            f"weights    {card.weights}, SHA-256 {card.sha256}",
+            f"input      {given.width_px} x {given.height_px}{resizable}, {given.colour}, "
+            f"{given.fit}",
+            f"output     {card.output.kind}, {len(card.output.classes)} classes",
+            f"cues       {cues}",
+        ]
+        for one in card.evidence:
+            interval = "" if one.low is None else f" ({one.low:g} to {one.high:g})"
+            result = f"{one.metric} {one.value:g}{interval}"
+            lines.append(f"measured   {result} on {one.pictures}. {one.note}")
+        if not card.evidence:
+            lines.append("measured   nothing yet")
+        return "\n".join(lines)
+
+
+class Models(Listing[Model]):
+    """Models, printed in a line each."""
+
+    head = ("name", "size_mb", "licence", "state", "about")
+
+    def cells(self, row: Model) -> tuple[str, ...]:
+        """One line."""
+        state = "fetched" if row.is_fetched else "not fetched"
+        return (row.name, f"{row.size_mb:.1f}", row.card.licence, state, row.card.about)
+
+    def as_dict(self) -> list[dict[str, object]]:
+        """What ``crosscue model list --json`` prints."""
+        return [
+            {
+                "name": one.name,
+                "about": one.card.about,
+                "kind": one.card.output.kind,
+                "licence": one.card.licence,
+                "size_mb": one.size_mb,
+                "is_fetched": one.is_fetched,
+            }
+            for one in self
+        ]
+
+    def __repr__(self) -> str:
+        return "\n".join(
+            "{:28} {:>6} MB  {:12} {:12} {}".format(*self.cells(model)) for model in self
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FetchedModel:
+    """A model's weights on this machine; printed in a line each.
+
+    Attributes:
+        name: Of the model.
+        files: Where each file is now, and where it came from.
+    """
+
+    name: str
+    files: tuple[Fetched, ...]
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue model fetch --json`` prints."""
+        return {self.name: [str(file.path) for file in self.files]}
+
+    def __repr__(self) -> str:
+        return "\n".join(f"{self.name}: {file.path} (from {file.came_from})" for file in self.files)
+
+
+def models() -> Models:
+    """The models of the catalog."""
+    return Models([Model(name, entry(name)) for name in names()])
+
+
+def model(name: Path | str) -> Model:
+    """A model: what it is, what its classes mean to the cues, what was measured.
+
+    Args:
+        name: In the catalog, or a card's file name, which ends in ``.toml``.
+
+    Raises:
+        UsageError: The catalog has no such model; the nearest is named.
+        VehicleError: The card cannot be read, or a key or value does not fit; with the line.
+    """
+    return Model(str(name), read_card(card_named(str(name))))
+
+
+def fetch_model(
+    name: str,
+    weights: Path | str | None = None,
+    *,
+    on_bytes: Callable[[str, int, int], None] = lambda file, done, of: None,
+) -> FetchedModel:
+    """Bring the weights of a model of the catalog to this machine, checked by their SHA-256.
+
+    They are kept in the user's cache, or in ``$CROSSCUE_MODELS``. They come from ``weights``, else
+    from ``$CROSSCUE_DATA``, else from ``$CROSSCUE_MODEL_MIRROR``, else from their publisher.
+
+    Args:
+        name: In the catalog.
+        weights: A file, or a folder with the files, to take them from; no network is used.
+        on_bytes: Called with a file's name, the bytes that are there, and of how many.
+
+    Raises:
+        UsageError: No such model, or ``weights`` is not there or another file.
+        CrosscueError: It cannot be had, or is not the file that the catalog means.
+        OutputError: The cache cannot be written.
+    """
+    given = None if weights is None else Path(weights)
+    return FetchedModel(name, tuple(fetch(name, given, on_bytes)))
