@@ -94,7 +94,7 @@ def check_length(path: Path) -> None:
     if is_settled and length < pages * page:
         raise LogFormatError(
             f"{path}: cut short: {length:,} of {pages * page:,} bytes; copy it again, or build it "
-            "anew with: crosscue landmarks add"
+            "again with: crosscue landmarks add"
         )
 
 

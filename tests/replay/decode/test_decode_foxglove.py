@@ -327,5 +327,5 @@ def test_json_numbers_keep_their_kind_and_missing_ones_are_nan() -> None:
 
 
 def test_a_json_schema_must_be_an_object() -> None:
-    with pytest.raises(SchemaError, match="no JSON object"):
+    with pytest.raises(SchemaError, match="not a JSON object"):
         decoder_for(Topic("/t", "made.Thing", "json", b"[1, 2", "jsonschema"))
