@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from crosscue.datasets.adapters.pandaset import FRONT, Poses, read_poses
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
-from crosscue.replay.base import Floats, write_text
+from crosscue.replay.base import Floats, json_tree, write_text
 from crosscue.replay.vehicle.vehicle import load
 
 FOLDER: Final = Path(__file__).parent / "pandaset_002"
@@ -188,9 +188,7 @@ def _ranges(poses: Poses, gone_m: Floats, camera_x_m: float) -> str:
 
 def _intrinsics(sequence: Path) -> tuple[float, float]:
     """Focal length and the column of the optical axis."""
-    import json
-
-    found = json.loads((sequence / "camera" / FRONT / "intrinsics.json").read_text("utf-8"))
+    found = json_tree((sequence / "camera" / FRONT / "intrinsics.json").read_bytes())
     return float(found["fx"]), float(found["cx"])
 
 

@@ -92,7 +92,9 @@ def test_quotes_without_end_take_no_time(text: str) -> None:
 
 def _vehicle(folder: Path) -> list[str]:
     (folder / "deep").rename(folder / "car.toml")
-    return ["decode", str(folder), "-o", str(folder / "out"), "--vehicle", str(folder / "car.toml")]
+    (folder / "can.log").write_text("(1.000000) can0 123#00\n")
+    log, car = str(folder / "can.log"), str(folder / "car.toml")
+    return ["decode", log, "-o", str(folder / "out"), "--vehicle", car]
 
 
 def _gates(folder: Path) -> list[str]:
