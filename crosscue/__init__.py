@@ -148,6 +148,10 @@ _EXPORTS: Final = {
     "CardDraft": "eval.interface.cards",
     "check_card": "eval.interface.cards",
     "CardCheck": "eval.interface.cards",
+    "find_drives": "eval.interface.batch",
+    "DriveList": "eval.batch.drive_list",
+    "replay_drives": "eval.interface.batch",
+    "ReplayedDrives": "eval.interface.batch",
 }
 """From a public name to its module."""
 
@@ -164,6 +168,7 @@ if TYPE_CHECKING:
     from crosscue.detectors.settings import Settings as Settings
     from crosscue.detectors.settings import identity_of as identity_of
     from crosscue.detectors.settings import settings_of as settings_of
+    from crosscue.eval.batch.drive_list import DriveList as DriveList
     from crosscue.eval.catalog.compare import Comparison as Comparison
     from crosscue.eval.catalog.decoded_logs import Decoded as Decoded
     from crosscue.eval.fit.sign_threshold import SignFit as SignFit
@@ -172,6 +177,9 @@ if TYPE_CHECKING:
     from crosscue.eval.fit.truth_check import TruthFit as TruthFit
     from crosscue.eval.fit.truth_check import check_truth as check_truth
     from crosscue.eval.fit.truth_check import import_truth as import_truth
+    from crosscue.eval.interface.batch import ReplayedDrives as ReplayedDrives
+    from crosscue.eval.interface.batch import find_drives as find_drives
+    from crosscue.eval.interface.batch import replay_drives as replay_drives
     from crosscue.eval.interface.cards import CardCheck as CardCheck
     from crosscue.eval.interface.cards import CardDraft as CardDraft
     from crosscue.eval.interface.cards import check_card as check_card

@@ -16,34 +16,14 @@ examples:
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from crosscue.eval.batch.drive_list import DriveInput, DriveList, drives_of
-from crosscue.eval.batch.engine import engine_of
-from crosscue.eval.batch.jobs import (
-    Done,
-    Job,
-    exit_status_of,
-    fingerprint_of,
-    run_many,
-)
-from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
+import crosscue
 from crosscue.eval.commands.shared.detectors import add_detector_arguments, cache_of, detectors_of
 from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.options import (
-    add_part_arguments,
-    print_json,
-    print_result,
-)
+from crosscue.eval.commands.shared.options import add_part_arguments, limits_of, print_result
 from crosscue.eval.commands.shared.progress import DriveLine, DrivesLine, is_shown
-from crosscue.eval.interface.runs import replay_drive
-from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.runs.folder import create
-from crosscue.eval.runs.input import files_named_in
-from crosscue.replay.base import CrosscueError, UsageError, versions, visible
-from crosscue.replay.vehicle.vehicle import Vehicle, load
+from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -97,30 +77,20 @@ def run(args: argparse.Namespace) -> int:
     """Replay; 3 when something was dropped."""
     if args.draw < 0:
         raise UsageError(f"--draw {args.draw}: expected 0 or more")
-    drives = drives_of(args.logs, each=args.each)
-    if drives.is_many:
-        return _run_many(args, drives)
+    found = crosscue.find_drives(*args.logs, each=args.each)
+    if found.is_many:
+        return _run_many(args, found)
     if args.workers is not None or args.ray is not None:
         raise UsageError("--workers, --ray: for many drives; this is one (--each makes it many)")
-    with DriveLine("replaying", is_shown=is_shown(args)) as line:
-        outcome = _replay(drives.drives[0], args.output, args, line)
-    print_result(outcome, args)
-    return outcome.exit_status
-
-
-def _vehicle(path: Path | None, own: Path | None) -> Vehicle:
-    found = path or own
-    return Vehicle(version=1) if found is None else load(found)
-
-
-def _replay(
-    drive: DriveInput | Job, output: Path, args: argparse.Namespace, line: DriveLine
-) -> Outcome:
-    with open_part(args, drive.logs) as log:
-        run = replay_drive(
+    (drive,) = found.drives
+    with (
+        DriveLine("replaying", is_shown=is_shown(args)) as line,
+        open_part(args, drive.logs) as log,
+    ):
+        run = crosscue.replay_drive(
             log,
-            output,
-            _vehicle(args.vehicle, drive.vehicle),
+            args.output,
+            args.vehicle or drive.vehicle or crosscue.Vehicle(version=1),
             detectors_of(args),
             landmarks=args.landmarks,
             cache=cache_of(args),
@@ -130,102 +100,29 @@ def _replay(
             on_frames=line.at_frame,
             on_time=line.at_time,
         )
-    assert isinstance(run.outcome, Outcome)
-    return run.outcome
+    print_result(run.made, args)
+    return run.made.exit_status
 
 
-@dataclass(frozen=True, slots=True)
-class _Work:
-    """One of many drives, here or in another process."""
-
-    args: argparse.Namespace
-
-    def __call__(self, job: Job) -> Outcome:
-        # Whether a folder may be replaced was decided before the drive was handed out.
-        args = argparse.Namespace(**{**vars(self.args), "overwrite": True})
-        return _replay(job, job.run, args, DriveLine("", is_shown=False))
-
-
-def _run_many(args: argparse.Namespace, drives: DriveList) -> int:
-    engine = engine_of(args.workers, args.ray)
-    jobs = [
-        Job(
-            drive.name,
-            drive.logs,
-            args.output / drive.name,
-            _fingerprint(args, drive),
-            drive.vehicle,
-            drive.truth,
-        )
-        for drive in drives.drives
-    ]
+def _run_many(args: argparse.Namespace, found: crosscue.DriveList) -> int:
     with DrivesLine("replaying", is_shown=is_shown(args)) as line:
-        done = run_many(jobs, _Work(args), engine, overwrite=args.overwrite, on_progress=line)
-    line.end()
-    status = exit_status_of(done)
-    where, why = str(args.output / FOLDER), None
-    try:
-        _merge(done, args.output)
-    except CrosscueError as error:
-        # The drives are done, and that must be reported, whatever became of their common table.
-        status, why = status or 3, str(error)
-    if args.json:
-        reported = [_drive_as_json(one) for one in done]
-        print_json({"drives": reported, "merged": where, "not_merged": why})
-    elif not args.quiet:
-        tables = where if why is None else f"not merged: {why}"
-        print("\n".join([*_drive_lines(done), f"tables   {visible(tables)}"]))
-    return status
-
-
-def _merge(done: Sequence[Done[Outcome]], output: Path) -> None:
-    """One table of all runs in the folder, those of earlier batches too."""
-    runs, failures = gathered([output])
-    ended = {one.job.name: one.error for one in done}
-    # A drive that failed now has no run, though an earlier start may have left one that was cut.
-    runs = {name: run for name, run in runs.items() if ended.get(name) is None}
-    failed = {name: why for name, why in ended.items() if why is not None}
-    merge_runs(runs, create(output / FOLDER, overwrite=True), {**failures, **failed})
-
-
-def _fingerprint(args: argparse.Namespace, drive: DriveInput) -> str:
-    """Of everything that decides a drive's run besides its logs."""
-    flags = {
-        name: None if getattr(args, name) is None else str(getattr(args, name))
-        for name in ("detectors", "draw", "start", "end", "topics")
-    }
-    flags["landmarks"] = None if args.landmarks is None else str(args.landmarks.resolve())
-    try:
-        settings: object = _vehicle(args.vehicle, drive.vehicle).model_dump(mode="json")
-    except CrosscueError as error:
-        # This drive's own attempt reports it; the others must not suffer.
-        settings = str(error)
-    return fingerprint_of(settings, flags, versions(), files_named_in([settings, flags]))
-
-
-def _drive_lines(done: Sequence[Done[Outcome]]) -> list[str]:
-    lines = []
-    for one in done:
-        if one.error is not None:
-            lines.append(f"failed   {one.job.name}: {one.error}")
-        elif one.is_earlier:
-            lines.append(f"earlier  {one.job.name}: done before, kept")
-        else:
-            lost = "" if not one.exit_status else ", with losses"
-            lines.append(f"done     {one.job.name}: {one.seconds:.1f} s{lost}")
-    failed = sum(one.error is not None for one in done)
-    lines.append(f"drives   {len(done) - failed} of {len(done)}, {failed} failed")
-    return [visible(line) for line in lines]
-
-
-def _drive_as_json(one: Done[Outcome]) -> dict[str, object]:
-    return {
-        "name": one.job.name,
-        "run": str(one.job.run),
-        "exit_status": one.exit_status,
-        "error": one.error,
-        "earlier": one.is_earlier,
-        "attempts": one.attempts,
-        "seconds": one.seconds,
-        "result": None if one.result is None else one.result.as_dict(),
-    }
+        done = crosscue.replay_drives(
+            found,
+            args.output,
+            args.vehicle,
+            detectors_of(args),
+            start=args.start,
+            end=args.end,
+            topics=args.topics,
+            limits=limits_of(args),
+            landmarks=args.landmarks,
+            cache=cache_of(args),
+            draw=args.draw,
+            workers=args.workers,
+            ray=args.ray,
+            overwrite=args.overwrite,
+            resume=args.resume,
+            on_progress=line,
+        )
+    print_result(done, args)
+    return done.exit_status

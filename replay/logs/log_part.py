@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 
 from crosscue.replay.base import Ledger, Log, MissingTopicError, Selection, UsageError
@@ -40,6 +41,47 @@ def part_of(
         None if value is None else begin_ns + round(value * 1e9) for value in (start_s, end_s)
     )
     return Selection(wanted, start_ns, end_ns)
+
+
+def part_in_words(
+    logs: Sequence[Log], start: str | None, end: str | None, topics: Iterable[str] | None
+) -> Selection:
+    """The part that ``--from``, ``--to`` and ``--topics`` ask for.
+
+    Args:
+        logs: Of one drive; seconds count from the first row of the earliest.
+        start: Seconds, ``12.5``, or absolute nanoseconds, ``17...ns``; None for the beginning.
+        end: Likewise, no longer wanted; None for the end.
+        topics: Names; None or none for all.
+
+    Raises:
+        UsageError: A time that cannot be read, or an empty span.
+        MissingTopicError: No log has a topic of that name, or no log has a row.
+    """
+    wanted = named_topics(logs, topics, "--topics") if topics else None
+    if start is None and end is None:
+        return Selection(wanted)
+    start_ns = _time_ns("--from", start, logs)
+    end_ns = _time_ns("--to", end, logs)
+    if start_ns is not None and end_ns is not None and end_ns <= start_ns:
+        raise UsageError(f"--to {end}: not after --from {start}; give a later time")
+    return Selection(wanted, start_ns, end_ns)
+
+
+def _time_ns(flag: str, text: str | None, logs: Sequence[Log]) -> int | None:
+    if text is None:
+        return None
+    if re.fullmatch(r"-?\d+ns", text):
+        return int(text[:-2])
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise UsageError(
+            f"{flag} {text}: expected seconds after the start (12.5) or absolute time (17...ns)"
+        )
+    return first_ns(logs) + round(seconds * 1e9)
 
 
 def named_topics(logs: Sequence[Log], names: Iterable[str], flag: str) -> frozenset[str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import crosscue
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.cli import run
@@ -77,3 +78,27 @@ def test_a_drive_folder_brings_its_vehicle_file(drives: Path, tmp_path: Path) ->
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     assert manifest["settings"]["can"]["dbc"]
     assert manifest["pose"]["rows"] > 1000
+
+
+def test_python_replays_many_drives_as_the_command_does(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "runs"
+    reported: list[int] = []
+
+    done = crosscue.replay_drives(
+        [drives / "monday", drives / "broken"],
+        out,
+        end=2.0,
+        on_progress=lambda at: reported.append(at.done),
+    )
+
+    assert [one.error is None for one in done.drives] == [True, False]
+    assert done.exit_status == 3
+    assert reported[-1] == 2
+    assert "drives   1 of 2, 1 failed" in repr(done)
+    assert done.merged == out / "merged"
+    assert crosscue.find_drives(drives).is_many
+    pattern = str(drives / "monday" / "*.mcap")
+    assert run(["replay", pattern, "-o", str(out), "--to", "2.0", "--json"]) == 0
+    assert [one["earlier"] for one in json.loads(capsys.readouterr().out)["drives"]] == [True]
