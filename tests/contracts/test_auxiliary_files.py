@@ -239,7 +239,10 @@ def test_a_file_that_an_option_names(
     names: dict[str, Path],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    # Weights that the user fetched before would be taken, and the file not looked at.
+    monkeypatch.setenv("CROSSCUE_MODELS", str(tmp_path / "models"))
     command, (line, wanted) = case[0], CASES[case]
     DAMAGE[damage](tmp_path / ("gone" + line.partition("{gone}")[2].partition(" ")[0]))
     if damage == "a folder" and case in FOLDERS:
