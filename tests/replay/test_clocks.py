@@ -157,6 +157,7 @@ def test_more_gaps_than_are_kept_are_still_counted() -> None:
     assert log.gaps == 6000 - 1
 
 
+@pytest.mark.slow
 @quick
 @given(
     rows=st.lists(st.integers(1, 180), unique=True, max_size=20),
@@ -172,6 +173,7 @@ def test_duplicates_are_counted_exactly(rows: list[int], repeats: int, rows_per_
     assert log_of(repeated, rows_per_block).duplicates == repeats * len(rows)
 
 
+@pytest.mark.slow
 @quick
 @given(
     stretches=st.dictionaries(
@@ -200,6 +202,7 @@ def test_late_rows_are_counted_exactly_and_make_no_gaps(
     assert log.longest_step_ns == 10 * MS
 
 
+@pytest.mark.slow
 @quick
 @given(
     rows=st.lists(st.integers(0, 8), unique=True, max_size=5),

@@ -22,6 +22,7 @@ for _ in range(3):
 """
 
 
+@pytest.mark.slow
 def test_a_process_that_has_read_a_table_ends_well(tmp_path: Path) -> None:
     # Read through one of Python's files, 26 processes of 60 were aborted at their end.
     columns = {f"column_{i}": np.arange(2000.0) for i in range(30)}

@@ -173,6 +173,7 @@ def _simulate(folder: Path) -> list[str]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [_convert, _simulate])
 def test_killed_anywhere_the_next_start_leaves_no_half_file(
     tmp_path: Path, command: Callable[[Path], list[str]]

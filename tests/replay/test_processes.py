@@ -22,6 +22,7 @@ def fail_at_two(number: int) -> int:
     return number
 
 
+@pytest.mark.slow
 def test_results_come_in_order_from_other_processes() -> None:
     found = list(in_processes(slow_square, range(6), 2))
 

@@ -163,6 +163,7 @@ def test_a_log_that_grows_while_fetched_is_refused(
         fetch(url)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("url", "said"),
     [

@@ -126,6 +126,7 @@ def test_a_part_of_a_log_at_a_url_costs_its_chunks(
     assert not list((tmp_path / "store").glob("*/log"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["info", "convert", "decode", "replay", "detect"])
 def test_a_log_at_a_url_gives_what_it_gives_on_disk(
     command: str,
@@ -156,6 +157,7 @@ def test_a_log_at_a_url_gives_what_it_gives_on_disk(
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_a_replay_of_a_long_part_fetches_nothing_twice(
     drive: Path, tmp_path: Path, web: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -171,6 +173,7 @@ def test_a_replay_of_a_long_part_fetches_nothing_twice(
     assert web.sent <= drive.stat().st_size + FIXED_BYTES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mcap", "bag", "log"])
 def test_the_identity_is_the_same_at_a_url_and_on_disk(
     kind: str, drive: Path, tmp_path: Path, web: Served
@@ -207,6 +210,7 @@ def test_the_identity_of_a_large_log_of_any_format_takes_a_part_of_it(
     assert not list((tmp_path / "store").glob("*/log"))
 
 
+@pytest.mark.slow
 def test_a_run_of_a_part_of_a_log_at_a_url_is_estimated_again_from_that_part(
     drive: Path, tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -230,6 +234,7 @@ def test_a_run_of_a_part_of_a_log_at_a_url_is_estimated_again_from_that_part(
     assert {one.name: one.read_bytes() for one in out.glob("*.parquet")} == before
 
 
+@pytest.mark.slow
 def test_a_run_of_a_whole_log_at_a_url_is_estimated_again_from_the_copy_here(
     drive: Path, tmp_path: Path, web: Served
 ) -> None:
@@ -247,6 +252,7 @@ def test_a_run_of_a_whole_log_at_a_url_is_estimated_again_from_the_copy_here(
     assert web.sent <= 2 * FIXED_BYTES
 
 
+@pytest.mark.slow
 def test_a_run_of_a_log_at_a_url_can_be_resumed(
     drive: Path, tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -95,6 +95,7 @@ def test_one_topic_of_a_remote_log_comes_as_columns(tmp_path: Path, web: Served)
     assert part.ledger.log.startswith("http://")
 
 
+@pytest.mark.slow
 def test_a_span_of_a_remote_bag_costs_its_chunks(tmp_path: Path, web: Served) -> None:
     rows = rows_of(20_000)
     path = write_bag(tmp_path / "a.bag", rows, chunk_bytes=64_000)
@@ -178,6 +179,7 @@ def test_decode_takes_a_window_of_a_url(
     assert web.sent < 0.4 * path.stat().st_size
 
 
+@pytest.mark.slow
 def test_a_window_of_an_object_in_an_s3_store(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

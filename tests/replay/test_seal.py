@@ -88,6 +88,7 @@ def test_an_untouched_sealed_log_is_whole(tmp_path: Path, kind: str) -> None:
     assert run(["seal", "--check", str(log)]) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", EVERY_FORMAT)
 def test_a_flipped_byte_anywhere_is_reported_with_its_block(
     tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
@@ -139,6 +140,7 @@ def test_neighbouring_blocks_are_one_span(long_log: Path) -> None:
     assert spans == [f"can.log: bytes 0 to {2 * MIB}", f"can.log: bytes {3 * MIB} to {size}"]
 
 
+@pytest.mark.slow
 def test_every_command_that_reads_a_sealed_log_reports(
     long_log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -386,6 +388,7 @@ def test_hidden_files_and_links_in_a_circle(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mcap", "rosbag1"])
 def test_a_window_of_an_indexed_log_checks_its_own_blocks_alone(tmp_path: Path, kind: str) -> None:
     rows = rows_of(40_000)

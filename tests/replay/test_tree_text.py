@@ -68,6 +68,7 @@ def test_deep_json_is_refused(text: str) -> None:
         json_tree(text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", DEEP_TOML)
 def test_deep_toml_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="nested"):
@@ -152,6 +153,7 @@ def _metrics(folder: Path) -> list[str]:
     return ["compare", str(folder / "a"), str(folder / "b")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deep", DEEP_TOML)
 @pytest.mark.parametrize("command", [_vehicle, _gates, _study])
 def test_every_command_refuses_deep_toml_in_a_line(
@@ -163,6 +165,7 @@ def test_every_command_refuses_deep_toml_in_a_line(
     _refused_in_a_line(tmp_path, capsys, command, deep)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deep", DEEP_JSON)
 @pytest.mark.parametrize("command", [_truth, _coco, _training, _manifest, _metrics])
 def test_every_command_refuses_deep_json_in_a_line(
@@ -189,6 +192,7 @@ def _refused_in_a_line(
     assert "bug" not in err
 
 
+@pytest.mark.slow
 def test_nothing_else_parses_json_or_toml() -> None:
     """A new reader of such a file cannot forget the limit."""
     for path in ROOT.glob("*/**/*.py"):

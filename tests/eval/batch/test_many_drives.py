@@ -33,6 +33,7 @@ from support.trees import tree
 TWO = Processes(2)
 
 
+@pytest.mark.slow
 def test_one_failing_drive_does_not_stop_the_rest(tmp_path: Path) -> None:
     words = ["plain", "damaged", "dies", "bug", "loss", "memory", "leaves", "dies once", "last"]
     jobs = made_jobs(tmp_path, words)
@@ -58,6 +59,7 @@ def test_one_failing_drive_does_not_stop_the_rest(tmp_path: Path) -> None:
     assert exit_status_of(results) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", [in_turn, TWO])
 def test_losses_met_in_a_worker_are_warned_of_here(tmp_path: Path, engine: Engine) -> None:
     jobs = made_jobs(tmp_path, ["plain", "warns"])
@@ -144,6 +146,7 @@ def test_a_log_that_is_not_there_fails_alone(tmp_path: Path) -> None:
     assert "No such file" in str(results[1].error)
 
 
+@pytest.mark.slow
 def test_the_same_bytes_on_one_and_on_two_workers(tmp_path: Path) -> None:
     words = ["plain", "loss", "some", "more"]
     engines: dict[str, Engine] = {"one": in_turn, "two": Processes(2, threads=1)}
@@ -220,6 +223,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "status"),
     [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)],

@@ -15,6 +15,7 @@ needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="ray is not inst
 WORDS = ("plain", "dies once", "damaged", "loss", "dies", "last")
 
 
+@pytest.mark.slow
 @needs_ray
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

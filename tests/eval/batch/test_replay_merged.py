@@ -26,6 +26,7 @@ def drives(tmp_path: Path) -> Path:
     return tmp_path / "drives"
 
 
+@pytest.mark.slow
 def test_a_broken_vehicle_file_costs_its_own_drive_and_an_edited_dbc_is_seen(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -24,6 +24,8 @@ from crosscue.replay.base import RunError
 from support import faults
 from support.trees import tree
 
+pytestmark = pytest.mark.slow
+
 DETECTORS = """
 [detectors.oracle]
 kind = "support.oracle:build"

@@ -114,6 +114,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_drive(folder, Clock(), seconds=FRAMES // 10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "said"),
     [

@@ -41,6 +41,7 @@ def _argv(command: str, runs: list[Path], out: Path) -> list[str]:
     }[command]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["view", "score", "score --workers"])
 def test_a_sealed_log_damaged_after_the_run_is_reported(
     command: str,

@@ -22,6 +22,7 @@ def _scored(folder: Path, log: Path) -> int:
     return cli.run(["score", str(run.path), "--truth", str(folder / "truth.json")])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_s", [-7.0, -3600.0])
 def test_truth_of_a_log_that_was_set_back_fits(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], by_s: float

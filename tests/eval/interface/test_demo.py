@@ -198,6 +198,7 @@ def test_the_truth_is_what_the_script_writes(tmp_path: Path) -> None:
         assert (tmp_path / name).read_bytes() == (annotate_pandaset.FOLDER / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_the_real_drive_is_replayed_and_scored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

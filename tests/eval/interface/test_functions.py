@@ -114,6 +114,7 @@ def test_damaged_intrinsics_are_one_line(tmp_path: Path) -> None:
         crosscue.draft_vehicle(drive)
 
 
+@pytest.mark.slow
 def test_a_draft_takes_intrinsics_from_a_calibration_message(tmp_path: Path) -> None:
     files = crosscue.simulate_approach(tmp_path, "L0", width_px=64)
     known = crosscue.load_vehicle(files.vehicle).camera

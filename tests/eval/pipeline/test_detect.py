@@ -282,6 +282,7 @@ def test_each_real_segmentation_sees_the_road_ahead_and_none_in_the_sky(
     assert cues["road_left"] == 0
 
 
+@pytest.mark.slow
 def test_networks_of_simulated_scenes_warn_on_any_other_log(tmp_path: Path) -> None:
     log, vehicle = _folder(tmp_path), tmp_path / "car.toml"
     arguments = ["detect", str(log), "--detectors", "road", "--no-cache", "-q"]

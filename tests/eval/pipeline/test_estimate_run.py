@@ -16,6 +16,8 @@ from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import RunFolder, open_run
 from support.oracle import Oracle
 
+pytestmark = pytest.mark.slow
+
 DETECTORS = """
 [detectors.oracle]
 kind = "support.oracle:build"

@@ -32,6 +32,8 @@ from support.data import shared
 from support.landmark_files import database_of, encoded, seen_from, wall
 from support.manifests import estimate_manifest
 
+pytestmark = pytest.mark.slow
+
 WALL_M = 40.0
 
 

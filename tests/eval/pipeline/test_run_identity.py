@@ -18,6 +18,8 @@ from crosscue.eval.runs.input import identity_in
 from crosscue.eval.runs.manifest import FORMAT_VERSION
 from support.trees import tree
 
+pytestmark = pytest.mark.slow
+
 DRIVES: int = 4
 REFUSAL: str = f"format 1, this crosscue reads {FORMAT_VERSION}: replay again"
 

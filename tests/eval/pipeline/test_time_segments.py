@@ -96,6 +96,7 @@ def test_a_clock_that_is_set_makes_no_distance_and_loses_none(tmp_path: Path, by
     np.testing.assert_array_equal(original, expected)
 
 
+@pytest.mark.slow
 @settings(
     max_examples=10,
     deadline=None,

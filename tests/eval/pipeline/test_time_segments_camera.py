@@ -48,6 +48,7 @@ def _are_the_same(one: dict[str, list[object]], other: dict[str, list[object]]) 
             assert mine == other[name], name
 
 
+@pytest.mark.slow
 @settings(
     max_examples=4,
     deadline=None,

@@ -171,6 +171,7 @@ def _reported(run: RunFolder, path: Path) -> Path:
     )
 
 
+@pytest.mark.slow
 def test_the_report_needs_no_network_and_hostile_names_stay_text(tmp_path: Path) -> None:
     run, path, _ = _scored(tmp_path)
     manifest = json.loads(run.file("manifest.json").read_text())
@@ -188,6 +189,7 @@ def test_the_report_needs_no_network_and_hostile_names_stay_text(tmp_path: Path)
     assert "{{ 7 * 7 }} &lt;img" in page
 
 
+@pytest.mark.slow
 def test_the_same_run_gives_the_same_report_and_figures(tmp_path: Path) -> None:
     pages = []
     for name in ("a", "b"):
@@ -209,6 +211,7 @@ def test_a_recording_is_written_with_and_without_truth(tmp_path: Path) -> None:
     assert 10_000 < sizes[0] < sizes[1]
 
 
+@pytest.mark.slow
 def test_the_score_command_prints_json_and_refuses_a_foreign_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

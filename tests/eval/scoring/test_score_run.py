@@ -385,6 +385,7 @@ def _log_of(folder: Path, run: Path) -> tuple[LogRow, ...]:
     return (log_row(folder / "drive.mcap", RunFolder(run), folder.name),)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_a_run_that_cannot_be_scored_does_not_stop_the_rest(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], workers: str
@@ -415,6 +416,7 @@ def test_two_runs_of_one_log_are_reported(
     assert "are runs of one log" in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.slow
 def test_neither_hash_seed_nor_zone_nor_locale_changes_a_byte(tmp_path: Path) -> None:
     run = _one(tmp_path)
     seen = []

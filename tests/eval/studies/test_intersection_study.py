@@ -17,6 +17,8 @@ from crosscue.replay.vehicle.cue_table import groups
 from crosscue.replay.vehicle.vehicle import DetectorSection, RangeCurve, Ranges, Vehicle
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
 
+pytestmark = pytest.mark.slow
+
 ARGUMENTS = ("--layouts", "A,E", "--runs", "1", "--width", "320", "--detectors", "oracle")
 
 

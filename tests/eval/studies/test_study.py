@@ -80,6 +80,7 @@ def counting(calls: list[int], fail_at: int | None = None) -> Callable[[Drive, K
     return drive
 
 
+@pytest.mark.slow
 def test_any_number_of_workers_gives_the_same_bytes(tmp_path: Path) -> None:
     one = study_bytes(whole(SMALL, tmp_path / "one", workers=1))
     three = study_bytes(whole(SMALL, tmp_path / "three", workers=3))
@@ -104,6 +105,7 @@ def test_a_study_goes_on_where_a_worker_died(tmp_path: Path) -> None:
     assert a.read_bytes() == b.read_bytes()
 
 
+@pytest.mark.slow
 def test_a_killed_study_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     settings = tmp_path / "s.toml"
     settings.write_text(
@@ -190,6 +192,7 @@ def test_a_folder_with_another_study_is_refused(tmp_path: Path) -> None:
     list(drive_study(other, tmp_path, 1, overwrite=True))
 
 
+@pytest.mark.slow
 def test_ray_gives_the_same_bytes_and_reports_of_dead_workers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -330,6 +333,7 @@ def test_reported_seeds_are_not_those_of_the_calibration() -> None:
     assert CALIBRATION_SEED not in (RangeStudy().seed, LandmarkStudy().seed, FieldStudy().seed)
 
 
+@pytest.mark.slow
 def test_the_default_compass_interval_is_the_calibrated_one() -> None:
     default = Drive()
 
@@ -370,6 +374,7 @@ def test_a_simulated_drive_goes_through_its_log(tmp_path: Path) -> None:
     assert score.nees_xyh.mean < 15.0
 
 
+@pytest.mark.slow
 def test_field_runs_are_kept_and_not_driven_twice(tmp_path: Path) -> None:
     study = FieldStudy(range_runs=1, landmark_runs=1, minutes=2.0)
     first = [run for _, run in drive_field(study, tmp_path, 1)]

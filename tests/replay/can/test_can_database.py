@@ -161,6 +161,7 @@ def test_sizes_that_would_eat_the_memory_are_refused(
         CanDatabase.load([write(tmp_path, text.replace(old, new, 1))])
 
 
+@pytest.mark.slow
 def test_a_dbc_file_cut_anywhere_is_refused_or_reported(tmp_path: Path) -> None:
     text = dbc_text([YAW, WHEEL]).rstrip()
     whole = CanDatabase.load([write(tmp_path, text)])

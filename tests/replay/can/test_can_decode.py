@@ -96,6 +96,7 @@ def assert_same_values(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
     assert all(math.isnan(ours[name]) for name in ours.keys() - theirs.keys())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @given(message=LAYOUTS, seed=SEEDS)
 @varied(max_examples=60)
@@ -141,6 +142,7 @@ def invertible(message: CanMessage) -> CanMessage:
     )
 
 
+@pytest.mark.slow
 @given(message=LAYOUTS.map(invertible), seed=SEEDS)
 @varied(max_examples=60)
 def test_encoding_gives_back_the_bits_and_equals_cantools(

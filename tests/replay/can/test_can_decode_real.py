@@ -67,6 +67,7 @@ def test_wheel_speeds_of_a_real_drive_are_those_the_data_set_publishes() -> None
     assert ledger.topic(block.topic).used == len(wheels)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["numpy", "numba"])
 @pytest.mark.parametrize("bus", sorted(BUSES))
 def test_every_decodable_frame_of_a_real_bus_equals_cantools(bus: str, engine: EngineName) -> None:

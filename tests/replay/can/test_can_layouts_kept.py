@@ -75,6 +75,7 @@ def _all_shared() -> list[Path]:
     return sorted(shared().rglob("*.dbc"))
 
 
+@pytest.mark.slow
 def test_every_real_file_reads_as_cantools_reads_it() -> None:
     files = _all_shared()
 
@@ -86,6 +87,7 @@ def test_every_real_file_reads_as_cantools_reads_it() -> None:
         assert _spelled(quick) == _spelled(_by_cantools(source)), path
 
 
+@pytest.mark.slow
 @given(message=st.one_of(messages(), messages(multiplexed=True)))
 @settings(max_examples=100, deadline=None)
 def test_every_layout_reads_as_cantools_reads_it(message: CanMessage) -> None:
@@ -309,6 +311,7 @@ for _ in range(20):
 """
 
 
+@pytest.mark.slow
 def test_concurrent_starts_do_not_disturb_each_other(tmp_path: Path, folder: Path) -> None:
     path = _file(tmp_path)
     command = [sys.executable, "-c", _LOAD_OFTEN, str(path), str(folder)]

@@ -73,6 +73,7 @@ def same_rows(walked: Block, repeated: Block) -> None:
         np.testing.assert_array_equal(walked.rows.bytes_.stop, repeated.rows.bytes_.stop)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("store", "topic_of"), [(ros2_store(), ros2_topic), (ros1_store(), ros1_topic)], ids=["2", "1"]
 )
@@ -98,6 +99,7 @@ def test_every_standard_type_has_the_values_that_rosbags_reads(
     assert compared > 100
 
 
+@pytest.mark.slow
 @given(seed=SEEDS, is_cdr=st.booleans())
 @QUICK
 def test_made_up_types_have_the_values_that_rosbags_reads(seed: int, is_cdr: bool) -> None:
@@ -124,6 +126,7 @@ def test_made_up_types_have_the_values_that_rosbags_reads(seed: int, is_cdr: boo
     same_values(decoded.rows, messages, store, name)
 
 
+@pytest.mark.slow
 @given(seed=SEEDS, is_cdr=st.booleans())
 @QUICK
 def test_a_decoder_that_knows_a_layout_says_what_one_that_walks_says(
@@ -474,6 +477,7 @@ def test_columns_pass_as_they_are() -> None:
     assert must_decode(Topic("/t", "crosscue/Table", "columns"))(block, Ledger("x")) is block
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
@@ -520,6 +524,7 @@ def test_a_lying_schema_for_a_known_type_is_refused() -> None:
         decoder_for(topic)
 
 
+@pytest.mark.slow
 def test_sequences_of_sequences_cannot_hold_us_up() -> None:
     text = "Row[] rows\n" + "=" * 80 + "\nMSG: made_msgs/Row\nstring s\n"
     count = 1_000_000

@@ -407,6 +407,7 @@ def test_image_time_is_the_time_of_obstacles_and_status() -> None:
     assert tables["obstacles"]["status_log_ns"].tolist() == [1000 * MS, 1071 * MS]
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10_000), cuts=st.lists(st.integers(0, 400), max_size=6))
 @settings(max_examples=25, deadline=None)
 def test_how_the_log_is_cut_into_blocks_changes_nothing(seed: int, cuts: list[int]) -> None:
@@ -428,6 +429,7 @@ def test_how_the_log_is_cut_into_blocks_changes_nothing(seed: int, cuts: list[in
     assert ledger.topic("can1").dropped == ledger_of_pieces.topic("can1").dropped
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10_000))
 @settings(max_examples=25, deadline=None)
 def test_losing_frames_never_makes_a_row_that_was_not_there(seed: int) -> None:

@@ -45,6 +45,7 @@ def assert_same_frames(got: Block, want: Block) -> None:
     np.testing.assert_array_equal(got.rows.data, want.rows.data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("revision", ["classic", "2.32"])
 @pytest.mark.parametrize("how", [MOUNTED, STRAIGHT])
 @given(seed=st.integers(0, 100_000))

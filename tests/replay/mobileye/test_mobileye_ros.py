@@ -62,6 +62,7 @@ def by_time(table: Table) -> Table:
     return table.take(np.lexsort(keys))
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10_000))
 @settings(max_examples=15, deadline=None)
 def test_messages_give_the_very_same_columns_as_frames(seed: int) -> None:
@@ -135,6 +136,7 @@ def test_high_beam_comes_in_one_message_for_two_frames() -> None:
             assert can["high_beam_state"][column] == bag["high_beam_state"][column]
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10_000), cut=st.integers(0, 60), order=st.permutations(range(5)))
 @settings(max_examples=20, deadline=None)
 def test_how_topics_interleave_changes_nothing(seed: int, cut: int, order: list[int]) -> None:

@@ -81,6 +81,7 @@ CASES: dict[str, tuple[str, str, Callable[[], bytes], int]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", list(CASES), ids=lambda name: name.replace(" ", "-"))
 def test_a_bomb_is_refused_with_both_numbers_in_bounded_memory(tmp_path: Path, case: str) -> None:
     suffix, compression, body, declared = CASES[case]

@@ -157,6 +157,7 @@ LOGS: dict[str, tuple[Callable[[Path], Path], int, tuple[str, str]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", list(LOGS), ids=lambda name: name.replace(" ", "-"))
 def test_a_bomb_in_a_log_is_refused_with_both_numbers(tmp_path: Path, case: str) -> None:
     make, wanted, numbers = LOGS[case]
@@ -170,6 +171,7 @@ def test_a_bomb_in_a_log_is_refused_with_both_numbers(tmp_path: Path, case: str)
         assert re.search(number, said), (number, said)
 
 
+@pytest.mark.slow
 def test_max_chunk_moves_the_limit(tmp_path: Path) -> None:
     path = _blf(3 * MIB)(tmp_path)
 
@@ -178,6 +180,7 @@ def test_max_chunk_moves_the_limit(tmp_path: Path) -> None:
     assert f"the limit is {2 * MIB} (--max-chunk)" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["message", "file"])
 def test_max_chunk_bounds_what_zstd_declares_in_a_bag(tmp_path: Path, kind: str) -> None:
     path = _in_db3(_honest)(tmp_path) if kind == "message" else _packed_file_that_declares(tmp_path)
@@ -188,6 +191,7 @@ def test_max_chunk_bounds_what_zstd_declares_in_a_bag(tmp_path: Path, kind: str)
     assert f"declares {BOMB_BYTES} bytes, the limit is {2 * MIB} (--max-chunk)" in said
 
 
+@pytest.mark.slow
 def test_a_log_packed_with_gzip_is_refused_and_not_unpacked(tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap.gz"
     with gzip.open(path, "wb", compresslevel=1) as file:
@@ -227,6 +231,7 @@ def _webp() -> bytes:
 PICTURES = {".png": _png, ".jpg": _jpeg, ".webp": _webp}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", PICTURES)
 @pytest.mark.parametrize("is_in_mcap", [False, True], ids=["folder", "mcap"])
 def test_a_picture_bomb_is_dropped_before_it_is_decoded(

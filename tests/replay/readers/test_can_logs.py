@@ -38,6 +38,7 @@ def test_what_was_sent_is_what_is_read(
     assert ledger.integrity != "not checked"
 
 
+@pytest.mark.slow
 @EACH
 def test_no_cut_is_silent_and_none_invents_a_frame(tmp_path: Path, kind: Kind) -> None:
     frames = kind.frames(60)
@@ -49,6 +50,7 @@ def test_no_cut_is_silent_and_none_invents_a_frame(tmp_path: Path, kind: Kind) -
         assert not verdict.is_fault, f"cut at {at}: {verdict}"
 
 
+@pytest.mark.slow
 @EACH
 def test_no_damage_invents_frames_or_hides_their_loss(tmp_path: Path, kind: Kind) -> None:
     frames = kind.frames(60)

@@ -203,6 +203,7 @@ MINUTE = [replace(f, t_ns=START_NS + k * 10_000_000) for k, f in enumerate(made(
 WHOLE = blf(MINUTE, container=4_000)
 
 
+@pytest.mark.slow
 @given(
     window=st.tuples(st.integers(-5, 65), st.integers(-5, 65)),
     ends=st.sampled_from(["both", "from", "to"]),

@@ -130,6 +130,7 @@ def test_a_last_line_without_end_is_not_trusted(tmp_path: Path) -> None:
     assert ledger.topic("").dropped == {"last line has no line end, may be cut": 1}
 
 
+@pytest.mark.slow
 def test_no_cut_is_silent_and_none_invents_a_frame(tmp_path: Path) -> None:
     frames = made(40)
     text = candump(frames)
@@ -258,6 +259,7 @@ def test_savvycan_candump_reads_as_python_can_reads_it() -> None:
     same_as_python_can(path, can.CanutilsLogReader(path))
 
 
+@pytest.mark.slow
 def test_busmaster_log_holds_the_same_frames_as_the_candump_of_it() -> None:
     busmaster, ledger = read_back(shared("can", "savvycan", "BusMasterLog.log"))
     candump_, _ = read_back(shared("can", "savvycan", "candump.log"))

@@ -146,6 +146,7 @@ def test_bus_logs_read_as_python_can_reads_them(tmp_path: Path, compression: int
     same_as_python_can(path, _peer(path), "can/{}", within_ns=2_000)
 
 
+@pytest.mark.slow
 def test_the_real_log_reads_as_python_can_reads_it() -> None:
     path = shared(*REAL)
     same_as_python_can(path, _peer(path), "can/{}", within_ns=2_000)
@@ -307,6 +308,7 @@ def test_a_span_of_time_reads_the_blocks_that_overlap_and_no_other(
     assert "of other times, were not read" in ledger.integrity
 
 
+@pytest.mark.slow
 def test_a_span_of_time_of_a_bus_gives_what_a_whole_pass_gives() -> None:
     path = shared(*REAL)
     whole, _ = read_back(path)

@@ -101,6 +101,7 @@ def _start_ns(path: Path) -> int:
     return int.from_bytes(path.read_bytes()[64 + 24 + 48 :][:8], "little")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("where", "expected"), REAL, ids=[where[-1] for where, _ in REAL])
 def test_every_frame_of_a_real_log_is_as_asammdf_returns_it_after_finalizing(
     where: tuple[str, ...], expected: dict[int, int]
@@ -189,6 +190,7 @@ def test_made_logs_read_as_asammdf_reads_them(tmp_path: Path, variant: str) -> N
     _same(ours, _peer(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["after", "before", "last"])
 @pytest.mark.parametrize("virtual", [False, True])
 def test_a_cut_end_costs_the_frames_it_cuts_and_no_other(
@@ -285,6 +287,7 @@ def test_sorted_groups_of_one_bus_come_in_time_order(tmp_path: Path) -> None:
     assert found == by_bus(frames, "can/{}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("virtual", [False, True])
 def test_long_runs_of_equal_frames_and_what_interrupts_them_keep_every_frame(
     tmp_path: Path, virtual: bool

@@ -71,6 +71,7 @@ def test_no_damage_is_silent(name: str, coded: bytes, tmp_path: Path) -> None:
     assert bad == []
 
 
+@pytest.mark.slow
 def test_a_cut_at_any_byte_keeps_all_that_came_before(tmp_path: Path) -> None:
     chunks = [ChunkOf([*DEFINED, *many(5)]), ChunkOf(many(5, 100)), ChunkOf(many(5, 200))]
     coded = McapFile(chunks).coded()

@@ -57,6 +57,7 @@ SHAPES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", list(CompressionType), ids=lambda c: c.name.lower())
 def test_every_shape_of_file_gives_the_same_messages(
     tmp_path: Path, compression: CompressionType
@@ -72,6 +73,7 @@ def test_every_shape_of_file_gives_the_same_messages(
         assert reading.names == ("/t0", "/t1", "/t2"), shape
 
 
+@pytest.mark.slow
 def test_a_real_recording_gives_the_messages_that_mcap_gives() -> None:
     recordings = sorted(shared("bags").rglob("*.mcap"))
     assert recordings

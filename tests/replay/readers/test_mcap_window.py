@@ -59,6 +59,7 @@ def files(draw: st.DrawFn) -> McapFile:
     return McapFile(parts, draw(st.booleans()), summary_crc=draw(st.integers(0, 3)) > 0)
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(
     file=files(),

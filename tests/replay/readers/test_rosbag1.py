@@ -79,6 +79,7 @@ def bag(path: Path, *records: bytes, **header: bytes) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [("plotjuggler", "tilt_laser.bag"), ("sail_il", "run1.bag")])
 def test_a_real_bag_reads_as_rosbags_reads_it(parts: tuple[str, str]) -> None:
     path = shared("bags", *parts)
@@ -184,6 +185,7 @@ def test_a_wrong_index_position_costs_nothing(tmp_path: Path) -> None:
     assert any("index at byte" in sentence for sentence in reading.ledger.notices)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(share=st.floats(0.0, 1.0), compression=st.sampled_from(COMPRESSIONS))
 def test_a_cut_bag_gives_what_was_before_the_cut(
@@ -455,6 +457,7 @@ def test_a_chunk_that_grows_beyond_its_word_is_dropped(tmp_path: Path) -> None:
     assert not reading.ledger.is_whole
 
 
+@pytest.mark.slow
 def test_a_chunk_of_too_many_records_is_stopped(tmp_path: Path) -> None:
     body = connection(0, b"/a") + message(0, START_NS, b"") * 70_000
     path = bag(tmp_path / "a.bag", chunk(bz2.compress(body), b"bz2", size=len(body)))
@@ -494,6 +497,7 @@ def test_topics_not_asked_for_are_counted(tmp_path: Path) -> None:
     assert reading.ledger.is_whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*COMPRESSIONS, "unclosed"])
 def test_no_damage_goes_unseen(tmp_path: Path, kind: str) -> None:
     rows = rows_of(250)

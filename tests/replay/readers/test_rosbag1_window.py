@@ -32,6 +32,7 @@ def walked(path: Path, selection: Selection) -> Reading:
         return read_rows(path, selection)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 1000),

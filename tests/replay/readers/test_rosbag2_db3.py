@@ -322,6 +322,7 @@ def test_a_database_without_the_tables_says_what_it_holds(tmp_path: Path, tables
         open_log(path)
 
 
+@pytest.mark.slow
 def test_a_locked_database_says_so(tmp_path: Path) -> None:
     path = make(tmp_path / "a.db3", (1, 5, b"x"))
     writer = sqlite3.connect(path, isolation_level=None)
@@ -363,6 +364,7 @@ def test_a_row_whose_time_the_index_disputes_is_not_given(tmp_path: Path) -> Non
     assert [d.reason for d in reading.ledger.drops()] == ["row and time index disagree"]
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(share=st.floats(0.0, 1.0))
 def test_a_cut_database_gives_only_true_rows_and_says_it_is_cut(
@@ -432,6 +434,7 @@ def test_messages_may_go_back_in_time(tmp_path: Path) -> None:
     assert [row.log_ns for row in read_rows(path).rows] == times
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", ["none", "message"])
 def test_no_damage_goes_unseen(tmp_path: Path, compression: str) -> None:
     rows = rows_of(250)

@@ -98,6 +98,7 @@ def test_overlapping_files_are_merged_by_time(tmp_path: Path, storage: Storage) 
     assert reading.ledger.is_whole
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(cuts=st.lists(st.integers(0, 300), min_size=2, max_size=4), seed=st.integers(0, 99))
 def test_however_rows_are_split_they_come_back_in_order(

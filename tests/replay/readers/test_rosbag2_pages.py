@@ -92,6 +92,7 @@ def fill(db: sqlite3.Connection, seed: int, count: int, largest: int, has_index:
     db.close()
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     page_bytes=st.sampled_from([512, 1024, 2048, 4096, 8192, 16384, 32768, 65536]),
@@ -227,6 +228,7 @@ def outcome(path: Path, selection: Selection = EVERYTHING) -> object:
     return by_topic(reading.rows), *said
 
 
+@pytest.mark.slow
 def test_damaged_copies_read_as_sqlite_alone_reads_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -249,6 +251,7 @@ def test_damaged_copies_read_as_sqlite_alone_reads_them(
     assert len(came) > 20
 
 
+@pytest.mark.slow
 def test_hostile_pages_end_the_reading_without_an_error(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     fill(empty(path, 512, 0), 9, 150, 3000, has_index=False)

@@ -378,6 +378,7 @@ def test_a_ros1_topic_whose_definition_lies_is_skipped_by_reason(tmp_path: Path)
     assert "made_msgs/msg/Missing" in ledger.details[0].detail
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "parts",
     [
@@ -424,6 +425,7 @@ def _values_of(value: Any) -> str:
     return repr(value.tolist()) if isinstance(value, np.ndarray) else repr(value)
 
 
+@pytest.mark.slow
 def test_the_real_comma2k19_minute_keeps_every_row(tmp_path: Path) -> None:
     segment = shared("comma2k19", "Example_1", "b0c9d2329ad1606b_2018-08-02--08-34-47", "40")
     out = tmp_path / "out.mcap"
@@ -440,6 +442,7 @@ def test_the_real_comma2k19_minute_keeps_every_row(tmp_path: Path) -> None:
     assert sum(map(len, source)) == sum(map(len, copied)) > 190_000
 
 
+@pytest.mark.slow
 def test_rerun_imports_what_we_write(tmp_path: Path) -> None:
     source, out, rrd = tmp_path / "in.mcap", tmp_path / "out.mcap", tmp_path / "x.rrd"
     made_source(source)

@@ -76,6 +76,7 @@ def _rosbags_reads(outgoing: Outgoing) -> list[Any]:
     return [store.deserialize_cdr(rows.payload(i), outgoing.type.name) for i in range(len(rows))]
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1))
 @QUICK
 def test_ros1_messages_of_made_up_types_become_what_rosbags_makes_of_them(seed: int) -> None:
@@ -97,6 +98,7 @@ def test_ros1_messages_of_made_up_types_become_what_rosbags_makes_of_them(seed: 
     _rosbags_reads(out[0])
 
 
+@pytest.mark.slow
 def test_ros1_messages_of_standard_types_become_what_rosbags_makes_of_them() -> None:
     rng = np.random.default_rng(8)
     ours, theirs = ros1_store(), ros2_store()
@@ -180,6 +182,7 @@ def test_can_frames_come_back_as_they_were() -> None:
     np.testing.assert_array_equal(back.header_ns, back.log_ns - 7)
 
 
+@pytest.mark.slow
 def test_can_fd_frames_go_to_a_topic_of_their_own_and_it_is_said() -> None:
     frames, ledger = can_frames(300, 64), Ledger("made")
 

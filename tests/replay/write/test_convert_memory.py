@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from support.mcap_files import channel, header, record, schema
 from support.measured import measured
@@ -38,6 +39,7 @@ def _unchunked() -> bytes:
     return magic + start + channel(1, 1, "/v") + rows.tobytes() + end + magic
 
 
+@pytest.mark.slow
 def test_an_unchunked_log_of_many_small_records_is_converted_in_little_memory(
     tmp_path: Path,
 ) -> None:

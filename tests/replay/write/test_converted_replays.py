@@ -70,6 +70,7 @@ def test_a_converted_segment_replays_as_its_original_does(tmp_path: Path) -> Non
     assert _tables(converted(log, tmp_path / "log.mcap"), tmp_path / "second") == first
 
 
+@pytest.mark.slow
 def test_a_real_segment_replays_as_its_original_does(tmp_path: Path) -> None:
     (log,) = shared("comma2k19/Example_1").glob("*/40")
 
