@@ -152,6 +152,11 @@ _EXPORTS: Final = {
     "DriveList": "eval.batch.drive_list",
     "replay_drives": "eval.interface.batch",
     "ReplayedDrives": "eval.interface.batch",
+    "render_training_frames": "eval.interface.training",
+    "TrainingFrames": "eval.interface.training",
+    "run_intersection_study": "eval.interface.intersections",
+    "IntersectionResult": "eval.interface.intersections",
+    "IntersectionStudy": "eval.studies.intersections.study",
 }
 """From a public name to its module."""
 
@@ -198,6 +203,10 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.fits.messages import fit_messages as fit_messages
     from crosscue.eval.interface.fits.ranges import FittedRanges as FittedRanges
     from crosscue.eval.interface.fits.ranges import fit_ranges as fit_ranges
+    from crosscue.eval.interface.intersections import IntersectionResult as IntersectionResult
+    from crosscue.eval.interface.intersections import (
+        run_intersection_study as run_intersection_study,
+    )
     from crosscue.eval.interface.landmarks import AddedLandmarks as AddedLandmarks
     from crosscue.eval.interface.landmarks import LandmarkList as LandmarkList
     from crosscue.eval.interface.landmarks import LandmarkMatches as LandmarkMatches
@@ -254,10 +263,13 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.tables import MergedRuns as MergedRuns
     from crosscue.eval.interface.tables import decode as decode
     from crosscue.eval.interface.tables import merge as merge
+    from crosscue.eval.interface.training import TrainingFrames as TrainingFrames
+    from crosscue.eval.interface.training import render_training_frames as render_training_frames
     from crosscue.eval.interface.truth import truth_schema as truth_schema
     from crosscue.eval.interface.truth import write_truth as write_truth
     from crosscue.eval.interface.vehicles import VehicleDraft as VehicleDraft
     from crosscue.eval.interface.vehicles import draft_vehicle as draft_vehicle
+    from crosscue.eval.studies.intersections.study import IntersectionStudy as IntersectionStudy
     from crosscue.eval.studies.town.settings import FieldStudy as FieldStudy
     from crosscue.eval.studies.town.settings import LandmarkStudy as LandmarkStudy
     from crosscue.eval.studies.town.settings import RangeStudy as RangeStudy

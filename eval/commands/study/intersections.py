@@ -12,14 +12,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import crosscue
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.detectors.registry import EMBEDDED
-from crosscue.eval.batch.engine import engine_of
-from crosscue.eval.batch.jobs import exit_status_of
+from crosscue.eval.commands.shared.options import print_result
 from crosscue.eval.commands.shared.progress import DrivesLine, is_shown
-from crosscue.eval.studies.intersections.report import TABLES, summary, write_study
-from crosscue.eval.studies.intersections.study import StudySettings, run_drives, score_study
-from crosscue.replay.base import RunError, visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,8 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, replay, score; 3 when a drive failed."""
-    engine = engine_of(args.workers, args.ray)
-    settings = StudySettings(
+    study = crosscue.IntersectionStudy(
         layouts=tuple(name.strip() for name in args.layouts.split(",") if name.strip()),
         runs=args.runs,
         seed=args.seed,
@@ -88,14 +84,13 @@ def run(args: argparse.Namespace) -> int:
         detectors=args.detectors,
     )
     with DrivesLine("driving", is_shown=is_shown(args)) as line:
-        done = run_drives(args.output, settings, engine, line)
-    names = [one.job.name for one in done if one.error is None]
-    if not names:
-        raise RunError(f"{args.output}: every drive failed; the first: {done[0].error}")
-    scored = score_study(args.output, names, attribution=not args.no_attribution)
-    written = write_study(args.output, settings, done, scored)
-    if args.json:
-        print((args.output / TABLES).read_text(encoding="utf-8"), end="")
-    elif not args.quiet:
-        print("\n".join(visible(text) for text in summary(done, scored, written).split("\n")))
-    return exit_status_of(done)
+        found = crosscue.run_intersection_study(
+            study,
+            args.output,
+            args.workers,
+            ray=args.ray,
+            attribution=not args.no_attribution,
+            on_progress=line,
+        )
+    print_result(found, args)
+    return found.exit_status

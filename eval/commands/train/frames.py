@@ -13,13 +13,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.datasets.scenes.drive import SOURCE, SceneSettings, camera_of_width
-from crosscue.datasets.scenes.export.coco import Objects
-from crosscue.datasets.scenes.export.training_frames import frames, joined
-from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.commands.shared.progress import Done, with_progress
-from crosscue.eval.commands.shared.training import check_place, learnt_layouts_of
-from crosscue.replay.errors import OutputError, UsageError
+import crosscue
+from crosscue.eval.commands.shared.options import print_result
+from crosscue.eval.commands.shared.progress import progress_line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,38 +54,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Render and write."""
-    if args.per_layout < 1 or args.workers < 1 or args.seed < 0:
-        raise UsageError("--per-layout, --workers: expected 1 or more; --seed: expected 0 or more")
-    wanted = [_settings(name, args) for name in learnt_layouts_of(args.layouts, "train frames")]
-    target = args.output / "coco.json"
-    if target.exists():
-        raise OutputError(f"{target}: exists; give another folder")
-    images = args.output / "images"
-    check_place(images / "any")
-    parts: list[Objects] = []
-    made = frames(wanted, args.per_layout, images, args.workers)
-
-    def at() -> Done:
-        return Done(len(parts), len(wanted), "runs")
-
-    for part in with_progress(made, at, args, "rendering"):
-        parts.append(part)
-    whole = joined(parts)
-    whole.save(target, f"{SOURCE}; layouts {' '.join(args.layouts)}, seed {args.seed}")
-    reported = {
-        "coco": str(target),
-        "pictures": len(whole.images),
-        "objects": len(whole.annotations),
-    }
-    if args.json:
-        print_json(reported)
-    elif not args.quiet:
-        print(f"{target}: {reported['pictures']} pictures, {reported['objects']} objects")
+    with progress_line(args, "rendering") as line:
+        found = crosscue.render_training_frames(
+            args.output,
+            args.layouts,
+            args.per_layout,
+            args.seed,
+            width_px=args.width,
+            workers=args.workers,
+            on_runs=line.counting("runs"),
+        )
+    print_result(found, args)
     return 0
-
-
-def _settings(layout: str, args: argparse.Namespace) -> SceneSettings:
-    # Conditions come in ten kinds; layout and run count up together, so each kind comes as often.
-    run = int(layout[1:]) % 10 + 1
-    camera = camera_of_width(args.width)
-    return SceneSettings(layout=layout, run=run, seed=args.seed, camera=camera)

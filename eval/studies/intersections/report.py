@@ -21,7 +21,7 @@ from crosscue.replay.base import strict_json, versions, write_text
 from .causes import Finding, by_cause, condition_costs, findings
 from .contact_sheet import write_sheet
 from .figures import draw_beliefs, draw_distances, draw_reliability
-from .study import StudySettings
+from .study import IntersectionStudy
 from .tables import attribution_rows, cue_rows, intersection_rows, mean_text, quoted_rows
 
 PAGE: Final = "study.html"
@@ -41,7 +41,7 @@ class StudyFiles:
 
 
 def write_study(
-    out: Path, settings: StudySettings, done: Sequence[Done[Outcome]], scored: StudyScores
+    out: Path, settings: IntersectionStudy, done: Sequence[Done[Outcome]], scored: StudyScores
 ) -> StudyFiles:
     """Write metrics, tables, figures and page into ``out``.
 
@@ -75,7 +75,7 @@ def write_study(
 
 
 def _tables(
-    settings: StudySettings,
+    settings: IntersectionStudy,
     done: Sequence[Done[Outcome]],
     scored: StudyScores,
     approaches: ApproachScore,

@@ -43,7 +43,7 @@ VEHICLE: Final = "vehicle.toml"
 
 
 @dataclass(frozen=True, slots=True)
-class StudySettings:
+class IntersectionStudy:
     """What to simulate and how to replay it.
 
     Attributes:
@@ -123,7 +123,7 @@ class Work:
 
 def run_drives(
     out: Path,
-    settings: StudySettings,
+    settings: IntersectionStudy,
     engine: Engine,
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> tuple[Done[Outcome], ...]:

@@ -1,4 +1,4 @@
-"""What the training commands share: names of layouts, and a place that can be written to."""
+"""What training begins with: names of layouts, and a place that can be written to."""
 
 from __future__ import annotations
 

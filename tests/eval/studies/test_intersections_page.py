@@ -1,0 +1,24 @@
+"""The page of the intersections study asks its records for nothing that they lack."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from crosscue.eval.studies.intersections.causes import ConditionCost, Finding
+
+PAGE: Final = Path(__file__).parents[3] / "eval" / "report" / "templates" / "intersections.html.j2"
+
+
+@pytest.mark.parametrize(("rows", "kind"), [("findings", Finding), ("conditions", ConditionCost)])
+def test_every_field_of_a_row_exists(rows: str, kind: type[Finding] | type[ConditionCost]) -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    loop = text.partition(f"{{% for one in {rows} %}}")[2].partition("{% endfor %}")[0]
+    asked = {*re.findall(r"\bone\.(\w+)", loop)}
+
+    assert asked
+    assert asked <= {field.name for field in fields(kind)}
