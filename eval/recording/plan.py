@@ -60,7 +60,7 @@ def log_pose(recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, 
 def log_landmarks(
     recording: rr.RecordingStream, pose: Mapping[str, Floats], names: Sequence[str | None]
 ) -> None:
-    """Where landmarks were weighed in, by name."""
+    """Where landmarks were used, by name."""
     rows = [i for i, name in enumerate(names) if name is not None]
     if not rows:
         return
