@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Protocol, TypeVar
 
 from .errors import AccountError
@@ -233,11 +233,42 @@ class Ledger:
         missing = account.declared - account.in_file
         if missing > 0:
             detail = f"declared {account.declared}, found {account.found}"
-            self.drop(topic, reason, missing, detail)
+            self.drop(topic, reason, missing - self.claim(topic, missing), detail)
         elif missing < 0:
             self.notice(
                 f"{topic}: the file declares {account.declared} messages, holds {account.in_file}"
             )
+
+    def claim(self, topic: str, missing: int) -> int:
+        """Give rows dropped without a name to the topic that lacks rows: they are the same ones.
+
+        Returns:
+            How many of the ``missing`` rows have so been dropped with their own reason and place.
+        """
+        nameless, account = self.accounts.get(""), self.topic(topic)
+        if nameless is None or nameless is account:
+            return 0
+        left = missing
+        for reason, count in list(nameless.dropped.items()):
+            taken = min(count, left)
+            left -= taken
+            nameless.dropped -= Counter({reason: taken})
+            account.dropped += Counter({reason: taken})
+            self._rename(reason, topic, taken)
+        return missing - left
+
+    def _rename(self, reason: str, topic: str, rows: int) -> None:
+        """Name the topic of so many ``rows`` among the details of losses without one."""
+        for i, one in enumerate(self.details):
+            if not rows:
+                return
+            if one.topic or not one.is_dropped or one.reason != reason or one.count is None:
+                continue
+            taken = min(one.count, rows)
+            rows -= taken
+            self.details[i] = replace(one, topic=topic, count=taken)
+            if one.count > taken:
+                self._keep(replace(one, count=one.count - taken))
 
     @property
     def is_whole(self) -> bool:

@@ -7,9 +7,12 @@ from typing import Final
 
 import pytest
 
+from crosscue.replay.base import Ledger
 from crosscue.replay.formats import FORMATS
+from crosscue.replay.logs.opening import open_log
 from crosscue.testing import check_reader
 from support.every_format import EVERY_FORMAT
+from support.mcap_files import McapFile, channel, message, schema
 from support.one_row import ONE_ROW
 
 WITHOUT_ROWS_OF_THEIR_OWN: Final = {
@@ -35,3 +38,22 @@ def test_one_damaged_row_is_one_lost_row(name: str, tmp_path: Path) -> None:
     write, damage = ONE_ROW[name]
 
     check_reader(write(tmp_path), damage)
+
+
+def test_a_damaged_row_that_the_statistics_count_is_lost_once(tmp_path: Path) -> None:
+    messages = [message(1, 10 * i, b"%4d" % i) for i in range(20)]
+    whole = McapFile([schema(1), channel(1, 1, "/a"), *messages]).coded()
+    log = tmp_path / "log.mcap"
+    at = whole.index(messages[7])
+    log.write_bytes(whole[: at + 9] + b"\x4d\0" + whole[at + 11 :])
+
+    ledger = Ledger(str(log))
+    with open_log(log) as opened:
+        rows = sum(len(block) for block in opened.read(ledger))
+
+    assert rows == 19
+    assert ledger.topic("/a").dropped.total() == 1
+    assert ledger.topic("").dropped.total() == 0
+    (drop,) = ledger.drops()
+    assert drop.topic == "/a"
+    assert "bytes" in drop.detail

@@ -541,7 +541,8 @@ class SegmentPass:
         detail = "; ".join(details) or f"the statistics declare {declared} messages in all"
         t_ns = self._damages[0].t_ns if self._damages else None
         for channel_id, count in sorted(missing.items()):
-            self._giver.lose_of_channel(channel_id, reason, count, detail, t_ns)
+            known = self._ledger.claim(self._declarations.topic(channel_id), count)
+            self._giver.lose_of_channel(channel_id, reason, count - known, detail, t_ns)
 
     def _report(self, damage: Damage) -> None:
         if not damage.counts:
