@@ -352,8 +352,7 @@ class Vehicle(Section):
         if regions.kind is not None:
             return regions
         is_drawn = not regions.model_fields_set.isdisjoint(("left", "straight", "right"))
-        is_simulated = info.data.get("name") == SIMULATED_CAR
-        kind = "picture" if is_drawn or is_simulated else "ground"
+        kind = "picture" if is_drawn or _is_simulated(info) else "ground"
         return regions.model_copy(update={"kind": kind})
 
     @field_validator("cars")
@@ -361,16 +360,14 @@ class Vehicle(Section):
     def _kind_of_cars(cls, cars: Cars, info: ValidationInfo) -> Cars:
         if cars.kind is not None:
             return cars
-        is_simulated = info.data.get("name") == SIMULATED_CAR
-        return cars.model_copy(update={"kind": "pairs" if is_simulated else "tracks"})
+        return cars.model_copy(update={"kind": "pairs" if _is_simulated(info) else "tracks"})
 
     @field_validator("fusion")
     @classmethod
     def _kind_of_belief(cls, fusion: Fusion, info: ValidationInfo) -> Fusion:
         if fusion.kind is not None:
             return fusion
-        is_simulated = info.data.get("name") == SIMULATED_CAR
-        return fusion.model_copy(update={"kind": "source" if is_simulated else "persistent"})
+        return fusion.model_copy(update={"kind": "source" if _is_simulated(info) else "persistent"})
 
     @field_validator("ranges")
     @classmethod
@@ -379,6 +376,11 @@ class Vehicle(Section):
         if ranges.kind == "motion" and camera is not None and camera.focal_px is None:
             raise PydanticCustomError("ranges", 'kind = "motion" needs camera.focal_px')
         return ranges
+
+
+def _is_simulated(info: ValidationInfo) -> bool:
+    """Is it the file of a simulated car, whose defaults are as published?"""
+    return bool(info.data.get("name") == SIMULATED_CAR)
 
 
 def load(path: Path) -> Vehicle:
