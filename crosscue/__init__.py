@@ -30,23 +30,23 @@ if _missing := _broken_links(Path(__file__).parent):
     )
 
 _EXPORTS: Final = {
-    "open": "eval.interface.logs",
-    "Log": "eval.interface.logs",
-    "Topics": "eval.interface.logs",
-    "LogTopic": "eval.interface.logs",
-    "CameraFrame": "eval.interface.logs",
-    "Signals": "eval.interface.logs",
-    "DriveSummary": "eval.interface.summary",
-    "Run": "eval.interface.runs",
-    "ScoredRun": "eval.interface.runs",
-    "open_run": "eval.interface.runs",
-    "replay_drive": "eval.interface.runs",
-    "detect_drive": "eval.interface.runs",
-    "estimate_run": "eval.interface.runs",
-    "score_run": "eval.interface.runs",
-    "compare_runs": "eval.interface.runs",
-    "save_recording": "eval.interface.runs",
-    "load_vehicle": "eval.interface.runs",
+    "open": "eval.interface.logs.log",
+    "Log": "eval.interface.logs.log",
+    "Topics": "eval.interface.logs.log",
+    "LogTopic": "eval.interface.logs.log",
+    "CameraFrame": "eval.interface.logs.log",
+    "Signals": "eval.interface.logs.log",
+    "DriveSummary": "eval.interface.logs.summary",
+    "Run": "eval.interface.runs.run",
+    "ScoredRun": "eval.interface.runs.run",
+    "open_run": "eval.interface.runs.run",
+    "replay_drive": "eval.interface.runs.run",
+    "detect_drive": "eval.interface.runs.run",
+    "estimate_run": "eval.interface.runs.run",
+    "score_run": "eval.interface.runs.run",
+    "compare_runs": "eval.interface.runs.run",
+    "save_recording": "eval.interface.runs.run",
+    "load_vehicle": "eval.interface.runs.run",
     "demo": "eval.interface.demo",
     "Demo": "eval.interface.demo",
     "fetch_drive": "eval.interface.demo",
@@ -55,8 +55,8 @@ _EXPORTS: Final = {
     "simulate_approach": "eval.interface.simulate",
     "simulate_drive": "eval.interface.simulate",
     "draw_sign": "eval.interface.simulate",
-    "StudyResult": "eval.interface.studies",
-    "run_study": "eval.interface.studies",
+    "StudyResult": "eval.interface.studies.town",
+    "run_study": "eval.interface.studies.town",
     "RangeStudy": "eval.studies.town.settings",
     "LandmarkStudy": "eval.studies.town.settings",
     "SignFit": "eval.fit.sign_threshold",
@@ -89,30 +89,30 @@ _EXPORTS: Final = {
     "EmptyResultError": "replay.errors",
     "AccountError": "replay.errors",
     "LossWarning": "replay.losses",
-    "convert": "eval.interface.convert",
-    "Converted": "eval.interface.convert",
-    "seal": "eval.interface.seals",
-    "check_seal": "eval.interface.seals",
-    "Sealed": "eval.interface.seals",
-    "Seals": "eval.interface.seals",
-    "SealCheck": "eval.interface.seals",
-    "SealChecks": "eval.interface.seals",
-    "decode": "eval.interface.tables",
-    "merge": "eval.interface.tables",
-    "MergedRuns": "eval.interface.tables",
+    "convert": "eval.interface.logs.convert",
+    "Converted": "eval.interface.logs.convert",
+    "seal": "eval.interface.logs.seals",
+    "check_seal": "eval.interface.logs.seals",
+    "Sealed": "eval.interface.logs.seals",
+    "Seals": "eval.interface.logs.seals",
+    "SealCheck": "eval.interface.logs.seals",
+    "SealChecks": "eval.interface.logs.seals",
+    "decode": "eval.interface.runs.tables",
+    "merge": "eval.interface.runs.tables",
+    "MergedRuns": "eval.interface.runs.tables",
     "Decoded": "eval.catalog.decoded_logs",
     "write_truth": "eval.interface.truth",
     "truth_schema": "eval.interface.truth",
     "draft_vehicle": "eval.interface.vehicles",
     "VehicleDraft": "eval.interface.vehicles",
-    "run_schema": "eval.interface.runs",
+    "run_schema": "eval.interface.runs.run",
     "Comparison": "eval.catalog.compare",
     "check_truth": "eval.fit.truth_check",
     "import_truth": "eval.fit.truth_check",
     "TruthFit": "eval.fit.truth_check",
     "ImportedTruth": "eval.fit.truth_check",
-    "score_runs": "eval.interface.scores",
-    "ScoredRuns": "eval.interface.scores",
+    "score_runs": "eval.interface.runs.scores",
+    "ScoredRuns": "eval.interface.runs.scores",
     "simulate_approaches": "eval.interface.simulate",
     "SimulatedDrives": "eval.interface.simulate",
     "draw_contact_sheet": "eval.interface.simulate",
@@ -132,30 +132,30 @@ _EXPORTS: Final = {
     "FittedMessages": "eval.interface.fits.messages",
     "fit_ranges": "eval.interface.fits.ranges",
     "FittedRanges": "eval.interface.fits.ranges",
-    "run_field_study": "eval.interface.studies",
-    "FieldResult": "eval.interface.studies",
-    "calibrate_study": "eval.interface.studies",
+    "run_field_study": "eval.interface.studies.town",
+    "FieldResult": "eval.interface.studies.town",
+    "calibrate_study": "eval.interface.studies.town",
     "FieldStudy": "eval.studies.town.settings",
-    "run_study_drive": "eval.interface.study_drive",
-    "StudyDrive": "eval.interface.study_drive",
-    "models": "eval.interface.models",
-    "Models": "eval.interface.models",
-    "model": "eval.interface.models",
-    "Model": "eval.interface.models",
-    "fetch_model": "eval.interface.models",
-    "FetchedModel": "eval.interface.models",
-    "draft_card": "eval.interface.cards",
-    "CardDraft": "eval.interface.cards",
-    "check_card": "eval.interface.cards",
-    "CardCheck": "eval.interface.cards",
-    "find_drives": "eval.interface.batch",
+    "run_study_drive": "eval.interface.studies.drive",
+    "StudyDrive": "eval.interface.studies.drive",
+    "models": "eval.interface.models.catalog",
+    "Models": "eval.interface.models.catalog",
+    "model": "eval.interface.models.catalog",
+    "Model": "eval.interface.models.catalog",
+    "fetch_model": "eval.interface.models.catalog",
+    "FetchedModel": "eval.interface.models.catalog",
+    "draft_card": "eval.interface.models.cards",
+    "CardDraft": "eval.interface.models.cards",
+    "check_card": "eval.interface.models.cards",
+    "CardCheck": "eval.interface.models.cards",
+    "find_drives": "eval.interface.runs.batch",
     "DriveList": "eval.batch.drive_list",
-    "replay_drives": "eval.interface.batch",
-    "ReplayedDrives": "eval.interface.batch",
-    "render_training_frames": "eval.interface.training",
-    "TrainingFrames": "eval.interface.training",
-    "run_intersection_study": "eval.interface.intersections",
-    "IntersectionResult": "eval.interface.intersections",
+    "replay_drives": "eval.interface.runs.batch",
+    "ReplayedDrives": "eval.interface.runs.batch",
+    "render_training_frames": "eval.interface.training.frames",
+    "TrainingFrames": "eval.interface.training.frames",
+    "run_intersection_study": "eval.interface.studies.intersections",
+    "IntersectionResult": "eval.interface.studies.intersections",
     "IntersectionStudy": "eval.studies.intersections.study",
 }
 """From a public name to its module."""
@@ -182,15 +182,6 @@ if TYPE_CHECKING:
     from crosscue.eval.fit.truth_check import TruthFit as TruthFit
     from crosscue.eval.fit.truth_check import check_truth as check_truth
     from crosscue.eval.fit.truth_check import import_truth as import_truth
-    from crosscue.eval.interface.batch import ReplayedDrives as ReplayedDrives
-    from crosscue.eval.interface.batch import find_drives as find_drives
-    from crosscue.eval.interface.batch import replay_drives as replay_drives
-    from crosscue.eval.interface.cards import CardCheck as CardCheck
-    from crosscue.eval.interface.cards import CardDraft as CardDraft
-    from crosscue.eval.interface.cards import check_card as check_card
-    from crosscue.eval.interface.cards import draft_card as draft_card
-    from crosscue.eval.interface.convert import Converted as Converted
-    from crosscue.eval.interface.convert import convert as convert
     from crosscue.eval.interface.demo import Demo as Demo
     from crosscue.eval.interface.demo import KnownDrive as KnownDrive
     from crosscue.eval.interface.demo import demo as demo
@@ -203,10 +194,6 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.fits.messages import fit_messages as fit_messages
     from crosscue.eval.interface.fits.ranges import FittedRanges as FittedRanges
     from crosscue.eval.interface.fits.ranges import fit_ranges as fit_ranges
-    from crosscue.eval.interface.intersections import IntersectionResult as IntersectionResult
-    from crosscue.eval.interface.intersections import (
-        run_intersection_study as run_intersection_study,
-    )
     from crosscue.eval.interface.landmarks import AddedLandmarks as AddedLandmarks
     from crosscue.eval.interface.landmarks import LandmarkList as LandmarkList
     from crosscue.eval.interface.landmarks import LandmarkMatches as LandmarkMatches
@@ -214,57 +201,74 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.landmarks import add_landmarks as add_landmarks
     from crosscue.eval.interface.landmarks import list_landmarks as list_landmarks
     from crosscue.eval.interface.landmarks import match_landmarks as match_landmarks
-    from crosscue.eval.interface.logs import CameraFrame as CameraFrame
-    from crosscue.eval.interface.logs import Log as Log
-    from crosscue.eval.interface.logs import LogTopic as LogTopic
-    from crosscue.eval.interface.logs import Signals as Signals
-    from crosscue.eval.interface.logs import Topics as Topics
-    from crosscue.eval.interface.logs import open as open  # noqa: A004
-    from crosscue.eval.interface.models import FetchedModel as FetchedModel
-    from crosscue.eval.interface.models import Model as Model
-    from crosscue.eval.interface.models import Models as Models
-    from crosscue.eval.interface.models import fetch_model as fetch_model
-    from crosscue.eval.interface.models import model as model
-    from crosscue.eval.interface.models import models as models
+    from crosscue.eval.interface.logs.convert import Converted as Converted
+    from crosscue.eval.interface.logs.convert import convert as convert
+    from crosscue.eval.interface.logs.log import CameraFrame as CameraFrame
+    from crosscue.eval.interface.logs.log import Log as Log
+    from crosscue.eval.interface.logs.log import LogTopic as LogTopic
+    from crosscue.eval.interface.logs.log import Signals as Signals
+    from crosscue.eval.interface.logs.log import Topics as Topics
+    from crosscue.eval.interface.logs.log import open as open  # noqa: A004
+    from crosscue.eval.interface.logs.seals import SealCheck as SealCheck
+    from crosscue.eval.interface.logs.seals import SealChecks as SealChecks
+    from crosscue.eval.interface.logs.seals import Sealed as Sealed
+    from crosscue.eval.interface.logs.seals import Seals as Seals
+    from crosscue.eval.interface.logs.seals import check_seal as check_seal
+    from crosscue.eval.interface.logs.seals import seal as seal
+    from crosscue.eval.interface.logs.summary import DriveSummary as DriveSummary
+    from crosscue.eval.interface.models.cards import CardCheck as CardCheck
+    from crosscue.eval.interface.models.cards import CardDraft as CardDraft
+    from crosscue.eval.interface.models.cards import check_card as check_card
+    from crosscue.eval.interface.models.cards import draft_card as draft_card
+    from crosscue.eval.interface.models.catalog import FetchedModel as FetchedModel
+    from crosscue.eval.interface.models.catalog import Model as Model
+    from crosscue.eval.interface.models.catalog import Models as Models
+    from crosscue.eval.interface.models.catalog import fetch_model as fetch_model
+    from crosscue.eval.interface.models.catalog import model as model
+    from crosscue.eval.interface.models.catalog import models as models
     from crosscue.eval.interface.plugins import plugins as plugins
-    from crosscue.eval.interface.runs import Run as Run
-    from crosscue.eval.interface.runs import ScoredRun as ScoredRun
-    from crosscue.eval.interface.runs import compare_runs as compare_runs
-    from crosscue.eval.interface.runs import detect_drive as detect_drive
-    from crosscue.eval.interface.runs import estimate_run as estimate_run
-    from crosscue.eval.interface.runs import load_vehicle as load_vehicle
-    from crosscue.eval.interface.runs import open_run as open_run
-    from crosscue.eval.interface.runs import replay_drive as replay_drive
-    from crosscue.eval.interface.runs import run_schema as run_schema
-    from crosscue.eval.interface.runs import save_recording as save_recording
-    from crosscue.eval.interface.runs import score_run as score_run
-    from crosscue.eval.interface.scores import ScoredRuns as ScoredRuns
-    from crosscue.eval.interface.scores import score_runs as score_runs
-    from crosscue.eval.interface.seals import SealCheck as SealCheck
-    from crosscue.eval.interface.seals import SealChecks as SealChecks
-    from crosscue.eval.interface.seals import Sealed as Sealed
-    from crosscue.eval.interface.seals import Seals as Seals
-    from crosscue.eval.interface.seals import check_seal as check_seal
-    from crosscue.eval.interface.seals import seal as seal
+    from crosscue.eval.interface.runs.batch import ReplayedDrives as ReplayedDrives
+    from crosscue.eval.interface.runs.batch import find_drives as find_drives
+    from crosscue.eval.interface.runs.batch import replay_drives as replay_drives
+    from crosscue.eval.interface.runs.run import Run as Run
+    from crosscue.eval.interface.runs.run import ScoredRun as ScoredRun
+    from crosscue.eval.interface.runs.run import compare_runs as compare_runs
+    from crosscue.eval.interface.runs.run import detect_drive as detect_drive
+    from crosscue.eval.interface.runs.run import estimate_run as estimate_run
+    from crosscue.eval.interface.runs.run import load_vehicle as load_vehicle
+    from crosscue.eval.interface.runs.run import open_run as open_run
+    from crosscue.eval.interface.runs.run import replay_drive as replay_drive
+    from crosscue.eval.interface.runs.run import run_schema as run_schema
+    from crosscue.eval.interface.runs.run import save_recording as save_recording
+    from crosscue.eval.interface.runs.run import score_run as score_run
+    from crosscue.eval.interface.runs.scores import ScoredRuns as ScoredRuns
+    from crosscue.eval.interface.runs.scores import score_runs as score_runs
+    from crosscue.eval.interface.runs.tables import MergedRuns as MergedRuns
+    from crosscue.eval.interface.runs.tables import decode as decode
+    from crosscue.eval.interface.runs.tables import merge as merge
     from crosscue.eval.interface.simulate import SimulatedDrives as SimulatedDrives
     from crosscue.eval.interface.simulate import draw_contact_sheet as draw_contact_sheet
     from crosscue.eval.interface.simulate import draw_sign as draw_sign
     from crosscue.eval.interface.simulate import simulate_approach as simulate_approach
     from crosscue.eval.interface.simulate import simulate_approaches as simulate_approaches
     from crosscue.eval.interface.simulate import simulate_drive as simulate_drive
-    from crosscue.eval.interface.studies import FieldResult as FieldResult
-    from crosscue.eval.interface.studies import StudyResult as StudyResult
-    from crosscue.eval.interface.studies import calibrate_study as calibrate_study
-    from crosscue.eval.interface.studies import run_field_study as run_field_study
-    from crosscue.eval.interface.studies import run_study as run_study
-    from crosscue.eval.interface.study_drive import StudyDrive as StudyDrive
-    from crosscue.eval.interface.study_drive import run_study_drive as run_study_drive
-    from crosscue.eval.interface.summary import DriveSummary as DriveSummary
-    from crosscue.eval.interface.tables import MergedRuns as MergedRuns
-    from crosscue.eval.interface.tables import decode as decode
-    from crosscue.eval.interface.tables import merge as merge
-    from crosscue.eval.interface.training import TrainingFrames as TrainingFrames
-    from crosscue.eval.interface.training import render_training_frames as render_training_frames
+    from crosscue.eval.interface.studies.drive import StudyDrive as StudyDrive
+    from crosscue.eval.interface.studies.drive import run_study_drive as run_study_drive
+    from crosscue.eval.interface.studies.intersections import (
+        IntersectionResult as IntersectionResult,
+    )
+    from crosscue.eval.interface.studies.intersections import (
+        run_intersection_study as run_intersection_study,
+    )
+    from crosscue.eval.interface.studies.town import FieldResult as FieldResult
+    from crosscue.eval.interface.studies.town import StudyResult as StudyResult
+    from crosscue.eval.interface.studies.town import calibrate_study as calibrate_study
+    from crosscue.eval.interface.studies.town import run_field_study as run_field_study
+    from crosscue.eval.interface.studies.town import run_study as run_study
+    from crosscue.eval.interface.training.frames import TrainingFrames as TrainingFrames
+    from crosscue.eval.interface.training.frames import (
+        render_training_frames as render_training_frames,
+    )
     from crosscue.eval.interface.truth import truth_schema as truth_schema
     from crosscue.eval.interface.truth import write_truth as write_truth
     from crosscue.eval.interface.vehicles import VehicleDraft as VehicleDraft

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.eval.interface.runs import (
+from crosscue.eval.interface.runs.run import (
     Run,
     ScoredRun,
     replay_drive,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from crosscue.eval.interface.logs import Log, opened
+from crosscue.eval.interface.logs.log import Log, opened
 from crosscue.replay.base import OutputError, write_text
 from crosscue.replay.vehicle.draft import draft
 from crosscue.replay.vehicle.vehicle import Vehicle, parse

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from crosscue.eval.interface.logs import Log as DriveLog
-from crosscue.eval.interface.logs import open as open_drive
+from crosscue.eval.interface.logs.log import Log as DriveLog
+from crosscue.eval.interface.logs.log import open as open_drive
 from crosscue.replay.logs.log_part import part_in_words
 from crosscue.replay.logs.opening import unless_damaged
 

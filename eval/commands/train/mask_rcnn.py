@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from crosscue.detectors.training.summary import measured_text, measured_tree
 from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.interface.training_inputs import check_place
+from crosscue.eval.interface.training.inputs import check_place
 from crosscue.replay.base import UsageError
 from crosscue.replay.files.made_of import made_of
 

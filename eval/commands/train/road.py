@@ -25,7 +25,7 @@ from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.eval.commands.shared.options import print_json
 from crosscue.eval.commands.shared.progress import Done, with_progress
-from crosscue.eval.interface.training_inputs import check_place, layouts_of, learnt_layouts_of
+from crosscue.eval.interface.training.inputs import check_place, layouts_of, learnt_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.made_of import made_of
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from crosscue.datasets.truth.truth import load
 from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, rates_of, section_of
-from crosscue.eval.interface.runs import Run
+from crosscue.eval.interface.runs.run import Run
 from crosscue.eval.runs.folder import open_run
 from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side

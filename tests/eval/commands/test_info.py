@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval.cli import run
-from crosscue.eval.interface.summary import lines_of, plain
+from crosscue.eval.interface.logs.summary import lines_of, plain
 from crosscue.replay.base import (
     DATA,
     EVERYTHING,

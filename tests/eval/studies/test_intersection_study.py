@@ -10,7 +10,7 @@ import pytest
 
 from crosscue.eval.batch.jobs import in_turn
 from crosscue.eval.cli import run
-from crosscue.eval.interface import intersections as study_intersections
+from crosscue.eval.interface.studies import intersections as study_intersections
 from crosscue.eval.studies.intersections import study as intersection_study
 from crosscue.eval.studies.intersections.tables import cue_rows
 from crosscue.replay.vehicle.cue_table import groups

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from crosscue.eval.catalog.find_runs import runs_of
-from crosscue.eval.interface.runs import Run, ScoredRun
+from crosscue.eval.interface.runs.run import Run, ScoredRun
 from crosscue.eval.report.junit import write_junit
 from crosscue.eval.report.page import REPORT, write_report
 from crosscue.eval.report.score_runs import Failed, ScoreWork

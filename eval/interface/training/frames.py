@@ -9,7 +9,7 @@ from pathlib import Path
 from crosscue.datasets.scenes.drive import SOURCE, SceneSettings, camera_of_width
 from crosscue.datasets.scenes.export.coco import Objects
 from crosscue.datasets.scenes.export.training_frames import frames, joined
-from crosscue.eval.interface.training_inputs import check_place, learnt_layouts_of
+from crosscue.eval.interface.training.inputs import check_place, learnt_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 
 

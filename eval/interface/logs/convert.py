@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.eval.interface.logs import NOT_ASKED, Log, opened
+from crosscue.eval.interface.logs.log import NOT_ASKED, Log, opened
 from crosscue.eval.interface.show import listing
 from crosscue.eval.pipeline.empty_result import empty_result
 from crosscue.replay.base import Ledger, LogError, OutputError, Topic, UsageError, visible

@@ -17,8 +17,8 @@ from crosscue.eval.batch.jobs import (
     run_many,
 )
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
-from crosscue.eval.interface.logs import open as open_drive
-from crosscue.eval.interface.runs import replay_drive
+from crosscue.eval.interface.logs.log import open as open_drive
+from crosscue.eval.interface.runs.run import replay_drive
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import create
 from crosscue.eval.runs.input import files_named_in

@@ -47,7 +47,7 @@ from crosscue.replay.remote.logs import name_of
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from crosscue.eval.interface.summary import DriveSummary
+    from crosscue.eval.interface.logs.summary import DriveSummary
     from crosscue.replay.base import Bytes
     from crosscue.replay.logs.log_summary import Progress
     from crosscue.replay.vehicle.vehicle import Vehicle
@@ -157,7 +157,7 @@ class Log:
             quick: Only what the log says of itself; its body is not read.
             progress: Passes blocks on while it shows how far the work is.
         """
-        from crosscue.eval.interface.summary import summary_of
+        from crosscue.eval.interface.logs.summary import summary_of
         from crosscue.replay.vehicle.vehicle import Vehicle
 
         settings = vehicle or Vehicle(version=1)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.eval.interface.logs import Log, opened
+from crosscue.eval.interface.logs.log import Log, opened
 from crosscue.eval.interface.show import listing
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.runs.manifest import Manifest, json_schema

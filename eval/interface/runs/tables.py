@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crosscue.eval.interface.logs import Log, opened
-from crosscue.eval.interface.runs import vehicle_of
+from crosscue.eval.interface.logs.log import Log, opened
+from crosscue.eval.interface.runs.run import vehicle_of
 from crosscue.eval.runs.folder import create
 from crosscue.replay.base import RunError, visible
 

@@ -1,0 +1,1 @@
+"""A drive: opened for reading, summarised, converted, sealed."""

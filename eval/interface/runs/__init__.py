@@ -1,0 +1,1 @@
+"""Runs: made from drives one or many, estimated again, scored, compared, merged."""

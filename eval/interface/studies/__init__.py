@@ -1,0 +1,1 @@
+"""The studies: of the town, of one drive in it, of intersections."""

@@ -1,0 +1,1 @@
+"""Networks trained, and the pictures they are trained on."""
