@@ -1,0 +1,1 @@
+"""A log: what it holds, converted, decoded, sealed."""

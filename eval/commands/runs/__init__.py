@@ -1,0 +1,1 @@
+"""A run: made, estimated again, scored, compared, merged, viewed."""
