@@ -20,8 +20,8 @@ from cantools.database.can import Signal
 from cantools.database.conversion import BaseConversion
 
 from crosscue.replay.base import BLOCK_ROWS, Block, CanFrames, Ledger, Table
-from crosscue.replay.mobileye.decode import MobileyeDecoder
-from crosscue.replay.mobileye.encode import bursts_of, encode_tables
+from crosscue.replay.mobileye.can.decode import MobileyeDecoder
+from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.layout import Columns, Field, Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings

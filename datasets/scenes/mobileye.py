@@ -15,7 +15,7 @@ from numpy.random import Generator
 
 from crosscue.datasets.scenes.rendering.render import Picture, Seen
 from crosscue.replay.columns import Block, Int64s, Table
-from crosscue.replay.mobileye.encode import bursts_of, encode_tables
+from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.mobileye.tables import table_block

@@ -33,8 +33,8 @@ from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.logs.log_summary import rows_declared, rows_read
 from crosscue.replay.logs.topic_part import columns_of
-from crosscue.replay.mobileye.admit import all_ids
-from crosscue.replay.mobileye.decode import MobileyeDecoder
+from crosscue.replay.mobileye.can.admit import all_ids
+from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.mobileye.samples import settings_of
 from crosscue.replay.remote.logs import name_of

@@ -8,12 +8,12 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.base import Block, CanFrames, Floats, Ledger, Table
+from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS, Samples, Signal
 from crosscue.replay.vehicle.vehicle import Mobileye
 
-from .decode import MobileyeDecoder
 from .settings import MobileyeSettings
 
 

@@ -188,7 +188,7 @@ class Extractor:
         bus = source.topic.name
         if bus not in self._buses:
             from crosscue.replay.can.decode import BusDecoder
-            from crosscue.replay.mobileye.admit import all_ids
+            from crosscue.replay.mobileye.can.admit import all_ids
             from crosscue.replay.mobileye.samples import settings_of
 
             database = database_of(self.vehicle.can.dbc)

@@ -30,7 +30,7 @@ from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.mobileye.decode import MobileyeDecoder
+from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
 
 TINY = Camera(width_px=192, height_px=108)

@@ -12,7 +12,7 @@ from crosscue.eval import cli
 from crosscue.eval.catalog.decoded_logs import decode_tables, file_name
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.replay.base import EVERYTHING, Block, Messages, Table, Topic
-from crosscue.replay.mobileye.encode import bursts_of, encode_tables
+from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.vehicle.vehicle import Mobileye, Vehicle

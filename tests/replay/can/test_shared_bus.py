@@ -10,7 +10,7 @@ from crosscue.replay.base import DATA, ERROR, REMOTE, Block, CanFrames, Ledger
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
 from crosscue.replay.can.layout import CanMessage, CanSignal
-from crosscue.replay.mobileye.admit import Admission, all_ids
+from crosscue.replay.mobileye.can.admit import Admission, all_ids
 from crosscue.replay.mobileye.settings import MobileyeSettings
 
 SPEED = CanMessage("Speed", 0x100, False, 2, (CanSignal("kph", 0, 16, scale=0.01, unit="km/h"),))

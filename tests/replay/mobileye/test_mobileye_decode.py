@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.base import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Ledger, Table
-from crosscue.replay.mobileye.decode import MobileyeDecoder
+from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.layout import VARIANTS
 from crosscue.replay.mobileye.settings import MobileyeSettings

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.base import Block, CanFrames, Floats, Ledger, Table
-from crosscue.replay.mobileye.decode import MobileyeDecoder
-from crosscue.replay.mobileye.encode import FRAME_NS, bursts_of, encode_burst, encode_tables
+from crosscue.replay.mobileye.can.decode import MobileyeDecoder
+from crosscue.replay.mobileye.can.encode import FRAME_NS, bursts_of, encode_burst, encode_tables
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.layout import Columns, Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from crosscue.replay.base import Block, CanFrames, Ledger, Table
 from crosscue.replay.decode import decoder_for
-from crosscue.replay.mobileye.decode import MobileyeDecoder
+from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.layout import layout
 from crosscue.replay.mobileye.ros.reader import RosMobileye, tables_from_ros

@@ -13,14 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table
+from crosscue.replay.mobileye.bits import Words, payloads_of
+from crosscue.replay.mobileye.clock import MS
 from crosscue.replay.mobileye.geometry import AT_REAR_AXLE, Mounting
-
-from .bits import Words, payloads_of
-from .clock import MS
-from .layout import UNKNOWN, VARIANTS, Column, Columns, Message, Variant, layout, variant_number
-from .settings import DEFAULTS, MobileyeSettings
-from .tables import floats, instance_of_lane, table_block, to_device
-from .wire import words_from
+from crosscue.replay.mobileye.layout import (
+    UNKNOWN,
+    VARIANTS,
+    Column,
+    Columns,
+    Message,
+    Variant,
+    layout,
+    variant_number,
+)
+from crosscue.replay.mobileye.settings import DEFAULTS, MobileyeSettings
+from crosscue.replay.mobileye.tables import floats, instance_of_lane, table_block, to_device
+from crosscue.replay.mobileye.wire import words_from
 
 FRAME_NS: Final = 250_000
 """One frame of 8 bytes takes about this long at 500 kbit/s."""

@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.base import Block, CanFrames, Int64s, Ledger
-
-from .admit import Admission, Admitted
-from .bits import Words, extract
-from .bursts import (
+from crosscue.replay.mobileye.bits import Words, extract
+from crosscue.replay.mobileye.bursts import (
     CUT,
     NO_BURST,
     Fault,
@@ -30,12 +28,23 @@ from .bursts import (
     shortage,
     sift,
 )
-from .clock import CounterClock
+from crosscue.replay.mobileye.clock import CounterClock
+from crosscue.replay.mobileye.layout import (
+    UNKNOWN,
+    VARIANTS,
+    Columns,
+    Field,
+    Message,
+    Variant,
+    layout,
+    variant_number,
+)
+from crosscue.replay.mobileye.settings import DEFAULTS, MobileyeSettings, mounting_of
+from crosscue.replay.mobileye.tables import lane_places, table_block, to_vehicle
+from crosscue.replay.mobileye.wire import columns_of, values_of
+
+from .admit import Admission, Admitted
 from .family import FamilyEvidence
-from .layout import UNKNOWN, VARIANTS, Columns, Field, Message, Variant, layout, variant_number
-from .settings import DEFAULTS, MobileyeSettings, mounting_of
-from .tables import lane_places, table_block, to_vehicle
-from .wire import columns_of, values_of
 
 CUT_AT_END: Final = "obstacle cut by the end of the log"
 NOT_COME: Final = "obstacle frames announced by a status frame that did not come"

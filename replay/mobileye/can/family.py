@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from .bits import Words
-from .layout import UNKNOWN, Variant, variant_number
-from .settings import Family
+from crosscue.replay.mobileye.bits import Words
+from crosscue.replay.mobileye.layout import UNKNOWN, Variant, variant_number
+from crosscue.replay.mobileye.settings import Family
 
 
 def _mask(*bits: int) -> np.uint64:

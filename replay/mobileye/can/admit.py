@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.base import DATA, ERROR, LENGTH_UNKNOWN, REMOTE, CanFrames, Int64s, Ledger
-
-from .bits import Words, words_of
-from .layout import Message, layout
-from .settings import MobileyeSettings
+from crosscue.replay.mobileye.bits import Words, words_of
+from crosscue.replay.mobileye.layout import Message, layout
+from crosscue.replay.mobileye.settings import MobileyeSettings
 
 ERROR_FRAME: Final = "error frame"
 REMOTE_FRAME: Final = "remote frame"

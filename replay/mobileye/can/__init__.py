@@ -1,0 +1,1 @@
+"""A Mobileye on a CAN bus: its frames told apart, decoded and encoded."""
