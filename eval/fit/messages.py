@@ -19,7 +19,7 @@ from crosscue.datasets.truth.truth import Truth
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import refuse_set_back
 from crosscue.eval.runs.tables.travelled import odometer_of
-from crosscue.eval.scoring.intervals import Interval, resampled, wilson
+from crosscue.eval.scoring.intervals import Interval, mean_by_cluster, wilson
 from crosscue.eval.scoring.truth import CROSSING_NS
 from crosscue.fusion.factor_graph import FactorGraph, graph_of
 from crosscue.fusion.fit.annotated_approach import NOT_LOOKED, AnnotatedApproach
@@ -185,7 +185,7 @@ class SideTold(NamedTuple):
         rate: Mean over places; NaN without any.
         wilson: Interval by independent observations; rounding them to whole ones costs less than
             pretending that every frame is one.
-        places: Interval by resampling places; NaN for fewer than two.
+        places: Interval over places; NaN for fewer than four.
     """
 
     rate: float
@@ -200,7 +200,7 @@ def rates_of(side: Side) -> SideTold:
     return SideTold(
         float(rates.mean()) if len(rates) else math.nan,
         wilson(min(round(side.hits), looks), looks),
-        resampled(rates, np.arange(len(rates))),
+        mean_by_cluster(rates, np.arange(len(rates))),
     )
 
 

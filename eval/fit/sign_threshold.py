@@ -13,7 +13,7 @@ import numpy as np
 from crosscue.detectors.signs.detector import build
 from crosscue.detectors.signs.templates import AMERICAN, KINDS
 from crosscue.detectors.training.operating_point import Judged, rates_at, threshold_for, together
-from crosscue.eval.scoring.intervals import Proportion, share
+from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, share
 from crosscue.replay.base import DEFAULT_LIMITS, EmptyResultError, Limits, UsageError
 
 from .sign_scores import Rules, judged_pictures
@@ -180,8 +180,8 @@ def _proportion_text(name: str, part: Proportion) -> str:
     if not part.of:
         return f"{name:9} none (0 of 0)"
     interval = f"95 % interval {part.low:.2f} to {part.high:.2f}"
-    if not math.isnan(part.clusters_low):
-        interval += f", by drive {part.clusters_low:.2f} to {part.clusters_high:.2f}"
+    by_drive = f"{part.clusters_low:.2f} to {part.clusters_high:.2f}"
+    interval += f", by drive {TOO_FEW if math.isnan(part.clusters_low) else by_drive}"
     return f"{name:9} {part.value:.2f} ({part.right} of {part.of}; {interval})"
 
 

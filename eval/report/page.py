@@ -18,6 +18,7 @@ from crosscue.eval.runs.candidates import CandidateRow, candidate_lines, not_loo
 from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest
 from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.drives import Scores
+from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.base import strict_json, write_text
 from crosscue.replay.vehicle.cue_table import CUES
@@ -113,7 +114,14 @@ def write_report(
     page = render_page(
         TEMPLATE,
         content,
-        {"number": _number, "signed": _signed, "never": _never, "span": _span, "ends": _ends},
+        {
+            "number": _number,
+            "signed": _signed,
+            "never": _never,
+            "span": _span,
+            "ends": _ends,
+            "by_cluster": _by_cluster,
+        },
     )
     write_text(folder / REPORT, page)
     return folder / REPORT
@@ -275,9 +283,14 @@ def _ends(low: float | None, high: float | None) -> str:
     return f"{low:.2f} to {high:.2f}"
 
 
+def _by_cluster(fraction: Mapping[str, Any]) -> str:
+    ends = _ends(fraction["clusters_low"], fraction["clusters_high"])
+    return TOO_FEW if ends == "-" and fraction["of"] else ends
+
+
 def _span(mean: Mapping[str, Any], digits: int = 2) -> str:
-    """An interval in brackets, or nothing where none exists."""
+    """An interval in brackets, or why none exists; nothing for no rows."""
     low, high = mean["low"], mean["high"]
     if low is None or high is None or math.isnan(low) or math.isnan(high):
-        return ""
+        return f" ({TOO_FEW})" if mean["of"] else ""
     return f" ({low:.{digits}f} to {high:.{digits}f})"

@@ -8,7 +8,7 @@ from typing import Final
 
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.gates import GateResult
-from crosscue.eval.scoring.intervals import Mean, Proportion
+from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW, Mean, Proportion
 from crosscue.eval.scoring.metric_values import MetricValue
 from crosscue.eval.scoring.pose.score import Errors, PoseScore
 from crosscue.eval.scoring.scene.approaches import ApproachScore
@@ -99,7 +99,7 @@ def _cues(cues: Mapping[str, CueScore]) -> list[str]:
     if any(not one.is_sources_reading for one in shown.values()):
         lines.append("* judged by the feature or thing that the source does not judge it by")
     if any(math.isnan(one.precision.clusters_low) for one in shown.values() if one.positives):
-        lines.append("few approaches: intervals count frames as independent, which they are not")
+        lines.append(f"{TOO_FEW}: under {MIN_CLUSTERS} approaches, intervals count frames only")
     return [*lines, *_left_out(cues)]
 
 
@@ -164,9 +164,9 @@ def _distance(found: Proportion, distance: Mean) -> str:
     if not distance.of:
         return text
     text += f", {distance.value:.1f} m away on average"
-    if not math.isnan(distance.low):
-        text += f" ({distance.low:.1f} to {distance.high:.1f})"
-    return text
+    if math.isnan(distance.low):
+        return f"{text} ({TOO_FEW})"
+    return f"{text} ({distance.low:.1f} to {distance.high:.1f})"
 
 
 def _belief(belief: Mapping[str, BeliefScore]) -> list[str]:

@@ -37,12 +37,10 @@ class ScoreSettings:
     Attributes:
         threshold: A feature is detected above this probability.
         bins_m: Borders of bins of true range.
-        seed: Of the resampling for intervals.
     """
 
     threshold: float = score_approaches.THRESHOLD
     bins_m: tuple[float, ...] = BINS_M
-    seed: int = intervals.SEED
 
     def __post_init__(self) -> None:
         """Refuse what means nothing.
@@ -198,16 +196,16 @@ def score(drives: Sequence[DriveJudged], settings: ScoreSettings = DEFAULTS) -> 
     names = [one.coverage.drive for one in drives]
     if not names or len(set(names)) != len(names):
         raise ValueError(f"drives: expected one or more with different names, got {names}")
-    bins_m, seed = settings.bins_m, settings.seed
+    bins_m = settings.bins_m
     return Scores(
         settings=settings,
         drives=tuple(one.coverage for one in drives),
-        cues=score_cues([cue for one in drives for cue in one.cues], bins_m, seed),
+        cues=score_cues([cue for one in drives for cue in one.cues], bins_m),
         approaches=score_approaches.score_approaches(
-            [one.approaches for one in drives if one.approaches is not None], seed
+            [one.approaches for one in drives if one.approaches is not None]
         ),
-        belief=score_belief.score_belief([part for one in drives for part in one.belief], seed),
-        range=score_range([part for one in drives for part in one.ranges], bins_m, seed),
+        belief=score_belief.score_belief([part for one in drives for part in one.belief]),
+        range=score_range([part for one in drives for part in one.ranges], bins_m),
     )
 
 
@@ -229,7 +227,6 @@ def as_metrics(scores: Scores) -> dict[str, Any]:
         "settings": tree["settings"]
         | {
             "confidence": intervals.CONFIDENCE,
-            "resampling_rounds": intervals.ROUNDS,
             "log_score_clip": score_belief.CLIP,
             "crossing_s": score_truth.CROSSING_NS * 1e-9,
         },

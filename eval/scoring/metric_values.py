@@ -50,7 +50,7 @@ def _walk(
 
 
 def _with_interval(branch: Mapping[str, object]) -> MetricValue:
-    """The wider of both intervals where rows were also resampled by drive or approach."""
+    """The wider of both intervals where rows were also counted by drive or approach."""
     low = [_number(branch.get(name)) for name in ("low", "clusters_low")]
     high = [_number(branch.get(name)) for name in ("high", "clusters_high")]
     of = branch.get("of")

@@ -1,7 +1,7 @@
 """What each cue was worth: every measure again with the cue left out, as if nobody had looked.
 
 Nothing is detected again; who calls supplies the estimates. Distances and log scores are compared
-approach by approach, so their intervals come from resampling paired differences.
+approach by approach, so their intervals are those of paired differences.
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ def _without(
         cues=cues,
         scores=scores,
         measures=_changed(whole, scores),
-        detected_m=_gain(detected, settings.seed),
-        full_m=_gain(full, settings.seed),
+        detected_m=_gain(detected),
+        full_m=_gain(full),
         detected_only_with=_only(detected, 0),
         detected_only_without=_only(detected, 1),
         full_only_with=_only(full, 0),
@@ -130,7 +130,6 @@ def _without(
         belief=compare_belief(
             [part for one in drives for part in one.judged.belief],
             [part for one in judged for part in one.belief],
-            settings.seed,
         ),
     )
 
@@ -142,9 +141,9 @@ def _pairs(whole: Scores, without: Scores) -> list[tuple[ApproachResult, Approac
     return [(one, others[one.drive, one.approach]) for one in whole.approaches.results]
 
 
-def _gain(pairs: Sequence[tuple[float | None, float | None]], seed: int) -> Mean:
+def _gain(pairs: Sequence[tuple[float | None, float | None]]) -> Mean:
     gains = [math.nan if a is None or b is None else a - b for a, b in pairs]
-    return mean(np.array(gains, np.float64), np.arange(len(gains)), seed)
+    return mean(np.array(gains, np.float64), np.arange(len(gains)))
 
 
 def _only(pairs: Sequence[tuple[float | None, float | None]], side: int) -> int:

@@ -1,6 +1,8 @@
 """Numbers with their 95 % intervals: means, shares, ratios, and the range at a success rate.
 
-Bootstrap: Efron, Tibshirani, *An Introduction to the Bootstrap*, section 13.3 (percentiles).
+Means and ratios: Student's t, a ratio's variance by linearisation (Cochran, *Sampling Techniques*,
+section 6.4). Everything else by the bootstrap, its percentiles widened for few drives (Hesterberg,
+*What Teachers Should Know About the Bootstrap*, The American Statistician 69, 2015, section 4.3).
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from crosscue.eval.scoring.intervals import wilson
+from crosscue.eval.scoring.intervals import MIN_CLUSTERS, wilson
 from crosscue.replay.columns import Floats
 
 Z_95: Final = 1.959964
@@ -21,7 +23,7 @@ STEEPEST: Final = 40.0
 
 
 class Measured(NamedTuple):
-    """A value and its 95 % interval; infinite where it lies beyond what was driven."""
+    """A value and its 95 % interval; infinite beyond what was driven, NaN for too few drives."""
 
     value: float
     low: float
@@ -29,13 +31,8 @@ class Measured(NamedTuple):
 
 
 def mean_of(values: Floats) -> Measured:
-    """Mean, with the interval of the normal distribution; NaN without values."""
-    n = len(values)
-    if n == 0:
-        return Measured(math.nan, math.nan, math.nan)
-    mean = float(values.mean())
-    half = Z_95 * float(values.std(ddof=1)) / math.sqrt(n) if n > 1 else math.inf
-    return Measured(mean, mean - half, mean + half)
+    """Mean, with the interval of Student's t; NaN without values."""
+    return ratio_of(values, np.ones(len(values)))
 
 
 def fraction_of(right: int, of: int) -> Measured:
@@ -52,34 +49,51 @@ def weights_of(n: int, replicates: int = REPLICATES, seed: int = 0) -> Floats:
     return np.vstack([np.ones((1, n)), drawn])
 
 
-def measured(values: Floats) -> Measured:
-    """The first value, with the percentiles of the replicates that follow it."""
+def measured(values: Floats, drives: int) -> Measured:
+    """The first value, with percentiles of the bootstrap's replicates that follow it."""
+    from scipy.special import ndtr, stdtrit
+
+    if drives < MIN_CLUSTERS:
+        return Measured(float(values[0]), math.nan, math.nan)
+    tail = float(ndtr(math.sqrt(drives / (drives - 1)) * stdtrit(drives - 1, 0.025)))
     # Infinite replicates are legitimate: percentiles by rank, without interpolation.
-    low, high = np.quantile(values[1:], [0.025, 0.975], method="nearest")
+    low, high = np.quantile(values[1:], [tail, 1.0 - tail], method="nearest")
     return Measured(float(values[0]), float(low), float(high))
 
 
 def ratio_of(top: Floats, bottom: Floats) -> Measured:
-    """Ratio of two paired sums."""
-    weights = weights_of(len(top))
-    return measured((weights @ top) / (weights @ bottom))
+    """Ratio of two sums over the same drives; NaN without any."""
+    if not bottom.any():
+        return Measured(math.nan, math.nan, math.nan)
+    ratio = float(top.sum() / bottom.sum())
+    return _with_t(ratio, (top - ratio * bottom) / bottom.sum())
+
+
+def _with_t(value: float, influence: Floats) -> Measured:
+    """A value and how much each drive moves it."""
+    from scipy.special import stdtrit
+
+    n = len(influence)
+    if n < MIN_CLUSTERS:
+        return Measured(value, math.nan, math.nan)
+    half = float(stdtrit(n - 1, 0.975)) * math.sqrt(n / (n - 1) * float(influence @ influence))
+    return Measured(value, value - half, value + half)
 
 
 def ratio_of_means(top: Floats, of_top: Floats, bottom: Floats, of_bottom: Floats) -> Measured:
     """Ratio of two means, each over the drives that its 0 or 1 chooses; drives are paired.
 
-    NaN where none is chosen; replicates without any are left out.
+    NaN where none is chosen.
     """
     if not (of_top.any() and of_bottom.any()):
         return Measured(math.nan, math.nan, math.nan)
-    weights = weights_of(len(top))
-    tops, bottoms = weights @ of_top, weights @ of_bottom
-    has_both = (tops > 0.0) & (bottoms > 0.0)
-    means = [
-        (weights[has_both] @ (way * chosen)) / count[has_both]
-        for way, chosen, count in ((top, of_top, tops), (bottom, of_bottom, bottoms))
-    ]
-    return measured(means[0] / means[1])
+    means = (top @ of_top) / of_top.sum(), (bottom @ of_bottom) / of_bottom.sum()
+    moves = (
+        (top / means[0] - 1.0) * of_top / of_top.sum(),
+        (bottom / means[1] - 1.0) * of_bottom / of_bottom.sum(),
+    )
+    ratio = float(means[0] / means[1])
+    return _with_t(ratio, ratio * (moves[0] - moves[1]))
 
 
 def range_at(distances_m: Floats, is_success: Floats, share: float) -> Measured:
@@ -102,7 +116,7 @@ def range_at(distances_m: Floats, is_success: Floats, share: float) -> Measured:
         found = (level - a) / b
     at_end = a + b * farthest_m
     found = np.where(at_end >= level, np.inf, np.where(a <= level, 0.0, found))
-    return measured(found)
+    return measured(found, len(distances_m))
 
 
 def logistic(x: Floats, is_success: Floats, weights: Floats) -> tuple[Floats, Floats]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from crosscue.eval.scoring.intervals import TOO_FEW
+
 from .intervals import Measured
 
 
@@ -11,10 +13,14 @@ def km(value: Measured, digits: int = 2) -> str:
     """Kilometres with their interval."""
     if math.isinf(value.value):
         return "beyond"
+    if math.isnan(value.low):
+        return f"{value.value / 1e3:.{digits}f} ({TOO_FEW})"
     high = "beyond" if math.isinf(value.high) else f"{value.high / 1e3:.{digits}f}"
     return f"{value.value / 1e3:.{digits}f} ({value.low / 1e3:.{digits}f}..{high})"
 
 
 def percent(value: Measured) -> str:
     """A share with its interval."""
+    if math.isnan(value.low):
+        return f"{100 * value.value:.1f} % ({TOO_FEW})"
     return f"{100 * value.value:.1f} % ({100 * value.low:.1f}..{100 * value.high:.1f})"

@@ -12,6 +12,7 @@ from crosscue.datasets.truth.truth import load
 from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, rates_of, section_of
 from crosscue.eval.interface.runs.run import Run
 from crosscue.eval.runs.folder import open_run
+from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.fusion.fit.message_fit import fit_messages as fit_approaches
@@ -112,10 +113,11 @@ def _unlearned_text(one: RateFit) -> str:
 
 def _side_text(side: Side) -> str:
     reported = rates_of(side)
+    low, high = reported.places
+    by_place = TOO_FEW if math.isnan(low) else f"{low:.2f} to {high:.2f}"
     return (
         f"{reported.rate:.2f} ({reported.wilson.low:.2f} to {reported.wilson.high:.2f} by "
-        f"{side.looks:.0f} looks in {side.frames} frames; {reported.places.low:.2f} to "
-        f"{reported.places.high:.2f} by {side.places} places)"
+        f"{side.looks:.0f} looks in {side.frames} frames; {by_place} by {side.places} places)"
     )
 
 

@@ -132,7 +132,7 @@ class ApproachScore:
         detected: Fraction of approaches.
         full: Fraction of approaches.
         full_from_8_m: Fraction of approaches with full detection at least 8 m away.
-        detected_m: Mean over those detected, resampled by approach.
+        detected_m: Mean over those detected, its interval over approaches.
         full_m: The same for full detection.
         false_features: Fraction of approaches with at least one absent feature above the threshold.
         false_by_feature: How often each was.
@@ -353,7 +353,7 @@ def _extras(
     return extra, detected, outside
 
 
-def score_approaches(judged: Sequence[ApproachesJudged], seed: int = 0) -> ApproachScore | None:
+def score_approaches(judged: Sequence[ApproachesJudged]) -> ApproachScore | None:
     """All drives together; None where none was judged."""
     results = tuple(result for one in judged for result in one.results)
     if not results:
@@ -369,8 +369,8 @@ def score_approaches(judged: Sequence[ApproachesJudged], seed: int = 0) -> Appro
         full_from_8_m=_fraction(
             [(one.full_m or 0.0) >= NEAR_M for one in results if not _is_unknown(one.full_m)]
         ),
-        detected_m=_mean([one.detected_m for one in results], seed),
-        full_m=_mean([one.full_m for one in results], seed),
+        detected_m=_mean([one.detected_m for one in results]),
+        full_m=_mean([one.full_m for one in results]),
         false_features=_fraction([bool(one.false_features) for one in results]),
         false_by_feature=_counts([name for one in results for name in one.false_features]),
         extra=sum(one.extra for one in judged),
@@ -405,9 +405,9 @@ def _fraction(values: Sequence[bool]) -> Proportion:
     return share(np.array(values, np.bool_), np.arange(len(values)))
 
 
-def _mean(values: Sequence[float | None], seed: int) -> Mean:
+def _mean(values: Sequence[float | None]) -> Mean:
     known = np.array([math.nan if value is None else value for value in values], np.float64)
-    return mean(known, np.arange(len(known)), seed)
+    return mean(known, np.arange(len(known)))
 
 
 def _counts(names: Sequence[str]) -> dict[str, int]:
@@ -426,7 +426,7 @@ def _groups(
             approaches=len(mine),
             detected=sum(one.detected_m is not None for one in mine),
             full=sum(one.full_m is not None for one in mine),
-            detected_m=_mean([one.detected_m for one in mine], 0).value,
-            full_m=_mean([one.full_m for one in mine], 0).value,
+            detected_m=_mean([one.detected_m for one in mine]).value,
+            full_m=_mean([one.full_m for one in mine]).value,
         )
     return groups

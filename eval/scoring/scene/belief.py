@@ -2,7 +2,7 @@
 
 A step is judged by what is true at its time: within a true approach by that intersection's
 features; where the truth says that no intersection is ahead, by the absence of one. Steps of one
-approach hang together, so intervals come from resampling approaches.
+approach hang together, so intervals count approaches.
 """
 
 from __future__ import annotations
@@ -170,15 +170,15 @@ def _labels(feature: str, at: Int64s, truth: DriveTruth) -> NDArray[np.int8]:
     return label
 
 
-def score_belief(judged: Sequence[BeliefJudged], seed: int = 0) -> dict[str, BeliefScore]:
+def score_belief(judged: Sequence[BeliefJudged]) -> dict[str, BeliefScore]:
     """Scores by feature, over all drives together."""
     return {
-        feature: _score([one for one in judged if one.feature == feature], seed)
+        feature: _score([one for one in judged if one.feature == feature])
         for feature in dict.fromkeys(one.feature for one in judged)
     }
 
 
-def _score(rows: Sequence[BeliefJudged], seed: int) -> BeliefScore:
+def _score(rows: Sequence[BeliefJudged]) -> BeliefScore:
     probability, is_there, clusters = _pooled(rows)
     left_out = summed(one.left_out for one in rows)
     base = float(is_there.mean()) if len(is_there) else math.nan
@@ -187,9 +187,9 @@ def _score(rows: Sequence[BeliefJudged], seed: int) -> BeliefScore:
         scored=len(probability),
         left_out=left_out,
         fraction_there=base,
-        brier=mean(brier(probability, is_there), clusters, seed),
+        brier=mean(brier(probability, is_there), clusters),
         brier_of_base_rate=base * (1.0 - base),
-        log_score=mean(log_score(probability, is_there), clusters, seed),
+        log_score=mean(log_score(probability, is_there), clusters),
         clip=CLIP,
         clipped=int(((probability < CLIP) | (probability > 1.0 - CLIP)).sum()),
         reliability=reliability(probability, is_there, clusters),
@@ -235,7 +235,7 @@ def reliability(
 
 
 def compare_belief(
-    first: Sequence[BeliefJudged], second: Sequence[BeliefJudged], seed: int = 0
+    first: Sequence[BeliefJudged], second: Sequence[BeliefJudged]
 ) -> dict[str, BeliefDifference]:
     """Two fusions over the same drives, feature by feature, on the steps that both have."""
     names = [
@@ -247,15 +247,12 @@ def compare_belief(
         name: _difference(
             [one for one in first if one.feature == name],
             [one for one in second if one.feature == name],
-            seed,
         )
         for name in names
     }
 
 
-def _difference(
-    first: Sequence[BeliefJudged], second: Sequence[BeliefJudged], seed: int
-) -> BeliefDifference:
+def _difference(first: Sequence[BeliefJudged], second: Sequence[BeliefJudged]) -> BeliefDifference:
     pairs: list[tuple[BeliefJudged, BeliefJudged]] = []
     drives = {one.drive: one for one in second}
     for one in first:
@@ -267,12 +264,12 @@ def _difference(
     p = np.concatenate([np.empty(0), *(a.probability for a, _ in pairs)])
     q = np.concatenate([np.empty(0), *(b.probability for _, b in pairs)])
     clusters = cluster_numbers([a.drive for a, _ in pairs], [a.approach for a, _ in pairs])
-    log = mean(log_score(q, there) - log_score(p, there), clusters, seed)
+    log = mean(log_score(q, there) - log_score(p, there), clusters)
     return BeliefDifference(
         steps=len(there),
         only_first=sum(len(one.t_ns) for one in first) - len(there),
         only_second=sum(len(one.t_ns) for one in second) - len(there),
-        brier=mean(brier(q, there) - brier(p, there), clusters, seed),
+        brier=mean(brier(q, there) - brier(p, there), clusters),
         log_score=log,
         verdict="second" if log.high < 0 else "first" if log.low > 0 else "undecided",
     )

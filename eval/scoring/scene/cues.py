@@ -288,25 +288,24 @@ class _Pooled:
 
 
 def score_cues(
-    judged: Sequence[CueFrames], bins_m: Sequence[float] = BINS_M, seed: int = 0
+    judged: Sequence[CueFrames], bins_m: Sequence[float] = BINS_M
 ) -> dict[str, CueScore]:
     """Scores by cue, over all drives together.
 
     Args:
         judged: From ``match_cues``, of any number of drives.
         bins_m: Borders of distance bins.
-        seed: Of the resampling for intervals.
     """
     by_cue: dict[str, list[CueFrames]] = {}
     for one in judged:
         by_cue.setdefault(one.cue, []).append(one)
-    return {cue: _score(cue, rows, bins_m, seed) for cue, rows in by_cue.items()}
+    return {cue: _score(cue, rows, bins_m) for cue, rows in by_cue.items()}
 
 
-def _score(cue: str, rows: Sequence[CueFrames], bins_m: Sequence[float], seed: int) -> CueScore:
+def _score(cue: str, rows: Sequence[CueFrames], bins_m: Sequence[float]) -> CueScore:
     pooled = _Pooled(rows)
     readings: dict[Reading, CueMetrics] = {
-        reading: _judgement(pooled, reading, bins_m, seed) for reading in ("object", "feature")
+        reading: _judgement(pooled, reading, bins_m) for reading in ("object", "feature")
     }
     wanted: Reading = CUES[cue].scored_as if cue in CUES else "object"
     other: Reading = "feature" if wanted == "object" else "object"
@@ -324,12 +323,12 @@ def _score(cue: str, rows: Sequence[CueFrames], bins_m: Sequence[float], seed: i
     )
 
 
-def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float], seed: int) -> CueMetrics:
+def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float]) -> CueMetrics:
     truth = pooled.ints("is_object" if reading == "object" else "is_feature")
     left_out = summed(one.left_out[reading] for one in pooled.rows)
     frames = sum(one.frames for one in pooled.rows)
     known = truth != NONE
-    cut = _Cut(truth, pooled.ints("count") > 0, pooled.cluster, reading == "object", seed)
+    cut = _Cut(truth, pooled.ints("count") > 0, pooled.cluster, reading == "object")
     visible = pooled.floats("visible")
     # A thing whose visibility nobody noted counts as seen.
     seen = known & ((truth == 0) | np.isnan(visible) | (visible >= SEEN))
@@ -363,17 +362,16 @@ class _Cut:
     is_found: NDArray[np.bool_]
     cluster: Int64s
     has_recall: bool
-    seed: int
 
     def precision(self, rows: NDArray[np.bool_]) -> Proportion:
         rows = rows & self.is_found
-        return share(self.truth[rows] == 1, self.cluster[rows], self.seed)
+        return share(self.truth[rows] == 1, self.cluster[rows])
 
     def recall(self, rows: NDArray[np.bool_]) -> Proportion | None:
         if not self.has_recall:
             return None
         rows = rows & (self.truth == 1)
-        return share(self.is_found[rows], self.cluster[rows], self.seed)
+        return share(self.is_found[rows], self.cluster[rows])
 
     def part(self, rows: NDArray[np.bool_]) -> Part:
         return Part(int(rows.sum()), self.precision(rows), self.recall(rows))

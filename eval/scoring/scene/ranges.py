@@ -70,7 +70,7 @@ class RangeScore:
         rows: All.
         scored: With a true range.
         left_out: Reason to rows.
-        bias_m: Mean error, resampled by approach.
+        bias_m: Mean error, its interval over approaches.
         rmse_m: Root mean square error.
         p95_m: 95 % of errors are smaller.
         nees: With its band as if each approach were one independent error.
@@ -130,16 +130,16 @@ def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
 
 
 def score_range(
-    judged: Sequence[RangeJudged], bins_m: Sequence[float] = BINS_M, seed: int = 0
+    judged: Sequence[RangeJudged], bins_m: Sequence[float] = BINS_M
 ) -> dict[str, RangeScore]:
     """Scores by reference, over all drives together."""
     return {
-        reference: _score([one for one in judged if one.reference == reference], bins_m, seed)
+        reference: _score([one for one in judged if one.reference == reference], bins_m)
         for reference in dict.fromkeys(one.reference for one in judged)
     }
 
 
-def _score(rows: Sequence[RangeJudged], bins_m: Sequence[float], seed: int) -> RangeScore:
+def _score(rows: Sequence[RangeJudged], bins_m: Sequence[float]) -> RangeScore:
     error = np.concatenate([one.error_m for one in rows])
     nees = error**2 / np.concatenate([one.var_m2 for one in rows])
     true_m = np.concatenate([one.true_m for one in rows])
@@ -149,7 +149,7 @@ def _score(rows: Sequence[RangeJudged], bins_m: Sequence[float], seed: int) -> R
         rows=len(error) + sum(left_out.values()),
         scored=len(error),
         left_out=left_out,
-        bias_m=mean(error, clusters, seed),
+        bias_m=mean(error, clusters),
         rmse_m=_rms(error),
         p95_m=float(np.percentile(np.abs(error), 95)) if len(error) else math.nan,
         nees=summarise_nees(nees, 1, max(len(np.unique(clusters)), 1)),

@@ -13,6 +13,7 @@ from crosscue.eval.batch.jobs import Done
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.report.html import render_page
 from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
+from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.runs import metrics_of, write_scores
 from crosscue.eval.scoring.scene.approaches import ApproachScore
 from crosscue.eval.studies.intersections.scores import StudyScores
@@ -185,7 +186,7 @@ def _between(mean: Mapping[str, Any], digits: int = 1) -> str:
     if math.isnan(value):
         return "-"
     if math.isnan(low):
-        return f"{value:+.{digits}f}"
+        return f"{value:+.{digits}f} ({TOO_FEW})"
     return f"{value:+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
 
 

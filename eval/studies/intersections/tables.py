@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from crosscue.eval.scoring.intervals import Mean, Proportion, wilson
+from crosscue.eval.scoring.intervals import TOO_FEW, Mean, Proportion, wilson
 from crosscue.eval.scoring.scene.approaches import ApproachResult
 from crosscue.eval.scoring.scene.cues import CueScore
 from crosscue.eval.studies.intersections.scores import StudyScores
@@ -34,7 +34,7 @@ def cue_rows(cues: Mapping[str, CueScore]) -> list[Row]:
         some = [cues[cue.name] for cue in group if cue.name in cues]
         right = sum(one.precision.right for one in some)
         of = sum(one.precision.of for one in some)
-        # Clusters are resampled column by column, so a pooled interval over them is the widest.
+        # Clusters are counted column by column, so a pooled interval over them is the widest.
         low, high = wilson(right, of)
         lows = [one.precision.clusters_low for one in some if one.precision.of]
         highs = [one.precision.clusters_high for one in some if one.precision.of]
@@ -149,5 +149,5 @@ def mean_text(mean: Mean) -> str:
     if math.isnan(mean.value):
         return "none"
     if math.isnan(mean.low):
-        return f"{mean.value:.1f} m"
+        return f"{mean.value:.1f} m ({TOO_FEW})"
     return f"{mean.value:.1f} m ({mean.low:.1f} to {mean.high:.1f})"

@@ -211,7 +211,9 @@ def fit_growth(distance_m: Floats, axis_m: Floats, start_m: float, limit_m: floa
     found = np.array([nnls(w[:, None] * terms, w * wanted)[0] for w in weights])
     crossings = np.array([_crossing(start_m2, a, b, limit_m) for a, b in found]) * scale
     linear, square = found[0]
-    return Growth(start_m2, float(linear / scale), float(square / scale**2), measured(crossings))
+    return Growth(
+        start_m2, float(linear / scale), float(square / scale**2), measured(crossings, len(u))
+    )
 
 
 def _crossing(start: float, linear: float, square: float, limit_m: float) -> float:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.eval.scoring.intervals import mean, resampled, share, wilson
+from crosscue.eval.scoring.intervals import mean, share, wilson
 from crosscue.eval.scoring.scene.cues import match_cues, score_cues
 from crosscue.replay.vehicle.cue_table import CUES
 from support.scoring import (
@@ -55,22 +55,6 @@ def test_repeated_frames_narrow_wilsons_interval_but_not_that_over_drives() -> N
 
     assert many.high - many.low < 0.2 * (few.high - few.low)
     assert many.clusters_high - many.clusters_low == few.clusters_high - few.clusters_low > 0.3
-
-
-def test_resampling_agrees_with_the_central_limit_where_clusters_are_single_rows() -> None:
-    values = np.random.default_rng(3).normal(5.0, 2.0, 400)
-    low, high = resampled(values, np.arange(400), seed=1)
-
-    assert high - low == pytest.approx(2 * 1.96 * values.std() / 20.0, rel=0.1)
-    assert resampled(values, np.arange(400), seed=1) == (low, high)
-
-
-def test_many_clusters_are_resampled_in_parts_with_the_same_spread() -> None:
-    values = np.random.default_rng(3).normal(5.0, 2.0, 3000)
-    low, high = resampled(values, np.arange(3000))
-
-    assert high - low == pytest.approx(2 * 1.96 * values.std() / np.sqrt(3000.0), rel=0.1)
-    assert low < values.mean() < high
 
 
 def test_a_hand_counted_drive() -> None:

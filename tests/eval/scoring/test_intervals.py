@@ -1,0 +1,109 @@
+"""Intervals over whole clusters: coverage by simulation, and what they become in the limit."""
+
+import numpy as np
+import pytest
+
+from crosscue.eval.scoring.intervals import mean_by_cluster, share_by_cluster
+from crosscue.eval.studies.intervals import mean_of, range_at, ratio_of, ratio_of_means
+from crosscue.replay.columns import Int64s
+
+TIMES = 800
+SLACK = 0.023
+"""Three standard deviations of a coverage of 95 % counted so often."""
+
+
+def sizes(chance: np.random.Generator, clusters: int, *, equal: bool) -> Int64s:
+    return np.full(clusters, 20) if equal else chance.integers(5, 60, clusters)
+
+
+@pytest.mark.parametrize("equal", [True, False])
+@pytest.mark.parametrize("clusters", [4, 5, 8, 30])
+def test_intervals_of_means_cover_what_they_state(clusters: int, equal: bool) -> None:
+    chance = np.random.default_rng(clusters)
+    held = 0
+    for _ in range(TIMES):
+        rows = sizes(chance, clusters, equal=equal)
+        which = np.repeat(np.arange(clusters), rows)
+        values = chance.normal(0.0, 1.0, clusters)[which] + chance.normal(0.0, 1.0, len(which))
+        low, high = mean_by_cluster(values, which)
+        held += low <= 0.0 <= high
+
+    assert held / TIMES > 0.95 - SLACK
+
+
+@pytest.mark.parametrize("alike", [0.05, 0.2])
+@pytest.mark.parametrize("fraction", [0.5, 0.8, 0.95])
+@pytest.mark.parametrize("clusters", [4, 5, 8, 30])
+def test_intervals_of_shares_cover_nearly_what_they_state(
+    clusters: int, fraction: float, alike: float
+) -> None:
+    chance = np.random.default_rng(clusters)
+    held = 0
+    for _ in range(TIMES):
+        rows = sizes(chance, clusters, equal=False)
+        rest = 1.0 / alike - 1.0
+        which = np.repeat(np.arange(clusters), rows)
+        is_right = (
+            chance.random(len(which))
+            < chance.beta(fraction * rest, (1.0 - fraction) * rest, clusters)[which]
+        )
+        low, high = share_by_cluster(is_right, which)
+        held += low <= fraction <= high
+
+    assert held / TIMES > 0.89
+
+
+def test_drawing_clusters_with_replacement_would_cover_too_little() -> None:
+    chance = np.random.default_rng(5)
+    held = 0
+    for _ in range(TIMES):
+        means = chance.normal(0.0, 1.0, 5)
+        drawn = chance.choice(means, (400, 5)).mean(axis=1)
+        low, high = np.percentile(drawn, [2.5, 97.5])
+        held += low <= 0.0 <= high
+
+    assert 0.78 < held / TIMES < 0.88
+
+
+def test_one_row_a_cluster_is_students_t() -> None:
+    values = np.random.default_rng(3).normal(5.0, 2.0, 9)
+    low, high = mean_by_cluster(values, np.arange(9))
+    of_study = mean_of(values)
+
+    assert high - low == pytest.approx(2 * 2.306004 * values.std(ddof=1) / 3.0, rel=1e-6)
+    assert (of_study.low, of_study.high) == pytest.approx((low, high), rel=1e-12)
+
+
+def test_intervals_stay_possible_and_need_four_clusters() -> None:
+    right, drives = np.ones(400, np.bool_), np.repeat(np.arange(4), 100)
+
+    low, high = share_by_cluster(right, drives)
+    assert 0.4 < low < 0.6
+    assert high == 1.0
+    assert share_by_cluster(~right, drives) == pytest.approx((0.0, 1.0 - low))
+    assert np.isnan(share_by_cluster(right[:300], drives[:300])).all()
+    assert np.isnan(mean_by_cluster(np.ones(300), drives[:300])).all()
+    assert np.isnan(mean_of(np.ones(3)).low)
+    assert np.isnan(range_at(np.arange(3.0), np.ones(3), 0.8).low)
+
+
+def test_one_cluster_that_holds_nearly_all_rows_leaves_the_mean_open() -> None:
+    values = np.random.default_rng(0).normal(0.0, 1.0, 1003)
+    even = mean_by_cluster(values, np.arange(1003) % 4)
+    uneven = mean_by_cluster(values, np.r_[np.zeros(1000, np.int64), [1, 2, 3]])
+
+    assert uneven.high - uneven.low > even.high - even.low
+
+
+def test_a_ratios_interval_covers_and_is_that_of_all_drives_where_all_are_chosen() -> None:
+    chance = np.random.default_rng(2)
+    held = 0
+    for _ in range(TIMES):
+        bottom = chance.gamma(5.0, 1.0, 20)
+        top = bottom * chance.gamma(20.0, 1.3 / 20.0, 20)
+        found = ratio_of(top, bottom)
+        held += found.low <= 1.3 <= found.high
+        every = np.ones(20)
+        assert ratio_of_means(top, every, bottom, every) == pytest.approx(found, rel=1e-9)
+
+    assert held / TIMES > 0.92
