@@ -22,7 +22,8 @@ from crosscue.datasets.scenes.drive import SceneSettings, jpeg, world_of
 from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, View
-from crosscue.detectors.cues.frame import CuePass, Seen
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.observed import Seen
 from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.registry import chosen
 from crosscue.eval.pipeline.detect import detect_drive

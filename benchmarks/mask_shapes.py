@@ -20,7 +20,7 @@ import numpy as np
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
 from crosscue.detectors.boxes import overlaps
-from crosscue.detectors.cues.cars import nose_of
+from crosscue.detectors.cues.observed import nose_of
 from crosscue.detectors.networks.mask_rcnn.detector import build
 from crosscue.detectors.training.annotations import LabelledPicture, LabelledSet, read_coco
 from crosscue.detectors.training.scores import detections_on

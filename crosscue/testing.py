@@ -341,15 +341,14 @@ def _observations(observed_by: str) -> dict[str, Any]:
         other = Detections(0, (64, 48), box, np.array([0.9]), ("surely unknown",), (b"",))
         return {"no detector": (), "nothing": (nothing,), "other labels": (other,)}
     if observed_by == "road":
-        from crosscue.detectors.cues.road import RoadShares
+        from crosscue.detectors.cues.observed import RoadShares
 
         return {"nothing": RoadShares(0.0, 0.0, 0.0), "road": RoadShares(1.0, 1.0, 1.0)}
     if observed_by == "car pairs":
         from crosscue.detectors.cues.cars import no_pairs
 
         return {"nothing": no_pairs(64)}
-    from crosscue.detectors.cues.far_side import Ahead
-    from crosscue.detectors.cues.mobileye_state import MobileyeState
+    from crosscue.detectors.cues.far_side import Ahead, MobileyeState
 
     none = np.empty((0, 8))
     return {

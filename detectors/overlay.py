@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.detectors.cues.frame import FrameCues
+from crosscue.detectors.cues.observed import FrameCues
 from crosscue.replay.base import Bytes, write_bytes
 
 from . import rle

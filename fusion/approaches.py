@@ -27,7 +27,16 @@ from typing import Final, NamedTuple
 from crosscue.fusion.situation import Situation
 from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
 
-from .belief import Belief, Speaker, begin, establish, multiply, probabilities
+from .belief import (
+    Belief,
+    Speaker,
+    begin,
+    establish,
+    multiply,
+    probabilities,
+    source_speaker,
+)
+from .calibrated import CalibratedMessageModel, voices_of
 from .evidence import FrameEvidence, RangePosterior, SignRange
 from .factor_graph import FactorGraph
 from .intersection_range import RangeBelief, Reference
@@ -41,7 +50,6 @@ from .range_track import (
     measure,
     predict_without_odometry,
 )
-from .speakers import speakers_of
 
 TURN_FADES_M: Final = 25.0
 """A turn counts less and less over this way, so that bends of a road do not add up to one."""
@@ -391,3 +399,20 @@ def _best(at_hand: _Open, wanted: Reference) -> tuple[RangeBelief | None, Refere
         if known[reference] is not None:
             return known[reference], reference
     return None, None
+
+
+def speakers_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], Speaker]:
+    """What gives each approach its speaker.
+
+    Raises:
+        ValueError: ``calibrated`` without what was learned; no vehicle file can say that.
+    """
+    if fusion.kind == "persistent":
+        return lambda: PersistentSpeaker(graph, fusion.dissent)
+    if fusion.kind in ("source", None):
+        speaker = source_speaker(graph, fusion.dissent)
+        return lambda: speaker
+    if fusion.calibrated is None:
+        raise ValueError("fusion.calibrated: expected what crosscue fit messages wrote, got None")
+    voices, size = voices_of(graph, fusion.calibrated), len(graph.features)
+    return lambda: CalibratedMessageModel(size, voices)

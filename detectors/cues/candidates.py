@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
+from crosscue.detectors.base import Detections
+
 SAME_OBJECT: Final = "found by another detector with a better score"
 BELOW_SCORE: Final = "below score"
 TOO_LITTLE_ROAD: Final = "too little road"
@@ -58,3 +60,13 @@ class Candidates:
         if scores:
             best = max(scores)
             self.max_score = best if self.max_score is None else max(self.max_score, best)
+
+
+def scores_of(boxes: Sequence[Detections], labels: Sequence[str]) -> list[float]:
+    """Scores of all detections with one of the labels."""
+    return [
+        score
+        for found in boxes
+        for label, score in zip(found.labels, found.scores.tolist(), strict=True)
+        if label in labels
+    ]

@@ -36,8 +36,7 @@ from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
-from .cars import Judged, Sides, nose_of
-from .place import Place
+from .observed import Judged, Place, Sides, nose_of
 
 CAR_HEIGHT_M: Final = 1.55
 """Of a usual car; between 1.4 (sports car) and 1.8 (van), so 15 % either way."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ from crosscue.detectors.base import Detections
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.vehicle import Cars, Vehicle
+
+from .observed import NONE, Judged, Sides, nose_of, of_side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,36 +43,6 @@ class CarShapes:
 
     def __len__(self) -> int:
         return len(self.area_px)
-
-
-class Sides(NamedTuple):
-    """How many say left and how many right."""
-
-    left: int
-    right: int
-
-
-NONE: Final = Sides(0, 0)
-
-
-class Judged(NamedTuple):
-    """What cars do, where they were followed over several frames and not only in two.
-
-    Attributes:
-        crossing: Cross traffic at the intersection.
-        parked: Parked cars there.
-        crossing_elsewhere: Cross traffic that is not there.
-        parked_elsewhere: Likewise, or nobody knows where the intersection is.
-        seen: Cars that were whole and near enough.
-        followed: Those of them that were seen in frames enough.
-    """
-
-    crossing: Sides
-    parked: Sides
-    crossing_elsewhere: Sides
-    parked_elsewhere: Sides
-    seen: int
-    followed: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,23 +112,6 @@ def car_shapes(found: Sequence[Detections], settings: Cars) -> CarShapes:
 def _is_long(box: Sequence[float], settings: Cars) -> bool:
     x0, y0, x1, y1 = box
     return x1 - x0 > settings.length_per_height * (y1 - y0)
-
-
-def nose_of(heights_px: Floats) -> int:
-    """-1 where the mask's left end is lower than its right, 1 where the right is, 0 where equal.
-
-    An end is the outer quarter of the mask's length: single columns are too noisy.
-
-    Args:
-        heights_px: Shape (width,): mask pixels in each column.
-    """
-    (columns,) = heights_px.nonzero()
-    if len(columns) < 4:
-        return 0
-    heights = heights_px[columns[0] : columns[-1] + 1]
-    quarter = max(len(heights) // 4, 1)
-    difference = heights[-quarter:].sum() - heights[:quarter].sum()
-    return int(difference < 0) - int(difference > 0)
 
 
 def pair_cars(before: CarShapes, now: CarShapes, settings: Cars) -> Pairs:
@@ -229,8 +184,3 @@ def count_parked(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int:
     """Parked cars that face the side that the cue supports."""
     sides = parked_cars(pairs, vehicle.cars) if pairs.judged is None else pairs.judged.parked
     return of_side(sides, cue)
-
-
-def of_side(sides: Sides, cue: CueSpec) -> int:
-    """How many say the side that the cue supports."""
-    return sides.left if cue.supports == ("left",) else sides.right

@@ -3,115 +3,24 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Final
 
 import numpy as np
 
-from crosscue.detectors.base import Detections, Found, RoadMask
+from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .car_tracks import CarTracks, judge
 from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
 from .labelled import count_labels
-from .place import Place
-from .road import RoadShares, road_fractions
+from .observed import FrameCues, Place, Seen
+from .road import road_fractions
 from .road_ground import ground_fractions
 from .rules import counts_of
-from .tally import CueTally, cue_labels
-
-
-class Role(StrEnum):
-    """What a detector looks for; where none of a role ran, its cues are not looked for."""
-
-    OBJECTS = "objects"
-    SIGNS = "signs"
-    ROAD = "road"
-
-
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """What detectors found in one frame, by what they look for.
-
-    Attributes:
-        t_ns: Log time of the frame.
-        objects: Of detectors of objects; empty where none ran.
-        signs: Of detectors of one-way and do-not-enter signs; empty where none ran.
-        road: Road pixels, or their shares where these are known already.
-        labels: What the detectors of objects and signs can report; None for anything.
-        doubles: What was left out of ``objects`` and ``signs``, since another detector found it
-            with a better score.
-    """
-
-    t_ns: int
-    objects: tuple[Detections, ...] = ()
-    signs: tuple[Detections, ...] = ()
-    road: RoadMask | RoadShares | None = None
-    labels: frozenset[str] | None = None
-    doubles: tuple[Detections, ...] = ()
-
-    @property
-    def boxes(self) -> tuple[Detections, ...]:
-        """Of all detectors of objects and signs."""
-        return (*self.objects, *self.signs)
-
-
-def all_labels(labels: Iterable[Sequence[str] | None]) -> frozenset[str] | None:
-    """What several detectors can report together; None for anything, if one does not say."""
-    known: set[str] = set()
-    for one in labels:
-        if one is None:
-            return None
-        known.update(one)
-    return frozenset(known)
-
-
-def role_of(found: Found, is_for_signs: bool) -> Role:
-    """The role that a result plays."""
-    if isinstance(found, RoadMask):
-        return Role.ROAD
-    return Role.SIGNS if is_for_signs else Role.OBJECTS
-
-
-def seen(
-    t_ns: int,
-    found: Sequence[Found],
-    is_for_signs: Sequence[bool],
-    labels: frozenset[str] | None = None,
-) -> Seen:
-    """One frame's results, sorted by role.
-
-    Args:
-        t_ns: Log time of the frame.
-        found: One result for each detector.
-        is_for_signs: Whether that detector looks for one-way and do-not-enter signs.
-        labels: What all detectors can report together.
-    """
-    boxes: dict[bool, list[Detections]] = {True: [], False: []}
-    road: RoadMask | None = None
-    for one, for_signs in zip(found, is_for_signs, strict=True):
-        if isinstance(one, Detections):
-            boxes[for_signs].append(one)
-        elif road is None:
-            road = one
-    return Seen(t_ns, tuple(boxes[False]), tuple(boxes[True]), road, labels)
-
-
-@dataclass(frozen=True, slots=True)
-class FrameCues:
-    """What one frame says.
-
-    Attributes:
-        counts: From each cue that was looked for, a user's own among them, to how many there were;
-            0 is looked and not found.
-        road: Fractions of road, where a detector segments.
-    """
-
-    counts: Mapping[str, int]
-    road: RoadShares | None
+from .tally import CueTally
 
 
 @dataclass(slots=True)
@@ -154,7 +63,7 @@ class CuePass:
             for name, own in self.vehicle.cues.own.items():
                 counts[name] = count_labels(frame.boxes, own.labels, own.score)
         if frame.labels is not None:
-            wanted = cue_labels(self.vehicle)
+            wanted = self.vehicle.cue_labels()
             counts = {
                 cue: count
                 for cue, count in counts.items()

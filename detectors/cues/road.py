@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,27 +13,7 @@ from crosscue.detectors.base import RoadMask
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.vehicle import Polygon, Regions, Vehicle
 
-
-@dataclass(frozen=True, slots=True)
-class RoadShares:
-    """How much of each region of interest is road (eq. 13).
-
-    Attributes:
-        left: Fraction of the left region's pixels, 0 to 1; NaN where the region is not seen.
-        straight: Of the straight one.
-        right: Of the right one.
-    """
-
-    left: float
-    straight: float
-    right: float
-
-    def positive(self, min_fraction: float) -> tuple[bool, bool, bool]:
-        """Left, straight and right road: more than ``min_fraction`` of the region (eq. 14)."""
-        return self.left > min_fraction, self.straight > min_fraction, self.right > min_fraction
-
-
-NOT_SEEN: Final = RoadShares(math.nan, math.nan, math.nan)
+from .observed import RoadShares
 
 
 def is_road(shares: RoadShares, vehicle: Vehicle, cue: CueSpec) -> int | None:

@@ -29,8 +29,7 @@ from crosscue.detectors.base import RoadMask
 from crosscue.replay.base import Floats
 from crosscue.replay.vehicle.vehicle import Camera, Regions
 
-from .place import Place
-from .road import NOT_SEEN, RoadShares
+from .observed import NOT_SEEN, Place, RoadShares
 
 MARGIN: Final = 0.25
 """Of the intersection's depth, left out at either end."""

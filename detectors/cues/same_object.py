@@ -17,10 +17,7 @@ import numpy as np
 from crosscue.detectors.base import Detections
 from crosscue.detectors.ranging.object_tracks import iou
 from crosscue.replay.base import Int64s
-from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Vehicle
-
-from .labelled import labels_of
 
 MIN_IOU: Final = 0.5
 KEPT: Final = -1
@@ -29,8 +26,7 @@ KEPT: Final = -1
 def meanings(vehicle: Vehicle) -> dict[str, str]:
     """From a label to what it means: labels that one cue counts mean the same."""
     found: dict[str, str] = {}
-    own = {name: one.labels for name, one in vehicle.cues.own.items()}
-    for labels in ({name: labels_of(cue, vehicle) for name, cue in CUES.items()} | own).values():
+    for labels in vehicle.cue_labels().values():
         for label in labels:
             found.setdefault(label, labels[0])
     return found

@@ -25,10 +25,9 @@ from .candidates import (
     TOO_LITTLE_ROAD,
     Candidates,
     Unit,
+    scores_of,
 )
-from .cars import Judged, of_side
-from .labelled import labels_of
-from .road import RoadShares
+from .observed import Judged, RoadShares, of_side
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +53,9 @@ class CueTally:
             counts: What came out, of all cues.
         """
         for cue in CUES.values():
-            labels = labels_of(cue, self.vehicle) if cue.observed_by == observed_by else ()
+            labels = self.vehicle.labels_of(cue) if cue.observed_by == observed_by else ()
             if labels and cue.name in counts:
-                setting, threshold = threshold_of(cue, self.vehicle)
+                setting, threshold = self.vehicle.threshold_of(cue)
                 self._count(cue.name, scores_of(boxes, labels), setting, threshold, counts)
 
     def own(self, boxes: Sequence[Detections], counts: Mapping[str, int]) -> None:
@@ -124,7 +123,7 @@ class CueTally:
             boxes: What was left out.
             counts: What came out, of all cues.
         """
-        for name, labels in cue_labels(self.vehicle).items():
+        for name, labels in self.vehicle.cue_labels().items():
             scores = scores_of(boxes, labels) if name in counts else []
             if scores and name in self.by_cue:
                 self.by_cue[name].take(scores, {SAME_OBJECT: len(scores)})
@@ -170,28 +169,3 @@ def _judged(judged: Judged, cue: CueSpec) -> tuple[int, int]:
     if cue.group == "cross_traffic":
         return of_side(judged.crossing, cue), of_side(judged.crossing_elsewhere, cue)
     return of_side(judged.parked, cue), of_side(judged.parked_elsewhere, cue)
-
-
-def scores_of(boxes: Sequence[Detections], labels: Sequence[str]) -> list[float]:
-    """Scores of all detections with one of the labels."""
-    return [
-        score
-        for found in boxes
-        for label, score in zip(found.labels, found.scores.tolist(), strict=True)
-        if label in labels
-    ]
-
-
-def threshold_of(cue: CueSpec, vehicle: Vehicle) -> tuple[str | None, float | None]:
-    """Where a cue's least score stands in the vehicle file, and the score; None without one."""
-    if cue.settings is None:
-        return None, None
-    name = f"{cue.settings}_score"
-    score: float = getattr(vehicle.cues, name)
-    return f"[cues] {name}", score
-
-
-def cue_labels(vehicle: Vehicle) -> dict[str, tuple[str, ...]]:
-    """From every cue, a user's own among them, to the labels it is made of; none for road."""
-    own = {name: one.labels for name, one in vehicle.cues.own.items()}
-    return {name: labels_of(cue, vehicle) for name, cue in CUES.items()} | own

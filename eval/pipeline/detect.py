@@ -20,7 +20,8 @@ from crosscue.detectors.base import (
     is_calibrated,
     reportable,
 )
-from crosscue.detectors.cues.frame import CuePass, FrameCues, Role, all_labels, role_of, seen
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.observed import FrameCues, Role, all_labels, role_of, seen
 from crosscue.detectors.cues.road import road_fractions
 from crosscue.detectors.cues.same_object import KEPT, meanings, same_objects
 from crosscue.detectors.overlay import Drawer

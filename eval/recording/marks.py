@@ -24,7 +24,8 @@ from crosscue.detectors.cues.cars import (
     pair_cars,
     parked_cars,
 )
-from crosscue.detectors.cues.road import RoadShares, road_fractions
+from crosscue.detectors.cues.observed import RoadShares
+from crosscue.detectors.cues.road import road_fractions
 from crosscue.eval.runs.tables.stored_frames import StoredFrame
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -10,8 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.detectors.base import Detections, View
-from crosscue.detectors.cues.frame import FrameCues
-from crosscue.detectors.cues.labelled import labels_of
+from crosscue.detectors.cues.observed import FrameCues
 from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.overlay import draw
 from crosscue.detectors.runner import FrameResult
@@ -92,7 +91,7 @@ def _mistakes(cue: CueFrames) -> list[np.typing.NDArray[np.intp]]:
 
 
 def _labels(cue: str, vehicle: Vehicle) -> tuple[str, ...]:
-    return labels_of(CUES[cue], vehicle) if cue in CUES else ()
+    return vehicle.labels_of(CUES[cue]) if cue in CUES else ()
 
 
 def _confidence(rows: Sequence[Mapping[str, Any]], labels: tuple[str, ...]) -> float | None:

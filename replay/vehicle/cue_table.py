@@ -119,6 +119,9 @@ DO_NOT_ENTER: Final = CueSpec(
     seen_frames=SIGN_FRAMES,
 )
 
+SAME_SIGN: Final = {"do not enter": ("do not enter", "no entry")}
+"""The American and the international sign, which say the same."""
+
 BUILTIN_CUES: Final[dict[str, CueSpec]] = {
     spec.name: spec
     for spec in (

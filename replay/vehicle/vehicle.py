@@ -16,7 +16,8 @@ from pydantic_core import PydanticCustomError
 
 from crosscue.replay.base import MIB, VehicleError, read_at_most, toml_tree
 
-from .cue_table import CUES
+from .cue_spec import CueSpec
+from .cue_table import CUES, SAME_SIGN
 from .fusion import Fusion, Name, RangeFilter
 from .mobileye_cues import Past
 from .section import Finite, NotNegative, Positive, Section
@@ -376,6 +377,28 @@ class Vehicle(Section):
         if ranges.kind == "motion" and camera is not None and camera.focal_px is None:
             raise PydanticCustomError("ranges", 'kind = "motion" needs camera.focal_px')
         return ranges
+
+    def labels_of(self, cue: CueSpec) -> tuple[str, ...]:
+        """Labels of the things that a cue is made of; none for road and Mobileye."""
+        if cue.observed_by == "car pairs":
+            return self.cars.labels
+        if cue.settings is not None:
+            labels: tuple[str, ...] = getattr(self.cues, f"{cue.settings}_labels")
+            return labels
+        return () if cue.label is None else SAME_SIGN.get(cue.label, (cue.label,))
+
+    def threshold_of(self, cue: CueSpec) -> tuple[str | None, float | None]:
+        """Where a cue's least score stands in the file, and the score; None without one."""
+        if cue.settings is None:
+            return None, None
+        name = f"{cue.settings}_score"
+        score: float = getattr(self.cues, name)
+        return f"[cues] {name}", score
+
+    def cue_labels(self) -> dict[str, tuple[str, ...]]:
+        """From every cue, a user's own among them, to its labels; none for road."""
+        own = {name: one.labels for name, one in self.cues.own.items()}
+        return {name: self.labels_of(cue) for name, cue in CUES.items()} | own
 
 
 def _is_simulated(info: ValidationInfo) -> bool:

@@ -13,7 +13,8 @@ import pytest
 from crosscue.datasets.scenes.cues import SIMULATED
 from crosscue.datasets.truth.truth import json_schema
 from crosscue.detectors.base import Detections
-from crosscue.detectors.cues.frame import CuePass, Seen
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.observed import Seen
 from crosscue.detectors.cues.rules import rule_of
 from crosscue.eval.recording.series import of_cue
 from crosscue.eval.report.page import write_report

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, RoadMask
-from crosscue.detectors.cues.frame import FrameCues
+from crosscue.detectors.cues.observed import FrameCues
 from crosscue.detectors.images import Encoded
 from crosscue.detectors.overlay import BLUE, GREEN, MARGIN_PX, Drawer, draw
 from crosscue.detectors.runner import FrameResult

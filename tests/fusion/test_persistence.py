@@ -9,12 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.fusion.approaches import Approaches, Step
+from crosscue.fusion.approaches import Approaches, Step, speakers_of
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.factor_graph import graph_of, log_odds
 from crosscue.fusion.intersection_range import Reference
 from crosscue.fusion.persistence import Persistence, PersistentSpeaker
-from crosscue.fusion.speakers import speakers_of
 from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle
 from support.fusion import NONE_SEEN, SECOND_NS, situation

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
-from crosscue.detectors.cues.frame import Role, all_labels
+from crosscue.detectors.cues.observed import Role, all_labels
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.replay.vehicle.cue_table import CUES
 

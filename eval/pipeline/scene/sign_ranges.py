@@ -10,8 +10,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.cues.candidates import BELOW_SCORE, NO_CURVE, Candidates
-from crosscue.detectors.cues.tally import cue_labels, scores_of, threshold_of
+from crosscue.detectors.cues.candidates import BELOW_SCORE, NO_CURVE, Candidates, scores_of
 from crosscue.detectors.ranging.height_to_range import range_of
 from crosscue.fusion.evidence import SignRange
 from crosscue.fusion.intersection_range import Reference
@@ -61,9 +60,9 @@ class SignRanges:
     ) -> list[SignRange]:
         """Of one row of ``MEASURED``."""
         cue, reference = MEASURED[row]
-        labels = cue_labels(self.vehicle)[cue.name]
+        labels = self.vehicle.labels_of(cue)
         curve: RangeCurve | None = getattr(self.vehicle.ranges, cue.name)
-        setting, threshold = threshold_of(cue, self.vehicle)
+        setting, threshold = self.vehicle.threshold_of(cue)
         source = source_of(self.vehicle, cue.name)
         ranges: list[SignRange] = []
         skipped: Counter[str] = Counter()
@@ -124,8 +123,8 @@ def usable(
 ) -> Usable:
     """Detections of one row of ``MEASURED``; ``SignRanges`` counts the rest."""
     cue, _ = MEASURED[row]
-    labels = cue_labels(vehicle)[cue.name]
-    score = threshold_of(cue, vehicle)[1] or 0.0
+    labels = vehicle.labels_of(cue)
+    score = vehicle.threshold_of(cue)[1] or 0.0
     some = [
         (detections.boxes_px[i], float(heights[i]), *(detections.lenses[i : i + 1] or ("",)))
         for detections, heights in zip(found, heights_px, strict=True)

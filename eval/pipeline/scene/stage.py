@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crosscue.detectors.cues.frame import CuePass, Seen
-from crosscue.detectors.cues.place import Place
-from crosscue.detectors.cues.tally import CueTally, cue_labels
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.observed import Place, Seen
+from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.eval.pipeline.outcome import (
     ApproachSummary,
@@ -111,7 +111,7 @@ def estimate_scene(
         scene.tally.by_cue,
         scene.signs.by_cue,
         not_looked_for(
-            scene.looked, detected.detectors, cue_labels(vehicle), scene.cues.not_followed
+            scene.looked, detected.detectors, vehicle.cue_labels(), scene.cues.not_followed
         ),
     )
 

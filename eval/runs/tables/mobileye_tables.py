@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
-from crosscue.detectors.cues.far_side import end_of, past_counts
-from crosscue.detectors.cues.mobileye_state import MobileyeState, state_at
+from crosscue.detectors.cues.far_side import MobileyeState, end_of, past_counts, state_at
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.fusion.approaches import PastCues
 from crosscue.fusion.intersection_range import RangeBelief, Reference

@@ -10,8 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.detectors.base import Detections, RoadMask
-from crosscue.detectors.cues.frame import Role, Seen, all_labels
-from crosscue.detectors.cues.road import RoadShares
+from crosscue.detectors.cues.observed import RoadShares, Role, Seen, all_labels
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.replay.columns import Floats

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.detectors.base import Found, RoadMask, View
-from crosscue.detectors.cues.frame import FrameCues
+from crosscue.detectors.cues.observed import FrameCues
 from crosscue.detectors.images import decode
 from crosscue.detectors.overlay import draw, write_label
 from crosscue.detectors.runner import FrameResult

@@ -59,6 +59,7 @@ MESSAGE_FIXED: Final = MESSAGE_HEAD.itemsize - PREFIX.size
 _INDEX_HEAD: Final = struct.Struct("<HI")
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 CHUNK_FIXED: Final = 40
+MAX_HEAD: Final = PREFIX.size + CHUNK_FIXED + 32
 """Bytes of a chunk record's content, besides its compression's name and its records."""
 
 

@@ -14,8 +14,8 @@ from crosscue.detectors.cues.candidates import (
     TOO_FEW_FRAMES,
     TOO_LITTLE_ROAD,
 )
-from crosscue.detectors.cues.frame import CuePass, Seen
-from crosscue.detectors.cues.road import RoadShares
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.observed import RoadShares, Seen
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.cue_table import CUES

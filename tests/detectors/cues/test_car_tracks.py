@@ -21,9 +21,8 @@ from crosscue.detectors.cues.car_tracks import (
     judge,
     parked,
 )
-from crosscue.detectors.cues.cars import Sides
-from crosscue.detectors.cues.frame import CuePass, Seen
-from crosscue.detectors.cues.place import Place
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.observed import Place, Seen, Sides
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Cars, Vehicle
 

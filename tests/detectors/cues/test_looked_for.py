@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from crosscue.detectors.base import Choice, Detections, reportable
-from crosscue.detectors.cues.frame import CuePass, Seen, all_labels
-from crosscue.detectors.cues.tally import cue_labels
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.observed import Seen, all_labels
 from crosscue.detectors.registry import make
 from crosscue.eval.pipeline.scene.looked_for import (
     NEVER,
@@ -84,14 +84,14 @@ def _row(role: str, labels: tuple[str, ...] | None) -> DetectorRow:
 
 def test_every_cue_without_a_row_has_its_reason() -> None:
     lights = [_row("objects", ("traffic light",))]
-    why = not_looked_for({"traffic_light"}, lights, cue_labels(VEHICLE))
+    why = not_looked_for({"traffic_light"}, lights, VEHICLE.cue_labels())
     assert set(why) == {*CUES, "crossing"} - {"traffic_light"}
     assert {why[cue] for cue in SIGNS | {"stop_sign", "parked_left", "crossing"}} == {NO_LABEL}
     assert why["road_left"] == NO_ROAD
     assert why["lanes_past"] == NO_MOBILEYE
 
-    only_road = not_looked_for((), [_row("road", ())], cue_labels(VEHICLE))
+    only_road = not_looked_for((), [_row("road", ())], VEHICLE.cue_labels())
     assert {only_road[cue] for cue in CONTROLS | SIGNS} == {NO_OBJECTS}
     assert only_road["road_left"] == NEVER
 
-    assert not_looked_for((), [_row("objects", None)], cue_labels(VEHICLE))["parked_left"] == NEVER
+    assert not_looked_for((), [_row("objects", None)], VEHICLE.cue_labels())["parked_left"] == NEVER

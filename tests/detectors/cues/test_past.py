@@ -14,8 +14,13 @@ from hypothesis import strategies as st
 from crosscue.datasets.scenes.drive import SceneSettings, write_scene
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.truth.truth import load as load_truth
-from crosscue.detectors.cues.far_side import end_of, past_counts, vehicles_past
-from crosscue.detectors.cues.mobileye_state import MobileyeState, state_at
+from crosscue.detectors.cues.far_side import (
+    MobileyeState,
+    end_of,
+    past_counts,
+    state_at,
+    vehicles_past,
+)
 from crosscue.replay.base import Block, Floats, Ledger, Selection, Topic, VehicleError
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.extractor import Extractor

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
-from crosscue.detectors.cues.road import RoadShares, region_mask, road_fractions
+from crosscue.detectors.cues.observed import RoadShares
+from crosscue.detectors.cues.road import region_mask, road_fractions
 from crosscue.replay.base import VehicleError
 from crosscue.replay.vehicle.vehicle import Regions, parse
 

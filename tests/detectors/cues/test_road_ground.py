@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.candidates import REGION_NOT_SEEN
-from crosscue.detectors.cues.frame import CuePass, Seen
-from crosscue.detectors.cues.place import Place
-from crosscue.detectors.cues.road import RoadShares
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.observed import Place, RoadShares, Seen
 from crosscue.detectors.cues.road_ground import ground_fractions, project
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.replay.errors import VehicleError

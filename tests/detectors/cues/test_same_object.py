@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.candidates import SAME_OBJECT
-from crosscue.detectors.cues.frame import CuePass, Seen
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.observed import Seen
 from crosscue.detectors.cues.same_object import KEPT, MIN_IOU, meanings, same_objects
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import iou

@@ -11,13 +11,12 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.cars import (
     CarShapes,
-    Sides,
     car_shapes,
     cross_traffic,
-    nose_of,
     pair_cars,
     parked_cars,
 )
+from crosscue.detectors.cues.observed import Sides, nose_of
 from crosscue.replay.vehicle.vehicle import Cars
 
 SIZE = (400, 200)

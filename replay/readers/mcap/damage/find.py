@@ -21,13 +21,13 @@ from crosscue.replay.readers.mcap.records import (
     COMPRESSIONS,
     HEADER,
     MAGIC,
+    MAX_HEAD,
     PREFIX,
     BrokenRecordError,
     ChunkHead,
     read_chunk_head,
 )
 
-MAX_HEAD: Final = PREFIX.size + CHUNK_FIXED + 32
 FIRST_PIECE: Final = 4 << 10
 """Searched first; doubled as long as nothing is found."""
 TRIES: Final = 16

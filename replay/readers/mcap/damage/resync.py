@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.readers.mcap.bytes import ByteFile
 from crosscue.replay.readers.mcap.chunks.rows import Definition, Rows
-from crosscue.replay.readers.mcap.damage.find import MAX_HEAD
 from crosscue.replay.readers.mcap.records import (
     ATTACHMENT,
     CHANNEL,
@@ -25,6 +24,7 @@ from crosscue.replay.readers.mcap.records import (
     COMPRESSIONS,
     DATA_END,
     DATA_END_SIZE,
+    MAX_HEAD,
     MESSAGE,
     MESSAGE_FIXED,
     MESSAGE_HEAD,
