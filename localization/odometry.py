@@ -320,6 +320,13 @@ def integrate(
     return Odometry(made, rest if joined is None else _keep_turn(rest, joined), counts)
 
 
+def first_reading(wheels: WheelSpeeds, settings: OdometrySettings) -> tuple[int, float] | None:
+    """Time, and speed of the rear axle in m/s, of the first row that is a number; or None."""
+    axle_mps, _ = _at_rear_axle(wheels, settings)
+    rows = np.flatnonzero(np.isfinite(axle_mps))
+    return (int(wheels.t_ns[rows[0]]), float(axle_mps[rows[0]])) if len(rows) else None
+
+
 def _check_geometry(settings: OdometrySettings, turn: TurnSignal | None) -> None:
     needs_base = settings.use_front_wheels or (turn is not None and turn.kind == "steering")
     if needs_base and settings.wheelbase_m is None:

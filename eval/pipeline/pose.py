@@ -198,12 +198,15 @@ class PoseStage:
         wheels = window.samples.get(Signal.WHEEL_SPEEDS)
         headings = self._headings(window)
         if self._state is None:
-            if wheels is None:
+            first = odometry.first_reading(_wheels(wheels), odometry_settings(self.vehicle))
+            if first is None:
+                n = 0 if wheels is None else len(wheels.t_ns)
+                self.odometry_counts += odometry.OdometryCounts(rows=n, not_finite=n)
                 self._missed(headings)
                 self.turn_early += 0 if (turn := self._turn(window)) is None else len(turn)
                 self.landmarks.let_go(window.end_ns)
                 return
-            headings = self._start(int(wheels.t_ns[0]), headings)
+            headings = self._start(*first, headings)
         assert self._state is not None
         self._last_ns = window.end_ns
         if self._gap is not None:
@@ -240,8 +243,11 @@ class PoseStage:
         if len(made.poses):
             yield made.poses
 
-    def _start(self, t_ns: int, headings: Headings) -> Headings:
-        """Fix the first belief; the headings used for it are not used again."""
+    def _start(self, t_ns: int, speed_mps: float, headings: Headings) -> Headings:
+        """Fix the first belief, where the car was first measured to go at a speed.
+
+        The headings used for it are not used again.
+        """
         start = self.vehicle.start
         heading_rad, sd_rad = start.heading_rad, start.heading_sd_rad
         if heading_rad is None and len(headings):
@@ -263,6 +269,7 @@ class PoseStage:
             start.x_m,
             start.y_m,
             heading_rad,
+            speed_mps,
             position_sd_m=start.position_sd_m,
             heading_sd_rad=sd_rad,
         )

@@ -61,6 +61,25 @@ def test_a_circle_closes(tmp_path: Path) -> None:
     assert np.linalg.norm(end) < 1e-6
 
 
+def test_the_speed_is_that_of_the_first_row_measured(tmp_path: Path) -> None:
+    blocks = _drive(0.0, speed_mps=17.0)
+
+    speeds = _replay(tmp_path / "run", blocks).run.table("pose")["speed_mps"].to_numpy()
+
+    np.testing.assert_allclose(speeds, 17.0, atol=1e-9)
+
+
+def test_a_car_is_nowhere_until_a_speed_is_a_number(tmp_path: Path) -> None:
+    unknown = wheel_block([-SECOND, -SECOND // 2], [math.nan, math.nan])
+
+    outcome = _replay(tmp_path / "run", [unknown, *_drive(0.0, speed_mps=17.0)])
+
+    table = outcome.run.table("pose")
+    assert min(table["t_ns"].to_pylist()) > 0
+    np.testing.assert_allclose(table["speed_mps"].to_numpy(), 17.0, atol=1e-9)
+    assert estimate_manifest(outcome.run).counts.odometry["not_finite"] == 2
+
+
 def test_the_mirror_image_drives_the_mirror_image(tmp_path: Path) -> None:
     left, right = (
         _replay(tmp_path / f"{sign}", _drive(sign * 0.1)).run.table("pose") for sign in (1, -1)
