@@ -167,7 +167,7 @@ class Extractor:
         decoder = self._bus_decoder(source)
         tables = {part.topic.rsplit("/", 1)[1]: part for part in decoder(block)}
         can = self.vehicle.can
-        if can.wheel_speeds is not None:
+        if can.wheel_speeds is not None and Signal.WHEEL_SPEEDS in source.signals:
             wheels = can.wheel_speeds
             names = (wheels.front_left, wheels.front_right, wheels.rear_left, wheels.rear_right)
             scales = dict(SPEED_UNITS)
@@ -181,7 +181,7 @@ class Extractor:
             (can.yaw_rate, Signal.YAW_RATE, "can.yaw_rate"),
             (can.steering, Signal.STEERING, "can.steering"),
         ):
-            if section is not None:
+            if section is not None and signal in source.signals:
                 yield from angle_samples(tables, section, signal, key)
 
     def _bus_decoder(self, source: Source) -> BusDecoder:
@@ -194,7 +194,7 @@ class Extractor:
             database = database_of(self.vehicle.can.dbc)
             for sentence in database.notices:
                 self.ledger.notice(sentence)
-            wanted = check_signals(database, self.vehicle)
+            wanted = check_signals(database, self.vehicle, source.signals)
             is_shared = not {*source.signals}.isdisjoint(MOBILEYE_SIGNALS)
             settings = settings_of(self.vehicle.mobileye, is_shared_bus=is_shared)
             elsewhere = all_ids(settings) if is_shared else ()

@@ -84,10 +84,10 @@ def _plan_can(planner: _Planner) -> None:
         return
     if not can.dbc:
         raise VehicleError("can.dbc: missing; CAN signals are named but no DBC file to decode them")
-    place = planner.only(Role.CAN, can.bus, "can.bus")
     for section, signal in wanted:
         if section is None:
             continue
+        place = planner.only(Role.CAN, section.bus or can.bus, "can.bus")
         if place is None:
             planner.missing[signal] = "the log has no CAN bus"
         else:

@@ -51,6 +51,8 @@ class Topics(Section):
 class WheelSpeeds(Section):
     """Signals with the speed of each wheel; the rear two alone are enough."""
 
+    bus: str | None = None
+    """Topic of the bus that carries them; left out, ``can.bus``."""
     front_left: Signal | None = None
     front_right: Signal | None = None
     rear_left: Signal
@@ -64,6 +66,8 @@ class WheelSpeeds(Section):
 class AngleSignal(Section):
     """One signal with an angle or an angular rate, counter-clockwise positive."""
 
+    bus: str | None = None
+    """Topic of the bus that carries it; left out, ``can.bus``."""
     signal: Signal
     unit: Literal["deg", "rad", "deg/s", "rad/s"] | None = None
     sign: Literal[1, -1] = 1
@@ -73,7 +77,7 @@ class Can(Section):
     """The bus with the car's own signals and how to decode it."""
 
     bus: str | None = None
-    """Topic of the bus; may be left out where the log has only one."""
+    """Topic of the bus; may be left out where the log has only one. A section may name another."""
     dbc: tuple[str, ...] = ()
     """Files, relative to the vehicle file's folder."""
     wheel_speeds: WheelSpeeds | None = None

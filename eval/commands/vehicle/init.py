@@ -8,9 +8,18 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Final
 
 import crosscue
 from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
+
+MOUNTING: Final = {
+    "x-m": "how far the camera sits ahead of the rear axle",
+    "y-m": "how far it sits left of the car's middle",
+    "height-m": "how far it sits above the road",
+    "pitch-deg": "how far its axis points below the horizon (default: estimated from pictures of a "
+    "straight way)",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,6 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="DBC, KCD, ARXML or SYM files of the CAN buses",
     )
+    for name, what in MOUNTING.items():
+        parser.add_argument(
+            f"--camera-{name}", type=float, metavar=name.rpartition("-")[2].upper(), help=what
+        )
     add_limit_arguments(parser)
     parser.add_argument(
         "-o",
@@ -39,7 +52,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Draft the file, check that it reads back, write or print it."""
     with crosscue.open(*args.logs, limits=limits_of(args)) as log:
-        found = crosscue.draft_vehicle(log, args.dbc, args.output, overwrite=args.overwrite)
+        found = crosscue.draft_vehicle(
+            log,
+            args.dbc,
+            args.output,
+            overwrite=args.overwrite,
+            camera_x_m=args.camera_x_m,
+            camera_y_m=args.camera_y_m,
+            camera_height_m=args.camera_height_m,
+            camera_pitch_deg=args.camera_pitch_deg,
+        )
     if args.json:
         print_json(found.as_dict())
     elif found.path is None:

@@ -10,8 +10,7 @@ from crosscue.replay.base import Ledger, Log, Selection, Table
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.losses import warn_of
 from crosscue.replay.remote.logs import name_of
-
-from .roles import Role, role_of
+from crosscue.replay.vehicle.roles import Role, role_of
 
 
 class Intrinsics(NamedTuple):
@@ -20,6 +19,31 @@ class Intrinsics(NamedTuple):
     focal_px: float
     center_px: tuple[float, float]
     source: str
+
+
+class Measured(NamedTuple):
+    """A number of the mounting, and where it is from."""
+
+    value: float
+    source: str
+
+
+class Mounting(NamedTuple):
+    """Where the camera sits, as far as it is known; names are those of the vehicle file.
+
+    Attributes:
+        x_m: Ahead of the rear axle.
+        y_m: To its left.
+        z_m: Above the road.
+        pitch_rad: How far its axis points below the horizon.
+        notes: Sentences about what else is known, or why it is not.
+    """
+
+    x_m: Measured | None = None
+    y_m: Measured | None = None
+    z_m: Measured | None = None
+    pitch_rad: Measured | None = None
+    notes: tuple[str, ...] = ()
 
 
 @runtime_checkable
@@ -35,11 +59,15 @@ class KnowsItsCameras(Protocol):
         ...
 
 
-AFTER_CAMERA: Final = """\
-# [mobileye]  # read only where its bus is named
-# bus = ""  # the topic of its CAN bus, if there is one
-# x_m = 0.0  # ahead of the rear axle: measure it
+MEASURE: Final = {
+    "x_m": "ahead of the rear axle: measure it, then give --camera-x-m",
+    "y_m": "left of the car's middle: measure it, then give --camera-y-m",
+    "z_m": "above the road: measure it, then give --camera-height-m",
+    "pitch_rad": "below the horizon, or give --camera-pitch-deg; a drive with pictures, speed and "
+    "focal_px shows it",
+}
 
+AFTER_CAMERA: Final = """\
 # [regions]  # where road is looked for: on the ground, which needs camera.focal_px, z_m and a range
 # kind = "ground"  # or "picture", with a polygon for each side drawn on a picture of:
 # crosscue detect LOG --draw 1
@@ -58,14 +86,12 @@ AFTER_CAMERA: Final = """\
 """
 
 
-def camera_lines(logs: Sequence[Log]) -> Iterator[str]:
+def camera_lines(logs: Sequence[Log], mounting: Mounting) -> Iterator[str]:
     """The section ``[camera]``; nothing for logs without one."""
-    cameras = [
-        (log, topic.name) for log in logs for topic in log.topics if role_of(topic) is Role.CAMERA
-    ]
-    if not cameras:
+    camera = camera_of(logs)
+    if camera is None:
         return
-    found = _intrinsics(logs, *cameras[0])
+    _, _, found = camera
     yield "[camera]"
     if found is None:
         yield "# No calibration in the log; without it there are no ranges from motion."
@@ -74,8 +100,23 @@ def camera_lines(logs: Sequence[Log]) -> Iterator[str]:
     else:
         yield f"focal_px = {found.focal_px:.10g}  # {found.source}"
         yield f"center_px = [{found.center_px[0]:.10g}, {found.center_px[1]:.10g}]"
-    yield "# Measure these on the car: ahead of the rear axle, left of it, above the road; pitch."
-    yield from ("# x_m = 0.0", "# y_m = 0.0", "# z_m = 1.2", "# pitch_rad = 0.0", "")
+    for name, default in (("x_m", 0.0), ("y_m", 0.0), ("z_m", 1.2), ("pitch_rad", 0.0)):
+        given: Measured | None = getattr(mounting, name)
+        if given is None:
+            yield f"# {name} = {default}  # {MEASURE[name]}"
+        else:
+            yield f"{name} = {given.value:.5g}  # {given.source}"
+    yield from (f"# {note}" for note in mounting.notes)
+    yield ""
+
+
+def camera_of(logs: Sequence[Log]) -> tuple[Log, str, Intrinsics | None] | None:
+    """The first camera, its topic and its calibration; None for logs without a camera."""
+    for log in logs:
+        for topic in log.topics:
+            if role_of(topic) is Role.CAMERA:
+                return log, topic.name, _intrinsics(logs, log, topic.name)
+    return None
 
 
 def _intrinsics(logs: Sequence[Log], log: Log, camera: str) -> Intrinsics | None:

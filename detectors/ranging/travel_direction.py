@@ -1,0 +1,139 @@
+"""Which way a camera moves, in its own axes, from two pictures: the essential matrix.
+
+Where a car drives straight, its camera moves along the road, so that this direction is the
+vanishing point of the road: how far the camera's axis points beside and below it. Hartley and
+Zisserman, *Multiple View Geometry*, 2nd ed., section 9.6; points are followed by Lucas and Kanade's
+method, there and back.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Bytes, Floats
+
+POINTS: Final = 600
+MIN_POINTS: Final = 60
+MIN_FLOW_PX: Final = 2.0
+"""Below this the noise of following a point decides."""
+THERE_AND_BACK_PX: Final = 0.5
+OFF_LINE_PX: Final = 0.7
+INLIERS: Final = 0.5
+"""The standing part of a street must be more than what moves in it."""
+
+
+class Travel(NamedTuple):
+    """How a camera moved from one picture to the next.
+
+    Attributes:
+        left_rad: How far its axis points left of where it went.
+        below_rad: How far its axis points below where it went.
+        turned_rad: How far it turned meanwhile, to the left.
+        points: How many points agree.
+    """
+
+    left_rad: float
+    below_rad: float
+    turned_rad: float
+    points: int
+
+
+def travel_between(
+    before: Bytes, after: Bytes, focal_px: float, center_px: tuple[float, float]
+) -> Travel | None:
+    """The direction of travel, in the axes half-way between both pictures.
+
+    Args:
+        before: Grey picture, shape (H, W), uint8.
+        after: The next one, of the same size.
+        focal_px: Focal length in pixels of these pictures.
+        center_px: Optical center in them.
+
+    Returns:
+        None where too few points can be followed, or they do not agree.
+    """
+    found = cv2.goodFeaturesToTrack(before, POINTS, 0.01, 8)
+    if found is None or len(found) < MIN_POINTS:
+        return None
+    start, end = _followed(before, after, np.asarray(found, np.float32))
+    if len(start) < MIN_POINTS or np.median(np.hypot(*(end - start).T)) < MIN_FLOW_PX:
+        return None
+    camera = np.array([[focal_px, 0, center_px[0]], [0, focal_px, center_px[1]], [0, 0, 1.0]])
+    cv2.setRNGSeed(0)
+    essential, inliers = cv2.findEssentialMat(
+        start, end, camera, cv2.RANSAC, 0.999, OFF_LINE_PX, 2000
+    )
+    if essential is None or essential.shape != (3, 3) or inliers.sum() < INLIERS * len(start):
+        return None
+    agree, rotation, shift, kept = cv2.recoverPose(
+        essential, start, end, camera, mask=inliers.copy()
+    )
+    if agree < MIN_POINTS:
+        return None
+    is_kept = np.asarray(kept).ravel() > 0
+    rays_before, rays_after = (_rays(of[is_kept], focal_px, center_px) for of in (start, end))
+    turn = np.asarray(cv2.Rodrigues(rotation)[0], np.float64).ravel()
+    first = np.asarray(shift, np.float64).ravel()
+    return _travel(*_refined(turn, first, rays_before, rays_after, focal_px), agree)
+
+
+def _rays(points: NDArray[np.float32], focal_px: float, center_px: tuple[float, float]) -> Floats:
+    """Directions of points in a picture, shape (N, 3), the last being 1."""
+    flat = (points.astype(np.float64) - np.array(center_px)) / focal_px
+    return np.column_stack([flat, np.ones(len(flat))])
+
+
+def _refined(
+    turn: Floats, shift: Floats, before: Floats, after: Floats, focal_px: float
+) -> tuple[Floats, Floats]:
+    """Turn and shift of the least distances from epipolar lines (Sampson's), robustly.
+
+    Five points, which random sampling makes do with, leave the shift off by degrees.
+    """
+    from scipy.optimize import least_squares
+
+    def off_line_px(parameters: Floats) -> Floats:
+        rotation = np.asarray(cv2.Rodrigues(parameters[:3])[0], np.float64)
+        x, y, z = parameters[3:] / np.linalg.norm(parameters[3:])
+        essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
+        lines, back = before @ essential.T, after @ essential
+        size = np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1))
+        return np.asarray(focal_px * (after * lines).sum(axis=1) / np.maximum(size, 1e-12))
+
+    found = least_squares(
+        off_line_px, np.concatenate([turn, shift]), loss="soft_l1", f_scale=OFF_LINE_PX / 2.0
+    )
+    return found.x[:3], found.x[3:] / np.linalg.norm(found.x[3:])
+
+
+def _followed(
+    before: Bytes, after: Bytes, found: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Points in both pictures, those that come back to where they were."""
+    size = (21, 21)
+    there, is_there, _ = cv2.calcOpticalFlowPyrLK(before, after, found, found.copy(), winSize=size)
+    back, is_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, found.copy(), winSize=size)
+    off = np.hypot(*(back - found).reshape(-1, 2).T)
+    good = (is_there.ravel() == 1) & (is_back.ravel() == 1) & (off < THERE_AND_BACK_PX)
+    return found.reshape(-1, 2)[good], np.asarray(there, np.float32).reshape(-1, 2)[good]
+
+
+def _travel(turn: Floats, shift: Floats, points: int) -> Travel:
+    """Points of the first camera's axes, turned and shifted, are in the second's."""
+    half = np.asarray(cv2.Rodrigues(0.5 * turn)[0], np.float64)
+    # In the second camera's axes the camera came from +shift; half the turn takes that half-way.
+    ahead = -half.T @ shift
+    if ahead[2] < 0.0:
+        ahead = -ahead
+    return Travel(
+        left_rad=math.atan2(ahead[0], ahead[2]),
+        below_rad=math.atan2(-ahead[1], math.hypot(ahead[0], ahead[2])),
+        # About the camera's y axis, which points down: points move right as it turns left.
+        turned_rad=float(turn[1]),
+        points=points,
+    )

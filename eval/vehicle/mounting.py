@@ -1,0 +1,165 @@
+"""Pitch and yaw of a camera, by the direction in which it moves while the car drives straight."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from crosscue.detectors.base import View
+from crosscue.detectors.images import decode, encoded
+from crosscue.detectors.ranging.travel_direction import Travel, travel_between
+from crosscue.replay.base import (
+    EVERYTHING,
+    Bytes,
+    Floats,
+    Images,
+    Ledger,
+    Log,
+    LogFormatError,
+)
+from crosscue.replay.signals.extractor import pictures_of
+from crosscue.replay.vehicle.drafting.camera import Intrinsics, Measured
+from crosscue.replay.vehicle.drafting.series import Series
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+DEGREE: Final = np.pi / 180.0
+WIDTH_PX: Final = 960
+APART_M: Final = 1.5
+"""Between two pictures: enough for nearby things to move, too little for them to leave."""
+MOVING_MPS: Final = 2.0
+STRAIGHT_RAD_PER_M: Final = 0.2 * DEGREE
+"""A bend of a larger radius than 290 m counts as straight."""
+PAIRS: Final = 200
+MIN_PAIRS: Final = 10
+LOOKED_AT_NS: Final = 60_000_000_000
+
+
+class Estimate(NamedTuple):
+    """Of the mounting, from pairs of pictures.
+
+    Attributes:
+        pitch_rad: How far the axis points below the direction of travel; None without enough pairs.
+        yaw_rad: How far it points to the left of it.
+        pairs: How many pairs of pictures were used.
+        why_not: Why there is no estimate; empty where there is one.
+    """
+
+    pitch_rad: Measured | None
+    yaw_rad: Measured | None
+    pairs: int
+    why_not: str = ""
+
+
+def estimate_mounting(
+    log: Log, camera: str, intrinsics: Intrinsics | None, speed: Series | None
+) -> Estimate:
+    """Pitch and yaw of a log's camera, each the median over pairs of pictures.
+
+    Args:
+        log: Open.
+        camera: Its topic.
+        intrinsics: Of the camera; needed for an estimate.
+        speed: Of the car, m/s; needed likewise.
+    """
+    if intrinsics is None or speed is None or len(speed) < 2:
+        lacks = "focal_px" if intrinsics is None else "the car's speed"
+        return Estimate(None, None, 0, f"not estimated: needs {lacks}")
+    number = next(i for i, topic in enumerate(log.topics) if topic.name == camera)
+    seen, bends = 0, 0
+    found: list[Travel] = []
+    for before, after, way_m, focal_px, center_px in _pairs(log, number, intrinsics, speed):
+        seen += 1
+        travel = travel_between(before, after, focal_px, center_px)
+        if travel is None:
+            continue
+        if abs(travel.turned_rad) > STRAIGHT_RAD_PER_M * way_m:
+            bends += 1
+            continue
+        found.append(travel)
+        if len(found) == PAIRS:
+            break
+    if len(found) < MIN_PAIRS:
+        return Estimate(
+            None,
+            None,
+            len(found),
+            f"not estimated: {len(found)} pairs of pictures where the car drives straight, of "
+            f"{seen} examined, {bends} in bends; expected {MIN_PAIRS} or more",
+        )
+    return Estimate(
+        _measured(np.array([one.below_rad for one in found])),
+        _measured(np.array([one.left_rad for one in found])),
+        len(found),
+    )
+
+
+def _measured(angles_rad: Floats) -> Measured:
+    median = float(np.median(angles_rad))
+    spread = 1.4826 * float(np.median(np.abs(angles_rad - median)))
+    return Measured(
+        median,
+        f"ESTIMATED: {median / DEGREE:.2f} deg, the vanishing point of {len(angles_rad)} pairs of "
+        f"pictures on a straight way, s.d. of one {spread / DEGREE:.2f} deg",
+    )
+
+
+def _pairs(
+    log: Log, number: int, intrinsics: Intrinsics, speed: Series
+) -> Iterator[tuple[Bytes, Bytes, float, float, tuple[float, float]]]:
+    """Pictures about ``APART_M`` apart with the way between them, and the optics at their size."""
+    way_m = _way_m(speed)
+    waiting: deque[tuple[float, Bytes]] = deque()
+    first_ns: int | None = None
+    for t_ns, grey, scale in _grey(log, number):
+        first_ns = t_ns if first_ns is None else first_ns
+        if t_ns - first_ns > LOOKED_AT_NS:
+            return
+        if not speed.t_ns[0] <= t_ns <= speed.t_ns[-1]:
+            continue
+        if abs(float(np.interp(t_ns, speed.t_ns, speed.values))) < MOVING_MPS:
+            waiting.clear()
+            continue
+        here_m = float(np.interp(t_ns, speed.t_ns, way_m))
+        while len(waiting) > 1 and here_m - waiting[1][0] >= APART_M:
+            waiting.popleft()
+        if waiting and here_m - waiting[0][0] >= APART_M and waiting[0][1].shape == grey.shape:
+            focal_px = intrinsics.focal_px * scale
+            center_px = (intrinsics.center_px[0] * scale, intrinsics.center_px[1] * scale)
+            yield waiting[0][1], grey, here_m - waiting[0][0], focal_px, center_px
+        waiting.append((here_m, grey))
+
+
+def _way_m(speed: Series) -> Floats:
+    steps = 0.5 * (speed.values[1:] + speed.values[:-1]) * np.diff(speed.t_ns) * 1e-9
+    return np.concatenate([[0.0], np.cumsum(np.abs(steps))])
+
+
+def _grey(log: Log, number: int) -> Iterator[tuple[int, Bytes, float]]:
+    """Pictures in order of time, small and grey, with their scale; damaged ones are left out."""
+    import cv2
+
+    view = View(is_grey=True, min_width_px=WIDTH_PX)
+    pictures = pictures_of(log, 0, log.topics[number], Vehicle(version=1), Ledger(""), EVERYTHING)
+    for block, rows in pictures:
+        assert isinstance(rows, Images)
+        for row, t_ns in enumerate(block.log_ns.tolist()):
+            try:
+                pixels, size_px = decode(encoded(rows, row), view)
+            except LogFormatError:
+                continue
+            if pixels.shape[1] > WIDTH_PX:
+                height = round(pixels.shape[0] * WIDTH_PX / pixels.shape[1])
+                small = cv2.resize(pixels, (WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+                pixels = np.asarray(small, np.uint8)
+            yield t_ns, pixels, pixels.shape[1] / size_px[0]
+
+
+def yaw_notes(estimate: Estimate) -> tuple[str, ...]:
+    """What a vehicle file says of the yaw, which it has no setting for, or why nothing is known."""
+    if estimate.why_not:
+        return (f"pitch and yaw {estimate.why_not}",)
+    assert estimate.yaw_rad is not None
+    return (f"yaw, to the left of the way: {estimate.yaw_rad.source}",)

@@ -1,0 +1,267 @@
+"""Whether signals that should say the same do, and what is wrong with one that does not.
+
+A signal is judged by others that measure the same: a speed by GNSS or the other wheels, a yaw rate
+by the course over ground, the steering wheel and the difference of the rear wheels, each with the
+error that is to be expected of it. One that contradicts is never proposed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from crosscue.replay.columns import Floats
+
+from .series import WINDOW_S, Grid, Series, Track
+
+DEGREE: Final = math.pi / 180.0
+MAX_SPEED_MPS: Final = 100.0
+MAX_STEERING_RAD: Final = 1000.0 * DEGREE
+MAX_YAW_RATE_RADPS: Final = 2.0
+MOVING_MPS: Final = 3.0
+STANDING_MPS: Final = 0.05
+TRACK_M: Final = 1.55
+STEERING_RATIO: Final = 15.0
+WHEELBASE_M: Final = 2.7
+GYRO_BIAS_RADPS: Final = 1.0 * DEGREE
+"""A constant error that a car's gyro may have; ``fit odometry`` takes it off."""
+STEERING_OFF_RAD: Final = 4.0 * DEGREE
+"""A steering wheel may be so far off its middle on a straight road (crowned, side wind)."""
+TYRES_DIFFER: Final = 0.005
+"""Radii of the left and right wheels may differ by such a part."""
+TURNS: Final = 3.0 * DEGREE
+"""A reference that turns by less within all windows says nothing of sign and scale."""
+FOLLOWS: Final = 0.7
+MIN_WINDOWS: Final = 5
+SURE_WINDOWS: Final = 15
+"""In so many windows signals do not follow each other by chance, however little the car turns."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turning:
+    """Something that turns with the car, to judge a yaw rate by.
+
+    Attributes:
+        name: What it is.
+        turned_rad: Shape (windows,): turned within each; NaN where unknown.
+        off_radps: Shape (windows,): how far its rate may be off, all drive long.
+        has_scale: Whether its scale is known.
+    """
+
+    name: str
+    turned_rad: Floats
+    off_radps: Floats
+    has_scale: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What was found out about one signal.
+
+    Attributes:
+        facts: What it shows, for the comment beside it.
+        wrong: Why it must not be used; empty where nothing speaks against it.
+        agrees_with: How many others it was found to agree with.
+        error: How far it is off them, to rank by.
+        sign: -1 where it is positive to the right.
+        is_judged: False where the log shows too little to judge it by.
+    """
+
+    facts: tuple[str, ...]
+    wrong: tuple[str, ...] = ()
+    agrees_with: int = 0
+    error: float = math.inf
+    sign: int = 1
+    is_judged: bool = False
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """Smaller is better."""
+        return -self.agrees_with, self.error
+
+
+def judge_speed(
+    series: Series, reference: Series | None, grid: Grid, radius_known: bool
+) -> Verdict:
+    """A speed, or a wheel's rate of turning if its radius is not known, by a reference.
+
+    Args:
+        series: Of the signal.
+        reference: A speed from elsewhere, m/s; None if unknown.
+        grid: The times to compare at.
+        radius_known: The series is in m/s, so that its scale is judged, too.
+    """
+    low, high = float(series.values.min()), float(series.values.max())
+    unit = "m/s" if radius_known else "rad/s"
+    facts = [f"{series.rate_hz:.3g} Hz", f"{low:.1f} to {high:.1f} {unit}"]
+    limit = MAX_SPEED_MPS if radius_known else MAX_SPEED_MPS / 0.2
+    if max(abs(low), abs(high)) > limit:
+        return Verdict(tuple(facts), (f"reaches {max(abs(low), abs(high)):.0f} {unit}",))
+    if reference is None:
+        return Verdict(tuple(facts))
+    measured, true = series.at(grid), reference.at(grid)
+    both = np.isfinite(measured) & np.isfinite(true)
+    if both.sum() < 50 or float(np.abs(true[both]).max()) < MOVING_MPS:
+        return Verdict((*facts, f"hardly moves or is not there together with {reference.name}"))
+    measured, true = np.abs(measured[both]), np.abs(true[both])
+    if not measured.any():
+        return Verdict(tuple(facts), (f"is 0 while {reference.name} moves",))
+    scale = float((true * measured).sum() / (measured * measured).sum())
+    rms_mps = float(np.sqrt(np.mean((scale * measured - true) ** 2)))
+    if radius_known:
+        facts.append(f"{rms_mps:.2g} m/s from {reference.name} (times {scale:.4g})")
+        wrong = not 0.85 <= scale <= 1.15
+    else:
+        facts.append(f"{rms_mps:.2g} m/s from {reference.name} with a radius of {scale:.4g} m")
+        wrong = not 0.2 <= scale <= 0.6
+    if wrong or rms_mps > max(0.5, 0.05 * float(true.max())):
+        return Verdict(tuple(facts), ("contradicts it",), error=rms_mps, is_judged=True)
+    return Verdict(tuple(facts), agrees_with=1, error=rms_mps, is_judged=True)
+
+
+def spread_mps(wheels: Sequence[Series], grid: Grid) -> float:
+    """How far wheels lie from their mean, root mean square; NaN where they are not together."""
+    stacked = np.stack([one.at(grid) for one in wheels])
+    together = np.isfinite(stacked).all(axis=0)
+    if not together.any():
+        return math.nan
+    off = stacked[:, together] - stacked[:, together].mean(axis=0)
+    return float(np.sqrt(np.mean(off**2)))
+
+
+def of_course(track: Track, grid: Grid) -> Turning | None:
+    """The course over ground; None where the car was too slow for one."""
+    if track.course is None:
+        return None
+    turned = np.diff(track.course.at(grid)[:: grid.steps])
+    return Turning(f"the course of {track.course.name}", turned, np.zeros(grid.windows))
+
+
+def of_wheels(left: Series, right: Series, grid: Grid) -> Turning:
+    """The difference of two wheels of one axle, with a usual track width."""
+    rate = (right.at(grid) - left.at(grid)) / TRACK_M
+    speed = 0.5 * (right.at(grid) + left.at(grid))
+    off = TYRES_DIFFER * np.abs(grid.mean(speed)) / TRACK_M
+    return Turning("the rear wheels", grid.mean(rate) * WINDOW_S, off)
+
+
+def of_steering(angle: Series, sign: int, speed: Series, grid: Grid) -> Turning:
+    """Speed times the steering angle, with a usual ratio and wheel base."""
+    v = speed.at(grid)
+    rate = sign * v * np.tan(np.clip(angle.at(grid) / STEERING_RATIO, -1.0, 1.0)) / WHEELBASE_M
+    off = np.abs(grid.mean(v)) * STEERING_OFF_RAD / STEERING_RATIO / WHEELBASE_M
+    return Turning(f"steering {angle.name}", grid.mean(rate) * WINDOW_S, off, has_scale=False)
+
+
+def of_rate(rate: Series, sign: int, grid: Grid) -> Turning:
+    """A yaw rate that was itself found to agree."""
+    off = np.full(grid.windows, GYRO_BIAS_RADPS)
+    return Turning(f"the yaw rate of {rate.name}", sign * rate.turned(grid), off)
+
+
+def judge_yaw_rate(
+    series: Series, references: Sequence[Turning], speed: Series | None, grid: Grid
+) -> Verdict:
+    """A yaw rate by all that turns with the car.
+
+    Args:
+        series: Of the signal, rad/s.
+        references: The best first.
+        speed: Of the car, m/s, to find out when it stands.
+        grid: The times to compare at.
+    """
+    found = _first_look(series, MAX_YAW_RATE_RADPS, "deg/s")
+    if found.wrong:
+        return found
+    if speed is not None and (bias := _bias(series, speed, grid)) is not None:
+        text = f"{bias / DEGREE:+.2f} deg/s while the car stands"
+        found = replace(found, facts=(*found.facts, text))
+        if abs(bias) > GYRO_BIAS_RADPS:
+            found = replace(found, wrong=(*found.wrong, "turns while the car stands"))
+    return _judged(found, series.turned(grid), references, GYRO_BIAS_RADPS)
+
+
+def judge_steering(
+    series: Series, references: Sequence[Turning], speed: Series | None, grid: Grid
+) -> Verdict:
+    """A steering angle by all that turns with the car; the ratio of the steering is not known."""
+    found = _first_look(series, MAX_STEERING_RAD, "deg")
+    if found.wrong or speed is None:
+        return found
+    as_turn = of_steering(series, 1, speed, grid)
+    scaleless = [replace(one, has_scale=False) for one in references]
+    # A steering wheel off its middle is no contradiction; what it must do is follow the turns.
+    return _judged(found, as_turn.turned_rad, scaleless, math.inf)
+
+
+def _first_look(series: Series, limit_rad: float, unit: str) -> Verdict:
+    low, high = float(series.values.min()) / DEGREE, float(series.values.max()) / DEGREE
+    facts = (f"{series.rate_hz:.3g} Hz", f"{low:.1f} to {high:.1f} {unit}")
+    if max(abs(low), abs(high)) * DEGREE > limit_rad:
+        return Verdict(facts, (f"reaches {max(abs(low), abs(high)):.0f} {unit}",))
+    if low == high:
+        return Verdict(facts, ("never changes",))
+    return Verdict(facts)
+
+
+def _bias(series: Series, speed: Series, grid: Grid) -> float | None:
+    """Mean rate while the car stands for two seconds or more."""
+    stands = grid.windows_where(np.abs(speed.at(grid)) < STANDING_MPS)
+    turned = series.turned(grid)[stands]
+    turned = turned[np.isfinite(turned)]
+    return float(turned.mean() / WINDOW_S) if len(turned) else None
+
+
+def _judged(
+    found: Verdict, turned: Floats, references: Sequence[Turning], bias_radps: float
+) -> Verdict:
+    facts, wrong = [*found.facts], [*found.wrong]
+    agrees, error, sign, is_judged = 0, math.inf, 1, False
+    for reference in references:
+        both = np.isfinite(turned) & np.isfinite(reference.turned_rad)
+        if both.sum() < MIN_WINDOWS:
+            continue
+        mine, other = turned[both], reference.turned_rad[both]
+        follows = _correlation(mine, other)
+        is_turning = float(np.abs(other - np.median(other)).max()) >= TURNS
+        if is_turning or (abs(follows) >= FOLLOWS and both.sum() >= SURE_WINDOWS):
+            text = f"correlation {follows:+.2f} with {reference.name}"
+            if not is_judged and follows <= -FOLLOWS:
+                sign = -1
+            is_judged = True
+            if sign * follows < FOLLOWS:
+                facts.append(text)
+                wrong.append(f"does not follow {reference.name}")
+                continue
+            ratio = float(np.std(mine) / np.std(other))
+            facts.append(text + (f" (times {ratio:.2f})" if reference.has_scale else ""))
+            if is_turning and reference.has_scale and not 0.6 <= ratio <= 1.6:
+                wrong.append(f"turns {ratio:.2g} times as far as {reference.name}")
+                continue
+            agrees += 1
+        off = float((sign * mine - other).mean()) / WINDOW_S
+        may_be = bias_radps + float(reference.off_radps[both].mean())
+        if abs(off) > may_be:
+            wrong.append(
+                f"turns {sign * mine.sum() / DEGREE:.0f} deg in all where {reference.name} turns "
+                f"{other.sum() / DEGREE:.0f} deg"
+            )
+        elif not math.isfinite(error):
+            error = abs(off)
+            is_judged = True
+            if math.isfinite(bias_radps):
+                facts.append(
+                    f"{off / DEGREE:+.2f} deg/s off {reference.name} on average, "
+                    f"over {both.sum() * WINDOW_S:.0f} s"
+                )
+    return Verdict(tuple(facts), tuple(wrong), agrees, error, sign, is_judged)
+
+
+def _correlation(mine: Floats, other: Floats) -> float:
+    if float(np.std(mine)) == 0.0 or float(np.std(other)) == 0.0:
+        return 0.0
+    return float(np.corrcoef(mine, other)[0, 1])

@@ -1,0 +1,156 @@
+"""Which signals of a CAN database could be a wheel's speed, the yaw rate or the steering angle.
+
+Names and units only propose; what the log shows of each decides (``agreement``).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final
+
+from crosscue.replay.signals.converters import ANGLE_UNITS, SPEED_UNITS
+
+if TYPE_CHECKING:
+    from crosscue.replay.can.layout import CanMessage, CanSignal
+
+REQUESTS: Final = frozenset(
+    {"REQ", "REQUEST", "REQUESTED", "RQ", "RQST", "CMD", "COMMAND", "COMMANDED", "TARGET", "TGT"}
+    | {"DES", "DESIRED", "DSRD", "DEMAND", "DMD", "SETPOINT", "SETPT", "SP", "SET", "SOLL"}
+    | {"WANTED", "LIMIT", "LIM", "LKA", "LKAS"}
+)
+"""Words in the name of a signal that asks for something and measures nothing."""
+OTHERS: Final = frozenset({"TRAILER", "TRLR", "OFFSET", "OFFST", "ACCURACY", "LEAD"})
+"""Words in the name of a signal about something else than the car, or about another signal."""
+WHEELS: Final = {
+    "front_left": ("FL", "LF", "FRONTLEFT", "LEFTFRONT", "VL"),
+    "front_right": ("FR", "RF", "FRONTRIGHT", "RIGHTFRONT", "VR"),
+    "rear_left": ("RL", "LR", "REARLEFT", "LEFTREAR", "HL"),
+    "rear_right": ("RR", "REARRIGHT", "RIGHTREAR", "HR"),
+}
+"""Words that say which wheel; the last of each are German."""
+OF_WHEELS: Final = ("WHEEL", "WHL", "WH", "RAD", "RADGESCHW")
+OF_SPEED: Final = ("SPEED", "SPD", "VELOCITY", "VEL", "GESCHW", "V")
+OF_YAW: Final = ("YAW", "GIER", "GIERRATE", "YR")
+OF_STEERING: Final = (
+    "STEER",
+    "STEERING",
+    "STE",
+    "STR",
+    "SAS",
+    "LENKRADWINKEL",
+    "LENKWINKEL",
+    "LWI",
+)
+OF_GNSS: Final = ("GPS", "GNSS")
+
+
+class Kind(Enum):
+    """What a signal could be."""
+
+    WHEEL = "wheel speed"
+    SPEED = "speed of the car"
+    GNSS_SPEED = "speed from GNSS"
+    YAW_RATE = "yaw rate"
+    STEERING = "steering angle"
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A signal that could be something that odometry needs.
+
+    Attributes:
+        message: As the database spells it, with its identifier where several have that name.
+        signal: Likewise.
+        kind: What it could be.
+        unit: As the database spells it; empty where it says nothing.
+        scale: From its unit to SI; 1 for rad/s of a wheel, whose radius is not known.
+        wheel: Which wheel, a key of ``WHEELS``; empty for other kinds.
+        stem: Name without the words that say which wheel: the same for wheels that belong together.
+    """
+
+    message: str
+    signal: str
+    kind: Kind
+    unit: str
+    scale: float
+    wheel: str = ""
+    stem: str = ""
+
+    @property
+    def name(self) -> str:
+        """As a vehicle file has it."""
+        return f"{self.message}.{self.signal}"
+
+    @property
+    def is_turning(self) -> bool:
+        """Is it a wheel's rate of turning, so that its speed needs a radius?"""
+        return self.kind is Kind.WHEEL and _unit(self.unit) in _TURNING
+
+
+_TURNING: Final = frozenset({"rad/s", "radians/second", "rad/sec"})
+
+
+def candidates(messages: Sequence[CanMessage]) -> Iterator[Candidate]:
+    """Every signal that could be something, by its name and unit; requests are left out."""
+    for message in messages:
+        for signal in message.signals:
+            found = _candidate(message, signal)
+            if found is not None:
+                yield found
+
+
+def _candidate(message: CanMessage, signal: CanSignal) -> Candidate | None:
+    of_signal, of_message = _words(signal.name), _words(message.name)
+    both = {*of_signal, *of_message}
+    if signal.length < 8 or not REQUESTS.isdisjoint(both) or not OTHERS.isdisjoint(both):
+        return None
+    unit = _unit(signal.unit)
+    wheel = next((w for w, words in WHEELS.items() if _has_word(of_signal, words)), "")
+    if unit in SPEED_UNITS or unit in _TURNING:
+        if wheel and (unit not in _TURNING or _mentions(both, OF_WHEELS)):
+            stem = "_".join([message.topic_name, *_without(of_signal, WHEELS[wheel])])
+            scale = 1.0 if unit in _TURNING else SPEED_UNITS[unit]
+            return Candidate(
+                message.topic_name, signal.name, Kind.WHEEL, signal.unit, scale, wheel, stem
+            )
+        if unit in SPEED_UNITS and _mentions(both, OF_SPEED):
+            kind = Kind.GNSS_SPEED if _mentions(both, OF_GNSS) else Kind.SPEED
+            return Candidate(message.topic_name, signal.name, kind, signal.unit, SPEED_UNITS[unit])
+    if unit in ANGLE_UNITS:
+        is_rate = unit.endswith(("/s", "/sec", "/second", "persecon"))
+        scale = ANGLE_UNITS[unit]
+        if is_rate and _mentions(of_signal, OF_YAW):
+            return Candidate(message.topic_name, signal.name, Kind.YAW_RATE, signal.unit, scale)
+        if not is_rate and _mentions(both, OF_STEERING) and not _mentions(of_signal, OF_YAW):
+            return Candidate(message.topic_name, signal.name, Kind.STEERING, signal.unit, scale)
+    return None
+
+
+def _unit(text: str) -> str:
+    return text.strip().lower()
+
+
+def _mentions(words: Collection[str], wanted: Sequence[str]) -> bool:
+    """Whether a word is one of these, or begins with a longer one of them."""
+    return any(
+        word == one or (len(one) > 3 and word.startswith(one)) for word in words for one in wanted
+    )
+
+
+def _has_word(words: Sequence[str], wanted: Sequence[str]) -> bool:
+    pairs = [a + b for a, b in pairwise(words)]
+    return any(word in words or word in pairs for word in wanted)
+
+
+def _without(words: Sequence[str], those: Sequence[str]) -> list[str]:
+    parts = {*those, "FRONT", "REAR", "LEFT", "RIGHT"}
+    return [word for word in words if word not in parts]
+
+
+def _words(name: str) -> list[str]:
+    """Of a name in capitals, in camel case or with underscores."""
+    return [word.upper() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]

@@ -1,0 +1,262 @@
+"""Which signals a first vehicle file names: the best that contradict nothing, and the others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from crosscue.replay.base import Floats
+
+from .agreement import (
+    Turning,
+    Verdict,
+    judge_speed,
+    judge_steering,
+    judge_yaw_rate,
+    of_course,
+    of_rate,
+    of_steering,
+    of_wheels,
+    spread_mps,
+)
+from .candidates import WHEELS, Candidate, Kind
+from .observed import Bus, Observed
+from .series import Grid, Series
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """One signal, or an inertial unit's, with what was found out about it.
+
+    Attributes:
+        name: As the vehicle file has it; the topic of an inertial unit.
+        bus: Topic of its bus; empty for a topic of its own.
+        series: Its readings.
+        verdict: What the log shows.
+    """
+
+    name: str
+    bus: str
+    series: Series
+    verdict: Verdict
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WheelSet:
+    """Wheels that belong together.
+
+    Attributes:
+        bus: Topic of their bus.
+        wheels: Signals by wheel, a key of ``WHEELS``.
+        series: Readings, alike.
+        verdict: What the log shows, of all of them.
+        radius_m: Where they turn in rad/s: the radius that fits the reference; else None.
+        is_turning: Whether they are in rad/s.
+    """
+
+    bus: str
+    wheels: dict[str, Candidate]
+    series: dict[str, Series]
+    verdict: Verdict
+    radius_m: float | None
+    is_turning: bool
+
+    @property
+    def has_axle(self) -> bool:
+        """Are the two rear wheels among them, which odometry needs?"""
+        return {"rear_left", "rear_right"} <= self.wheels.keys()
+
+    @property
+    def speed(self) -> Series:
+        """Mean of the rear wheels, m/s."""
+        left, right = self.series["rear_left"], self.series["rear_right"]
+        scale = (self.radius_m or 0.32) if self.is_turning else 1.0
+        other = np.interp(left.t_ns, right.t_ns, right.values)
+        return Series("the rear wheels", left.t_ns, 0.5 * scale * (left.values + other))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choices:
+    """What was chosen, the best of each kind first.
+
+    Attributes:
+        wheels: Sets of wheels.
+        speeds: Speeds of the car, for one without wheel speeds.
+        yaw_rates: CAN signals and inertial units.
+        steering: CAN signals.
+        reference: What speeds were compared with; empty for nothing.
+        speed: The best speed of the car there is, m/s.
+    """
+
+    wheels: tuple[WheelSet, ...]
+    speeds: tuple[Choice, ...]
+    yaw_rates: tuple[Choice, ...]
+    steering: tuple[Choice, ...]
+    reference: str
+    speed: Series | None
+
+    def is_chosen(self, choice: Choice | WheelSet) -> bool:
+        """Is it the best of its kind, with nothing against it?"""
+        of_kind: Sequence[Choice | WheelSet] = next(
+            kind
+            for kind in (self.wheels, self.speeds, self.yaw_rates, self.steering)
+            if choice in kind
+        )
+        return choice is of_kind[0] and not choice.verdict.wrong
+
+
+def choose(seen: Observed) -> Choices:
+    """Judge every candidate by the others."""
+    grid = Grid.over(seen.start_ns, seen.end_ns)
+    reference = _reference_speed(seen, grid)
+    wheels = sorted(_wheel_sets(seen, reference, grid), key=_wheel_rank)
+    chosen = next((one for one in wheels if one.has_axle and not one.verdict.wrong), None)
+    speed = chosen.speed if chosen is not None else reference
+    speeds = _ranked(
+        Choice(one.name, bus.topic, series, judge_speed(series, speed, grid, True))
+        for bus, one, series in seen.of_kind(Kind.SPEED)
+    )
+    if speed is None and speeds and not speeds[0].verdict.wrong:
+        speed = speeds[0].series
+    turnings = [turn for track in seen.tracks if (turn := of_course(track, grid)) is not None][:1]
+    if chosen is not None and (not chosen.is_turning or chosen.radius_m is not None):
+        scale = chosen.radius_m if chosen.is_turning and chosen.radius_m else 1.0
+        left, right = (
+            replace(one, values=one.values * scale)
+            for one in (chosen.series["rear_left"], chosen.series["rear_right"])
+        )
+        turnings.append(of_wheels(left, right, grid))
+    yaw_rates = _yaw_rates(seen, turnings, speed, grid)
+    # The steering judges a yaw rate where nothing better does, and is judged by the one chosen.
+    by_rate = [
+        of_rate(one.series, one.verdict.sign, grid)
+        for one in yaw_rates[:1]
+        if not one.verdict.wrong
+    ]
+    steering = _ranked(
+        Choice(
+            one.name,
+            bus.topic,
+            series,
+            judge_steering(series, [*turnings[:1], *by_rate, *turnings[1:]], speed, grid),
+        )
+        for bus, one, series in seen.of_kind(Kind.STEERING)
+    )
+    if speed is not None and steering and steering[0].verdict.agrees_with:
+        best = steering[0]
+        turnings.append(of_steering(best.series, best.verdict.sign, speed, grid))
+        yaw_rates = _yaw_rates(seen, turnings, speed, grid)
+    return Choices(
+        tuple(wheels),
+        speeds,
+        yaw_rates,
+        steering,
+        reference.name if reference is not None else "",
+        speed,
+    )
+
+
+def _reference_speed(seen: Observed, grid: Grid) -> Series | None:
+    """GNSS, else the median of all that could be a speed in m/s."""
+    for track in seen.tracks:
+        if np.isfinite(track.speed.at(grid)).sum() > 50:
+            return replace(track.speed, name=f"GNSS {track.speed.name}")
+    for bus, one, series in seen.of_kind(Kind.GNSS_SPEED):
+        return replace(series, name=f"GNSS {bus.topic} {one.name}")
+    others = [
+        series
+        for kind in (Kind.WHEEL, Kind.SPEED)
+        for _, one, series in seen.of_kind(kind)
+        if not one.is_turning
+    ]
+    if seen.speeds:
+        return seen.speeds[0]
+    if len(others) < 3:
+        return None
+    at_grid = np.stack([np.abs(one.at(grid)) for one in others])
+    known = np.isfinite(at_grid).sum(axis=0) >= 3
+    median: Floats = np.full(len(grid.t_ns), np.nan)
+    if known.any():
+        median[known] = np.nanmedian(at_grid[:, known], axis=0)
+    return Series.of(f"the median of {len(others)} speeds", grid.t_ns, median)
+
+
+def _wheel_sets(seen: Observed, reference: Series | None, grid: Grid) -> Iterator[WheelSet]:
+    groups: dict[tuple[str, str, bool], dict[str, tuple[Candidate, Series]]] = {}
+    for bus, one, series in seen.of_kind(Kind.WHEEL):
+        group = groups.setdefault((bus.topic, one.stem, one.is_turning), {})
+        group.setdefault(one.wheel, (one, series))
+    for (bus_name, _, is_turning), group in groups.items():
+        readings = {wheel: group[wheel][1] for wheel in WHEELS if wheel in group}
+        verdicts = [judge_speed(one, reference, grid, not is_turning) for one in readings.values()]
+        verdict, radius_m = _of_all(verdicts, readings, reference, grid, is_turning)
+        names = {wheel: group[wheel][0] for wheel in readings}
+        yield WheelSet(bus_name, names, readings, verdict, radius_m, is_turning)
+
+
+def _of_all(
+    verdicts: Sequence[Verdict],
+    series: dict[str, Series],
+    reference: Series | None,
+    grid: Grid,
+    is_turning: bool,
+) -> tuple[Verdict, float | None]:
+    """One verdict on a set: the worst wheel's, and how well the wheels agree."""
+    worst = max(verdicts, key=lambda one: (len(one.wrong), one.rank))
+    facts = [*worst.facts]
+    radius_m = None
+    if is_turning and reference is not None and worst.agrees_with:
+        radius_m = _radius_m(list(series.values()), reference, grid)
+    if len(series) > 1:
+        spread = spread_mps(list(series.values()), grid)
+        if math.isfinite(spread):
+            unit = "rad/s" if is_turning else "m/s"
+            facts.append(f"the {len(series)} wheels lie {spread:.2g} {unit} from their mean")
+    return replace(worst, facts=tuple(facts)), radius_m
+
+
+def _radius_m(wheels: Sequence[Series], reference: Series, grid: Grid) -> float | None:
+    mean = np.abs(np.stack([one.at(grid) for one in wheels]).mean(axis=0))
+    true = np.abs(reference.at(grid))
+    both = np.isfinite(mean) & np.isfinite(true)
+    square = float((mean[both] ** 2).sum())
+    return float((true[both] * mean[both]).sum() / square) if square > 0.0 else None
+
+
+def _wheel_rank(one: WheelSet) -> tuple[object, ...]:
+    rate_hz = min(series.rate_hz for series in one.series.values())
+    return (
+        not one.has_axle,
+        bool(one.verdict.wrong),
+        *one.verdict.rank,
+        -len(one.wheels),
+        -rate_hz,
+    )
+
+
+def _yaw_rates(
+    seen: Observed, turnings: Sequence[Turning], speed: Series | None, grid: Grid
+) -> tuple[Choice, ...]:
+    return _ranked(
+        Choice(name, bus, series, judge_yaw_rate(series, turnings, speed, grid))
+        for name, bus, series in (
+            *((one.name, bus.topic, series) for bus, one, series in seen.of_kind(Kind.YAW_RATE)),
+            *((series.name, "", series) for series in seen.yaw_rates if len(series) > 1),
+        )
+    )
+
+
+def _ranked(choices: Iterator[Choice]) -> tuple[Choice, ...]:
+    return tuple(
+        sorted(choices, key=lambda one: (bool(one.verdict.wrong), *one.verdict.rank, one.name))
+    )
+
+
+def bus_of(buses: Sequence[Bus], choices: Choices) -> str:
+    """The bus that ``can.bus`` names: of the wheels, else the one best known."""
+    if choices.wheels and choices.is_chosen(choices.wheels[0]):
+        return choices.wheels[0].bus
+    return buses[0].topic

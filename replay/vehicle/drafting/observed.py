@@ -1,0 +1,263 @@
+"""What the first minutes of a drive hold: its CAN buses and all that shows how the car moved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from crosscue.replay.base import Block, CanFrames, Floats, Int64s, Ledger, Log, Selection, Table
+from crosscue.replay.decode import decoder_for
+from crosscue.replay.losses import warn_of
+from crosscue.replay.remote.logs import name_of
+from crosscue.replay.vehicle.roles import Role, role_of
+
+from .candidates import Candidate, Kind, candidates
+from .series import Series, Track
+
+if TYPE_CHECKING:
+    from crosscue.replay.can.database import CanDatabase
+    from crosscue.replay.can.decode import BusDecoder
+
+LOOKED_AT_NS: Final = 300_000_000_000
+"""Five minutes hold some bends and stops, and are read in seconds."""
+MOBILEYE_MESSAGES: Final = 4
+"""So many of its messages, the status among them, make a bus a Mobileye's: identifiers of others
+coincide, but not with their lengths and in such number."""
+
+
+@dataclass(slots=True, eq=False)
+class Bus:
+    """One CAN bus of the drive.
+
+    Attributes:
+        topic: Its name.
+        frames: How many were examined.
+        ids: Identifiers seen, each with whether it is extended, and their frames' lengths.
+        known: How many of them the database holds.
+        signals: Readings of every signal that could be something, in SI units.
+    """
+
+    topic: str
+    frames: int = 0
+    ids: dict[tuple[int, bool], set[int]] = field(default_factory=dict)
+    known: int = 0
+    signals: list[tuple[Candidate, Series]] = field(default_factory=list)
+
+    @property
+    def mobileye(self) -> tuple[str, ...]:
+        """Names of a Mobileye's messages on it; empty where it is not a Mobileye's bus."""
+        from crosscue.replay.base import LENGTH_UNKNOWN
+        from crosscue.replay.mobileye.layout import layout
+
+        found = []
+        for message in layout().messages:
+            fits = {*message.lengths, LENGTH_UNKNOWN}
+            seen = [self.ids.get((one, False)) for one in message.ids]
+            if any(lengths is not None and lengths <= fits for lengths in seen):
+                found.append(message.name)
+        is_mobileye = "status" in found and len(found) >= MOBILEYE_MESSAGES
+        return tuple(found) if is_mobileye else ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """What was seen of a drive.
+
+    Attributes:
+        buses: Those of which the database knows most first.
+        tracks: Speed and course over ground, of every topic that reports them.
+        yaw_rates: Of inertial units and odometry, by topic.
+        speeds: Of wheel-speed and odometry topics, by topic.
+        start_ns: Earliest time seen.
+        end_ns: Latest one.
+    """
+
+    buses: tuple[Bus, ...]
+    tracks: tuple[Track, ...]
+    yaw_rates: tuple[Series, ...]
+    speeds: tuple[Series, ...]
+    start_ns: int
+    end_ns: int
+
+    def of_kind(self, kind: Kind) -> list[tuple[Bus, Candidate, Series]]:
+        """Every signal of a kind with the bus that carries it."""
+        return [
+            (bus, candidate, series)
+            for bus in self.buses
+            for candidate, series in bus.signals
+            if candidate.kind is kind and len(series) > 1
+        ]
+
+
+_MOTION: Final = (Role.GNSS, Role.IMU, Role.ODOMETRY, Role.WHEELS)
+
+
+def observe(logs: Sequence[Log], database: CanDatabase | None) -> Observed:
+    """Read the first minutes of every log; what is damaged there is warned of."""
+    found = _Collected(database)
+    for log in logs:
+        roles = {
+            topic.name: role
+            for topic in log.topics
+            if (role := role_of(topic)) is Role.CAN or role in _MOTION
+        }
+        if roles:
+            _read(log, roles, found)
+    return found.result()
+
+
+def _read(log: Log, roles: Mapping[str, Role], found: _Collected) -> None:
+    ledger = Ledger(name_of(log))
+    decoders = {
+        topic.name: decoder_for(topic) if topic.encoding != "columns" else None
+        for topic in log.topics
+        if topic.name in roles
+    }
+    first_ns: int | None = None
+    for name, role in roles.items():
+        if role is Role.CAN:
+            found.buses.setdefault(name, Bus(name))
+    for block in log.read(ledger, Selection(frozenset(roles))):
+        if not len(block):
+            continue
+        decode = decoders[block.topic]
+        shown = decode(block, ledger) if decode is not None else block
+        first_ns = int(block.log_ns[0]) if first_ns is None else first_ns
+        if int(block.log_ns[0]) - first_ns > LOOKED_AT_NS:
+            break
+        found.take(shown, roles[block.topic])
+    warn_of(ledger)
+
+
+class _Collected:
+    """Readings as they come, until they become series."""
+
+    def __init__(self, database: CanDatabase | None) -> None:
+        self.buses: dict[str, Bus] = {}
+        self._database: Final = database
+        found = [] if database is None else [*candidates(database.messages)]
+        self._candidates: Final = {(one.message, one.signal): one for one in found}
+        self._decoders: dict[str, BusDecoder] = {}
+        self._parts: dict[tuple[str, str, str], list[tuple[Int64s, Floats]]] = {}
+        self._first_ns: list[int] = []
+        self._last_ns: list[int] = []
+
+    def take(self, block: Block, role: Role) -> None:
+        """One block of one topic, decoded."""
+        if not len(block):
+            return
+        self._first_ns.append(int(block.log_ns.min()))
+        self._last_ns.append(int(block.log_ns.max()))
+        if isinstance(block.rows, CanFrames):
+            self._take_frames(block, block.rows)
+        elif isinstance(block.rows, Table) and role is not Role.CAN:
+            for column in _COLUMNS[role]:
+                if column in block.rows.columns:
+                    values = np.asarray(block.rows[column], np.float64)
+                    self._add(block.topic, role.name, column, block.log_ns, values)
+
+    def _take_frames(self, block: Block, rows: CanFrames) -> None:
+        bus = self.buses.setdefault(block.topic, Bus(block.topic))
+        bus.frames += len(block)
+        key = rows.arbitration_id.astype(np.int64) | rows.is_extended.astype(np.int64) << 32
+        for one in np.unique(key | rows.length.astype(np.int64) << 40).tolist():
+            place = (one & 0xFFFF_FFFF, bool(one >> 32 & 1))
+            bus.ids.setdefault(place, set()).add(one >> 40)
+        if not self._candidates:
+            return
+        for part in self._decoder(block.topic)(block):
+            if not isinstance(part.rows, Table):
+                continue
+            message = part.topic.rsplit("/", 1)[1]
+            for signal in part.rows.columns:
+                if (one := self._candidates.get((message, signal))) is not None:
+                    values = np.asarray(part.rows[signal], np.float64) * one.scale
+                    self._add(block.topic, message, signal, part.log_ns, values)
+
+    def _decoder(self, bus: str) -> BusDecoder:
+        if bus not in self._decoders:
+            from crosscue.replay.can.decode import BusDecoder
+
+            assert self._database is not None
+            self._decoders[bus] = BusDecoder(
+                self._database, bus, Ledger(""), frozenset(self._candidates)
+            )
+        return self._decoders[bus]
+
+    def _add(self, topic: str, part: str, column: str, t_ns: Int64s, values: Floats) -> None:
+        self._parts.setdefault((topic, part, column), []).append((t_ns, values))
+
+    def result(self) -> Observed:
+        """All that came."""
+        joined = {
+            place: (
+                np.concatenate([t_ns for t_ns, _ in parts]),
+                np.concatenate([values for _, values in parts]),
+            )
+            for place, parts in self._parts.items()
+        }
+        for bus in self.buses.values():
+            if self._database is not None:
+                bus.known = sum(self._database.find(*key) is not None for key in bus.ids)
+            for (topic, message, signal), (t_ns, values) in joined.items():
+                one = self._candidates.get((message, signal))
+                if topic == bus.topic and one is not None:
+                    bus.signals.append((one, Series.of(one.name, t_ns, values)))
+        known_first = sorted(self.buses.values(), key=lambda bus: (-bus.known, bus.topic))
+        topics = list(dict.fromkeys((topic, part) for topic, part, _ in joined))
+        columns = {
+            place: {c: v for (t, p, c), v in joined.items() if (t, p) == place} for place in topics
+        }
+        return Observed(
+            tuple(known_first),
+            tuple(
+                track
+                for (topic, part), found in columns.items()
+                if part == Role.GNSS.name and (track := _track(topic, found)) is not None
+            ),
+            tuple(_series(columns, (Role.IMU, Role.ODOMETRY), _YAW_COLUMNS)),
+            tuple(_series(columns, (Role.ODOMETRY, Role.WHEELS), _SPEED_COLUMNS)),
+            min(self._first_ns, default=0),
+            max(self._last_ns, default=0),
+        )
+
+
+_Columns = Mapping[str, tuple[Int64s, Floats]]
+_YAW_COLUMNS: Final = ("gyro_z_radps", "yaw_rate_radps")
+_SPEED_COLUMNS: Final = ("speed_x_mps", "rear_left_mps")
+_COLUMNS: Final[dict[Role, tuple[str, ...]]] = {
+    Role.GNSS: (
+        "speed_mps", "course_rad", "velocity_east_mps", "velocity_north_mps",
+        "latitude_deg", "longitude_deg",
+    ),
+    Role.IMU: _YAW_COLUMNS,
+    Role.ODOMETRY: ("speed_x_mps", *_YAW_COLUMNS),
+    Role.WHEELS: _SPEED_COLUMNS,
+}  # fmt: skip
+
+
+def _series(
+    columns: Mapping[tuple[str, str], _Columns], roles: Iterable[Role], wanted: Sequence[str]
+) -> Iterable[Series]:
+    names = {role.name for role in roles}
+    for (topic, part), found in columns.items():
+        name = next((name for name in wanted if name in found), None)
+        if part in names and name is not None:
+            yield Series.of(topic, *found[name])
+
+
+def _track(topic: str, found: _Columns) -> Track | None:
+    """As the topic says it, or by the way between its positions."""
+    if {"speed_mps", "course_rad"} <= found.keys():
+        t_ns, speed = found["speed_mps"]
+        return Track.of_course(topic, t_ns, speed, found["course_rad"][1])
+    if {"velocity_east_mps", "velocity_north_mps"} <= found.keys():
+        t_ns, east = found["velocity_east_mps"]
+        return Track.of_velocity(topic, t_ns, east, found["velocity_north_mps"][1])
+    if {"latitude_deg", "longitude_deg"} <= found.keys():
+        t_ns, latitude = found["latitude_deg"]
+        return Track.of_positions(topic, t_ns, latitude, found["longitude_deg"][1])
+    return None

@@ -1,0 +1,169 @@
+"""Signals as series of time and value, and the two ways in which they are compared.
+
+Speeds are compared at common times, and yaw rates by how far they turn within a few seconds: a
+GNSS course is too rough to be differentiated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats, Int64s
+
+STEP_S: Final = 0.1
+WINDOW_S: Final = 2.0
+MAX_GAP_S: Final = 1.5
+"""Longer silences of a signal are not bridged; a GNSS fix may come once a second."""
+EARTH_RADIUS_M: Final = 6_371_000.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """N readings of one signal in SI units.
+
+    Attributes:
+        name: What it is called in the vehicle file's comments.
+        t_ns: Shape (N,), int64, in order.
+        values: Shape (N,).
+    """
+
+    name: str
+    t_ns: Int64s
+    values: Floats
+
+    @classmethod
+    def of(cls, name: str, t_ns: Int64s, values: Floats) -> Series:
+        """Readings in any order; those that are not numbers are left out."""
+        keep = np.isfinite(values)
+        order = np.argsort(t_ns[keep], kind="stable")
+        return cls(name, t_ns[keep][order], np.asarray(values, np.float64)[keep][order])
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @property
+    def rate_hz(self) -> float:
+        """Readings a second, by the median time between them; 0 for fewer than two."""
+        steps_s = np.diff(self.t_ns) * 1e-9
+        steps_s = steps_s[steps_s > 0.0]
+        return float(1.0 / np.median(steps_s)) if len(steps_s) else 0.0
+
+    def at(self, grid: Grid) -> Floats:
+        """Values at the grid's times, linear between readings; NaN where they are far apart."""
+        if len(self) < 2:
+            return np.full(len(grid.t_ns), np.nan)
+        values = np.interp(grid.t_ns, self.t_ns, self.values)
+        after = np.clip(np.searchsorted(self.t_ns, grid.t_ns), 1, len(self) - 1)
+        is_near = (self.t_ns[after] - self.t_ns[after - 1]) * 1e-9 <= MAX_GAP_S
+        is_inside = (grid.t_ns >= self.t_ns[0]) & (grid.t_ns <= self.t_ns[-1])
+        return np.where(is_near & is_inside, values, np.nan)
+
+    def turned(self, grid: Grid) -> Floats:
+        """Of a rate: how far it turns within each window, rad; NaN where it is silent."""
+        rate = self.at(grid)
+        if not np.isfinite(rate).any():
+            return np.full(grid.windows, np.nan)
+        # Between the grid's times, too: a gyro's noise averages out instead of being sampled.
+        area = np.concatenate(
+            [
+                [0.0],
+                np.cumsum(0.5 * (self.values[1:] + self.values[:-1]) * np.diff(self.t_ns) * 1e-9),
+            ]
+        )
+        edges_ns = grid.edges_ns
+        turned = np.diff(np.interp(edges_ns, self.t_ns, area))
+        return np.where(grid.windows_where(np.isfinite(rate)), turned, np.nan)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid:
+    """Common times, every ``STEP_S``, in whole windows of ``WINDOW_S``.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+    """
+
+    t_ns: Int64s
+
+    @classmethod
+    def over(cls, start_ns: int, end_ns: int) -> Grid:
+        """As many whole windows as fit."""
+        step_ns, steps = round(STEP_S * 1e9), round(WINDOW_S / STEP_S)
+        windows = max((end_ns - start_ns) // (step_ns * steps), 0)
+        return cls(start_ns + np.arange(windows * steps + 1, dtype=np.int64) * step_ns)
+
+    @property
+    def steps(self) -> int:
+        """Of a window."""
+        return round(WINDOW_S / STEP_S)
+
+    @property
+    def windows(self) -> int:
+        """How many."""
+        return (len(self.t_ns) - 1) // self.steps
+
+    @property
+    def edges_ns(self) -> Int64s:
+        """Where windows begin and end, shape (windows + 1,)."""
+        return self.t_ns[:: self.steps]
+
+    def windows_where(self, is_so: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """In which windows something holds throughout, both edges included."""
+        whole: NDArray[np.bool_] = (
+            is_so[:-1].reshape(self.windows, self.steps).all(axis=1)
+            & is_so[self.steps :: self.steps]
+        )
+        return whole
+
+    def mean(self, values: Floats) -> Floats:
+        """Of each window."""
+        return np.asarray(values[:-1].reshape(self.windows, self.steps).mean(axis=1), np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Speed and course over ground, as GNSS reports them.
+
+    Attributes:
+        speed: m/s.
+        course: rad from east, counter-clockwise and continuous.
+    """
+
+    speed: Series
+    course: Series | None
+
+    @classmethod
+    def of_positions(
+        cls, name: str, t_ns: Int64s, latitude_deg: Floats, longitude_deg: Floats
+    ) -> Track | None:
+        """By the way from one fix to one about a second later; None for too few fixes."""
+        keep = np.isfinite(latitude_deg) & np.isfinite(longitude_deg)
+        t_ns, lat, lon = t_ns[keep], latitude_deg[keep], longitude_deg[keep]
+        later = np.searchsorted(t_ns, t_ns + 900_000_000)
+        first = np.flatnonzero(later < len(t_ns))
+        if len(first) < 2:
+            return None
+        last = later[first]
+        dt_s = (t_ns[last] - t_ns[first]) * 1e-9
+        north = np.deg2rad(lat[last] - lat[first]) * EARTH_RADIUS_M
+        east = np.deg2rad(lon[last] - lon[first]) * EARTH_RADIUS_M * np.cos(np.deg2rad(lat[first]))
+        middle_ns = t_ns[first] + (t_ns[last] - t_ns[first]) // 2
+        return cls.of_velocity(name, middle_ns, east / dt_s, north / dt_s)
+
+    @classmethod
+    def of_velocity(cls, name: str, t_ns: Int64s, east_mps: Floats, north_mps: Floats) -> Track:
+        """From the velocity over ground."""
+        course = np.arctan2(north_mps, east_mps)
+        return cls.of_course(name, t_ns, np.hypot(east_mps, north_mps), course)
+
+    @classmethod
+    def of_course(cls, name: str, t_ns: Int64s, speed_mps: Floats, course_rad: Floats) -> Track:
+        """As reported; a course counts only where the car surely moves."""
+        moves = np.isfinite(course_rad) & (speed_mps > 3.0)
+        course = Series.of(name, t_ns[moves], np.unwrap(course_rad[moves]))
+        speed = Series.of(name, t_ns, np.asarray(speed_mps, np.float64))
+        return cls(speed, course if len(course) > 1 else None)

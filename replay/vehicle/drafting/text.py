@@ -1,0 +1,273 @@
+"""The text of a first vehicle file: what was chosen, each choice with its reason beside it."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from crosscue.replay.base import EmptyResultError, Log
+from crosscue.replay.remote.logs import name_of
+from crosscue.replay.vehicle.roles import Role, role_of
+
+from .agreement import Verdict
+from .camera import AFTER_CAMERA, Mounting, camera_lines
+from .candidates import WHEELS
+from .choice import Choice, Choices, bus_of, choose
+from .observed import Bus, Observed, observe
+
+if TYPE_CHECKING:
+    from crosscue.replay.can.database import CanDatabase
+
+DEVICES: Final = (
+    (Role.CAMERA, "camera"),
+    (Role.IMU, "imu"),
+    (Role.MAGNETOMETER, "magnetometer"),
+    (Role.GNSS, "gnss"),
+    (Role.ODOMETRY, "odometry"),
+)
+LISTED: Final = 6
+"""So many signals that were not chosen are listed with their reasons."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Examined:
+    """A drive's logs with what was found in them.
+
+    Attributes:
+        logs: Open.
+        databases: Files that describe the buses.
+        database: What they hold; None for no files.
+        seen: Buses and motion.
+        choices: The signals chosen.
+    """
+
+    logs: Sequence[Log]
+    databases: Sequence[Path]
+    database: CanDatabase | None
+    seen: Observed
+    choices: Choices
+
+
+def examine(logs: Sequence[Log], dbc: Sequence[Path]) -> Examined:
+    """Read the first minutes of a drive and judge its signals.
+
+    Args:
+        logs: Open logs of one drive.
+        dbc: Files that describe its buses.
+
+    Raises:
+        EmptyResultError: No topic of the logs plays any role.
+        SchemaError: A DBC file cannot be read.
+    """
+    topics = [topic for log in logs for topic in log.topics]
+    if all(role_of(topic) is None for topic in topics):
+        names = ", ".join(f"{topic.name} ({topic.type_name})" for topic in topics) or "none"
+        raise EmptyResultError(
+            f"{', '.join(map(name_of, logs))}: no topic plays a role in a vehicle file; there are: "
+            f"{names}; give a log with a CAN bus, camera, compass or inertial unit"
+        )
+    database = None
+    if dbc:
+        from crosscue.replay.can.database import CanDatabase
+
+        database = CanDatabase.load(list(dbc))
+    seen = observe(logs, database)
+    return Examined(logs, dbc, database, seen, choose(seen))
+
+
+def draft(examined: Examined, folder: Path, mounting: Mounting) -> str:
+    """The text of a first vehicle file.
+
+    Args:
+        examined: What the logs hold.
+        folder: Where the file will lie; DBC paths are written relative to it where possible.
+        mounting: Where the camera sits, as far as it is known.
+    """
+    logs, choices, buses = examined.logs, examined.choices, examined.seen.buses
+    lines = [
+        "# A first vehicle file, made from what the log holds. Check every line against the car:",
+        "# what could not be seen in the log stands here as a comment or with its default.",
+        "# To see it on a picture: crosscue vehicle check LOG --vehicle THIS_FILE -o check.html",
+        "version = 1",
+        'name = "unnamed"',
+        "",
+        *_topic_lines(logs, choices),
+        *_can_lines(examined, folder),
+        "[odometry]",
+        "# Measure these on the car:",
+        "# wheelbase_m = 2.7",
+        "# track_width_m = 1.55",
+        "",
+        "# [compass] is written by: crosscue fit compass LOG --vehicle THIS_FILE",
+        "",
+        *_mobileye_lines(logs, buses),
+        *camera_lines(logs, mounting),
+    ]
+    return "\n".join(lines).rstrip("\n") + "\n\n" + AFTER_CAMERA
+
+
+def _topic_lines(logs: Sequence[Log], choices: Choices) -> Iterator[str]:
+    topics = [topic for log in logs for topic in log.topics]
+    chosen: list[str] = []
+    for role, key in DEVICES:
+        names = [topic.name for topic in topics if role_of(topic) is role]
+        if len(names) > 1:
+            chosen.append(f"{key} = {_quoted(names[0])}  # or: {', '.join(names[1:])}")
+        elif names:
+            chosen.append(f"# {key} = {_quoted(names[0])}  # found without naming it")
+        if role is Role.IMU:
+            units = [one for one in choices.yaw_rates if one.name in names]
+            chosen += [
+                line for one in units for line in _comment(f"{one.name}: {_says(one.verdict)}")
+            ]
+    if chosen:
+        yield from ("[topics]", *chosen, "")
+
+
+def _can_lines(examined: Examined, folder: Path) -> Iterator[str]:
+    buses, choices, database = examined.seen.buses, examined.choices, examined.database
+    if not buses:
+        yield from ("# The log has no CAN bus.", "")
+        return
+    main = bus_of(buses, choices)
+    yield "[can]"
+    if len(buses) > 1:
+        yield f"bus = {_quoted(main)}"
+    for bus in buses:
+        of_it = f", {bus.known} of them in the DBC files" if database is not None else ""
+        is_mobileye = "; a Mobileye's" if bus.mobileye else ""
+        yield f"# {bus.topic}: {len(bus.ids)} identifiers{of_it}{is_mobileye}"
+    if database is None:
+        yield from ("# dbc = [...]  # give the files with --dbc to have signals looked up", "")
+        return
+    yield f"dbc = [{', '.join(_quoted(_relative(path, folder)) for path in examined.databases)}]"
+    yield ""
+    yield from _wheel_lines(choices, main)
+    yield from _angle_lines("yaw_rate", choices.yaw_rates, main)
+    yield from _angle_lines("steering", choices.steering, main)
+
+
+def _wheel_lines(choices: Choices, main: str) -> Iterator[str]:
+    best = next((one for one in choices.wheels if one.has_axle), None)
+    if best is None or best.verdict.wrong:
+        yield from _without_wheels(choices)
+    else:
+        is_sure = best.verdict.is_judged
+        yield "[can.wheel_speeds]"
+        yield from _comment(_says(best.verdict))
+        if not is_sure:
+            yield "# Chosen by name and unit alone: nothing in the log confirms the speed."
+        if best.bus != main:
+            yield f"bus = {_quoted(best.bus)}"
+        for wheel in WHEELS:
+            if wheel in best.wheels:
+                yield f"{wheel} = {_quoted(best.wheels[wheel].name)}"
+        if best.is_turning and best.radius_m is not None:
+            yield f"wheel_radius_m = {best.radius_m:.3f}  # fits {choices.reference}"
+        elif best.is_turning:
+            yield "# wheel_radius_m = 0.32  # needed, as the signals are in rad/s: measure it"
+    yield from _not_chosen(
+        (", ".join(one.name for one in other.wheels.values()), other.bus, other.verdict)
+        for other in choices.wheels
+        if other is not best or other.verdict.wrong
+    )
+    yield ""
+
+
+def _without_wheels(choices: Choices) -> Iterator[str]:
+    speed = next((one for one in choices.speeds if not one.verdict.wrong), None)
+    yield "# No signal looks like a wheel speed; name them under [can.wheel_speeds]."
+    if speed is None:
+        return
+    yield from _comment(f"The car's own speed instead, of no axle: {_says(speed.verdict)}")
+    yield "# [can.wheel_speeds]"
+    if speed.bus:
+        yield f"# bus = {_quoted(speed.bus)}"
+    yield f"# rear_left = {_quoted(speed.name)}"
+    yield f"# rear_right = {_quoted(speed.name)}"
+
+
+def _angle_lines(key: str, found: Sequence[Choice], main: str) -> Iterator[str]:
+    """A section for the best signal; none where an inertial unit's topic is better."""
+    if not any(one.bus for one in found):
+        return
+    best = found[0]
+    if best.verdict.wrong:
+        yield f"# [can.{key}]: no signal that agrees with the others."
+    elif not best.bus:
+        yield from _comment(f"[can.{key}]: left out, {best.name} agrees better, see [topics]")
+    else:
+        is_shown = best.verdict.agrees_with > 0
+        mark = "" if is_shown else "# "
+        if not is_shown:
+            yield "# The drive is too straight to show its sign; counter-clockwise is positive."
+        yield f"{mark}[can.{key}]"
+        yield from _comment(_says(best.verdict))
+        if best.bus != main:
+            yield f"{mark}bus = {_quoted(best.bus)}"
+        yield f"{mark}signal = {_quoted(best.name)}"
+        if is_shown:
+            yield f"sign = {best.verdict.sign}"
+    yield from _not_chosen(
+        (one.name, one.bus, one.verdict) for one in found if one is not best or one.verdict.wrong
+    )
+    yield ""
+
+
+def _not_chosen(others: Iterator[tuple[str, str, Verdict]]) -> Iterator[str]:
+    for number, (name, bus, verdict) in enumerate(others):
+        if number == LISTED:
+            yield "# and more"
+            return
+        where = f" on {bus}" if bus else ""
+        yield from _comment(f"not chosen: {name}{where}: {_says(verdict)}")
+
+
+def _comment(text: str) -> Iterator[str]:
+    """As lines of a comment."""
+    yield from textwrap.wrap(
+        text,
+        99,
+        initial_indent="# ",
+        subsequent_indent="#   ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _says(verdict: Verdict) -> str:
+    """What the log shows of a signal, in one line."""
+    wrong = f"WRONG: {', '.join(verdict.wrong)}; " if verdict.wrong else ""
+    return wrong + ", ".join(verdict.facts)
+
+
+def _mobileye_lines(logs: Sequence[Log], buses: Sequence[Bus]) -> Iterator[str]:
+    topics = [topic.name for log in logs for topic in log.topics if role_of(topic) is Role.MOBILEYE]
+    on_bus = [bus for bus in buses if bus.mobileye]
+    if on_bus:
+        yield "[mobileye]"
+        for bus in on_bus[1:]:
+            yield f"# or: {bus.topic}"
+        yield f"bus = {_quoted(on_bus[0].topic)}  # sends: {', '.join(on_bus[0].mobileye)}"
+    elif topics:
+        yield f"# [mobileye]  # its messages are found without naming them: {', '.join(topics[:4])}"
+    else:
+        yield "# [mobileye]  # none of the buses is a Mobileye's"
+        yield '# bus = ""'
+    yield "# x_m = 0.0  # ahead of the rear axle: measure it"
+    yield ""
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped) + '"'
+
+
+def _relative(path: Path, folder: Path) -> str:
+    try:
+        return str(path.resolve().relative_to(folder.resolve()))
+    except ValueError:
+        return str(path.resolve())

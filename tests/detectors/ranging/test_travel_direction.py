@@ -1,0 +1,66 @@
+"""Where a camera goes is seen in what it sees."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from crosscue.detectors.ranging.travel_direction import travel_between
+from crosscue.replay.base import Bytes, Floats
+
+FOCAL_PX, SIZE_PX = 600.0, (640, 400)
+CENTER_PX = (320.0, 200.0)
+
+
+def street(camera: Floats, looks: Rotation) -> Bytes:
+    """Dots in space, x right, y down, z ahead, as a camera sees them from a place."""
+    rng = np.random.default_rng(4)
+    dots = np.stack(
+        [rng.uniform(-12, 12, 400), rng.uniform(-6, 3, 400), rng.uniform(8, 40, 400)], 1
+    )
+    seen = looks.inv().apply(dots - camera)
+    picture = np.zeros(SIZE_PX[::-1], np.uint8)
+    for (x, y, z), grey in zip(seen, rng.integers(80, 255, 400), strict=True):
+        if z > 1.0:
+            at = (FOCAL_PX * x / z + CENTER_PX[0], FOCAL_PX * y / z + CENTER_PX[1])
+            place = (round(at[0] * 16), round(at[1] * 16))
+            cv2.circle(picture, place, 24, int(grey), -1, cv2.LINE_AA, 4)
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), 1.0), np.uint8)
+
+
+@pytest.mark.parametrize(("left_deg", "below_deg"), [(0.0, 0.0), (2.0, 0.0), (-1.0, 3.0)])
+def test_the_axis_is_beside_and_below_the_way_by_its_mounting(
+    left_deg: float, below_deg: float
+) -> None:
+    # About y (down): positive turns z towards x, to the right. About x (right): z turns upwards.
+    looks = Rotation.from_euler("yx", [-left_deg, -below_deg], degrees=True)
+    before, after = (street(np.array([0.0, 0.0, z]), looks) for z in (0.0, 0.7))
+
+    found = travel_between(before, after, FOCAL_PX, CENTER_PX)
+
+    assert found is not None
+    assert np.rad2deg(found.left_rad) == pytest.approx(left_deg, abs=0.4)
+    assert np.rad2deg(found.below_rad) == pytest.approx(below_deg, abs=0.4)
+    assert np.rad2deg(found.turned_rad) == pytest.approx(0.0, abs=0.1)
+
+
+def test_a_turn_to_the_left_is_positive() -> None:
+    ahead = Rotation.identity()
+    later = Rotation.from_euler("y", -1.0, degrees=True)
+
+    found = travel_between(
+        street(np.zeros(3), ahead), street(np.array([0.0, 0.0, 0.7]), later), FOCAL_PX, CENTER_PX
+    )
+
+    assert found is not None
+    assert np.rad2deg(found.turned_rad) == pytest.approx(1.0, abs=0.15)
+
+
+def test_nothing_is_said_of_pictures_without_points_or_motion() -> None:
+    black = np.zeros(SIZE_PX[::-1], np.uint8)
+    still = street(np.zeros(3), Rotation.identity())
+
+    assert travel_between(black, black, FOCAL_PX, CENTER_PX) is None
+    assert travel_between(still, still, FOCAL_PX, CENTER_PX) is None

@@ -1,0 +1,199 @@
+"""A first vehicle file names signals that agree, and says what is wrong with those that do not."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pytest
+
+from crosscue.replay.base import Floats
+from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.vehicle.drafting.candidates import WHEELS, Candidate, Kind, candidates
+from crosscue.replay.vehicle.drafting.choice import Choices, choose
+from crosscue.replay.vehicle.drafting.observed import Bus, Observed
+from crosscue.replay.vehicle.drafting.series import Series, Track
+
+SECONDS: Final = 60
+T_NS: Final = np.arange(SECONDS * 20, dtype=np.int64) * 50_000_000
+T_S: Final = T_NS * 1e-9
+SPEED: Final = 12.0 + 4.0 * np.sin(0.1 * T_S)
+YAW_RATE: Final = 0.15 * np.sin(0.3 * T_S) + 0.02
+"""A winding road."""
+STRAIGHT: Final = np.zeros_like(T_S)
+
+
+def named(
+    kind: Kind, name: str, values: Floats, wheel: str = "", unit: str = ""
+) -> tuple[Candidate, Series]:
+    message, _, signal = name.partition(".")
+    one = Candidate(message, signal, kind, unit, 1.0, wheel, message)
+    return one, Series.of(name, T_NS, values)
+
+
+def wheels(
+    message: str, speed: Floats, yaw_rate: Floats, scale: float = 1.0
+) -> list[tuple[Candidate, Series]]:
+    sides = {"left": -1.0, "right": 1.0}
+    return [
+        named(
+            Kind.WHEEL,
+            f"{message}.{wheel}",
+            scale * (speed + sides[wheel.rpartition("_")[2]] * 0.775 * yaw_rate),
+            wheel,
+        )
+        for wheel in WHEELS
+    ]
+
+
+def chosen(
+    *signals: tuple[Candidate, Series], yaw_rate: Floats | None = None, with_gnss: bool = True
+) -> Choices:
+    """What is chosen of these signals on one bus."""
+    course = np.cumsum(YAW_RATE if yaw_rate is None else yaw_rate) * 0.05
+    each = slice(None, None, 20)
+    track = Track.of_course("fix", T_NS[each], SPEED[each], course[each])
+    bus = Bus("can0", signals=list(signals))
+    last_ns = int(T_NS[-1])
+    return choose(Observed((bus,), (track,) if with_gnss else (), (), (), 0, last_ns))
+
+
+@pytest.mark.parametrize("with_gnss", [True, False])
+def test_the_yaw_rate_that_follows_the_wheels_is_chosen(with_gnss: bool) -> None:
+    rng = np.random.default_rng(1)
+    found = chosen(
+        *wheels("ABS", SPEED, YAW_RATE),
+        named(Kind.YAW_RATE, "A.YAW", 0.15 * rng.standard_normal(len(T_S))),
+        named(Kind.YAW_RATE, "B.YAW", YAW_RATE + 0.002),
+        with_gnss=with_gnss,
+    )
+
+    best, other = found.yaw_rates
+    assert best.name == "B.YAW"
+    assert not best.verdict.wrong
+    assert best.verdict.agrees_with >= 1
+    assert "does not follow" in other.verdict.wrong[0]
+
+
+def test_a_yaw_rate_that_turns_on_a_straight_road_is_never_chosen() -> None:
+    found = chosen(
+        *wheels("ABS", SPEED, STRAIGHT),
+        named(Kind.YAW_RATE, "A.YAW", STRAIGHT + 0.05 + 1e-6 * T_S),
+        yaw_rate=STRAIGHT,
+    )
+
+    (only,) = found.yaw_rates
+    assert re.match(
+        r"turns 16\d deg in all where the course of fix turns 0 deg", only.verdict.wrong[0]
+    )
+    assert not found.is_chosen(only)
+
+
+def test_a_yaw_rate_that_turns_while_the_car_stands_is_never_chosen() -> None:
+    stop = np.where(T_S > 50.0, 0.0, SPEED)
+    turn = np.where(T_S > 50.0, 0.0, YAW_RATE)
+    found = chosen(
+        *wheels("ABS", stop, turn),
+        named(Kind.YAW_RATE, "A.YAW", turn + np.where(T_S > 50.0, 0.1, 0.0)),
+        with_gnss=False,
+    )
+
+    assert "turns while the car stands" in found.yaw_rates[0].verdict.wrong
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_sign_is_that_with_which_the_signal_follows(sign: int) -> None:
+    steering = np.arctan(2.7 * YAW_RATE / SPEED) * 15.0
+    found = chosen(
+        *wheels("ABS", SPEED, YAW_RATE),
+        named(Kind.YAW_RATE, "A.YAW", sign * YAW_RATE),
+        named(Kind.STEERING, "A.ANGLE", sign * steering + 0.05),
+    )
+
+    assert found.yaw_rates[0].verdict.sign == sign
+    assert found.steering[0].verdict.sign == sign
+    assert not found.steering[0].verdict.wrong
+
+
+def test_an_angle_without_its_sign_does_not_follow() -> None:
+    steering = np.abs(np.arctan(2.7 * YAW_RATE / SPEED) * 15.0)
+    found = chosen(*wheels("ABS", SPEED, YAW_RATE), named(Kind.STEERING, "A.ANGLE", steering))
+
+    assert "does not follow" in found.steering[0].verdict.wrong[0]
+
+
+def test_wheels_that_gnss_contradicts_are_not_chosen() -> None:
+    found = chosen(*wheels("OLD", SPEED, YAW_RATE, 1.6), *wheels("ABS", SPEED, YAW_RATE))
+
+    best, other = found.wheels
+    assert best.wheels["rear_left"].name == "ABS.rear_left"
+    assert not best.verdict.wrong
+    assert other.verdict.wrong == ("contradicts it",)
+
+
+def test_wheels_in_turns_have_the_radius_that_fits() -> None:
+    turning = [
+        (replace(one, unit="rad/s"), replace(series, values=series.values / 0.31))
+        for one, series in wheels("ABS", SPEED, YAW_RATE)
+    ]
+    (best,) = chosen(*turning).wheels
+
+    assert best.radius_m == pytest.approx(0.31, rel=0.01)
+    assert not best.verdict.wrong
+
+
+def test_without_bends_a_sign_is_not_claimed() -> None:
+    rng = np.random.default_rng(2)
+    found = chosen(
+        *wheels("ABS", SPEED, STRAIGHT),
+        named(Kind.YAW_RATE, "A.YAW", 0.001 * rng.standard_normal(len(T_S))),
+        yaw_rate=STRAIGHT,
+    )
+
+    assert found.yaw_rates[0].verdict.agrees_with == 0
+    assert not found.yaw_rates[0].verdict.wrong
+
+
+DBC: Final = """VERSION ""
+BU_: A
+BO_ 100 Wheels: 8 A
+ SG_ WhlSpdRL : 0|16@1+ (0.01,0) [0|0] "km/h" A
+ SG_ WhlSpdRR : 16|16@1+ (0.01,0) [0|0] "km/h" A
+ SG_ WhlSpdRL_Cmd : 32|16@1+ (0.01,0) [0|0] "km/h" A
+BO_ 101 ESP: 8 A
+ SG_ YawRate : 0|16@1- (0.01,0) [0|0] "deg/s" A
+ SG_ YawRateTarget : 16|16@1- (0.01,0) [0|0] "deg/s" A
+ SG_ YawAngle : 32|16@1- (0.01,0) [0|0] "deg" A
+BO_ 102 SteerReq: 8 A
+ SG_ SteerAngle : 0|16@1- (0.1,0) [0|0] "deg" A
+BO_ 103 EPS: 8 A
+ SG_ SteerAngle : 0|16@1- (0.1,0) [0|0] "deg" A
+ SG_ SteerRate : 16|16@1- (0.1,0) [0|0] "deg/s" A
+"""
+
+
+def test_names_and_units_propose_and_requests_are_left_out(tmp_path: Path) -> None:
+    file = tmp_path / "car.dbc"
+    file.write_text(DBC)
+
+    found = {one.name: one.kind for one in candidates(CanDatabase.load([file]).messages)}
+
+    assert found == {
+        "Wheels.WhlSpdRL": Kind.WHEEL,
+        "Wheels.WhlSpdRR": Kind.WHEEL,
+        "ESP.YawRate": Kind.YAW_RATE,
+        "EPS.SteerAngle": Kind.STEERING,
+    }
+
+
+def test_a_mobileye_is_known_by_the_lengths_of_its_messages() -> None:
+    of_it = {0x738: {7}, 0x739: {8}, 0x73A: {8}, 0x73B: {8}, 0x700: {8}, 0x669: {8}, 0x737: {8}}
+    others = {key: {4} for key in of_it}
+
+    assert "status" in Bus("can1", ids={(key, False): of for key, of in of_it.items()}).mobileye
+    assert not Bus("can1", ids={(key, False): of for key, of in others.items()}).mobileye
+    assert not Bus("can1", ids={(key, True): of for key, of in of_it.items()}).mobileye
+    assert not Bus("can1", ids={(0x738, False): {7}}).mobileye
