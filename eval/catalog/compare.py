@@ -1,7 +1,7 @@
 """Two runs side by side: what changed in versions, settings, tables and metrics, and what is worse.
 
-A metric is worse when it moved in its bad direction by more than its tolerance. Where a run was not
-scored there are no metrics to judge by; then every difference of a table counts.
+Metrics are judged drive by drive (``paired``). Where a run was not scored there are none to judge
+by; then every difference of a table counts.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, open_run
+from crosscue.eval.scoring.by_drive import DriveMetric, direction
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
-from crosscue.eval.scoring.runs import FOLDER, METRICS
+from crosscue.eval.scoring.runs import BY_DRIVE, FOLDER, METRICS
 from crosscue.replay.base import (
     MIB,
     UnreadableRunError,
@@ -28,32 +29,12 @@ from crosscue.replay.base import (
     visible,
 )
 
+from .paired import FALSE_ALARMS, MIN_DRIVES, PairedMetric, Verdict, compare_drives
+
 if TYPE_CHECKING:
     import pyarrow as pa
 
 T = TypeVar("T")
-Direction = Literal["higher", "lower"]
-BETTER: Final[Mapping[str, Direction]] = {
-    **dict.fromkeys(
-        ("precision", "recall", "scored", "matched", "detected", "full", "full_from_8_m",
-         "detected_m", "full_m"), "higher",
-    ),
-    **dict.fromkeys(
-        ("brier", "log_score", "rmse", "rmse_m", "p95_m", "ape_rmse_m", "extra", "extra_detected",
-         "splits", "false_features", "lost"), "lower",
-    ),
-}  # fmt: skip
-"""By the last part of a metric's path; metrics of other names are shown but not judged."""
-PARTS: Final = (
-    "by_distance",
-    "by_condition",
-    "by_intersection",
-    "by_drive",
-    "readings",
-    "things",
-    "attribution",
-)
-"""Metrics below these stand on few rows each; they are shown but not judged."""
 COMPARED: Final = {
     "versions", "settings", "detectors", "camera", "selection", "logs", "landmarks",
 }  # fmt: skip
@@ -75,6 +56,7 @@ class Tolerance(NamedTuple):
         return self.by * abs(before) if self.is_fraction else self.by
 
 
+ORDER: Final[tuple[Verdict, ...]] = ("worse", "better", "undecided")
 NONE: Final = Tolerance("*", 0.0, False)
 
 
@@ -121,23 +103,11 @@ class TableChange:
 
 @dataclass(frozen=True, slots=True)
 class MetricChange:
-    """A metric that differs; NaN where a run lacks it.
-
-    Attributes:
-        path: As in gates.
-        before: Value in the first run.
-        after: In the second.
-        better: Its good direction, or None where it is not judged.
-        allowed: How much worse it may be.
-        is_worse: Beyond that.
-    """
+    """A metric that differs and is not judged; NaN where a run lacks it."""
 
     path: str
     before: float
     after: float
-    better: Direction | None
-    allowed: float
-    is_worse: bool
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -147,34 +117,44 @@ class Comparison:
     Attributes:
         changes: Versions, settings, detectors, selection, logs.
         tables: Tables that differ.
-        metrics: Metrics that differ.
+        judged: Metrics that both runs have and that have a good direction, differing or not.
+        metrics: Other metrics that differ.
+        no_longer_scored: Judged metrics that only the first run has.
         tables_same: How many tables are equal.
-        metrics_same: How many metrics are equal.
+        drives: Drives in both runs, only in the first, only in the second.
         why_no_metrics: Empty where both runs were scored.
         is_whole: Nothing was dropped in either.
     """
 
     changes: tuple[Change, ...]
     tables: tuple[TableChange, ...]
+    judged: tuple[PairedMetric, ...]
     metrics: tuple[MetricChange, ...]
+    no_longer_scored: tuple[str, ...]
     tables_same: int
-    metrics_same: int
+    drives: tuple[int, int, int]
     why_no_metrics: str
     is_whole: bool = True
 
     @property
     def worse(self) -> tuple[str, ...]:
-        """What makes the second run worse."""
-        found = tuple(one.path for one in self.metrics if one.is_worse)
-        if self.why_no_metrics:
-            found += tuple(f"table {one.name}" for one in self.tables)
-        return found
+        """Metrics that are worse, or no longer scored."""
+        return (*self.of("worse"), *self.no_longer_scored)
+
+    @property
+    def is_passed(self) -> bool:
+        """Nothing is worse; of runs that were not scored, no table differs."""
+        return not (self.worse or (self.why_no_metrics and self.tables))
+
+    def of(self, verdict: Verdict) -> tuple[str, ...]:
+        """Paths of the metrics with this verdict."""
+        return tuple(one.path for one in self.judged if one.verdict == verdict)
 
     def as_dict(self) -> dict[str, object]:
         """What ``crosscue compare --json`` prints."""
         tree = asdict(self)
         del tree["is_whole"]
-        return tree | {"worse": self.worse}
+        return tree | {"worse": self.worse, "better": self.of("better")}
 
     def __repr__(self) -> str:
         return "\n".join(_lines(self))
@@ -224,16 +204,38 @@ def compare_runs(
     scores = [_metrics_of(run) for run in (first, second)]
     same = len(names) - len(tables)
     is_whole = _is_whole_run(first) and _is_whole_run(second)
-    if scores[0] is None or scores[1] is None:
+    parts = [_parts_of(run) for run in (first, second)]
+    before, after = parts
+    if None in scores or before is None or after is None:
         bare = [
             str(run.path)
-            for run, found in zip((first, second), scores, strict=True)
-            if found is None
+            for run, found, part in zip((first, second), scores, parts, strict=True)
+            if found is None or part is None
         ]
-        why = f"not scored: {', '.join(bare)}"
-        return Comparison(changes, tuple(tables), (), same, 0, why, is_whole)
-    metrics, metrics_same = compare_metrics(scores[0], scores[1], tolerances)
-    return Comparison(changes, tuple(tables), metrics, same, metrics_same, "", is_whole)
+        why = f"not scored, or by an earlier version: {', '.join(bare)}"
+        return Comparison(changes, tuple(tables), (), (), (), same, (0, 0, 0), why, is_whole)
+    judged = compare_drives(before, after, lambda path, value: _allowed(path, value, tolerances))
+    known = {one.metric for one in after}
+    missing = {one.metric: None for one in before if one.rows and one.metric not in known}
+    logs = [{one.log for one in part} for part in (before, after)]
+    counts = (len(logs[0] & logs[1]), len(logs[0] - logs[1]), len(logs[1] - logs[0]))
+    others = _others(scores[0] or {}, scores[1] or {})
+    return Comparison(
+        changes, tuple(tables), judged, others, tuple(missing), same, counts, "", is_whole
+    )
+
+
+def _allowed(path: str, before: float, tolerances: Sequence[Tolerance]) -> float:
+    fitting = (one for one in reversed(tolerances) if fnmatch.fnmatchcase(path, one.pattern))
+    return next(fitting, NONE).allowed(before)
+
+
+def _parts_of(run: RunFolder) -> list[DriveMetric] | None:
+    """What each drive adds to the metrics; None where the run was not scored."""
+    folder = run if _is_pooled(run.path) else RunFolder(run.file(FOLDER))
+    if not folder.file(f"{BY_DRIVE}.parquet").exists():
+        return None
+    return [DriveMetric(**row) for row in folder.table(BY_DRIVE).to_pylist()]
 
 
 def open_scored(path: Path) -> RunFolder:
@@ -300,39 +302,18 @@ def _tree_of(path: Path) -> dict[str, Any]:
     return tree
 
 
-def compare_metrics(
-    before: Mapping[str, MetricValue],
-    after: Mapping[str, MetricValue],
-    tolerances: Sequence[Tolerance] = (),
-) -> tuple[tuple[MetricChange, ...], int]:
-    """Metrics that differ, the worse ones first; and how many are equal."""
-    changes: list[MetricChange] = []
-    same = 0
+def _others(
+    before: Mapping[str, MetricValue], after: Mapping[str, MetricValue]
+) -> tuple[MetricChange, ...]:
+    """Metrics that differ and are not judged."""
     lacking = MetricValue(math.nan)
+    changes = []
     for path in dict.fromkeys([*before, *after]):
         old, new = before.get(path, lacking).value, after.get(path, lacking).value
-        if old == new or (math.isnan(old) and math.isnan(new)):
-            same += 1
-            continue
-        better = None if set(path.split(".")) & set(PARTS) else BETTER.get(path.rpartition(".")[2])
-        tolerance = next(
-            (one for one in reversed(tolerances) if fnmatch.fnmatchcase(path, one.pattern)), NONE
-        )
-        allowed = 0.0 if math.isnan(old) else tolerance.allowed(old)
-        changes.append(
-            MetricChange(path, old, new, better, allowed, _is_worse(old, new, better, allowed))
-        )
-    return tuple(sorted(changes, key=lambda one: (not one.is_worse, one.path))), same
-
-
-def _is_worse(old: float, new: float, better: Direction | None, allowed: float) -> bool:
-    if better is None or math.isnan(old):
-        return False
-    if math.isnan(new):
-        return True
-    loss = old - new if better == "higher" else new - old
-    # Written so that a loss of exactly what is allowed passes in spite of rounding.
-    return loss > allowed + 1e-12 * max(abs(old), abs(new))
+        is_same = old == new or (math.isnan(old) and math.isnan(new))
+        if not is_same and direction(path) is None:
+            changes.append(MetricChange(path, old, new))
+    return tuple(changes)
 
 
 def _compare_table(name: str, first: RunFolder, second: RunFolder) -> TableChange | None:
@@ -394,15 +375,44 @@ def _lines(found: Comparison) -> Iterator[str]:
             yield f"setting    {visible(one.path)}: {_short(one.before)} -> {_short(one.after)}"
     for table in found.tables:
         yield from _table_lines(table)
+    ranked = sorted(found.judged, key=lambda one: (ORDER.index(one.verdict), one.path))
+    differing = tuple(one for one in ranked if one.before != one.after)
+    for judged in _first_of(differing, "judged metrics"):
+        yield from [judged] if isinstance(judged, str) else _judged_lines(judged)
+    for path in found.no_longer_scored:
+        yield f"WORSE      {visible(path)}: no longer scored"
     for metric in _first_of(found.metrics, "metrics"):
         yield metric if isinstance(metric, str) else _metric_line(metric)
+    same = len(found.judged) - len(differing)
     yield (
-        f"equal      {found.tables_same} tables, {found.metrics_same} metrics; different: "
-        f"{len(found.changes)} settings, {len(found.tables)} tables, {len(found.metrics)} metrics"
+        f"equal      {found.tables_same} tables, {same} judged metrics; "
+        f"different: {len(found.changes)} settings, {len(found.tables)} tables, "
+        f"{len(differing)} judged metrics, {len(found.metrics)} others"
     )
     if found.why_no_metrics:
         yield f"{visible(found.why_no_metrics)}; judged by tables alone"
-    yield f"worse      {len(found.worse)}" if found.worse else "nothing is worse"
+        yield f"different  {len(found.tables)} tables" if found.tables else "nothing differs"
+        return
+    yield from _verdict_lines(found, len(differing))
+
+
+def _verdict_lines(found: Comparison, differing: int) -> Iterator[str]:
+    both, only_first, only_second = found.drives
+    left_out = f"; {only_first} only in the first, {only_second} only in the second"
+    yield f"drives     {both} in both runs" + (left_out if only_first or only_second else "")
+    if differing and both < MIN_DRIVES:
+        yield f"           too few to judge: below {MIN_DRIVES} drives every metric is undecided"
+    elif differing:
+        yield (
+            f"           equal runs get a verdict other than undecided in at most "
+            f"{100 * FALSE_ALARMS:.0f} % of comparisons, over all metrics"
+        )
+    worse, better = len(found.worse), len(found.of("better"))
+    undecided = differing - worse - better + len(found.no_longer_scored)
+    yield (
+        f"worse      {worse or 'nothing is worse'}; better {better or 'nothing'}; "
+        f"undecided {undecided or 'nothing'}"
+    )
 
 
 def _first_of(things: tuple[T, ...], what: str) -> Iterator[T | str]:
@@ -424,10 +434,18 @@ def _table_lines(one: TableChange) -> Iterator[str]:
         yield f"           {visible(name)}: {column.rows} rows differ{far}"
 
 
+def _judged_lines(one: PairedMetric) -> Iterator[str]:
+    label = "WORSE" if one.verdict == "worse" else one.verdict
+    yield f"{label:11}{visible(one.path)}: {_value(one.before)} -> {_value(one.after)}"
+    ends = "too few drives" if math.isnan(one.low) else f"95 % {one.low:+.3g} to {one.high:+.3g}"
+    seen = "" if not math.isfinite(one.could_see) else f"; could have seen {one.could_see:.3g}"
+    allowed = f"; allowed {one.allowed:.3g}" if one.allowed else ""
+    drives = f"{one.drives} drive" + ("s" if one.drives != 1 else "")
+    yield f"{'':11}{one.after - one.before:+.3g} ({ends}) over {drives}{seen}{allowed}"
+
+
 def _metric_line(one: MetricChange) -> str:
-    label = "WORSE" if one.is_worse else "metric"
-    allowed = f" (allowed {one.allowed:.3g})" if one.is_worse else ""
-    return f"{label:11}{visible(one.path)}: {_value(one.before)} -> {_value(one.after)}{allowed}"
+    return f"metric     {visible(one.path)}: {_value(one.before)} -> {_value(one.after)}"
 
 
 def _value(value: float) -> str:

@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -34,7 +35,7 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.remote.logs import is_remote
 
-from . import intervals
+from . import by_drive, intervals
 from . import truth as score_truth
 from .columns import RunTables
 from .drives import DEFAULTS, DriveJudged, Scores, ScoreSettings, as_metrics, judge, score
@@ -52,6 +53,7 @@ TABLES: Final = ("frames", "cues", "range", "belief")
 METRICS: Final = "metrics.json"
 CURVES: Final = "curves"
 CUE_FRAMES: Final = "cue_frames"
+BY_DRIVE: Final = "by_drive"
 SLACK_NS: Final = 1_000_000_000
 """An approach may lie so far outside the run: clocks and last pictures differ a little."""
 
@@ -299,15 +301,22 @@ def _poses(poses: Mapping[str, PoseScore]) -> dict[str, Any]:
 
 
 def write_scores(folder: Path, scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> None:
-    """Write ``metrics.json`` and, for figures, ``curves`` and ``cue_frames`` as Parquet.
+    """Write ``metrics.json``, and ``curves``, ``cue_frames`` and ``by_drive`` as Parquet.
 
     Raises:
         OutputError: They cannot be written.
     """
     write_text(folder / METRICS, strict_json(metrics) + "\n")
     judged = [one.judged for one in scored]
-    for name, table in ((CURVES, curve_table(judged)), (CUE_FRAMES, cue_frame_table(judged))):
+    parts = chain.from_iterable(map(_parts, scored))
+    tables = {CURVES: curve_table(judged), CUE_FRAMES: cue_frame_table(judged)}
+    for name, table in (tables | {BY_DRIVE: by_drive.table_of(parts)}).items():
         write_whole(folder / f"{name}.parquet", _writer(table))
+
+
+def _parts(one: RunScored) -> Iterator[by_drive.DriveMetric]:
+    logs = "+".join(sorted(log.identity.digest for log in one.run.drive_manifest().logs))
+    return by_drive.parts_of(logs, one.judged, one.pose)
 
 
 def _writer(table: pa.Table) -> Any:

@@ -1,10 +1,13 @@
 """What changed between two runs: versions, settings, tables, metrics.
 
-Exit status 1 when the second run is worse: a metric moved in its bad direction by more than its
-tolerance, or is no longer scored. Without --tolerance none is allowed. A tolerance is a number in
-the metric's unit, a fraction of the first run's value (2%), or either for the metrics of a pattern;
-the last that fits counts. If a run was not scored, every difference of a table counts as worse.
-Folders that crosscue score -o wrote for several runs can be compared as well.
+Each metric is better, worse or undecided, by the drives that both runs have (six or more). Two runs
+that differ by chance only are all undecided in at least 95 % of comparisons. Each line shows the
+95 % interval of the difference, and how large a difference these drives would have shown.
+
+Exit status 1 when a metric is worse by more than its tolerance (default: 0) or no longer scored. A
+tolerance is a number in the metric's unit, a fraction of the first run's value (2%), or either for
+the metrics of a pattern; the last that fits counts. Runs that were not scored: exit status 1 when a
+table differs. Folders that crosscue score -o wrote for several runs can be compared as well.
 
 examples:
   crosscue compare runs/before runs/after
@@ -38,4 +41,4 @@ def run(args: argparse.Namespace) -> int:
     """Compare, report, and return 1 when the second run is worse, 3 when either has drops."""
     found = crosscue.compare_runs(args.first, args.second, args.tolerance)
     print_result(found, args)
-    return 1 if found.worse else 0 if found.is_whole else 3
+    return 0 if found.is_passed and found.is_whole else 3 if found.is_passed else 1

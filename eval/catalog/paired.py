@@ -1,0 +1,223 @@
+"""Better, worse or undecided: metrics of two runs compared drive by drive.
+
+If both runs are equally good, which of a drive's two results came from which run is arbitrary.
+Swapping them at random, drive by drive, shows how far metrics then differ by chance (a permutation
+test; Good, *Permutation, Parametric and Bootstrap Tests of Hypotheses*, chapter 3). The largest
+difference over all metrics counts, in units of its own spread (Westfall, Young, *Resampling-Based
+Multiple Testing*, 1993), so that equal runs get one or more verdicts in at most 5 % of comparisons,
+however many metrics there are and however they depend on each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+
+from crosscue.eval.scoring.by_drive import Direction, DriveMetric, Kind, direction
+from crosscue.eval.scoring.intervals import MIN_CLUSTERS
+from crosscue.replay.base import Floats
+
+FALSE_ALARMS: Final = 0.05
+"""Comparisons of equal runs in which any verdict falls, at most."""
+MIN_DRIVES: Final = 6
+"""Of five, swapping can make a difference no rarer than 2 in 32: nothing is ever decided."""
+POWER_QUANTILE: Final = 0.841621
+"""A difference as large as the smallest that could be seen is seen in 80 % of comparisons."""
+EXACT_DRIVES: Final = 12
+SWAPS: Final = 1 << EXACT_DRIVES
+SEED: Final = 0
+ROUNDING: Final = 1e-9
+
+Verdict = Literal["better", "worse", "undecided"]
+
+
+@dataclass(frozen=True, slots=True)
+class PairedMetric:
+    """One metric over the drives that both runs have.
+
+    Attributes:
+        path: As in gates.
+        before: In the first run.
+        after: In the second.
+        better: Its good direction.
+        drives: Of which at least one run has rows.
+        low: Lower end of the 95 % interval of after minus before, by drive; NaN below four drives.
+        high: Its upper end.
+        p: How often chance makes some metric differ so much in equal runs.
+        could_see: The smallest difference that would be seen in 80 % of comparisons; infinite below
+            six drives.
+        allowed: How much worse it may be.
+        verdict: Of the second run.
+    """
+
+    path: str
+    before: float
+    after: float
+    better: Direction
+    drives: int
+    low: float
+    high: float
+    p: float
+    could_see: float
+    allowed: float
+    verdict: Verdict
+
+
+class _Sums(NamedTuple):
+    """Shapes (G,), by drive: total and rows in the first run, then in the second."""
+
+    total: Floats
+    rows: Floats
+    other_total: Floats
+    other_rows: Floats
+
+
+def compare_drives(
+    first: Sequence[DriveMetric],
+    second: Sequence[DriveMetric],
+    allowed_of: Callable[[str, float], float] = lambda path, before: 0.0,
+) -> tuple[PairedMetric, ...]:
+    """Compare every judged metric that both runs have, over the drives that both have.
+
+    Args:
+        first: Parts of the run that was good.
+        second: Parts of the run to judge.
+        allowed_of: From path and value before to how much worse it may be.
+    """
+    logs = sorted({one.log for one in first} & {one.log for one in second})
+    kinds: dict[str, Kind] = {one.metric: one.kind for one in (*first, *second)}
+    known = {one.metric for one in first} & {one.metric for one in second}
+    paths = [path for path in kinds if path in known]
+    sums = {path: _sums(path, logs, first, second) for path in paths}
+    sums = {path: one for path, one in sums.items() if one.rows.any() and one.other_rows.any()}
+    swaps = _swaps(len(logs))
+    spread = {path: _swapped(kinds[path], one, swaps) for path, one in sums.items()}
+    units = {path: float(np.sqrt(np.mean(one**2))) for path, one in spread.items()}
+    differing = [path for path in sums if units[path] > 0.0]
+    largest = np.max([np.abs(spread[p]) / units[p] for p in differing] or [np.zeros(len(swaps))], 0)
+    critical = _critical(largest)
+    return tuple(
+        _judged(path, kinds[path], sums[path], units[path], largest, critical, allowed_of)
+        for path in sums
+    )
+
+
+def _sums(
+    path: str, logs: Sequence[str], first: Sequence[DriveMetric], second: Sequence[DriveMetric]
+) -> _Sums:
+    place = {log: i for i, log in enumerate(logs)}
+    columns = []
+    for parts in (first, second):
+        total, rows = np.zeros(len(logs)), np.zeros(len(logs))
+        for one in parts:
+            if one.metric == path and one.log in place:
+                total[place[one.log]] += one.total
+                rows[place[one.log]] += one.rows
+        columns += [total, rows]
+    return _Sums(*columns)
+
+
+def _swaps(drives: int) -> Floats:
+    """Shape (S, G): 1 where a drive's results are swapped; the first row swaps none."""
+    if drives <= EXACT_DRIVES:
+        return np.array(
+            [[float(row >> i & 1) for i in range(drives)] for row in range(1 << drives)]
+        ).reshape(1 << drives, drives)
+    drawn = np.random.default_rng(SEED).integers(0, 2, (SWAPS, drives)).astype(np.float64)
+    drawn[0] = 0.0
+    return drawn
+
+
+def _swapped(kind: Kind, sums: _Sums, swaps: Floats) -> Floats:
+    """After minus before for every way of swapping, shape (S,)."""
+    total = swaps @ (sums.other_total - sums.total)
+    rows = swaps @ (sums.other_rows - sums.rows)
+    before = _value(kind, sums.total.sum() + total, sums.rows.sum() + rows)
+    after = _value(kind, sums.other_total.sum() - total, sums.other_rows.sum() - rows)
+    return np.nan_to_num(after - before)
+
+
+def _value(kind: Kind, total: Floats, rows: Floats) -> Floats:
+    if kind == "sum":
+        return total
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(rows > 0.5, total / rows, np.nan)
+    return np.sqrt(np.maximum(mean, 0.0)) if kind == "rms" else mean
+
+
+def _critical(largest: Floats) -> float:
+    """What the largest difference must reach; infinite where no difference could be rare enough."""
+    ordered = np.sort(largest)[::-1]
+    rank = math.floor(FALSE_ALARMS * len(ordered) + ROUNDING)
+    if rank < 1 or len(ordered) < 1 << MIN_DRIVES:
+        return math.inf
+    return float(ordered[rank - 1])
+
+
+def _judged(
+    path: str,
+    kind: Kind,
+    sums: _Sums,
+    unit: float,
+    largest: Floats,
+    critical: float,
+    allowed_of: Callable[[str, float], float],
+) -> PairedMetric:
+    better = direction(path)
+    assert better is not None
+    before, after = (
+        float(_value(kind, np.array(total.sum()), np.array(rows.sum())))
+        for total, rows in ((sums.total, sums.rows), (sums.other_total, sums.other_rows))
+    )
+    difference = after - before
+    sd, drives = _jackknife(kind, sums)
+    half = _t(drives - 1, 0.95) * sd if drives >= MIN_CLUSTERS else math.nan
+    p = float(np.mean(largest >= abs(difference) / unit - ROUNDING)) if unit else 1.0
+    allowed = allowed_of(path, before)
+    sign = 1.0 if better == "higher" else -1.0
+    verdict: Verdict = "undecided"
+    if p <= FALSE_ALARMS and drives >= MIN_DRIVES and half < abs(difference):
+        if sign * difference > 0.0:
+            verdict = "better"
+        elif abs(difference) - half > allowed:
+            verdict = "worse"
+    could_see = (critical + POWER_QUANTILE) * sd if sd else math.nan
+    return PairedMetric(
+        path=path,
+        before=before,
+        after=after,
+        better=better,
+        drives=drives,
+        low=difference - half,
+        high=difference + half,
+        p=p,
+        could_see=could_see if drives >= MIN_DRIVES else math.inf,
+        allowed=allowed,
+        verdict=verdict,
+    )
+
+
+def _jackknife(kind: Kind, sums: _Sums) -> tuple[float, int]:
+    """Standard deviation of the difference by leaving out each drive, and how many drives speak."""
+    mine = (sums.rows > 0.0) | (sums.other_rows > 0.0)
+    some = _Sums(*(column[mine] for column in sums))
+    n = int(mine.sum())
+    if n < 2:
+        return math.nan, n
+    differences = _value(
+        kind, some.other_total.sum() - some.other_total, some.other_rows.sum() - some.other_rows
+    ) - _value(kind, some.total.sum() - some.total, some.rows.sum() - some.rows)
+    if kind == "sum":
+        differences = differences * n / (n - 1)
+    known = differences[np.isfinite(differences)]
+    return math.sqrt((n - 1) / n * float(((known - known.mean()) ** 2).sum())), n
+
+
+def _t(freedom: int, confidence: float) -> float:
+    from scipy.special import stdtrit
+
+    return float(stdtrit(freedom, 0.5 + 0.5 * confidence))

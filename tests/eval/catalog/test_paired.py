@@ -1,0 +1,113 @@
+"""Runs compared drive by drive: false alarms by simulation, and differences that are seen."""
+
+import math
+
+import numpy as np
+import pytest
+
+from crosscue.eval.catalog.paired import FALSE_ALARMS, MIN_DRIVES, compare_drives
+from crosscue.eval.scoring.by_drive import DriveMetric, Kind
+from crosscue.replay.columns import Floats
+
+TIMES = 300
+METRICS: dict[str, Kind] = {
+    "cues.a.precision": "mean",
+    "cues.b.recall": "mean",
+    "belief.left.brier": "mean",
+    "range.start.rmse_m": "rms",
+    "approaches.extra": "sum",
+}
+
+
+def drawn(
+    chance: np.random.Generator, drives: int, shift: float = 0.0, hard: Floats | None = None
+) -> list[DriveMetric]:
+    """Metrics of one run that depend on each other and on how hard each drive is."""
+    hard = chance.normal(0.0, 1.0, drives) if hard is None else hard
+    found = []
+    for drive in range(drives):
+        luck = chance.normal(0.0, 0.3)
+        for path, kind in METRICS.items():
+            rows = int(chance.integers(1, 40)) if kind != "sum" else 1
+            level = 1.0 / (1.0 + math.exp(-(hard[drive] + luck + shift)))
+            wrong = float(chance.binomial(rows, level)) if kind != "sum" else float(luck > 0.3)
+            found.append(DriveMetric(f"log {drive}", path, kind, wrong, rows))
+    return found
+
+
+@pytest.mark.parametrize("drives", [6, 10, 30])
+def test_equal_runs_are_all_undecided_as_often_as_stated(drives: int) -> None:
+    chance = np.random.default_rng(drives)
+    alarms = 0
+    for _ in range(TIMES):
+        hard = chance.normal(0.0, 1.0, drives)
+        one, other = (drawn(chance, drives, hard=hard) for _ in range(2))
+        alarms += any(found.verdict != "undecided" for found in compare_drives(one, other))
+
+    assert alarms / TIMES <= FALSE_ALARMS + 2.0 * math.sqrt(FALSE_ALARMS / TIMES)
+
+
+def test_a_large_difference_is_seen_and_its_direction_named() -> None:
+    chance = np.random.default_rng(1)
+    hard = chance.normal(0.0, 1.0, 30)
+    before, after = drawn(chance, 30, hard=hard), drawn(chance, 30, shift=1.0, hard=hard)
+    verdicts = {one.path: one.verdict for one in compare_drives(before, after)}
+
+    assert verdicts["cues.a.precision"] == "better"
+    assert verdicts["belief.left.brier"] == "worse"
+    turned = {one.path: one.verdict for one in compare_drives(after, before)}
+    assert turned["cues.a.precision"] == "worse"
+
+
+def test_the_difference_that_could_be_seen_is_seen_in_four_of_five() -> None:
+    chance = np.random.default_rng(4)
+    path, drives, times = "cues.a.precision", 20, 300
+    seen, stated = 0, []
+
+    def parts(shift: float) -> list[DriveMetric]:
+        values = 0.5 + shift + chance.normal(0.0, 0.1, drives)
+        return [DriveMetric(str(i), path, "mean", 10.0 * v, 10) for i, v in enumerate(values)]
+
+    # Two runs with noise of 0.1 each over 20 drives: (2.09 + 0.84) * 0.1 * sqrt(2 / 20).
+    for _ in range(times):
+        (one,) = compare_drives(parts(0.0), parts(0.0927))
+        stated.append(one.could_see)
+        seen += one.verdict == "better"
+
+    assert np.mean(stated) == pytest.approx(0.0927, rel=0.1)
+    assert seen / times == pytest.approx(0.8, abs=0.08)
+
+
+@pytest.mark.parametrize("drives", [1, 3, MIN_DRIVES - 1])
+def test_too_few_drives_decide_nothing_however_large_the_difference(drives: int) -> None:
+    before, after = (
+        [DriveMetric(str(i), "cues.a.precision", "mean", total, 10) for i in range(drives)]
+        for total in (10.0, 0.0)
+    )
+    (one,) = compare_drives(before, after)
+
+    assert one.verdict == "undecided"
+    assert math.isinf(one.could_see)
+    assert math.isnan(one.low) == (drives < 4)
+
+
+def test_a_metric_that_one_drive_alone_moves_is_undecided() -> None:
+    before = [DriveMetric(str(i), "approaches.detected", "mean", 1.0, 1) for i in range(40)]
+    after = [*before[:-1], before[-1]._replace(total=0.0)]
+    (one,) = compare_drives(before, after)
+
+    assert (one.before, one.after) == (1.0, 39 / 40)
+    assert one.verdict == "undecided"
+
+
+def test_equal_parts_differ_in_nothing_and_order_does_not_matter() -> None:
+    parts = drawn(np.random.default_rng(2), 8)
+    other = drawn(np.random.default_rng(3), 8)
+
+    for one in compare_drives(parts, parts):
+        assert (one.before, one.p, one.verdict) == (one.after, 1.0, "undecided")
+    forward = {one.path: one for one in compare_drives(parts, other)}
+    shuffled = {one.path: one for one in compare_drives(parts[::-1], other[::-1])}
+    assert {path: one.p for path, one in forward.items()} == {
+        path: pytest.approx(one.p) for path, one in shuffled.items()
+    }
