@@ -142,6 +142,8 @@ def _approaches(one: ApproachScore) -> list[str]:
         _line("detected", _distance(one.detected, one.detected_m)),
         _line("in full", _distance(one.full, one.full_m)),
     ]
+    if one.spurious:
+        lines.append(_line("spurious", _spurious(one)))
     if one.false_by_feature:
         reported = ", ".join(f"{name} {n}" for name, n in one.false_by_feature.items())
         lines.append(
@@ -157,6 +159,15 @@ def _approaches(one: ApproachScore) -> list[str]:
     if one.not_judged:
         lines.append(_line("not judged", f"{one.not_judged} outside the truth's time"))
     return lines
+
+
+def _spurious(one: ApproachScore) -> str:
+    reasons: dict[str, int] = {}
+    for result in one.results:
+        if result.why_spurious:
+            reasons[result.why_spurious] = reasons.get(result.why_spurious, 0) + 1
+    reported = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+    return f"{one.spurious} detections as published do not count: {reported}"
 
 
 def _distance(found: Proportion, distance: Mean) -> str:

@@ -17,6 +17,7 @@ from crosscue.eval.scoring.scene import belief as score_belief
 from crosscue.eval.scoring.scene.approaches import ApproachesJudged, ApproachScore, judge_approaches
 from crosscue.eval.scoring.scene.belief import BeliefJudged, BeliefScore, judge_belief
 from crosscue.eval.scoring.scene.cues import CueFrames, CueScore, match_cues, score_cues
+from crosscue.eval.scoring.scene.detection import RULES, Definition
 from crosscue.eval.scoring.scene.ranges import RangeJudged, RangeScore, judge_range, score_range
 from crosscue.replay.errors import SchemaError
 
@@ -37,10 +38,12 @@ class ScoreSettings:
     Attributes:
         threshold: A feature is detected above this probability.
         bins_m: Borders of bins of true range.
+        detection: ``confirmed``, or ``published``: the first frame counts, with any range.
     """
 
     threshold: float = score_approaches.THRESHOLD
     bins_m: tuple[float, ...] = BINS_M
+    detection: Definition = "confirmed"
 
     def __post_init__(self) -> None:
         """Refuse what means nothing.
@@ -50,6 +53,8 @@ class ScoreSettings:
         """
         if not 0.0 < self.threshold < 1.0:
             raise ValueError(f"threshold: expected in (0, 1), got {self.threshold}")
+        if self.detection not in RULES:
+            raise ValueError(f"detection: expected {' or '.join(RULES)}, got {self.detection}")
         if len(self.bins_m) < 2 or (np.diff(self.bins_m) <= 0.0).any():
             raise ValueError(f"bins_m: expected two or more growing borders, got {self.bins_m}")
 
@@ -128,7 +133,7 @@ def judge(tables: RunTables, truth: DriveTruth, settings: ScoreSettings = DEFAUL
     """
     covered_s = _check_fits(tables, truth)
     cues = tuple(match_cues(tables, truth))
-    approaches = judge_approaches(tables, truth, settings.threshold)
+    approaches = judge_approaches(tables, truth, settings.threshold, settings.detection)
     belief, ranges = tuple(judge_belief(tables, truth)), tuple(judge_range(tables, truth))
     frames = _frames(tables)
     ambiguous = tables.ambiguous.get("frames", 0)

@@ -65,6 +65,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="probability above which a feature counts as detected (default: 0.9)",
     )
     parser.add_argument(
+        "--detection",
+        choices=("confirmed", "published"),
+        default="confirmed",
+        help="a detection counts when confirmed by 3 frames and a range within its 95 %% interval, "
+        "or as published: from the first frame, with any range (default: confirmed)",
+    )
+    parser.add_argument(
         "--rpe",
         nargs="+",
         type=metres,
@@ -118,6 +125,7 @@ def run(args: argparse.Namespace) -> int:
             args.output,
             gates=args.gate,
             threshold=args.threshold,
+            detection=args.detection,
             rpe_m=args.rpe,
             has_attribution=args.attribution,
             has_smoother=args.smoother is not None,

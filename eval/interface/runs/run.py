@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from crosscue.eval.catalog.compare import Comparison
     from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
     from crosscue.eval.report.score_runs import Scored
+    from crosscue.eval.scoring.scene.detection import Definition
 
 VEHICLE: Final = "vehicle.toml"
 
@@ -337,6 +338,7 @@ def score_run(
     truth: Path | str | None = None,
     *,
     threshold: float = 0.9,
+    detection: Definition = "confirmed",
     rpe_m: Sequence[float] = (10.0, 100.0),
     any_log: bool = False,
     has_figures: bool = True,
@@ -347,6 +349,8 @@ def score_run(
         run: A finished run.
         truth: Its truth; None for the ``truth.json`` beside its log.
         threshold: A feature is detected above this probability.
+        detection: ``confirmed`` by three frames and a right range, or as ``published``: the first
+            frame counts, with any range.
         rpe_m: Distances of the relative pose error.
         any_log: Take a truth that names the hash of another file: the same drive, converted.
         has_figures: Draw figures, for which matplotlib is imported.
@@ -360,9 +364,9 @@ def score_run(
 
     of = _run(run)
     try:
-        settings = ScoreSettings(threshold=threshold)
+        settings = ScoreSettings(threshold=threshold, detection=detection)
     except ValueError as error:
-        raise UsageError(f"threshold: {error}") from None
+        raise UsageError(f"score: {error}") from None
     work = ScoreWork(
         _path(truth),
         settings,

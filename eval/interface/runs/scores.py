@@ -29,6 +29,7 @@ from crosscue.eval.scoring.runs import (
     scores_of,
     write_scores,
 )
+from crosscue.eval.scoring.scene.detection import Definition
 from crosscue.eval.studies.attribution import (
     Attribution,
     Drive,
@@ -153,6 +154,7 @@ def score_runs(
     *,
     gates: Path | str | None = None,
     threshold: float = 0.9,
+    detection: Definition = "confirmed",
     rpe_m: Sequence[float] = (10.0, 100.0),
     has_attribution: bool = False,
     has_smoother: bool = False,
@@ -177,6 +179,8 @@ def score_runs(
         output: Folder for metrics and report of all runs together.
         gates: File of bounds on metrics; ``junit.xml`` goes into ``output``.
         threshold: A feature is detected above this probability.
+        detection: ``confirmed`` by three frames and a right range, or as ``published``: the first
+            frame counts, with any range.
         rpe_m: Distances of the relative pose error.
         has_attribution: Estimate without each cue as well, and report what it was worth.
         has_smoother: Run a batch smoother on the same measurements as well (needs gtsam).
@@ -201,9 +205,9 @@ def score_runs(
     if workers < 1:
         raise UsageError(f"--workers {workers}: expected 1 or more")
     try:
-        settings = ScoreSettings(threshold=threshold)
+        settings = ScoreSettings(threshold=threshold, detection=detection)
     except ValueError as error:
-        raise UsageError(f"--threshold: {error}") from None
+        raise UsageError(f"score: {error}") from None
     bounds = () if gates is None else load_gates(Path(gates))
     work = ScoreWork(
         None if truth is None else Path(truth),

@@ -5,8 +5,9 @@ its range is available; the full intersection once every *present* feature excee
 neither sign nor light stands, nothing speaks of 'intersection' itself (its Fig. 27 as we read it),
 yet the source detects such a one in full 6 times of 10: for the full intersection, presence that a
 road or a car to the side has established counts as well. Distances are true ones, of the rear axle
-to the start of the intersection. Beyond the source: absent features that exceeded 0.9, and
-approaches of the run where none exists.
+to the start of the intersection. Beyond the source: detections must be confirmed (``detection``),
+else they are spurious; absent features that exceeded 0.9, and approaches of the run where none
+exists.
 
 A run's approach belongs to the true one that it shares most time with, from its start until the car
 enters; each belongs to one at most. A further one during the same true approach is a split, one
@@ -29,7 +30,11 @@ from crosscue.eval.scoring.intervals import Mean, Proportion, mean, share
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
 from crosscue.replay.columns import Floats, Int64s
 
+from .detection import CONFIRM_FRAMES, RULES, Definition, Rule, held, is_range_right
+
 THRESHOLD: Final = 0.9
+BRIEF: Final = f"for fewer than {CONFIRM_FRAMES} frames"
+WRONG_RANGE: Final = "range outside its 95 % interval"
 NEAR_M: Final = 8.0
 """The source's full detections all came at least this far away."""
 
@@ -53,6 +58,8 @@ class ApproachResult:
         full_m: The same for the full intersection.
         why_not_detected: Empty when it was.
         why_not_full: Empty when it was.
+        spurious_m: True distance of a detection as published that was not confirmed; None without.
+        why_spurious: Empty without.
         features_m: True distance at which each present feature first exceeded the threshold.
         false_features: Absent features that exceeded it at any time before entering.
         at_entering: Last probabilities before entering.
@@ -72,6 +79,8 @@ class ApproachResult:
     full_m: float | None
     why_not_detected: str
     why_not_full: str
+    spurious_m: float | None
+    why_spurious: str
     features_m: dict[str, float | None]
     false_features: tuple[str, ...]
     at_entering: dict[str, float]
@@ -134,6 +143,7 @@ class ApproachScore:
         full_from_8_m: Fraction of approaches with full detection at least 8 m away.
         detected_m: Mean over those detected, its interval over approaches.
         full_m: The same for full detection.
+        spurious: Approaches with a detection as published that was not confirmed.
         false_features: Fraction of approaches with at least one absent feature above the threshold.
         false_by_feature: How often each was.
         extra: Approaches of runs where none exists.
@@ -155,6 +165,7 @@ class ApproachScore:
     full_from_8_m: Proportion
     detected_m: Mean
     full_m: Mean
+    spurious: int
     false_features: Proportion
     false_by_feature: dict[str, int]
     extra: int
@@ -169,7 +180,10 @@ class ApproachScore:
 
 
 def judge_approaches(
-    tables: RunTables, truth: DriveTruth, threshold: float = THRESHOLD
+    tables: RunTables,
+    truth: DriveTruth,
+    threshold: float = THRESHOLD,
+    definition: Definition = "confirmed",
 ) -> ApproachesJudged | None:
     """Lay the run's approaches beside the true ones; None for a run or truth without any."""
     belief = tables.belief
@@ -190,7 +204,8 @@ def judge_approaches(
     for one in truth.truth.approaches:
         mine = _steps_of(kept, pairs.get(one.id), one)
         others = [n for n in spans if n not in pairs.values() and overlap_ns(one, spans[n]) > 0]
-        results.append(_result(one, mine, pairs.get(one.id), len(others), tables, truth, threshold))
+        number, rule = pairs.get(one.id), RULES[definition]
+        results.append(_result(one, mine, number, len(others), tables, truth, threshold, rule))
         if len(mine.t_ns):
             curves.append(_curve(one, mine, truth))
     extra, detected, outside = _extras(kept, spans, pairs, truth, threshold)
@@ -250,6 +265,7 @@ def _result(
     tables: RunTables,
     truth: DriveTruth,
     threshold: float,
+    rule: Rule,
 ) -> ApproachResult:
     present = tuple(name for name in FEATURES if has_feature(one, name))
     absent = tuple(name for name in FEATURES if has_feature(one, name) is False)
@@ -257,13 +273,20 @@ def _result(
     never = np.zeros(len(steps.t_ns), np.bool_)
     likely = above.get("intersection", never)
     ranged = _has_range(tables, number, steps.t_ns)
+    is_right = np.ones(len(steps.t_ns), np.bool_)
+    if rule.checks_range:
+        is_right = is_range_right(tables, truth, number, steps.t_ns)
+    published = likely & ranged
+    detected = held(published & is_right, rule.frames)
     # Where a sign or light stands, it is what must be found; elsewhere nothing could speak of it.
     sure = likely | steps.established if one.control == "none" else likely
     known = above | {"intersection": sure}
     full = np.ones(len(steps.t_ns), np.bool_)
     for name in present:
         full &= known.get(name, never)
+    was_full, full = full.any(), held(full, rule.frames)
     distance = truth.start_m(steps.t_ns)
+    is_spurious = bool(published.any()) and not detected[np.argmax(published)]
     missing = [name for name in present if not known.get(name, never).any()]
     return ApproachResult(
         drive=truth.drive,
@@ -276,10 +299,16 @@ def _result(
         overlap_s=_overlap_s(steps),
         splits=splits,
         steps=len(steps.t_ns),
-        detected_m=_first(likely & ranged, distance),
+        detected_m=_first(detected, distance),
         full_m=_first(full, distance),
-        why_not_detected=_why(number, likely & ranged, _range_reason(likely, ranged)),
-        why_not_full=_why(number, full, _full_reason(missing)),
+        why_not_detected=_why(
+            number, detected, _spurious_reason(published, is_right) or _range_reason(likely, ranged)
+        ),
+        why_not_full=_why(
+            number, full, BRIEF if was_full and not missing else _full_reason(missing)
+        ),
+        spurious_m=_first(published, distance) if is_spurious else None,
+        why_spurious=_spurious_reason(published, is_right) if is_spurious else "",
         features_m={name: _first(above.get(name, never), distance) for name in present},
         false_features=tuple(name for name in absent if above.get(name, never).any()),
         at_entering={
@@ -307,6 +336,13 @@ def _range_reason(likely: NDArray[np.bool_], ranged: NDArray[np.bool_]) -> str:
     if not likely.any():
         return "never probable enough"
     return "no range" if not ranged.any() else "range only while not probable enough"
+
+
+def _spurious_reason(published: NDArray[np.bool_], is_right: NDArray[np.bool_]) -> str:
+    """Why the first detection as published is not confirmed; empty without any."""
+    if not published.any():
+        return ""
+    return BRIEF if is_right[np.argmax(published)] else WRONG_RANGE
 
 
 def _full_reason(missing: Sequence[str]) -> str:
@@ -371,6 +407,7 @@ def score_approaches(judged: Sequence[ApproachesJudged]) -> ApproachScore | None
         ),
         detected_m=_mean([one.detected_m for one in results]),
         full_m=_mean([one.full_m for one in results]),
+        spurious=sum(one.spurious_m is not None for one in results),
         false_features=_fraction([bool(one.false_features) for one in results]),
         false_by_feature=_counts([name for one in results for name in one.false_features]),
         extra=sum(one.extra for one in judged),

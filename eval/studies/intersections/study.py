@@ -24,7 +24,7 @@ from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import create, open_run
-from crosscue.eval.scoring.drives import judge, score
+from crosscue.eval.scoring.drives import ScoreSettings, judge, score
 from crosscue.eval.scoring.runs import RunScored, judge_run
 from crosscue.eval.scoring.scene.belief import compare_belief
 from crosscue.eval.studies.attribution import Drive, attribute
@@ -36,6 +36,8 @@ from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.fusion import Calibrated
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
+AS_PUBLISHED: Final = ScoreSettings(detection="published")
+"""What the published distances are compared with counts as the source counts it."""
 MIN_PLACES: Final = 3
 """Intersections, so that messages for one can be learned at two others or more."""
 LOG: Final = "drive.mcap"
@@ -154,26 +156,28 @@ def score_study(out: Path, names: Sequence[str], *, attribution: bool = True) ->
         RunError: None is done, or one is damaged.
     """
     scored = tuple(
-        judge_run(open_run(out / "runs" / name), out / "drives" / name / FILE) for name in names
+        judge_run(open_run(out / "runs" / name), out / "drives" / name / FILE, AS_PUBLISHED)
+        for name in names
     )
     if not scored:
         raise RunError(f"{out}: not one drive is done, so there is nothing to score")
     worth = {}
     if attribution:
-        worth = attribute([Drive(one.judged, one.truth, estimate_of(one.run)) for one in scored])
+        drives = [Drive(one.judged, one.truth, estimate_of(one.run)) for one in scored]
+        worth = attribute(drives, settings=AS_PUBLISHED)
     first = [one.judged for one in scored]
     learned = calibrated_vehicles(scored)
     if learned is None:
-        return StudyScores(scored, score(first), worth, None, {})
+        return StudyScores(scored, score(first, AS_PUBLISHED), worth, None, {})
     second = [
-        judge(estimate_of(one.run, vehicle)(frozenset()), one.truth)
+        judge(estimate_of(one.run, vehicle)(frozenset()), one.truth, AS_PUBLISHED)
         for one, vehicle in zip(scored, learned, strict=True)
     ]
     return StudyScores(
         scored,
-        score(first),
+        score(first, AS_PUBLISHED),
         worth,
-        score(second),
+        score(second, AS_PUBLISHED),
         compare_belief(
             [part for one in first for part in one.belief],
             [part for one in second for part in one.belief],

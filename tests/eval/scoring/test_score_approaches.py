@@ -100,6 +100,58 @@ def test_absent_features_that_were_believed_are_counted() -> None:
     assert score.false_features.value == 1.0
 
 
+def test_a_spike_of_one_frame_is_spurious_and_published_by_name() -> None:
+    spike = {**BELIEF, "intersection": {4: 0.95, 5: 0.5, 20: 0.95}}
+    run = tables(belief=belief_table(spike), ranges=range_table(0, 45))
+
+    for definition, detected_m, spurious_m in (
+        ("confirmed", 20.0, 36.0),
+        ("published", 36.0, None),
+    ):
+        judged = judge_approaches(run, truth(), definition=definition)
+        assert judged is not None
+        (one,) = judged.results
+        assert (one.detected_m, one.spurious_m) == (detected_m, spurious_m)
+        assert one.why_spurious == ("for fewer than 3 frames" if spurious_m else "")
+
+
+def test_a_spike_alone_is_no_detection_and_no_full_one() -> None:
+    only = {name: {35: 0.95, 37: 0.5} for name in ("intersection", "left", "right")}
+    judged = judge_approaches(tables(belief=belief_table(only), ranges=range_table(0, 45)), truth())
+    assert judged is not None
+    (one,) = judged.results
+
+    assert (one.detected_m, one.why_not_detected) == (None, "for fewer than 3 frames")
+    assert (one.full_m, one.why_not_full) == (None, "for fewer than 3 frames")
+    score = score_approaches([judged])
+    assert score is not None
+    assert score.spurious == 1
+
+
+def test_a_range_100_m_off_is_no_detection_unless_it_says_how_unsure_it_is() -> None:
+    for error_m, var_m2, detected_m in (
+        (100.0, 1.0, None),
+        (1.9, 1.0, 30.0),
+        (2.0, 1.0, None),
+        (100.0, 60.0**2, 30.0),
+    ):
+        ranges = range_table(8, 45, error_m, var_m2)
+        judged = judge_approaches(tables(belief=belief_table(BELIEF), ranges=ranges), truth())
+        assert judged is not None
+        (one,) = judged.results
+        assert one.detected_m == detected_m
+        assert one.spurious_m == (30.0 if detected_m is None else None)
+        assert one.why_not_detected == ("" if detected_m else "range outside its 95 % interval")
+
+
+def test_a_range_to_the_end_confirms_as_well_as_one_to_the_start() -> None:
+    ranges = range_table(8, 45, 0.5, reference="end")
+    judged = judge_approaches(tables(belief=belief_table(BELIEF), ranges=ranges), truth())
+
+    assert judged is not None
+    assert judged.results[0].detected_m == pytest.approx(30.0)
+
+
 def test_failures_have_no_part_in_means_but_are_named() -> None:
     good = judge_approaches(good_tables(), good_truth())
     bad = judge_approaches(tables(belief=belief_table({"intersection": {5: 0.95}})), truth())
