@@ -154,6 +154,15 @@ _EXPORTS: Final = {
     "ReplayedDrives": "eval.interface.runs.batch",
     "render_training_frames": "eval.interface.training.frames",
     "TrainingFrames": "eval.interface.training.frames",
+    "train_road": "eval.interface.training.road",
+    "measure_road": "eval.interface.training.road",
+    "RoadTrainingSettings": "eval.interface.training.road",
+    "TrainedRoad": "eval.interface.training.road",
+    "train_mask_rcnn": "eval.interface.training.mask_rcnn",
+    "measure_mask_rcnn": "eval.interface.training.mask_rcnn",
+    "MaskRcnnTrainingSettings": "eval.interface.training.mask_rcnn",
+    "TrainedMaskRcnn": "eval.interface.training.mask_rcnn",
+    "MeasuredMaskRcnn": "eval.interface.training.mask_rcnn",
     "run_intersection_study": "eval.interface.studies.intersections",
     "IntersectionResult": "eval.interface.studies.intersections",
     "IntersectionStudy": "eval.studies.intersections.study",
@@ -269,6 +278,17 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.training.frames import (
         render_training_frames as render_training_frames,
     )
+    from crosscue.eval.interface.training.mask_rcnn import (
+        MaskRcnnTrainingSettings as MaskRcnnTrainingSettings,
+    )
+    from crosscue.eval.interface.training.mask_rcnn import MeasuredMaskRcnn as MeasuredMaskRcnn
+    from crosscue.eval.interface.training.mask_rcnn import TrainedMaskRcnn as TrainedMaskRcnn
+    from crosscue.eval.interface.training.mask_rcnn import measure_mask_rcnn as measure_mask_rcnn
+    from crosscue.eval.interface.training.mask_rcnn import train_mask_rcnn as train_mask_rcnn
+    from crosscue.eval.interface.training.road import RoadTrainingSettings as RoadTrainingSettings
+    from crosscue.eval.interface.training.road import TrainedRoad as TrainedRoad
+    from crosscue.eval.interface.training.road import measure_road as measure_road
+    from crosscue.eval.interface.training.road import train_road as train_road
     from crosscue.eval.interface.truth import truth_schema as truth_schema
     from crosscue.eval.interface.truth import write_truth as write_truth
     from crosscue.eval.interface.vehicles import VehicleDraft as VehicleDraft

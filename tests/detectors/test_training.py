@@ -63,7 +63,6 @@ def _with(row: dict[str, Any]) -> Any:
         ({"category_id": [3]}, "annotations of unknown classes"),
         ({"category_id": 9}, "annotations of other classes"),
         ({"image_id": 99}, "annotations of other pictures"),
-        ({"segmentation": []}, "annotations without a mask of the picture's size"),
         ({"segmentation": [[1, 2, 3]]}, "annotations without a mask of the picture's size"),
         (
             {"segmentation": {"size": [9, 9], "counts": "0"}},
@@ -390,7 +389,7 @@ def test_nothing_is_rendered_for_training_of_what_is_scored(
         (["--classes", ""], "empty or named twice"),
         (["--width", "10"], "width_px: input should be greater than or equal to 64"),
         (["--measure", "embedded"], "not with -o"),
-        (["--val-data", "x.json"], "give both or none"),
+        (["--val-data", "x.json"], "give both or neither"),
         (["--crop-top", "0.6", "--crop-bottom", "0.6"], "less than a tenth"),
     ],
 )

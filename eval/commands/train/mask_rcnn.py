@@ -16,28 +16,14 @@ examples:
 from __future__ import annotations
 
 import argparse
-import re
 import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
 
-from crosscue.detectors.training.summary import measured_text, measured_tree
-from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.interface.training.inputs import check_place
-from crosscue.replay.base import UsageError
-from crosscue.replay.files.made_of import made_of
-
-if TYPE_CHECKING:
-    from crosscue.detectors.networks.mask_rcnn.checkpoint import Facts
-    from crosscue.detectors.training.annotations import LabelledSet
-    from crosscue.detectors.training.job import Job, Point
-
-CLASSES = ("car", "stop sign", "traffic light")
-EVERY = 10
-PROPOSALS = 100
-"""The detector's own."""
-MAX_WINDOW_PX = 4096
-"""As wide as the widest picture."""
+import crosscue
+from crosscue.eval.commands.shared.options import print_result
+from crosscue.eval.commands.shared.progress import progress_line
+from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--val-data",
         type=Path,
         metavar="COCO",
-        help=f"annotations to validate on (default: every {EVERY}th image of --data)",
+        help="annotations to validate on (default: every 10th image of --data)",
     )
     parser.add_argument("--val-images", type=Path, metavar="DIR", help="folder of their images")
     parser.add_argument(
@@ -70,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--proposals",
         type=int,
         nargs="+",
-        default=[PROPOSALS],
+        default=[100],
         metavar="N",
         help="measure with N region proposals; several values in turn (default: 100)",
     )
@@ -87,7 +73,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="inference engine to measure with (default: torch)",
     )
     parser.add_argument(
-        "--classes", nargs="+", default=list(CLASSES), metavar="NAME", help="classes to train"
+        "--classes",
+        nargs="+",
+        default=["car", "stop sign", "traffic light"],
+        metavar="NAME",
+        help="classes to train",
     )
     parser.add_argument(
         "--steps", type=int, default=4000, metavar="N", help="training steps (default: 4000)"
@@ -168,219 +158,62 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train."""
-    from crosscue.detectors.training.job import run_job
-
-    _check(args)
+    """Train or measure."""
     if args.measure is not None:
         return _measure(args)
-    job = _job(args)
-    check_place(args.output)
-    train, held_out = _sets(args)
-    if not args.quiet:
-        for name, one in (("training", train), ("held out", held_out)):
-            left = ", ".join(f"{count} {why}" for why, count in sorted(one.left_out.items()))
-            said = f"{name}: {len(one.pictures)} pictures" + (f"; {left}" if left else "")
-            print(said, file=_talk(args), flush=True)
-
-    def tell(point: Point) -> None:
-        if not args.quiet:
-            print(
-                f"step {point.step} of {args.steps}: loss {point.loss:.3f}, "
-                f"box AP {point.ap.get('box')}, mask AP {point.ap.get('mask')}, "
-                f"{point.seconds:.0f} s",
-                file=_talk(args),
-                flush=True,
-            )
-
-    facts = run_job(job, train, held_out, resume=args.resume, overwrite=args.overwrite, tell=tell)
-    _draw(job)
-    _report(facts, job, args)
-    return 0
-
-
-def _check(args: argparse.Namespace) -> None:
-    if args.measure is not None:
-        if args.output is not None or args.val_data is not None:
-            raise UsageError("--measure: trains nothing, so not with -o or --val-data; leave those")
-        if not all(1 <= count <= 2000 for count in args.proposals):
-            raise UsageError("--proposals: expected 1 to 2000")
-        return
     if args.output is None:
         raise UsageError("train mask-rcnn: give -o OUT.safetensors, or --measure")
-    if args.output.suffix != ".safetensors":
-        raise UsageError(f"-o {args.output}: expected a name that ends in .safetensors")
-    for name in ("steps", "batch", "check_every", "check_images", "threads"):
-        if getattr(args, name) < 1:
-            raise UsageError(f"--{name.replace('_', '-')}: expected 1 or more")
-    if not 0.0 < args.learning_rate < 1.0 or args.seed < 0:
-        raise UsageError(
-            "--learning-rate, --seed: expected a rate between 0 and 1, and a seed of 0 or more"
-        )
-    if not 0.0 <= args.balance <= 1.0:
-        raise UsageError(f"--balance {args.balance}: expected 0 to 1")
-    if any(side % 32 or not 64 <= side <= MAX_WINDOW_PX for side in args.window):
-        raise UsageError(
-            f"--window {args.window[0]} {args.window[1]}: expected multiples of 32 from 64 to "
-            f"{MAX_WINDOW_PX}"
-        )
-    if not all(args.classes) or len(set(args.classes)) != len(args.classes):
-        raise UsageError("--classes: one is empty or named twice; name each once")
-    if (args.val_data is None) != (args.val_images is None):
-        raise UsageError("--val-data, --val-images: give both or none")
-
-
-def _talk(args: argparse.Namespace) -> TextIO:
-    """Where progress is printed: JSON is alone on standard output."""
-    return sys.stderr if args.json else sys.stdout
+    # JSON is alone on standard output.
+    show = partial(print, file=sys.stderr if args.json else sys.stdout, flush=True)
+    found = crosscue.train_mask_rcnn(
+        _settings(args),
+        args.output,
+        resume=args.resume,
+        overwrite=args.overwrite,
+        on_line=(lambda text: None) if args.quiet else show,
+    )
+    print_result(found, args)
+    return 0
 
 
 def _measure(args: argparse.Namespace) -> int:
-    """Measure how good a network is."""
-    from dataclasses import replace
-
-    from crosscue.detectors.devices import chosen_device
-    from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, checkpoint_named
-    from crosscue.detectors.training.annotations import read_coco
-    from crosscue.detectors.training.measure import measure
-
-    asked = args.device if args.backend == "torch" else "cpu"
-    device = chosen_device(asked, "train mask-rcnn")
-    checkpoint = checkpoint_named(args.measure)
-    classes = [name for name in checkpoint.facts.plan.classes if name]
-    whole = read_coco(args.data, args.images, classes)
-    labelled = replace(whole, pictures=whole.pictures[_slice(args.subset)])
-    if not labelled.pictures:
-        count = len(whole.pictures)
-        raise UsageError(f"--subset {args.subset}: none of {count} pictures; name others")
-    reported = []
-    for proposals in args.proposals:
-        settings = MaskRcnnSettings(proposals=proposals, threads=args.threads, backend=args.backend)
-        reached = measure(checkpoint, labelled, settings, device)
-        reported.append(measured_tree(proposals, reached))
-        if not args.quiet and not args.json:
-            print(measured_text(args.measure, len(labelled.pictures), proposals, reached))
-    if args.json:
-        print_json(
-            {"network": args.measure, "pictures": len(labelled.pictures), "measured": reported}
+    if args.output is not None or args.val_data is not None:
+        raise UsageError("--measure: trains nothing, so not with -o or --val-data; leave those")
+    with progress_line(args, "measuring") as line:
+        found = crosscue.measure_mask_rcnn(
+            args.measure,
+            args.data,
+            args.images,
+            subset=args.subset,
+            proposals=args.proposals,
+            backend=args.backend,
+            device=args.device,
+            threads=args.threads,
+            on_measured=line.counting("measurements"),
         )
+    print_result(found, args)
     return 0
 
 
-def _slice(text: str | None) -> slice:
-    """Of ``A:B:N``, any of which may be missing.
-
-    Raises:
-        UsageError: It is not one.
-    """
-    match = re.fullmatch(r"(\d{0,9}):(\d{0,9})(?::([1-9]\d{0,8})?)?", text or ":")
-    if match is None:
-        raise UsageError(f"--subset {text}: expected A:B:N, as 300: or 300:600 or ::4")
-    return slice(*(int(part) if part else None for part in match.groups()))
-
-
-def _sets(args: argparse.Namespace) -> tuple[LabelledSet, LabelledSet]:
-    from dataclasses import replace
-
-    from crosscue.detectors.training.annotations import read_coco
-
-    whole = read_coco(args.data, args.images, args.classes)
-    if args.val_data is not None:
-        return whole, read_coco(args.val_data, args.val_images, args.classes)
-    held_out = whole.pictures[::EVERY]
-    rest = tuple(one for i, one in enumerate(whole.pictures) if i % EVERY)
-    if not rest:
-        raise UsageError(f"{args.data}: one picture is too little; give more, or --val-data")
-    return replace(whole, pictures=rest), replace(whole, pictures=held_out)
-
-
-def _job(args: argparse.Namespace) -> Job:
-    from pydantic import ValidationError
-
-    from crosscue.detectors.networks.mask_rcnn.network import Plan
-    from crosscue.detectors.training.job import Job, architecture_of
-    from crosscue.detectors.training.loop import Schedule
-    from crosscue.detectors.training.samples import Window
-
-    try:
-        plan = Plan.model_validate(
-            {
-                "architecture": architecture_of(args.init),
-                "classes": args.classes,
-                "width_px": args.width,
-                "top": args.crop_top,
-                "bottom": args.crop_bottom,
-            }
-        )
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        name = ".".join(str(part) for part in first["loc"]) or "--crop-top, --crop-bottom"
-        raise UsageError(f"train mask-rcnn: {name}: {first['msg'].lower()}") from None
-    schedule = Schedule(
-        args.steps, args.batch, args.learning_rate, min(100, args.steps), seed=args.seed
+def _settings(args: argparse.Namespace) -> crosscue.MaskRcnnTrainingSettings:
+    return crosscue.MaskRcnnTrainingSettings(
+        data=args.data,
+        images=args.images,
+        val_data=args.val_data,
+        val_images=args.val_images,
+        init=args.init,
+        classes=args.classes,
+        steps=args.steps,
+        batch=args.batch,
+        learning_rate=args.learning_rate,
+        seed=args.seed,
+        width_px=args.width,
+        crop_top=args.crop_top,
+        crop_bottom=args.crop_bottom,
+        window_px=tuple(args.window),
+        balance=args.balance,
+        check_every=args.check_every,
+        check_images=args.check_images,
+        device=args.device,
+        threads=args.threads,
     )
-    window = Window(args.window[0], args.window[1], balance=args.balance)
-    return Job(
-        args.init,
-        plan,
-        schedule,
-        window,
-        args.output,
-        args.check_every,
-        args.check_images,
-        args.device,
-        args.threads,
-        {"data": args.data.parent.name, "window": str(args.window), "balance": args.balance},
-        _made_of(args),
-    )
-
-
-def _made_of(args: argparse.Namespace) -> dict[str, Any]:
-    """Annotations, pictures, weights to begin with, and settings: what decides the training."""
-    places = [args.data, args.images, args.val_data, args.val_images]
-    if (start := Path(args.init)).is_file():
-        places.append(start)
-    names = ("classes", "steps", "batch", "learning_rate", "seed", "width", "window", "balance")
-    more = ("crop_top", "crop_bottom", "check_every", "check_images")
-    return made_of(
-        [path for path in places if path is not None],
-        {name: getattr(args, name) for name in (*names, *more)}
-        | {"init": start.name if start.is_file() else args.init},
-    )
-
-
-def _draw(job: Job) -> None:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    from crosscue.detectors.training.job import read_curve
-    from crosscue.replay.base import write_whole
-
-    points = read_curve(job.curve_path)
-    figure, (above, below) = plt.subplots(2, 1, sharex=True, figsize=(7, 6))
-    steps = [point.step for point in points]
-    above.plot(steps, [point.loss for point in points], marker=".")
-    above.set_ylabel("loss")
-    for name in ("box", "mask", "box50", "mask50"):
-        below.plot(steps, [point.ap.get(name) for point in points], marker=".", label=name)
-    below.set(xlabel="step", ylabel="average precision, %", ylim=(0, 100))
-    below.legend()
-    figure.tight_layout()
-    write_whole(
-        job.output.with_suffix(".curve.png"),
-        lambda path: figure.savefig(path, format="png", dpi=100),
-    )
-    plt.close(figure)
-
-
-def _report(facts: Facts, job: Job, args: argparse.Namespace) -> None:
-    if args.json:
-        print_json(facts.model_dump(mode="json"))
-    elif not args.quiet:
-        size = job.output.stat().st_size / 1e6
-        print(
-            f"{job.output}: {size:.1f} MB, box AP {facts.measured['box']}, "
-            f"mask AP {facts.measured['mask']}"
-        )

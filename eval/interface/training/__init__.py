@@ -1,1 +1,1 @@
-"""Networks trained, and the pictures they are trained on."""
+"""Networks to train and to measure, and pictures to train them on."""

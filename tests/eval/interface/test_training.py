@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -40,3 +43,49 @@ def test_training_frames_are_those_of_the_command(
 def test_a_study_of_intersections_refuses_layouts_that_are_not_scored() -> None:
     with pytest.raises(crosscue.UsageError, match="expected some of A to H"):
         crosscue.IntersectionStudy(layouts=("L1",))
+
+
+def _defaults(command: str) -> dict[str, object]:
+    """What the command takes for the flags that are not given."""
+    parser = argparse.ArgumentParser()
+    import_module(f"crosscue.eval.commands.train.{command}").add_arguments(parser)
+    return {
+        action.dest: action.default
+        for action in parser._actions
+        if not action.required and action.default is not argparse.SUPPRESS
+    }
+
+
+@pytest.mark.parametrize(
+    ("command", "settings"),
+    [
+        ("road", crosscue.RoadTrainingSettings()),
+        ("mask_rcnn", crosscue.MaskRcnnTrainingSettings(data="", images="")),
+    ],
+)
+def test_a_training_from_python_has_the_command_s_defaults(
+    command: str, settings: crosscue.RoadTrainingSettings | crosscue.MaskRcnnTrainingSettings
+) -> None:
+    flags = {"width_px": "width", "window_px": "window"}
+    defaults = _defaults(command)
+
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if field.name not in ("data", "images"):
+            default = defaults[flags.get(field.name, field.name)]
+            if isinstance(value, tuple):
+                value, default = list(value), list(default or ())  # type: ignore[call-overload]
+            assert value == default, field.name
+
+
+def test_a_training_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    road = crosscue.RoadTrainingSettings(layouts=["L1"], width_px=130)
+    masks = crosscue.MaskRcnnTrainingSettings(data="gone", images="gone", window_px=(65, 64))
+
+    with pytest.raises(crosscue.UsageError, match="multiple of 16"):
+        crosscue.train_road(road, tmp_path / "a.safetensors")
+    with pytest.raises(crosscue.UsageError, match="multiples of 32"):
+        crosscue.train_mask_rcnn(masks, tmp_path / "a.safetensors")
+    with pytest.raises(crosscue.UsageError, match="give --test-layouts"):
+        crosscue.measure_road("embedded")
+    assert not [*tmp_path.iterdir()]

@@ -1,0 +1,340 @@
+"""Training and measuring Mask R-CNN networks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from crosscue.detectors.training.summary import measured_text, measured_tree
+from crosscue.eval.interface.training.inputs import check_place
+from crosscue.replay.base import UsageError
+from crosscue.replay.files.made_of import made_of
+
+if TYPE_CHECKING:
+    from crosscue.detectors.networks.mask_rcnn.checkpoint import Facts
+    from crosscue.detectors.training.annotations import LabelledSet
+    from crosscue.detectors.training.job import Job, Point
+    from crosscue.detectors.training.measure import Measured
+
+CLASSES: Final = ("car", "stop sign", "traffic light")
+HELD_EVERY: Final = 10
+PROPOSALS: Final = 100
+"""The detector's own."""
+MAX_WINDOW_PX: Final = 4096
+"""As wide as the widest picture."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MaskRcnnTrainingSettings:
+    """What a Mask R-CNN is trained on, and for how long.
+
+    Attributes:
+        data: COCO annotations to train on.
+        images: Folder of their images.
+        val_data: Annotations to validate on; every tenth image of ``data``, if left out.
+        val_images: Folder of their images.
+        init: Initial weights: ``compact``, ``resnet50``, ``resnet50-v2``, ``embedded``, or a
+            checkpoint.
+        classes: Names of the classes to train.
+        steps: Batches altogether.
+        batch: Images in a batch.
+        learning_rate: The highest one.
+        seed: Everything random comes from it.
+        width_px: Images are scaled to this width.
+        crop_top: Fraction of an image's height to skip at the top.
+        crop_bottom: Likewise at the bottom.
+        window_px: Width and height of the training windows, multiples of 32.
+        balance: 0 samples every object equally often, 1 every class.
+        check_every: Steps between validations.
+        check_images: Images per validation during training; the last one takes all.
+        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        threads: CPU threads.
+    """
+
+    data: Path | str
+    images: Path | str
+    val_data: Path | str | None = None
+    val_images: Path | str | None = None
+    init: Path | str = "compact"
+    classes: Sequence[str] = CLASSES
+    steps: int = 4000
+    batch: int = 8
+    learning_rate: float = 1e-3
+    seed: int = 0
+    width_px: int = 1280
+    crop_top: float = 0.0
+    crop_bottom: float = 0.0
+    window_px: tuple[int, int] = (544, 288)
+    balance: float = 1.0
+    check_every: int = 500
+    check_images: int = 60
+    device: str = "auto"
+    threads: int = 1
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class TrainedMaskRcnn:
+    """A Mask R-CNN that was trained; printed in a line.
+
+    Attributes:
+        path: The checkpoint.
+        facts: What it says of itself: its plan, calibration, measured precision and recipe.
+    """
+
+    path: Path
+    facts: Facts
+
+    def as_dict(self) -> dict[str, Any]:
+        """What ``crosscue train mask-rcnn --json`` prints: the facts."""
+        return self.facts.model_dump(mode="json")
+
+    def __repr__(self) -> str:
+        size, measured = self.path.stat().st_size / 1e6, self.facts.measured
+        return f"{self.path}: {size:.1f} MB, box AP {measured['box']}, mask AP {measured['mask']}"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class MeasuredMaskRcnn:
+    """What a Mask R-CNN reaches on labelled images; printed as tables.
+
+    Attributes:
+        network: Its name.
+        pictures: How many it was measured on.
+        by_proposals: Average precisions, and rates at the cues' scores, by number of proposals.
+    """
+
+    network: str
+    pictures: int
+    by_proposals: dict[int, Measured]
+
+    def as_dict(self) -> dict[str, Any]:
+        """What ``crosscue train mask-rcnn --measure --json`` prints."""
+        measured = [measured_tree(count, reached) for count, reached in self.by_proposals.items()]
+        return {"network": self.network, "pictures": self.pictures, "measured": measured}
+
+    def __repr__(self) -> str:
+        return "\n".join(
+            measured_text(self.network, self.pictures, count, reached)
+            for count, reached in self.by_proposals.items()
+        )
+
+
+def train_mask_rcnn(
+    settings: MaskRcnnTrainingSettings,
+    output: Path | str,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    on_line: Callable[[str], None] = lambda text: None,
+) -> TrainedMaskRcnn:
+    """Train a Mask R-CNN on COCO annotations: a compact one from nothing, or an existing one.
+
+    The same settings and seed yield the same bytes on the same machine's CPU.
+
+    Args:
+        settings: What to train on, and for how long.
+        output: Checkpoint to write, ``.safetensors``. Beside it lie the curve (JSON and PNG) and,
+            until the training ends, the state to resume from.
+        resume: Continue an interrupted training from its state.
+        overwrite: Replace existing results.
+        on_line: Called with a line of text on each set of images and after each validation.
+
+    Raises:
+        UsageError: A value out of range, or a state of another training.
+        OutputError: Results exist, or cannot be written.
+        AnnotationError: The annotations are not a COCO file, or the folder is missing.
+        LogError: An image cannot be read.
+        SchemaError: No usable annotation, or the state is damaged.
+        VehicleError: ``init`` is not a Mask R-CNN that fits, or the device is missing.
+        CrosscueError: The losses are not finite any more.
+    """
+    path = Path(output)
+    _check(settings, path)
+    job = _job(settings, path)
+    check_place(path)
+    train, held_out = _sets(settings)
+    for name, one in (("training", train), ("held out", held_out)):
+        left_out = ", ".join(f"{count} {why}" for why, count in sorted(one.left_out.items()))
+        on_line(f"{name}: {len(one.pictures)} pictures" + (f"; {left_out}" if left_out else ""))
+
+    def report(point: Point) -> None:
+        on_line(
+            f"step {point.step} of {settings.steps}: loss {point.loss:.3f}, "
+            f"box AP {point.ap.get('box')}, mask AP {point.ap.get('mask')}, {point.seconds:.0f} s"
+        )
+
+    from crosscue.detectors.training.job import run_job
+    from crosscue.eval.interface.training.curve import draw_curve
+
+    facts = run_job(job, train, held_out, resume=resume, overwrite=overwrite, tell=report)
+    draw_curve(job.curve_path, path.with_suffix(".curve.png"))
+    return TrainedMaskRcnn(path, facts)
+
+
+def measure_mask_rcnn(
+    network: str,
+    data: Path | str,
+    images: Path | str,
+    *,
+    subset: str | None = None,
+    proposals: Sequence[int] = (PROPOSALS,),
+    backend: str = "torch",
+    device: str = "auto",
+    threads: int = 1,
+    on_measured: Callable[[int, int], None] = lambda done, of: None,
+) -> MeasuredMaskRcnn:
+    """Measure how good a Mask R-CNN is on COCO annotations, without training it.
+
+    Args:
+        network: ``compact``, ``resnet50``, ``resnet50-v2``, ``embedded``, or a checkpoint.
+        data: COCO annotations.
+        images: Folder of their images.
+        subset: ``A:B:N`` measures on these images only: ``::4`` is every fourth.
+        proposals: Numbers of region proposals to measure with, in turn.
+        backend: Inference engine, ``torch`` or ``openvino``.
+        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        threads: CPU threads.
+        on_measured: Called with how many of the numbers of proposals are done, and of how many.
+
+    Raises:
+        UsageError: A value out of range, or a subset without images.
+        AnnotationError: The annotations are not a COCO file, or the folder is missing.
+        LogError: An image cannot be read.
+        SchemaError: No usable annotation.
+        VehicleError: Not a Mask R-CNN, or the device is missing.
+    """
+    if not all(1 <= count <= 2000 for count in proposals):
+        raise UsageError("--proposals: expected 1 to 2000")
+    from crosscue.detectors.devices import chosen_device
+    from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, checkpoint_named
+    from crosscue.detectors.training.annotations import read_coco
+    from crosscue.detectors.training.measure import measure
+
+    chosen = chosen_device(device if backend == "torch" else "cpu", "train mask-rcnn")
+    checkpoint = checkpoint_named(network)
+    classes = [name for name in checkpoint.facts.plan.classes if name]
+    whole = read_coco(Path(data), Path(images), classes)
+    labelled = replace(whole, pictures=whole.pictures[_slice(subset)])
+    if not labelled.pictures:
+        count = len(whole.pictures)
+        raise UsageError(f"--subset {subset}: none of {count} pictures; name others")
+    measured: dict[int, Measured] = {}
+    for count in proposals:
+        settings = MaskRcnnSettings.model_validate(
+            {"proposals": count, "threads": threads, "backend": backend}
+        )
+        measured[count] = measure(checkpoint, labelled, settings, chosen)
+        on_measured(len(measured), len(proposals))
+    return MeasuredMaskRcnn(network, len(labelled.pictures), measured)
+
+
+def _check(settings: MaskRcnnTrainingSettings, output: Path) -> None:
+    if output.suffix != ".safetensors":
+        raise UsageError(f"-o {output}: expected a name that ends in .safetensors")
+    for name in ("steps", "batch", "check_every", "check_images", "threads"):
+        if getattr(settings, name) < 1:
+            raise UsageError(f"--{name.replace('_', '-')}: expected 1 or more")
+    if not 0.0 < settings.learning_rate < 1.0 or settings.seed < 0:
+        raise UsageError(
+            "--learning-rate, --seed: expected a rate between 0 and 1, and a seed of 0 or more"
+        )
+    if not 0.0 <= settings.balance <= 1.0:
+        raise UsageError(f"--balance {settings.balance}: expected 0 to 1")
+    width_px, height_px = settings.window_px
+    if any(side % 32 or not 64 <= side <= MAX_WINDOW_PX for side in (width_px, height_px)):
+        raise UsageError(
+            f"--window {width_px} {height_px}: expected multiples of 32 from 64 to {MAX_WINDOW_PX}"
+        )
+    if not all(settings.classes) or len(set(settings.classes)) != len(settings.classes):
+        raise UsageError("--classes: one is empty or named twice; name each once")
+    if (settings.val_data is None) != (settings.val_images is None):
+        raise UsageError("--val-data, --val-images: give both or neither")
+
+
+def _slice(text: str | None) -> slice:
+    """Of ``A:B:N``, any of which may be missing.
+
+    Raises:
+        UsageError: It is not one.
+    """
+    match = re.fullmatch(r"(\d{0,9}):(\d{0,9})(?::([1-9]\d{0,8})?)?", text or ":")
+    if match is None:
+        raise UsageError(f"--subset {text}: expected A:B:N, as 300: or 300:600 or ::4")
+    return slice(*(int(part) if part else None for part in match.groups()))
+
+
+def _sets(settings: MaskRcnnTrainingSettings) -> tuple[LabelledSet, LabelledSet]:
+    from crosscue.detectors.training.annotations import read_coco
+
+    whole = read_coco(Path(settings.data), Path(settings.images), settings.classes)
+    if settings.val_data is not None and settings.val_images is not None:
+        held_out = read_coco(Path(settings.val_data), Path(settings.val_images), settings.classes)
+        return whole, held_out
+    rest = tuple(one for i, one in enumerate(whole.pictures) if i % HELD_EVERY)
+    if not rest:
+        raise UsageError(
+            f"{settings.data}: expected two pictures or more, found one; add some, or --val-data"
+        )
+    return replace(whole, pictures=rest), replace(whole, pictures=whole.pictures[::HELD_EVERY])
+
+
+def _job(settings: MaskRcnnTrainingSettings, output: Path) -> Job:
+    from pydantic import ValidationError
+
+    from crosscue.detectors.networks.mask_rcnn.network import Plan
+    from crosscue.detectors.training.job import Job, architecture_of
+    from crosscue.detectors.training.loop import Schedule
+    from crosscue.detectors.training.samples import Window
+
+    start, steps, window_px = str(settings.init), settings.steps, settings.window_px
+    try:
+        plan = Plan.model_validate(
+            {
+                "architecture": architecture_of(start),
+                "classes": settings.classes,
+                "width_px": settings.width_px,
+                "top": settings.crop_top,
+                "bottom": settings.crop_bottom,
+            }
+        )
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = ".".join(str(part) for part in first["loc"]) or "--crop-top, --crop-bottom"
+        raise UsageError(f"train mask-rcnn: {name}: {first['msg'].lower()}") from None
+    return Job(
+        start=start,
+        plan=plan,
+        schedule=Schedule(
+            steps, settings.batch, settings.learning_rate, min(100, steps), seed=settings.seed
+        ),
+        window=Window(*window_px, balance=settings.balance),
+        output=output,
+        check_every=settings.check_every,
+        check_pictures=settings.check_images,
+        device=settings.device,
+        threads=settings.threads,
+        recipe={
+            "data": Path(settings.data).parent.name,
+            "window": str(list(window_px)),
+            "balance": settings.balance,
+        },
+        made_of=_made_of(settings),
+    )
+
+
+def _made_of(settings: MaskRcnnTrainingSettings) -> dict[str, Any]:
+    """Annotations, pictures, initial weights, and settings: what decides the training."""
+    places = [settings.data, settings.images, settings.val_data, settings.val_images]
+    if (start := Path(settings.init)).is_file():
+        places.append(start)
+    names = ("classes", "steps", "batch", "learning_rate", "seed", "balance")
+    more = ("crop_top", "crop_bottom", "check_every", "check_images")
+    return made_of(
+        [Path(path) for path in places if path is not None],
+        {name: getattr(settings, name) for name in (*names, *more)}
+        | {"width": settings.width_px, "window": settings.window_px}
+        | {"init": start.name if start.is_file() else str(settings.init)},
+    )
