@@ -38,6 +38,8 @@ def _result(**changes: object) -> ApproachResult:
         full_m=30.0,
         why_not_detected="",
         why_not_full="",
+        spurious_m=None,
+        why_spurious="",
         features_m={"intersection": 40.0, "left": 30.0},
         false_features=(),
         at_entering={},
