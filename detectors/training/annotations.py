@@ -1,8 +1,9 @@
 """COCO annotations, checked at the door: what cannot be used is counted, with the reason.
 
-Masks are compressed run lengths, plain run lengths or polygons. An annotation is left out when its
-class is none of those wanted, its picture is not listed, its box has no area within the picture, or
-its mask is not one of that picture's size; a box that sticks out is cut off at the picture's edge.
+Masks are compressed run lengths, plain run lengths or polygons; an annotation may also have a box
+only. It is left out when its class is not among those wanted, its picture is not listed, its box
+has no area within the picture, or its mask is not one of that picture's size; a box that sticks out
+is cut off at the picture's edge.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ MAX_SIDE_PX: Final = 32768
 
 Box: TypeAlias = tuple[float, float, float, float]
 """x0, y0, x1, y1."""
+Mask: TypeAlias = bytes | tuple[tuple[float, ...], ...]
+"""Compressed runs, or polygons as (x, y) pairs one after another."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +38,14 @@ class Labelled:
     Attributes:
         label: Index into the classes.
         box_px: x0, y0, x1, y1 within the picture.
-        mask: Compressed runs, or polygons as (x, y) pairs one after another.
+        mask: Compressed runs, or polygons as (x, y) pairs one after another; None where only the
+            box is known.
         is_crowd: Neither to be found nor wrong when found.
     """
 
     label: int
     box_px: Box
-    mask: bytes | tuple[tuple[float, ...], ...]
+    mask: Mask | None
     is_crowd: bool
 
 
@@ -77,6 +81,16 @@ class LabelledSet:
     classes: tuple[str, ...]
     pictures: tuple[LabelledPicture, ...]
     left_out: Mapping[str, int]
+
+    @property
+    def objects(self) -> int:
+        """How many there are in all pictures."""
+        return sum(len(picture.objects) for picture in self.pictures)
+
+    @property
+    def masks(self) -> int:
+        """How many of them have a mask."""
+        return sum(one.mask is not None for picture in self.pictures for one in picture.objects)
 
 
 def read_coco(path: Path, folder: Path, classes: Sequence[str]) -> LabelledSet:
@@ -187,8 +201,9 @@ def _labelled(
     box = _box(row.get("bbox"), size, left_out)
     if box is None:
         return None
-    mask = _mask(row.get("segmentation"), size)
-    if mask is None:
+    segmentation = row.get("segmentation")
+    mask = _mask(segmentation, size)
+    if segmentation and mask is None:
         left_out["annotations without a mask of the picture's size"] += 1
         return None
     return Labelled(numbers[names[category]], box, mask, bool(row.get("iscrowd", 0)))
@@ -215,7 +230,7 @@ def _is_numbers(given: object) -> TypeGuard[list[float]]:
     )
 
 
-def _mask(given: Any, size: tuple[int, int]) -> bytes | tuple[tuple[float, ...], ...] | None:
+def _mask(given: Any, size: tuple[int, int]) -> Mask | None:
     if isinstance(given, list) and given:
         is_polygons = all(_is_numbers(one) and len(one) >= 6 and len(one) % 2 == 0 for one in given)
         return tuple(tuple(float(v) for v in one) for one in given) if is_polygons else None
@@ -240,9 +255,14 @@ def _from_lengths(lengths: Int64s, size: tuple[int, int]) -> bytes:
 
 
 def mask_of(labelled: Labelled, size_px: tuple[int, int]) -> NDArray[np.bool_]:
-    """An object's pixels over the whole picture, shape (height, width)."""
+    """An object's pixels in the picture, shape (height, width); its box where it has no mask."""
     import cv2
 
+    if labelled.mask is None:
+        inside = np.zeros((size_px[1], size_px[0]), np.bool_)
+        x0, y0, x1, y1 = (round(value) for value in labelled.box_px)
+        inside[y0:y1, x0:x1] = True
+        return inside
     if isinstance(labelled.mask, bytes):
         return rle.decode(labelled.mask, size_px)
     canvas = np.zeros((size_px[1], size_px[0]), np.uint8)

@@ -47,6 +47,9 @@ def judged(labelled: LabelledSet, found: Sequence[Detections]) -> Mapping[str, J
 
 
 def _counts(one: Labelled, picture: LabelledPicture) -> bool:
+    if one.mask is None:
+        x0, y0, x1, y1 = one.box_px
+        return not one.is_crowd and (x1 - x0) * (y1 - y0) >= MIN_AREA_PX
     return not one.is_crowd and (
         not isinstance(one.mask, bytes) or area_px(one.mask) >= MIN_AREA_PX
     )

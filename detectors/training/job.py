@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import torch
@@ -34,6 +34,7 @@ from .samples import Sampler, Window
 from .scores import average_precisions
 
 COMPACT: Final = "compact"
+Recipe: TypeAlias = dict[str, str | int | float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ class Job:
     check_pictures: int
     device: str = "auto"
     threads: int = 1
-    recipe: dict[str, str | int | float] = field(default_factory=dict)
+    recipe: Recipe = field(default_factory=dict)
     made_of: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -130,7 +131,10 @@ def _run(
     resume: bool,
     tell: Callable[[Point], None],
 ) -> Facts:
-    training = Training(lambda: starting_network(job), job.schedule, device)
+    learns_masks = train.masks > 0
+    training = Training(
+        lambda: starting_network(job), job.schedule, device, learns_masks=learns_masks
+    )
     points: list[Point] = []
     if resume and job.state_path.exists():
         said = training.resume(job.state_path, job.made_of)
@@ -138,7 +142,10 @@ def _run(
     sampler = Sampler(train, job.plan, job.window, job.schedule.seed)
     for point in _learned(job, training, sampler, held_out, points):
         tell(point)
-    facts = finished_facts(job, training.averaged, held_out, device)
+    recipe: Recipe = {"objects": train.objects, "boxes_without_mask": train.objects - train.masks}
+    job = replace(job, recipe={**job.recipe, **recipe})
+    has_masks = learns_masks or knows_masks(job)
+    facts = finished_facts(job, training.averaged, held_out, device, has_masks=has_masks)
     save_checkpoint(job.output, training.averaged, facts)
     job.state_path.unlink(missing_ok=True)
     return facts
@@ -168,6 +175,14 @@ def starting_network(job: Job) -> Any:
         fitting = {name: value for name, value in fitting.items() if "predictor" not in name}
     network.load_state_dict(fitting, strict=False)
     return network
+
+
+def knows_masks(job: Job) -> bool:
+    """Whether the network to start from has learnt masks of the very classes of the plan."""
+    if job.start == COMPACT:
+        return False
+    facts = checkpoint_named(job.start).facts
+    return facts.has_masks and facts.plan.classes == job.plan.classes
 
 
 def architecture_of(start: str) -> str:
@@ -221,7 +236,9 @@ def _spread(pictures: tuple[Any, ...], most: int) -> tuple[Any, ...]:
     return tuple(pictures[i] for i in np.linspace(0, len(pictures) - 1, most).astype(int))
 
 
-def finished_facts(job: Job, network: Any, held_out: LabelledSet, device: torch.device) -> Facts:
+def finished_facts(
+    job: Job, network: Any, held_out: LabelledSet, device: torch.device, *, has_masks: bool
+) -> Facts:
     """What the checkpoint says: its measured average precision, and calibrated scores.
 
     The first half of the held-out pictures calibrates, the second half measures how well.
@@ -242,7 +259,9 @@ def finished_facts(job: Job, network: Any, held_out: LabelledSet, device: torch.
         "held_out_pictures": len(held_out.pictures),
         **decides_bits(device),
     }
-    return Facts(plan=job.plan, calibration=by, recipe=recipe, measured=measured)
+    return Facts(
+        plan=job.plan, calibration=by, recipe=recipe, measured=measured, has_masks=has_masks
+    )
 
 
 def reported_rates(name: str, rows: Judged, by: Calibration) -> dict[str, float | None]:

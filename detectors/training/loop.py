@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from crosscue.detectors.networks.mask_rcnn.network import forward_training
+from crosscue.detectors.networks.mask_rcnn.network import forward_training, freeze_masks
 from crosscue.detectors.weights_file import serialised
 from crosscue.replay.base import CrosscueError, SchemaError, json_tree, one_line, write_bytes
 from crosscue.replay.files.made_of import NOTHING, refuse_another
@@ -70,17 +70,26 @@ class Training:
         done: Steps taken.
     """
 
-    def __init__(self, make: Callable[[], Any], schedule: Schedule, device: torch.device) -> None:
+    def __init__(
+        self,
+        make: Callable[[], Any],
+        schedule: Schedule,
+        device: torch.device,
+        *,
+        learns_masks: bool = True,
+    ) -> None:
         """Build twice: what learns and its average.
 
         Args:
             make: Builds the network, with the weights to start from.
             schedule: How long and how fast.
             device: Where.
+            learns_masks: Otherwise the mask head is frozen: its weights stay as they are.
         """
         torch.manual_seed(schedule.seed)
         self.schedule, self.device = schedule, device
         self.network = make().to(device).to(memory_format=torch.channels_last).train()
+        freeze_masks(self.network, is_frozen=not learns_masks)
         self.averaged = make().to(device).to(memory_format=torch.channels_last).eval()
         self.averaged.load_state_dict(self.network.state_dict())
         self.averaged.requires_grad_(False)
@@ -244,4 +253,5 @@ def _target(sample: Sample, device: torch.device) -> dict[str, Tensor]:
         "boxes": torch.from_numpy(sample.boxes_px).to(device),
         "labels": torch.from_numpy(sample.labels).to(device),
         "masks": torch.from_numpy(sample.masks).to(device),
+        "has_mask": torch.from_numpy(sample.has_mask).to(device),
     }

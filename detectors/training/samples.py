@@ -56,13 +56,15 @@ class Sample:
         pixels: Shape (3, H, W), float32, normalised.
         boxes_px: Shape (N, 4), float32.
         labels: Shape (N,), int64, from 1.
-        masks: Shape (N, H, W), uint8.
+        masks: Shape (N, H, W), uint8; the box where the object has no mask.
+        has_mask: Shape (N,), bool.
     """
 
     pixels: NDArray[np.float32]
     boxes_px: NDArray[np.float32]
     labels: NDArray[np.int64]
     masks: Bytes
+    has_mask: NDArray[np.bool_]
 
 
 def read_picture(picture: LabelledPicture) -> Bytes:
@@ -215,7 +217,7 @@ def recoloured(pixels: Bytes, rng: Generator) -> Bytes:
 
 
 def _sample(pixels: Bytes, picture: LabelledPicture, warp: Floats, window: Window) -> Sample:
-    boxes, labels, masks = [], [], []
+    boxes, labels, masks, has_mask = [], [], [], []
     for one in picture.objects:
         if one.is_crowd or not _may_be_inside(one, warp, window):
             continue
@@ -231,15 +233,19 @@ def _sample(pixels: Bytes, picture: LabelledPicture, warp: Floats, window: Windo
             boxes.append(box)
             labels.append(one.label + 1)
             masks.append(mask)
+            has_mask.append(one.mask is not None)
     if len(boxes) > MAX_OBJECTS:
         order = np.argsort([-int(mask.sum()) for mask in masks], kind="stable")[:MAX_OBJECTS]
-        boxes, labels, masks = ([part[i] for i in order] for part in (boxes, labels, masks))
+        boxes, labels, masks, has_mask = (
+            [part[i] for i in order] for part in (boxes, labels, masks, has_mask)
+        )
     size = (window.height_px, window.width_px)
     return Sample(
         normalised(pixels),
         np.array(boxes, np.float32).reshape(-1, 4),
         np.array(labels, np.int64),
         np.stack(masks) if masks else np.zeros((0, *size), np.uint8),
+        np.array(has_mask, np.bool_),
     )
 
 

@@ -10,14 +10,16 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.rle import area_px, encode
-from crosscue.replay.errors import UsageError
+from crosscue.replay.base import Floats, UsageError
 
 from .annotations import LabelledPicture, LabelledSet, mask_of
 from .samples import read_picture
 
 MIN_AREA_PX: Final = 24
 """Smaller truth is neither asked for nor wrong when found."""
+HALF: Final = 0.5
 SIZES: Final = ("all", "small", "medium", "large")
 """COCO's: small below 32 x 32 pixels, large above 96 x 96."""
 
@@ -42,7 +44,9 @@ def average_precisions(
     """AP by COCO's rules, of boxes and masks: overall, by class and by size; in percent.
 
     Names are ``box``, ``box50`` (overlap of one half), ``box car``, ``box small``, ``box50 car``,
-    ``box car small``, and likewise ``mask``. None where the truth has no such object.
+    ``box car small``, and likewise ``mask``. None where the truth has no such object, or nobody
+    found or labelled a mask. For masks, objects without one are left out, and so are detections of
+    their class whose box overlaps theirs by half.
 
     Raises:
         UsageError: pycocotools is not installed.
@@ -54,16 +58,20 @@ def average_precisions(
         raise UsageError(
             "average precision needs pycocotools, which is not installed: pip install pycocotools"
         ) from None
-    truth = COCO()
-    truth.dataset = _truth(labelled)
+    has_masks = labelled.masks and all(one.masks[0] for one in found if len(one))
     scores: dict[str, float | None] = {}
     with contextlib.redirect_stdout(io.StringIO()):
-        truth.createIndex()
-        answers = _answers(labelled, found)
         for kind, name in (("bbox", "box"), ("segm", "mask")):
+            if kind == "segm" and not has_masks:
+                scores |= dict.fromkeys((name, f"{name}50"), None)
+                continue
+            answers = _answers(labelled, found, of_masks=kind == "segm")
             if not answers:
                 scores |= dict.fromkeys((name, f"{name}50"), 0.0)
                 continue
+            truth = COCO()
+            truth.dataset = _truth(labelled, of_masks=kind == "segm")
+            truth.createIndex()
             judge = COCOeval(truth, truth.loadRes(answers), kind)
             judge.evaluate()
             judge.accumulate()
@@ -90,10 +98,12 @@ def _mean(values: Any) -> float | None:
     return round(100.0 * float(known.mean()), 2) if known.size else None
 
 
-def _truth(labelled: LabelledSet) -> dict[str, Any]:
+def _truth(labelled: LabelledSet, *, of_masks: bool) -> dict[str, Any]:
     annotations: list[dict[str, Any]] = []
     for number, picture in enumerate(labelled.pictures):
         for one in picture.objects:
+            if of_masks and one.mask is None:
+                continue
             text = _runs(one.mask, picture, one)
             area = area_px(text)
             x0, y0, x1, y1 = one.box_px
@@ -124,7 +134,9 @@ def _runs(mask: Any, picture: LabelledPicture, one: Any) -> bytes:
     return encode(mask_of(one, picture.size_px), (0, 0), picture.size_px)
 
 
-def _answers(labelled: LabelledSet, found: Sequence[Detections]) -> list[dict[str, Any]]:
+def _answers(
+    labelled: LabelledSet, found: Sequence[Detections], *, of_masks: bool
+) -> list[dict[str, Any]]:
     numbers = {name: i for i, name in enumerate(labelled.classes)}
     return [
         {
@@ -139,4 +151,11 @@ def _answers(labelled: LabelledSet, found: Sequence[Detections]) -> list[dict[st
             one.boxes_px, one.scores, one.labels, one.masks, strict=True
         )
         if label in numbers
+        and not (of_masks and _is_unmasked(labelled.pictures[i], numbers[label], box))
     ]
+
+
+def _is_unmasked(picture: LabelledPicture, label: int, box_px: Floats) -> bool:
+    """Whether a detection lies on an object of its class that has no mask to compare with."""
+    bare = [one.box_px for one in picture.objects if one.label == label and one.mask is None]
+    return bool(bare) and bool((overlaps(box_px, np.array(bare)) >= HALF).any())

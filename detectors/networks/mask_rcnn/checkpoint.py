@@ -50,6 +50,8 @@ class Facts(Settings):
         calibration: By class; a class without one keeps its scores.
         measured: Average precisions, precisions and recalls on held-out pictures, by name.
         recipe: How it was made, in words and numbers.
+        has_masks: Whether the mask head has learnt these classes; if not, detections have boxes
+            only.
     """
 
     version: Annotated[int, Field(ge=1, le=VERSION)] = VERSION
@@ -57,6 +59,7 @@ class Facts(Settings):
     calibration: dict[str, Calibration] = Field(default_factory=dict)
     measured: dict[str, Finite | None] = Field(default_factory=dict)
     recipe: dict[str, str | int | Finite] = Field(default_factory=dict)
+    has_masks: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -245,7 +245,10 @@ class MaskRcnnDetector:
             boxes_px[keep],
             scores[keep],
             tuple(str(names[i]) for i in keep),
-            tuple(laid_in(masks[i, 0], boxes_px[i], frame.size_px) for i in keep),
+            tuple(
+                laid_in(masks[i, 0], boxes_px[i], frame.size_px) if facts.has_masks else b""
+                for i in keep
+            ),
         )
 
 

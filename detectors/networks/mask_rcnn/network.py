@@ -195,16 +195,69 @@ def _conv(inputs: int, outputs: int, stride: int) -> nn.Sequential:
     )
 
 
+def freeze_masks(network: Any, *, is_frozen: bool) -> None:
+    """Whether a training leaves the mask head as it is."""
+    for part in (network.roi_heads.mask_head, network.roi_heads.mask_predictor):
+        part.requires_grad_(not is_frozen)
+
+
 def forward_training(network: Any, pictures: Tensor, targets: list[dict[str, Tensor]]) -> Tensor:
     """Sum of all losses of a batch of normalised pictures (N, 3, H, W) of one size.
 
     Torchvision's own transform is left out: it would scale pictures that have their size already.
+    Its loop over regions is written out here, since its mask loss wants a mask of every object.
+
+    Args:
+        network: A torchvision ``MaskRCNN``; without a mask loss where ``freeze_masks`` froze it.
+        pictures: The batch.
+        targets: Of each picture, ``boxes``, ``labels``, ``masks`` and ``has_mask``.
     """
     from torchvision.models.detection.image_list import ImageList
+    from torchvision.models.detection.roi_heads import fastrcnn_loss
 
     size = (int(pictures.shape[2]), int(pictures.shape[3]))
-    images = ImageList(pictures, [size] * len(pictures))
+    sizes = [size] * len(pictures)
     features = network.backbone(pictures)
-    proposals, of_proposals = network.rpn(images, features, targets)
-    _, of_objects = network.roi_heads(features, proposals, images.image_sizes, targets)
-    return torch.stack([*of_proposals.values(), *of_objects.values()]).sum()
+    proposals, of_proposals = network.rpn(ImageList(pictures, sizes), features, targets)
+    heads = network.roi_heads
+    proposals, matched, labels, offsets = heads.select_training_samples(proposals, targets)
+    regions = heads.box_head(heads.box_roi_pool(features, proposals, sizes))
+    losses = [
+        *of_proposals.values(),
+        *fastrcnn_loss(*heads.box_predictor(regions), labels, offsets),
+    ]
+    if next(heads.mask_predictor.parameters()).requires_grad:
+        losses.append(_mask_loss(heads, features, proposals, matched, labels, sizes, targets))
+    return torch.stack(losses).sum()
+
+
+def _mask_loss(
+    heads: Any,
+    features: Any,
+    proposals: list[Tensor],
+    matched: list[Tensor],
+    labels: list[Tensor],
+    sizes: list[tuple[int, int]],
+    targets: list[dict[str, Tensor]],
+) -> Tensor:
+    """Of the regions on objects that have a mask."""
+    from torchvision.models.detection.roi_heads import maskrcnn_loss
+
+    learnt = [
+        # A picture without objects has nothing to ask of; its regions are all background.
+        torch.where((label > 0) & target["has_mask"][index])[0]
+        if len(target["has_mask"])
+        else torch.where(label > 0)[0]
+        for label, index, target in zip(labels, matched, targets, strict=True)
+    ]
+    regions = [part[rows] for part, rows in zip(proposals, learnt, strict=True)]
+    objects = [part[rows] for part, rows in zip(matched, learnt, strict=True)]
+    pooled = heads.mask_roi_pool(features, regions, sizes)
+    loss: Tensor = maskrcnn_loss(
+        heads.mask_predictor(heads.mask_head(pooled)),
+        regions,
+        [target["masks"] for target in targets],
+        [target["labels"] for target in targets],
+        objects,
+    )
+    return loss

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -92,8 +92,8 @@ class TrainedMaskRcnn:
         return self.facts.model_dump(mode="json")
 
     def __repr__(self) -> str:
-        size, measured = self.path.stat().st_size / 1e6, self.facts.measured
-        return f"{self.path}: {size:.1f} MB, box AP {measured['box']}, mask AP {measured['mask']}"
+        size = self.path.stat().st_size / 1e6
+        return f"{self.path}: {size:.1f} MB, {_precision_text(self.facts.measured)}"
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -157,13 +157,12 @@ def train_mask_rcnn(
     check_place(path)
     train, held_out = _sets(settings)
     for name, one in (("training", train), ("held out", held_out)):
-        left_out = ", ".join(f"{count} {why}" for why, count in sorted(one.left_out.items()))
-        on_line(f"{name}: {len(one.pictures)} pictures" + (f"; {left_out}" if left_out else ""))
+        on_line(f"{name}: {_set_text(one)}")
 
     def report(point: Point) -> None:
         on_line(
             f"step {point.step} of {settings.steps}: loss {point.loss:.3f}, "
-            f"box AP {point.ap.get('box')}, mask AP {point.ap.get('mask')}, {point.seconds:.0f} s"
+            f"{_precision_text(point.ap)}, {point.seconds:.0f} s"
         )
 
     from crosscue.detectors.training.job import run_job
@@ -229,6 +228,20 @@ def measure_mask_rcnn(
         measured[count] = measure(checkpoint, labelled, settings, chosen)
         on_measured(len(measured), len(proposals))
     return MeasuredMaskRcnn(network, len(labelled.pictures), measured)
+
+
+def _set_text(one: LabelledSet) -> str:
+    """Its pictures, objects without a mask, and what was left out."""
+    text, bare = f"{len(one.pictures)} pictures", one.objects - one.masks
+    if bare:
+        text += f", {bare} of {one.objects} objects without a mask"
+    left_out = ", ".join(f"{count} {why}" for why, count in sorted(one.left_out.items()))
+    return f"{text}; {left_out}" if left_out else text
+
+
+def _precision_text(ap: Mapping[str, float | None]) -> str:
+    mask = ap.get("mask")
+    return f"box AP {ap.get('box')}, " + ("no masks" if mask is None else f"mask AP {mask}")
 
 
 def _check(settings: MaskRcnnTrainingSettings, output: Path) -> None:

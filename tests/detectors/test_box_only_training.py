@@ -1,0 +1,207 @@
+"""Labels without masks train boxes; the mask head keeps its weights and no masks are invented."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import crosscue
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections
+from crosscue.detectors.networks.mask_rcnn.checkpoint import Checkpoint, Facts, load_checkpoint
+from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, detector_of
+from crosscue.detectors.networks.mask_rcnn.network import build_network
+from crosscue.detectors.training.annotations import LabelledSet, mask_of, read_coco
+from crosscue.detectors.training.loop import Schedule, Training
+from crosscue.detectors.training.samples import Sampler, Window
+from crosscue.detectors.training.scores import average_precisions
+from crosscue.eval.cli import run
+from support.mask_rcnn import CPU, noise_frame, plan_of, random_checkpoint, write_bars
+
+WINDOW = Window(96, 64)
+MASK_HEAD = ("roi_heads.mask_head.", "roi_heads.mask_predictor.")
+
+
+def _without_masks(path: Path, every: int = 1) -> None:
+    """Leave only the box of each annotation, or of every ``every``-th."""
+    tree = json.loads(path.read_text())
+    for row in tree["annotations"][::every]:
+        row.pop("segmentation", None)
+    path.write_text(json.dumps(tree))
+
+
+def _boxes(folder: Path, every: int = 1, count: int = 4) -> LabelledSet:
+    path = write_bars(folder / "set", count)
+    _without_masks(path, every)
+    return read_coco(path, folder / "set" / "images", ("car",))
+
+
+def _training(labelled: LabelledSet, schedule: Schedule) -> tuple[Training, Sampler]:
+    plan = plan_of()
+    training = Training(lambda: build_network(plan), schedule, CPU, learns_masks=labelled.masks > 0)
+    return training, Sampler(labelled, plan, WINDOW, schedule.seed)
+
+
+def _mask_head(network: Any) -> dict[str, torch.Tensor]:
+    return {
+        name: value.clone()
+        for name, value in network.state_dict().items()
+        if name.startswith(MASK_HEAD)
+    }
+
+
+@pytest.mark.parametrize("absent", [None, []])
+def test_an_annotation_with_a_box_only_is_read(tmp_path: Path, absent: object) -> None:
+    path = write_bars(tmp_path, 2)
+    tree = json.loads(path.read_text())
+    tree["annotations"][0]["segmentation"] = absent
+    path.write_text(json.dumps(tree))
+
+    labelled = read_coco(path, tmp_path / "images", ("car",))
+
+    assert (labelled.objects, labelled.masks, labelled.left_out) == (4, 3, {})
+    one = labelled.pictures[0].objects[0]
+    rows, columns = np.nonzero(mask_of(one, (128, 96)))
+    assert one.box_px == (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+
+
+def test_a_sample_marks_the_objects_that_have_a_mask(tmp_path: Path) -> None:
+    sampler = Sampler(_boxes(tmp_path, every=2), plan_of(), WINDOW, 0)
+
+    marks = np.concatenate([sampler(number).has_mask for number in range(12)])
+
+    assert marks.any()
+    assert not marks.all()
+
+
+@pytest.mark.slow
+def test_boxes_only_lower_the_loss_and_leave_the_mask_head_alone(tmp_path: Path) -> None:
+    training, sampler = _training(_boxes(tmp_path), Schedule(16, batch=2, rate=2e-3, warm_up=4))
+    before = _mask_head(training.network)
+
+    losses = [loss for _, loss in training.steps(sampler)]
+
+    assert np.mean(losses[-4:]) < 0.85 * np.mean(losses[:3])
+    assert before
+    for network in (training.network, training.averaged):
+        after = _mask_head(network)
+        assert all(torch.equal(value, after[name]) for name, value in before.items())
+
+
+@pytest.mark.slow
+def test_a_mixed_set_trains_the_mask_head_on_the_objects_with_a_mask(tmp_path: Path) -> None:
+    training, sampler = _training(_boxes(tmp_path, every=2), Schedule(2, batch=4, warm_up=1))
+    before = _mask_head(training.network)
+
+    list(training.steps(sampler))
+
+    after = _mask_head(training.network)
+    assert any(not torch.equal(value, after[name]) for name, value in before.items())
+
+
+def test_precision_of_masks_is_asked_only_of_objects_that_have_one(tmp_path: Path) -> None:
+    path = write_bars(tmp_path, 2)
+    whole = read_coco(path, tmp_path / "images", ("car",))
+    _without_masks(path, every=2)
+    mixed = read_coco(path, tmp_path / "images", ("car",))
+    _without_masks(path)
+    boxes = read_coco(path, tmp_path / "images", ("car",))
+
+    found = []
+    for number, picture in enumerate(whole.pictures):
+        # The masks of what has only a box in the mixed set are all wrong: half of the object.
+        masks = []
+        for k, one in enumerate(picture.objects):
+            mask = mask_of(one, picture.size_px)
+            if k % 2 == 0:
+                mask[:, : int(one.box_px[0] + one.box_px[2]) // 2] = False
+            masks.append(rle.encode(mask, (0, 0), picture.size_px))
+        corners = np.array([one.box_px for one in picture.objects], np.float64)
+        found.append(
+            Detections(
+                number, picture.size_px, corners, np.full(2, 0.9), ("car",) * 2, tuple(masks)
+            )
+        )
+
+    assert average_precisions(whole, found)["mask"] != 100.0
+    mixed_scores = average_precisions(mixed, found)
+    assert mixed_scores["box"] == mixed_scores["mask"] == 100.0
+    box_scores = average_precisions(boxes, found)
+    assert (box_scores["box"], box_scores["mask"], box_scores["mask50"]) == (100.0, None, None)
+
+
+def test_a_network_whose_mask_head_never_learnt_returns_boxes_without_masks() -> None:
+    known = random_checkpoint()
+    facts = Facts(plan=known.facts.plan, has_masks=False)
+    blind = Checkpoint(facts, known.network, "blind")
+    settings = MaskRcnnSettings(score=0.0, proposals=20)
+
+    (masked,) = detector_of(known, settings, CPU)([noise_frame()])
+    (bare,) = detector_of(blind, settings, CPU)([noise_frame()])
+
+    assert isinstance(bare, Detections)
+    assert isinstance(masked, Detections)
+    assert len(bare) == len(masked) > 0
+    assert np.array_equal(bare.boxes_px, masked.boxes_px)
+    assert set(bare.masks) == {b""}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("every", "has_masks", "bare"), [(1, False, 6), (2, True, 3)])
+def test_the_recipe_says_how_many_boxes_had_no_mask(
+    every: int, has_masks: bool, bare: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_bars(tmp_path, 4)
+    _without_masks(path, every)
+    out = tmp_path / "net.safetensors"
+    line = f"train mask-rcnn --data {path} --images {tmp_path}/images -o {out} --classes car"
+    flags = "--steps 1 --batch 1 --check-every 1 --window 96 64 --width 128 --device cpu"
+
+    assert run(f"{line} {flags}".split()) == 0
+
+    printed = capsys.readouterr().out
+    facts = load_checkpoint(out).facts
+    assert (facts.recipe["objects"], facts.recipe["boxes_without_mask"]) == (6, bare)
+    assert facts.has_masks is has_masks
+    assert f"training: 3 pictures, {bare} of 6 objects without a mask" in printed
+    assert ("mask AP" in printed) is has_masks
+
+
+@pytest.mark.slow
+def test_a_mask_head_that_learnt_these_classes_before_keeps_its_masks(tmp_path: Path) -> None:
+    masked = crosscue.MaskRcnnTrainingSettings(
+        data=write_bars(tmp_path / "a", 2),
+        images=tmp_path / "a" / "images",
+        classes=["car"],
+        steps=1,
+        batch=1,
+        width_px=128,
+        window_px=(96, 64),
+        device="cpu",
+    )
+    first = crosscue.train_mask_rcnn(masked, tmp_path / "first.safetensors")
+    bare = write_bars(tmp_path / "b", 2)
+    _without_masks(bare)
+    later = crosscue.MaskRcnnTrainingSettings(
+        data=bare,
+        images=tmp_path / "b" / "images",
+        init=first.path,
+        classes=["car"],
+        steps=1,
+        batch=1,
+        width_px=128,
+        window_px=(96, 64),
+        device="cpu",
+    )
+
+    second = crosscue.train_mask_rcnn(later, tmp_path / "second.safetensors")
+
+    heads = [_mask_head(load_checkpoint(one.path).network) for one in (first, second)]
+    assert second.facts.has_masks
+    assert all(torch.equal(value, heads[1][name]) for name, value in heads[0].items())
+    assert "no masks" in repr(second)
