@@ -316,13 +316,18 @@ if TYPE_CHECKING:
     from crosscue.replay.plugins import PluginWarning as PluginWarning
     from crosscue.replay.vehicle.cue_spec import CueSpec as CueSpec
     from crosscue.replay.vehicle.vehicle import Vehicle as Vehicle
+
+    __version__: str
 else:
 
     def __getattr__(name: str) -> object:
         """Import a public name when it is first asked for."""
-        if name not in _EXPORTS:
+        if name == "__version__":
+            found = import_module("crosscue.replay.versions").installed("crosscue")
+        elif name in _EXPORTS:
+            found = getattr(import_module(f"crosscue.{_EXPORTS[name]}"), name)
+        else:
             raise AttributeError(f"module 'crosscue' has no attribute {name!r}")
-        found = getattr(import_module(f"crosscue.{_EXPORTS[name]}"), name)
         globals()[name] = found
         return found
 

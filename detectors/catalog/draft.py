@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+import tomlkit
 
 from crosscue.detectors.decoders.base import Guess, Interface, static
 from crosscue.replay.errors import UsageError
@@ -154,17 +155,11 @@ def _layout(shape: Sequence[int | str | None]) -> str | None:
 
 def _value(value: object) -> str:
     """A TOML value; long lists over several lines."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, int | float):
-        return repr(value)
     if isinstance(value, tuple | list):
         items = [_value(one) for one in value]
         line = f"[{', '.join(items)}]"
         return line if len(line) < _LINE - 20 else _over_lines(items)
-    raise TypeError(f"no TOML for {value!r}")
+    return tomlkit.item(value).as_string()
 
 
 def _over_lines(items: Sequence[str]) -> str:

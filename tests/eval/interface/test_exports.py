@@ -12,6 +12,7 @@ from typing import Final
 import pytest
 
 import crosscue
+from crosscue.eval import cli
 
 ROOT: Final = Path(__file__).parents[3]
 HEAVY: Final = ("torch", "rerun", "ray", "matplotlib", "numba", "pyarrow", "numpy", "pydantic")
@@ -23,6 +24,15 @@ def test_importing_crosscue_imports_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 
     assert done.stdout.strip() == "[]"
+
+
+def test_the_version_is_the_one_that_the_command_prints(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.run(["--version"]) == 0
+
+    assert capsys.readouterr().out == f"crosscue {crosscue.__version__}\n"
+    assert re.fullmatch(r"\d+\.\d+.*", crosscue.__version__)
 
 
 @pytest.mark.parametrize("name", crosscue.__all__)

@@ -39,6 +39,17 @@ def test_a_misspelt_model_is_answered_with_the_nearest() -> None:
         crosscue.fetch_model("yolox-nanno")
 
 
+@pytest.mark.parametrize(
+    "name", ['a "quoted" one', "back\\slash", "delete\x7f", "tab\t", "Stoppschild ü"]
+)
+def test_a_card_keeps_any_class_name(name: str, tmp_path: Path) -> None:
+    (tmp_path / "net.onnx").write_bytes(bright_box_model())
+
+    drafted = crosscue.draft_card(tmp_path / "net.onnx", class_names=[name], size_px=(96, 64))
+
+    assert crosscue.model(drafted.path).card.output.classes == (name,)
+
+
 def test_a_card_is_drafted_and_checked_without_files_of_names(tmp_path: Path) -> None:
     (tmp_path / "net.onnx").write_bytes(bright_box_model())
 
