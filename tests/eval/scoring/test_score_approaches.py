@@ -18,6 +18,7 @@ from crosscue.eval.scoring.scene.belief import (
     reliability,
     score_belief,
 )
+from crosscue.eval.scoring.scene.detection import Definition
 from crosscue.eval.scoring.scene.ranges import judge_range, score_range
 from support.scoring import (
     BELIEF,
@@ -104,10 +105,11 @@ def test_a_spike_of_one_frame_is_spurious_and_published_by_name() -> None:
     spike = {**BELIEF, "intersection": {4: 0.95, 5: 0.5, 20: 0.95}}
     run = tables(belief=belief_table(spike), ranges=range_table(0, 45))
 
-    for definition, detected_m, spurious_m in (
+    cases: list[tuple[Definition, float, float | None]] = [
         ("confirmed", 20.0, 36.0),
         ("published", 36.0, None),
-    ):
+    ]
+    for definition, detected_m, spurious_m in cases:
         judged = judge_approaches(run, truth(), definition=definition)
         assert judged is not None
         (one,) = judged.results
