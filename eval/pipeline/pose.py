@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.eval.runs.account import Line, line
+from crosscue.eval.runs.manifest import OWN_FRAME
 from crosscue.eval.runs.tables.measurements import (
     gap_rows,
     heading_rows,
@@ -261,9 +262,7 @@ class PoseStage:
             headings = NO_HEADINGS
         elif heading_rad is None:
             heading_rad, sd_rad = 0.0, OWN_FRAME_SD_RAD
-            self.notices.append(
-                "no start heading and no compass: the map's x axis points where the car did"
-            )
+            self.notices.append(OWN_FRAME)
         belief = pose_track.start_belief(
             t_ns,
             start.x_m,

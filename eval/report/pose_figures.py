@@ -23,7 +23,7 @@ ELLIPSES: Final = 12
 
 
 def draw_all(poses: ScoredPoses, folder: Path) -> list[Path]:
-    """Write the four figures as PNG files; their paths come back."""
+    """Write the figures as PNG files; their paths come back. NEES only where it is defined."""
     jobs: dict[str, tuple[Callable[[Axes, ScoredPoses], None], tuple[float, float]]] = {
         "pose_plan.png": (_plan, (7.0, 6.0)),
         "pose_error.png": (_error, (7.0, 3.4)),
@@ -31,6 +31,9 @@ def draw_all(poses: ScoredPoses, folder: Path) -> list[Path]:
         "pose_nees.png": (_nees, (7.0, 3.4)),
         "pose_major_axis.png": (_major_axis, (7.0, 3.4)),
     }
+    if not np.isfinite(poses.nees).any():
+        del jobs["pose_nees.png"]
+        (folder / "pose_nees.png").unlink(missing_ok=True)
     return [_draw(folder / name, paint, poses, size) for name, (paint, size) in jobs.items()]
 
 

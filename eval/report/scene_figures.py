@@ -288,12 +288,11 @@ def draw_range(
     drawing.axes(below, "true range (m)", "mean NEES, 1 is honest")
     drawing.rule(below.left, below.y(1.0), below.right, below.y(1.0), "line dash")
     for name, score in scores.items():
-        middles = {bin_: _middle(bin_) for bin_ in score.by_distance}
-        for bin_, middle in middles.items():
-            if middle is not None and near <= middle <= far:
-                nees = min(score.by_distance[bin_].nees, below.y_range[1])
-                style = "s2" if name == "start" else "s5"
-                drawing.dot(below.x(middle), below.y(nees), 4.0, f"fill {style}", bin_)
+        style = "s2" if name == "start" else "s5"
+        for bin_, part in score.by_distance.items():
+            middle = min(max(_middle(bin_), near), far)
+            hint = f"{bin_} m: {part.nees:.2f}"
+            drawing.dot(below.x(middle), below.y(part.nees), 4.0, f"fill {style}", hint)
     drawing.legend(
         10,
         14,
@@ -324,7 +323,7 @@ def _traces(
 
 def _bins(drawing: Drawing, panel: Panel, score: RangeScore, style: str) -> None:
     known = {_middle(name): one for name, one in score.by_distance.items()}
-    places = sorted(middle for middle in known if middle is not None)
+    places = sorted(known)
     x = np.array(places, np.float64)
     bias: Floats = np.array([known[p].bias_m for p in places])
     rmse: Floats = np.array([known[p].rmse_m for p in places])
@@ -332,15 +331,15 @@ def _bins(drawing: Drawing, panel: Panel, score: RangeScore, style: str) -> None
     drawing.curve(panel, x, bias, f"line {style}")
 
 
-def _middle(name: str) -> float | None:
-    """Of a bin such as ``10-20``; the open ones at both ends have none."""
-    low, dash, high = name.partition("-")
-    return (float(low) + float(high)) / 2.0 if dash else None
+def _middle(name: str) -> float:
+    """Of a bin such as ``10-20``; of ``under 0`` and ``over 120`` the border."""
+    ends = [float(end) for end in name.removeprefix("under ").removeprefix("over ").split("-")]
+    return sum(ends) / len(ends)
 
 
 def _max_nees(scores: Mapping[str, RangeScore]) -> float:
     found = [one.nees for score in scores.values() for one in score.by_distance.values()]
-    return max(2.0, min(10.0, max(found, default=2.0)) * 1.1)
+    return max(2.0, max(found, default=2.0) * 1.1)
 
 
 def draw_reliability(belief: Mapping[str, BeliefScore]) -> Markup:

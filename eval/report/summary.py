@@ -263,7 +263,7 @@ def _pose_row(name: str, errors: Errors) -> str:
 
 
 def _nees_lines(result: PoseScore) -> list[str]:
-    lines = []
+    lines = [f"NEES not computed: {result.why_no_nees}"] if result.why_no_nees else []
     for name, n in (("x, y", result.nees_xy), ("x, y, heading", result.nees_xyh)):
         if math.isnan(n.mean):
             continue

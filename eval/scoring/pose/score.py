@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import OWN_FRAME
 from crosscue.eval.runs.tables.log_time import Gap, comes_twice, gaps_of, table_in_log_time
 from crosscue.localization.angles import wrap_all
 from crosscue.replay.base import Floats, Int64s, SchemaError
@@ -48,6 +49,10 @@ LONGEST_GAP_SHOWN: Final = 0.25
 """A longer gap is drawn as long as this part of the time without gaps."""
 MAX_DIFFERENCE_NS: Final = 100_000_000
 COVARIANCES: Final = ("xx_m2", "xy_m2", "xh_mrad", "yy_m2", "yh_mrad", "hh_rad2")
+PLANE: Final[tuple[Literal[2, 3], ...]] = (2, 3)
+NO_NEES: Final = (
+    "the run's frame is its own: neither start heading nor compass; set [start] heading_rad"
+)
 ALIGNMENTS: Final[tuple[Alignment, ...]] = ("none", "origin", "yaw")
 
 
@@ -68,7 +73,7 @@ class PoseScore:
         distance_m: Way of the true track that was scored.
         ape: By alignment.
         rpe: By distance, such as ``100 m``; distances longer than the drive are left out.
-        nees_xy: Are position errors as large as claimed?
+        nees_xy: Are position errors as large as claimed? NaN where ``why_no_nees``.
         nees_xyh: The same with heading.
         major_axis_m: Full major axis of the 2-sigma ellipse at the end.
         lost_at_m: Distance travelled when it first exceeded the vehicle file's limit, or None.
@@ -82,6 +87,7 @@ class PoseScore:
     nees_xyh: NeesSummary
     major_axis_m: float
     lost_at_m: float | None
+    why_no_nees: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,16 +189,22 @@ def measure(
     estimate, cov = _estimate(table, vehicle, truth)
     flat = planar(track.t_ns, track.xyz_m[:, 0], track.xyz_m[:, 1], heading_rad(track))
     paired = _paired(flat, estimate, cov, comes_twice(run.drive_manifest().timeline, flat.t_ns))
-    values = nees(paired, 3)
+    why_no_nees = NO_NEES if OWN_FRAME in run.drive_manifest().notices else ""
+    # Errors across two frames say nothing of a covariance that holds in one of them.
+    nees_xy, values = (
+        np.full(len(paired.truth), np.nan) if why_no_nees else nees(paired, dimensions)
+        for dimensions in PLANE
+    )
     result = PoseScore(
         coverage=paired.coverage,
         distance_m=_length(paired.truth.xyz_m),
         ape={how: _ape(paired, how) for how in ALIGNMENTS},
         rpe=_rpe(paired, rpe_m),
-        nees_xy=summarise_nees(nees(paired, 2), 2),
+        nees_xy=summarise_nees(nees_xy, 2),
         nees_xyh=summarise_nees(values, 3),
         major_axis_m=float(table["major_axis_m"][-1].as_py()),
         lost_at_m=_lost_at(table, vehicle.lost_above_m),
+        why_no_nees=why_no_nees,
     )
     folder = run.file("score")
     write_tum(folder / "estimate.tum", paired.estimate, "crosscue estimate, planar")

@@ -302,6 +302,22 @@ def test_the_claimed_interval_fits_into_the_chart_of_ranges(tmp_path: Path) -> N
     assert not re.search(r">-20<", draw_range(one.judged.ranges, scores.range))
 
 
+def test_the_chart_of_ranges_keeps_its_worst_bin(tmp_path: Path) -> None:
+    one = _scored(tmp_path / "drive")
+    scores = dict(scores_of([one]).range)
+    bins = dict(scores["start"].by_distance)
+    worst = max(bins)
+    bins |= {worst: replace(bins[worst], nees=73.5), "over 120": replace(bins[worst], nees=41.0)}
+    scores["start"] = replace(scores["start"], by_distance=bins)
+
+    chart = draw_range(one.judged.ranges, scores)
+
+    assert f"{worst} m: 73.50" in chart
+    assert "over 120 m: 41.00" in chart
+    heights = [float(y) for y in re.findall(r'cy="([0-9.]+)"', chart)]
+    assert sorted(heights)[0] < sorted(heights)[1] < sorted(heights)[2]
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6), st.integers(2, 9))
 def test_ticks_are_few_round_and_inside(low: float, width: float, most: int) -> None:

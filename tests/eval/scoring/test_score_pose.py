@@ -17,6 +17,7 @@ from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.recording import save as save_recording
 from crosscue.eval.report.page import write_report
 from crosscue.eval.report.score_runs import score_pose
+from crosscue.eval.report.summary import pose_summary
 from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
@@ -252,3 +253,16 @@ def test_pictures_pass_into_the_recording_as_stored(tmp_path: Path) -> None:
 
     sizes = [(tmp_path / f"{name}.rrd").stat().st_size for name in ("drive", "without")]
     assert edges[-1] <= sizes[0] - sizes[1] < 1.02 * edges[-1] + 20_000
+
+
+def test_no_nees_where_the_runs_frame_is_its_own(tmp_path: Path) -> None:
+    run = _run(tmp_path / "run", Vehicle(version=1))
+    path = _truth(tmp_path / "truth", _circle(np.arange(-1.0, 33.0, 0.05)))
+    result = score_pose(run, path)
+
+    assert np.isnan([result.nees_xy.mean, result.nees_xyh.mean]).all()
+    text = pose_summary(result)
+    assert "NEES not computed: the run's frame is its own" in text
+    assert "NEES of" not in text
+    # What does not need a common frame is still measured.
+    assert result.ape["yaw"].translation_m.max < 1e-2
