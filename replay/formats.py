@@ -85,6 +85,18 @@ FORMATS: Final[dict[str, Format]] = {
         "crosscue.datasets.adapters.kitti:open_drive",
         "KITTI raw drive",
     ),
+    "kitti-odometry": Format(
+        (),
+        ("image_[0-9]/*.png",),
+        "crosscue.datasets.adapters.kitti_odometry:open_sequence",
+        "KITTI odometry sequence",
+    ),
+    "nuscenes": Format(
+        (".nuscenes",),
+        ("v1.0-*/scene.json",),
+        "crosscue.datasets.adapters.nuscenes:open_scene",
+        "nuScenes scene",
+    ),
     "pandaset": Format(
         (),
         ("camera/*/poses.json",),

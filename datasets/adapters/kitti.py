@@ -6,6 +6,10 @@ row) and ``timestamps.txt`` (UTC date-times to the nanosecond). The tracking set
 made from the frame number at 10 Hz, which is reported.
 
 Topics: one per camera folder; from the OXTS box ``oxts/imu``, ``oxts/gnss`` and ``oxts/ins_speed``.
+Intrinsics are those of ``calib/SEQ.txt`` or of ``calib_cam_to_cam.txt`` in the folder of the raw
+drive's day. Labels of the tracking set (``label_02/SEQ.txt``) become objects of the truth; a raw
+drive's tracklets are not read.
+
 All of the box's numbers come from one filter: ``ins_speed`` is no wheel speed, and ``gnss`` is no
 raw fix.
 """
@@ -45,6 +49,8 @@ from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files, pair
 from crosscue.replay.seal.touched import Touched, open_noted
 
+from .kitti_labels import read_labels
+from .kitti_odometry import projection
 from .kitti_oxts import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse
 
 POSE_FILE: Final = "pose.tum"
@@ -162,6 +168,19 @@ class Drive(Closing):
             if part
         )
 
+    def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
+        """Focal length and optical center of a rectified camera; None where not published.
+
+        Raises:
+            LogFormatError: The file is damaged.
+        """
+        single = self._oxts.single if self._oxts is not None else None
+        if single is not None:
+            file = self.path / "calib" / single.name
+        else:
+            file = self.path.resolve().parent / "calib_cam_to_cam.txt"
+        return projection(file, str(int(camera.rpartition("_")[2])))
+
     def report_missing(self, ledger: Ledger) -> None:
         """Files without a time, times without a file; see ``KnowsItsEnd``."""
         for loss in self._unreadable:
@@ -207,6 +226,7 @@ def write_truth(path: Path, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     note = "KITTI OXTS: the GNSS/INS box in a local frame, x east, y north, z up"
     write_tum(folder / POSE_FILE, Trajectory(packets.t_ns, xyz_m, packets.attitude_wxyz()), note)
+    objects, lost = _objects(path, oxts, folder)
     truth = Truth(
         version=1,
         log=path.resolve().name,
@@ -218,9 +238,21 @@ def write_truth(path: Path, folder: Path) -> Path:
         source=(
             "KITTI: OXTS RT3003 GNSS/INS; the box's own position, taken for the rear axle; "
             f"it claims {float(np.median(packets['pos_accuracy'])):.2g} m"
+            + (f"; {lost} damaged labels are left out" if lost else "")
         ),
+        objects=objects,
     )
     return save(truth, folder)
+
+
+def _objects(path: Path, oxts: Oxts | None, folder: Path) -> tuple[str | None, int]:
+    """Labels of a tracking sequence, as a file beside the truth; and how many were damaged."""
+    single = oxts.single if oxts is not None else None
+    if single is None or not (path / "label_02" / single.name).is_file():
+        return None, 0
+    pictures = path / "image_02" / single.stem
+    found = read_labels(path / "label_02" / single.name, pictures, TRACKING_PERIOD_NS)
+    return found.objects.save(folder, "KITTI tracking (CC BY-NC-SA 3.0): label_02"), found.lost
 
 
 def _open_raw(path: Path, limits: Limits) -> Drive:

@@ -26,8 +26,6 @@ from crosscue.datasets.truth.tum import Trajectory, write_tum
 from crosscue.replay.base import (
     EVERYTHING,
     MIB,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
     Block,
     Closing,
     Floats,
@@ -42,13 +40,14 @@ from crosscue.replay.base import (
     read_at_most,
 )
 from crosscue.replay.readers.images.files import SUFFIXES, PictureFiles
-from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files
+from crosscue.replay.readers.timed_files import TimedFiles, list_files
 from crosscue.replay.seal.touched import Touched
+
+from .held_rows import HeldRows
 
 POSE_FILE: Final = "pose.tum"
 MAX_FILE_BYTES: Final = 64 * MIB
 FRONT: Final = "front_camera"
-NO_PARTNER: Final = "a row without its time, or a time without its row"
 _GNSS: Final = {
     "lat": "latitude_deg",
     "long": "longitude_deg",
@@ -96,29 +95,6 @@ class Poses:
         return Table({"speed_x_mps": self.speed_mps(), "yaw_rate_radps": yaw_rate})
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
-    """A stream of numbers held in memory: a sequence has some hundred rows."""
-
-    topic: Topic
-    t_ns: Int64s
-    table: Table
-
-    def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
-        name, n = self.topic.name, len(self.t_ns)
-        ledger.declare(name, self.topic.declared)
-        ledger.find(name, n)
-        if not selection.wants(name):
-            ledger.skip(name, NOT_ASKED_TOPIC, n)
-        else:
-            wanted = is_inside(self.t_ns, selection)
-            ledger.skip(name, NOT_ASKED_TIME, n - int(wanted.sum()))
-            if wanted.any():
-                yield Block(name, self.t_ns, self.table).take(wanted)
-        if selection.start_ns is None and selection.end_ns is None:
-            ledger.settle(name, NO_PARTNER)
-
-
 class Drive(Closing):
     """One sequence as a ``Log``."""
 
@@ -128,7 +104,7 @@ class Drive(Closing):
         self,
         path: Path,
         cameras: Sequence[PictureFiles],
-        rows: Sequence[_Rows],
+        rows: Sequence[HeldRows],
         unreadable: Sequence[tuple[str, str, int | None, str]],
         limits: Limits,
         touched: Touched,
@@ -184,8 +160,7 @@ class Drive(Closing):
         for camera in self._cameras:
             camera.report_missing(ledger)
         for rows in self._rows:
-            missing = (rows.topic.declared or 0) - len(rows.t_ns)
-            ledger.drop(rows.topic.name, NO_PARTNER, missing)
+            rows.report_missing(ledger)
 
     def close(self) -> None:
         """Nothing is held open."""
@@ -290,15 +265,15 @@ def write_truth(path: Path, folder: Path) -> Path:
     return save(truth, folder)
 
 
-def _odometry(path: Path) -> _Rows | None:
+def _odometry(path: Path) -> HeldRows | None:
     if not (path / "camera" / FRONT / "poses.json").is_file():
         return None
     poses = read_poses(path)
     topic = Topic("odometry", "nav_msgs/msg/Odometry", "columns", declared=poses.declared)
-    return _Rows(topic, poses.t_ns, poses.odometry())
+    return HeldRows(topic, poses.t_ns, poses.odometry())
 
 
-def _gnss(path: Path) -> _Rows | None:
+def _gnss(path: Path) -> HeldRows | None:
     file = path / "meta" / "gps.json"
     if not file.is_file():
         return None
@@ -314,7 +289,7 @@ def _gnss(path: Path) -> _Rows | None:
         ) from None
     n, declared = len(columns["latitude_deg"]), max(len(t_ns), len(rows))
     topic = Topic("gnss", "sensor_msgs/msg/NavSatFix", "columns", declared=declared)
-    return _Rows(topic, t_ns[:n], Table(columns))
+    return HeldRows(topic, t_ns[:n], Table(columns))
 
 
 def _timed(paths: Sequence[Path], t_ns: Int64s) -> TimedFiles:

@@ -33,6 +33,8 @@ MAX_BYTES: Final = 256 * MIB
 CARRIED: Final[dict[str, str]] = {
     "comma2k19": "crosscue.datasets.adapters.comma2k19_truth:write",
     "kitti-raw": "crosscue.datasets.adapters.kitti:write_truth",
+    "kitti-odometry": "crosscue.datasets.adapters.kitti_odometry:write_truth",
+    "nuscenes": "crosscue.datasets.adapters.nuscenes_truth:write",
     "pandaset": "crosscue.datasets.adapters.pandaset:write_truth",
 }
 """From a format of ``crosscue.replay.formats.FORMATS`` to the function that writes its truth."""

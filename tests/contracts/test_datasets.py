@@ -12,6 +12,8 @@ import pytest
 from crosscue.datasets.truth.truth import CARRIED
 from crosscue.testing import check_dataset
 from support.kitti_drive import raw_drive
+from support.kitti_odometry_drive import kitti_odometry_drive
+from support.nuscenes_drive import nuscenes_drive
 from support.pandaset_drive import pandaset_drive
 
 
@@ -38,6 +40,8 @@ def _comma(path: Path) -> Path:
 DRIVES: Final[dict[str, Callable[[Path], Path]]] = {
     "comma2k19": _comma,
     "kitti-raw": raw_drive,
+    "kitti-odometry": kitti_odometry_drive,
+    "nuscenes": nuscenes_drive,
     "pandaset": pandaset_drive,
 }
 """By format: writes a small drive."""

@@ -179,6 +179,15 @@ def _images(folder: Path) -> Path:
     return log
 
 
+def _without_a_picture(name: str) -> Callable[[Path], Path]:
+    def made(folder: Path) -> Path:
+        log = EVERY_FORMAT[name](folder)
+        sorted(log.rglob("*.png"))[7].unlink()
+        return log
+
+    return made
+
+
 def _pandaset(folder: Path) -> Path:
     log = EVERY_FORMAT["pandaset"](folder)
     fixes = json.loads((log / "meta" / "gps.json").read_text())
@@ -196,6 +205,8 @@ ONE_TAKEN_OUT: Final[dict[str, Callable[[Path], Path]]] = {
     "mf4": _mf4,
     "comma2k19": _comma2k19,
     "kitti-raw": _kitti,
+    "kitti-odometry": _without_a_picture("kitti-odometry"),
+    "nuscenes": _without_a_picture("nuscenes"),
     "pandaset": _pandaset,
     "video": _video,
     "images": _images,

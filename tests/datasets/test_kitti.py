@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 from crosscue.datasets.adapters.kitti import TOPICS, open_drive, write_truth
 from crosscue.datasets.adapters.kitti_oxts import COLUMNS, Packets, parse
+from crosscue.datasets.truth.coco import read_coco
+from crosscue.datasets.truth.truth import load as load_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.eval.cli import run
 from crosscue.replay.base import (
@@ -28,6 +30,7 @@ from crosscue.replay.base import (
     Table,
 )
 from crosscue.replay.logs.opening import open_log
+from crosscue.replay.vehicle.drafting.camera import KnowsItsCameras
 from crosscue.replay.vehicle.roles import Role, role_of
 from support.data import shared
 from support.kitti_drive import (
@@ -321,3 +324,39 @@ def test_the_real_sequence_turns_74_degrees_and_its_speeds_fit_its_positions(
     course = np.arctan2(steps_m[:, 1], steps_m[:, 0])
     off = np.angle(np.exp(1j * (course - heading[1:])))[moving]
     assert np.degrees(np.abs(np.median(off))) < 1.0
+
+
+def test_labels_of_the_tracking_set_are_objects_of_its_truth(tmp_path: Path) -> None:
+    drive = tracking_drive(tmp_path / "drive")
+    (drive / "label_02").mkdir()
+    (drive / "label_02" / "0003.txt").write_text(
+        "0 -1 DontCare -1 -1 -10 5 5 9 9 -1000 -1000 -1000 -10 -1 -1 -1\n"
+        "2 7 Van 0 1 -1.5 10 2 20.5 14 1.5 1.7 4.2 3.0 1.6 20.0 -1.5\n"
+        "2 7 Van 0 ? -1.5 10\n"
+    )
+
+    truth = load_truth(write_truth(drive, tmp_path / "truth"))
+
+    assert truth.objects is not None
+    assert "1 damaged labels" in truth.source
+    first, second = read_coco(tmp_path / "truth" / truth.objects).pictures
+    assert (first.t_ns, second.t_ns) == (0, 200_000_000)
+    assert all(thing.is_crowd for thing in first.things)
+    (van,) = second.things
+    assert (van.label, van.track, van.visible) == ("car", 7, 0.7)
+    assert van.box_px == (10.0, 2.0, 20.5, 14.0)
+
+
+def test_intrinsics_are_those_of_the_rectified_camera(tmp_path: Path) -> None:
+    drive = tracking_drive(tmp_path / "drive")
+    (drive / "calib").mkdir()
+    line = "721.5 0 609.6 44.9 0 721.5 172.9 0.2 0 0 1 0.003\n"
+    (drive / "calib" / "0003.txt").write_text(f"P1: {line.replace('721.5', '1')}P2: {line}")
+    raw = raw_drive(tmp_path / "day" / "raw")
+    (tmp_path / "day" / "calib_cam_to_cam.txt").write_text(f"calib_time: x\nP_rect_02: {line}")
+
+    for path in (drive, raw):
+        with open_log(path) as log:
+            assert isinstance(log, KnowsItsCameras)
+            assert log.intrinsics("image_02") == (721.5, 609.6, 172.9)
+            assert log.intrinsics("image_03") is None

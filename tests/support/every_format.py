@@ -13,6 +13,8 @@ import numpy as np
 
 from support.can_files import Sent, asc, blf, candump, made, trc
 from support.kitti_drive import raw_drive
+from support.kitti_odometry_drive import kitti_odometry_drive
+from support.nuscenes_drive import nuscenes_drive
 from support.pandaset_drive import pandaset_drive
 from support.pictures import picture_folder
 from support.rosbag_files import rows_of, write_bag, write_folder
@@ -84,6 +86,8 @@ EVERY_FORMAT: Final[dict[str, Callable[[Path], Path]]] = {
     "mf4": lambda folder: _mf4(folder / "can.mf4", made(FRAMES)),
     "comma2k19": lambda folder: _comma2k19(folder / "segment"),
     "kitti-raw": lambda folder: raw_drive(folder / "drive"),
+    "kitti-odometry": kitti_odometry_drive,
+    "nuscenes": lambda folder: nuscenes_drive(folder / "root"),
     "pandaset": lambda folder: pandaset_drive(folder / "002"),
     "video": _video,
     "images": lambda folder: picture_folder(folder / "front", 12, "rate_hz: 10\n"),

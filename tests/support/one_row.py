@@ -41,6 +41,12 @@ def _cut_jpeg(folder: Path) -> None:
     whole.write_bytes(whole.read_bytes()[:-20])
 
 
+def _cut_png(folder: Path) -> None:
+    pictures = sorted(folder.rglob("*.png"))
+    whole = pictures[len(pictures) // 2]
+    whole.write_bytes(whole.read_bytes()[:-20])
+
+
 def _null_payload(path: Path) -> None:
     """One row whose payload is gone."""
     file = path if path.is_file() else next(path.glob("*.db3"))
@@ -110,6 +116,8 @@ ONE_ROW: Final[dict[str, tuple[Callable[[Path], Path], Callable[[Path], None]]]]
     "rosbag2-sqlite3": (EVERY_FORMAT["rosbag2-sqlite3"], _null_payload),
     "rosbag2": (EVERY_FORMAT["rosbag2"], _null_payload),
     "images": (EVERY_FORMAT["images"], _garbled_picture),
+    "kitti-odometry": (EVERY_FORMAT["kitti-odometry"], _cut_png),
+    "nuscenes": (EVERY_FORMAT["nuscenes"], _cut_png),
     "pandaset": (EVERY_FORMAT["pandaset"], _cut_jpeg),
 }
 """By format: writes a log, and damages one row of it."""

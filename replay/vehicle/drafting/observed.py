@@ -230,13 +230,17 @@ _YAW_COLUMNS: Final = ("gyro_z_radps", "yaw_rate_radps")
 _SPEED_COLUMNS: Final = ("speed_x_mps", "rear_left_mps")
 _COLUMNS: Final[dict[Role, tuple[str, ...]]] = {
     Role.GNSS: (
-        "speed_mps", "course_rad", "velocity_east_mps", "velocity_north_mps",
-        "latitude_deg", "longitude_deg",
+        "speed_mps",
+        "course_rad",
+        "velocity_east_mps",
+        "velocity_north_mps",
+        "latitude_deg",
+        "longitude_deg",
     ),
     Role.IMU: _YAW_COLUMNS,
     Role.ODOMETRY: ("speed_x_mps", *_YAW_COLUMNS),
     Role.WHEELS: _SPEED_COLUMNS,
-}  # fmt: skip
+}
 
 
 def _series(

@@ -1,0 +1,103 @@
+"""KITTI tracking's labels of one sequence, ``label_02/SEQ.txt``: boxes in the left colour camera.
+
+A line has frame, track, class, truncation, occlusion, observation angle, the box's left, top, right
+and bottom in pixels, the cuboid's height, width and length, its place right, down and ahead of the
+camera, and its rotation. Lines of class DontCare mark parts of a picture that were not labelled.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from crosscue.datasets.truth.objects import Objects
+from crosscue.replay.base import MIB, LogFormatError, read_at_most
+from crosscue.replay.files.image_header import size_in_header
+
+MAX_FILE_BYTES: Final = 64 * MIB
+HEADER_BYTES: Final = 4096
+LABELS: Final = {
+    "Car": "car",
+    "Van": "car",
+    "Truck": "truck",
+    "Tram": "train",
+    "Pedestrian": "person",
+    "Person": "person",
+    "Person_sitting": "person",
+    "Cyclist": "cyclist",
+}
+"""From the set's classes to COCO's names; a cyclist's box holds person and bicycle."""
+UNLABELLED: Final = ("car", "person")
+"""Where nothing was labelled, neither of these is missed nor false."""
+VISIBLE: Final = {0: 1.0, 1: 0.7, 2: 0.3}
+"""From the set's degrees of occlusion: none, partly, largely."""
+
+
+class Labelled(NamedTuple):
+    """Objects of a sequence, and how many lines were damaged."""
+
+    objects: Objects
+    lost: int
+
+
+def read_labels(file: Path, pictures: Path, period_ns: int) -> Labelled:
+    """The labels of a sequence, frame by frame.
+
+    Args:
+        file: Of the labels.
+        pictures: Folder of the sequence's pictures, for their size.
+        period_ns: Time from one frame to the next; frame 0 is at 0.
+
+    Raises:
+        LogFormatError: It cannot be read, or no picture shows the size.
+    """
+    content = read_at_most(file, MAX_FILE_BYTES)
+    if content is None:
+        raise LogFormatError(f"{file}: over {MAX_FILE_BYTES // MIB} MiB; not read")
+    size_px = _size_px(pictures)
+    by_frame: dict[int, list[tuple[str, int, list[float]]]] = {}
+    lost = 0
+    for line in content.decode("utf-8", errors="replace").splitlines():
+        parts = line.split()
+        try:
+            frame, track, numbers = (
+                int(parts[0]),
+                int(parts[1]),
+                [float(one) for one in parts[3:17]],
+            )
+        except (ValueError, IndexError):
+            lost += 1
+            continue
+        if len(numbers) != 14 or frame < 0 or not np.isfinite(numbers).all():
+            lost += 1
+            continue
+        by_frame.setdefault(frame, []).append((parts[2], track, numbers))
+    objects = Objects()
+    for frame in sorted(by_frame):
+        objects.add_picture(frame * period_ns, f"{frame:06d}.png", size_px)
+        for name, track, numbers in by_frame[frame]:
+            x0, y0, x1, y1 = numbers[3:7]
+            if name == "DontCare":
+                for label in UNLABELLED:
+                    objects.add(label, (x0, y0, x1, y1), iscrowd=1)
+                continue
+            objects.add(
+                LABELS.get(name, name.lower()),
+                (x0, y0, x1, y1),
+                track_id=track,
+                visible=VISIBLE.get(int(numbers[1])),
+                x_m=round(numbers[12], 3),
+                y_m=round(-numbers[10], 3),
+            )
+    return Labelled(objects, lost)
+
+
+def _size_px(pictures: Path) -> tuple[int, int]:
+    for picture in sorted(pictures.glob("*.png")):
+        with picture.open("rb") as file:
+            size = size_in_header(file.read(HEADER_BYTES), "png")
+        if size is not None:
+            return size
+    raise LogFormatError(f"{pictures}: no picture; the labels need the size of one")

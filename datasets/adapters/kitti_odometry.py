@@ -1,0 +1,298 @@
+"""KITTI odometry: one sequence in its published folder layout as a log; its truth from the poses.
+
+``sequences/NN/`` holds ``image_0`` to ``image_3`` (``NNNNNN.png``), ``times.txt`` (seconds from the
+first picture, one line each) and ``calib.txt`` (projection matrices P0 to P3 of the rectified
+cameras); ``poses/NN.txt``, for sequences 00 to 10, one line of twelve numbers a picture: the upper
+rows of the matrix that turns points of the left grey camera (image_0: x right, y down, z ahead)
+into that camera's axes at the first picture. The scans in ``velodyne`` are not read.
+
+Topics: one per camera folder and, where poses exist, ``odometry``: forward speed and yaw rate by
+the poses, so it is as good as the truth and no wheel speed.
+
+The truth is the left grey camera's track. Its map has the first picture's axes as REP-103 has them:
+x ahead (their z), y left (their -x), z up (their -y).
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from crosscue.datasets.truth.truth import Truth, save
+from crosscue.datasets.truth.tum import Trajectory, write_tum
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    EVERYTHING,
+    MIB,
+    Block,
+    Closing,
+    Floats,
+    Int64s,
+    Ledger,
+    Limits,
+    LogFormatError,
+    Selection,
+    Table,
+    Topic,
+    read_at_most,
+)
+from crosscue.replay.readers.images.files import SUFFIXES, PictureFiles
+from crosscue.replay.readers.time_file import read_time_file
+from crosscue.replay.readers.timed_files import TimedFiles, list_files
+from crosscue.replay.seal.touched import Touched
+
+from .held_rows import HeldRows, Loss
+
+POSE_FILE: Final = "pose.tum"
+MAX_FILE_BYTES: Final = 64 * MIB
+AXES: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""From right, down, ahead to ahead, left, up."""
+
+
+class Poses(NamedTuple):
+    """The left grey camera's track.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        xyz_m: Shape (N, 3): ahead, left, up of the first picture.
+        turn: N rotations from ahead, left, up of the camera into those axes.
+        losses: Lines that could not be understood.
+        declared: How many there are times or poses for, whichever are more.
+    """
+
+    t_ns: Int64s
+    xyz_m: Floats
+    turn: Rotation
+    losses: tuple[Loss, ...]
+    declared: int
+
+    def odometry(self) -> Table:
+        """Forward speed and yaw rate, by differences between neighbours."""
+        seconds = (self.t_ns - self.t_ns[0]) * 1e-9
+        ahead = self.turn.apply((1.0, 0.0, 0.0))
+        velocity = np.gradient(self.xyz_m, seconds, axis=0)
+        heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+        return Table(
+            {
+                "speed_x_mps": np.asarray((velocity * ahead).sum(axis=1), np.float64),
+                "yaw_rate_radps": np.gradient(heading, seconds),
+            }
+        )
+
+
+class Drive(Closing):
+    """One sequence as a ``Log``."""
+
+    format: Final = "kitti-odometry"
+
+    def __init__(
+        self,
+        path: Path,
+        cameras: Sequence[PictureFiles],
+        odometry: HeldRows | None,
+        unreadable: Sequence[tuple[str, str, int | None, str]],
+        limits: Limits,
+        touched: Touched,
+    ) -> None:
+        """Put a sequence together; ``unreadable`` holds arguments for ``Ledger.drop``."""
+        self.path: Final = path
+        self.touched: Final = touched
+        self._cameras: Final = tuple(cameras)
+        self._odometry: Final = odometry
+        self._unreadable: Final = tuple(unreadable)
+        self._limits: Final = limits
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """Cameras, then odometry."""
+        cameras = tuple(camera.topic for camera in self._cameras)
+        return cameras if self._odometry is None else (*cameras, self._odometry.topic)
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """All streams side by side, in order of each block's first time; see ``Log.read``."""
+        for loss in self._unreadable:
+            ledger.drop(*loss)
+        if (self.path / "velodyne").is_dir():
+            ledger.notice("velodyne: laser scans are not read")
+        streams = [camera.read(ledger, selection, self._limits) for camera in self._cameras]
+        if self._odometry is not None:
+            ledger.notice("odometry: made of the true poses; a pose estimated from it is no result")
+            streams.append(self._odometry.read(ledger, selection))
+        yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
+
+    def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
+        """Focal length and optical center of a rectified camera; None where not published.
+
+        Raises:
+            LogFormatError: The file is damaged.
+        """
+        return projection(self.path / "calib.txt", camera.rpartition("_")[2].lstrip("0") or "0")
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """Pictures without a time, times without a picture; see ``KnowsItsEnd``."""
+        for loss in self._unreadable:
+            ledger.drop(*loss)
+        for camera in self._cameras:
+            camera.report_missing(ledger)
+        if self._odometry is not None:
+            self._odometry.report_missing(ledger)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def projection(file: Path, camera: str) -> tuple[float, float, float] | None:
+    """Focal length and optical center, px, of a rectified camera in a calibration file.
+
+    Args:
+        file: ``calib.txt`` of the odometry set, a sequence's of the tracking set, or
+            ``calib_cam_to_cam.txt`` of a raw drive's day.
+        camera: Its number.
+
+    Raises:
+        LogFormatError: Its line does not hold twelve numbers.
+    """
+    if not file.is_file():
+        return None
+    for line in _lines(file):
+        name, _, rest = line.partition(" ")
+        if name.rstrip(":") in (f"P{camera}", f"P_rect_0{camera}"):
+            numbers = _numbers(rest)
+            if numbers is None or numbers[0] <= 0.0:
+                raise LogFormatError(f"{file}: P{camera}: expected twelve numbers; copy it again")
+            return float(numbers[0]), float(numbers[2]), float(numbers[6])
+    return None
+
+
+def open_sequence(path: Path, limits: Limits) -> Drive:
+    """Open a sequence's folder; see ``crosscue.replay.formats.FORMATS``.
+
+    Raises:
+        LogFormatError: No times, or no camera.
+    """
+    touched = Touched()
+    times_file = path / "times.txt"
+    if not times_file.is_file():
+        raise LogFormatError(f"{times_file}: not there; a KITTI odometry sequence has one")
+    times = read_time_file(times_file, limits)
+    touched.add(times_file, 0, times_file.stat().st_size)
+    cameras = []
+    for folder in sorted(path.glob("image_[0-9]")):
+        paths = list_files(folder, SUFFIXES)
+        if paths:
+            files = _timed(paths, times.t_ns)
+            topic = Topic(folder.name, "crosscue/Images", "columns", declared=files.declared)
+            cameras.append(PictureFiles(topic, files, touched))
+    if not cameras:
+        raise LogFormatError(f"{path}: no image_N with pictures; expected a KITTI sequence")
+    unreadable: list[tuple[str, str, int | None, str]] = []
+    odometry = None
+    if (file := pose_file(path)) is not None:
+        touched.add(file, 0, file.stat().st_size)
+        try:
+            poses = read_poses(path, limits)
+            topic = Topic("odometry", "nav_msgs/msg/Odometry", "columns", declared=poses.declared)
+            odometry = HeldRows(topic, poses.t_ns, poses.odometry(), poses.losses)
+        except LogFormatError as error:
+            unreadable.append(("odometry", "file cannot be read", None, str(error)))
+    return Drive(path, cameras, odometry, unreadable, limits, touched)
+
+
+def pose_file(path: Path) -> Path | None:
+    """``poses/NN.txt`` beside ``sequences``, or ``poses.txt`` in the sequence; None for neither."""
+    here = path.resolve()
+    for file in (here.parent.parent / "poses" / f"{here.name}.txt", here / "poses.txt"):
+        if file.is_file():
+            return file
+    return None
+
+
+def read_poses(path: Path, limits: Limits = DEFAULT_LIMITS) -> Poses:
+    """The poses of a sequence.
+
+    Raises:
+        LogFormatError: There are none, or fewer than two that can be understood.
+    """
+    file = pose_file(path)
+    if file is None:
+        raise LogFormatError(
+            f"{path}: no poses; expected ../../poses/{path.resolve().name}.txt, which the set "
+            "publishes for sequences 00 to 10"
+        )
+    times = read_time_file(path / "times.txt", limits).t_ns
+    found = [_numbers(line) for line in _lines(file)]
+    n = min(len(found), len(times))
+    good = np.array([one is not None for one in found[:n]], np.bool_)
+    bad = [f"line {i + 1}" for i, one in enumerate(found) if one is None]
+    losses = (Loss("a pose that is no matrix", len(bad), ", ".join(bad[:8])),) if bad else ()
+    matrices = np.array([one for one in found[:n] if one is not None]).reshape(-1, 3, 4)
+    t_ns = times[:n][good]
+    if len(matrices) < 2 or not (np.diff(t_ns) > 0).all():
+        raise LogFormatError(
+            f"{file}: {len(matrices)} poses in order of time; expected two or more"
+        )
+    turn = Rotation.from_matrix(AXES @ matrices[:, :, :3] @ AXES.T)
+    declared = max(len(times), len(found))
+    return Poses(t_ns, matrices[:, :, 3] @ AXES.T, turn, losses, declared)
+
+
+def write_truth(path: Path, folder: Path) -> Path:
+    """Write the left grey camera's track.
+
+    Raises:
+        LogFormatError: The sequence has no poses.
+        OutputError: It cannot be written.
+    """
+    poses = read_poses(path)
+    note = "KITTI odometry: the left grey camera; x ahead, y left, z up of the first picture"
+    folder.mkdir(parents=True, exist_ok=True)
+    wxyz = poses.turn.as_quat()[:, [3, 0, 1, 2]]
+    write_tum(folder / POSE_FILE, Trajectory(poses.t_ns, poses.xyz_m, wxyz), note)
+    truth = Truth(
+        version=1,
+        log=path.resolve().name,
+        start_ns=int(poses.t_ns[0]),
+        end_ns=int(poses.t_ns[-1]) + 1,
+        pose=POSE_FILE,
+        pose_point="camera",
+        source=(
+            "KITTI odometry (CC BY-NC-SA 3.0): published poses of the left grey camera, image_0; "
+            "other cameras sit beside it by -P[0, 3] / P[0, 0] of calib.txt, in metres to its right"
+        ),
+    )
+    return save(truth, folder)
+
+
+def _timed(paths: Sequence[Path], t_ns: Int64s) -> TimedFiles:
+    """Picture ``NNNNNN`` has the time at place NNNNNN."""
+    numbered = [p.stem.isascii() and p.stem.isdecimal() and len(p.stem) < 10 for p in paths]
+    places = np.array(
+        [int(p.stem) if is_so else -1 for p, is_so in zip(paths, numbered, strict=True)], np.int64
+    )
+    is_timed = (places >= 0) & (places < len(t_ns))
+    found = np.full(len(paths), -1, np.int64)
+    found[is_timed] = t_ns[places[is_timed]]
+    is_missing = np.ones(len(t_ns), np.bool_)
+    is_missing[places[is_timed]] = False
+    return TimedFiles(tuple(paths), found, t_ns[is_missing], len(t_ns), ())
+
+
+def _lines(file: Path) -> list[str]:
+    content = read_at_most(file, MAX_FILE_BYTES)
+    if content is None:
+        raise LogFormatError(f"{file}: over {MAX_FILE_BYTES // MIB} MiB; not read")
+    return content.decode("utf-8", errors="replace").splitlines()
+
+
+def _numbers(text: str) -> Floats | None:
+    """Twelve finite numbers, or None."""
+    try:
+        numbers = np.array([float(part) for part in text.split()], np.float64)
+    except ValueError:
+        return None
+    return numbers if len(numbers) == 12 and np.isfinite(numbers).all() else None

@@ -1,0 +1,552 @@
+"""nuScenes, with its CAN bus expansion: one scene as a log.
+
+A scene is named by an empty file beside the tables' folder, ``scene-0061.nuscenes``; the folder
+itself (``DATAROOT`` with ``v1.0-.../*.json``) stands for its scene where it holds only one. Tables
+are those of the published schema, read row by row; the CAN expansion is ``can_bus/NAME_*.json``.
+
+Topics: one per camera (key frames and sweeps); ``can/wheel_speed`` (zoe_veh_info, rpm of a wheel
+of 0.305 m); ``can/steering`` (steeranglefeedback, positive to the right as published, to the left
+here); ``can/imu`` (ms_imu); ``can/vehicle_monitor``; ``can/zoesensors``; ``can/pose``. Without
+wheel speeds of the CAN expansion ``odometry`` is made of the ego poses, which are the truth. Laser
+and radar are not read.
+
+The ego frame's origin is the middle of the rear axle, x ahead, y left, as here. The layout is that
+of the published schema; no drive of the set was at hand when this was written.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from crosscue.replay.base import (
+    EVERYTHING,
+    Block,
+    Closing,
+    Floats,
+    Int64s,
+    Ledger,
+    Limits,
+    LogFormatError,
+    Selection,
+    Table,
+    Topic,
+)
+from crosscue.replay.readers.images.files import PictureFiles
+from crosscue.replay.readers.timed_files import TimedFiles
+from crosscue.replay.seal.touched import Touched
+
+from .held_rows import HeldRows, Loss
+from .nuscenes_tables import Row, RowsOf, checked, whole_table
+
+WHEEL_RADIUS_M: Final = 0.305
+"""Of the Renault Zoe, as the set's own tutorial has it."""
+RPM_TO_MPS: Final = WHEEL_RADIUS_M * 2.0 * math.pi / 60.0
+DAMAGED_ROW: Final = "a row that is not understood"
+FRONT: Final = "CAM_FRONT"
+
+
+class Scene(NamedTuple):
+    """Which scene, and where its tables are.
+
+    Attributes:
+        name: ``scene-0061``.
+        token: Of its row.
+        root: The folder that ``filename`` in tables is relative to.
+        tables: The folder of the tables.
+    """
+
+    name: str
+    token: str
+    root: Path
+    tables: Path
+
+
+def find_scene(path: Path) -> Scene:
+    """The scene that a path names.
+
+    Raises:
+        LogFormatError: No such scene, or several and none named.
+    """
+    root = path if path.is_dir() else path.parent
+    folders = sorted(file.parent for file in root.glob("v1.0-*/scene.json"))
+    if not folders:
+        raise LogFormatError(f"{root}: no v1.0-.../scene.json; expected nuScenes' tables there")
+    scenes = {
+        str(row["name"]): Scene(str(row["name"]), token, root, folder)
+        for folder in folders
+        for token, row in whole_table(folder / "scene.json").items()
+    }
+    if not path.is_dir():
+        if path.stem not in scenes:
+            raise LogFormatError(f"{path}: no scene {path.stem!r} in the tables; {_some(scenes)}")
+        return scenes[path.stem]
+    if len(scenes) != 1:
+        raise LogFormatError(
+            f"{path}: {len(scenes)} scenes; name one by an empty file: touch "
+            f"{path / (next(iter(scenes)) + '.nuscenes')}; {_some(scenes)}"
+        )
+    return next(iter(scenes.values()))
+
+
+def _some(scenes: dict[str, Scene]) -> str:
+    names = sorted(scenes)
+    return f"there are: {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneTables:
+    """What the tables say of one scene's cameras.
+
+    Attributes:
+        scene: The scene.
+        samples: Times of its samples in ns, by token.
+        pictures: Rows of ``sample_data`` of cameras, by channel, in order of time.
+        calibrated: ``calibrated_sensor`` rows, by token.
+        losses: What was damaged.
+        files: The tables read.
+    """
+
+    scene: Scene
+    samples: dict[str, int]
+    pictures: dict[str, list[Row]]
+    calibrated: dict[str, Row]
+    losses: tuple[tuple[str, str, int | None, str], ...]
+    files: tuple[Path, ...]
+
+    def calibration(self, channel: str) -> Row | None:
+        """Of a camera in this scene."""
+        rows = self.pictures.get(channel)
+        return self.calibrated.get(str(rows[0]["calibrated_sensor_token"])) if rows else None
+
+
+def read_tables(scene: Scene) -> SceneTables:
+    """Read the rows of one scene.
+
+    Raises:
+        LogFormatError: A table is missing, or one that all rows lean on is damaged.
+    """
+    folder = scene.tables
+    sensors = whole_table(folder / "sensor.json")
+    calibrated = whole_table(folder / "calibrated_sensor.json")
+    channels = {
+        token: str(sensor["channel"])
+        for token, row in calibrated.items()
+        if (sensor := sensors.get(str(row.get("sensor_token")))) is not None
+        and sensor.get("modality") == "camera"
+    }
+    samples_table = RowsOf(checked(folder / "sample.json"))
+    samples = {
+        str(row["token"]): int(row["timestamp"]) * 1000
+        for row in samples_table
+        if row.get("scene_token") == scene.token and _has(row, "token", "timestamp")
+    }
+    data_table = RowsOf(checked(folder / "sample_data.json"))
+    pictures: dict[str, list[Row]] = {}
+    for row in data_table:
+        channel = channels.get(str(row.get("calibrated_sensor_token")))
+        if channel is None or row.get("sample_token") not in samples:
+            continue
+        if _has(row, "timestamp", "filename", "token", "ego_pose_token"):
+            pictures.setdefault(channel, []).append(row)
+        else:
+            data_table.damaged += 1
+            data_table.first_damage = data_table.first_damage or str(row.get("token"))
+    for rows in pictures.values():
+        rows.sort(key=lambda row: int(row["timestamp"]))
+    losses: list[tuple[str, str, int | None, str]] = [
+        ("", f"{DAMAGED_ROW} of {table.path.name}", table.damaged, table.first_damage)
+        for table in (samples_table, data_table)
+        if table.damaged
+    ]
+    losses += [
+        ("", f"{table.path.name} is cut", None, "its array does not end")
+        for table in (samples_table, data_table)
+        if table.is_cut
+    ]
+    names = ("scene", "sensor", "calibrated_sensor", "sample", "sample_data")
+    files = tuple(folder / f"{name}.json" for name in names)
+    return SceneTables(
+        scene, samples, dict(sorted(pictures.items())), calibrated, tuple(losses), files
+    )
+
+
+def _has(row: Row, *keys: str) -> bool:
+    return all(
+        isinstance(row.get(key), int) if key == "timestamp" else isinstance(row.get(key), str)
+        for key in keys
+    )
+
+
+class Drive(Closing):
+    """One scene as a ``Log``."""
+
+    format: Final = "nuscenes"
+
+    def __init__(
+        self,
+        path: Path,
+        tables: SceneTables,
+        cameras: Sequence[PictureFiles],
+        rows: Sequence[HeldRows],
+        unreadable: Sequence[tuple[str, str, int | None, str]],
+        limits: Limits,
+        touched: Touched,
+    ) -> None:
+        """Put a scene together; ``unreadable`` holds arguments for ``Ledger.drop``."""
+        self.path: Final = path
+        self.touched: Final = touched
+        self._tables: Final = tables
+        self._cameras: Final = tuple(cameras)
+        self._rows: Final = tuple(rows)
+        self._unreadable: Final = tuple(unreadable)
+        self._limits: Final = limits
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """Cameras, then numbers."""
+        return (
+            *(camera.topic for camera in self._cameras),
+            *(rows.topic for rows in self._rows),
+        )
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """All streams side by side, in order of each block's first time; see ``Log.read``."""
+        for loss in self._unreadable:
+            ledger.drop(*loss)
+        ledger.notice("laser and radar are not read")
+        streams = [camera.read(ledger, selection, self._limits) for camera in self._cameras]
+        streams += [rows.read(ledger, selection) for rows in self._rows]
+        yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
+
+    def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
+        """Focal length and optical center of a camera, px.
+
+        Raises:
+            LogFormatError: Its matrix is damaged.
+        """
+        row = self._tables.calibration(camera)
+        if row is None:
+            return None
+        return matrix_of(row, self._tables.scene)
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """Files without a row, rows without a file, damaged rows; see ``KnowsItsEnd``."""
+        for loss in self._unreadable:
+            ledger.drop(*loss)
+        for camera in self._cameras:
+            camera.report_missing(ledger)
+        for rows in self._rows:
+            rows.report_missing(ledger)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def matrix_of(row: Row, scene: Scene) -> tuple[float, float, float]:
+    """Focal length and optical center of a ``calibrated_sensor`` row.
+
+    Raises:
+        LogFormatError: They are no numbers of pixels.
+    """
+    try:
+        matrix = np.array(row["camera_intrinsic"], np.float64)
+        focal, x, y = float(matrix[0, 0]), float(matrix[0, 2]), float(matrix[1, 2])
+    except (TypeError, KeyError, ValueError, IndexError):
+        focal, x, y = math.nan, math.nan, math.nan
+    if not (0.0 < focal < math.inf and math.isfinite(x) and math.isfinite(y)):
+        raise LogFormatError(
+            f"{scene.tables / 'calibrated_sensor.json'}: {row.get('token')}: camera_intrinsic: "
+            "expected a matrix in pixels"
+        )
+    return focal, x, y
+
+
+def open_scene(path: Path, limits: Limits) -> Drive:
+    """Open a scene; see ``crosscue.replay.formats.FORMATS``.
+
+    Raises:
+        LogFormatError: No such scene, or no camera in it.
+    """
+    tables = read_tables(find_scene(path))
+    scene, touched = tables.scene, Touched()
+    for file in tables.files:
+        touched.add(file, 0, file.stat().st_size)
+    cameras = [
+        PictureFiles(
+            Topic(channel, "crosscue/Images", "columns", declared=len(rows)),
+            _timed(scene.root, rows),
+            touched,
+        )
+        for channel, rows in tables.pictures.items()
+    ]
+    unreadable = [*tables.losses]
+    held = []
+    for message, (topic_name, type_name, to_table) in MESSAGES.items():
+        file = scene.root / "can_bus" / f"{scene.name}_{message}.json"
+        if not file.is_file():
+            continue
+        touched.add(file, 0, file.stat().st_size)
+        rows = _held(file, topic_name, type_name, to_table)
+        if isinstance(rows, HeldRows):
+            held.append(rows)
+        else:
+            unreadable.append((topic_name, *rows))
+    if not any(rows.topic.name == "can/wheel_speed" for rows in held) and cameras:
+        held.append(_odometry(tables))
+    if not cameras and not held:
+        raise LogFormatError(f"{path}: {scene.name}: no picture of a camera in sample_data.json")
+    return Drive(path, tables, cameras, held, unreadable, limits, touched)
+
+
+def _timed(root: Path, rows: Sequence[Row]) -> TimedFiles:
+    """Pictures that are there, and the times of those that are not."""
+    places = [(root / str(row["filename"]), int(row["timestamp"]) * 1000) for row in rows]
+    there = [(path, t_ns) for path, t_ns in places if path.is_file()]
+    missing = [t_ns for path, t_ns in places if not path.is_file()]
+    return TimedFiles(
+        tuple(path for path, _ in there),
+        np.array([t_ns for _, t_ns in there], np.int64),
+        np.array(missing, np.int64),
+        len(rows),
+        (),
+    )
+
+
+class EgoPoses(NamedTuple):
+    """The car's track, of the middle of its rear axle.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        xyz_m: Shape (N, 3), the map's axes.
+        wxyz: Shape (N, 4), from the car's axes into those.
+        losses: Rows that were damaged.
+        declared: How many there should be.
+    """
+
+    t_ns: Int64s
+    xyz_m: Floats
+    wxyz: Floats
+    losses: tuple[Loss, ...]
+    declared: int
+
+
+def ego_poses(tables: SceneTables) -> EgoPoses:
+    """At the pictures of the front camera, or the first there is.
+
+    Raises:
+        LogFormatError: The table is missing, or holds fewer than two of them.
+    """
+    channel = FRONT if FRONT in tables.pictures else next(iter(tables.pictures), "")
+    wanted = {str(row["ego_pose_token"]) for row in tables.pictures.get(channel, ())}
+    table = RowsOf(checked(tables.scene.tables / "ego_pose.json"))
+    found: dict[int, tuple[list[float], list[float]]] = {}
+    bad = 0
+    for row in table:
+        if row.get("token") not in wanted:
+            continue
+        xyz, wxyz = numbers(row.get("translation"), 3), numbers(row.get("rotation"), 4)
+        if xyz is None or wxyz is None or not isinstance(row.get("timestamp"), int):
+            bad += 1
+        else:
+            found[int(row["timestamp"]) * 1000] = (xyz, wxyz)
+    if len(found) < 2:
+        raise LogFormatError(
+            f"{table.path}: {len(found)} poses of {tables.scene.name}; expected more"
+        )
+    times = sorted(found)
+    lost = len(wanted) - len(found)
+    reason = f"{DAMAGED_ROW} of ego_pose.json"
+    losses = (Loss(reason, lost, table.first_damage),) if bad or (lost and table.damaged) else ()
+    return EgoPoses(
+        np.array(times, np.int64),
+        np.array([found[t_ns][0] for t_ns in times], np.float64),
+        np.array([found[t_ns][1] for t_ns in times], np.float64),
+        losses,
+        len(wanted),
+    )
+
+
+def _odometry(tables: SceneTables) -> HeldRows:
+    """Forward speed and yaw rate by the ego poses."""
+    poses = ego_poses(tables)
+    w, x, y, z = poses.wxyz.T
+    heading = np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    seconds = (poses.t_ns - poses.t_ns[0]) * 1e-9
+    velocity = np.gradient(poses.xyz_m[:, :2], seconds, axis=0)
+    ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    table = Table(
+        {
+            "speed_x_mps": np.asarray((velocity * ahead).sum(axis=1), np.float64),
+            "yaw_rate_radps": np.gradient(heading, seconds),
+        }
+    )
+    topic = Topic("odometry", "nav_msgs/msg/Odometry", "columns", declared=poses.declared)
+    return HeldRows(topic, poses.t_ns, table, poses.losses)
+
+
+def numbers(value: Any, count: int) -> list[float] | None:
+    """So many finite numbers, or None."""
+    try:
+        found = [float(one) for one in value]
+    except (TypeError, ValueError):
+        return None
+    return found if len(found) == count and all(map(math.isfinite, found)) else None
+
+
+_Columns = Callable[[Row], list[float]]
+
+
+def _plain(*keys: str, scale: float = 1.0) -> _Columns:
+    return lambda row: [scale * float(row[key]) for key in keys]
+
+
+def _vectors(**sizes: int) -> _Columns:
+    def columns(row: Row) -> list[float]:
+        found: list[float] = []
+        for key, count in sizes.items():
+            values = numbers(row[key], count)
+            if values is None:
+                raise ValueError(key)
+            found += values
+        return found
+
+    return columns
+
+
+class _Message(NamedTuple):
+    """How rows of a CAN message become columns."""
+
+    names: tuple[str, ...]
+    of: _Columns
+
+
+_MONITOR: Final = (
+    "available_distance",
+    "battery_level",
+    "brake",
+    "brake_switch",
+    "gear_position",
+    "left_signal",
+    "rear_left_rpm",
+    "rear_right_rpm",
+    "right_signal",
+    "steering",
+    "steering_speed",
+    "throttle",
+    "vehicle_speed",
+    "yaw_rate",
+)
+_MONITOR_NAMES: Final = (
+    "available_distance_km",
+    "battery_level",
+    "brake_bar",
+    "brake_switch",
+    "gear_position",
+    "left_signal",
+    "rear_left_rpm",
+    "rear_right_rpm",
+    "right_signal",
+    "steering_deg",
+    "steering_speed_degps",
+    "throttle",
+    "vehicle_speed_kmph",
+    "yaw_rate_degps",
+)
+_XYZ: Final = ("x", "y", "z")
+MESSAGES: Final[dict[str, tuple[str, str, _Message]]] = {
+    "zoe_veh_info": (
+        "can/wheel_speed",
+        "crosscue/WheelSpeeds",
+        _Message(
+            ("front_left_mps", "front_right_mps", "rear_left_mps", "rear_right_mps"),
+            _plain(*(f"{w}_wheel_speed" for w in ("FL", "FR", "RL", "RR")), scale=RPM_TO_MPS),
+        ),
+    ),
+    "steeranglefeedback": (
+        "can/steering",
+        "crosscue/Table",
+        _Message(("steering_rad",), _plain("value", scale=-1.0)),
+    ),
+    "ms_imu": (
+        "can/imu",
+        "sensor_msgs/msg/Imu",
+        _Message(
+            (
+                *(f"accel_{a}_mps2" for a in _XYZ),
+                *(f"gyro_{a}_radps" for a in _XYZ),
+                *(f"q{i}" for i in range(4)),
+            ),
+            _vectors(linear_accel=3, rotation_rate=3, q=4),
+        ),
+    ),
+    "pose": (
+        "can/pose",
+        "crosscue/Table",
+        _Message(
+            (
+                *(f"{a}_m" for a in _XYZ),
+                *(f"q{i}" for i in range(4)),
+                *(f"velocity_{a}_mps" for a in _XYZ),
+                *(f"rotation_rate_{a}_radps" for a in _XYZ),
+            ),
+            _vectors(pos=3, orientation=4, vel=3, rotation_rate=3),
+        ),
+    ),
+    "vehicle_monitor": (
+        "can/vehicle_monitor",
+        "crosscue/Table",
+        _Message(_MONITOR_NAMES, _plain(*_MONITOR)),
+    ),
+    "zoesensors": (
+        "can/zoesensors",
+        "crosscue/Table",
+        _Message(
+            ("brake_sensor", "steering_sensor_deg", "throttle_sensor"),
+            _plain("brake_sensor", "steering_sensor", "throttle_sensor"),
+        ),
+    ),
+}
+
+
+def _held(
+    file: Path, topic_name: str, type_name: str, message: _Message
+) -> HeldRows | tuple[str, int | None, str]:
+    """A message's rows in order of time; or why none can be read."""
+    rows = RowsOf(file)
+    times: list[int] = []
+    values: list[list[float]] = []
+    bad, first = 0, ""
+    for row in rows:
+        try:
+            found = message.of(row)
+            t_ns = int(row["utime"]) * 1000
+            if not all(map(math.isfinite, found)):
+                raise ValueError(topic_name)
+        except (KeyError, TypeError, ValueError, OverflowError):
+            bad += 1
+            first = first or f"row {len(times) + bad}"
+            continue
+        times.append(t_ns)
+        values.append(found)
+    if not times:
+        return DAMAGED_ROW, bad + rows.damaged or None, rows.first_damage or first
+    losses = []
+    if lost := bad + rows.damaged:
+        losses.append(Loss(DAMAGED_ROW, lost, rows.first_damage or first))
+    if rows.is_cut:
+        losses.append(Loss(f"{file.name} is cut", None, "its array does not end"))
+    order = np.argsort(np.array(times, np.int64), kind="stable")
+    table = np.array(values, np.float64)[order]
+    return HeldRows(
+        Topic(topic_name, type_name, "columns", declared=len(times) + lost),
+        np.array(times, np.int64)[order],
+        Table({name: table[:, i] for i, name in enumerate(message.names)}),
+        tuple(losses),
+    )

@@ -1,0 +1,80 @@
+"""Objects that a data set labels, written as the COCO file that a truth file names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from crosscue.replay.base import strict_json, write_text
+
+OBJECTS_FILE: Final = "objects.json"
+
+COCO_IDS: Final = {
+    "person": 1,
+    "bicycle": 2,
+    "car": 3,
+    "motorcycle": 4,
+    "bus": 6,
+    "train": 7,
+    "truck": 8,
+}
+"""COCO's own numbers; other labels get numbers from 200 on."""
+
+
+@dataclass(slots=True)
+class Objects:
+    """Boxes in pictures, as they come."""
+
+    images: list[dict[str, Any]] = field(default_factory=list)
+    annotations: list[dict[str, Any]] = field(default_factory=list)
+    labels: dict[str, int] = field(default_factory=dict)
+
+    def add_picture(self, t_ns: int, file_name: str, size_px: tuple[int, int]) -> None:
+        """A picture; boxes added afterwards are in it."""
+        wide, high = size_px
+        number = len(self.images) + 1
+        row = {"id": number, "t_ns": t_ns, "file_name": file_name, "width": wide, "height": high}
+        self.images.append(row)
+
+    def add(self, label: str, box_px: tuple[float, float, float, float], **more: object) -> None:
+        """A box, x0, y0, x1, y1, in the last picture; what lies outside is cut off.
+
+        Args:
+            label: COCO's name where COCO has the class.
+            box_px: Left out if nothing of it is in the picture.
+            more: Further keys of its row.
+        """
+        image = self.images[-1]
+        x0, x1 = (min(max(x, 0.0), image["width"]) for x in (box_px[0], box_px[2]))
+        y0, y1 = (min(max(y, 0.0), image["height"]) for y in (box_px[1], box_px[3]))
+        if x1 - x0 < 1.0 or y1 - y0 < 1.0:
+            return
+        number = self.labels.setdefault(label, COCO_IDS.get(label, 200 + len(self.labels)))
+        self.annotations.append(
+            {
+                "id": len(self.annotations) + 1,
+                "image_id": image["id"],
+                "category_id": number,
+                "bbox": [round(x0, 2), round(y0, 2), round(x1 - x0, 2), round(y1 - y0, 2)],
+                "area": round((x1 - x0) * (y1 - y0), 1),
+                "iscrowd": 0,
+                **more,
+            }
+        )
+
+    def save(self, folder: Path, source: str) -> str:
+        """Write the file beside a truth file, and give its name.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        tree: Mapping[str, object] = {
+            "info": {"description": source},
+            "images": self.images,
+            "annotations": self.annotations,
+            "categories": [{"id": number, "name": name} for name, number in self.labels.items()],
+        }
+        write_text(folder / OBJECTS_FILE, strict_json(tree) + "\n")
+        return OBJECTS_FILE

@@ -1,0 +1,179 @@
+"""nuScenes on tables made to its published schema: no drive of the set itself is at hand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.adapters.nuscenes_tables import MAX_ROW_CHARS, RowsOf
+from crosscue.datasets.adapters.nuscenes_truth import write
+from crosscue.datasets.truth.coco import read_coco
+from crosscue.datasets.truth.truth import load
+from crosscue.datasets.truth.tum import heading_rad, read_tum
+from crosscue.replay.base import Floats, Ledger, LogFormatError, Table
+from crosscue.replay.logs.opening import open_log
+from support.nuscenes_drive import (
+    FIRST_US,
+    FOCAL_PX,
+    SPEED_MPS,
+    YAW_RATE_RADPS,
+    nuscenes_drive,
+    pose,
+)
+
+
+def columns(path: Path, topic: str) -> tuple[dict[str, Floats], Ledger]:
+    ledger = Ledger(str(path))
+    found: dict[str, list[Floats]] = {}
+    with open_log(path) as log:
+        for block in log.read(ledger):
+            if block.topic == topic and isinstance(block.rows, Table):
+                for name, values in block.rows.columns.items():
+                    found.setdefault(name, []).append(np.asarray(values, np.float64))
+    return {name: np.concatenate(parts) for name, parts in found.items()}, ledger
+
+
+def test_wheels_steering_and_imu_turn_left_in_si_units(tmp_path: Path) -> None:
+    drive = nuscenes_drive(tmp_path / "root")
+
+    wheels, _ = columns(drive, "can/wheel_speed")
+    steering, _ = columns(drive, "can/steering")
+    imu, _ = columns(drive, "can/imu")
+
+    rear = 0.5 * (wheels["rear_left_mps"] + wheels["rear_right_mps"])
+    np.testing.assert_allclose(rear, SPEED_MPS, rtol=1e-9)
+    assert (wheels["rear_right_mps"] > wheels["rear_left_mps"]).all()
+    # Published as positive to the right.
+    np.testing.assert_allclose(steering["steering_rad"], 0.7)
+    np.testing.assert_allclose(imu["gyro_z_radps"], YAW_RATE_RADPS)
+
+
+def test_without_the_can_expansion_odometry_is_by_the_poses(tmp_path: Path) -> None:
+    drive = nuscenes_drive(tmp_path / "root", with_can=False)
+
+    found, _ = columns(drive, "odometry")
+
+    np.testing.assert_allclose(found["speed_x_mps"], SPEED_MPS, rtol=1e-3)
+    np.testing.assert_allclose(found["yaw_rate_radps"], YAW_RATE_RADPS, rtol=1e-9)
+    with open_log(nuscenes_drive(tmp_path / "with")) as log:
+        assert "odometry" not in {topic.name for topic in log.topics}
+
+
+def test_one_of_several_scenes_is_named_by_a_file(tmp_path: Path) -> None:
+    drive = nuscenes_drive(tmp_path / "root", scenes=3)
+    with pytest.raises(LogFormatError, match=r"3 scenes; name one by an empty file: touch .*0061"):
+        open_log(drive)
+
+    (drive / "scene-0061.nuscenes").touch()
+    with open_log(drive / "scene-0061.nuscenes") as log:
+        assert "CAM_FRONT" in {topic.name for topic in log.topics}
+    (drive / "scene-0999.nuscenes").touch()
+    with pytest.raises(LogFormatError, match="no scene 'scene-0999'"):
+        open_log(drive / "scene-0999.nuscenes")
+
+
+def test_the_truth_is_the_rear_axle_and_the_boxes_it_sees(tmp_path: Path) -> None:
+    truth = load(write(nuscenes_drive(tmp_path / "root"), tmp_path / "truth"))
+
+    assert truth.pose_point == "rear_axle"
+    assert truth.pose is not None
+    track = read_tum(tmp_path / "truth" / truth.pose)
+    for i in range(len(track.t_ns)):
+        east, north, yaw = pose((int(track.t_ns[i]) - FIRST_US * 1000) * 1e-9)
+        np.testing.assert_allclose(track.xyz_m[i], (east, north, 0.0), atol=1e-6)
+        assert heading_rad(track)[i] == pytest.approx(yaw, abs=1e-6)
+    assert truth.objects is not None
+    pictures = read_coco(tmp_path / "truth" / truth.objects).pictures
+    assert [one.t_ns for one in pictures] == [(FIRST_US + 500_000 * i) * 1000 for i in range(3)]
+    # The third box lies behind the car.
+    assert {thing.label for one in pictures for thing in one.things} == {"car", "person"}
+    first = json.loads((tmp_path / "truth" / truth.objects).read_text())["annotations"][0]
+    assert first["motion"] == "parked"
+    assert (first["x_m"], first["y_m"]) == (20.0, 3.0)
+    assert first["visible"] == 0.9
+
+
+def test_a_box_is_where_a_pinhole_camera_sees_it(tmp_path: Path) -> None:
+    truth = load(write(nuscenes_drive(tmp_path / "root"), tmp_path / "truth"))
+
+    assert truth.objects is not None
+    box_px = read_coco(tmp_path / "truth" / truth.objects).pictures[0].things[0].box_px
+    assert box_px is not None
+    x0, y0, x1, y1 = box_px
+    # The car's near end is 20 - 2.25 - 1.7 m ahead of the camera, its roof 1.6 m above the road
+    # and so 0.1 m above the camera; its right side is 3 - 0.95 m to the left.
+    near_m, far_m = 20.0 - 2.25 - 1.7, 20.0 + 2.25 - 1.7
+    assert x0 == pytest.approx(816 - FOCAL_PX * 3.95 / near_m, abs=0.01)
+    assert x1 == pytest.approx(816 - FOCAL_PX * 2.05 / far_m, abs=0.01)
+    assert y0 == pytest.approx(491 - FOCAL_PX * 0.1 / near_m, abs=0.01)
+    assert y1 == pytest.approx(491 + FOCAL_PX * 1.5 / near_m, abs=0.01)
+
+
+@pytest.mark.parametrize("what", ["value", "opening brace", "closing brace"])
+def test_a_damaged_row_of_a_table_costs_itself_and_is_counted(tmp_path: Path, what: str) -> None:
+    drive = nuscenes_drive(tmp_path / "root")
+    table = drive / "v1.0-mini" / "sample_data.json"
+    text = table.read_text()
+    at = text.index('"token": "d7"')
+    if what == "value":
+        text = text[:at] + "?" + text[at + 1 :]
+    elif what == "opening brace":
+        brace = text.rindex("{", 0, at)
+        text = text[:brace] + "?" + text[brace + 1 :]
+    else:
+        brace = text.index("}", at)
+        text = text[:brace] + "?" + text[brace + 1 :]
+    table.write_text(text)
+
+    ledger = Ledger("")
+    with open_log(drive) as log:
+        pictures = sum(len(b) for b in log.read(ledger) if b.topic == "CAM_FRONT")
+
+    assert pictures == 11
+    assert ledger.topic("").dropped.total() == 1
+    assert "sample_data.json" in next(iter(ledger.topic("").dropped))
+
+
+def test_a_damaged_can_row_is_one_row_of_its_topic(tmp_path: Path) -> None:
+    drive = nuscenes_drive(tmp_path / "root")
+    file = drive / "can_bus" / "scene-0061_zoe_veh_info.json"
+    rows = json.loads(file.read_text())
+    del rows[5]["RL_wheel_speed"]
+    file.write_text(json.dumps(rows))
+
+    wheels, ledger = columns(drive, "can/wheel_speed")
+
+    assert len(wheels["rear_left_mps"]) == 119
+    assert ledger.topic("can/wheel_speed").dropped.total() == 1
+    assert ledger.topic("can/wheel_speed").declared == 120
+
+
+def test_a_cut_table_is_reported(tmp_path: Path) -> None:
+    drive = nuscenes_drive(tmp_path / "root")
+    file = drive / "v1.0-mini" / "sample_data.json"
+    text = file.read_text()
+    file.write_text(text[: text.index('"token": "d9"')])
+
+    ledger = Ledger("")
+    with open_log(drive) as log:
+        for _ in log.read(ledger):
+            pass
+
+    assert not ledger.is_whole
+    assert any("is cut" in why for why in ledger.topic("").dropped_unknown)
+
+
+def test_a_table_is_read_a_piece_at_a_time(tmp_path: Path) -> None:
+    rows = [{"token": f"t{i}", "text": "x{y" * 40} for i in range(40_000)]
+    file = tmp_path / "big.json"
+    file.write_text(json.dumps(rows, indent=0))
+    assert file.stat().st_size > 60 * MAX_ROW_CHARS
+
+    table = RowsOf(file)
+
+    assert [row["token"] for row in table] == [row["token"] for row in rows]
+    assert not table.damaged
+    assert not table.is_cut
