@@ -62,6 +62,7 @@ _EXPORTS: Final = {
     "SignFit": "eval.fit.sign_threshold",
     "fit_signs": "eval.fit.sign_threshold",
     "Detector": "detectors.base",
+    "BoxDetector": "detectors.box_detector",
     "Detections": "detectors.base",
     "Frame": "detectors.base",
     "View": "detectors.base",
@@ -178,6 +179,7 @@ if TYPE_CHECKING:
     from crosscue.detectors.base import Frame as Frame
     from crosscue.detectors.base import View as View
     from crosscue.detectors.base import nothing_found as nothing_found
+    from crosscue.detectors.box_detector import BoxDetector as BoxDetector
     from crosscue.detectors.result_cache import default_cache as default_cache
     from crosscue.detectors.settings import Settings as Settings
     from crosscue.detectors.settings import identity_of as identity_of

@@ -100,6 +100,15 @@ class Detections:
     def __len__(self) -> int:
         return len(self.labels)
 
+    @property
+    def heights_px(self) -> Floats:
+        """Height of each box, shape (N,)."""
+        return np.asarray(self.boxes_px[:, 3] - self.boxes_px[:, 1])
+
+    def of(self, label: str) -> Self:
+        """The detections with this label, in the same order."""
+        return self.taken(np.array([one == label for one in self.labels], np.bool_))
+
     def above(self, score: float) -> Self:
         """The detections with a score of at least ``score``, in the same order."""
         return self.taken(self.scores >= score)

@@ -12,6 +12,7 @@ import difflib
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.metadata import entry_points
+from operator import attrgetter
 from typing import Final, cast
 
 from crosscue.replay.errors import UsageError, VehicleError
@@ -97,7 +98,7 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
         hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names)}."
         raise UsageError(f"detector {choice.kind!r}: no such name; {hint} Or give module:factory")
     try:
-        build = cast("Callable[..., Detector]", getattr(import_module(module), factory))
+        build = cast("Callable[..., Detector]", attrgetter(factory)(import_module(module)))
     except (ImportError, AttributeError) as error:
         raise UsageError(f"detector {place}: {error}; check the module and the name") from None
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
@@ -74,7 +73,6 @@ def test_the_reader(
 
 def test_the_detector(module: Callable[[str, str], str]) -> None:
     (code,) = _code("a detector")
-    place = f"{module('example_detector', code)}:build"
+    place = f"{module('example_detector', code)}:Lamp.build"
 
     check_detector(lambda: make(Choice("lamp", "lamp"), {**BUILTIN, "lamp": place}))
-    assert import_module("example_detector").Lamp

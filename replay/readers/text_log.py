@@ -1,0 +1,105 @@
+"""A text file with a row of numbers in each line; a reader states only how a line is read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Final, TextIO, TypeAlias
+
+import numpy as np
+
+from crosscue.replay.base import (
+    BLOCK_ROWS,
+    EVERYTHING,
+    NOT_ASKED_TIME,
+    NOT_ASKED_TOPIC,
+    Block,
+    Closing,
+    Ledger,
+    Selection,
+    Table,
+    Topic,
+)
+
+from .timed_files import is_inside
+
+MAX_LINE: Final = 4096
+"""Characters of a line; a longer one is no row of numbers, and memory stays bounded."""
+Row: TypeAlias = tuple[int, *tuple[float, ...]]
+"""Time in nanoseconds of the log's clock, and a number for each column."""
+
+
+@dataclass(frozen=True, slots=True)
+class TextLog(Closing):
+    """A log of one topic whose rows are the lines of a text file.
+
+    Attributes:
+        path: The file.
+        format: Its name in the table of formats.
+        topic: What the topic is called.
+        columns: Names of the columns after the time, each with its unit at the end.
+        row_of: From a line to its row. A ``ValueError`` drops the line and reports it. Empty lines
+            are no rows.
+    """
+
+    path: Path
+    format: str
+    topic: str
+    columns: Sequence[str]
+    row_of: Callable[[str], Row]
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The one topic."""
+        return (Topic(self.topic, "crosscue/Table", "columns"),)
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """The lines, a block at a time; see ``Log.read``."""
+        ledger.integrity = "not checkable: lines carry no checksum"
+        with self.path.open(encoding="utf-8", errors="replace") as file:
+            whole = _lines(file)
+            while lines := list(islice(whole, BLOCK_ROWS)):
+                block = self._block_of(lines, ledger)
+                ledger.find(self.topic, len(block))
+                if not selection.wants(self.topic):
+                    ledger.skip(self.topic, NOT_ASKED_TOPIC, len(block))
+                    continue
+                wanted = block.take(is_inside(block.log_ns, selection))
+                ledger.skip(self.topic, NOT_ASKED_TIME, len(block) - len(wanted))
+                yield wanted
+
+    def _block_of(self, lines: Sequence[str | None], ledger: Ledger) -> Block:
+        t_ns: list[np.int64] = []
+        values: list[tuple[float, ...]] = []
+        for line in lines:
+            if line is None:
+                ledger.drop(self.topic, "line too long", 1)
+                continue
+            try:
+                time, *row = self.row_of(line)
+                if len(row) != len(self.columns):
+                    raise ValueError(f"expected {len(self.columns)} numbers, found {len(row)}")
+                values.append(tuple(map(float, row)))
+                t_ns.append(np.int64(time))
+            except (ValueError, OverflowError):
+                del values[len(t_ns) :]
+                ledger.drop(self.topic, "line not understood", 1, line[:80])
+        table = np.array(values, np.float64).reshape(-1, len(self.columns))
+        columns = {name: table[:, i].copy() for i, name in enumerate(self.columns)}
+        return Block(self.topic, np.array(t_ns, np.int64), Table(columns))
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def _lines(file: TextIO) -> Iterator[str | None]:
+    """Every line that is not empty; None for one that is longer than ``MAX_LINE``."""
+    while line := file.readline(MAX_LINE):
+        is_cut = len(line) == MAX_LINE and not line.endswith("\n")
+        piece = line
+        while is_cut and piece and not piece.endswith("\n"):
+            piece = file.readline(MAX_LINE)
+        if line.strip():
+            yield None if is_cut else line
