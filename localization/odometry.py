@@ -62,6 +62,8 @@ class OdometrySettings:
             times the root of the distance over which its error persists.
         wheel_turn_rad_per_sqrt_m: S.d. of the heading by wheel difference after one metre.
         turn_per_turn: S.d. of the change of heading as a fraction of that change.
+        turn_rad_per_sqrt_rad: S.d. of the heading after one radian of turning.
+        turn_delay_s: How long after the wheel speeds' the stamps of the turn signal come.
         max_gap_s: Samples further apart are a gap: counted, and the variances grow.
         gap_accel_mps2: How fast the speed may have changed, unseen, inside a gap.
         gap_yaw_accel_radps2: How fast the yaw rate may have changed inside a gap.
@@ -82,6 +84,8 @@ class OdometrySettings:
     steering_noise_rad_sqrt_m: float = 0.01
     wheel_turn_rad_per_sqrt_m: float = 0.01
     turn_per_turn: float = 0.0
+    turn_rad_per_sqrt_rad: float = 0.0
+    turn_delay_s: float = 0.0
     max_gap_s: float = 0.5
     gap_accel_mps2: float = 3.0
     gap_yaw_accel_radps2: float = 0.5
@@ -100,6 +104,8 @@ class OdometrySettings:
             raise ValueError(
                 f"steering_ratio: expected finite and not 0, got {self.steering_ratio}"
             )
+        if not math.isfinite(self.turn_delay_s):
+            raise ValueError(f"turn_delay_s: expected finite, got {self.turn_delay_s}")
         noises = [f.name for f in fields(self) if "_per_" in f.name or f.name.startswith("gap_")]
         for name in (*noises, "wheel_step_mps", "steering_noise_rad_sqrt_m"):
             value = getattr(self, name)
@@ -298,11 +304,14 @@ def integrate(
     t_ns = np.concatenate([pending.t_ns, wheels.t_ns[clean.keep]])
     axle_mps = np.concatenate([pending.axle_mps, axle_mps[clean.keep]])
     yaw_radps = np.concatenate([pending.yaw_radps, yaw_radps[clean.keep]])
-    joined, turn_dropped = _join_turn(turn, pending)
+    delay_ns = round(settings.turn_delay_s * 1e9)
+    joined, turn_dropped = _join_turn(turn, pending, delay_ns)
 
     ready = len(t_ns)
     if joined is not None and until_ns is not None:
-        ready = _ready(t_ns, joined.t_ns, round(settings.max_gap_s * 1e9), until_ns)
+        # Turn rows up to here are known, on the wheels' clock.
+        turn_until_ns = until_ns - max(delay_ns, 0)
+        ready = _ready(t_ns, joined.t_ns, round(settings.max_gap_s * 1e9), turn_until_ns)
     made = _increments(t_ns[:ready], axle_mps[:ready], yaw_radps[:ready], joined, settings)
     counts = OdometryCounts(
         rows=len(wheels),
@@ -363,11 +372,15 @@ def _clean(t_ns: Int64s, values: Floats, before_ns: Int64s) -> _Clean:
     return _Clean(keep, int((~finite).sum()), n_repeated, int((finite & ~later).sum()) - n_repeated)
 
 
-def _join_turn(turn: TurnSignal | None, pending: Pending) -> tuple[_Turn | None, int]:
+def _join_turn(
+    turn: TurnSignal | None, pending: Pending, delay_ns: int
+) -> tuple[_Turn | None, int]:
+    """Rows that waited and new ones, these moved to the wheels' clock."""
     if turn is None:
         return None, 0
-    keep = _clean(turn.t_ns, turn.values, pending.turn_t_ns).keep
-    t_ns = np.concatenate([pending.turn_t_ns, turn.t_ns[keep]])
+    moved_ns = turn.t_ns - delay_ns
+    keep = _clean(moved_ns, turn.values, pending.turn_t_ns).keep
+    t_ns = np.concatenate([pending.turn_t_ns, moved_ns[keep]])
     values = np.concatenate([pending.turn_values, turn.values[keep]])
     return _Turn(t_ns, values, turn.kind), int((~keep).sum())
 
@@ -416,7 +429,9 @@ def _increments(
         distance_m=distance_m,
         turn_rad=turn_rad,
         distance_var_m2=by_slip + by_step * dt_s**2 + (settings.gap_accel_mps2 * unseen_s2) ** 2,
-        turn_var_rad2=turn_var + (settings.turn_per_turn * turn_rad) ** 2,
+        turn_var_rad2=turn_var
+        + (settings.turn_per_turn * turn_rad) ** 2
+        + settings.turn_rad_per_sqrt_rad**2 * np.abs(turn_rad),
         speed_mps=axle_mps[1:],
         speed_var_m2ps2=by_step + by_slip / dt_s**2,
         turn_source=source,

@@ -217,6 +217,35 @@ def update_position(
     return PositionUpdate(after, True, nis)
 
 
+def at_point(state: State, ahead_m: float, left_m: float) -> State:
+    """The same belief of another point of the car, which swings with the heading's error.
+
+    Args:
+        state: Of a point of the car.
+        ahead_m: The other point, ahead of it.
+        left_m: And to its left.
+    """
+    x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
+    c, s = math.cos(heading), math.sin(heading)
+    dx, dy = c * ahead_m - s * left_m, s * ahead_m + c * left_m
+    return State(
+        x + dx,
+        y + dy,
+        heading,
+        speed,
+        xx - 2.0 * dy * xh + dy * dy * hh,
+        xy + dx * xh - dy * yh - dx * dy * hh,
+        xh - dy * hh,
+        xv - dy * hv,
+        yy + 2.0 * dx * yh + dx * dx * hh,
+        yh + dx * hh,
+        yv + dx * hv,
+        hh,
+        hv,
+        vv,
+    )
+
+
 def major_axis_m(var_x: float, cov_xy: float, var_y: float) -> float:
     """Full major axis of the 2-sigma position ellipse: four standard deviations."""
     radius = math.hypot(0.5 * (var_x - var_y), cov_xy)

@@ -19,6 +19,7 @@ from crosscue.replay.base import Floats, Int64s, UsageError
 
 from .angles import wrap
 from .ekf import PoseBelief
+from .fixes import NO_FIXES, Fixes
 from .odometry import BY_NOTHING, Increments
 from .pose_filter import State, predict
 from .pose_track import Headings
@@ -33,37 +34,6 @@ _MIN_VARIANCE: Final = np.diag([1e-5, 1e-5, 1e-8])
 RELATIVE_TOLERANCE: Final = 1e-10
 ABSOLUTE_TOLERANCE: Final = 1e-6
 _AT_REST: Final = State(*(0.0,) * len(State._fields))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Fixes:
-    """N positions of the camera, from landmarks.
-
-    Attributes:
-        t_ns: Shape (N,), int64.
-        xy_m: Shape (N, 2).
-        cov_m2: Shape (N, 2, 2).
-    """
-
-    t_ns: Int64s
-    xy_m: Floats
-    cov_m2: Floats
-
-    def __post_init__(self) -> None:
-        """Refuse columns that do not line up.
-
-        Raises:
-            ValueError: Naming the shapes wanted and given.
-        """
-        n = len(self.t_ns)
-        if self.xy_m.shape != (n, 2) or self.cov_m2.shape != (n, 2, 2):
-            raise ValueError(
-                f"expected xy_m ({n}, 2), cov_m2 ({n}, 2, 2); got {self.xy_m.shape}, "
-                f"{self.cov_m2.shape}"
-            )
-
-
-NO_FIXES: Final = Fixes(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

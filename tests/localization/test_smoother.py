@@ -21,7 +21,8 @@ from crosscue.localization.pose_track import (
     advance,
     start_belief,
 )
-from crosscue.localization.smoother import Fixes, smooth
+from crosscue.localization.fixes import Fixes
+from crosscue.localization.smoother import smooth
 from crosscue.replay.base import Floats, Int64s, UsageError
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
 

@@ -20,7 +20,7 @@ from crosscue.localization.gap import Crossed
 from crosscue.localization.landmarks.update import Sighting
 from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
 from crosscue.localization.pose_track import ACCEPTED, HeadingColumns, Headings
-from crosscue.localization.smoother import Fixes
+from crosscue.localization.fixes import Fixes
 from crosscue.replay.base import Floats, RunError
 
 if TYPE_CHECKING:

@@ -1,0 +1,49 @@
+"""Measured positions of a point of the car: GNSS, a true track, or landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats, Int64s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fixes:
+    """N positions of a camera or an antenna.
+
+    Attributes:
+        t_ns: Shape (N,), int64.
+        xy_m: Shape (N, 2).
+        cov_m2: Shape (N, 2, 2).
+    """
+
+    t_ns: Int64s
+    xy_m: Floats
+    cov_m2: Floats
+
+    def __post_init__(self) -> None:
+        """Refuse columns that do not line up.
+
+        Raises:
+            ValueError: Naming the shapes wanted and given.
+        """
+        n = len(self.t_ns)
+        if self.xy_m.shape != (n, 2) or self.cov_m2.shape != (n, 2, 2):
+            raise ValueError(
+                f"expected xy_m ({n}, 2), cov_m2 ({n}, 2, 2); got {self.xy_m.shape}, "
+                f"{self.cov_m2.shape}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Fixes:
+        """The fixes picked by ``index``."""
+        return Fixes(self.t_ns[index], self.xy_m[index], self.cov_m2[index])
+
+
+NO_FIXES: Final = Fixes(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
