@@ -127,6 +127,8 @@ _EXPORTS: Final = {
     "LandmarkMatches": "eval.interface.landmarks",
     "fit_compass": "eval.interface.fits.compass",
     "FittedCompass": "eval.interface.fits.compass",
+    "fit_odometry": "eval.interface.fits.odometry",
+    "FittedOdometry": "eval.interface.fits.odometry",
     "fit_landmarks": "eval.interface.fits.landmarks",
     "FittedLandmarks": "eval.interface.fits.landmarks",
     "fit_messages": "eval.interface.fits.messages",
@@ -203,6 +205,8 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.fits.landmarks import fit_landmarks as fit_landmarks
     from crosscue.eval.interface.fits.messages import FittedMessages as FittedMessages
     from crosscue.eval.interface.fits.messages import fit_messages as fit_messages
+    from crosscue.eval.interface.fits.odometry import FittedOdometry as FittedOdometry
+    from crosscue.eval.interface.fits.odometry import fit_odometry as fit_odometry
     from crosscue.eval.interface.fits.ranges import FittedRanges as FittedRanges
     from crosscue.eval.interface.fits.ranges import fit_ranges as fit_ranges
     from crosscue.eval.interface.landmarks import AddedLandmarks as AddedLandmarks

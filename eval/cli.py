@@ -47,6 +47,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "model init": ("model.init", "write a model card for an ONNX or OpenVINO file"),
     "model check": ("model.check", "run a network with its card, on a picture if one is given"),
     "fit compass": ("fit.compass", "fit compass mounting, hard iron and soft iron to a drive"),
+    "fit odometry": ("fit.odometry", "fit wheels, gyro, steering and noise to a drive"),
     "fit signs": ("fit.signs", "fit the sign threshold to a required precision"),
     "fit ranges": ("fit.ranges", "fit the curve from heights in pixels to ranges"),
     "fit messages": ("fit.messages", "fit the reliability of each cue to annotated drives"),

@@ -326,7 +326,7 @@ def integrate(
     )
     last = max(ready - 1, 0)
     rest = Pending(t_ns[last:], axle_mps[last:], yaw_radps[last:])
-    return Odometry(made, rest if joined is None else _keep_turn(rest, joined), counts)
+    return Odometry(made, rest if joined is None else _keep_turn(rest, joined, until_ns), counts)
 
 
 def first_reading(wheels: WheelSpeeds, settings: OdometrySettings) -> tuple[int, float] | None:
@@ -385,19 +385,20 @@ def _join_turn(
     return _Turn(t_ns, values, turn.kind), int((~keep).sum())
 
 
-def _keep_turn(rest: Pending, turn: _Turn) -> Pending:
-    """Add the turn rows from the last one at or before the first wheel row that waits."""
+def _keep_turn(rest: Pending, turn: _Turn, until_ns: int | None) -> Pending:
+    """Add the turn rows from the last one at or before the first wheel row that waits or comes."""
+    next_ns = rest.t_ns[0] if len(rest.t_ns) else until_ns
     used = len(turn.t_ns)
-    if len(rest.t_ns):
-        used = int(np.searchsorted(turn.t_ns, rest.t_ns[0], side="right"))
+    if next_ns is not None:
+        used = int(np.searchsorted(turn.t_ns, next_ns, side="right"))
     first = max(used - 1, 0)
     return replace(rest, turn_t_ns=turn.t_ns[first:], turn_values=turn.values[first:])
 
 
 def _ready(t_ns: Int64s, turn_t_ns: Int64s, max_gap_ns: int, until_ns: int) -> int:
-    """How many wheel rows can be closed: up to the turn signal, or all if that has a gap here."""
+    """How many wheel rows can be closed: up to the turn signal or, in its gaps, ``until_ns``."""
     if len(turn_t_ns) == 0 or until_ns - turn_t_ns[-1] > max_gap_ns:
-        return len(t_ns)
+        return int(np.searchsorted(t_ns, until_ns))
     return int(np.searchsorted(t_ns, turn_t_ns[-1], side="right"))
 
 

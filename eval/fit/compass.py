@@ -10,14 +10,12 @@ import tomlkit
 from crosscue.eval.pipeline.pose import compass_settings
 from crosscue.localization.compass import course_at
 from crosscue.localization.compass_fit import CompassFit, fit_compass
-from crosscue.replay.base import EmptyResultError, Ledger, Log, Selection, VehicleError
-from crosscue.replay.losses import warn_of
-from crosscue.replay.remote.logs import name_of
-from crosscue.replay.signals.extractor import Extractor
-from crosscue.replay.signals.kinds import Samples, Signal
+from crosscue.replay.base import EmptyResultError, Log, Selection, VehicleError
+from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.signals.plan import plan
-from crosscue.replay.signals.windows import windows
 from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .log_signals import read_signals
 
 
 def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassFit:
@@ -31,36 +29,15 @@ def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassF
     magnetometer = planned.source_of(Signal.MAGNETIC_FIELD)
     if magnetometer is None:
         raise EmptyResultError(f"no magnetometer: {planned.missing[Signal.MAGNETIC_FIELD]}")
-    course = planned.source_of(Signal.COURSE)
-    wanted = {source.topic.name for source in (magnetometer, course) if source is not None}
-    narrowed = Selection(frozenset(wanted), selection.start_ns, selection.end_ns)
-    extractors = [
-        Extractor(planned, vehicle, i, Ledger(name_of(log))) for i, log in enumerate(logs)
-    ]
-    found: dict[Signal, list[Samples]] = {Signal.MAGNETIC_FIELD: [], Signal.COURSE: []}
-    for window in windows(logs, extractors, [narrowed] * len(logs), planned):
-        for signal, parts in found.items():
-            if signal in window.samples:
-                parts.append(window.samples[signal])
-    for extractor in extractors:
-        warn_of(extractor.ledger)
-    field = _joined(found[Signal.MAGNETIC_FIELD])
+    found = read_signals(logs, planned, vehicle, selection, (Signal.MAGNETIC_FIELD, Signal.COURSE))
+    field = found.get(Signal.MAGNETIC_FIELD)
     if field is None:
         raise VehicleError(f"{magnetometer.topic.name}: not one magnetometer reading in this part")
     reference = None
-    ground = _joined(found[Signal.COURSE])
+    ground = found.get(Signal.COURSE)
     if ground is not None:
         reference = course_at(field.t_ns, ground.t_ns, ground.values[:, 0], ground.values[:, 1])
     return fit_compass(field.t_ns, field.values, reference, compass_settings(vehicle))
-
-
-def _joined(parts: Sequence[Samples]) -> Samples | None:
-    if not parts:
-        return None
-    t_ns = np.concatenate([part.t_ns for part in parts])
-    later = np.diff(t_ns, prepend=t_ns[0] - 1) > 0
-    values = np.concatenate([part.values for part in parts])
-    return Samples(parts[0].signal, t_ns[later], values[later])
 
 
 def section_of(fitted: CompassFit) -> dict[str, object]:

@@ -148,8 +148,9 @@ def _table(block: Block, ledger: Ledger, *names: str) -> Table | None:
 
 
 def _wheels(block: Block, ledger: Ledger) -> Iterator[Samples]:
-    if isinstance(block.rows, Table) and "speed_x_mps" in block.rows.columns:
-        speed = np.asarray(block.rows["speed_x_mps"], np.float64)
+    columns = block.rows.columns if isinstance(block.rows, Table) else {}
+    for name in {"speed_x_mps", "speed_mps"} & set(columns):
+        speed = np.asarray(columns[name], np.float64)
         nothing = np.full(len(block), np.nan)
         values = np.stack([nothing, nothing, speed, speed], axis=1)
         yield Samples(Signal.WHEEL_SPEEDS, block.log_ns, values)
@@ -200,6 +201,33 @@ def _course(block: Block, ledger: Ledger) -> Iterator[Samples]:
         yield Samples(Signal.COURSE, block.log_ns, np.stack(columns, axis=1))
 
 
+def _position(block: Block, ledger: Ledger) -> Iterator[Samples]:
+    names = ("latitude_deg", "longitude_deg", "altitude_m")
+    table = block.rows
+    if not (isinstance(table, Table) and {*names} <= set(table.columns)):
+        return
+    columns = [np.asarray(table[name], np.float64) for name in names]
+    values = np.column_stack([*columns, _position_sd_m(table)])
+    usable = np.isfinite(values[:, :2]).all(axis=1)
+    if "status" in table.columns:
+        usable &= np.asarray(table["status"]) >= 0
+    ledger.skip(block.topic, "no position fix", int((~usable).sum()))
+    yield Samples(Signal.POSITION, block.log_ns[usable], values[usable])
+
+
+def _position_sd_m(table: Table) -> Floats:
+    """East and north alike; NaN where the receiver does not say."""
+    sd = np.full(len(table), np.nan)
+    if "position_sd_m" in table.columns:
+        sd = np.asarray(table["position_sd_m"], np.float64)
+    elif "covariance_m2" in table.columns:
+        cov = np.asarray(table["covariance_m2"], np.float64).reshape(len(table), -1)
+        sd = np.sqrt(np.maximum(0.5 * (cov[:, 0] + cov[:, 4]), 0.0))
+        if "covariance_type" in table.columns:
+            sd = np.where(np.asarray(table["covariance_type"]) > 0, sd, np.nan)
+    return np.where(sd > 0.0, sd, np.nan)
+
+
 FROM_TABLE: Final[Mapping[Signal, Callable[[Block, Ledger], Iterator[Samples]]]] = {
     Signal.WHEEL_SPEEDS: _wheels,
     Signal.YAW_RATE: _one_of(Signal.YAW_RATE, "gyro_z_radps", "yaw_rate_radps"),
@@ -207,4 +235,5 @@ FROM_TABLE: Final[Mapping[Signal, Callable[[Block, Ledger], Iterator[Samples]]]]
     Signal.MAGNETIC_FIELD: _magnetic,
     Signal.HEADING: _heading,
     Signal.COURSE: _course,
+    Signal.POSITION: _position,
 }

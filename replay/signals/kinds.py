@@ -21,6 +21,7 @@ class Signal(Enum):
     MAGNETIC_FIELD = "(N, 3) tesla, forward, left, up"
     HEADING = "(N,) rad from east, counter-clockwise"
     COURSE = "(N, 2) rad from east, counter-clockwise, and speed in m/s, of the ground track"
+    POSITION = "(N, 4) latitude and longitude in degrees, altitude and horizontal s.d. in m"
     MOBILEYE_OBSTACLES = "(N, 8) vehicles and when each picture was reported; mobileye/samples.py"
     MOBILEYE_LANES = "(N, 8) lane lines left and right, as cubics; mobileye/samples.py"
 

@@ -104,7 +104,8 @@ def _plan_odometry(planner: _Planner) -> None:
     place = planner.only(Role.ODOMETRY, planner.vehicle.topics.odometry, "topics.odometry")
     if place is not None:
         planner.choose(place, Signal.WHEEL_SPEEDS)
-        if planner.vehicle.can.yaw_rate is None:
+        # A table named for its speed has no yaw rate.
+        if planner.vehicle.can.yaw_rate is None and role_of(place[1]) is Role.ODOMETRY:
             planner.choose(place, Signal.YAW_RATE)
         return
     planner.missing[Signal.WHEEL_SPEEDS] = (
@@ -137,6 +138,7 @@ def _plan_heading(planner: _Planner) -> None:
     place = planner.only(Role.GNSS, names.gnss, "topics.gnss")
     if place is not None:
         planner.choose(place, Signal.COURSE)
+        planner.choose(place, Signal.POSITION)
 
 
 def _plan_mobileye(planner: _Planner) -> None:

@@ -7,7 +7,6 @@ REP-103: x forward, y left, heading counter-clockwise. Every default is written 
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -20,13 +19,13 @@ from .cue_spec import CueSpec
 from .cue_table import CUES, SAME_SIGN
 from .fusion import Fusion, Name, RangeFilter
 from .mobileye_cues import Past
+from .pose import DEGREE, Gnss, Odometry, Start
 from .section import Finite, NotNegative, Positive, Section
 from .time import Time
 from .validation_errors import explain
 
 VERSION: Final = 1
 MAX_BYTES: Final = 1 * MIB
-DEGREE: Final = math.pi / 180.0
 
 Vector = tuple[Finite, Finite, Finite]
 Matrix = tuple[Vector, Vector, Vector]
@@ -100,33 +99,6 @@ class Mobileye(Section):
     yaw_rad: Finite = 0.0
 
 
-class Odometry(Section):
-    """Wheels, gyro and steering; the terms are those of ``crosscue.localization.odometry``."""
-
-    track_width_m: Positive = 1.55
-    wheelbase_m: Positive = 2.7
-    wheel_scale: Positive = 1.0
-    right_wheel_scale: Positive = 1.0
-    use_front_wheels: bool = False
-    wheel_step_mps: NotNegative = 0.0028
-    slip_per_sqrt_m: NotNegative = 0.3
-    """A wheel radius off by one per cent, as an uncalibrated car's, is 10 m after 1 km: so much."""
-    heading_from: Literal["auto", "yaw_rate", "steering", "wheels"] = "auto"
-    """Which signal turns the pose; ``auto`` takes the first of these three that the log has."""
-    yaw_rate_scale: Positive = 1.0
-    gyro_bias_radps: Finite = 0.0
-    gyro_noise_rad_per_sqrt_s: NotNegative = 0.005
-    """A bias of 0.0006 rad/s, left in, is 2 degrees after a minute: so much."""
-    steering_ratio: Positive = 15.0
-    steering_offset_rad: Finite = 0.0
-    steering_noise_rad_sqrt_m: NotNegative = 0.01
-    wheel_turn_rad_per_sqrt_m: NotNegative = 0.03
-    """Tyres that differ by 0.3 % turn the pose 0.2 rad in 100 m: so much, where wheels turn it."""
-    turn_per_turn: NotNegative = 0.0
-    max_gap_s: Positive = 0.5
-    accel_var_m2ps3: NotNegative = 1.0
-
-
 class Compass(Section):
     """From a magnetometer's reading to a heading; ``crosscue fit compass`` writes this section."""
 
@@ -147,17 +119,6 @@ class Compass(Section):
     """Refuse readings whose normalised innovation squared is larger."""
 
 
-class Start(Section):
-    """The pose at the log's first row, in the map frame (x east, y north)."""
-
-    x_m: Finite = 0.0
-    y_m: Finite = 0.0
-    position_sd_m: Positive = 1.0
-    heading_rad: Finite | None = None
-    """Left out: taken from the first compass readings."""
-    heading_sd_rad: Positive = 5.0 * DEGREE
-
-
 class Camera(Section):
     """Pinhole camera and where it sits."""
 
@@ -167,8 +128,13 @@ class Camera(Section):
     z_m: Finite = 1.2
     focal_px: Positive | None = None
     center_px: tuple[Finite, Finite] | None = None
+    roll_rad: Finite = 0.0
+    """How far it is turned about its axis: its right side down is positive."""
     pitch_rad: Finite = 0.0
     """How far its axis points below the horizon."""
+    yaw_rad: Finite = 0.0
+    """How far its axis points to the left; ``crosscue fit odometry`` finds it where the truth is
+    the camera's track."""
     pitch_sd_rad: NotNegative = 0.01
     """How far that is off in a frame: a car pitches by some half a degree as it brakes."""
     depth_bits: Annotated[int, Field(ge=8, le=16)] = 16
@@ -337,6 +303,7 @@ class Vehicle(Section):
     odometry: Odometry = Odometry()
     time: Time = Time()
     compass: Compass = Compass()
+    gnss: Gnss = Gnss()
     start: Start = Start()
     camera: Camera = Camera()
     landmarks: Landmarks = Landmarks()

@@ -42,6 +42,7 @@ OPENS_LOGS: dict[str, str] = {
     "view": "{run} -o {out}.rrd",
     "vehicle init": "{log} -o {out}.toml",
     "fit compass": "{compass} --vehicle {its_car}",
+    "fit odometry": "{compass} --vehicle {its_car} --truth {its_truth}",
     "fit signs": "{drive} --label stop_sign",
     "fit landmarks": "{log} --database {db} --poses {truth} --vehicle {car}",
     "landmarks add": "{out}.db {log} --poses {truth} --vehicle {car}",
@@ -91,6 +92,7 @@ def names(tmp_path: Path) -> dict[str, Path]:
         "out": tmp_path / "out",
         "compass": compass.log,
         "its_car": compass.vehicle,
+        "its_truth": compass.truth,
     }
 
 

@@ -30,6 +30,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "merge": ("gone -o out", INPUT),
     "view": ("gone -o x.rrd", INPUT),
     "fit compass": ("gone.mcap --vehicle gone.toml", SETTINGS),
+    "fit odometry": ("gone.mcap --vehicle gone.toml", SETTINGS),
     "fit signs": ("gone.json --label a", INPUT),
     "fit ranges": ("--cue stop_sign --truth gone.json", INPUT),
     "fit messages": ("gone --truth gone.json", INPUT),
@@ -206,7 +207,7 @@ def test_a_misspelt_command_is_answered_with_the_nearest(
 
 def test_the_first_word_alone_lists_its_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["fit"]) == 2
-    assert "fit: needs one of: fit compass, fit signs" in capsys.readouterr().err
+    assert "fit: needs one of: fit compass, fit odometry" in capsys.readouterr().err
     assert cli.run(["fit", "--help"]) == 0
     assert capsys.readouterr().out.startswith("  fit compass ")
 

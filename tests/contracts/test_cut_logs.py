@@ -151,6 +151,7 @@ def test_rows_whose_times_are_cut_off_are_dropped_and_no_time_is_invented(
         "decode -o {out} --topics /can",
         "convert -o {out}.mcap --topics /can",
         "fit compass --vehicle {car}",
+        "fit odometry --vehicle {car}",
     ],
 )
 def test_a_log_cut_before_its_first_topic_is_unreadable_and_not_wrong_usage(

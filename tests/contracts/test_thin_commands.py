@@ -51,6 +51,7 @@ CALLS: Final = {
     "landmarks list": ("list_landmarks",),
     "landmarks match": ("match_landmarks",),
     "fit compass": ("fit_compass",),
+    "fit odometry": ("fit_odometry",),
     "fit landmarks": ("fit_landmarks",),
     "fit messages": ("fit_messages",),
     "fit ranges": ("fit_ranges",),

@@ -237,6 +237,28 @@ def test_a_share_of_every_turn_may_be_wrong() -> None:
     assert not integrate(both_wheels(5.0), exact, rate).increments.turn_var_rad2.any()
 
 
+@pytest.mark.parametrize("rate_hz", [10, 100])
+def test_noise_per_radian_does_not_depend_on_the_rate(rate_hz: int) -> None:
+    t_ns = times(2 * rate_hz + 1, 1_000_000_000 // rate_hz)
+    turn = TurnSignal(t_ns, np.full(len(t_ns), -0.5), "yaw rate")
+    car = replace(CAR, gyro_noise_rad_per_sqrt_s=0.0, turn_rad_per_sqrt_rad=0.02)
+    speeds = WheelSpeeds(t_ns, np.full((len(t_ns), 2), 5.0))
+
+    assert integrate(speeds, car, turn).increments.turn_var_rad2.sum() == pytest.approx(0.02**2)
+
+
+def test_a_delayed_turn_signal_is_taken_back_by_its_delay() -> None:
+    at_s = times(101) * 1e-9
+    late = TurnSignal(times(101) + 130_000_000, np.sin(at_s), "yaw rate")
+    on_time = TurnSignal(times(101), np.sin(at_s), "yaw rate")
+    car = replace(CAR, turn_delay_s=0.13)
+
+    np.testing.assert_array_equal(
+        integrate(both_wheels(5.0), car, late).increments.turn_rad,
+        integrate(both_wheels(5.0), CAR, on_time).increments.turn_rad,
+    )
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.3, -0.5])
 def test_steering_noise_is_the_slope_of_the_turn(angle: float) -> None:
     def turned(by: float) -> float:
@@ -277,16 +299,17 @@ def test_nothing_in_nothing_out() -> None:
     cuts=st.lists(st.integers(-10, 2_100), max_size=5),
     turn_period=st.integers(3, 90),
     lag=st.integers(-400, 400),
+    delay=st.integers(-60, 60),
 )
 @settings(max_examples=60, deadline=None)
 def test_windows_give_the_same_increments_bit_for_bit(
-    cuts: list[int], turn_period: int, lag: int
+    cuts: list[int], turn_period: int, lag: int, delay: int
 ) -> None:
     rng = np.random.default_rng(0)
     speeds = WheelSpeeds(times(101), rng.normal(5.0, 1.0, (101, 2)))
     turn_t = times(2_000 // turn_period, turn_period * 1_000_000) + lag * 1_000_000
     turn = TurnSignal(turn_t, rng.normal(size=len(turn_t)), "yaw rate")
-    car = replace(CAR, max_gap_s=0.08)
+    car = replace(CAR, max_gap_s=0.08, turn_delay_s=delay * 1e-3)
     whole = integrate(speeds, car, turn)
 
     edges = [-(10**10), *sorted(c * 1_000_000 for c in cuts), 10**10]

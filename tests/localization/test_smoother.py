@@ -11,6 +11,7 @@ import pytest
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.ekf import PoseBelief
+from crosscue.localization.fixes import Fixes
 from crosscue.localization.landmarks.update import update_camera_position
 from crosscue.localization.odometry import Increments, OdometrySettings, WheelSpeeds, integrate
 from crosscue.localization.pose_track import (
@@ -21,7 +22,6 @@ from crosscue.localization.pose_track import (
     advance,
     start_belief,
 )
-from crosscue.localization.fixes import Fixes
 from crosscue.localization.smoother import smooth
 from crosscue.replay.base import Floats, Int64s, UsageError
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels

@@ -16,11 +16,11 @@ import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.localization.ekf import PoseBelief
+from crosscue.localization.fixes import Fixes
 from crosscue.localization.gap import Crossed
 from crosscue.localization.landmarks.update import Sighting
 from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
 from crosscue.localization.pose_track import ACCEPTED, HeadingColumns, Headings
-from crosscue.localization.fixes import Fixes
 from crosscue.replay.base import Floats, RunError
 
 if TYPE_CHECKING:

@@ -1,0 +1,53 @@
+"""Fit odometry to half of a drive and test it on the rest: scales, biases, delays, noise.
+
+The positions are the log's GNSS or, with --truth, a true track. What a drive cannot show keeps its
+value and is named: a straight drive shows neither the gyro's scale nor the steering ratio.
+
+examples:
+  crosscue fit odometry drive.mcap --vehicle car.toml -o car.toml
+  crosscue fit odometry drive.mcap --vehicle car.toml --truth truth/ -o car.toml
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import crosscue
+from crosscue.eval.commands.shared.drive_part import open_part
+from crosscue.eval.commands.shared.options import (
+    add_log_arguments,
+    add_vehicle_output,
+    print_result,
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    add_log_arguments(parser)
+    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="vehicle file")
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="T.json",
+        help="truth file with the true track, or its folder (default: the log's GNSS)",
+    )
+    add_vehicle_output(parser)
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit, test, report, and write where asked."""
+    if args.vehicle is not None:
+        # What is wrong with the settings is reported before a long log is opened.
+        crosscue.load_vehicle(args.vehicle)
+    with open_part(args, args.logs) as log:
+        found = crosscue.fit_odometry(
+            log,
+            args.vehicle,
+            args.output,
+            truth=args.truth,
+            overwrite=args.overwrite,
+        )
+    print_result(found, args)
+    return 0

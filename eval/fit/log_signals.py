@@ -1,0 +1,56 @@
+"""Whole signals of a drive, for fits that need all of it at once."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from crosscue.replay.base import Ledger, Log, Selection
+from crosscue.replay.losses import warn_of
+from crosscue.replay.remote.logs import name_of
+from crosscue.replay.signals.extractor import Extractor, probe_clocks
+from crosscue.replay.signals.kinds import Plan, Samples, Signal
+from crosscue.replay.signals.windows import windows
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+
+def read_signals(
+    logs: Sequence[Log],
+    planned: Plan,
+    vehicle: Vehicle,
+    selection: Selection,
+    wanted: Collection[Signal],
+) -> dict[Signal, Samples]:
+    """The wanted signals of a drive, in order of time; those without a row are left out.
+
+    Losses are reported as warnings.
+    """
+    sources = [source for signal in wanted if (source := planned.source_of(signal)) is not None]
+    topics = frozenset(source.topic.name for source in sources)
+    narrowed = Selection(topics, selection.start_ns, selection.end_ns)
+    extractors = [
+        Extractor(
+            planned,
+            vehicle,
+            i,
+            Ledger(name_of(log)),
+            probe_clocks(log, planned, vehicle, i, narrowed),
+        )
+        for i, log in enumerate(logs)
+    ]
+    found: dict[Signal, list[Samples]] = {signal: [] for signal in wanted}
+    for window in windows(logs, extractors, [narrowed] * len(logs), planned):
+        for signal, parts in found.items():
+            if signal in window.samples:
+                parts.append(window.samples[signal])
+    for extractor in extractors:
+        warn_of(extractor.ledger)
+    return {signal: _joined(parts) for signal, parts in found.items() if parts}
+
+
+def _joined(parts: Sequence[Samples]) -> Samples:
+    t_ns = np.concatenate([part.t_ns for part in parts])
+    later = np.diff(t_ns, prepend=t_ns[0] - 1) > 0
+    values = np.concatenate([part.values for part in parts])
+    return Samples(parts[0].signal, t_ns[later], values[later])

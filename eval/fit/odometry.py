@@ -1,0 +1,326 @@
+"""Fit the odometry of a vehicle file to one half of a drive, and test it on the other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import tomlkit
+
+from crosscue.eval.pipeline.pose import odometry_settings, turn_signal_of
+from crosscue.eval.scoring.consistency import mean_band
+from crosscue.localization.angles import circular_mean, wrap_all
+from crosscue.localization.compass_fit import persistence
+from crosscue.localization.known_drive import KnownDrive, whitened
+from crosscue.localization.odometry import OdometrySettings, TurnKind, TurnSignal, WheelSpeeds
+from crosscue.localization.odometry_fit import FIX_DELAY, OdometryFit, fit_odometry
+from crosscue.replay.base import EmptyResultError, Floats, Log, Selection, VehicleError
+from crosscue.replay.remote.logs import name_of
+from crosscue.replay.signals.kinds import Samples, Signal
+from crosscue.replay.signals.plan import plan
+from crosscue.replay.vehicle.pose import OdometryFitted
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .log_signals import read_signals
+from .reference import Reference, of_gnss, of_truth
+
+SHARED: Final = ("wheel_scale", "slip_per_sqrt_m", "turn_delay_s", "turn_rad_per_sqrt_rad")
+OF_ONE_TURN: Final = {
+    "yaw rate": ("yaw_rate_scale", "gyro_bias_radps", "gyro_noise_rad_per_sqrt_s"),
+    "steering": (
+        "steering_ratio",
+        "steering_offset_rad",
+        "wheelbase_m",
+        "steering_noise_rad_sqrt_m",
+    ),
+    "wheels": ("right_wheel_scale", "track_width_m", "wheel_turn_rad_per_sqrt_m"),
+}
+"""What belongs to one source of turns alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Odometry alone against known positions, from the fitted start.
+
+    Attributes:
+        fitted_m: Root mean square over the fitted half.
+        held_out_m: Over the other half.
+        all_m: Over both.
+        end_m: At the last position.
+        fitted_nees: Mean squared error in units of its covariance; 2 is honest.
+        held_out_nees: The same of the other half.
+        all_nees: Of both.
+    """
+
+    fitted_m: float
+    held_out_m: float
+    all_m: float
+    end_m: float
+    fitted_nees: float
+    held_out_nees: float
+    all_nees: float
+
+
+@dataclass(frozen=True, slots=True)
+class SourceFit:
+    """The fit with one thing that turns the pose.
+
+    Attributes:
+        fit: To the first half.
+        before: With the values that were given.
+        after: With the fitted ones.
+        camera_yaw_rad: How far the reference's body points to the left of the car; None where the
+            reference has no heading.
+        camera_yaw_sd_rad: Its s.d., with correlated differences counted as few.
+    """
+
+    fit: OdometryFit
+    before: Errors
+    after: Errors
+    camera_yaw_rad: float | None = None
+    camera_yaw_sd_rad: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class DriveFit:
+    """All that a drive shows of a car's odometry.
+
+    Attributes:
+        log: Its name.
+        reference: Where the positions come from.
+        is_of_camera: Whether the reference is the camera's track.
+        start_ns: The fitted half.
+        middle_ns: Its end.
+        end_ns: The end of what was held out.
+        sources: By what turns the pose; that of the vehicle file first.
+        not_fitted: What could not be fitted, and why.
+        settings: With the values of all sources.
+        nees_band: The mean NEES of one drive lies in here with 95 %, if the claims are right.
+    """
+
+    log: str
+    reference: str
+    is_of_camera: bool
+    start_ns: int
+    middle_ns: int
+    end_ns: int
+    sources: tuple[SourceFit, ...]
+    not_fitted: dict[str, str]
+    settings: OdometrySettings
+    nees_band: tuple[float, float]
+
+
+def fit(
+    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, truth: Path | None = None
+) -> DriveFit:
+    """Fit to the first half of the drive, test on the second.
+
+    Args:
+        logs: Open.
+        vehicle: Where to begin.
+        selection: Which part of the logs.
+        truth: Truth file with the positions; None for the log's GNSS.
+
+    Raises:
+        EmptyResultError: No wheel speeds, or no positions.
+        VehicleError: The drive is too short.
+        SchemaError: The truth file does not fit, or holds no pose.
+    """
+    planned = plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+    gnss = planned.source_of(Signal.POSITION)
+    if truth is None and gnss is None:
+        raise EmptyResultError(
+            f"no positions to fit to: no GNSS in the log ({planned.missing[Signal.POSITION]}); "
+            "name a truth file with --truth"
+        )
+    wanted = [Signal.WHEEL_SPEEDS, Signal.YAW_RATE, Signal.STEERING]
+    found = read_signals(
+        logs, planned, vehicle, selection, wanted + ([Signal.POSITION] if truth is None else [])
+    )
+    if (wheels := found.get(Signal.WHEEL_SPEEDS)) is None:
+        why = planned.missing.get(Signal.WHEEL_SPEEDS, "not one row in this part")
+        raise EmptyResultError(f"no wheel speeds: {why}")
+    reference = _reference(
+        truth, found.get(Signal.POSITION), gnss.topic.name if gnss else None, vehicle
+    )
+    given = odometry_settings(vehicle)
+    first = turn_signal_of(planned, vehicle)
+    turns: list[Signal | None] = [Signal.YAW_RATE, Signal.STEERING, None]
+    turns = [first, *(turn for turn in turns if turn is not first)]
+    sources: list[SourceFit] = []
+    not_fitted: dict[str, str] = {}
+    span = (0, 0, 0)
+    for turn in turns:
+        if turn is not None and turn not in found:
+            not_fitted[_name(turn)] = planned.missing.get(turn, "not one row in this part")
+            continue
+        drive = KnownDrive(_wheels(wheels), _turn(turn, found), reference.fixes, reference.lever_m)
+        try:
+            sources.append(_fitted(drive, given, reference))
+        except VehicleError as error:
+            if not sources and turn is first:
+                raise
+            not_fitted[_name(turn)] = str(error)
+            continue
+        if len(sources) == 1:
+            t_ns = drive.fixes.t_ns
+            span = int(t_ns[0]), _middle_ns(drive), int(t_ns[-1]) + 1
+    return DriveFit(
+        ", ".join(name_of(log).rstrip("/").rpartition("/")[2] for log in logs),
+        reference.name,
+        reference.is_of_camera,
+        *span,
+        tuple(sources),
+        not_fitted,
+        _together(given, sources),
+        mean_band(2, 1),
+    )
+
+
+def _reference(
+    truth: Path | None, samples: Samples | None, topic: str | None, vehicle: Vehicle
+) -> Reference:
+    if truth is not None:
+        return of_truth(truth, vehicle)
+    if samples is None or topic is None:
+        raise EmptyResultError(f"{topic}: not one GNSS position in this part of the log")
+    return of_gnss(topic, samples, vehicle)
+
+
+def _wheels(samples: Samples) -> WheelSpeeds:
+    return WheelSpeeds(
+        samples.t_ns,
+        samples.values[:, 2:] if np.isnan(samples.values[:, :2]).all() else samples.values,
+    )
+
+
+def _turn(signal: Signal | None, found: dict[Signal, Samples]) -> TurnSignal | None:
+    if signal is None:
+        return None
+    kind: TurnKind = "yaw rate" if signal is Signal.YAW_RATE else "steering"
+    return TurnSignal(found[signal].t_ns, found[signal].values, kind)
+
+
+def _name(turn: Signal | None) -> str:
+    return "wheels" if turn is None else turn.name.lower().replace("_", " ")
+
+
+def _middle_ns(drive: KnownDrive) -> int:
+    t_ns = drive.fixes.t_ns
+    return (int(t_ns[0]) + int(t_ns[-1])) // 2
+
+
+def _fitted(drive: KnownDrive, given: OdometrySettings, reference: Reference) -> SourceFit:
+    whole_s = float(drive.seconds[-1]) if len(drive.seconds) else None
+    half = drive.until(_middle_ns(drive)) if len(drive.fixes) else drive
+    fit = fit_odometry(half, given, whole_s)
+    before, after = (_errors(drive, car, fit) for car in (given, fit.settings))
+    if reference.heading_rad is None:
+        return SourceFit(fit, before, after)
+    yaw_rad, sd_rad = _yaw(half, fit, reference)
+    return SourceFit(fit, before, after, yaw_rad, sd_rad)
+
+
+def _errors(drive: KnownDrive, settings: OdometrySettings, fit: OdometryFit) -> Errors:
+    steps = drive.steps(settings, delay_s=fit.value(FIX_DELAY))
+    found = drive.follow(fit.start, steps)
+    fixes = drive.fixes
+    apart = np.hypot(*(found.xy_m - fixes.xy_m).T)
+    cov = np.tile(np.eye(2) * fit.fix_sd_m**2, (len(fixes), 1, 1))
+    nees = np.sum(whitened(found, fixes.xy_m, cov)[0] ** 2, axis=1)
+    first = fixes.t_ns < _middle_ns(drive)
+    return Errors(
+        fitted_m=_rms(apart[first]),
+        held_out_m=_rms(apart[~first]),
+        all_m=_rms(apart),
+        end_m=float(apart[-1]),
+        fitted_nees=float(nees[first].mean()),
+        held_out_nees=float(nees[~first].mean()),
+        all_nees=float(nees.mean()),
+    )
+
+
+def _rms(values: Floats) -> float:
+    return math.sqrt(float(np.mean(values**2)))
+
+
+def _yaw(half: KnownDrive, fit: OdometryFit, reference: Reference) -> tuple[float, float]:
+    """The reference's heading less the car's, over the fitted half."""
+    assert reference.heading_rad is not None
+    fixes = half.fixes
+    rows = np.searchsorted(reference.fixes.t_ns, fixes.t_ns)
+    cov = np.tile(np.eye(2) * fit.fix_sd_m**2, (len(fixes), 1, 1))
+    car = half.follow(fit.start, half.steps(fit.settings, delay_s=fit.value(FIX_DELAY)), cov)
+    apart = wrap_all(reference.heading_rad[rows] - car.heading_rad)
+    yaw_rad = circular_mean(apart)
+    around = wrap_all(apart - yaw_rad)
+    independent = persistence(fixes.t_ns, around).independent
+    spread = float(np.std(around)) / math.sqrt(independent)
+    return yaw_rad, math.hypot(spread, math.sqrt(fit.start.hh))
+
+
+def _together(given: OdometrySettings, sources: Sequence[SourceFit]) -> OdometrySettings:
+    """Values of the first source, and of each other what belongs to its turns alone."""
+    values = {name: getattr(sources[0].fit.settings, name) for name in SHARED}
+    for source in sources:
+        names = OF_ONE_TURN[source.fit.source]
+        values |= {name: getattr(source.fit.settings, name) for name in names}
+    return replace(given, **values)
+
+
+def section_of(found: DriveFit) -> dict[str, object]:
+    """The fit as a vehicle file's [odometry] section, with where it comes from."""
+    names = [*SHARED, *(name for one in found.sources for name in OF_ONE_TURN[one.fit.source])]
+    values = {
+        name: float(f"{value:.6g}")
+        for name in names
+        if (value := getattr(found.settings, name)) is not None
+    }
+    return {**values, "fitted": _provenance(found)}
+
+
+def _provenance(found: DriveFit) -> dict[str, object]:
+    first = found.sources[0]
+    shown = [
+        one
+        for source in found.sources
+        for one in source.fit.fitted
+        if hasattr(found.settings, one.parameter)
+    ]
+    missing = [one.parameter for source in found.sources for one in source.fit.not_observable]
+    rounded = OdometryFitted(
+        log=found.log,
+        reference=found.reference,
+        start_ns=found.start_ns,
+        end_ns=found.middle_ns,
+        positions=first.fit.fixes,
+        outliers=first.fit.outliers,
+        position_sd_m=round(first.fit.fix_sd_m, 3),
+        rms_m=round(first.after.fitted_m, 3),
+        held_out_rms_m=round(first.after.held_out_m, 3),
+        held_out_before_rms_m=round(first.before.held_out_m, 3),
+        sd={one.parameter: float(f"{one.sd:.3g}") for one in reversed(shown)},
+        not_observable=tuple(dict.fromkeys(missing)),
+    )
+    return rounded.model_dump(mode="json")
+
+
+def camera_yaw_of(found: DriveFit) -> float | None:
+    """The camera's mounting yaw, where the reference was its track."""
+    yaw_rad = found.sources[0].camera_yaw_rad
+    return None if yaw_rad is None or not found.is_of_camera else round(yaw_rad, 5)
+
+
+def with_section(text: str, found: DriveFit) -> str:
+    """A vehicle file's text with its [odometry] values replaced; comments stay."""
+    document = tomlkit.parse(text)
+    section = document.setdefault("odometry", tomlkit.table())
+    for key, value in section_of(found).items():
+        section[key] = value
+    if (yaw_rad := camera_yaw_of(found)) is not None:
+        document.setdefault("camera", tomlkit.table())["yaw_rad"] = yaw_rad
+    return tomlkit.dumps(document)

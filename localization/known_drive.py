@@ -1,0 +1,191 @@
+"""A drive whose positions are known: its odometry cut at them, followed with or without them."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from crosscue.replay.columns import Floats, Int64s
+
+from .fixes import Fixes
+from .odometry import OdometrySettings, TurnSignal, WheelSpeeds, integrate
+from .pose_filter import State, at_point, predict, update_position
+from .start_pose import start_pose
+
+STEP_S: Final = 0.2
+"""Odometry is followed in arcs no longer than this."""
+GATE_NIS: Final = 13.8
+"""One good position in a thousand is further off; beyond, it counts for less and less."""
+
+
+class Steps(NamedTuple):
+    """M arcs of odometry between positions.
+
+    Attributes:
+        at_fix: Shape (M,): the position at the arc's end, or -1.
+        distance_m: Shape (M,).
+        turn_rad: Shape (M,).
+        distance_var_m2: Shape (M,).
+        turn_var_rad2: Shape (M,).
+    """
+
+    at_fix: Int64s
+    distance_m: Floats
+    turn_rad: Floats
+    distance_var_m2: Floats
+    turn_var_rad2: Floats
+
+
+class Predicted(NamedTuple):
+    """What a filter expects of N positions, before it is told them.
+
+    Attributes:
+        xy_m: Shape (N, 2).
+        heading_rad: Shape (N,).
+        cov_m2: Shape (N, 2, 2).
+    """
+
+    xy_m: Floats
+    heading_rad: Floats
+    cov_m2: Floats
+
+
+class KnownDrive:
+    """Wheel speeds, what reports turns, and positions while both speak."""
+
+    def __init__(
+        self,
+        wheels: WheelSpeeds,
+        turn: TurnSignal | None,
+        fixes: Fixes,
+        lever_m: tuple[float, float],
+    ) -> None:
+        """Take the positions that lie within the odometry.
+
+        Args:
+            wheels: The drive's wheel speeds.
+            turn: Yaw rate or steering; None takes the wheels' difference.
+            fixes: Positions in order of time.
+            lever_m: The point they are of, ahead of and to the left of the rear axle.
+        """
+        self.wheels, self.turn, self.lever_m = wheels, turn, lever_m
+        self.source = "wheels" if turn is None else turn.kind
+        self.fixes = fixes = _covered(wheels, turn, fixes)
+        self.seconds = (fixes.t_ns - fixes.t_ns[0]) * 1e-9 if len(fixes) else np.empty(0)
+        knots, at = [np.zeros(1)], [np.zeros(1, np.int64)]
+        for k, (before, after) in enumerate(
+            zip(self.seconds[:-1].tolist(), self.seconds[1:].tolist(), strict=True), start=1
+        ):
+            parts = max(math.ceil((after - before) / STEP_S), 1)
+            knots.append(np.linspace(before, after, parts + 1)[1:])
+            at.append(np.array([-1] * (parts - 1) + [k]))
+        self.knots_s, self.at_fix = np.concatenate(knots), np.concatenate(at)
+
+    @property
+    def fix_sd_m(self) -> float:
+        """Of the positions on average, east and north, as they state it."""
+        return math.sqrt(float(np.mean(np.trace(self.fixes.cov_m2, axis1=1, axis2=2))) / 2.0)
+
+    def until(self, t_ns: int) -> KnownDrive:
+        """The same drive with the positions before a time."""
+        before = self.fixes.take(self.fixes.t_ns < t_ns)
+        return KnownDrive(self.wheels, self.turn, before, self.lever_m)
+
+    def steps(
+        self, settings: OdometrySettings, drift_radps2: float = 0.0, delay_s: float = 0.0
+    ) -> Steps:
+        """Odometry between the positions.
+
+        Args:
+            settings: The car.
+            drift_radps2: Of the gyro's bias, which is the settings' in the middle of the drive.
+            delay_s: How long after they were true the positions are stamped.
+        """
+        turn = self.turn
+        if turn is not None and drift_radps2:
+            middle_s = (turn.t_ns - self.fixes.t_ns[0]) * 1e-9 - 0.5 * self.seconds[-1]
+            turn = TurnSignal(turn.t_ns, turn.values - drift_radps2 * middle_s, turn.kind)
+        made = integrate(self.wheels, settings, turn).increments
+        edges_s = (np.append(made.start_ns[:1], made.stop_ns) - self.fixes.t_ns[0]) * 1e-9
+        at_s = self.knots_s - delay_s
+
+        def between(column: Floats) -> Floats:
+            sums = np.interp(at_s, edges_s, np.append(0.0, np.cumsum(column)))
+            return np.diff(sums, prepend=sums[0])
+
+        return Steps(
+            self.at_fix,
+            between(made.distance_m),
+            between(made.turn_rad),
+            between(made.distance_var_m2),
+            between(made.turn_var_rad2),
+        )
+
+    def start(self, settings: OdometrySettings) -> State:
+        """A first guess of the pose at the first position."""
+        made = integrate(self.wheels, settings, self.turn).increments
+        return start_pose(made, self.fixes, self.lever_m)
+
+    def follow(self, start: State, steps: Steps, cov_m2: Floats | None = None) -> Predicted:
+        """Drive along the steps.
+
+        Args:
+            start: Of the rear axle, at the first position.
+            steps: From there on.
+            cov_m2: Shape (N, 2, 2): of the positions, which the filter then weighs in one after
+                the other; None lets it dead reckon.
+        """
+        ahead, left = self.lever_m
+        fixes = self.fixes.xy_m.tolist()
+        covs = None if cov_m2 is None else cov_m2.tolist()
+        found: list[State] = []
+        state = start
+        columns = (column.tolist() for column in steps)
+        for k, distance, turn, distance_var, turn_var in zip(*columns, strict=True):
+            state = predict(state, distance, turn, distance_var, turn_var, 0.0)
+            if k < 0:
+                continue
+            seen = at_point(state, ahead, left)
+            found.append(seen)
+            if covs is not None:
+                state = at_point(_weighed(seen, fixes[k], covs[k]), -ahead, -left)
+        table = np.array(found).reshape(-1, len(State._fields))
+        x, y, heading, _, xx, xy, _, _, yy = table.T[:9]
+        cov = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+        return Predicted(np.stack([x, y], axis=1), heading, cov)
+
+
+def _weighed(seen: State, xy_m: list[float], cov_m2: list[list[float]]) -> State:
+    """After one position; an outlier counts as one that bad, without a jump at the gate."""
+    (x, y), ((var_x, cov_xy), (_, var_y)) = xy_m, cov_m2
+    nis = update_position(seen, x, y, var_x, cov_xy, var_y, 0.0).nis
+    more = max(nis / GATE_NIS, 1.0)
+    return update_position(seen, x, y, more * var_x, more * cov_xy, more * var_y, math.inf).state
+
+
+def whitened(predicted: Predicted, xy_m: Floats, cov_m2: Floats) -> tuple[Floats, Floats]:
+    """What positions differ from the prediction, in units of their common covariance.
+
+    Args:
+        predicted: Of N positions.
+        xy_m: Shape (N, 2).
+        cov_m2: Shape (N, 2, 2): of the positions alone.
+
+    Returns:
+        Shape (N, 2), and the logarithm of each covariance's determinant, shape (N,).
+    """
+    root = np.linalg.cholesky(predicted.cov_m2 + cov_m2)
+    white: Floats = np.linalg.solve(root, (xy_m - predicted.xy_m)[:, :, None])[:, :, 0]
+    log_det: Floats = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    return white, log_det
+
+
+def _covered(wheels: WheelSpeeds, turn: TurnSignal | None, fixes: Fixes) -> Fixes:
+    """Positions while everything speaks, a little inside because of the delays fitted."""
+    spans = [wheels.t_ns] + ([] if turn is None else [turn.t_ns])
+    if any(len(t_ns) < 2 for t_ns in spans):
+        return fixes.take(slice(0, 0))
+    first, last = max(int(t[0]) for t in spans), min(int(t[-1]) for t in spans)
+    return fixes.take((fixes.t_ns >= first) & (fixes.t_ns <= last))

@@ -1,0 +1,192 @@
+"""Laws of odometry fitted to known positions, on simulated drives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from crosscue.localization.fixes import Fixes
+from crosscue.localization.known_drive import KnownDrive
+from crosscue.localization.odometry import OdometrySettings, TurnSignal, integrate
+from crosscue.localization.odometry_fit import OdometryFit, fit_odometry
+from crosscue.localization.start_pose import start_pose
+from crosscue.replay.base import Floats, VehicleError
+from support.simulated_drive import BASE_M, TRACK_M, Truth, drive, gyro, wheels
+
+CAR = OdometrySettings(
+    track_width_m=TRACK_M,
+    wheelbase_m=BASE_M,
+    slip_per_sqrt_m=0.02,
+    gyro_noise_rad_per_sqrt_s=1e-3,
+)
+TRUE = {"wheel_scale": 1.02, "gyro_bias_radps": 0.01, "yaw_rate_scale": 0.97}
+LEVER = (1.5, -0.4)
+
+
+def positions(truth: Truth, sd_m: float, rng: np.random.Generator, lever: bool = True) -> Fixes:
+    """A position of the antenna each second."""
+    rows = slice(0, None, 20)
+    x, y, heading = truth.xyh[rows].T
+    ahead, left = LEVER if lever else (0.0, 0.0)
+    cos, sin = np.cos(heading), np.sin(heading)
+    xy = np.column_stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left])
+    xy += rng.normal(0.0, sd_m, xy.shape)
+    return Fixes(truth.t_ns[rows], xy, np.tile(sd_m**2 * np.eye(2), (len(xy), 1, 1)))
+
+
+def wrong_gyro(truth: Truth, rng: np.random.Generator) -> TurnSignal:
+    """A gyro that reports too much, and something at rest."""
+    right = gyro(truth, CAR, rng)
+    values = right.values / TRUE["yaw_rate_scale"] + TRUE["gyro_bias_radps"]
+    return TurnSignal(right.t_ns, values, "yaw rate")
+
+
+def known(truth: Truth, rng: np.random.Generator, sd_m: float = 0.5) -> KnownDrive:
+    """The drive of a car whose wheels report too little and whose gyro is biased."""
+    car = wheels(truth, CAR, rng)
+    car = replace(car, wheels_mps=car.wheels_mps / TRUE["wheel_scale"])
+    return KnownDrive(car, wrong_gyro(truth, rng), positions(truth, sd_m, rng), LEVER)
+
+
+def rms_m(found: KnownDrive, settings: OdometrySettings, fit: OdometryFit) -> float:
+    path = found.follow(fit.start, found.steps(settings))
+    return float(np.sqrt(np.mean(np.sum((path.xy_m - found.fixes.xy_m) ** 2, axis=1))))
+
+
+@pytest.fixture(scope="module")
+def turning() -> tuple[KnownDrive, OdometryFit]:
+    rng = np.random.default_rng(seed=4)
+    found = known(drive(rng, seconds=120.0), rng)
+    half = found.until(int(found.fixes.t_ns[60]))
+    return found, fit_odometry(half, CAR, 120.0)
+
+
+def test_a_drive_with_turns_shows_scales_and_bias_within_their_deviations(
+    turning: tuple[KnownDrive, OdometryFit],
+) -> None:
+    _, fit = turning
+    shown = {one.parameter: one for one in fit.fitted}
+
+    assert TRUE.keys() <= shown.keys()
+    for name, value in TRUE.items():
+        assert abs(shown[name].value - value) < 4.0 * shown[name].sd
+        assert shown[name].sd < 0.5 * abs(value - getattr(CAR, name))
+    assert fit.fix_sd_m == pytest.approx(0.5, rel=0.5)
+
+
+def test_the_half_that_was_not_fitted_is_nearer_to_its_positions(
+    turning: tuple[KnownDrive, OdometryFit],
+) -> None:
+    found, fit = turning
+
+    assert rms_m(found, fit.settings, fit) < 0.2 * rms_m(found, CAR, fit)
+
+
+def test_errors_of_what_was_not_fitted_are_as_large_as_claimed(
+    turning: tuple[KnownDrive, OdometryFit],
+) -> None:
+    found, fit = turning
+    path = found.follow(fit.start, found.steps(fit.settings))
+    apart = path.xy_m - found.fixes.xy_m
+    cov = path.cov_m2 + 0.25 * np.eye(2)
+    nees = np.einsum("ni,nij,nj->n", apart, np.linalg.inv(cov), apart)
+
+    assert 0.05 < nees.mean() < 7.4  # 95 % of a chi-square with two degrees of freedom
+
+
+def straight(seconds: float = 60.0) -> Truth:
+    rng = np.random.default_rng(seed=1)
+    there = drive(rng, seconds=seconds)
+    speed = 12.0 + 3.0 * np.sin(np.arange(len(there.t_ns)) / 150.0)
+    x = np.concatenate([[0.0], np.cumsum(0.025 * (speed[1:] + speed[:-1]))])
+    zero = np.zeros(len(x))
+    return Truth(there.t_ns, np.column_stack([x, zero, zero]), speed, zero)
+
+
+def test_a_straight_drive_does_not_show_what_only_turns_show() -> None:
+    rng = np.random.default_rng(seed=2)
+    fit = fit_odometry(known(straight(), rng), CAR)
+    missing = {one.parameter for one in fit.not_observable}
+
+    assert {"yaw_rate_scale", "turn_delay_s"} <= missing
+    assert fit.settings.yaw_rate_scale == CAR.yaw_rate_scale
+    assert fit.settings.turn_delay_s == CAR.turn_delay_s
+    assert fit.value("wheel_scale") == pytest.approx(1.02, abs=0.005)
+
+
+def steered(truth: Truth) -> TurnSignal:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        curvature = np.where(truth.speed_mps != 0.0, truth.yaw_radps / truth.speed_mps, 0.0)
+    values = 18.0 * np.arctan(BASE_M * np.clip(curvature, -0.2, 0.2)) + 0.05
+    return TurnSignal(truth.t_ns, values, "steering")
+
+
+def test_wide_turns_show_the_steering_ratio_only_together_with_the_wheelbase() -> None:
+    rng = np.random.default_rng(seed=6)
+    there = drive(rng, seconds=60.0)
+    speed = np.full(len(there.t_ns), 12.0)
+    yaw = 0.1 * np.sin(np.arange(len(speed)) / 60.0)
+    heading = np.concatenate([[0.0], np.cumsum(0.025 * (yaw[1:] + yaw[:-1]))])
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    steps = 0.6 * np.column_stack([np.cos(middle), np.sin(middle)])
+    xy = np.vstack([[0.0, 0.0], np.cumsum(steps, axis=0)])
+    truth = Truth(there.t_ns, np.column_stack([xy, heading]), speed, yaw)
+    found = KnownDrive(
+        wheels(truth, CAR, rng), steered(truth), positions(truth, 0.3, rng, lever=False), (0.0, 0.0)
+    )
+    fit = fit_odometry(found, replace(CAR, steering_ratio=15.0))
+
+    assert fit.settings.wheelbase_m == BASE_M
+    assert "wheelbase_m" in {one.parameter for one in fit.not_observable}
+    assert fit.value("steering_ratio") == pytest.approx(18.0, rel=0.05)
+    assert fit.value("steering_offset_rad") == pytest.approx(0.05, abs=0.01)
+
+
+def test_too_short_a_drive_is_refused() -> None:
+    rng = np.random.default_rng(seed=3)
+    there = straight()
+
+    with pytest.raises(VehicleError, match="5 positions lie within the wheel speeds; expected 15"):
+        fit_odometry(known(there, rng).until(int(there.t_ns[81])), CAR)
+
+
+def test_a_car_that_stands_is_refused() -> None:
+    still = straight()
+    zero = np.zeros_like(still.xyh)
+    still = Truth(still.t_ns, zero, zero[:, 0], zero[:, 0])
+
+    with pytest.raises(VehicleError, match="the car went 0 m while its position is known"):
+        fit_odometry(known(still, np.random.default_rng(0)), CAR)
+
+
+def shifted(fixes: Fixes, turn_rad: float, by_m: Floats) -> Fixes:
+    cos, sin = np.cos(turn_rad), np.sin(turn_rad)
+    return replace(fixes, xy_m=fixes.xy_m @ np.array([[cos, sin], [-sin, cos]]) + by_m)
+
+
+def test_the_start_is_laid_onto_the_first_positions_and_moves_with_them() -> None:
+    truth = drive(np.random.default_rng(seed=8), seconds=30.0)
+    odometry = integrate(wheels(truth, CAR), CAR, gyro(truth, CAR)).increments
+    exact = positions(truth, 1e-6, np.random.default_rng(0))
+    moved = shifted(exact, 2.0, np.array([300.0, -70.0]))
+
+    here, there = start_pose(odometry, exact, LEVER), start_pose(odometry, moved, LEVER)
+
+    assert [here.x_m, here.y_m] == pytest.approx(truth.xyh[0, :2], abs=0.05)
+    assert np.exp(1j * here.heading_rad) == pytest.approx(np.exp(1j * truth.xyh[0, 2]), abs=0.01)
+    assert np.exp(1j * there.heading_rad) == pytest.approx(
+        np.exp(1j * (here.heading_rad + 2.0)), abs=1e-9
+    )
+
+
+def test_a_car_that_has_not_moved_does_not_know_its_heading() -> None:
+    still = straight()
+    zero = np.zeros_like(still.xyh)
+    still = Truth(still.t_ns, zero, zero[:, 0], zero[:, 0])
+    odometry = integrate(wheels(still, CAR), CAR, gyro(still, CAR)).increments
+
+    found = start_pose(odometry, positions(still, 1.0, np.random.default_rng(0)), (0.0, 0.0))
+
+    assert found.hh == pytest.approx(np.pi**2)
