@@ -54,6 +54,25 @@ class Origin(Section):
     altitude_m: float
 
 
+class Mounting(Section):
+    """A rigid transform from the rear axle, on the ground, to a body; ISO 8855 axes.
+
+    Angles turn yaw first, then pitch, then roll.
+    """
+
+    x_m: float = 0.0
+    """Ahead of the rear axle."""
+    y_m: float = 0.0
+    """To its left."""
+    z_m: float = 0.0
+    """Above the ground."""
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
+    """Downwards."""
+    yaw_rad: float = 0.0
+    """Counter-clockwise."""
+
+
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
 
@@ -118,8 +137,14 @@ class Truth(Section):
     """Log times between which the truth speaks; half open."""
     pose: str | None = None
     """TUM trajectory, a file beside this one: seconds on the log clock, metres, quaternion."""
-    pose_point: Literal["rear_axle", "camera"] = "rear_axle"
-    """Whose position the trajectory gives."""
+    pose_point: Literal["rear_axle", "camera", "antenna"] = "rear_axle"
+    """The body whose pose the trajectory is: the car, about its rear axle; a camera, x along its
+    optical axis; or a GNSS antenna, x along the car."""
+    mounting: Mounting | None = None
+    """Where that body sits on the car. Left out: nowhere but at the rear axle, or where the vehicle
+    file's ``[camera]`` or ``[gnss]`` puts it."""
+    position_sd_m: Annotated[float, Field(gt=0.0)] | None = None
+    """S.d. of east and of north; left out: taken for exact."""
     origin: Origin | None = None
     source: str = ""
     """Who measured it, and how well."""

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from crosscue.datasets.truth.mounting import mounting_of
 from crosscue.datasets.truth.tum import heading_rad
 from crosscue.detectors.images import Encoded
 from crosscue.eval.pipeline.landmarks import UNDECODABLE
@@ -107,7 +108,9 @@ def read_poses(path: Path, vehicle: Vehicle) -> CameraPoses:
     lever = (vehicle.camera.x_m, vehicle.camera.y_m)
     xy_m = track.xyz_m[:, :2]
     if truth.pose_point != "camera":
-        xy_m = xy_m + _turned(lever, heading)
+        body = mounting_of(truth, vehicle)
+        heading = heading - body.yaw_rad
+        xy_m = xy_m + _turned((lever[0] - body.x_m, lever[1] - body.y_m), heading)
     return CameraPoses(track.t_ns, xy_m, heading, np.zeros((len(xy_m), 2, 2)))
 
 

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.datasets.geodesy import geodetic_to_enu
+from crosscue.datasets.truth.mounting import mounting_of
 from crosscue.datasets.truth.tum import heading_rad
 from crosscue.eval.scoring.pose.score import load_truth
 from crosscue.localization.fixes import Fixes
@@ -70,14 +71,12 @@ def of_truth(path: Path, vehicle: Vehicle) -> Reference:
     rows = spaced(track.t_ns)
     if not len(rows):
         raise EmptyResultError(f"{path}: its track has no pose; expected the true positions")
-    fixes = Fixes(
-        track.t_ns[rows],
-        track.xyz_m[rows, :2],
-        np.tile(TRUTH_SD_M**2 * np.eye(2), (len(rows), 1, 1)),
-    )
+    var = (truth.position_sd_m or TRUTH_SD_M) ** 2
+    cov = np.tile(var * np.eye(2), (len(rows), 1, 1))
+    fixes = Fixes(track.t_ns[rows], track.xyz_m[rows, :2], cov)
     is_of_camera = truth.pose_point == "camera"
-    camera = vehicle.camera
-    lever_m = (camera.x_m, camera.y_m) if is_of_camera else (0.0, 0.0)
+    mounting = mounting_of(truth, vehicle)
+    lever_m = (mounting.x_m, mounting.y_m)
     return Reference(
         truth.source or path.name, fixes, lever_m, heading_rad(track)[rows], is_of_camera
     )

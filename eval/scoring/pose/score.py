@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.datasets.truth import truth as truth_file
+from crosscue.datasets.truth.mounting import mounting_of
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
 from crosscue.eval.runs.folder import RunFolder
@@ -257,19 +258,21 @@ def _estimate(table: pa.Table, vehicle: Vehicle, truth: Truth) -> tuple[Trajecto
 def at_truths_point(
     t_ns: Int64s, xyh: Floats, cov_xyh: Floats, vehicle: Vehicle, truth: Truth
 ) -> tuple[Trajectory, Floats]:
-    """Rear-axle poses, shape (N, 3), moved to the point the truth speaks of.
+    """Rear-axle poses, shape (N, 3), as poses of the body whose track the truth is.
+
+    The covariance that returns is that of estimate less truth: the truth's own is added.
 
     Args:
         t_ns: Shape (N,).
         xyh: Shape (N, 3).
         cov_xyh: Shape (N, 6): covariance of x, y, heading: xx, xy, xh, yy, yh, hh.
-        vehicle: For the camera's place.
-        truth: Names the point.
+        vehicle: Says where the camera and the antenna sit, unless the truth does.
+        truth: Names the body whose track it is.
     """
     x, y, heading = xyh.T
     cov = cov_xyh
-    if truth.pose_point == "camera":
-        ahead, left = vehicle.camera.x_m, vehicle.camera.y_m
+    ahead, left, yaw_rad = mounting_of(truth, vehicle)
+    if ahead or left:
         cos, sin = np.cos(heading), np.sin(heading)
         dx, dy = ahead * cos - left * sin, ahead * sin + left * cos
         x, y = x + dx, y + dy
@@ -285,7 +288,9 @@ def at_truths_point(
                 hh,
             ]
         )
-    return planar(t_ns, x, y, heading), cov
+    if truth.position_sd_m is not None:
+        cov = cov + truth.position_sd_m**2 * np.array([1.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    return planar(t_ns, x, y, heading + yaw_rad), cov
 
 
 def _ape(paired: Paired, how: Alignment) -> Errors:

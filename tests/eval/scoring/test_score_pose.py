@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from crosscue.datasets.truth.truth import Truth, save
-from crosscue.datasets.truth.tum import Trajectory, planar, write_tum
+from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, write_tum
 from crosscue.eval import cli
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.recording import save as save_recording
@@ -108,6 +108,39 @@ def test_truth_of_the_camera_is_compared_at_the_camera(tmp_path: Path) -> None:
     path = _truth(tmp_path / "truth", _circle(np.arange(0.5, 29.0, 0.05), 2.0), pose_point="camera")
 
     assert score_pose(_run(tmp_path / "run", vehicle), path).ape["none"].translation_m.max < 1e-2
+
+
+def _turned(track: Trajectory, yaw_rad: float) -> Trajectory:
+    """The same track of a body that is mounted turned to the left."""
+    heading = heading_rad(track) + yaw_rad
+    return planar(track.t_ns, track.xyz_m[:, 0], track.xyz_m[:, 1], heading)
+
+
+@pytest.mark.parametrize("says", ["truth", "vehicle"])
+def test_a_camera_that_looks_aside_is_no_heading_error(tmp_path: Path, says: str) -> None:
+    start = Start(heading_rad=0.0)
+    at_s = np.arange(0.5, 29.0, 0.05)
+    track = _turned(_circle(at_s, 2.0), 0.016)
+    camera = Camera(x_m=2.0, yaw_rad=0.016) if says == "vehicle" else Camera(x_m=9.0)
+    mounting = {"x_m": 2.0, "yaw_rad": 0.016} if says == "truth" else None
+    path = _truth(tmp_path / "truth", track, pose_point="camera", mounting=mounting)
+    result = score_pose(
+        _run(tmp_path / "run", Vehicle(version=1, start=start, camera=camera)), path
+    )
+
+    assert result.ape["none"].rotation_deg.max < 0.01
+    assert result.ape["none"].translation_m.max < 0.1
+
+
+def test_nees_counts_what_the_truth_itself_is_uncertain_by(tmp_path: Path) -> None:
+    run = _run(tmp_path / "run")
+    shifted = _circle(np.arange(0.5, 29.0, 0.05))
+    shifted = replace(shifted, xyz_m=shifted.xyz_m + np.array([30.0, 0.0, 0.0]))
+    exact = score_pose(run, _truth(tmp_path / "exact", shifted))
+    rough = score_pose(run, _truth(tmp_path / "rough", shifted, position_sd_m=1000.0))
+
+    assert exact.nees_xy.mean > 50.0
+    assert rough.nees_xy.mean < 0.01
 
 
 def test_evo_gives_the_same_numbers_from_the_files_written(tmp_path: Path) -> None:
