@@ -268,7 +268,7 @@ def test_completion_scripts_are_printed(shell: str, capsys: pytest.CaptureFixtur
     [
         ("crosscue re", {"replay"}),
         ("crosscue ", {name.split()[0] for name in cli.COMMANDS}),
-        ("crosscue fit ", {"compass", "signs", "ranges", "messages", "landmarks"}),
+        ("crosscue fit ", {"compass", "odometry", "signs", "ranges", "messages", "landmarks"}),
         ("crosscue truth c", {"check"}),
         ("crosscue truth check t.json --lo", {"--log"}),
         ("crosscue replay drive.mcap --wor", {"--workers"}),
