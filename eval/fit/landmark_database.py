@@ -12,12 +12,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from crosscue.datasets.truth.mounting import mounting_of
 from crosscue.datasets.truth.tum import heading_rad
 from crosscue.detectors.images import Encoded
 from crosscue.eval.pipeline.landmarks import UNDECODABLE
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.scoring.pose.score import load_truth
+from crosscue.eval.scoring.pose.score import load_truth, mounting_of
 from crosscue.localization.angles import interpolate_angle
 from crosscue.localization.landmarks.database import LandmarkWriter, Place
 from crosscue.localization.landmarks.features import Matcher

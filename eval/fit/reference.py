@@ -9,9 +9,8 @@ from typing import Final
 import numpy as np
 
 from crosscue.datasets.geodesy import geodetic_to_enu
-from crosscue.datasets.truth.mounting import mounting_of
 from crosscue.datasets.truth.tum import heading_rad
-from crosscue.eval.scoring.pose.score import load_truth
+from crosscue.eval.scoring.pose.score import load_truth, mounting_of
 from crosscue.localization.fixes import Fixes
 from crosscue.replay.base import EmptyResultError, Floats, Int64s
 from crosscue.replay.signals.kinds import Samples

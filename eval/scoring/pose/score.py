@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.datasets.truth import truth as truth_file
-from crosscue.datasets.truth.mounting import mounting_of
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
 from crosscue.eval.runs.folder import RunFolder
@@ -55,6 +54,20 @@ NO_NEES: Final = (
     "the run's frame is its own: neither start heading nor compass; set [start] heading_rad"
 )
 ALIGNMENTS: Final[tuple[Alignment, ...]] = ("none", "origin", "yaw")
+
+
+class PlaneMounting(NamedTuple):
+    """A body's pose seen from the rear axle, in the ground plane.
+
+    Attributes:
+        x_m: Ahead.
+        y_m: To the left.
+        yaw_rad: Counter-clockwise.
+    """
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,6 +266,19 @@ def _estimate(table: pa.Table, vehicle: Vehicle, truth: Truth) -> tuple[Trajecto
     xyh = np.column_stack([table[name].to_numpy() for name in ("x_m", "y_m", "heading_rad")])
     cov = np.column_stack([table[f"cov_{name}"].to_numpy() for name in COVARIANCES])
     return at_truths_point(table["t_ns"].to_numpy(), xyh, cov, vehicle, truth)
+
+
+def mounting_of(truth: Truth, vehicle: Vehicle) -> PlaneMounting:
+    """What the truth file says of it, else what the vehicle file does."""
+    given = truth.mounting
+    if given is not None:
+        return PlaneMounting(given.x_m, given.y_m, given.yaw_rad)
+    if truth.pose_point == "camera":
+        camera = vehicle.camera
+        return PlaneMounting(camera.x_m, camera.y_m, camera.yaw_rad)
+    if truth.pose_point == "antenna":
+        return PlaneMounting(vehicle.gnss.x_m, vehicle.gnss.y_m, 0.0)
+    return PlaneMounting(0.0, 0.0, 0.0)
 
 
 def at_truths_point(
