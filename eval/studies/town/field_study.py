@@ -25,6 +25,7 @@ from crosscue.localization.town.random_stream import key_of
 from crosscue.replay.base import RunError, json_tree, strict_json, write_text
 from crosscue.replay.processes import in_processes
 
+from .range_study import implied_m
 from .replayed import through_log
 from .settings import FieldStudy
 
@@ -36,7 +37,9 @@ NOTES: Final = (
     "with crosscue replay and crosscue score.",
     "In a town of 1 km2 no goal is 6.9 km from the start; the source's Euclidean distance can only "
     "be a sum over successive goals, which is what stands here as the way from goal to goal.",
-    "Range runs last longer than the published 'nearly 10 km': in a small town blocks are short "
+    "The published field runs lie between the published curves of 20 and 30 degrees; at 25 degrees "
+    f"those curves imply {implied_m(20.0, 25.0) / 1e3:.1f} km, not 'nearly 10 km'.",
+    "Range runs last longer than both: in a small town blocks are short "
     "and turns many, so that a heading's error, which persists for a while, is spread over both "
     "axes and partly undone. Towns of 25 km2, or wheels that forget a heading sooner, give 13 to "
     "14 km (docs/studies.md). Streets in which the compass is worse, the source's explanation, "

@@ -133,6 +133,11 @@ def law_m(settings: Drive) -> float:
     return half_m**2 / (variance * settings.sensors.compass_interval_m)
 
 
+def implied_m(published_deg: float, compass_deg: float) -> float:
+    """The mean distance at loss that a published one implies for another compass, by r ds D."""
+    return PUBLISHED_M[published_deg] * (published_deg / compass_deg) ** 2
+
+
 def calibrate(drive: Drive, workers: int, tolerance: float = 2e-3) -> float:
     """The compass interval with which cars at 30 degrees are lost after the published mean.
 

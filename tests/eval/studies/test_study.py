@@ -26,9 +26,15 @@ from crosscue.eval.studies.intervals import (
 )
 from crosscue.eval.studies.page import Table, write_page
 from crosscue.eval.studies.town import work
+from crosscue.eval.studies.town.choices import drive_choices
 from crosscue.eval.studies.town.field_study import drive_field, finish_field
 from crosscue.eval.studies.town.landmark_study import comparisons_of
-from crosscue.eval.studies.town.range_study import CALIBRATION_SEED, calibrate, summarise
+from crosscue.eval.studies.town.range_study import (
+    CALIBRATION_SEED,
+    calibrate,
+    implied_m,
+    summarise,
+)
 from crosscue.eval.studies.town.replayed import through_log
 from crosscue.eval.studies.town.settings import (
     FieldStudy,
@@ -171,6 +177,48 @@ def test_ways_are_averaged_over_pairs_over_each_ones_own_goals_and_over_all() ->
     assert found.extra.value == pytest.approx(0.1)
     assert found.extra_reached.value == pytest.approx((15_300.0 / 3.0) / (3000.0 / 2.0) - 1.0)
     assert found.extra_all.value == pytest.approx(15_300.0 / 12_000.0 - 1.0)
+    # Below 10 landmarks per km2 lies the only cell; all cities are of 1 km2.
+    assert found.extra_sparse.value == found.extra_reached.value
+    assert found.by_city[0].extra.value == found.extra_reached.value
+    assert all(math.isnan(one.extra.value) for one in found.by_city[1:])
+
+
+def test_the_like_for_like_figure_comes_first_and_says_how_the_subset_was_chosen(
+    tmp_path: Path,
+) -> None:
+    study = SMALL.model_copy(update={"drives": 20})
+    made = finish_landmarks(study, driven(study, tmp_path))
+    compared = next(table for table in made.tables if table.heading == "Against straight to goal")
+
+    names = compared.head
+    assert names.index("drives farther by") < names.index("published") < names.index("paired")
+    assert any("chosen after seeing" in note for note in made.notes)
+    cities = next(table for table in made.tables if "by size of city" in table.heading)
+    assert [row[0] for row in cities.rows] == ["landmark to landmark", "hybrid"]
+
+
+def test_other_choices_follow_the_law_and_include_the_studied_one() -> None:
+    study = RangeStudy(drives=200)
+    found = {
+        (round(one.slip_per_sqrt_m, 4), round(one.compass_interval_m, 3)): one
+        for one in drive_choices(study)
+    }
+
+    assert [key for key, one in found.items() if one.is_studied] == [(0.003, 1.876)]
+    for slip in (0.0015, 0.003, 0.006, 0.009):
+        means = [one.lost_after_m[30.0].value for key, one in found.items() if key[0] == slip]
+        # The longer a compass error lasts, the sooner the car is lost: about as 1 / interval.
+        assert means == sorted(means, reverse=True)
+        assert 1.5 < means[0] / means[-1] < 4.0
+    for one in found.values():
+        assert one.lost_after_m[20.0].value > one.lost_after_m[30.0].value
+        assert one.lost_after_m[None].value < 1000.0
+
+
+def test_published_means_imply_what_the_field_would_have_reached() -> None:
+    assert implied_m(20.0, 25.0) == pytest.approx(13_312.0)
+    assert implied_m(30.0, 25.0) == pytest.approx(13_392.0)
+    assert implied_m(20.0, 20.0) == 20_800.0
 
 
 def test_strategies_share_their_cities_and_conditions_do_not(tmp_path: Path) -> None:
