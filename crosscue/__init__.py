@@ -105,6 +105,8 @@ _EXPORTS: Final = {
     "write_truth": "eval.interface.truth",
     "truth_schema": "eval.interface.truth",
     "draft_vehicle": "eval.interface.vehicles",
+    "check_vehicle": "eval.interface.vehicles",
+    "VehicleCheck": "eval.interface.vehicles",
     "VehicleDraft": "eval.interface.vehicles",
     "run_schema": "eval.interface.runs.run",
     "Comparison": "eval.catalog.compare",
@@ -297,7 +299,9 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.training.road import train_road as train_road
     from crosscue.eval.interface.truth import truth_schema as truth_schema
     from crosscue.eval.interface.truth import write_truth as write_truth
+    from crosscue.eval.interface.vehicles import VehicleCheck as VehicleCheck
     from crosscue.eval.interface.vehicles import VehicleDraft as VehicleDraft
+    from crosscue.eval.interface.vehicles import check_vehicle as check_vehicle
     from crosscue.eval.interface.vehicles import draft_vehicle as draft_vehicle
     from crosscue.eval.studies.intersections.study import IntersectionStudy as IntersectionStudy
     from crosscue.eval.studies.town.settings import FieldStudy as FieldStudy

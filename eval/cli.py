@@ -33,6 +33,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "convert": ("logs.convert", "convert a log or data set to MCAP with ROS 2 types"),
     "seal": ("logs.seal", "write a checksum of each MiB beside a log, or verify a log with it"),
     "vehicle init": ("vehicle.init", "write a first vehicle file from the contents of a log"),
+    "vehicle check": ("vehicle.check", "draw a vehicle file on a picture, list contradictions"),
     "decode": ("logs.decode", "decode every topic and CAN message into a Parquet file"),
     "detect": ("runs.detect", "run detectors on the camera images of a log"),
     "estimate": ("runs.estimate", "repeat the estimate of a run from its stored detections"),

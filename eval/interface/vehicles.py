@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from crosscue.eval.interface.logs.log import Log, opened
+from crosscue.eval.interface.show import listing
+from crosscue.eval.vehicle.check import Checked, Shown, check
+from crosscue.eval.vehicle.check_page import check_output, write_check
 from crosscue.eval.vehicle.mounting import estimate_mounting, yaw_notes
-from crosscue.replay.base import OutputError, UsageError, write_text
+from crosscue.replay.base import EmptyResultError, OutputError, UsageError, write_text
+from crosscue.replay.remote.logs import name_of
 from crosscue.replay.vehicle.drafting.camera import Measured, Mounting, camera_of
 from crosscue.replay.vehicle.drafting.text import Examined, draft, examine
-from crosscue.replay.vehicle.vehicle import Vehicle, parse
+from crosscue.replay.vehicle.vehicle import Vehicle, parse, vehicle_given
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -89,6 +93,111 @@ def draft_vehicle(
     if path is not None:
         write_text(path, text)
     return VehicleDraft(text, path)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class VehicleCheck:
+    """What a vehicle file makes of a drive, and what contradicts what; printed as a table.
+
+    Attributes:
+        path: The page or picture; None where none was asked for.
+        part: Which seconds were examined, in words.
+    """
+
+    path: Path | None
+    part: str
+    _found: Checked
+
+    @property
+    def contradictions(self) -> tuple[str, ...]:
+        """Sentences; empty where nothing contradicts anything."""
+        return self._found.contradictions
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue vehicle check --json`` prints."""
+        picture = self._found.picture
+        return {
+            "page": None if self.path is None else str(self.path),
+            "part": self.part,
+            "contradictions": list(self.contradictions),
+            "signals": [_known(asdict(row)) for row in self._found.signals],
+            "missing": dict(self._found.missing),
+            "picture": None
+            if picture is None
+            else {"topic": picture.topic, "t_ns": picture.t_ns, "size_px": _size_px(picture)},
+        }
+
+    def __repr__(self) -> str:
+        rows = [
+            (row.signal, row.source, row.count, row.rate_hz, row.low, row.high, row.unit)
+            for row in self._found.signals
+        ]
+        head = ("signal", "read from", "readings", "rate_hz", "lowest", "highest", "unit")
+        lines = [f"examined {self.part}", "", listing(head, rows, 2) if rows else "no signal", ""]
+        lines += [
+            f"agrees   {row.signal}: {row.agrees}" for row in self._found.signals if row.agrees
+        ]
+        lines += [f"not read {signal}: {why}" for signal, why in self._found.missing.items()]
+        lines += [f"WRONG    {text}" for text in self.contradictions] or ["no contradiction found"]
+        lines += [str(self.path)] if self.path is not None else []
+        return "\n".join(lines)
+
+
+def _size_px(picture: Shown) -> tuple[int, int]:
+    return picture.pixels.shape[1], picture.pixels.shape[0]
+
+
+def _known(row: dict[str, object]) -> dict[str, object]:
+    """The same, with None where JSON has no number."""
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in row.items()
+    }
+
+
+def check_vehicle(
+    log: Log | Path | str,
+    vehicle: Vehicle | Path | str,
+    output: Path | str | None = None,
+    *,
+    start_s: float = 0.0,
+    seconds: float = 10.0,
+    overwrite: bool = False,
+) -> VehicleCheck:
+    """Read a few seconds of a drive as a vehicle file says, and hold its signals together.
+
+    Args:
+        log: The drive, or its path.
+        vehicle: The vehicle file, or its settings.
+        output: A page (``.html``) or a picture (``.jpg``, ``.png``) with the horizon, metres on the
+            road and the regions; if left out, none is written.
+        start_s: Seconds after the first row at which to begin.
+        seconds: How many to read.
+        overwrite: Replace a file that is there.
+
+    Raises:
+        VehicleError: The vehicle file does not fit the drive.
+        UsageError: A span that cannot be, or an output that is no page or picture.
+        OutputError: The file exists, or cannot be written.
+        EmptyResultError: Nothing in those seconds: no signal and no picture.
+    """
+    path = None if output is None else Path(output)
+    if path is not None:
+        check_output(path, overwrite)
+    if not (math.isfinite(seconds) and seconds > 0.0):
+        raise UsageError(f"seconds: expected more than 0, got {seconds:g}")
+    settings = vehicle_given(vehicle)
+    with opened(log) as drive:
+        part = drive.part(start_s, start_s + seconds)
+        found = check(part.logs, settings, part.selection)
+        names = [name_of(one) for one in part.logs]
+    words = f"{seconds:g} s from {start_s:g} s on"
+    if not found.signals and found.picture is None:
+        why = "; ".join(f"{signal}: {text}" for signal, text in found.missing.items())
+        raise EmptyResultError(f"{', '.join(names)}: {words}: no signal and no picture: {why}")
+    if path is not None:
+        write_check(path, found, settings, names, words)
+    return VehicleCheck(path, words, found)
 
 
 def _given(

@@ -41,6 +41,7 @@ OPENS_LOGS: dict[str, str] = {
     "score": "{run} --truth {truth}",
     "view": "{run} -o {out}.rrd",
     "vehicle init": "{log} -o {out}.toml",
+    "vehicle check": "{log} --vehicle {car} -o {out}.html",
     "fit compass": "{compass} --vehicle {its_car}",
     "fit odometry": "{compass} --vehicle {its_car} --truth {its_truth}",
     "fit signs": "{drive} --label stop_sign",

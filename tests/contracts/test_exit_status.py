@@ -107,7 +107,7 @@ EMPTY: Final[dict[str, list[tuple[int, str]]]] = {
     "`truth`, `truth import`, `truth check`": _nothing("truth"),
     "`fit ...`, `train ...`": _nothing("fit", "train"),
     "`landmarks add`": _nothing("landmarks"),
-    "`vehicle init`": _nothing("vehicle"),
+    "`vehicle init`, `vehicle check`": _nothing("vehicle"),
     "`merge`": _nothing("merge"),
     "`info`": [(0, "info {rowless}"), (3, "info {nothing_whole}")],
     "many drives": [

@@ -23,6 +23,7 @@ LINES: Final[dict[str, tuple[str, int]]] = {
     "info": ("LOG --vehicle CAR", 3),
     "seal": ("LOG", 0),
     "vehicle init": ("LOG -o made.toml", 0),
+    "vehicle check": ("LOG --vehicle CAR -o check.html", 0),
     "convert": ("LOG -o converted.mcap", 0),
     "decode": ("LOG --vehicle CAR -o tables", 3),
     "detect": ("LOG --vehicle CAR -o found --no-cache", 3),

@@ -22,6 +22,7 @@ CALLS: Final = {
     "merge": ("merge",),
     "compare": ("compare_runs",),
     "vehicle init": ("draft_vehicle",),
+    "vehicle check": ("check_vehicle",),
     "truth": ("write_truth",),
     "truth import": ("import_truth",),
     "truth check": ("check_truth",),

@@ -25,6 +25,7 @@ COMMANDS: dict[str, str] = {
     "train road": "--data {empty} -o {out}.safetensors",
     "landmarks add": "{out}.db --images {empty} --coordinates {empty}/places.csv",
     "vehicle init": "{strange} -o {out}.toml",
+    "vehicle check": "{strange} --vehicle {bare} -o {out}.html",
     "merge": "{empty} -o {out}",
 }
 """Commands that such input gives nothing, and their arguments."""
@@ -44,11 +45,13 @@ def empty_inputs(folder: Path) -> dict[str, Path]:
     (empty / "labels.csv").write_text("picture,label,x0,y0,x1,y1\na.png,,,,,\n")
     (empty / "pairs.csv").write_text("query,known,same\n")
     (empty / "places.csv").write_text("image,x_m,y_m,sd_m\na.png,0,0,1\n")
+    (empty / "bare.toml").write_text("version = 1\n")
     message = Row("/can", BEGIN, b"\0\1\0\0\2\0\0\0a\0")
     return {
         "log": log,
         "run": run.path,
         "car": drive / "car.toml",
+        "bare": empty / "bare.toml",
         "empty": empty,
         "other": picture_folder(folder / "front", 3, "rate_hz: 10\n"),
         "strange": write_folder(folder / "strange", [message]),

@@ -130,11 +130,12 @@ def choose(seen: Observed) -> Choices:
         )
         turnings.append(of_wheels(left, right, grid))
     yaw_rates = _yaw_rates(seen, turnings, speed, grid)
-    # The steering judges a yaw rate where nothing better does, and is judged by the one chosen.
+    # An inertial unit's axes are those of its type; a CAN signal nobody confirms may have any sign,
+    # and two of them that agree with each other may both be wrong.
     by_rate = [
         of_rate(one.series, one.verdict.sign, grid)
         for one in yaw_rates[:1]
-        if not one.verdict.wrong
+        if not one.verdict.wrong and (one.verdict.agrees_with or not one.bus)
     ]
     steering = _ranked(
         Choice(

@@ -157,6 +157,20 @@ def test_without_bends_a_sign_is_not_claimed() -> None:
     assert not found.yaw_rates[0].verdict.wrong
 
 
+def test_signals_that_only_agree_with_each_other_have_no_sign() -> None:
+    bend = 0.02 * np.sin(0.3 * T_S)
+    steering = np.arctan(2.7 * bend / SPEED) * 15.0
+    found = chosen(
+        named(Kind.SPEED, "A.SPEED", SPEED),
+        named(Kind.YAW_RATE, "A.YAW", -bend),
+        named(Kind.STEERING, "A.ANGLE", -steering),
+        with_gnss=False,
+    )
+
+    assert found.yaw_rates[0].verdict.agrees_with == 0
+    assert found.steering[0].verdict.agrees_with == 0
+
+
 DBC: Final = """VERSION ""
 BU_: A
 BO_ 100 Wheels: 8 A

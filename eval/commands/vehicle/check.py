@@ -1,0 +1,55 @@
+"""Read seconds of a drive as a vehicle file says: what each signal shows, and what contradicts.
+
+The page shows a picture with the horizon, metres on the road and the regions in which road is
+looked for. Exit status 1 where signals contradict each other.
+
+example:
+  crosscue vehicle check drive.mcap --vehicle car.toml -o check.html
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import crosscue
+from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_result
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recordings of one drive")
+    parser.add_argument(
+        "--vehicle", type=Path, required=True, metavar="V.toml", help="the vehicle file to check"
+    )
+    parser.add_argument(
+        "--start-s", type=float, default=0.0, metavar="S", help="begin so long after the first row"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=10.0, metavar="S", help="read so many (default: 10)"
+    )
+    add_limit_arguments(parser)
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="FILE",
+        help="page (.html) or picture (.jpg, .png) to write",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check, print the table, and fail where something contradicts."""
+    with crosscue.open(*args.logs, limits=limits_of(args)) as log:
+        found = crosscue.check_vehicle(
+            log,
+            args.vehicle,
+            args.output,
+            start_s=args.start_s,
+            seconds=args.seconds,
+            overwrite=args.overwrite,
+        )
+    print_result(found, args)
+    return 1 if found.contradictions else 0

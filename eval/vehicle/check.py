@@ -1,0 +1,375 @@
+"""Seconds of a drive read as the vehicle file says, and what contradicts what in them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from crosscue.detectors.base import View
+from crosscue.detectors.images import decode, encoded
+from crosscue.replay.base import (
+    Bytes,
+    Floats,
+    Int64s,
+    Ledger,
+    Log,
+    LogFormatError,
+    Selection,
+    Topic,
+)
+from crosscue.replay.losses import warn_of
+from crosscue.replay.remote.logs import name_of
+from crosscue.replay.signals.extractor import Extractor, pictures_of
+from crosscue.replay.signals.kinds import Plan, Samples, Signal
+from crosscue.replay.signals.plan import camera_of, plan
+from crosscue.replay.signals.windows import windows
+from crosscue.replay.vehicle.drafting.agreement import (
+    DEGREE,
+    Verdict,
+    judge_speed,
+    judge_steering,
+    judge_yaw_rate,
+    of_course,
+    of_rate,
+    of_steering,
+    of_wheels,
+)
+from crosscue.replay.vehicle.drafting.camera import KnowsItsCameras
+from crosscue.replay.vehicle.drafting.series import Grid, Series, Track
+from crosscue.replay.vehicle.vehicle import Camera, Vehicle
+
+WHEELS: Final = ("front left", "front right", "rear left", "rear right")
+INTRINSICS_OFF: Final = 0.02
+"""Focal lengths that differ by more are those of different pictures."""
+CENTER_OFF: Final = 0.15
+"""Of the picture's size: no lens points further from its middle, unless the picture is cropped."""
+VIEW_DEG: Final = (15.0, 150.0)
+WHEEL_OFF: Final = 0.1
+UNCONFIRMED: Final = "too few bends here for course or wheels to confirm its sign"
+
+
+@dataclass(frozen=True, slots=True)
+class SignalRow:
+    """One signal as the vehicle file has it read.
+
+    Attributes:
+        signal: What it is.
+        source: Topic, and the names in the database.
+        count: Readings in the seconds examined.
+        rate_hz: By the median time between them.
+        low: Smallest reading, in ``unit``.
+        high: Largest one.
+        unit: Of both.
+        agrees: What it agrees with, in words.
+        wrong: What contradicts it.
+    """
+
+    signal: str
+    source: str
+    count: int
+    rate_hz: float
+    low: float
+    high: float
+    unit: str
+    agrees: str = ""
+    wrong: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """One picture of the camera.
+
+    Attributes:
+        topic: The camera.
+        t_ns: When it was taken.
+        pixels: Shape (H, W, 3), uint8, blue first.
+    """
+
+    topic: str
+    t_ns: int
+    pixels: Bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checked:
+    """What was found.
+
+    Attributes:
+        signals: A row for each that is read.
+        missing: From a signal that is not read to why.
+        contradictions: Sentences, the gravest first.
+        picture: From the middle of the seconds examined; None without a camera.
+    """
+
+    signals: tuple[SignalRow, ...]
+    missing: Mapping[str, str]
+    contradictions: tuple[str, ...]
+    picture: Shown | None
+
+
+def check(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> Checked:
+    """Read a part of a drive and hold its signals against each other.
+
+    Args:
+        logs: Open logs of one drive.
+        vehicle: The vehicle file.
+        selection: The part; its topics do not count.
+
+    Raises:
+        VehicleError: The vehicle file does not fit the logs.
+    """
+    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
+    planned = plan(topics, vehicle)
+    camera = camera_of(topics, vehicle)
+    samples = _samples(logs, vehicle, planned, selection)
+    rows, contradictions = _judged(samples, planned, vehicle)
+    picture = None
+    if camera is not None:
+        picture = _picture(logs[camera[0]], *camera, vehicle, selection)
+        contradictions += _of_camera(picture, logs[camera[0]], vehicle.camera)
+    missing = {
+        signal.name.lower(): why for signal, why in planned.missing.items() if signal not in samples
+    } | {
+        signal.name.lower(): "not one reading in the seconds examined"
+        for source in planned.sources
+        for signal in source.signals
+        if signal not in samples
+    }
+    return Checked(tuple(rows), missing, tuple(contradictions), picture)
+
+
+def _samples(
+    logs: Sequence[Log], vehicle: Vehicle, planned: Plan, selection: Selection
+) -> dict[Signal, Samples]:
+    """All readings, by signal, in order of time."""
+    ledgers = [Ledger(name_of(log)) for log in logs]
+    extractors = [Extractor(planned, vehicle, i, ledger) for i, ledger in enumerate(ledgers)]
+    wanted = [
+        Selection(planned.topics_of(i), selection.start_ns, selection.end_ns)
+        for i in range(len(logs))
+    ]
+    parts: dict[Signal, list[Samples]] = {}
+    for window in windows(logs, extractors, wanted, planned):
+        for signal, samples in window.samples.items():
+            parts.setdefault(signal, []).append(samples)
+    for ledger in ledgers:
+        warn_of(ledger)
+    return {
+        signal: Samples(
+            signal,
+            np.concatenate([one.t_ns for one in found]),
+            np.concatenate([one.values for one in found]),
+        )
+        for signal, found in parts.items()
+    }
+
+
+def _judged(
+    samples: Mapping[Signal, Samples], planned: Plan, vehicle: Vehicle
+) -> tuple[list[SignalRow], list[str]]:
+    times = [one.t_ns for one in samples.values() if len(one.t_ns)]
+    if not times:
+        return [], []
+    start_ns, end_ns = min(int(t[0]) for t in times), max(int(t[-1]) for t in times)
+    grid = Grid.over(start_ns, end_ns)
+    wheels = _wheels(samples)
+    speed = wheels.get("rear")
+    track = _track(samples, planned)
+    turnings = [] if track is None else [of_course(track, grid)]
+    references = [one for one in turnings if one is not None]
+    if "rear left" in wheels and "rear right" in wheels and _differ(wheels):
+        references.append(of_wheels(wheels["rear left"], wheels["rear right"], grid))
+    yaw = _series(samples, planned, Signal.YAW_RATE)
+    steering = _series(samples, planned, Signal.STEERING)
+    verdicts: dict[Signal, Verdict] = {}
+    confirmed = yaw is not None and judge_yaw_rate(yaw, references, speed, grid).agrees_with > 0
+    if steering is not None:
+        rates = [] if yaw is None else [of_rate(yaw, 1, grid)]
+        verdicts[Signal.STEERING] = judge_steering(
+            _as_usual(steering, vehicle), [*references, *rates], speed, grid
+        )
+        if speed is not None:
+            references.append(of_steering(_as_usual(steering, vehicle), 1, speed, grid))
+    if yaw is not None:
+        found = judge_yaw_rate(yaw, references, speed, grid)
+        if not confirmed and not found.wrong:
+            found = replace(found, facts=(*found.facts, UNCONFIRMED))
+        verdicts[Signal.YAW_RATE] = found
+    if speed is not None and track is not None:
+        verdicts[Signal.WHEEL_SPEEDS] = judge_speed(speed, track.speed, grid, True)
+    rows = [*_rows(samples, planned, vehicle, verdicts)]
+    said = [f"{row.signal}: {text}" for row in rows for text in row.wrong]
+    return rows, [*said, *_of_wheels(wheels)]
+
+
+def _rows(
+    samples: Mapping[Signal, Samples],
+    planned: Plan,
+    vehicle: Vehicle,
+    verdicts: Mapping[Signal, Verdict],
+) -> Iterator[SignalRow]:
+    for signal, found in samples.items():
+        source = planned.source_of(signal)
+        if source is None:
+            continue
+        names = _named(signal, vehicle)
+        verdict = verdicts.get(signal, Verdict(()))
+        wrong = verdict.wrong
+        if verdict.sign < 0:
+            wrong = ("is positive to the right: change its sign", *wrong)
+        scale, unit = _UNITS.get(signal, (1.0, ""))
+        values = found.values[:, 1] if signal is Signal.COURSE else found.values
+        known = np.asarray(values)[np.isfinite(values)]
+        yield SignalRow(
+            signal.name.lower(),
+            f"{source.topic.name}{': ' if names else ''}{', '.join(names)}",
+            len(found.t_ns),
+            _rate_hz(found.t_ns),
+            float(known.min() * scale) if len(known) else math.nan,
+            float(known.max() * scale) if len(known) else math.nan,
+            unit,
+            # Rate and range stand in columns of their own.
+            ", ".join(verdict.facts[2:]),
+            wrong,
+        )
+
+
+_UNITS: Final = {
+    Signal.WHEEL_SPEEDS: (1.0, "m/s"),
+    Signal.YAW_RATE: (1.0 / DEGREE, "deg/s"),
+    Signal.STEERING: (1.0 / DEGREE, "deg"),
+    Signal.MAGNETIC_FIELD: (1e6, "uT"),
+    Signal.HEADING: (1.0 / DEGREE, "deg"),
+    Signal.COURSE: (1.0, "m/s"),
+}
+
+
+def _named(signal: Signal, vehicle: Vehicle) -> tuple[str, ...]:
+    """Names of CAN signals that the vehicle file has for it."""
+    can = vehicle.can
+    if signal is Signal.WHEEL_SPEEDS and can.wheel_speeds is not None:
+        of = can.wheel_speeds
+        names = (of.front_left, of.front_right, of.rear_left, of.rear_right)
+        return tuple(dict.fromkeys(name for name in names if name is not None))
+    section = {Signal.YAW_RATE: can.yaw_rate, Signal.STEERING: can.steering}.get(signal)
+    return () if section is None else (section.signal,)
+
+
+def _rate_hz(t_ns: Int64s) -> float:
+    return Series("", t_ns, np.zeros(len(t_ns))).rate_hz
+
+
+def _series(samples: Mapping[Signal, Samples], planned: Plan, signal: Signal) -> Series | None:
+    found, source = samples.get(signal), planned.source_of(signal)
+    if found is None or source is None or len(found.t_ns) < 2:
+        return None
+    series = Series.of(source.topic.name, found.t_ns, found.values)
+    return series if len(series) > 1 else None
+
+
+def _as_usual(steering: Series, vehicle: Vehicle) -> Series:
+    """The angle as that of a car with a usual ratio and its wheel straight ahead at zero."""
+    odometry = vehicle.odometry
+    scale = 15.0 / odometry.steering_ratio
+    return replace(steering, values=(steering.values - odometry.steering_offset_rad) * scale)
+
+
+def _wheels(samples: Mapping[Signal, Samples]) -> dict[str, Series]:
+    """Speeds of the wheels that are read, and their mean at the rear."""
+    found = samples.get(Signal.WHEEL_SPEEDS)
+    if found is None:
+        return {}
+    wheels = {
+        name: series
+        for i, name in enumerate(WHEELS)
+        if len(series := Series.of(name, found.t_ns, found.values[:, i])) > 1
+    }
+    rear = found.values[:, 2:].mean(axis=1)
+    if len(series := Series.of("the rear wheels", found.t_ns, rear)) > 1:
+        wheels["rear"] = series
+    return wheels
+
+
+def _differ(wheels: Mapping[str, Series]) -> bool:
+    """Are left and right two signals? Odometry topics have one speed for both."""
+    left, right = wheels["rear left"], wheels["rear right"]
+    return len(left) != len(right) or bool((left.values != right.values).any())
+
+
+def _of_wheels(wheels: Mapping[str, Series]) -> Iterator[str]:
+    """Wheels that disagree with the others."""
+    means = {
+        name: float(np.abs(one.values).mean()) for name, one in wheels.items() if name in WHEELS
+    }
+    if len(means) < 2:
+        return
+    middle = float(np.median([*means.values()]))
+    for name, mean in means.items():
+        if middle > 1.0 and abs(mean - middle) > WHEEL_OFF * middle:
+            yield (
+                f"wheel_speeds: {name} is {mean:.2f} m/s on average where the wheels' median is "
+                f"{middle:.2f} m/s"
+            )
+
+
+def _track(samples: Mapping[Signal, Samples], planned: Plan) -> Track | None:
+    found, source = samples.get(Signal.COURSE), planned.source_of(Signal.COURSE)
+    if found is None or source is None or len(found.t_ns) < 2:
+        return None
+    course: Floats = found.values[:, 0]
+    return Track.of_course(f"GNSS {source.topic.name}", found.t_ns, found.values[:, 1], course)
+
+
+def _picture(
+    log: Log, number: int, topic: Topic, vehicle: Vehicle, selection: Selection
+) -> Shown | None:
+    """The picture in the middle of the part; the first that decodes, where the part has no end."""
+    ledger = Ledger(name_of(log))
+    shown: Shown | None = None
+    middle_ns = None
+    if selection.start_ns is not None and selection.end_ns is not None:
+        middle_ns = (selection.start_ns + selection.end_ns) // 2
+    depth = vehicle.camera.depth_bits
+    for block, rows in pictures_of(log, number, topic, vehicle, ledger, selection):
+        for row, t_ns in enumerate(block.log_ns.tolist()):
+            if shown is not None and (middle_ns is None or t_ns > middle_ns):
+                return shown
+            if shown is None or middle_ns is not None:
+                try:
+                    pixels, _ = decode(encoded(rows, row), View(), depth)
+                except LogFormatError:
+                    continue
+                shown = Shown(topic.name, t_ns, pixels)
+    return shown
+
+
+def _of_camera(shown: Shown | None, log: Log, camera: Camera) -> Iterator[str]:
+    """Intrinsics that do not fit the pictures, or what the log itself publishes."""
+    if shown is None:
+        yield "camera: not one picture in the seconds examined"
+        return
+    wide, high = shown.pixels.shape[1], shown.pixels.shape[0]
+    if camera.focal_px is not None:
+        view_deg = 2.0 * math.degrees(math.atan(0.5 * wide / camera.focal_px))
+        if not VIEW_DEG[0] <= view_deg <= VIEW_DEG[1]:
+            yield (
+                f"camera.focal_px = {camera.focal_px:g}: a picture {wide} pixels wide would show "
+                f"{view_deg:.0f} deg; the intrinsics are those of another size"
+            )
+    if camera.center_px is not None:
+        off = [abs(c - s / 2) / s for c, s in zip(camera.center_px, (wide, high), strict=True)]
+        if max(off) > CENTER_OFF:
+            yield (
+                f"camera.center_px = ({camera.center_px[0]:g}, {camera.center_px[1]:g}): far from "
+                f"the middle of a picture of {wide} x {high}; the intrinsics are those of another "
+                "size"
+            )
+    published = log.intrinsics(shown.topic) if isinstance(log, KnowsItsCameras) else None
+    if published is not None and camera.focal_px is not None:
+        focal = published[0]
+        if abs(camera.focal_px / focal - 1.0) > INTRINSICS_OFF:
+            yield f"camera.focal_px = {camera.focal_px:g}: the data set publishes {focal:g}"

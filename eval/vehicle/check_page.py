@@ -1,0 +1,106 @@
+"""What a check of a vehicle file found, as a page or a picture."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+
+from crosscue.eval.report.html import render_page
+from crosscue.replay.base import Bytes, OutputError, UsageError, write_bytes, write_text
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .check import Checked
+from .ground_picture import ASSUMED, draw_ground
+
+PAGES: Final = (".html",)
+PICTURES: Final = (".jpg", ".jpeg", ".png")
+WIDTH_PX: Final = 1280
+
+
+def check_output(path: Path, overwrite: bool) -> None:
+    """Refuse a file that cannot be written, before anything is read.
+
+    Raises:
+        UsageError: Its ending is that of no page or picture.
+        OutputError: It exists.
+    """
+    if path.suffix.lower() not in PAGES + PICTURES:
+        endings = ", ".join(PAGES + PICTURES)
+        raise UsageError(f"{path}: expected a page or a picture, by its ending: {endings}")
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists; give another name or --overwrite")
+
+
+def write_check(
+    path: Path, found: Checked, vehicle: Vehicle, logs: Sequence[str], part: str
+) -> None:
+    """Write the page, or the picture alone, by the file's ending.
+
+    Args:
+        path: The file.
+        found: What the check found.
+        vehicle: What was checked.
+        logs: Names of the logs.
+        part: Which seconds were examined, in words.
+
+    Raises:
+        UsageError: A picture is wanted of a log without one.
+        OutputError: It cannot be written.
+    """
+    drawn = None if found.picture is None else draw_ground(found.picture.pixels, vehicle)
+    if path.suffix.lower() in PICTURES:
+        if drawn is None:
+            raise UsageError(f"{path}: the log has no picture to draw on; give a name in .html")
+        write_bytes(path, _encoded(drawn, path.suffix.lower()))
+        return
+    picture, caption = "", ""
+    if drawn is not None and found.picture is not None:
+        if drawn.shape[1] > WIDTH_PX:
+            size = (WIDTH_PX, round(drawn.shape[0] * WIDTH_PX / drawn.shape[1]))
+            drawn = np.asarray(cv2.resize(drawn, size, interpolation=cv2.INTER_AREA), np.uint8)
+        coded = base64.b64encode(_encoded(drawn, ".jpg")).decode("ascii")
+        picture = f"data:image/jpeg;base64,{coded}"
+        caption = f"{found.picture.topic} at {found.picture.t_ns} ns. {_in_words(vehicle)}"
+    content = {
+        "vehicle": vehicle.name,
+        "logs": logs,
+        "part": part,
+        "contradictions": found.contradictions,
+        "picture": picture,
+        "caption": caption,
+        "signals": found.signals,
+        "missing": found.missing,
+    }
+    write_text(path, render_page("vehicle_check.html.j2", content, {"number": _number}))
+
+
+def _encoded(pixels: Bytes, ending: str) -> bytes:
+    _, coded = cv2.imencode(ending, pixels)
+    return coded.tobytes()
+
+
+def _in_words(vehicle: Vehicle) -> str:
+    """What the lines in the picture are."""
+    if vehicle.camera.focal_px is None:
+        return "No horizon and no grid: camera.focal_px is not in the vehicle file."
+    grid = (
+        f"Yellow: the horizon. White: metres from the rear axle on a level road, for a camera "
+        f"{vehicle.camera.z_m:g} m above it, {math.degrees(vehicle.camera.pitch_rad):.2f} deg "
+        "below the horizon; the lines along the road are 5 m apart."
+    )
+    if vehicle.regions.kind == "picture":
+        return f"{grid} Green: the regions in which road is looked for."
+    return (
+        f"{grid} Green: the regions in which road would be looked for if an intersection began "
+        f"{ASSUMED.start_m:g} m ahead and ended at {ASSUMED.end_m:g} m."
+    )
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:,.{digits}f}" if math.isfinite(value) else "-"

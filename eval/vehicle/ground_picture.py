@@ -1,0 +1,115 @@
+"""What a vehicle file says of the camera, drawn on a picture: horizon, metres on the road, regions.
+
+The road is taken for level. Regions on the ground follow the believed intersection, which is not
+known here: they are drawn for one assumed ahead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+import cv2
+import numpy as np
+
+from crosscue.detectors.cues.observed import Place
+from crosscue.detectors.cues.road_ground import project, rectangles
+from crosscue.replay.columns import Bytes, Floats
+from crosscue.replay.vehicle.vehicle import Camera, Vehicle
+
+AHEAD_M: Final = (5, 10, 15, 20, 30, 50, 80)
+ASIDE_M: Final = (-15, -10, -5, 0, 5, 10, 15)
+NEAREST_M: Final = 0.5
+"""Ahead of the camera; lines on the road begin there."""
+ASSUMED: Final = Place(30.0, 50.0, 0.0)
+"""From the rear axle to the start and the end of the intersection that regions are drawn for."""
+YELLOW, WHITE, GREEN, BLACK = (0, 230, 255), (255, 255, 255), (80, 230, 80), (0, 0, 0)
+
+
+def horizon_px(camera: Camera, size_px: tuple[int, int]) -> float | None:
+    """Height of the horizon in the picture; None without a focal length."""
+    if camera.focal_px is None:
+        return None
+    center = camera.center_px[1] if camera.center_px is not None else 0.5 * size_px[1]
+    return center - camera.focal_px * math.tan(camera.pitch_rad)
+
+
+def draw_ground(pixels: Bytes, vehicle: Vehicle) -> Bytes:
+    """A copy with the horizon, a grid in metres on the road, and the regions.
+
+    Args:
+        pixels: Shape (H, W, 3), uint8, blue first.
+        vehicle: Its camera and regions.
+    """
+    canvas = pixels.copy()
+    size_px = (pixels.shape[1], pixels.shape[0])
+    scale = max(size_px[0] / 1280, 0.5)
+    camera = vehicle.camera
+    y = horizon_px(camera, size_px)
+    if y is not None:
+        _line(canvas, np.array([[0.0, y], [float(size_px[0]), y]]), YELLOW, scale)
+        _write(canvas, "horizon", (8.0, y - 6.0), YELLOW, scale)
+    if y is not None and camera.z_m > 0.0:
+        for line, text in _grid(camera):
+            points = project(line, camera, size_px)
+            _line(canvas, points, WHITE, 0.6 * scale)
+            x, below = points[0].tolist()
+            if text and below < size_px[1]:
+                _write(canvas, text, (x + 4.0, below - 4.0), WHITE, scale)
+    for name, polygon in _regions(vehicle, size_px):
+        _line(canvas, np.vstack([polygon, polygon[:1]]), GREEN, scale)
+        middle = polygon.mean(axis=0)
+        _write(canvas, name, (float(middle[0]), float(middle[1])), GREEN, scale)
+    return canvas
+
+
+def _grid(camera: Camera) -> Iterator[tuple[Floats, str]]:
+    """Lines across the road with their labels, from the left; then those along it."""
+    for ahead in AHEAD_M:
+        if ahead - camera.x_m > NEAREST_M:
+            across = np.array([[ahead, max(ASIDE_M)], [ahead, min(ASIDE_M)]], np.float64)
+            yield across, f"{ahead} m ahead"
+    near = camera.x_m + max(NEAREST_M, 2.0 * camera.z_m)
+    for aside in ASIDE_M:
+        yield np.array([[near, aside], [max(AHEAD_M), aside]], np.float64), ""
+
+
+def _regions(vehicle: Vehicle, size_px: tuple[int, int]) -> Iterator[tuple[str, Floats]]:
+    regions, camera = vehicle.regions, vehicle.camera
+    names = ("left", "straight", "right")
+    if regions.kind == "picture":
+        for name in names:
+            yield name, np.array(getattr(regions, name), np.float64) * np.array(size_px)
+        return
+    if camera.focal_px is None or camera.z_m <= 0.0:
+        return
+    for name, (one, _) in zip(names, rectangles(regions, ASSUMED), strict=True):
+        first, last, rightmost, leftmost = one
+        corners = [(first, rightmost), (first, leftmost), (last, leftmost), (last, rightmost)]
+        if first - camera.x_m > NEAREST_M:
+            yield name, project(np.array(corners), camera, size_px)
+
+
+def _line(canvas: Bytes, points: Floats, colour: tuple[int, int, int], scale: float) -> None:
+    high, wide = canvas.shape[:2]
+    # A polygon may reach far beyond the picture; OpenCV wants numbers that fit.
+    clipped = np.clip(points, -4.0 * max(high, wide), 4.0 * max(high, wide))
+    places = np.rint(clipped * 16).astype(np.int32).reshape(-1, 1, 2)
+    thick = max(1, round(2 * scale))
+    cv2.polylines(canvas, [places], False, BLACK, thick + 2, cv2.LINE_AA, 4)
+    cv2.polylines(canvas, [places], False, colour, thick, cv2.LINE_AA, 4)
+
+
+def _write(
+    canvas: Bytes, text: str, at: tuple[float, float], colour: tuple[int, int, int], scale: float
+) -> None:
+    high, wide = canvas.shape[:2]
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.6 * scale
+    (width, height), _ = cv2.getTextSize(text, font, size, 1)
+    place = (
+        int(min(max(at[0], 2.0), wide - width - 2.0)),
+        int(min(max(at[1], height + 2.0), high - 4.0)),
+    )
+    cv2.putText(canvas, text, place, font, size, BLACK, max(3, round(4 * scale)), cv2.LINE_AA)
+    cv2.putText(canvas, text, place, font, size, colour, max(1, round(1.4 * scale)), cv2.LINE_AA)

@@ -1,0 +1,150 @@
+"""A vehicle file is held against a drive: signals, and intrinsics against pictures."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import crosscue
+from crosscue.detectors.cues.road_ground import project
+from crosscue.eval.cli import run
+from crosscue.eval.vehicle.check import Checked, check
+from crosscue.eval.vehicle.ground_picture import draw_ground, horizon_px
+from crosscue.replay.base import EVERYTHING, Block, Table, Topic
+from crosscue.replay.vehicle.vehicle import Camera, Vehicle
+from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block
+from support.pandaset_drive import pandaset_drive
+
+FIX = Topic("fix", "sensor_msgs/msg/NavSatFix", "columns")
+
+
+def checked(yaw_sign: float = 1.0, wheel_scale: float = 1.0) -> Checked:
+    """Twenty seconds of bends at 10 m/s with wheels, gyro and GNSS."""
+    times = np.arange(400, dtype=np.int64) * 50_000_000
+    yaw_rate = 0.3 * np.sin(0.8 * times * 1e-9)
+    course = np.cumsum(yaw_rate) * 0.05
+    blocks: list[Block] = []
+    for start in range(0, 400, 20):
+        some = slice(start, start + 20)
+        speeds = {
+            f"{end}_{side}_mps": wheel_scale * (10.0 + sign * 0.775 * yaw_rate[some])
+            for end in ("front", "rear")
+            for side, sign in (("left", -1.0), ("right", 1.0))
+        }
+        blocks.append(Block("wheels", times[some], Table(speeds)))
+        blocks.append(gyro_block(times[some].tolist(), (yaw_sign * yaw_rate[some]).tolist()))
+        fix = {"course_rad": course[some], "speed_mps": np.full(20, 10.0)}
+        blocks.append(Block("fix", times[some], Table(fix)))
+    log = MemoryLog((WHEELS, GYRO, FIX), blocks, path=Path(__file__))
+    return check([log], Vehicle(version=1), EVERYTHING)
+
+
+def test_signals_that_agree_are_said_to() -> None:
+    found = checked()
+
+    assert found.contradictions == ()
+    by_name = {row.signal: row for row in found.signals}
+    assert by_name["yaw_rate"].count == 400
+    assert by_name["yaw_rate"].rate_hz == pytest.approx(20.0)
+    assert by_name["yaw_rate"].high == pytest.approx(math.degrees(0.3), rel=0.01)
+    assert "the course of GNSS fix" in by_name["yaw_rate"].agrees
+
+
+def test_a_yaw_rate_of_the_wrong_sign_contradicts() -> None:
+    assert any("positive to the right" in text for text in checked(yaw_sign=-1.0).contradictions)
+
+
+def test_speeds_that_disagree_contradict() -> None:
+    found = checked(wheel_scale=1.6).contradictions
+
+    assert any(text.startswith("wheel_speeds: contradicts") for text in found)
+
+
+def test_the_horizon_is_where_a_level_road_ends() -> None:
+    camera = Camera(focal_px=800.0, center_px=(320.0, 200.0), pitch_rad=0.05, z_m=1.4)
+    size_px = (640, 400)
+
+    far = project(np.array([[1e7, 0.0]]), camera, size_px)
+
+    assert horizon_px(camera, size_px) == pytest.approx(far[0, 1], abs=1e-3)
+
+
+def test_a_picture_shows_the_horizon_unless_nobody_knows_where_it_is() -> None:
+    pixels = np.full((400, 640, 3), 90, np.uint8)
+    known = Vehicle(version=1, camera=Camera(focal_px=800.0, center_px=(320.0, 150.0)))
+
+    drawn = draw_ground(pixels, known)
+
+    assert (drawn[150, 300] != 90).any()
+    np.testing.assert_array_equal(pixels, 90)
+    np.testing.assert_array_equal(draw_ground(pixels, Vehicle(version=1)), pixels)
+
+
+def vehicle_of(path: Path, camera: str) -> Path:
+    """A vehicle file with this section."""
+    path.write_text(f"version = 1\n[camera]\n{camera}\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("camera", "says"),
+    [
+        ("focal_px = 1970.0\ncenter_px = [970.5, 483.0]", "center_px = (970.5, 483): far from"),
+        ("focal_px = 20000.0", "focal_px = 20000: a picture"),
+        ("focal_px = 1500.0", "the data set publishes 1970"),
+    ],
+)
+def test_intrinsics_of_other_pictures_contradict(tmp_path: Path, camera: str, says: str) -> None:
+    drive = pandaset_drive(tmp_path / "002")
+    vehicle = vehicle_of(tmp_path / "car.toml", camera)
+
+    found = crosscue.check_vehicle(drive, vehicle)
+
+    # The made pictures are tiny, with the published intrinsics of 1920 x 1080.
+    assert any(says in text for text in found.contradictions)
+    assert f"WRONG    {found.contradictions[0]}" in repr(found)
+
+
+def test_the_page_and_the_table_hold_the_same(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive = pandaset_drive(tmp_path / "002")
+    vehicle = vehicle_of(tmp_path / "car.toml", "focal_px = 1500.0")
+    page = tmp_path / "check.html"
+    line = ["vehicle", "check", str(drive), "--vehicle", str(vehicle), "-o", str(page)]
+
+    assert run([*line, "--json"]) == 1
+
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["page"] == str(page)
+    html = page.read_text(encoding="utf-8")
+    assert all(row["signal"] in html for row in printed["signals"])
+    assert printed["contradictions"][0] in html
+    assert "data:image/jpeg;base64," in html
+    assert run(line) == 1
+    assert "exists; give another name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["-o", "page.pdf"], "expected a page or a picture"),
+        (["--seconds", "0"], "seconds: expected more than 0"),
+        (["--start-s", "1000"], "no signal and no picture"),
+    ],
+)
+def test_what_cannot_be_is_one_line(
+    tmp_path: Path, arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive = pandaset_drive(tmp_path / "002")
+    vehicle = vehicle_of(tmp_path / "car.toml", "focal_px = 1500.0")
+
+    assert run(["vehicle", "check", str(drive), "--vehicle", str(vehicle), *arguments]) in (1, 2)
+
+    said = capsys.readouterr().err
+    assert says in said
+    assert said.count("\n") == 1
