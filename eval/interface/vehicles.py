@@ -11,7 +11,7 @@ from crosscue.eval.interface.logs.log import Log, opened
 from crosscue.eval.interface.show import listing
 from crosscue.eval.vehicle.check import Checked, Shown, check
 from crosscue.eval.vehicle.check_page import check_output, write_check
-from crosscue.eval.vehicle.mounting import estimate_mounting, yaw_notes
+from crosscue.eval.vehicle.mounting import estimate_mounting
 from crosscue.replay.base import EmptyResultError, OutputError, UsageError, write_text
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.vehicle.drafting.camera import Measured, Mounting, camera_of
@@ -54,11 +54,12 @@ def draft_vehicle(
     camera_y_m: float | None = None,
     camera_height_m: float | None = None,
     camera_pitch_deg: float | None = None,
+    camera_yaw_deg: float | None = None,
 ) -> VehicleDraft:
     """Write a first vehicle file from what a drive holds.
 
     Wheel speeds, yaw rate and steering are chosen by how well signals agree with GNSS and with each
-    other; the camera's pitch is estimated where it is not given, from pictures of a straight way.
+    other; pitch and yaw of the camera, if not given, by pictures of a straight way.
 
     Args:
         log: The drive, or its path.
@@ -69,6 +70,7 @@ def draft_vehicle(
         camera_y_m: How far to the left of the car's middle.
         camera_height_m: How far above the road.
         camera_pitch_deg: How far its axis points below the horizon.
+        camera_yaw_deg: How far it points to the left.
 
     Raises:
         UsageError: A number of the mounting that cannot be.
@@ -85,6 +87,7 @@ def draft_vehicle(
         _given(camera_y_m, "camera_y_m", -5.0, 5.0),
         _given(camera_height_m, "camera_height_m", 0.1, 10.0),
         _given(camera_pitch_deg, "camera_pitch_deg", -60.0, 60.0, math.pi / 180.0),
+        _given(camera_yaw_deg, "camera_yaw_deg", -180.0, 180.0, math.pi / 180.0),
     )
     with opened(log) as drive:
         examined = examine(drive.logs, [Path(name) for name in databases])
@@ -216,9 +219,11 @@ def _mounting(examined: Examined, given: Mounting) -> Mounting:
     if camera is None:
         return given
     estimate = estimate_mounting(*camera, examined.choices.speed)
-    notes = yaw_notes(estimate)
-    if given.pitch_rad is not None:
-        if estimate.pitch_rad is not None:
-            notes = (*notes, f"pitch_rad of the pictures, not used: {estimate.pitch_rad.source}")
-        return given._replace(notes=notes)
-    return given._replace(pitch_rad=estimate.pitch_rad, notes=notes)
+    found, notes = given, [estimate.why_not] if estimate.why_not else []
+    for name in ("pitch_rad", "yaw_rad"):
+        seen: Measured | None = getattr(estimate, name)
+        if getattr(given, name) is None:
+            found = found._replace(**{name: seen})
+        elif seen is not None:
+            notes.append(f"{name} of the pictures, not used: {seen.source}")
+    return found._replace(notes=tuple(notes))

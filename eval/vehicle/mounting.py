@@ -66,7 +66,7 @@ def estimate_mounting(
     """
     if intrinsics is None or speed is None or len(speed) < 2:
         lacks = "focal_px" if intrinsics is None else "the car's speed"
-        return Estimate(None, None, 0, f"not estimated: needs {lacks}")
+        return Estimate(None, None, 0, f"pitch and yaw not estimated: needs {lacks}")
     number = next(i for i, topic in enumerate(log.topics) if topic.name == camera)
     seen, bends = 0, 0
     found: list[Travel] = []
@@ -86,7 +86,7 @@ def estimate_mounting(
             None,
             None,
             len(found),
-            f"not estimated: {len(found)} pairs of pictures where the car drives straight, of "
+            f"pitch and yaw not estimated: {len(found)} pairs of pictures of a straight way, of "
             f"{seen} examined, {bends} in bends; expected {MIN_PAIRS} or more",
         )
     return Estimate(
@@ -155,11 +155,3 @@ def _grey(log: Log, number: int) -> Iterator[tuple[int, Bytes, float]]:
                 small = cv2.resize(pixels, (WIDTH_PX, height), interpolation=cv2.INTER_AREA)
                 pixels = np.asarray(small, np.uint8)
             yield t_ns, pixels, pixels.shape[1] / size_px[0]
-
-
-def yaw_notes(estimate: Estimate) -> tuple[str, ...]:
-    """What a vehicle file says of the yaw, which it has no setting for, or why nothing is known."""
-    if estimate.why_not:
-        return (f"pitch and yaw {estimate.why_not}",)
-    assert estimate.yaw_rad is not None
-    return (f"yaw, to the left of the way: {estimate.yaw_rad.source}",)

@@ -19,6 +19,7 @@ MOUNTING: Final = {
     "height-m": "how far it sits above the road",
     "pitch-deg": "how far its axis points below the horizon (default: estimated from pictures of a "
     "straight way)",
+    "yaw-deg": "how far its axis points to the left (default: likewise)",
 }
 
 
@@ -61,6 +62,7 @@ def run(args: argparse.Namespace) -> int:
             camera_y_m=args.camera_y_m,
             camera_height_m=args.camera_height_m,
             camera_pitch_deg=args.camera_pitch_deg,
+            camera_yaw_deg=args.camera_yaw_deg,
         )
     if args.json:
         print_json(found.as_dict())

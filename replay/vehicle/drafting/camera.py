@@ -36,6 +36,7 @@ class Mounting(NamedTuple):
         y_m: To its left.
         z_m: Above the road.
         pitch_rad: How far its axis points below the horizon.
+        yaw_rad: How far it points to the left.
         notes: Sentences about what else is known, or why it is not.
     """
 
@@ -43,6 +44,7 @@ class Mounting(NamedTuple):
     y_m: Measured | None = None
     z_m: Measured | None = None
     pitch_rad: Measured | None = None
+    yaw_rad: Measured | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -63,6 +65,7 @@ MEASURE: Final = {
     "x_m": "ahead of the rear axle: measure it, then give --camera-x-m",
     "y_m": "left of the car's middle: measure it, then give --camera-y-m",
     "z_m": "above the road: measure it, then give --camera-height-m",
+    "yaw_rad": "to the left, or give --camera-yaw-deg; likewise",
     "pitch_rad": "below the horizon, or give --camera-pitch-deg; a drive with pictures, speed and "
     "focal_px shows it",
 }
@@ -100,7 +103,13 @@ def camera_lines(logs: Sequence[Log], mounting: Mounting) -> Iterator[str]:
     else:
         yield f"focal_px = {found.focal_px:.10g}  # {found.source}"
         yield f"center_px = [{found.center_px[0]:.10g}, {found.center_px[1]:.10g}]"
-    for name, default in (("x_m", 0.0), ("y_m", 0.0), ("z_m", 1.2), ("pitch_rad", 0.0)):
+    for name, default in (
+        ("x_m", 0.0),
+        ("y_m", 0.0),
+        ("z_m", 1.2),
+        ("pitch_rad", 0.0),
+        ("yaw_rad", 0.0),
+    ):
         given: Measured | None = getattr(mounting, name)
         if given is None:
             yield f"# {name} = {default}  # {MEASURE[name]}"

@@ -97,7 +97,7 @@ def draft(examined: Examined, folder: Path, mounting: Mounting) -> str:
         *_topic_lines(logs, choices),
         *_can_lines(examined, folder),
         "[odometry]",
-        "# Measure these on the car:",
+        "# Measure these on the car, or: crosscue fit odometry LOG --vehicle THIS_FILE",
         "# wheelbase_m = 2.7",
         "# track_width_m = 1.55",
         "",

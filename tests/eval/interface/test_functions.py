@@ -176,3 +176,21 @@ def test_runs_are_scored_together_and_one_that_cannot_be_is_named(
     assert repr(found).startswith("failed     1 of 2 runs, left out\n")
     assert "FAILED     cues.stop_sign.precision" in repr(found)
     assert (tmp_path / "pooled" / "junit.xml").exists()
+
+
+def test_a_mounting_that_is_given_is_written(tmp_path: Path) -> None:
+    log = pandaset_drive(tmp_path / "002", 4)
+
+    camera = crosscue.draft_vehicle(
+        log, camera_x_m=1.7, camera_height_m=1.4, camera_pitch_deg=2.0, camera_yaw_deg=-1.0
+    ).vehicle.camera
+
+    assert (camera.x_m, camera.z_m) == (1.7, 1.4)
+    assert camera.pitch_rad == pytest.approx(0.0349, abs=1e-4)
+    assert camera.yaw_rad == pytest.approx(-0.01745, abs=1e-4)
+    with pytest.raises(crosscue.UsageError, match="camera_height_m: expected"):
+        crosscue.draft_vehicle(log, camera_height_m=-1.0)
+    # Four tiny pictures show no vanishing point: a comment says so, and the default stays.
+    text = crosscue.draft_vehicle(log).text
+    assert "# pitch and yaw not estimated" in text
+    assert "# pitch_rad = 0.0" in text
