@@ -219,11 +219,13 @@ def _mounting(examined: Examined, given: Mounting) -> Mounting:
     if camera is None:
         return given
     estimate = estimate_mounting(*camera, examined.choices.speed)
-    found, notes = given, [estimate.why_not] if estimate.why_not else []
+    notes = [estimate.why_not] if estimate.why_not else []
     for name in ("pitch_rad", "yaw_rad"):
         seen: Measured | None = getattr(estimate, name)
-        if getattr(given, name) is None:
-            found = found._replace(**{name: seen})
-        elif seen is not None:
+        if getattr(given, name) is not None and seen is not None:
             notes.append(f"{name} of the pictures, not used: {seen.source}")
-    return found._replace(notes=tuple(notes))
+    return given._replace(
+        pitch_rad=given.pitch_rad or estimate.pitch_rad,
+        yaw_rad=given.yaw_rad or estimate.yaw_rad,
+        notes=tuple(notes),
+    )
