@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 
 from crosscue.replay.errors import VehicleError
@@ -25,3 +28,16 @@ def chosen_device(asked: str, who: str) -> torch.device:
             f"{who}: device {asked}: not there or not in this torch; use auto or cpu"
         )
     return torch.device(asked)
+
+
+@contextmanager
+def threads_of(count: int, device: torch.device) -> Iterator[None]:
+    """So many threads on a CPU; more than there are cores free make it slower by far."""
+    before = torch.get_num_threads()
+    if device.type == "cpu" and before != count:
+        torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        if torch.get_num_threads() != before:
+            torch.set_num_threads(before)

@@ -1,7 +1,7 @@
 """Model cards: what a network wants to be given and what its numbers mean, as a TOML file.
 
 version = 1
-weights = "yolox_nano.onnx"      # next to the card; .onnx, .xml (OpenVINO) or .tflite
+weights = "yolox_nano.onnx"      # next to the card; .onnx, .xml (OpenVINO), .tflite, or tensors
 sha256 = "..."                   # of the weights; for OpenVINO also sha256_bin
 
 [input]
@@ -12,6 +12,9 @@ fit = "letterbox"                # or "stretch"
 [output]
 kind = "yolox"                   # or another of detectors/decoders, or "segmentation"
 classes = ["person", "bicycle", "car"]
+
+[network]                        # for tensors alone (.pth, .pt, .safetensors)
+architecture = "maskrcnn_resnet50_fpn"
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ from crosscue.detectors.settings import Proportion, Settings
 from crosscue.replay.base import MIB, VehicleError, read_at_most, toml_tree
 from crosscue.replay.vehicle.validation_errors import explain
 from crosscue.replay.vehicle.vehicle import tuples
+
+from .architectures import WEIGHTS_SUFFIXES, ArchitectureName
 
 MAX_BYTES: Final = 2048 * MIB
 """Largest weights read."""
@@ -45,9 +50,11 @@ class Input(Settings):
     colour: Literal["bgr", "rgb"] = "bgr"
     mean: Colour = (0.0, 0.0, 0.0)
     scale: Colour = (1.0, 1.0, 1.0)
-    fit: Literal["stretch", "letterbox", "letterbox-center", "crop"] = "stretch"
+    fit: Literal["stretch", "letterbox", "letterbox-center", "crop", "network"] = "stretch"
     """Letterbox: proportions kept, at the top left or in the center, the rest filled with ``pad``;
-    crop: proportions kept, the middle of the picture."""
+    crop: proportions kept, the middle of the picture; network: it scales the picture itself, the
+    shorter side to the smaller of width and height, the longer one to at most the larger, as
+    torchvision's do."""
     pad: Annotated[int, Field(ge=0, le=255)] = 114
     layout: Literal["nchw", "nhwc", "chw"] = "nchw"
     """``chw`` has no batch axis, as torchvision exports its detectors."""
@@ -80,6 +87,16 @@ class SegmentationOutput(Settings):
     """Names of the classes that one can drive on."""
 
 
+class TorchNetwork(Settings):
+    """What to build for weights that are tensors alone, by torchvision."""
+
+    architecture: ArchitectureName
+    norm_epsilon: Annotated[float, Field(ge=0.0, le=0.1)] | None = None
+    """Added to the variances of its normalisation; left out, as torchvision builds it. 0 for
+    networks trained further from torchvision's COCO weights of the first versions, whose
+    normalisation is frozen."""
+
+
 class WeightFile(Settings):
     """A file that the publisher offers, for ``crosscue model fetch``."""
 
@@ -94,11 +111,17 @@ class Evidence(Settings):
 
     pictures: str
     """Which, how many, by whom labelled."""
+    boxes: Annotated[int, Field(ge=0)] | None = None
+    """Labelled objects that were counted."""
+    input: str = ""
+    """At which size of the network's input, where it runs at several."""
     metric: str
     value: Finite
     low: Finite | None = None
     """Lower end of the 95 % interval."""
     high: Finite | None = None
+    measured: str = ""
+    """When, with which version: a date and a commit."""
     note: str = ""
 
 
@@ -116,6 +139,8 @@ class ModelCard(Settings):
     source: str = ""
     input: Input
     output: Annotated[AnyBoxOutput | SegmentationOutput, Field(discriminator="kind")]
+    network: TorchNetwork | None = None
+    """For weights that are tensors alone: .pth, .pt and .safetensors."""
     labels: dict[str, str] = Field(default_factory=dict)
     """What a class means to crosscue, where its own name says something else: the cues count
     "stop sign", "traffic light", "car", "truck", "bus", "one way left" and so on."""
@@ -138,6 +163,28 @@ class ModelCard(Settings):
         unknown = [name for name in self.labels if name not in classes]
         if unknown:
             raise ValueError(f"labels: {unknown[0]!r} is not one of output.classes")
+        return self
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Self:
+        """Refuse tensors without a network, and a network whose pictures the card scales."""
+        is_tensors = self.weights.lower().endswith(WEIGHTS_SUFFIXES)
+        if is_tensors != (self.network is not None):
+            raise ValueError(
+                "network.architecture is for tensors alone (.pth, .pt, .safetensors), and they "
+                "need it"
+            )
+        given = self.input
+        if is_tensors != (given.fit == "network"):
+            raise ValueError('input.fit = "network" goes with [network], and only with it')
+        if is_tensors and (
+            (given.colour, given.layout, given.dtype) != ("rgb", "chw", "uint8")
+            or self.output.kind != "torchvision"
+        ):
+            raise ValueError(
+                'networks of torchvision need colour = "rgb", layout = "chw", dtype = "uint8" in '
+                '[input], and kind = "torchvision" in [output]'
+            )
         return self
 
     def meaning(self, number: int) -> str:

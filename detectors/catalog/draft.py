@@ -17,6 +17,8 @@ from .class_names import COCO_80, COCO_90, meaning_of
 from .recognise import DEFAULT_SIDE_PX, size_in
 
 _LINE: Final = 100
+_NOTHING: Final = ("background", "bg")
+"""Names of a first class that detections never have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +78,13 @@ def draft(
         f"licence = {_value(licence)}" + ("" if licence else "  # not in the file"),
         "",
         "[input]",
-        *(f"{key} = {_value(value)}" for key, value in given.items()),
+        *_table(given),
         "",
         "[output]",
-        *(f"{key} = {_value(value)}" for key, value in output.items()),
+        *_table(output),
     ]
+    if guess.network is not None:
+        lines += ["", "[network]  # what the weights are for", *_table(guess.network)]
     if labels:
         lines += ["", "[labels]  # what a class means to the cues", *_table(labels)]
     return Draft(
@@ -97,6 +101,8 @@ def _classes(
     assumed: list[str],
 ) -> tuple[str, ...]:
     count = guess.class_count
+    if count is not None and len(names) == count + 1 and names[0].strip("_").lower() in _NOTHING:
+        names = names[1:]
     if names:
         if count is not None and len(names) != count:
             raise UsageError(f"{path}: {count} classes, but {len(names)} names are given")
@@ -123,8 +129,10 @@ def _input(
     certain: list[str],
     assumed: list[str],
 ) -> dict[str, object]:
-    shape = model.inputs[0].shape
     usual = dict(guess.input or {})
+    if guess.network is not None:
+        return usual
+    shape = model.inputs[0].shape
     layout = _layout(shape) or str(usual.get("layout", "nchw"))
     rows, columns = {"nchw": (2, 3), "chw": (1, 2), "nhwc": (1, 2)}[layout]
     declared = (static(shape, columns), static(shape, rows))
@@ -172,5 +180,9 @@ def _over_lines(items: Sequence[str]) -> str:
     return "\n".join(["[", *lines, current, "]"])
 
 
-def _table(values: Mapping[str, str]) -> list[str]:
-    return [f"{_value(key)} = {_value(value)}" for key, value in values.items()]
+def _table(values: Mapping[str, object]) -> list[str]:
+    return [f"{_key(name)} = {_value(value)}" for name, value in values.items()]
+
+
+def _key(name: str) -> str:
+    return name if name.isidentifier() else _value(name)

@@ -18,6 +18,7 @@ from crosscue.detectors.networks.openvino import import_openvino
 from crosscue.detectors.networks.picture_input import prepared
 from crosscue.replay.base import UsageError, one_line, read_at_most
 
+from .architectures import WEIGHTS_SUFFIXES
 from .card import MAX_BYTES, Input, Weights
 
 _MAX_NAMES_CHARACTERS: Final = 100_000
@@ -28,9 +29,6 @@ MAX_INPUT_VALUES: Final = 3 * 8192 * 8192
 SENSIBLE_FRACTION: Final = 0.99
 """Of boxes that a network gives for noise, where their layout is read rightly."""
 _REFUSED: Final = {
-    ".pt": "a pickle runs code when it is read; export it to ONNX",
-    ".pth": "a pickle runs code when it is read; export it to ONNX, or give a state dict to the "
-    "detector mask-rcnn",
     ".pkl": "a pickle runs code when it is read; export it to ONNX",
     ".torchscript": "a TorchScript archive carries code; export it to ONNX",
 }
@@ -46,7 +44,10 @@ def read_interface(path: Path) -> Interface:
     if suffix in _REFUSED:
         raise UsageError(f"{path}: {_REFUSED[suffix]}")
     if suffix not in _READERS:
-        raise UsageError(f"{path}: expected {' or '.join(_READERS)}")
+        raise UsageError(
+            f"{path}: expected {', '.join(_READERS)}, or weights of a network of torchvision's: "
+            f"{', '.join(WEIGHTS_SUFFIXES)}"
+        )
     try:
         content = read_at_most(path, MAX_BYTES)
         if content is None:

@@ -84,6 +84,7 @@ class Guess:
         reasons: What in the file says so.
         assumptions: What nothing in the file says.
         input: Keys of the card's ``[input]`` that networks of this layout usually have.
+        network: Keys of the card's ``[network]``, for tensors alone.
     """
 
     settings: Mapping[str, object]
@@ -91,6 +92,7 @@ class Guess:
     reasons: tuple[str, ...]
     assumptions: tuple[str, ...] = ()
     input: Mapping[str, object] | None = None
+    network: Mapping[str, object] | None = None
 
 
 class BoxOutput(Settings):

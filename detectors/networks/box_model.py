@@ -71,8 +71,8 @@ class BoxModel:
 
     @property
     def view(self) -> View:
-        """No finer than the network's input; the full size for tiles."""
-        if self.card.tiles is not None:
+        """No finer than the network's input; the full size for tiles, or if it scales itself."""
+        if self.card.tiles is not None or self.card.input.fit == "network":
             return View()
         return View(min_width_px=self.card.input.width_px)
 
@@ -113,8 +113,7 @@ class BoxModel:
     def _kept(
         self, outputs: Mapping[str, Array], part: _Part, placement: Placement, frame: Frame
     ) -> _Found:
-        size = (self.card.input.width_px, self.card.input.height_px)
-        some = self.output.candidates(outputs, size)
+        some = self.output.candidates(outputs, placement.size_px)
         bad = len(some) - int(
             np.isfinite(np.column_stack([some.boxes_px, some.scores])).all(1).sum()
         )
@@ -125,7 +124,8 @@ class BoxModel:
         if part.corner is not None:
             boxes = boxes + np.tile(part.corner, 2)
             height, width = frame.pixels.shape[:2]
-            is_kept = is_whole(boxes, part.corner, size, (width, height))
+            tile = (self.card.input.width_px, self.card.input.height_px)
+            is_kept = is_whole(boxes, part.corner, tile, (width, height))
             boxes, keep = boxes[is_kept], keep[is_kept]
         masks = self._masks(some, keep, boxes, part, placement, frame)
         return _Found(boxes, some.scores[keep], some.classes[keep], masks)
@@ -144,10 +144,8 @@ class BoxModel:
         texts = []
         for i, box in zip(keep, boxes, strict=True):
             (grid,) = some.masks(np.array([i]))
-            per_input = (
-                grid.shape[1] / self.card.input.width_px,
-                grid.shape[0] / self.card.input.height_px,
-            )
+            wide, high = placement.size_px
+            per_input = (grid.shape[1] / wide, grid.shape[0] / high)
             corner = part.corner or (0, 0)
             affine = [
                 (

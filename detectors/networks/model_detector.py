@@ -18,6 +18,7 @@ from crosscue.detectors.base import Detector, Found, Frame, RoadMask, View
 from crosscue.detectors.catalog.card import (
     ModelCard,
     SegmentationOutput,
+    Weights,
     read_card,
     read_weights,
 )
@@ -54,16 +55,28 @@ def build(**given: Any) -> Detector:
     settings = settings_of(ModelSettings, given, "detector model")
     path = Path(settings.card)
     card = read_card(path)
-    size = (card.input.width_px, card.input.height_px) if card.input.is_resizable else None
     weights = read_weights(card, weights_folder(card, path))
-    network = load_network(weights, settings.backend, settings.threads, size)
-    identity = _identity(card, settings, network)
     if isinstance(card.output, SegmentationOutput):
-        detector: Detector = RoadModel(card, card.output, network, str(path), identity)
-    else:
-        score = card.output.score if settings.score is None else settings.score
-        detector = BoxModel(card, card.output, score, network, str(path), identity)
-    return _tried(detector, card, path)
+        network = _network(card, weights, settings, 0.0)
+        identity = _identity(card, settings, network)
+        return _tried(RoadModel(card, card.output, network, str(path), identity), card, path)
+    score = card.output.score if settings.score is None else settings.score
+    network = _network(card, weights, settings, score)
+    identity = _identity(card, settings, network)
+    return _tried(BoxModel(card, card.output, score, network, str(path), identity), card, path)
+
+
+def _network(card: ModelCard, weights: Weights, settings: ModelSettings, score: float) -> Network:
+    if card.network is None:
+        size = (card.input.width_px, card.input.height_px) if card.input.is_resizable else None
+        return load_network(weights, settings.backend, settings.threads, size)
+    if settings.backend is not None:
+        raise VehicleError(
+            f"{weights.name}: tensors run in torch, not in {settings.backend}; leave backend out"
+        )
+    from .torchvision_weights import load_torchvision
+
+    return load_torchvision(card, weights, score, settings.threads)
 
 
 def _tried(detector: Detector, card: ModelCard, path: Path) -> Detector:

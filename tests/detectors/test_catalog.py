@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from torchvision.models import get_model_weights
 
 from crosscue.detectors.base import Choice
 from crosscue.detectors.catalog import entries, fetch
@@ -63,6 +64,30 @@ def test_every_entry_says_what_it_is_and_where_its_weights_are(name: str) -> Non
     assert card.files[0].name == card.weights
     assert card.files[0].sha256 == card.sha256
     assert len(set(card.output.classes)) == len(card.output.classes)
+
+
+@pytest.mark.parametrize("name", [name for name in entries.names() if "rcnn" in name])
+def test_torchvision_s_weights_are_those_that_torchvision_names(name: str) -> None:
+    """URL, beginning of the hash, network and classes, as the installed package has them."""
+    card = entries.entry(name)
+    assert card.network is not None
+    weights = get_model_weights(card.network.architecture).DEFAULT
+    (file,) = card.files
+
+    assert file.url == weights.url
+    assert file.sha256.startswith(Path(weights.url).stem.rsplit("-", 1)[-1])
+    assert file.size_bytes / 2**20 == pytest.approx(weights.meta["_file_size"], abs=1e-3)
+    assert entries.place_of(card, file).name == Path(weights.url).name
+    theirs = weights.meta["categories"][1:]
+    assert len(theirs) == len(card.output.classes)
+    assert all(
+        ours == name or (name == "N/A" and ours.startswith("unused"))
+        for ours, name in zip(card.output.classes, theirs, strict=True)
+    )
+    published = weights.meta["_metrics"]["COCO-val2017"]
+    stated = {one.metric: one.value for one in card.evidence if "COCO val2017" in one.pictures}
+    assert stated["box AP, %"] == published["box_map"]
+    assert stated.get("mask AP, %") == published.get("mask_map")
 
 
 @pytest.mark.parametrize("name", entries.names())

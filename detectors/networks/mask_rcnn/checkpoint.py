@@ -122,8 +122,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
 def _content(path: Path) -> bytes:
     if path.suffix.lower() in _PICKLES:
         raise VehicleError(
-            f"{path}: weights of this kind can run programs when read; expected .safetensors "
-            "(convert with safetensors.torch.save_file where you trust the file)"
+            f"{path}: weights of this kind can run programs when read; expected .safetensors; "
+            "for weights of torchvision's networks write a card: crosscue model init"
         )
     try:
         content = read_at_most(path, MAX_BYTES)
@@ -138,7 +138,8 @@ def _facts(description: str | None, path: Path) -> Facts:
     if description is None:
         raise VehicleError(
             f"{path}: says nothing of its classes and size; expected one that "
-            "crosscue train mask-rcnn wrote"
+            "crosscue train mask-rcnn wrote; for weights of torchvision's networks write a card: "
+            "crosscue model init"
         )
     try:
         return Facts.model_validate_json(description)

@@ -12,8 +12,7 @@ same detections in 1.2 to 1.5 times the CPU time (``benchmarks/mask_rcnn.py --on
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -26,7 +25,7 @@ from torch import Tensor
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Detector, Found, Frame, View
-from crosscue.detectors.devices import chosen_device
+from crosscue.detectors.devices import chosen_device, threads_of
 from crosscue.detectors.settings import Proportion, Settings, identity_of, settings_of
 from crosscue.replay.base import Bytes, CrosscueError, Floats, VehicleError
 
@@ -121,7 +120,7 @@ def detector_of(
     )
     set_limits(network, settings.proposals, lowest, settings.objectness)
     batch = settings.batch or (1 if device.type == "cpu" else GPU_BATCH)
-    with _threads(settings.threads, device):
+    with threads_of(settings.threads, device):
         parts = _parts(network, settings, device)
     return MaskRcnnDetector(checkpoint, settings, device, parts, _Batch(batch))
 
@@ -208,7 +207,7 @@ class MaskRcnnDetector:
     def _detect(self, frames: Sequence[Frame]) -> list[Found]:
         plan = self.checkpoint.facts.plan
         placed = [place(frame.pixels, plan) for frame in frames]
-        with torch.inference_mode(), _threads(self.settings.threads, self.device):
+        with torch.inference_mode(), threads_of(self.settings.threads, self.device):
             pictures = np.stack([one.pixels for one in placed])
             is_halved = self.settings.halve and self.device.type == "cuda"
             with torch.autocast(self.device.type, enabled=is_halved):
@@ -257,19 +256,6 @@ def _alike(frames: Sequence[Frame]) -> Sequence[Frame]:
     shape = frames[0].pixels.shape
     count = next((i for i, f in enumerate(frames) if f.pixels.shape != shape), len(frames))
     return frames[:count]
-
-
-@contextmanager
-def _threads(count: int, device: torch.device) -> Iterator[None]:
-    """So many threads on a CPU; more than there are cores free make it slower by far."""
-    before = torch.get_num_threads()
-    if device.type == "cpu" and before != count:
-        torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        if torch.get_num_threads() != before:
-            torch.set_num_threads(before)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

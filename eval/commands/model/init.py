@@ -1,10 +1,12 @@
-"""Write a model card for an ONNX or OpenVINO file, from what the file says of itself.
+"""Write a model card for an ONNX or OpenVINO file, or for weights of a network of torchvision's.
 
-The layout of its outputs is recognised from names, shapes and metadata. What the file does not say
-stands in the card as an assumption to check; where several layouts fit, they are listed.
+The layout of the outputs, or the network, is recognised from names, shapes and metadata. What the
+file does not say stands in the card as an assumption to check; where several fit, they are listed.
+Weights are a state_dict (.pth, .pt) or safetensors: tensors, without code.
 
 example:
   crosscue model init my.onnx --picture street.jpg
+  crosscue model init weights.pth --class-names names.txt
   crosscue replay drive.mcap --vehicle car.toml --detectors my.toml
 """
 
@@ -19,7 +21,12 @@ from crosscue.eval.commands.shared.options import print_result
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("weights", type=Path, metavar="MODEL", help=".onnx, or OpenVINO .xml")
+    parser.add_argument(
+        "weights",
+        type=Path,
+        metavar="MODEL",
+        help=".onnx, OpenVINO .xml, .pth, .pt or .safetensors",
+    )
     parser.add_argument(
         "-o",
         "--output",
@@ -28,7 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the card, in the folder of the weights (default: their name, .toml)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing card")
-    parser.add_argument("--kind", metavar="KIND", help="layout of its outputs, where several fit")
+    parser.add_argument(
+        "--kind", metavar="KIND", help="layout of its outputs or network, where several fit"
+    )
     parser.add_argument(
         "--class-names",
         type=Path,

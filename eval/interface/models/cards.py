@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crosscue.detectors.base import Detections, Detector, Frame, View
+from crosscue.detectors.catalog.architectures import WEIGHTS_SUFFIXES
 from crosscue.detectors.catalog.draft import Draft, draft
 from crosscue.detectors.catalog.entries import card_named
 from crosscue.detectors.catalog.recognise import closed, guesses, plausible, read_interface
@@ -109,9 +110,10 @@ def draft_card(
     """Write a model card for a file, from what the file says of itself, and run it with the card.
 
     Args:
-        weights: An ONNX file, or an OpenVINO ``.xml``.
+        weights: An ONNX file, an OpenVINO ``.xml``, or the ``state_dict`` of a network of
+            torchvision's (``.pth``, ``.pt``, ``.safetensors``).
         output: The card, in the folder of the weights; their name, ``.toml``, if left out.
-        kind: Layout of its outputs, where several fit.
+        kind: Layout of its outputs, or torchvision's name of the network, where several fit.
         class_names: In the order of its outputs, or a file with one a line, where it has none.
         size_px: Width and height of its input, or as text, ``1280x736``, where it allows any.
         picture: What the network finds in it is drawn beside it, as ``.found.jpg``.
@@ -120,7 +122,8 @@ def draft_card(
     Raises:
         UsageError: The card exists, the file is of another kind or damaged, no layout or several
             fit, or class names are missing.
-        VehicleError: The network does not run with the card; no card is left.
+        VehicleError: The network does not run with the card, or a file of weights holds more than
+            tensors; no card is left.
         LogError: The picture cannot be read or decoded.
     """
     path = Path(weights)
@@ -130,8 +133,13 @@ def draft_card(
     if place.resolve().parent != path.resolve().parent:
         raise UsageError(f"{place}: a card lies beside its weights, in {path.parent}")
     size = _size(size_px) if isinstance(size_px, str) else size_px
-    model = read_interface(path)
-    guess = _guess(path, closed(path, model, size), kind)
+    if path.suffix.lower() in WEIGHTS_SUFFIXES:
+        from crosscue.detectors.catalog.recognise_weights import recognise_weights
+
+        model, guess = recognise_weights(path, kind, size)
+    else:
+        model = read_interface(path)
+        guess = _guess(path, closed(path, model, size), kind)
     written = draft(path, model, guess, _names(class_names), size)
     if picture is None:
         _try(place, written)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from crosscue.detectors.catalog.card import ModelCard, read_card
+from crosscue.detectors.catalog.card import Evidence, ModelCard, read_card
 from crosscue.detectors.catalog.class_names import CUE_LABELS
 from crosscue.detectors.catalog.entries import card_named, entry, names, place_of
 from crosscue.detectors.catalog.fetch import Fetched, fetch
@@ -49,6 +49,7 @@ class Model:
     def __repr__(self) -> str:
         card, given = self.card, self.card.input
         resizable = ", resizable" if given.is_resizable else ""
+        network = "" if card.network is None else f"{card.network.architecture}, "
         cues = ", ".join(self.cue_labels) or "none of its classes is counted by a default cue"
         lines = [
             f"{self.name}: {card.about or 'no description'}",
@@ -57,16 +58,23 @@ class Model:
             f"weights    {card.weights}, SHA-256 {card.sha256}",
             f"input      {given.width_px} x {given.height_px}{resizable}, {given.colour}, "
             f"{given.fit}",
-            f"output     {card.output.kind}, {len(card.output.classes)} classes",
+            f"output     {network}{card.output.kind}, {len(card.output.classes)} classes",
             f"cues       {cues}",
         ]
-        for one in card.evidence:
-            interval = "" if one.low is None else f" ({one.low:g} to {one.high:g})"
-            result = f"{one.metric} {one.value:g}{interval}"
-            lines.append(f"measured   {result} on {one.pictures}. {one.note}")
+        lines += [f"evidence   {_evidence(one)}" for one in card.evidence]
         if not card.evidence:
-            lines.append("measured   nothing yet")
+            lines.append("evidence   nothing measured yet")
         return "\n".join(lines)
+
+
+def _evidence(one: Evidence) -> str:
+    """A measurement in a line."""
+    interval = "" if one.low is None else f" ({one.low:g} to {one.high:g})"
+    boxes = "" if one.boxes is None else f", {one.boxes:,} boxes"
+    facts = [f"{one.metric}: {one.value:g}{interval} on {one.pictures}{boxes}"]
+    facts += [f"at {one.input}"] if one.input else []
+    facts += [text for text in (one.measured, one.note) if text]
+    return "; ".join(facts)
 
 
 class Models(Listing[Model]):
@@ -95,7 +103,7 @@ class Models(Listing[Model]):
 
     def __repr__(self) -> str:
         return "\n".join(
-            "{:28} {:>6} MB  {:12} {:12} {}".format(*self.cells(model)) for model in self
+            "{:34} {:>6} MB  {:12} {:12} {}".format(*self.cells(model)) for model in self
         )
 
 

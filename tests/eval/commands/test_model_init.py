@@ -152,9 +152,9 @@ def test_the_real_yolox_is_reported_from_its_twin_by_running_it(
     ("name", "content", "said"),
     [
         ("my.onnx", b"not a model", "not a whole model file"),
-        ("my.pt", b"", "a pickle runs code when it is read"),
+        ("my.pkl", b"", "a pickle runs code when it is read"),
         ("my.torchscript", b"", "a TorchScript archive carries code"),
-        ("my.bin", b"", "expected .onnx or .xml"),
+        ("my.bin", b"", "expected .onnx, .xml, or weights"),
     ],
 )
 def test_what_is_no_model_is_one_line(

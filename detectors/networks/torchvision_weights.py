@@ -1,0 +1,271 @@
+"""torchvision's own detection networks with weights of the user's, run as torchvision runs them.
+
+The file holds tensors and nothing else: a ``state_dict``, read with ``weights_only=True``, or
+safetensors. The card says what to build; torchvision scales and normalises the picture.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from crosscue.detectors.catalog.architectures import ARCHITECTURES, ArchitectureName
+from crosscue.detectors.catalog.card import MAX_BYTES, ModelCard, Weights
+from crosscue.detectors.decoders.base import Array
+from crosscue.detectors.devices import chosen_device, threads_of
+from crosscue.replay.errors import VehicleError, one_line
+
+_COUNTER: Final = "num_batches_tracked"
+"""Of training: missing where normalisation is frozen, and without a meaning for detection."""
+_NESTED: Final = ("model", "state_dict", "model_state_dict", "weights")
+_PREFIXES: Final = ("module.", "model.", "_orig_mod.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StateDict:
+    """Weights by name.
+
+    Attributes:
+        tensors: Without counters of training.
+        is_frozen: The normalisation of the network that they were saved from was frozen.
+        notes: What was taken off to find them.
+    """
+
+    tensors: Mapping[str, Tensor]
+    is_frozen: bool
+    notes: tuple[str, ...]
+
+
+def read_state_dict(content: bytes, where: str) -> StateDict:
+    """Tensors by name from a file's bytes, without running anything.
+
+    Raises:
+        VehicleError: The file holds code or objects besides tensors, no tensors, or is damaged.
+    """
+    tree = (
+        _safetensors(content, where) if where.endswith(".safetensors") else _torch(content, where)
+    )
+    notes = []
+    for key in _NESTED:
+        if isinstance(tree, Mapping) and isinstance(tree.get(key), Mapping):
+            tree = tree[key]
+            notes.append(f"its weights lie under {key!r}")
+            break
+    if not isinstance(tree, Mapping) or not tree:
+        raise VehicleError(f"{where}: {type(tree).__name__}; expected a state dict: {_SAVE}")
+    strange = next((k for k, v in tree.items() if not isinstance(v, Tensor)), None)
+    if strange is not None:
+        raise VehicleError(
+            f"{where}: {strange!r} is {type(tree[strange]).__name__}, not a tensor; {_SAVE}"
+        )
+    named: dict[str, Tensor] = {str(name): value for name, value in tree.items()}
+    for prefix in _PREFIXES:
+        if all(name.startswith(prefix) for name in named):
+            named = {name.removeprefix(prefix): value for name, value in named.items()}
+            notes.append(f"its names begin with {prefix!r}")
+    kept = {name: value for name, value in named.items() if not name.endswith(_COUNTER)}
+    return StateDict(kept, len(kept) == len(named), tuple(notes))
+
+
+_SAVE: Final = "save tensors alone: torch.save(model.state_dict(), FILE)"
+
+
+def _safetensors(content: bytes, where: str) -> Mapping[str, Tensor]:
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    try:
+        found: Mapping[str, Tensor] = load(content)
+    except (SafetensorError, ValueError) as error:
+        why = one_line(error, 120)
+        raise VehicleError(f"{where}: no safetensors file ({why}); is it whole?") from None
+    return found
+
+
+def _torch(content: bytes, where: str) -> Any:
+    try:
+        if _is_program(content):
+            raise VehicleError(
+                f"{where}: a TorchScript archive carries code; {_SAVE}, or export to ONNX"
+            )
+        return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except VehicleError:
+        raise
+    except Exception as error:
+        if found := re.search(r"GLOBAL ([\w.]+)", str(error)):
+            raise VehicleError(
+                f"{where}: holds code or objects besides tensors ({found[1]}), and reading them "
+                f"can run a program; {_SAVE}, or export the network to ONNX"
+            ) from None
+        why = one_line(error, 120)
+        raise VehicleError(f"{where}: not a whole file of weights: {why}; {_SAVE}") from None
+
+
+def _is_program(content: bytes) -> bool:
+    """Whether an archive is one of TorchScript.
+
+    Raises:
+        ValueError: It unpacks to more than a file may hold.
+    """
+    if not zipfile.is_zipfile(io.BytesIO(content)):
+        return False
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        entries = archive.infolist()
+    size = sum(entry.file_size for entry in entries)
+    if size > MAX_BYTES:
+        raise ValueError(f"unpacks to {size:,} bytes, the limit is {MAX_BYTES:,}")
+    return any(entry.filename.endswith("/constants.pkl") for entry in entries)
+
+
+def shapes_of(architecture: ArchitectureName, class_count: int) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a network's weights, without building them in memory.
+
+    Args:
+        architecture: Which.
+        class_count: As torchvision counts, with the background where it has one.
+    """
+    with torch.device("meta"):
+        network = _empty(architecture, class_count)
+    return {
+        name: tuple(value.shape)
+        for name, value in network.state_dict().items()
+        if not name.endswith(_COUNTER)
+    }
+
+
+def _empty(architecture: ArchitectureName, class_count: int) -> Any:
+    from torchvision.models import detection
+
+    make = getattr(detection, architecture)
+    return make(weights=None, weights_backbone=None, num_classes=class_count)
+
+
+def load_torchvision(
+    card: ModelCard, weights: Weights, score: float, threads: int
+) -> TorchvisionNetwork:
+    """The network that a card names, with its weights.
+
+    Raises:
+        VehicleError: Weights and card do not fit each other, or a weight is not finite.
+    """
+    if card.network is None:
+        raise ValueError(f"{weights.name}: the card has no [network]")
+    name = card.network.architecture
+    shape = ARCHITECTURES[name]
+    state = read_state_dict(weights.content, weights.name)
+    listed = len(card.output.classes) + shape.first_class
+    _check_classes(state.tensors, name, listed, weights.name)
+    network = _empty(name, listed)
+    _fill(network, state.tensors, name, weights.name)
+    if card.network.norm_epsilon is not None:
+        for module in network.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eps = card.network.norm_epsilon
+    size = (card.input.width_px, card.input.height_px)
+    if not shape.is_stretched:
+        network.transform.min_size, network.transform.max_size = (size[1],), size[0]
+    elif size != shape.size_px:
+        own = f"{shape.size_px[0]} x {shape.size_px[1]}"
+        raise VehicleError(
+            f"{weights.name}: {name} takes pictures of {own}, the card says {size[0]} x {size[1]}; "
+            "correct input.width_px and height_px"
+        )
+    holder = network.roi_heads if hasattr(network, "roi_heads") else network
+    holder.score_thresh = score
+    device = chosen_device("auto", f"model {weights.name}")
+    return TorchvisionNetwork(network.to(device).eval(), device, threads)
+
+
+def _check_classes(
+    tensors: Mapping[str, Tensor], name: ArchitectureName, listed: int, where: str
+) -> None:
+    shape = ARCHITECTURES[name]
+    found = class_count(tensors, name)
+    if found is not None and found != listed:
+        background = " and the background" if shape.first_class else ""
+        raise VehicleError(
+            f"{where}: its head has {found - shape.first_class} classes{background}, the card "
+            f"lists {listed - shape.first_class}; correct output.classes"
+        )
+
+
+def class_count(tensors: Mapping[str, Tensor], name: ArchitectureName) -> int | None:
+    """How many classes the head is for, as torchvision counts; None where it is not this one."""
+    shape = ARCHITECTURES[name]
+    head = tensors.get(shape.head)
+    if head is None or not head.ndim or len(head) % shape.per_class or len(head) == 0:
+        return None
+    return len(head) // shape.per_class
+
+
+def difference(
+    wanted: Mapping[str, tuple[int, ...]], tensors: Mapping[str, Tensor]
+) -> tuple[int, str]:
+    """In how many tensors weights differ from a network's, and the first of them in words."""
+    missing = [name for name in wanted if name not in tensors]
+    unknown = [name for name in tensors if name not in wanted]
+    other = [n for n, v in tensors.items() if n in wanted and tuple(v.shape) != wanted[n]]
+    first = ""
+    if missing:
+        first = f"{missing[0]} is missing"
+    elif unknown:
+        first = f"{unknown[0]} is unknown to it"
+    elif other:
+        first = (
+            f"{other[0]} has shape {tuple(tensors[other[0]].shape)}, expected {wanted[other[0]]}"
+        )
+    return len(missing) + len(unknown) + len(other), first
+
+
+def _fill(network: Any, tensors: Mapping[str, Tensor], name: str, where: str) -> None:
+    """Put weights into a network.
+
+    Raises:
+        VehicleError: They are another network's, or not finite.
+    """
+    wanted = {
+        key: value for key, value in network.state_dict().items() if not key.endswith(_COUNTER)
+    }
+    count, first = difference({key: tuple(v.shape) for key, v in wanted.items()}, tensors)
+    if count:
+        raise VehicleError(
+            f"{where}: {count} tensors do not fit {name}: {first}; correct network.architecture, "
+            "or take the file that was trained as it"
+        )
+    for key, value in tensors.items():
+        if not bool(value.isfinite().all()):
+            raise VehicleError(
+                f"{where}: {key}: holds values that are not finite; take weights from before "
+                "training diverged"
+            )
+    # Counters of training are all that is left out.
+    network.load_state_dict(dict(tensors), strict=False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TorchvisionNetwork:
+    """A network of torchvision's as a back end: one picture in, boxes and perhaps masks out."""
+
+    network: Any
+    device: torch.device
+    threads: int
+
+    @property
+    def backend(self) -> str:
+        """Version of torch, and where it runs."""
+        return f"torch {torch.__version__} {self.device.type}"
+
+    def __call__(self, picture: Array, /) -> Mapping[str, Array]:
+        """All that torchvision finds in a picture (3, H, W), red green blue, uint8."""
+        given = torch.from_numpy(np.asarray(picture, np.uint8)).to(self.device).float() / 255.0
+        with torch.inference_mode(), threads_of(self.threads, self.device):
+            (found,) = self.network([given])
+        return {name: np.asarray(value.cpu().numpy()) for name, value in found.items()}
