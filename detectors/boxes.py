@@ -28,11 +28,12 @@ def best_of(
         min_score: Lower scores go.
         max_overlap: Of two with a larger intersection over union, the better stays.
     """
-    candidates = np.flatnonzero(scores >= min_score)
-    candidates = candidates[np.argsort(-scores[candidates], kind="stable")]
+    left = np.flatnonzero(scores >= min_score)
+    left = left[np.argsort(-scores[left], kind="stable")]
     kept: list[int] = []
-    for i in candidates.tolist():
-        rivals = [k for k in kept if groups[k] == groups[i]]
-        if not rivals or float(overlaps(boxes[i], boxes[rivals]).max()) <= max_overlap:
-            kept.append(i)
+    while len(left):
+        first, left = int(left[0]), left[1:]
+        kept.append(first)
+        is_rival = overlaps(boxes[first], boxes[left]) > max_overlap
+        left = left[~(is_rival & (groups[left] == groups[first]))]
     return np.array(kept, np.int64)

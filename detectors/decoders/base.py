@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol, TypeAlias, get_args
 
 import numpy as np
@@ -156,12 +157,16 @@ def from_centers(table: Floats) -> Floats:
     return np.hstack([center - half, center + half])
 
 
-def best_class(scores: Floats) -> tuple[Floats, Int64s]:
-    """Of scores (N, C), each row's highest and its class."""
+def best_class(scores: Array) -> tuple[Floats, Int64s]:
+    """Of scores (N, C), each row's highest and its class.
+
+    They keep their type until few are left: a network has a million of them.
+    """
     if not scores.shape[1]:
         raise ValueError("0 classes; a detector needs at least one")
     classes = scores.argmax(axis=1)
-    return scores[np.arange(len(scores)), classes], classes.astype(np.int64)
+    best = np.take_along_axis(scores, classes[:, None], axis=1)[:, 0]
+    return np.asarray(best, np.float64), classes.astype(np.int64)
 
 
 def sigmoid(values: Floats) -> Floats:
@@ -180,8 +185,9 @@ def cell_count(size_px: Size, strides: Sequence[int], *, round_up: bool = False)
     return sum(w * h for w, h in _grids(size_px, strides, round_up))
 
 
+@lru_cache(maxsize=8)
 def cells(
-    size_px: Size, strides: Sequence[int], *, round_up: bool = False
+    size_px: Size, strides: tuple[int, ...], *, round_up: bool = False
 ) -> tuple[Floats, Floats]:
     """Column and row of each cell, shape (N, 2), and its stride in pixels, shape (N, 1)."""
     grids = _grids(size_px, strides, round_up)
@@ -189,7 +195,11 @@ def cells(
         np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1).reshape(-1, 2) for w, h in grids
     ]
     steps = [np.full((w * h, 1), s) for (w, h), s in zip(grids, strides, strict=True)]
-    return np.concatenate(corners).astype(np.float64), np.concatenate(steps).astype(np.float64)
+    found = (np.concatenate(corners).astype(np.float64), np.concatenate(steps).astype(np.float64))
+    for one in found:
+        # The same arrays serve every picture of a size.
+        one.setflags(write=False)
+    return found
 
 
 def _grids(size_px: Size, strides: Sequence[int], round_up: bool) -> list[Size]:

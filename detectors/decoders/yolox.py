@@ -43,12 +43,12 @@ class YoloxOutput(BoxOutput):
                 f"expected {shape} for {len(self.classes)} classes at {size_px[0]} x {size_px[1]}, "
                 f"got {rows.shape}"
             )
-        table: Floats = np.asarray(rows[0], np.float64)
+        table: Floats = np.asarray(rows[0, :, :5], np.float64)
         corner, stride = cells(size_px, self.strides)
         center = (table[:, :2] + corner) * stride
         # A width of e^20 cells is wider than any picture; more would overflow.
         half = np.exp(np.minimum(table[:, 2:4], 20.0)) * stride / 2.0
-        best, classes = best_class(table[:, 5:])
+        best, classes = best_class(np.asarray(rows[0, :, 5:]))
         return Candidates(np.hstack([center - half, center + half]), table[:, 4] * best, classes)
 
     @override
