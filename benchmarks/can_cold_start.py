@@ -2,7 +2,7 @@
 
     python benchmarks/can_cold_start.py [--rounds 5]
 
-Each run is a process of its own, so each parses the DBC file anew, but for ours after the first,
+Each run is a process of its own, so each parses the DBC file again, but for ours after the first,
 which finds its layout in the user's cache. Two CPU times are taken (user and system, all threads):
 of opening, parsing and decoding, with all imports done before ("work"), and of the whole process
 with Python's start and all imports. Values are counted, not compared; the counts are printed.

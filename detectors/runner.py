@@ -75,7 +75,7 @@ class Runner:
         camera: Topic.
         depth_bits: Of 16-bit pictures.
         on_skip: Reported the time and reason of each picture that cannot be decoded.
-        light_labels: Labels of traffic lights, whose lenses are looked at.
+        light_labels: Labels of traffic lights, whose lenses are examined.
         counts: Grow as it works.
     """
 
@@ -173,7 +173,7 @@ class Runner:
         ]
 
     def _identity(self, named: Named) -> str:
-        """Of all that decides a result: the detector, and the rule that looks at its lights."""
+        """Of all that decides a result: the detector, and the rule that examines its lights."""
         return f"{named.detector.identity} lens {VERSION} {' '.join(self.light_labels)}"
 
     def _count(self, name: str, ran: int, from_cache: int) -> None:

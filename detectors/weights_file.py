@@ -88,7 +88,7 @@ def unpacked(content: bytes, key: str, path: Path) -> tuple[str | None, dict[str
         if found != wanted:
             raise VehicleError(
                 f"{path}: damaged: expected sha256 {wanted[:12]}..., got {found[:12]}...; install "
-                "crosscue anew"
+                "crosscue again"
             )
     return description, tensors
 

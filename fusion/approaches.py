@@ -7,7 +7,7 @@ The source scores one approach for each run; a drive has many. An approach
 * closes once its end is behind the rear axle (the end as ranged, or the start and a usual length),
   once the car has turned at it, or when evidence has gone stale. Where no sign reports a range it
   goes stale sooner, and ends after ``longest_m`` in any case, since nothing else could end it;
-* begins anew when its first range shows that it began too far away to be about that intersection;
+* starts over when its first range shows that it began too far away to be about that intersection;
 * that closes before presence was established was noise: counted as neutral, no detection.
 
 Only signs with a range and cues that speak first keep evidence fresh: road straight ahead is seen
@@ -163,7 +163,7 @@ class Approaches:
         return self._step(self._open, evidence, heard, signs, past, moved)
 
     def restart(self) -> None:
-        """Begin anew after a gap in time: what was believed is about another place."""
+        """Start over after a gap in time: what was believed is about another place."""
         if self._open is not None:
             self._close("a gap in time")
         if self._persistence is not None:

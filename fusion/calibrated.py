@@ -13,7 +13,7 @@ so a cue that appears says log(p / q) at once and little more while it stays; on
 log((1 - p) / (1 - q)); a car that stands, or a picture seen before, says nothing new. The chain
 alone would hear noise in a cue that flickers: an appearance soon after another is worth only its
 independent share. A thing not seen before in this approach (a new identity, or more things than
-ever at once) appears anew. Absence speaks as much as was learned, in place of the source's 0.49.
+ever at once) appears again. Absence speaks as much as was learned, in place of the source's 0.49.
 Rates are learned apart for near and far, where the same absence means different things.
 
 Cues are not independent of each other given a feature; one exponent for each feature makes up for

@@ -39,7 +39,7 @@ class Steps(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """What a filter expects of N positions, before it is told them.
+    """What a filter expects of N positions, before it gets them.
 
     Attributes:
         xy_m: Shape (N, 2).

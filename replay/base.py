@@ -1,4 +1,4 @@
-"""What every module may ask of a log, and the ground that all of crosscue stands on.
+"""What every module may ask of a log, and the names that nearly every module imports.
 
 What every open recording can do, whatever its format, is written here (``opening.open_log`` opens
 one). With it comes the ground that all of crosscue stands on, so that one line imports it: what a

@@ -112,7 +112,7 @@ class Device:
         elif abs(seen.thing.at[1]) > self._world.layout.half_width_m:
             chance = faults.hit_off_road
         chance *= 1.0 - 0.15 * self._world.conditions.rain
-        # A state is thrown anew about once a second, so hits and misses come in runs.
+        # A state is drawn about once a second, so hits and misses come in runs.
         if number not in self._reports or self._rng.random() < 0.1:
             self._reports[number] = bool(self._rng.random() < chance)
         return self._reports[number]

@@ -57,7 +57,7 @@ MIN_SAID: Final = 0.25
 MIN_SEEN: Final = 5
 """A light seen less often says nothing of the others' make."""
 STRAIGHT_RAD: Final = 0.15
-"""Heights follow the way only while the car goes straight; after such a turn they begin anew."""
+"""Heights follow the way only while the car goes straight; after such a turn they start over."""
 
 
 class Facing(StrEnum):
@@ -145,7 +145,7 @@ class Track:
 
     @property
     def facing(self) -> Facing:
-        """From all frames so far; one that nobody looked at is unknown."""
+        """From all frames so far; one that was never examined is unknown."""
         looked = self.lit + self.dark
         if self.lit >= MIN_LIT and self.lit >= MIN_LIT_FRACTION * looked:
             return Facing.EGO

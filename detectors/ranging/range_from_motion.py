@@ -2,7 +2,7 @@
 
 A pinhole camera of focal length f sees an object of height H at depth R as h = f H / R pixels. Over
 the distance s travelled towards it, 1 / h falls linearly: 1 / h = (R0 - s) / (f H). So the growth
-tells R without knowing H; what is known of H beforehand (``standard_sizes``) is only the prior. It
+yields R without knowing H; what is known of H beforehand (``standard_sizes``) is only the prior. It
 is all there is while the car stands, and is outweighed as the car moves.
 
 In logarithms, ln h = ln f + ln H - ln R + error, and H is lognormal: given R, everything is

@@ -160,7 +160,7 @@ def _check_place(job: Job, overwrite: bool) -> None:
 
 
 def starting_network(job: Job) -> Any:
-    """A network of the plan, with the weights it starts from; heads of other classes start anew."""
+    """A network of the plan, with the weights it starts from; heads of other classes are random."""
     network = build_network(job.plan)
     if job.start == COMPACT:
         return network

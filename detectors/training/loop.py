@@ -109,7 +109,7 @@ class Training:
         schedule = self.schedule
         first, last = self.done * schedule.batch, schedule.steps * schedule.batch
         with ThreadPoolExecutor(1, "samples") as pool:
-            # One batch is always in the making while the last one is learnt from.
+            # The next batch is made while the last one is learnt from.
             waiting = [
                 pool.submit(sampler, k) for k in range(first, min(first + schedule.batch, last))
             ]
@@ -208,7 +208,7 @@ class Training:
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         except (SafetensorError, OSError, ValueError) as error:
             raise SchemaError(
-                f"{path}: damaged ({error}); delete it and begin the training anew"
+                f"{path}: damaged ({error}); delete it and start the training over"
             ) from None
         refuse_another(path, "--resume", kept.get("made_of"), made_of)
         if kept.get("schedule") != asdict(self.schedule):

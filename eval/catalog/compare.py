@@ -1,7 +1,7 @@
 """Two runs side by side: what changed in versions, settings, tables and metrics, and what is worse.
 
-Metrics are judged drive by drive (``paired``). Where a run was not scored there are none to judge
-by; then every difference of a table counts.
+Metrics are judged drive by drive (``paired``). Where a run was not scored, every difference of a
+table counts instead.
 """
 
 from __future__ import annotations

@@ -279,7 +279,7 @@ def import_truth(
         log: The log whose pictures were annotated.
         output: The truth file, or its folder; labelled objects go beside it.
         vehicle: Names the camera where the log has several, and cues of the user's own.
-        labels: From label to cue; an empty cue says that the label is none.
+        labels: From label to cue; an empty cue leaves the label out.
         add: Keep everything but cues and objects of the truth file that is there.
         overwrite: Replace a truth file that is there.
         limits: What the log is read with.

@@ -113,7 +113,7 @@ class Drive(Section):
     navigation: Navigation = Navigation()
     landmarks_per_km2: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
     landmark_per_goal: bool = False
-    """One landmark at a time instead, drawn anew with every goal."""
+    """One landmark at a time instead, drawn again for every goal."""
     goals: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """Goals one after another; a million of them means until lost or too far."""
     longest_m: Annotated[float, Field(gt=0.0, le=1e6)] = 60_000.0

@@ -192,7 +192,7 @@ class _Plan:
 
 
 def _plain(column: Column) -> Column:
-    """Contiguous and writable, since Numba would compile anew for each other kind of array."""
+    """Contiguous and writable, since Numba would compile again for every other kind of array."""
     return np.require(column, requirements=("C", "W"))
 
 

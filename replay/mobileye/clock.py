@@ -9,7 +9,7 @@ how far apart images are, modulo 256 ms; the log says roughly when each frame ar
 latency is known only up to a constant: the fastest frame is given ``min_latency_ns`` (0 unless
 you know better), and the others what they took more. And it is known only modulo 256 ms: a frame
 that the host held back for 240 ms or more longer than the fastest is placed 256 ms late. Where that
-shows (the next image would come first), or a counter starts anew, a notice says so.
+shows (the next image would come first), or a counter restarts, a notice says so.
 
 The offset follows the fastest frames: down as quickly as keeps images in order, up by no more than
 a crystal drifts.
@@ -34,7 +34,7 @@ LAST_EARLY_NS: Final = 16 * MS
 SETTLED_AFTER: Final = 15
 """The first frame may be a slow one: until so many have come, half a wrap of them may be faster."""
 GAP_NS: Final = 60_000 * MS
-"""After this long without a frame, drift may have moved the counter: start anew."""
+"""After this long without a frame, drift may have moved the counter: start over."""
 WATCHED: Final = 32
 STEP_NS: Final = 12 * MS
 """If none of ``WATCHED`` frames is this near the fastest, the counter or a clock was set."""
@@ -139,7 +139,7 @@ class CounterClock:
         return over_ns - change_ns
 
     def _watch(self, over_ns: int, log_ns: int) -> int:
-        """Start the offset anew where frames no longer come near it."""
+        """Restart the offset where frames no longer come near it."""
         self._fastest_ns = min(self._fastest_ns, over_ns)
         self._watched += 1
         if self._watched < WATCHED:

@@ -34,7 +34,7 @@ def keep_memory() -> None:
     """Let the C library keep freed memory of this size for reuse instead of returning it.
 
     glibc raises its thresholds when one large block is freed. Without it every chunk's short-lived
-    columns are mapped and cleared anew, which costs a quarter of the reading time.
+    columns are mapped and cleared again, which costs a quarter of the reading time.
     """
     np.empty(31 << 20, np.uint8)
 

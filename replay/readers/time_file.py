@@ -11,8 +11,8 @@ the one whose name has ``time`` or ``stamp`` is the time, and a unit there (``ti
 * a date-time (``2011-09-26 13:02:25.964389445``, ``...T13:02:25Z``, ``...+02:00``), UTC where it
   names no zone.
 
-A last line without a line end that is no time, or has fewer decimals than all lines above it, was
-cut while it was written: it gives no time, and a notice says so.
+A last line without a line end that is not a time, or has fewer decimals than all lines above it,
+was cut while it was written: it yields no time, and a notice says so.
 
 Instead of times, one line ``rate_hz: 15`` says that they were not kept and pictures came at that
 rate. Times are computed in integers and fractions, never in floats.

@@ -659,7 +659,7 @@ def _removed(entry: Path) -> bool:
         return not entry.exists()
     try:
         fcntl.flock(hold, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # Renamed first: whoever comes now begins anew instead of finding half of it.
+        # Renamed first: another process now starts over instead of finding half of it.
         gone = entry.with_name(f".{entry.name}.{os.getpid()}")
         entry.replace(gone)
         shutil.rmtree(gone)

@@ -148,7 +148,7 @@ def _fail(error: OSError) -> None:
 
 @dataclass(slots=True)
 class Sealing:
-    """A seal in the making; iterate over it to make it.
+    """A seal that is not finished yet; iterate over it to make it.
 
     Attributes:
         log: What is sealed.

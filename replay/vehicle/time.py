@@ -11,7 +11,7 @@ class Time(Section):
     max_silence_s: Positive = 1.0
     """Wheel speeds silent for longer than this begin a new segment."""
     restart_after_s: NotNegative = 5.0
-    """After a longer gap, or a clock set back, the range filter and the belief start anew."""
+    """After a longer gap, or a clock set back, the range filter and the belief start over."""
     unknown_gap_s: Positive = 1.0
     """Taken for the gap where a clock was set back: its true length cannot be known."""
     max_accel_mps2: NotNegative = 4.0

@@ -145,7 +145,7 @@ NAMED_IN_THE_VEHICLE_FILE: Final[dict[str, str]] = {
 }
 """Commands that read the DBC files of a vehicle file."""
 WRITTEN: Final = {"--output", "--cache", "--figure", "--sheet"}
-"""Options whose file is made where there is none."""
+"""Options whose file is made if it is missing."""
 ANY_BYTES: Final = {"seal", "model fetch", "completion"}
 """Their arguments are no files that could be of another kind."""
 MADE: Final = {("landmarks add", "DB")}
@@ -246,7 +246,7 @@ def test_a_file_that_an_option_names(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # Weights that the user fetched before would be taken, and the file not looked at.
+    # Weights that the user fetched before would be taken, and the file not examined.
     monkeypatch.setenv("CROSSCUE_MODELS", str(tmp_path / "models"))
     command, (line, wanted) = case[0], CASES[case]
     DAMAGE[damage](tmp_path / ("gone" + line.partition("{gone}")[2].partition(" ")[0]))

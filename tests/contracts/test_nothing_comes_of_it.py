@@ -22,7 +22,7 @@ ELSEWHERE: dict[str, str] = {
     "study intersections": "simulates", "study landmarks": "simulates", "study range": "simulates",
     "truth schema": "prints a constant",
     "run schema": "prints a constant", "completion": "prints a constant",
-    "plugins": "that there are none is its result", "model list": "prints a table",
+    "plugins": "an empty list is its result", "model list": "prints a table",
     "model show": "prints a card", "model check": "that nothing is found is its result",
     "model fetch": "copies a file", "model init": "copies a file",
 }  # fmt: skip

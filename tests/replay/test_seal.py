@@ -473,7 +473,7 @@ def test_a_window_checks_only_what_it_reads(tmp_path: Path, kind: str) -> None:
     checked, none = losses(window)
     assert 0 < checked < total
     assert not none
-    # A byte of a payload, or one that no decoder looks at: only the seal can see it.
+    # A byte of a payload, or one that no decoder reads: only the seal can see it.
     if not files:
         at = int(log.stat().st_size * 0.6)
         _flip(log, at)

@@ -71,7 +71,7 @@ def frames(
 
 
 def joined(parts: Sequence[Objects]) -> Objects:
-    """The annotations of many runs as those of one set, numbered anew."""
+    """The annotations of many runs as those of one set, renumbered."""
     whole = Objects()
     for part in parts:
         images, annotations = len(whole.images), len(whole.annotations)

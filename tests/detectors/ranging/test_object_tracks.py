@@ -52,7 +52,7 @@ def test_several_lights_are_several_tracks_with_a_range_each() -> None:
     assert heights == pytest.approx([1.0, 1.3, 1.5], rel=0.06)
 
 
-def test_a_near_light_tells_the_size_of_a_far_one_of_its_make() -> None:
+def test_a_near_light_narrows_the_size_of_a_far_one_of_its_make() -> None:
     near: Light = (45.0, -5.0, 5.0, 1.5)
     far: Light = (140.0, 2.0, 5.0, 1.5)
     alone, beside = tracks(), tracks()

@@ -175,7 +175,7 @@ def test_a_name_depends_on_the_logs_alone(tmp_path: Path) -> None:
         (alone,) = drives_of([log]).drives
         assert together[alone.logs] == alone.name
     before = drives_of([logs[0]]).drives[0].name
-    Path(logs[0]).write_text("recorded anew")
+    Path(logs[0]).write_text("recorded again")
     assert drives_of([logs[0]]).drives[0].name != before
 
 

@@ -1,4 +1,4 @@
-"""Which light or sign tells the range, and what happens where nothing can."""
+"""Which light or sign yields the range, and what happens where nothing can."""
 
 from collections.abc import Sequence
 
@@ -61,7 +61,7 @@ def drive(
     return rows
 
 
-def test_the_far_lights_tell_the_end_and_groups_are_never_averaged() -> None:
+def test_the_far_lights_mark_the_end_and_groups_are_never_averaged() -> None:
     beside: Thing = ("traffic light", 57.0, -9.0, 1.3)
     rows = drive(MotionRanges(vehicle()), [NEAR, beside, FAR], 45, ("red", "red", "red"))
 
@@ -128,7 +128,7 @@ def test_a_larger_light_that_comes_into_view_does_not_take_over() -> None:
     assert one.range_m == pytest.approx(84.0 - 30.0 + 1.5 - SETBACK_M, rel=0.06)
 
 
-def test_the_nearest_stop_sign_tells_the_start() -> None:
+def test_the_nearest_stop_sign_marks_the_start() -> None:
     near: Thing = ("stop sign", 40.0, 4.0, 0.75)
     far: Thing = ("stop sign", 65.0, -4.0, 0.75)
 
@@ -180,10 +180,10 @@ def test_boxes_cut_by_the_edge_give_no_range_and_are_counted() -> None:
 def test_a_posterior_begins_a_range_and_is_taken_up_along_the_way() -> None:
     settings = vehicle()
     loop = Approaches(graph_of(settings.fusion), settings.fusion, settings.range_filter)
-    told = RangePosterior(Reference.END, 50.0, 9.0, 51.0)
+    known = RangePosterior(Reference.END, 50.0, 9.0, 51.0)
     steps = [
         loop(FrameEvidence(i, 1.0, 0.01, (), {"traffic_light": 1}, posteriors=some))
-        for i, some in enumerate(((told,), (told,), ()), start=1)
+        for i, some in enumerate(((known,), (known,), ()), start=1)
     ]
 
     first, again, carried = (step.ranges for step in steps)

@@ -224,7 +224,7 @@ def test_landmarks_find_the_car_again_after_a_gap(marked: Outcome, tmp_path: Pat
     assert later
     assert all(float(name) > START_M - 15.0 for name in later)
     assert _off_m(marked.run)[-1] < 2.0
-    # The way from pose to pose is measured motion; what a landmark moves the pose is none.
+    # The way from pose to pose is measured motion; a correction by a landmark is not.
     assert _column(marked.run, "pose", "travelled_m")[-1] == pytest.approx(
         _column(without, "pose", "travelled_m")[-1], abs=1e-6
     )

@@ -49,7 +49,7 @@ def test_a_range_without_a_curve_says_so() -> None:
     ]
 
 
-def test_road_is_told_only_where_it_never_was() -> None:
+def test_road_is_reported_only_where_it_never_was() -> None:
     road = {"unit": "frames", "setting": "[cues] road_fraction", "threshold": 0.2}
     never = _row(8, {"too little road": 8}, **{**road, "max_score": 0.13})
     lines = candidate_lines(
