@@ -103,6 +103,7 @@ _EXPORTS: Final = {
     "MergedRuns": "eval.interface.runs.tables",
     "Decoded": "eval.catalog.decoded_logs",
     "write_truth": "eval.interface.truth",
+    "truth_from_gnss": "eval.interface.truth",
     "truth_schema": "eval.interface.truth",
     "draft_vehicle": "eval.interface.vehicles",
     "check_vehicle": "eval.interface.vehicles",
@@ -297,6 +298,7 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.training.road import TrainedRoad as TrainedRoad
     from crosscue.eval.interface.training.road import measure_road as measure_road
     from crosscue.eval.interface.training.road import train_road as train_road
+    from crosscue.eval.interface.truth import truth_from_gnss as truth_from_gnss
     from crosscue.eval.interface.truth import truth_schema as truth_schema
     from crosscue.eval.interface.truth import write_truth as write_truth
     from crosscue.eval.interface.vehicles import VehicleCheck as VehicleCheck

@@ -57,6 +57,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "landmarks list": ("landmarks.list", "list the contents of a landmark database"),
     "landmarks match": ("landmarks.match", "match one image against a landmark database"),
     "truth": ("truth.write", "write the truth that a data set contains"),
+    "truth from-gnss": ("truth.from_gnss", "write a drive's own GNSS as truth"),
     "truth import": ("truth.import_annotations", "import annotations from COCO or CVAT as truth"),
     "truth check": ("truth.check", "check a truth file against its log"),
     "run schema": ("runs.schema", "print the JSON Schema of a run's manifest.json"),

@@ -28,23 +28,28 @@ class Path(NamedTuple):
     heading_rad: Floats
 
 
-def path_of(increments: Increments, at_ns: Int64s) -> Path:
-    """Dead reckoning at the given times, from the first of them; linear inside an increment."""
+def path_of(increments: Increments, at_ns: Int64s, begin_ns: int) -> Path:
+    """Dead reckoning from the pose at ``begin_ns`` to given times; linear inside increments."""
     heading = np.append(0.0, np.cumsum(increments.turn_rad))
     half = 0.5 * increments.turn_rad
     chord = increments.distance_m * np.sinc(half / np.pi)
     x = np.append(0.0, np.cumsum(chord * np.cos(heading[:-1] + half)))
     y = np.append(0.0, np.cumsum(chord * np.sin(heading[:-1] + half)))
     edges = np.append(increments.start_ns[:1], increments.stop_ns)
-    at_s, edges_s = (at_ns - edges[0]) * 1e-9, (edges - edges[0]) * 1e-9
-    x, y, heading = (np.interp(at_s, edges_s, column) for column in (x, y, heading))
+    at_s = (np.append(begin_ns, at_ns) - edges[0]) * 1e-9
+    x, y, heading = (np.interp(at_s, (edges - edges[0]) * 1e-9, c) for c in (x, y, heading))
     cos, sin = math.cos(heading[0]), math.sin(heading[0])
-    dx, dy = x - x[0], y - y[0]
-    return Path(cos * dx + sin * dy, cos * dy - sin * dx, heading - heading[0])
+    dx, dy = x[1:] - x[0], y[1:] - y[0]
+    return Path(cos * dx + sin * dy, cos * dy - sin * dx, heading[1:] - heading[0])
 
 
-def start_pose(increments: Increments, fixes: Fixes, lever_m: tuple[float, float]) -> State:
-    """Pose of the rear axle at the first fix: the first seconds' odometry laid onto the fixes.
+def start_pose(
+    increments: Increments,
+    fixes: Fixes,
+    lever_m: tuple[float, float],
+    at_ns: int | None = None,
+) -> State:
+    """Pose of the rear axle at one time: the first seconds' odometry laid onto the fixes.
 
     The planar case of S. Umeyama (PAMI 13, 1991) without scale. The covariance follows from what
     the fixes say of themselves, or from the residuals where these are larger. Of a car that did
@@ -54,9 +59,11 @@ def start_pose(increments: Increments, fixes: Fixes, lever_m: tuple[float, float
         increments: Odometry that covers the first seconds of fixes.
         fixes: At least one, in order.
         lever_m: The point they are of, ahead of and to the left of the rear axle.
+        at_ns: When; None for the first fix.
     """
     first = fixes.take(fixes.t_ns <= fixes.t_ns[0] + round(START_S * 1e9))
-    path = path_of(increments, first.t_ns)
+    begin_ns = int(first.t_ns[0]) if at_ns is None else at_ns
+    path = path_of(increments, first.t_ns, begin_ns)
     driven = path.x_m + 1j * path.y_m + np.exp(1j * path.heading_rad) * complex(*lever_m)
     seen = first.xy_m[:, 0] + 1j * first.xy_m[:, 1]
     middle, to = driven.mean(), seen.mean()

@@ -145,6 +145,8 @@ class Truth(Section):
     file's ``[camera]`` or ``[gnss]`` puts it."""
     position_sd_m: Annotated[float, Field(gt=0.0)] | None = None
     """S.d. of east and of north; left out: taken for exact."""
+    heading_sd_rad: Annotated[float, Field(gt=0.0)] | None = None
+    """Of the heading."""
     origin: Origin | None = None
     source: str = ""
     """Who measured it, and how well."""

@@ -21,10 +21,12 @@ def read_signals(
     vehicle: Vehicle,
     selection: Selection,
     wanted: Collection[Signal],
+    *,
+    warns: bool = True,
 ) -> dict[Signal, Samples]:
     """The wanted signals of a drive, in order of time; those without a row are left out.
 
-    Losses are reported as warnings.
+    Losses are reported as warnings, unless another pass over the log will report them.
     """
     sources = [source for signal in wanted if (source := planned.source_of(signal)) is not None]
     topics = frozenset(source.topic.name for source in sources)
@@ -44,7 +46,7 @@ def read_signals(
         for signal, parts in found.items():
             if signal in window.samples:
                 parts.append(window.samples[signal])
-    for extractor in extractors:
+    for extractor in extractors if warns else ():
         warn_of(extractor.ledger)
     return {signal: _joined(parts) for signal, parts in found.items() if parts}
 

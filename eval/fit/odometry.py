@@ -16,7 +16,7 @@ from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import circular_mean, wrap_all
 from crosscue.localization.compass_fit import persistence
 from crosscue.localization.known_drive import KnownDrive, whitened
-from crosscue.localization.odometry import OdometrySettings, TurnKind, TurnSignal, WheelSpeeds
+from crosscue.localization.odometry import OdometrySettings
 from crosscue.localization.odometry_fit import FIX_DELAY, OdometryFit, fit_odometry
 from crosscue.replay.base import EmptyResultError, Floats, Log, Selection, VehicleError
 from crosscue.replay.remote.logs import name_of
@@ -27,6 +27,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .log_signals import read_signals
 from .reference import Reference, of_gnss, of_truth
+from .turns import turn_samples, wheel_speeds
 
 SHARED: Final = ("wheel_scale", "slip_per_sqrt_m", "turn_delay_s", "turn_rad_per_sqrt_rad")
 OF_ONE_TURN: Final = {
@@ -158,7 +159,9 @@ def fit(
         if turn is not None and turn not in found:
             not_fitted[_name(turn)] = planned.missing.get(turn, "not one row in this part")
             continue
-        drive = KnownDrive(_wheels(wheels), _turn(turn, found), reference.fixes, reference.lever_m)
+        drive = KnownDrive(
+            wheel_speeds(wheels), turn_samples(turn, found), reference.fixes, reference.lever_m
+        )
         try:
             sources.append(_fitted(drive, given, reference))
         except VehicleError as error:
@@ -189,20 +192,6 @@ def _reference(
     if samples is None or topic is None:
         raise EmptyResultError(f"{topic}: not one GNSS position in this part of the log")
     return of_gnss(topic, samples, vehicle)
-
-
-def _wheels(samples: Samples) -> WheelSpeeds:
-    return WheelSpeeds(
-        samples.t_ns,
-        samples.values[:, 2:] if np.isnan(samples.values[:, :2]).all() else samples.values,
-    )
-
-
-def _turn(signal: Signal | None, found: dict[Signal, Samples]) -> TurnSignal | None:
-    if signal is None:
-        return None
-    kind: TurnKind = "yaw rate" if signal is Signal.YAW_RATE else "steering"
-    return TurnSignal(found[signal].t_ns, found[signal].values, kind)
 
 
 def _name(turn: Signal | None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from crosscue.replay.base import EmptyResultError, Floats, Int64s
 from crosscue.replay.signals.kinds import Samples
 from crosscue.replay.vehicle.vehicle import Vehicle
 
+GeodeticOrigin: TypeAlias = tuple[float, float, float]
+"""Latitude and longitude in degrees, altitude in metres."""
 SPACING_NS: Final = 1_000_000_000
 """Positions nearer to each other say little more: their errors last."""
 TRUTH_SD_M: Final = 0.3
@@ -32,6 +34,8 @@ class Reference:
         lever_m: The point, ahead of and to the left of the rear axle.
         heading_rad: Shape (N,): of the body whose track it is; None where it has none.
         is_of_camera: Whether that body is the camera.
+        is_map: Whether the frame is the map of a truth file, in which runs are scored.
+        origin: Where the frame's zero lies.
     """
 
     name: str
@@ -39,6 +43,8 @@ class Reference:
     lever_m: tuple[float, float]
     heading_rad: Floats | None = None
     is_of_camera: bool = False
+    is_map: bool = False
+    origin: GeodeticOrigin | None = None
 
 
 def of_gnss(name: str, samples: Samples, vehicle: Vehicle) -> Reference:
@@ -53,21 +59,27 @@ def of_gnss(name: str, samples: Samples, vehicle: Vehicle) -> Reference:
     t_ns = samples.t_ns - round(gnss.delay_s * 1e9)
     lat, lon, alt, sd = samples.values.T
     alt = np.where(np.isfinite(alt), alt, 0.0)
-    xyz = geodetic_to_enu(lat, lon, alt, (float(lat[0]), float(lon[0]), float(alt[0])))
+    origin = float(lat[0]), float(lon[0]), float(alt[0])
+    xyz = geodetic_to_enu(lat, lon, alt, origin)
     rows = spaced(t_ns)
     var = np.where(np.isfinite(sd), sd, gnss.position_sd_m)[rows] ** 2
     fixes = Fixes(t_ns[rows], xyz[rows, :2], var[:, None, None] * np.eye(2))
-    return Reference(f"GNSS ({name})", fixes, (gnss.x_m, gnss.y_m))
+    return Reference(f"GNSS ({name})", fixes, (gnss.x_m, gnss.y_m), origin=origin)
 
 
-def of_truth(path: Path, vehicle: Vehicle) -> Reference:
+def of_truth(path: Path, vehicle: Vehicle, spacing_ns: int = SPACING_NS) -> Reference:
     """A truth file's track.
+
+    Args:
+        path: ``truth.json`` or its folder.
+        vehicle: Where the camera and the antenna sit, unless the truth says so.
+        spacing_ns: How far apart its poses are taken.
 
     Raises:
         SchemaError: The file does not fit, or holds no pose.
     """
     truth, track = load_truth(path)
-    rows = spaced(track.t_ns)
+    rows = spaced(track.t_ns, spacing_ns)
     if not len(rows):
         raise EmptyResultError(f"{path}: its track has no pose; expected the true positions")
     var = (truth.position_sd_m or TRUTH_SD_M) ** 2
@@ -77,15 +89,20 @@ def of_truth(path: Path, vehicle: Vehicle) -> Reference:
     mounting = mounting_of(truth, vehicle)
     lever_m = (mounting.x_m, mounting.y_m)
     return Reference(
-        truth.source or path.name, fixes, lever_m, heading_rad(track)[rows], is_of_camera
+        truth.source or path.name,
+        fixes,
+        lever_m,
+        heading_rad(track)[rows],
+        is_of_camera,
+        is_map=True,
     )
 
 
-def spaced(t_ns: Int64s) -> Int64s:
-    """Indices of rows about ``SPACING_NS`` apart, the first among them."""
+def spaced(t_ns: Int64s, spacing_ns: int = SPACING_NS) -> Int64s:
+    """Indices of rows about so far apart, the first among them."""
     kept: list[int] = []
     for row, t in enumerate(t_ns.tolist()):
         # A little early is on time: a row of a jittery clock.
-        if not kept or t - int(t_ns[kept[-1]]) >= SPACING_NS * 0.95:
+        if not kept or t - int(t_ns[kept[-1]]) >= spacing_ns * 0.95:
             kept.append(row)
     return np.array(kept, np.int64)

@@ -251,6 +251,8 @@ class PoseStage:
         """
         start = self.vehicle.start
         heading_rad, sd_rad = start.heading_rad, start.heading_sd_rad
+        if heading_rad is not None and start.source:
+            self.notices.append(f"start heading {np.rad2deg(heading_rad):.1f} deg: {start.source}")
         if heading_rad is None and len(headings):
             mean = np.exp(1j * headings.heading_rad).mean()
             heading_rad, sd_rad = float(np.angle(mean)), float(np.sqrt(headings.var_rad2[0]))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Final, Literal
+from typing import Final, Literal, TypeAlias
 
 from pydantic import Field
 
 from .section import Finite, NotNegative, Positive, Section
 
+GnssUse: TypeAlias = Literal["start", "truth", "off"]
 DEGREE: Final = math.pi / 180.0
 
 
@@ -80,13 +81,21 @@ class Odometry(Section):
 class Gnss(Section):
     """A GNSS receiver and its antenna."""
 
+    use: GnssUse = "start"
+    """``start``: its first seconds say where the drive begins and which way the car faces, unless
+    ``start.heading_rad`` does. ``truth``: it is kept for ``crosscue truth from-gnss`` alone.
+    ``off``: neither. It is never weighed into the pose, as published."""
     x_m: Finite = 0.0
     """The antenna, ahead of the rear axle."""
     y_m: Finite = 0.0
     position_sd_m: Positive = 3.0
     """S.d. of east and of north, where the receiver states none."""
+    course_sd_rad: Positive = 3.0 * DEGREE
+    """S.d. of the course over ground, from ``min_speed_mps`` on."""
+    min_speed_mps: Positive = 3.0
+    """Below, the course is noise."""
     delay_s: Finite = 0.0
-    """How long after they were true positions are stamped."""
+    """How long after they were true positions and courses are stamped."""
 
 
 class Start(Section):
@@ -98,3 +107,7 @@ class Start(Section):
     heading_rad: Finite | None = None
     """Left out: taken from the first compass readings."""
     heading_sd_rad: Positive = 5.0 * DEGREE
+    map_origin: tuple[Finite, Finite, Finite] | None = None
+    """Latitude and longitude in degrees and altitude in metres of the map's zero, where known."""
+    source: str = ""
+    """Where this pose comes from; a run that found it in the log records it here."""

@@ -61,6 +61,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_detector_arguments(parser)
     parser.add_argument(
+        "--gnss",
+        choices=("start", "truth", "off"),
+        help="what GNSS is for: the first pose and heading, truth alone, or nothing "
+        "(default: gnss.use of the vehicle file, which is start unless set)",
+    )
+    parser.add_argument(
+        "--start",
+        dest="first_pose",
+        metavar="POSE",
+        help="first pose: X,Y,HEADING in metres and degrees counter-clockwise from east, or a truth "
+        "file with a track",
+    )
+    parser.add_argument(
         "--landmarks",
         type=Path,
         metavar="DB",
@@ -92,6 +105,8 @@ def run(args: argparse.Namespace) -> int:
             args.output,
             args.vehicle or drive.vehicle or crosscue.Vehicle(version=1),
             detectors_of(args),
+            gnss=args.gnss,
+            start=args.first_pose,
             landmarks=args.landmarks,
             cache=cache_of(args),
             draw=args.draw,
@@ -105,6 +120,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_many(args: argparse.Namespace, found: crosscue.DriveList) -> int:
+    if args.first_pose is not None:
+        raise UsageError("--start: for one drive; these are many, each with a start of its own")
     with DrivesLine("replaying", is_shown=is_shown(args)) as line:
         done = crosscue.replay_drives(
             found,
@@ -115,6 +132,7 @@ def _run_many(args: argparse.Namespace, found: crosscue.DriveList) -> int:
             end=args.end,
             topics=args.topics,
             limits=limits_of(args),
+            gnss=args.gnss,
             landmarks=args.landmarks,
             cache=cache_of(args),
             draw=args.draw,

@@ -25,6 +25,7 @@ from crosscue.eval.runs.input import files_named_in
 from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, versions, visible
 from crosscue.replay.logs.log_part import part_in_words
 from crosscue.replay.logs.opening import unless_damaged
+from crosscue.replay.vehicle.pose import GnssUse
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 
 
@@ -96,6 +97,7 @@ class _Work:
     end: str | None
     topics: Sequence[str] | None
     limits: Limits
+    gnss: GnssUse | None
     landmarks: Path | None
     cache: Path | str | None
     draw: int
@@ -110,6 +112,7 @@ class _Work:
                 job.run,
                 self.settings(job),
                 self.detectors,
+                gnss=self.gnss,
                 landmarks=self.landmarks,
                 cache=self.cache,
                 draw=self.draw,
@@ -132,6 +135,7 @@ class _Work:
             "draw": str(self.draw),
             "start": self.start,
             "end": self.end,
+            "gnss": self.gnss,
             "topics": None if self.topics is None else str([*self.topics]),
             "landmarks": None if self.landmarks is None else str(self.landmarks.resolve()),
         }
@@ -174,6 +178,7 @@ def replay_drives(
     end: float | str | None = None,
     topics: Sequence[str] | None = None,
     limits: Limits = DEFAULT_LIMITS,
+    gnss: GnssUse | None = None,
     landmarks: Path | str | None = None,
     cache: Path | str | None = None,
     draw: int = 0,
@@ -196,6 +201,7 @@ def replay_drives(
         end: Likewise, no longer wanted.
         topics: Names; None for all.
         limits: What the logs are read with.
+        gnss: As in ``replay_drive``.
         landmarks: As in ``replay_drive``.
         cache: As in ``replay_drive``.
         draw: As in ``replay_drive``.
@@ -219,6 +225,7 @@ def replay_drives(
         None if end is None else str(end),
         topics,
         limits,
+        gnss,
         None if landmarks is None else Path(landmarks),
         cache,
         draw,

@@ -14,6 +14,7 @@ from crosscue.eval.interface.show import listing
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.runs.manifest import Manifest, json_schema
 from crosscue.replay.base import DEFAULT_LIMITS, Limits, OutputError, RunError, UsageError
+from crosscue.replay.vehicle.pose import GnssUse
 from crosscue.replay.vehicle.vehicle import Vehicle, load, vehicle_given
 
 if TYPE_CHECKING:
@@ -222,6 +223,8 @@ def replay_drive(
     vehicle: Vehicle | Path | str | None = None,
     detectors: Sequence[str] | None = None,
     *,
+    gnss: GnssUse | None = None,
+    start: Path | str | None = None,
     landmarks: Path | str | None = None,
     cache: Path | str | None = None,
     draw: int = 0,
@@ -238,6 +241,9 @@ def replay_drive(
         vehicle: The vehicle file; None for the ``vehicle.toml`` beside the log, if there is one.
         detectors: Names, model cards or ``module:factory``; None for the vehicle file's, and an
             empty list for pose alone.
+        gnss: What GNSS is for: ``start``, ``truth`` or ``off``; None for the vehicle file's
+            ``gnss.use``.
+        start: The first pose: ``X,Y,HEADING`` in metres and degrees, or a truth file with a track.
         landmarks: Database that frames are compared with.
         cache: File in which results of detectors are kept; see ``default_cache``.
         draw: Up to so many pictures are written with what was found.
@@ -251,12 +257,19 @@ def replay_drive(
         RunError: The folder holds something else.
         EmptyResultError: Nothing comes of it; the folder is as it was.
     """
+    from crosscue.eval.fit.first_pose import with_start
     from crosscue.eval.pipeline.landmarks import matcher_for, open_for
     from crosscue.eval.pipeline.replay import Detecting
     from crosscue.eval.pipeline.replay import replay_drive as replay_into
 
     with opened(log) as drive, ExitStack() as stack:
-        settings = vehicle_of(drive, vehicle)
+        settings = with_start(
+            drive.logs,
+            vehicle_of(drive, vehicle),
+            drive.selection,
+            gnss,
+            None if start is None else str(start),
+        )
         detecting = Detecting(
             choices_for(settings, detectors), _path(cache), draw, resume, on_frames
         )
@@ -316,7 +329,8 @@ def estimate_run(
 
     Args:
         run: A finished run.
-        vehicle: Other settings; the run's own, if left out.
+        vehicle: Other settings; the run's own, if left out. A first pose that the run took from
+            GNSS or a truth file stays, unless the settings have one.
         output: A new folder beside the run; if left out, the run's tables are replaced.
         on_time: Called with the seconds of log that are done, and of how many.
 
@@ -324,12 +338,15 @@ def estimate_run(
         RunError: The run is damaged, or its log is gone.
         OutputError: The new folder exists.
     """
+    from crosscue.eval.fit.first_pose import with_start_of
     from crosscue.eval.pipeline.reestimate import estimate_run as estimate_in
 
     folder = _run(run).folder
     if output is not None:
         folder = _copied(folder, Path(output))
-    settings = None if vehicle is None else vehicle_given(vehicle)
+    settings = None
+    if vehicle is not None:
+        settings = with_start_of(folder.drive_manifest().settings, vehicle_given(vehicle))
     return Run(folder, estimate_in(folder, settings, on_time))
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.datasets.geodesy import geodetic_to_enu
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
@@ -176,10 +177,12 @@ def truth_track(path: Path, run: RunFolder) -> TruthTrack:
     Raises:
         SchemaError: The truth does not fit the run.
     """
-    _, track = load_truth(path)
+    truth, track = load_truth(path)
     table = table_in_log_time(run.table("pose"), run.drive_manifest().timeline)
     inside = _inside(track, table, path)
-    return TruthTrack(track.t_ns[inside], track.xyz_m[inside, 0], track.xyz_m[inside, 1])
+    east_m, north_m = map_shift(run.drive_manifest().settings, truth)
+    x_m, y_m = track.xyz_m[inside, 0] - east_m, track.xyz_m[inside, 1] - north_m
+    return TruthTrack(track.t_ns[inside], x_m, y_m)
 
 
 def measure(
@@ -296,6 +299,8 @@ def at_truths_point(
         truth: Names the body whose track it is.
     """
     x, y, heading = xyh.T
+    east_m, north_m = map_shift(vehicle, truth)
+    x, y = x + east_m, y + north_m
     cov = cov_xyh
     ahead, left, yaw_rad = mounting_of(truth, vehicle)
     if ahead or left:
@@ -316,7 +321,20 @@ def at_truths_point(
         )
     if truth.position_sd_m is not None:
         cov = cov + truth.position_sd_m**2 * np.array([1.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    if truth.heading_sd_rad is not None:
+        cov = cov + truth.heading_sd_rad**2 * np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     return planar(t_ns, x, y, heading + yaw_rad), cov
+
+
+def map_shift(vehicle: Vehicle, truth: Truth) -> tuple[float, float]:
+    """Where the zero of a run's map lies in the truth's; both point east, at most some km apart."""
+    of_run, of_truth = vehicle.start.map_origin, truth.origin
+    if of_run is None or of_truth is None:
+        return 0.0, 0.0
+    there = of_truth.latitude_deg, of_truth.longitude_deg, of_truth.altitude_m
+    latitude, longitude, altitude = of_run
+    (east_m, north_m, _), *_ = geodetic_to_enu(latitude, longitude, altitude, there).tolist()
+    return east_m, north_m
 
 
 def _ape(paired: Paired, how: Alignment) -> Errors:

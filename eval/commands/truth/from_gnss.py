@@ -1,0 +1,45 @@
+"""Write a drive's own GNSS as truth: an antenna's track of stated quality.
+
+Each pose is scored with the receiver's own s.d. (or gnss.position_sd_m of the vehicle file) and
+with gnss.course_sd_rad. Positions without a heading, before the car first moves, are left out.
+
+example:
+  crosscue truth from-gnss drive.mcap --vehicle car.toml -o truth/
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import crosscue
+from crosscue.eval.commands.shared.drive_part import open_part
+from crosscue.eval.commands.shared.options import add_log_arguments, print_json
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    add_log_arguments(parser)
+    parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="vehicle file")
+    parser.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        type=Path,
+        metavar="DIR",
+        help="folder for the truth file and its track",
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write truth.json."""
+    if args.vehicle is not None:
+        crosscue.load_vehicle(args.vehicle)
+    with open_part(args, args.logs) as log:
+        written = crosscue.truth_from_gnss(log, args.output, args.vehicle)
+    if args.json:
+        print_json({"truth": str(written)})
+    elif not args.quiet:
+        print(written)
+    return 0

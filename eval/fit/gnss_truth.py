@@ -1,0 +1,108 @@
+"""A drive's own GNSS as a true track of stated quality."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from crosscue.datasets.geodesy import geodetic_to_enu
+from crosscue.datasets.truth.truth import Mounting, Origin, Truth, save
+from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.localization.compass import course_at
+from crosscue.replay.base import EmptyResultError, Floats, Int64s, Log, Selection
+from crosscue.replay.remote.logs import name_of
+from crosscue.replay.signals.kinds import Samples, Signal
+from crosscue.replay.signals.plan import plan
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .log_signals import read_signals
+
+POSE_FILE: Final = "gnss.tum"
+HELD_S: Final = 60.0
+"""A car that stands keeps its heading; so long, at most, is one carried on."""
+
+
+def write_gnss_truth(
+    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, folder: Path
+) -> Path:
+    """Write ``truth.json`` and the antenna's track.
+
+    Rows without a heading (the car has not moved yet, or stood too long) are left out: a pose
+    without one cannot be scored.
+
+    Raises:
+        EmptyResultError: No GNSS position, or none with a heading.
+        OutputError: It cannot be written.
+    """
+    planned = plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+    source = planned.source_of(Signal.POSITION)
+    if source is None:
+        raise EmptyResultError(f"no GNSS in the log: {planned.missing[Signal.POSITION]}")
+    found = read_signals(logs, planned, vehicle, selection, (Signal.POSITION, Signal.COURSE))
+    fixes = found.get(Signal.POSITION)
+    if fixes is None:
+        raise EmptyResultError(f"{source.topic.name}: not one position in this part of the log")
+    gnss = vehicle.gnss
+    lat, lon, alt, sd = fixes.values.T
+    alt = np.where(np.isfinite(alt), alt, 0.0)
+    origin = float(lat[0]), float(lon[0]), float(alt[0])
+    xyz = geodetic_to_enu(lat, lon, alt, origin)
+    heading = _headings(fixes.t_ns, xyz, found.get(Signal.COURSE), gnss.min_speed_mps)
+    known = np.isfinite(heading)
+    if not known.any():
+        raise EmptyResultError(
+            f"{source.topic.name}: no position has a heading: the car never went "
+            f"{gnss.min_speed_mps:g} m/s (gnss.min_speed_mps)"
+        )
+    t_ns = fixes.t_ns[known] - round(gnss.delay_s * 1e9)
+    stated = np.where(np.isfinite(sd), sd, gnss.position_sd_m)[known]
+    track = planar(t_ns, xyz[known, 0], xyz[known, 1], heading[known])
+    folder.mkdir(parents=True, exist_ok=True)
+    note = f"GNSS ({source.topic.name}): the antenna in a local frame, x east, y north"
+    write_tum(folder / POSE_FILE, track, note)
+    name = name_of(logs[source.log]).rstrip("/").rpartition("/")[2]
+    return save(
+        Truth(
+            version=1,
+            log=name,
+            start_ns=int(t_ns[0]),
+            end_ns=int(t_ns[-1]) + 1,
+            pose=POSE_FILE,
+            pose_point="antenna",
+            mounting=Mounting(x_m=gnss.x_m, y_m=gnss.y_m),
+            position_sd_m=float(np.sqrt(np.mean(stated**2))),
+            heading_sd_rad=gnss.course_sd_rad,
+            origin=Origin(latitude_deg=origin[0], longitude_deg=origin[1], altitude_m=origin[2]),
+            source=f"GNSS of the log ({source.topic.name}), as received; {int((~known).sum())} of "
+            f"{len(known)} positions left out for want of a heading",
+        ),
+        folder,
+    )
+
+
+def _headings(t_ns: Int64s, xyz_m: Floats, course: Samples | None, min_speed_mps: float) -> Floats:
+    """The course at each position; a slow or standing car keeps its last."""
+    if course is not None and np.isfinite(course.values[:, 0]).any():
+        found = course_at(
+            t_ns, course.t_ns, course.values[:, 0], course.values[:, 1], min_speed_mps
+        )
+    else:
+        found = _between_positions(t_ns, xyz_m, min_speed_mps)
+    rows = np.where(np.isfinite(found), np.arange(len(found)), -1)
+    last = np.maximum.accumulate(rows)
+    held = np.where(last >= 0, found[np.maximum(last, 0)], np.nan)
+    age_s = (t_ns - t_ns[np.maximum(last, 0)]) * 1e-9
+    return np.where(age_s <= HELD_S, held, np.nan)
+
+
+def _between_positions(t_ns: Int64s, xyz_m: Floats, min_speed_mps: float) -> Floats:
+    """From the position a second before to the one a second after."""
+    before = np.searchsorted(t_ns, t_ns - 1_000_000_000)
+    after = np.minimum(np.searchsorted(t_ns, t_ns + 1_000_000_000), len(t_ns) - 1)
+    way = xyz_m[after, :2] - xyz_m[before, :2]
+    seconds = np.maximum((t_ns[after] - t_ns[before]) * 1e-9, 1e-9)
+    moved = np.hypot(*way.T) >= min_speed_mps * seconds
+    return np.where(moved & (after > before), np.arctan2(way[:, 1], way[:, 0]), np.nan)
