@@ -43,6 +43,7 @@ OPENS_LOGS: dict[str, str] = {
     "vehicle init": "{log} -o {out}.toml",
     "vehicle check": "{log} --vehicle {car} -o {out}.html",
     "fit compass": "{compass} --vehicle {its_car}",
+    "truth from-gnss": "{log} -o {out} --vehicle {car}",
     "fit odometry": "{compass} --vehicle {its_car} --truth {its_truth}",
     "fit signs": "{drive} --label stop_sign",
     "fit landmarks": "{log} --database {db} --poses {truth} --vehicle {car}",

@@ -31,6 +31,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "merge": ("gone -o out", INPUT),
     "view": ("gone -o x.rrd", INPUT),
     "fit compass": ("gone.mcap --vehicle gone.toml", SETTINGS),
+    "truth from-gnss": ("gone.mcap -o out", INPUT),
     "fit odometry": ("gone.mcap --vehicle gone.toml", SETTINGS),
     "fit signs": ("gone.json --label a", INPUT),
     "fit ranges": ("--cue stop_sign --truth gone.json", INPUT),

@@ -52,6 +52,7 @@ MADE: Final[dict[str, tuple[str, int]]] = {
     "landmarks match": ("new.db photos/seen1.png", 0),
     "model init": ("net.onnx", 0),
     "model check": ("net.toml --picture photos/0.png", 0),
+    "truth from-gnss": ("KITTI -o from_gnss", 0),
     "truth": ("KITTI -o its_truth", 0),
     "truth import": ("road/coco.json --log LOG -o imported.json", 0),
     "simulate": ("A -o simulated --width 64 --fps 10", 0),

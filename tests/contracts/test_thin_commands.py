@@ -52,6 +52,7 @@ CALLS: Final = {
     "landmarks list": ("list_landmarks",),
     "landmarks match": ("match_landmarks",),
     "fit compass": ("fit_compass",),
+    "truth from-gnss": ("truth_from_gnss",),
     "fit odometry": ("fit_odometry",),
     "fit landmarks": ("fit_landmarks",),
     "fit messages": ("fit_messages",),

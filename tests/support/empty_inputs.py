@@ -15,6 +15,7 @@ COMMANDS: dict[str, str] = {
     "truth import": "{empty}/coco.json --log {log} -o {out}.json --vehicle {car}",
     "truth check": "{empty}/truth.json --log {other}",
     "fit compass": "{log} --vehicle {car}",
+    "truth from-gnss": "{log} -o {out} --vehicle {car}",
     "fit odometry": "{log} --vehicle {car}",
     "fit signs": "{empty}/labels.csv --label stop",
     "fit messages": "{run} --truth {empty}/truth.json -o {out}.toml",

@@ -70,8 +70,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--start",
         dest="first_pose",
         metavar="POSE",
-        help="first pose: X,Y,HEADING in metres and degrees counter-clockwise from east, or a truth "
-        "file with a track",
+        help="first pose: X,Y,HEADING in metres and degrees counter-clockwise from east, or a "
+        "truth file with a track",
     )
     parser.add_argument(
         "--landmarks",

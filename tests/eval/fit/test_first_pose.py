@@ -1,0 +1,139 @@
+"""Where a drive begins: from GNSS, a truth file, or three numbers; and GNSS as truth."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.geodesy import ecef_to_enu_matrix, ecef_to_geodetic, geodetic_to_ecef
+from crosscue.datasets.truth.truth import load
+from crosscue.datasets.truth.tum import heading_rad, read_tum
+from crosscue.eval.fit.first_pose import with_start
+from crosscue.eval.fit.gnss_truth import write_gnss_truth
+from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.report.score_runs import score_pose
+from crosscue.eval.runs.folder import RunFolder, create
+from crosscue.replay.base import EVERYTHING, Block, Table, Topic, UsageError, VehicleError
+from crosscue.replay.vehicle.pose import Gnss, Start
+from crosscue.replay.vehicle.vehicle import Vehicle
+from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
+
+SECOND = 1_000_000_000
+HEADING_RAD = 2.1
+PLACE = (48.137, 11.575, 520.0)
+SPEED_MPS = 8.0
+GNSS = Topic("/gnss", "sensor_msgs/msg/NavSatFix", "columns")
+
+
+def along(t_s: np.ndarray[tuple[int], np.dtype[np.float64]], speed_mps: float) -> Table:
+    """Positions of a straight drive, as a receiver reports them."""
+    east, north = np.cos(HEADING_RAD) * t_s * speed_mps, np.sin(HEADING_RAD) * t_s * speed_mps
+    turn = ecef_to_enu_matrix(math.radians(PLACE[0]), math.radians(PLACE[1]))
+    xyz = geodetic_to_ecef(*PLACE) + np.column_stack([east, north, 0.0 * east]) @ turn
+    lat, lon, alt = ecef_to_geodetic(xyz)
+    return Table(
+        {
+            "latitude_deg": lat,
+            "longitude_deg": lon,
+            "altitude_m": alt,
+            "position_sd_m": np.full(len(lat), 0.5),
+        }
+    )
+
+
+def driven(speed_mps: float = SPEED_MPS, seconds: int = 30) -> MemoryLog:
+    blocks: list[Block] = []
+    for second in range(seconds):
+        t = [second * SECOND + i * SECOND // 10 for i in range(10)]
+        blocks.append(gyro_block(t, [0.0] * 10))
+        blocks.append(wheel_block(t, [speed_mps] * 10))
+        at = np.array([second * SECOND], np.int64)
+        blocks.append(Block("/gnss", at, along(at * 1e-9, speed_mps)))
+    return MemoryLog((WHEELS, GYRO, GNSS), blocks, path=Path(__file__))
+
+
+def run_of(folder: Path, vehicle: Vehicle) -> RunFolder:
+    return replay_drive([driven()], vehicle, create(folder, overwrite=False), EVERYTHING).run
+
+
+def test_gnss_says_where_a_drive_begins_and_which_way_the_car_faces() -> None:
+    start = with_start([driven()], Vehicle(version=1), EVERYTHING).start
+
+    assert start.heading_rad == pytest.approx(HEADING_RAD, abs=1e-4)
+    assert start.map_origin is not None
+    np.testing.assert_allclose(start.map_origin[:2], PLACE[:2], atol=1e-7)
+    assert (start.x_m, start.y_m) == (0.0, 0.0)
+    assert start.source == "first seconds of GNSS (/gnss)"
+
+
+@pytest.mark.parametrize(
+    "vehicle",
+    [
+        Vehicle(version=1, start=Start(heading_rad=0.3)),
+        Vehicle(version=1, gnss=Gnss(use="truth")),
+        Vehicle(version=1, gnss=Gnss(use="off")),
+    ],
+)
+def test_a_heading_of_the_vehicle_file_and_a_wish_are_kept(vehicle: Vehicle) -> None:
+    assert with_start([driven()], vehicle, EVERYTHING) == vehicle
+
+
+def test_a_car_that_stands_gets_no_heading_from_gnss() -> None:
+    assert with_start([driven(0.0)], Vehicle(version=1), EVERYTHING) == Vehicle(version=1)
+
+
+def test_a_run_that_begins_by_gnss_is_scored_in_the_map_of_its_own_gnss(tmp_path: Path) -> None:
+    vehicle = with_start([driven()], Vehicle(version=1), EVERYTHING)
+    run = run_of(tmp_path / "run", vehicle)
+    truth = write_gnss_truth([driven()], Vehicle(version=1), EVERYTHING, tmp_path / "truth")
+    found = score_pose(run, truth)
+
+    assert found.ape["none"].translation_m.max < 0.1
+    assert found.ape["none"].rotation_deg.max < 0.1
+
+
+def test_gnss_as_truth_states_its_quality_its_antenna_and_its_place(tmp_path: Path) -> None:
+    vehicle = Vehicle(version=1, gnss=Gnss(x_m=1.2, y_m=-0.3))
+    path = write_gnss_truth([driven()], vehicle, EVERYTHING, tmp_path)
+    truth = load(path)
+    track = read_tum(tmp_path / str(truth.pose))
+
+    assert truth.position_sd_m == pytest.approx(0.5)
+    assert truth.pose_point == "antenna"
+    assert truth.mounting is not None
+    assert (truth.mounting.x_m, truth.mounting.y_m) == (1.2, -0.3)
+    assert truth.origin is not None
+    assert truth.origin.latitude_deg == pytest.approx(PLACE[0])
+    np.testing.assert_allclose(heading_rad(track), HEADING_RAD, atol=1e-4)
+
+
+def test_a_truth_file_gives_the_pose_in_its_own_map(tmp_path: Path) -> None:
+    path = write_gnss_truth([driven()], Vehicle(version=1), EVERYTHING, tmp_path)
+    start = with_start([driven()], Vehicle(version=1), EVERYTHING, start=str(path)).start
+
+    assert start.heading_rad == pytest.approx(HEADING_RAD, abs=1e-4)
+    assert [start.x_m, start.y_m] == pytest.approx([0.0, 0.0], abs=0.01)
+    assert start.map_origin is None
+
+
+def test_three_numbers_are_a_pose() -> None:
+    start = with_start([driven()], Vehicle(version=1), EVERYTHING, start="3,-4.5,90").start
+
+    assert (start.x_m, start.y_m) == (3.0, -4.5)
+    assert start.heading_rad == pytest.approx(math.pi / 2)
+
+
+@pytest.mark.parametrize("text", ["1,2,north", "1,nan,3"])
+def test_three_words_that_are_no_numbers_are_wrong_usage(text: str) -> None:
+    with pytest.raises(UsageError, match=r"expected X,Y,HEADING in metres and degrees"):
+        with_start([driven()], Vehicle(version=1), EVERYTHING, start=text)
+
+
+def test_a_truth_that_cannot_show_the_heading_is_refused(tmp_path: Path) -> None:
+    path = write_gnss_truth([driven()], Vehicle(version=1), EVERYTHING, tmp_path)
+
+    with pytest.raises(VehicleError, match="does not show the first pose"):
+        with_start([driven(0.0)], Vehicle(version=1), EVERYTHING, start=str(path))
