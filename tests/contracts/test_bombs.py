@@ -43,7 +43,7 @@ OPENS_LOGS: dict[str, str] = {
     "vehicle init": "{log} -o {out}.toml",
     "vehicle check": "{log} --vehicle {car} -o {out}.html",
     "fit compass": "{compass} --vehicle {its_car}",
-    "truth from-gnss": "{log} -o {out} --vehicle {car}",
+    "truth from-gnss": "{compass} -o {out} --vehicle {gnss_car}",
     "fit odometry": "{compass} --vehicle {its_car} --truth {its_truth}",
     "fit signs": "{drive} --label stop_sign",
     "fit landmarks": "{log} --database {db} --poses {truth} --vehicle {car}",
@@ -81,6 +81,8 @@ def names(tmp_path: Path) -> dict[str, Path]:
     compass = simulated(tmp_path / "compass", DriveSettings(seed=3, blocks=1, block_m=60.0))
     with_bomb(compass.log)
     (drive / "vehicle.toml").write_bytes((drive / "car.toml").read_bytes())
+    gnss_car = tmp_path / "gnss.toml"
+    gnss_car.write_text('version = 1\n[topics]\ngnss = "/imu"\n')
     objects = drive / "objects.json"
     objects.write_text(_coco([("0.png", BEGIN)], SIZE))
     return {
@@ -94,6 +96,7 @@ def names(tmp_path: Path) -> dict[str, Path]:
         "out": tmp_path / "out",
         "compass": compass.log,
         "its_car": compass.vehicle,
+        "gnss_car": gnss_car,
         "its_truth": compass.truth,
     }
 
