@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -25,6 +26,9 @@ from .agreement import (
 from .candidates import WHEELS, Candidate, Kind
 from .observed import Bus, Observed
 from .series import Grid, Series
+
+USUAL_RADIUS_M: Final = 0.32
+"""Of a car's wheel, to tell whether it moves where nothing shows the true one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +77,7 @@ class WheelSet:
     def speed(self) -> Series:
         """Mean of the rear wheels, m/s."""
         left, right = self.series["rear_left"], self.series["rear_right"]
-        scale = (self.radius_m or 0.32) if self.is_turning else 1.0
+        scale = (self.radius_m or USUAL_RADIUS_M) if self.is_turning else 1.0
         other = np.interp(left.t_ns, right.t_ns, right.values)
         return Series("the rear wheels", left.t_ns, 0.5 * scale * (left.values + other))
 

@@ -220,8 +220,17 @@ class _Collected:
             ),
             tuple(_series(columns, (Role.IMU, Role.ODOMETRY), _YAW_COLUMNS)),
             tuple(_series(columns, (Role.ODOMETRY, Role.WHEELS), _SPEED_COLUMNS)),
-            min(self._first_ns, default=0),
-            max(self._last_ns, default=0),
+            *self._span_ns(),
+        )
+
+    def _span_ns(self) -> tuple[int, int]:
+        """Earliest and latest time; a damaged one may lie years away, and must not count."""
+        if not self._first_ns:
+            return 0, 0
+        middle_ns = sorted(self._first_ns)[len(self._first_ns) // 2]
+        return (
+            max(min(self._first_ns), middle_ns - LOOKED_AT_NS),
+            min(max(self._last_ns), middle_ns + LOOKED_AT_NS),
         )
 
 

@@ -98,6 +98,29 @@ def test_each_section_is_read_from_its_own_bus(log: MemoryLog, dbc: Path) -> Non
     np.testing.assert_allclose(np.rad2deg(rates[0].values), YAW_RATE_DEGPS, atol=0.01)
 
 
+@pytest.mark.parametrize("rows", [1, 2, 30])
+def test_a_log_too_short_to_show_anything_is_drafted(log: MemoryLog, dbc: Path, rows: int) -> None:
+    short = MemoryLog(log.topics, [block.take(slice(0, rows)) for block in log.blocks])
+
+    can = parse(draft(examine([short], [dbc]), dbc.parent, Mounting()), "the draft").can
+
+    assert can.bus is not None
+    assert can.yaw_rate is None
+
+
+def test_a_time_that_is_years_away_costs_no_memory(log: MemoryLog, dbc: Path) -> None:
+    first = log.blocks[1]
+    times = first.log_ns.copy()
+    times[5], times[6] = -(2**61), 2**61
+    damaged = [
+        Block(first.topic, times, first.rows) if block is first else block for block in log.blocks
+    ]
+
+    seen = observe([MemoryLog(log.topics, damaged)], None)
+
+    assert seen.end_ns - seen.start_ns <= 600_000_000_000
+
+
 def test_a_draft_names_every_bus_and_that_of_each_signal(log: MemoryLog, dbc: Path) -> None:
     text = draft(examine([log], [dbc]), dbc.parent, Mounting())
 
