@@ -24,6 +24,13 @@ FIELD_T: Final = np.array([20e-6, -43e-6])
 """Horizontal (towards magnetic north) and vertical (up) part of the Earth's field."""
 START_NS: Final = 1_700_000_000_000_000_000
 RATE_HZ: Final = 100
+TYRE_SD: Final = 0.003
+"""Of a tyre's radius, as a fraction; the same for a whole drive."""
+SLIP_SD: Final = 0.004
+"""Of a wheel's speed, as a fraction that persists for ``SLIP_TIME_S``."""
+SLIP_TIME_S: Final = 2.0
+GYRO_SD_RADPS: Final = 0.004
+"""Of a reading, besides the bias."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,12 +168,12 @@ def sense(motion: TrueMotion, settings: DriveSettings) -> Sensed:
     rear = v[:, None] + w[:, None] * side
     front = np.hypot(rear, (w * WHEELBASE_M)[:, None])
     true_wheels = np.concatenate([front, rear], axis=1)
-    tyre = 1.0 + rng.normal(0.0, 0.003, 4)
-    slip = _wander(rng, len(v), 4, rate_hz=RATE_HZ / 2, time_s=2.0) * 0.004
+    tyre = 1.0 + rng.normal(0.0, TYRE_SD, 4)
+    slip = _wander(rng, len(v), 4, rate_hz=RATE_HZ / 2, time_s=SLIP_TIME_S) * SLIP_SD
     wheels = true_wheels * tyre * (1.0 + slip) + rng.normal(0.0, 0.02, true_wheels.shape)
     with np.errstate(invalid="ignore", divide="ignore"):
         road_wheel = np.where(v > 0.1, np.arctan(WHEELBASE_M * w / np.maximum(v, 0.1)), 0.0)
-    gyro = rng.normal(0.0, 0.004, (len(motion), 3))
+    gyro = rng.normal(0.0, GYRO_SD_RADPS, (len(motion), 3))
     gyro[:, 2] += motion.yaw_rate_radps + settings.gyro_bias_radps
     tenth = slice(None, None, 10)
     return Sensed(
@@ -178,6 +185,17 @@ def sense(motion: TrueMotion, settings: DriveSettings) -> Sensed:
         motion.t_ns[tenth],
         _magnetometer(motion.heading_rad[tenth], settings, rng),
     )
+
+
+def slip_per_sqrt_m(way_m: float, speed_mps: float) -> float:
+    """What the rear wheels' simulated errors amount to over a drive, as a vehicle file states it.
+
+    A wrong radius grows with the way, slip that persists for a while with its root: one number
+    can match both at one length only.
+    """
+    radius = TYRE_SD**2 / 2.0 * way_m
+    slip = SLIP_SD**2 / 2.0 * 2.0 * SLIP_TIME_S * speed_mps
+    return float(np.sqrt(radius + slip))
 
 
 def _magnetometer(heading_rad: Floats, settings: DriveSettings, rng: Generator) -> Floats:

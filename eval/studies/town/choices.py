@@ -1,4 +1,4 @@
-"""What the range study would give with other choices of the two numbers that decide it most.
+"""Results of the range study for other choices of the two numbers that decide it most.
 
 The source states neither how long a compass error lasts nor how much its wheels slip. The first was
 calibrated to one published figure; here both are varied, so that a reader sees what the others are
@@ -161,5 +161,5 @@ def draw(choices: Sequence[Choice], folder: Path) -> Path:
         role = "calibrated here" if compass == CALIBRATED_DEG else "predicted"
         panel.set_title(f"compass ±{compass:g}°: {role}; dashed: published", fontsize=9)
     axes[0].legend(frameon=False, fontsize=8)
-    made.suptitle("What other choices would give, simulated", fontsize=11)
+    made.suptitle("Other choices of slip and compass interval, simulated", fontsize=11)
     return save(made, folder, NAME)
