@@ -112,7 +112,7 @@ class Evidence(Settings):
     pictures: str
     """Which, how many, by whom labelled."""
     boxes: Annotated[int, Field(ge=0)] | None = None
-    """Labelled objects that were counted."""
+    """Labelled objects, or boxes found, that were counted."""
     input: str = ""
     """At which size of the network's input, where it runs at several."""
     metric: str
