@@ -21,7 +21,6 @@ from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib import import_module
-from importlib import import_module
 from io import StringIO
 from itertools import product
 from pathlib import Path
