@@ -1,0 +1,129 @@
+"""How good the rules of cars, signs and lights can get: perfect masks in place of networks.
+
+Run it as ``python benchmarks/perfect_inputs.py DRIVES`` on what ``crosscue simulate`` wrote.
+Every object of ``objects.json`` of which enough is visible becomes a detection with its true mask
+and a score of 1. What is wrong then is wrong with the rule, and no network repairs it.
+Roads are not covered: their true masks are not stored with a drive.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crosscue.datasets.truth.truth import Truth, load
+from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.cars import (
+    CarShapes,
+    car_shapes,
+    cross_traffic,
+    pair_cars,
+    parked_cars,
+)
+from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, share
+from crosscue.eval.scoring.truth import cue_at
+from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import load as load_vehicle
+
+VISIBLE = (0.3, 0.5, 0.7, 0.9)
+LABELLED = {"stop_sign": "stop sign", "traffic_light": "traffic light"}
+Claims = dict[str, tuple[list[bool], list[int]]]
+
+
+def frames(drive: Path, min_visible: float) -> Iterator[Detections]:
+    """The drive's objects as a perfect detector would find them, picture by picture."""
+    content: dict[str, Any] = json.loads((drive / "objects.json").read_text())
+    names = {one["id"]: one["name"] for one in content["categories"]}
+    by_image: dict[int, list[dict[str, Any]]] = {one["id"]: [] for one in content["images"]}
+    for one in content["annotations"]:
+        if one["visible"] >= min_visible:
+            by_image[one["image_id"]].append(one)
+    for image in content["images"]:
+        found = by_image[image["id"]]
+        boxes = np.array([one["bbox"] for one in found], np.float64).reshape(-1, 4)
+        boxes[:, 2:] += boxes[:, :2]
+        yield Detections(
+            image["t_ns"],
+            (image["width"], image["height"]),
+            boxes,
+            np.ones(len(found)),
+            tuple(names[one["category_id"]] for one in found),
+            tuple(one["segmentation"]["counts"].encode() for one in found),
+        )
+
+
+def counts(drive: Path, vehicle: Vehicle, min_visible: float) -> Iterator[tuple[int, str, int]]:
+    """Time, cue and how many of it, for each frame and rule."""
+    before: CarShapes | None = None
+    rules = vehicle.cars
+    for found in frames(drive, min_visible):
+        for cue, label in LABELLED.items():
+            yield found.t_ns, cue, found.labels.count(label)
+        now = car_shapes([found], rules)
+        if before is not None:
+            pairs = pair_cars(before, now, rules)
+            for cue, sides in (
+                ("cross_traffic", cross_traffic(pairs, rules)),
+                ("parked", parked_cars(pairs, rules)),
+            ):
+                for side, number in zip(("left", "right"), sides, strict=True):
+                    yield found.t_ns, f"{cue}_{side}", number
+        before = now
+
+
+def is_there(truth: Truth, cue: str, t_ns: int) -> bool | None:
+    """Whether the thing is there in the frame; None where the truth does not say."""
+    at = cue_at([one for one in truth.cues if one.cue == cue], np.array([t_ns], np.int64))
+    return None if at.present[0] < 0 else bool(at.present[0])
+
+
+def score(drives: list[Path], min_visible: float) -> dict[str, tuple[Proportion, Proportion]]:
+    """Precision and recall of each kind of cue, both sides together, by frames."""
+    right: Claims = {}
+    found: Claims = {}
+    for number, drive in enumerate(drives):
+        truth, vehicle = load(drive / "truth.json"), load_vehicle(drive / "vehicle.toml")
+        for t_ns, cue, count in counts(drive, vehicle, min_visible):
+            there = is_there(truth, cue, t_ns)
+            if there is None:
+                continue
+            kind = cue.removesuffix("_left").removesuffix("_right")
+            for rows, is_row, value in ((right, count > 0, there), (found, there, count > 0)):
+                values, clusters = rows.setdefault(kind, ([], []))
+                if is_row:
+                    values.append(value)
+                    clusters.append(number)
+    return {kind: (_share(*right[kind]), _share(*found[kind])) for kind in right}
+
+
+def _share(values: list[bool], clusters: list[int]) -> Proportion:
+    return share(np.array(values, np.bool_), np.array(clusters, np.int64))
+
+
+def _text(one: Proportion) -> str:
+    if not one.of:
+        return "none"
+    ends = f"{one.clusters_low:.2f} to {one.clusters_high:.2f}"
+    by_drive = TOO_FEW if np.isnan(one.clusters_low) else ends
+    return f"{one.value:.2f} ({by_drive}; {one.of} frames, {one.clusters} drives)"
+
+
+def main() -> None:
+    """Print the ceiling of each rule, by how much of a thing must be visible."""
+    drives = sorted(path.parent for path in Path(sys.argv[1]).glob("*/objects.json"))
+    kinds = Counter(path.name[0] for path in drives)
+    print(f"{len(drives)} simulated drives, layouts {' '.join(sorted(kinds))}; perfect masks")
+    for min_visible in VISIBLE:
+        print(f"\nat least {100 * min_visible:.0f} % visible: precision; recall")
+        for kind, (precision, recall) in score(drives, min_visible).items():
+            print(f"  {kind:14} {_text(precision)}; {_text(recall)}")
+
+
+if __name__ == "__main__":
+    main()
