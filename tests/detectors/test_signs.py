@@ -176,7 +176,7 @@ def test_fit_signs_chooses_on_some_frames_and_measures_on_others(
 
     reported = capsys.readouterr().out
     assert "min_score = " in reported
-    assert "precision 1.00 (4 of 4; 95 % interval 0.51 to 1.00)" in reported
+    assert "precision 1.00 (4 of 4; 95 % interval 0.51 to 1.00, by drive too few" in reported
     printed = reported.split()[2]
     assert (
         run(["fit", "signs", str(labels), "--label", "one way left", "--threshold", printed]) == 0

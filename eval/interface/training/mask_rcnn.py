@@ -145,9 +145,9 @@ def train_mask_rcnn(
     Raises:
         UsageError: A value out of range, or a state of another training.
         OutputError: Results exist, or cannot be written.
-        AnnotationError: The annotations are not a COCO file, or the folder is missing.
         LogError: An image cannot be read.
-        SchemaError: No usable annotation, or the state is damaged.
+        SchemaError: The annotations are not a COCO file, or have nothing usable; the folder of
+            images is missing; or the state is damaged.
         VehicleError: ``init`` is not a Mask R-CNN that fits, or the device is missing.
         CrosscueError: The losses are not finite any more.
     """
@@ -200,9 +200,9 @@ def measure_mask_rcnn(
 
     Raises:
         UsageError: A value out of range, or a subset without images.
-        AnnotationError: The annotations are not a COCO file, or the folder is missing.
         LogError: An image cannot be read.
-        SchemaError: No usable annotation.
+        SchemaError: The annotations are not a COCO file, or have nothing usable, or the folder of
+            images is missing.
         VehicleError: Not a Mask R-CNN, or the device is missing.
     """
     if not all(1 <= count <= 2000 for count in proposals):
