@@ -1,6 +1,6 @@
 """Choose the match threshold for a wanted false-match rate, from labelled pictures.
 
-Half of the query pictures choose it, the other half gives the rates. Pairs come from a CSV file
+Half of the query pictures choose it, the other half yields the rates. Pairs come from a CSV file
 query,known,same (pictures relative to its folder; same is 1 or 0), or from a drive with known poses
 against a database that another drive made.
 

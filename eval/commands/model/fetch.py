@@ -1,7 +1,7 @@
 """Fetch the weights of models of the catalog, checked by their SHA-256 before they are used.
 
 What is already at hand below $CROSSCUE_DATA/weights is taken from there. A transfer that was cut
-goes on where it stopped. $CROSSCUE_MODEL_MIRROR names a server to ask instead of the publisher,
+continues where it stopped. $CROSSCUE_MODEL_MIRROR names a server to ask instead of the publisher,
 $CROSSCUE_MODELS the folder to keep them in.
 
 example:

@@ -2,7 +2,7 @@
 
 33 range runs without landmarks and 10 with at most one landmark at a time, 75 minutes each, compass
 at 25 degrees. Every run is a log, a vehicle file and a truth file, replayed and scored by the code
-that takes real ones; each can be examined with crosscue view. An interrupted study goes on with
+that takes real ones; each can be examined with crosscue view. An interrupted study continues with
 the runs that are missing. A run takes seconds to a minute.
 
 examples:

@@ -1,7 +1,7 @@
 """Who reaches the goal? 3 strategies by 5 landmark densities by 5 detection rates by 700 drives.
 
 Success against the distance to the goal, range at 80 % success, and how much farther the
-strategies drive, beside the published numbers. An interrupted study goes on where it stopped; the
+strategies drive, beside the published numbers. An interrupted study continues where it stopped; the
 result is the same on any number of workers.
 
 examples:

@@ -1,8 +1,8 @@
 """How far without landmarks? 4,000 simulated drives with three compasses and with none.
 
-Each drive goes from goal to goal until its 2-sigma ellipse is longer than 100 m. Results stand
-beside the published ones. An interrupted study goes on where it stopped; the result is the same on
-any number of workers.
+Each drive goes from goal to goal until its 2-sigma ellipse is longer than 100 m. Results are printed
+beside the published ones. An interrupted study continues where it stopped; the result is the same
+on any number of workers.
 
 examples:
   crosscue study range -o range
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--calibrate",
         action="store_true",
-        help="find the compass interval that gives the published 9.3 km at 30 degrees, with "
+        help="find the compass interval that yields the published 9.3 km at 30 degrees, with "
         "separate seeds, instead of running the study",
     )
 

@@ -1,7 +1,7 @@
-r"""Train a Mask R-CNN on COCO annotations: a compact one from nothing, or go on with another.
+r"""Train a Mask R-CNN on COCO annotations: a compact one from nothing, or an existing one.
 
 OUT is a checkpoint (.safetensors) for the detector mask-rcnn. Beside it lie OUT's curve (JSON and
-PNG) and, until the training ends, the state that --resume goes on with. --measure trains nothing:
+PNG) and, until the training ends, the state that --resume continues from. --measure trains nothing:
 it reports average precision (COCO's rules), and precision and recall at the scores that cues take.
 
 examples:

@@ -26,7 +26,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--start-s", type=float, default=0.0, metavar="S", help="begin so long after the first row"
     )
     parser.add_argument(
-        "--seconds", type=float, default=10.0, metavar="S", help="read so many (default: 10)"
+        "--seconds",
+        type=float,
+        default=10.0,
+        metavar="S",
+        help="seconds of the log to read (default: 10)",
     )
     add_limit_arguments(parser)
     parser.add_argument(
