@@ -6,7 +6,9 @@ writes ``truth.json`` and ``ranges.csv`` beside this file, or into FOLDER. SEQUE
 the sequence with its 3-D boxes in ``annotations/cuboids.parquet``, one row for each box in each
 frame (the set publishes them as pickles, which are not read here).
 
-From the boxes: moving cars across the ego road, cars parked across it, vehicles past the far kerb.
+From the boxes: moving cars across the ego road, cars parked across it, vehicles past the far kerb,
+and those of them that come towards the ego vehicle or go away, with how much of the most visible
+one no other box hides: boxes are wider than cars, so that is a lower bound.
 By eye, on frames 0, 20, 40, 60 and 79: the four signals that face the ego vehicle, the roads, and
 that no stop sign stands there. The crosswalk and the far kerb were measured in the frames on the
 ground plane under the boxes; each is known to 2.5 m. Left open, since nothing here can say: lane
@@ -38,8 +40,12 @@ SIGNALS: Final = 4
 """Two with a green light, two with a red arrow; three more are seen from behind or the side."""
 VEHICLES: Final = ("Car", "Pickup Truck", "Medium-sized Truck", "Bus")
 WIDTH_PX: Final = 1920
+GRID: Final = 10
+BEHIND_M: Final = 3.0
+"""Boxes nearer to each other are of one car: most cars are boxed twice."""
 REACH_M: Final = 110.0
 """Of a vehicle further away nobody can tell its direction in these frames apart from others."""
+ALONG: Final = ("oncoming_cars", "outgoing_cars")
 ACROSS_DEG: Final = 45.0
 """A vehicle whose heading is further off the road, both ways, stands or moves across it."""
 
@@ -52,17 +58,20 @@ class Boxes:
         import pyarrow.parquet as pq
 
         table = pq.read_table(sequence / "annotations" / "cuboids.parquet")
+        sizes = ("width_m", "length_m", "height_m")
         columns: dict[str, Any] = {
-            name: table[name].to_numpy() for name in ("frame", "x_m", "y_m", "yaw_rad")
+            name: table[name].to_numpy()
+            for name in ("frame", "x_m", "y_m", "z_m", "yaw_rad", *sizes)
         }
         frame = columns["frame"]
+        boxes_px, depth_m = _projected(columns, poses, _intrinsics(sequence))
         at = np.column_stack([columns["x_m"], columns["y_m"]]) - poses.xyz_m[frame, :2]
         forward, left = poses.forward[frame, :2], poses.left[frame, :2]
         ahead, aside = (at * forward).sum(axis=1), (at * left).sum(axis=1)
         # A box is long along its own y axis.
         along = np.column_stack([-np.sin(columns["yaw_rad"]), np.cos(columns["yaw_rad"])])
         turn = np.arctan2((along * left).sum(axis=1), (along * forward).sum(axis=1))
-        focal, center = _intrinsics(sequence)
+        focal, center, _ = _intrinsics(sequence)
         column_px = center - focal * aside / np.maximum(ahead, 1e-9)
         kept = np.isin(table["label"].to_pylist(), VEHICLES) & (ahead > 0.0) & (ahead < REACH_M)
         kept &= (column_px >= 0.0) & (column_px < WIDTH_PX)
@@ -70,12 +79,19 @@ class Boxes:
         self.ahead_m: Final[Floats] = ahead[kept]
         self.turn_deg: Final[Floats] = np.degrees(turn[kept])
         self.motion: Final = np.array(table["motion"].to_pylist())[kept]
+        self.visible: Final[Floats] = _visible(frame, boxes_px, depth_m)[kept]
 
     def across(self, motion: str, *, to_left: bool) -> NDArray[np.bool_]:
         """Vehicles across the road that move so, by where they head."""
         turn = self.turn_deg if to_left else -self.turn_deg
         is_across = (turn > ACROSS_DEG) & (turn < 180.0 - ACROSS_DEG)
         return np.asarray(is_across & (self.motion == motion))
+
+    def along(self, *, oncoming: bool) -> NDArray[np.bool_]:
+        """Vehicles that move along the road, by where they head."""
+        off = np.abs(self.turn_deg)
+        heads = off > 180.0 - ACROSS_DEG if oncoming else off < ACROSS_DEG
+        return np.asarray(heads & (self.motion == "Moving"))
 
 
 def annotate(sequence: Path, folder: Path = FOLDER) -> Path:
@@ -96,12 +112,14 @@ def annotate(sequence: Path, folder: Path = FOLDER) -> Path:
         "cross_traffic_right": boxes.across("Moving", to_left=False),
         "parked_left": boxes.across("Parked", to_left=True),
         "parked_right": boxes.across("Parked", to_left=False),
+        "oncoming_cars": past & boxes.along(oncoming=True),
+        "outgoing_cars": past & boxes.along(oncoming=False),
         "vehicles_past": past,
     }
     cues = [
         span
         for name, rows in seen.items()
-        for span in _spans(name, poses, np.bincount(boxes.frame[rows], minlength=len(poses.t_ns)))
+        for span in _spans(name, poses, boxes, rows, with_visible=name in ALONG)
     ]
     everywhere = {"traffic_light": SIGNALS, "stop_sign": 0} | dict.fromkeys(
         ("road_left", "road_straight", "road_right"), 1
@@ -148,14 +166,20 @@ _SOURCE: Final = (
     "annotated for crosscue from PandaSet's boxes and poses (Scale AI, Hesai; CC BY 4.0) and by "
     "eye; crosswalk 59 m and far kerb 79 m from the camera in the first frame, each to 2.5 m; the "
     "log ends before the vehicle enters; a car waiting in the left leg is neither parked nor "
-    "crossing; vehicles_past counts boxes, hidden ones included"
+    "crossing; vehicles_past, oncoming_cars and outgoing_cars count boxes, hidden ones included"
 )
 
 
-def _spans(cue: str, poses: Poses, counts: NDArray[np.int64]) -> list[CueTruth]:
-    """Runs of frames with the same answer, as spans that touch."""
-    present = counts > 0
-    starts = [0, *(np.flatnonzero(np.diff(present)) + 1).tolist()]
+def _spans(
+    cue: str, poses: Poses, boxes: Boxes, rows: NDArray[np.bool_], *, with_visible: bool
+) -> list[CueTruth]:
+    """Runs of frames with the same answer, as spans that touch; visibility counts in tenths."""
+    present = np.bincount(boxes.frame[rows], minlength=len(poses.t_ns)) > 0
+    visible = np.zeros(len(present))
+    np.maximum.at(visible, boxes.frame[rows], boxes.visible[rows])
+    visible = np.round(visible, 1) if with_visible else np.zeros(len(present))
+    changes = (np.diff(present) != 0) | (np.diff(visible) != 0.0)
+    starts = [0, *(np.flatnonzero(changes) + 1).tolist()]
     times = [*poses.t_ns[starts].tolist(), int(poses.t_ns[-1]) + 1]
     return [
         CueTruth(
@@ -165,6 +189,7 @@ def _spans(cue: str, poses: Poses, counts: NDArray[np.int64]) -> list[CueTruth]:
             end_ns=times[i + 1],
             approach=1,
             count=None if present[first] else 0,
+            visible=float(visible[first]) if with_visible and present[first] else None,
         )
         for i, first in enumerate(starts)
     ]
@@ -186,10 +211,45 @@ def _ranges(poses: Poses, gone_m: Floats, camera_x_m: float) -> str:
     return text.getvalue()
 
 
-def _intrinsics(sequence: Path) -> tuple[float, float]:
-    """Focal length and the column of the optical axis."""
+def _projected(
+    boxes: dict[str, Any], poses: Poses, intrinsics: tuple[float, float, float]
+) -> tuple[Floats, Floats]:
+    """Outlines of N boxes in their pictures, shape (N, 4), and depths of their middles."""
+    focal, center_x, center_y = intrinsics
+    frame = boxes["frame"]
+    forward, left = poses.forward[frame], poses.left[frame]
+    axes = np.stack([forward, left, np.cross(forward, left)], axis=1)
+    unit = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    own = unit * np.stack([boxes[f"{of}_m"] for of in ("width", "length", "height")], 1)[:, None]
+    cos, sin = np.cos(boxes["yaw_rad"])[:, None], np.sin(boxes["yaw_rad"])[:, None]
+    turned = [own[..., 0] * cos - own[..., 1] * sin, own[..., 0] * sin + own[..., 1] * cos]
+    middle = np.stack([boxes["x_m"], boxes["y_m"], boxes["z_m"]], 1) - poses.xyz_m[frame]
+    corners = np.stack([*turned, own[..., 2]], axis=2) + middle[:, None]
+    depth, leftwards, up = np.moveaxis(corners @ np.swapaxes(axes, 1, 2), 2, 0)
+    depth = np.maximum(depth, 0.1)
+    x, y = center_x - focal * leftwards / depth, center_y - focal * up / depth
+    outlines = np.stack([x.min(1), y.min(1), x.max(1), y.max(1)], axis=1)
+    return outlines, np.asarray((middle * forward).sum(axis=1))
+
+
+def _visible(frame: NDArray[np.int64], boxes_px: Floats, depth_m: Floats) -> Floats:
+    """Fractions of N outlines that no nearer one of the same frame covers, on a grid of points."""
+    found = np.ones(len(frame))
+    steps = (np.arange(GRID) + 0.5) / GRID
+    for i, (x0, y0, x1, y1) in enumerate(boxes_px.tolist()):
+        nearer = boxes_px[(frame == frame[i]) & (depth_m > 0.0) & (depth_m < depth_m[i] - BEHIND_M)]
+        x, y = np.meshgrid(x0 + steps * (x1 - x0), y0 + steps * (y1 - y0))
+        covered = np.zeros(x.shape, np.bool_)
+        for near in nearer:
+            covered |= (x >= near[0]) & (x <= near[2]) & (y >= near[1]) & (y <= near[3])
+        found[i] = 1.0 - covered.mean()
+    return found
+
+
+def _intrinsics(sequence: Path) -> tuple[float, float, float]:
+    """Focal length and the optical axis's column and row."""
     found = json_tree((sequence / "camera" / FRONT / "intrinsics.json").read_bytes())
-    return float(found["fx"]), float(found["cx"])
+    return float(found["fx"]), float(found["cx"]), float(found["cy"])
 
 
 if __name__ == "__main__":

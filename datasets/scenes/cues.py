@@ -80,6 +80,12 @@ def _is_past(layout: Layout, thing: Thing, t_s: float) -> bool:
     return _is_car(thing, "oncoming", "outgoing", "parked_past") and x > layout.end_m
 
 
+def _cars_past(role: str) -> Simulated:
+    return _things(
+        lambda layout, thing, t_s: _is_past(layout, thing, t_s) and thing.role == role, PAST_REACH_M
+    )
+
+
 def _is_car(thing: Thing, *roles: str) -> bool:
     return thing.role in roles and thing.category == "car"
 
@@ -102,6 +108,8 @@ SIMULATED: Final[dict[str, Simulated]] = {
     "cross_traffic_right": _crossing(left=False),
     "parked_left": _parked(left=True),
     "parked_right": _parked(left=False),
+    "oncoming_cars": _cars_past("oncoming"),
+    "outgoing_cars": _cars_past("outgoing"),
     "lanes_past": _always(_runs_on),
     "vehicles_past": _things(_is_past, PAST_REACH_M),
     "one_way_left": _sign("one_way_left"),

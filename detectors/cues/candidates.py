@@ -19,6 +19,7 @@ REGION_NOT_SEEN: Final = "region not seen: its place unknown, or too far to be r
 NOT_FROM_THE_SIDE: Final = "not seen from the side"
 NOT_FOUND_BEFORE: Final = "not found in the frame before"
 OTHER_MOTION: Final = "moves or faces otherwise"
+NOT_PAST: Final = "not surely past the intersection, or not moving along the road"
 CUT_OR_FAR: Final = "cut by the picture's edge or too far"
 TOO_FEW_FRAMES: Final = "not followed over frames enough"
 ELSEWHERE: Final = "not at the intersection, as far as its place is known"

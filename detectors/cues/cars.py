@@ -184,3 +184,15 @@ def count_parked(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int:
     """Parked cars that face the side that the cue supports."""
     sides = parked_cars(pairs, vehicle.cars) if pairs.judged is None else pairs.judged.parked
     return of_side(sides, cue)
+
+
+def count_oncoming(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int | None:
+    """Cars past the intersection that come towards the ego vehicle; None where nobody knows."""
+    past = None if pairs.judged is None else pairs.judged.past
+    return None if past is None else past.oncoming
+
+
+def count_outgoing(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int | None:
+    """Cars past the intersection that go away; None where nobody knows."""
+    past = None if pairs.judged is None else pairs.judged.past
+    return None if past is None else past.outgoing

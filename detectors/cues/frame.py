@@ -13,7 +13,8 @@ from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .car_tracks import CarTracks, judge
+from .car_judge import cars_past, judge
+from .car_tracks import CarTracks
 from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
 from .labelled import count_labels
 from .observed import FrameCues, Place, Seen
@@ -100,7 +101,7 @@ class CuePass:
         tally.own(frame.boxes, found.counts)
         is_any = frame.labels is None or not frame.labels.isdisjoint(self.vehicle.cars.labels)
         if pairs is not None and pairs.judged is not None and is_any:
-            tally.followed(frame.objects, pairs.judged)
+            tally.followed(frame.objects, pairs.judged, found.counts)
         elif self._before is not None and frame.objects and is_any:
             again = 0 if pairs is None else len(pairs.nose)
             tally.cars(frame.objects, len(self._before), again, found.counts)
@@ -124,6 +125,7 @@ class CuePass:
         self._tracks = self._tracks or CarTracks(camera, cars)
         found = self._tracks(boxes, ego)
         judged = judge(found, self._tracks.seen, camera, cars, place)
+        judged = judged._replace(past=cars_past(self._tracks.longer(), camera, cars, place))
         return Pairs(
             np.array([car.step_px for car in found]).reshape(-1, 2),
             np.array([car.center_px for car in found]).reshape(-1, 2),

@@ -59,6 +59,13 @@ class Sides(NamedTuple):
 NONE: Final = Sides(0, 0)
 
 
+class Ways(NamedTuple):
+    """How many cars come towards the ego vehicle, and how many go away."""
+
+    oncoming: int
+    outgoing: int
+
+
 class Judged(NamedTuple):
     """What cars do, where they were followed over several frames and not only in two.
 
@@ -69,6 +76,7 @@ class Judged(NamedTuple):
         parked_elsewhere: Likewise, or nobody knows where the intersection is.
         seen: Cars that were whole and near enough.
         followed: Those of them that were seen in frames enough.
+        past: Cars that move along the road past the intersection; None where its place is unknown.
     """
 
     crossing: Sides
@@ -77,6 +85,7 @@ class Judged(NamedTuple):
     parked_elsewhere: Sides
     seen: int
     followed: int
+    past: Ways | None = None
 
 
 def nose_of(heights_px: Floats) -> int:

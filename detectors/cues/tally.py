@@ -18,6 +18,7 @@ from .candidates import (
     NOT_COUNTED,
     NOT_FOUND_BEFORE,
     NOT_FROM_THE_SIDE,
+    NOT_PAST,
     OTHER_MOTION,
     REGION_NOT_SEEN,
     SAME_OBJECT,
@@ -81,7 +82,7 @@ class CueTally:
         scores = scores_of(boxes, cars.labels)
         low = sum(score <= cars.score for score in scores)
         for cue in CUES.values():
-            if cue.observed_by == "car pairs":
+            if cue.observed_by == "car pairs" and cue.group != "cars_past":
                 self._of(cue.name, "detections", "[cars] score", cars.score).take(
                     scores,
                     {
@@ -92,17 +93,25 @@ class CueTally:
                     },
                 )
 
-    def followed(self, boxes: Sequence[Detections], judged: Judged) -> None:
+    def followed(
+        self, boxes: Sequence[Detections], judged: Judged, counts: Mapping[str, int]
+    ) -> None:
         """Of cues that follow cars over several frames.
 
         Args:
             boxes: All detections of the frame.
             judged: What became of the cars among them.
+            counts: What came out, of all cues.
         """
         cars = self.vehicle.cars
         scores = scores_of(boxes, cars.labels)
         low = sum(score <= cars.score for score in scores)
         for cue in CUES.values():
+            if cue.group == "cars_past" and cue.name in counts:
+                self._of(cue.name, "detections", "[cars] score", cars.score).take(
+                    scores,
+                    {BELOW_SCORE: low, NOT_PAST: len(scores) - low - counts[cue.name]},
+                )
             if cue.group in ("cross_traffic", "parked"):
                 here, there = _judged(judged, cue)
                 self._of(cue.name, "detections", "[cars] score", cars.score).take(

@@ -115,6 +115,7 @@ class Track:
         unseen_s: Time since then.
         lit: In how many frames a lens was lit.
         dark: And in how many none was, though the box was large enough.
+        way_scale_sd: Of the odometer, as a fraction of any way.
     """
 
     number: int
@@ -130,6 +131,7 @@ class Track:
     unseen_s: float = 0.0
     lit: int = 0
     dark: int = 0
+    way_scale_sd: float = 0.0
     _way_m: list[float] = field(default_factory=list)
     _height_px: list[float] = field(default_factory=list)
     _aspect: list[float] = field(default_factory=list)
@@ -171,7 +173,9 @@ class Track:
     def _stretch(self) -> float:
         """S.d. of the way as a fraction of it."""
         way_m = abs(self._way_m[-1] - self._way_m[0])
-        return 0.0 if way_m < MERGE_M else math.sqrt(self._way_var_m2) / way_m
+        if way_m < MERGE_M:
+            return 0.0
+        return math.hypot(self.way_scale_sd, math.sqrt(self._way_var_m2) / way_m)
 
     def size_by_motion(self) -> tuple[float, float] | None:
         """How much larger it is than its standard size, as mean and variance of the logarithm.
@@ -249,10 +253,17 @@ class ObjectTracks:
         counts: What became of boxes, by outcome.
     """
 
-    def __init__(self, cue: str, focal_px: float, center_px: tuple[float, float]) -> None:
+    def __init__(
+        self,
+        cue: str,
+        focal_px: float,
+        center_px: tuple[float, float],
+        way_scale_sd: float = 0.0,
+    ) -> None:
         self.tracks: list[Track] = []
         self.counts: Counter[str] = Counter()
         self._cue = cue
+        self._way_scale_sd = way_scale_sd
         self._lens = Lens(focal_px, center_px)
 
     def __call__(
@@ -332,6 +343,7 @@ class ObjectTracks:
         first = range_from_motion(np.zeros(1), np.array([height_px]), self._lens.focal_px, size)
         number = self.counts["objects followed"]
         track = Track(number, box_px.copy(), height_px, first, first, size)
+        track.way_scale_sd = self._way_scale_sd
         track.observe(box_px, height_px, self._cue, self._lens)
         track.look(lens)
         track.seen = 1

@@ -93,6 +93,7 @@ class ApproachSummary:
         detected_m: The range then.
         reference: What that range goes to.
         probabilities: At the last step.
+        not_seen: Features that no cue has said anything about: a probability that is the prior.
     """
 
     number: int
@@ -102,6 +103,7 @@ class ApproachSummary:
     detected_m: float | None = None
     reference: str | None = None
     probabilities: Mapping[str, float] = field(default_factory=dict)
+    not_seen: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,7 +273,10 @@ def _scene_lines(scene: SceneOutcome) -> list[str]:
 
 
 def _approach(one: ApproachSummary) -> str:
-    said = ", ".join(f"{feature} {p:.2f}" for feature, p in one.probabilities.items())
+    said = ", ".join(
+        f"{feature} not seen" if feature in one.not_seen else f"{feature} {p:.2f}"
+        for feature, p in one.probabilities.items()
+    )
     where = "not detected"
     if one.detected_m is not None:
         where = f"detected {one.detected_m:.1f} m before its {one.reference}"

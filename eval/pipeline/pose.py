@@ -57,7 +57,8 @@ def turn_signal_of(planned: Plan, vehicle: Vehicle) -> Signal | None:
 
 def odometry_settings(vehicle: Vehicle) -> OdometrySettings:
     """The vehicle file's odometry section as the integrator takes it."""
-    fields = vehicle.odometry.model_dump(exclude={"heading_from", "accel_var_m2ps3", "fitted"})
+    left_out = {"heading_from", "accel_var_m2ps3", "fitted", "scale_sd"}
+    fields = vehicle.odometry.model_dump(exclude=left_out)
     return OdometrySettings(**fields)
 
 

@@ -173,6 +173,8 @@ class ApproachRow(Record):
     detected_m: float | None
     reference: str | None
     probabilities: dict[str, float]
+    not_seen: tuple[str, ...] = ()
+    """Features that no cue has said anything about: their probability is the prior."""
 
 
 class SceneSummary(Record):

@@ -70,6 +70,21 @@ def _crossing(side: str) -> CueSpec:
     return _cars("cross_traffic", "cross traffic", "cars:count_crossing", 0.86, side, MOVES_FADE_S)
 
 
+def _cars_past(way: str) -> CueSpec:
+    return CueSpec(
+        name=f"{way}_cars",
+        group="cars_past",
+        title="oncoming and outgoing cars",
+        observed_by="car pairs",
+        rule=f"crosscue.detectors.cues.cars:count_{way}",
+        precision=0.86,
+        supports=("straight",),
+        per_detection=True,
+        colour=FEATURE_COLOURS["straight"],
+        fade_s=MOVES_FADE_S,
+    )
+
+
 def _past(name: str, title: str, *, per_detection: bool) -> CueSpec:
     return CueSpec(
         name=name,
@@ -134,6 +149,8 @@ BUILTIN_CUES: Final[dict[str, CueSpec]] = {
         _crossing("right"),
         _cars("parked", "parked cars", "cars:count_parked", 0.83, "left"),
         _cars("parked", "parked cars", "cars:count_parked", 0.83, "right"),
+        _cars_past("oncoming"),
+        _cars_past("outgoing"),
         _past("lanes_past", "lane lines past", per_detection=False),
         _past("vehicles_past", "vehicles past", per_detection=True),
         _one_way("left", "right"),

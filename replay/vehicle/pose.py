@@ -57,6 +57,9 @@ class Odometry(Section):
     wheel_step_mps: NotNegative = 0.0028
     slip_per_sqrt_m: NotNegative = 0.3
     """A wheel radius off by one per cent, as an uncalibrated car's, is 10 m after 1 km: so much."""
+    scale_sd: NotNegative = 0.01
+    """The same as what it is, a fraction of every distance: over the 20 m by which a range comes
+    from motion, ``slip_per_sqrt_m`` would be seven times too much."""
     heading_from: Literal["auto", "yaw_rate", "steering", "wheels"] = "auto"
     """Which signal turns the pose; ``auto`` takes the first of these three that the log has."""
     yaw_rate_scale: Positive = 1.0

@@ -234,7 +234,15 @@ class Cars(Section):
     within_m: Positive = 60.0
     """Cars that are further away by their height are not judged."""
     crossing_mps: Positive = 2.0
-    """A car that crosses moves sideways by more; a parked one surely moves by less."""
+    """A car that crosses moves sideways by more; a parked one surely moves by less. One past the
+    intersection comes or goes by more."""
+    past_within_m: Positive = 120.0
+    """Oncoming and outgoing cars past the intersection are looked for so far ahead by their
+    height ..."""
+    past_aside_m: Positive = 12.0
+    """... and so far to either side of the ego vehicle's way: three lanes beside its own."""
+    past_frames: Annotated[int, Field(ge=3, le=100)] = 30
+    """And judged by the newest so many frames."""
 
 
 class RangeCurve(Section):

@@ -14,6 +14,7 @@ NO_LABEL: Final = "no detector can report their labels"
 NO_OBJECTS: Final = "no detector of objects"
 NO_ROAD: Final = "no detector of road"
 NO_MOBILEYE: Final = "no Mobileye, or no range to an intersection"
+NO_PLACE: Final = 'no range to an intersection, or not cars.kind = "tracks"'
 NEVER: Final = "no frame in which they could be computed"
 
 
@@ -48,6 +49,8 @@ def not_looked_for(
         has_any = bool(finders) if can_be_signs else Role.OBJECTS in roles
         if has_any and observed_by == "car pairs" and not_followed:
             return max(not_followed, key=lambda why: not_followed[why])
+        if has_any and cue in CUES and CUES[cue].group == "cars_past":
+            return NO_PLACE
         return NEVER if has_any else NO_OBJECTS
 
     return {cue: why(cue) for cue in cue_labels if cue not in looked}

@@ -107,7 +107,10 @@ class MotionRanges:
             without: Cues to leave out.
         """
         turned_rad = evidence.turned_rad or 0.0
-        motion = Motion(evidence.travelled_m, evidence.travelled_var_m2, turned_rad, seconds)
+        # What slip_per_sqrt_m stands for is scale_sd of the whole way, which the tracks know.
+        slip_m2 = self.vehicle.odometry.slip_per_sqrt_m**2 * abs(evidence.travelled_m or 0.0)
+        var_m2 = max(evidence.travelled_var_m2 - slip_m2, 0.0)
+        motion = Motion(evidence.travelled_m, var_m2, turned_rad, seconds)
         ranges: dict[Reference, RangePosterior] = {}
         objects: list[RangedObject] = []
         for row, (cue, _) in enumerate(MEASURED):
@@ -132,7 +135,8 @@ class MotionRanges:
     def _chain(self, cue: str, size_px: tuple[int, int]) -> _Chain:
         camera = self.vehicle.camera
         center_px = camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1])
-        tracks = ObjectTracks(cue, camera.focal_px or 0.0, center_px)
+        scale_sd = self.vehicle.odometry.scale_sd
+        tracks = ObjectTracks(cue, camera.focal_px or 0.0, center_px, scale_sd)
         tracks.counts = self.counts
         choices = {
             reference: _Choice(self.vehicle, reference, self.counts) for reference in Reference

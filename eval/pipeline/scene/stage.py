@@ -8,7 +8,7 @@ and each cue left out to see what it was worth.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -33,6 +33,7 @@ from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
 from crosscue.eval.runs.tables.travelled import Odometer, odometer_of
 from crosscue.fusion.approaches import Approaches, PastCues, RangeRow, Step
+from crosscue.fusion.belief import begin, probabilities
 from crosscue.fusion.evidence import FrameEvidence
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
@@ -148,6 +149,7 @@ class _Scene:
     tally: CueTally = field(init=False)
     signs: SignRanges = field(init=False)
     motion: MotionRanges = field(init=False)
+    priors: Mapping[str, float] = field(init=False)
     frames: int = 0
     without_odometry: int = 0
     positive: Counter[str] = field(default_factory=Counter)
@@ -162,6 +164,8 @@ class _Scene:
         self.signs = SignRanges(self.vehicle)
         self.cues = CuePass(self.vehicle, tally=self.tally)
         self.motion = MotionRanges(self.vehicle)
+        graph = graph_of(self.vehicle.fusion)
+        self.priors = probabilities(begin(graph), graph)
 
     def step(self, frame: StoredFrame, past: PastCues | None, without: frozenset[str]) -> None:
         seen = frame.seen
@@ -239,11 +243,17 @@ class _Scene:
     def _sum_up(self, step: Step) -> None:
         if step.approach is None:
             return
+        is_new = step.approach not in self.summaries
         one = self.summaries.setdefault(
             step.approach, ApproachSummary(step.approach, step.t_ns, step.t_ns)
         )
         one.end_ns = step.t_ns
         one.probabilities = step.probabilities
+        one.not_seen = tuple(
+            name
+            for name, p in step.probabilities.items()
+            if p == self.priors[name] and (is_new or name in one.not_seen)
+        )
         is_sure = step.probabilities.get(FEATURES[0], 0.0) > self.vehicle.fusion.established
         if is_sure and step.ranges and one.detected_ns is None:
             one.detected_ns = step.t_ns

@@ -305,7 +305,7 @@ def _result(
             number, detected, _spurious_reason(published, is_right) or _range_reason(likely, ranged)
         ),
         why_not_full=_why(
-            number, full, BRIEF if was_full and not missing else _full_reason(missing)
+            number, full, BRIEF if was_full and not missing else _full_reason(missing, steps)
         ),
         spurious_m=_first(published, distance) if is_spurious else None,
         why_spurious=_spurious_reason(published, is_right) if is_spurious else "",
@@ -345,10 +345,19 @@ def _spurious_reason(published: NDArray[np.bool_], is_right: NDArray[np.bool_]) 
     return BRIEF if is_right[np.argmax(published)] else WRONG_RANGE
 
 
-def _full_reason(missing: Sequence[str]) -> str:
+def _full_reason(missing: Sequence[str], steps: BeliefRows) -> str:
+    """What was never probable enough, and what the run never changed its mind about."""
     if not missing:
         return "never all at once"
-    return f"never probable enough: {', '.join(missing)}"
+    unseen = [name for name in missing if name in steps.features and _never_changes(steps, name)]
+    unlikely = [name for name in missing if name not in unseen]
+    parts = (("never probable enough", unlikely), ("not seen", unseen))
+    return "; ".join(f"{what}: {', '.join(names)}" for what, names in parts if names)
+
+
+def _never_changes(steps: BeliefRows, name: str) -> bool:
+    values = steps.features[name]
+    return len(values) > 0 and bool((values == values[0]).all())
 
 
 def _has_range(tables: RunTables, number: int | None, t_ns: Int64s) -> NDArray[np.bool_]:

@@ -10,7 +10,8 @@ A positive is right in one of two readings, and both are given:
 The source compares detections of signs, lights and cars with the things themselves, and what roads,
 lanes and vehicles past the intersection say with the direction of travel (chapter 3). The table of
 cues says which; where the truth knows only the other reading, that one leads, and the result says
-so.
+so. A truth that speaks of things leaves those open that it does not name: there the intersection's
+features say nothing of them.
 """
 
 from __future__ import annotations
@@ -63,6 +64,7 @@ class CueFrames:
         moments_unmatched: True moments (not spans) at which the run has no frame.
         left_out: By reading, from reason to frames that could not be scored.
         conditions: From approach id to its tags.
+        is_open: The truth speaks of other things, and leaves this one open.
     """
 
     drive: str
@@ -79,6 +81,7 @@ class CueFrames:
     moments_unmatched: int
     left_out: Mapping[Reading, Mapping[str, int]]
     conditions: Mapping[int, tuple[str, ...]]
+    is_open: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +185,7 @@ def match_cues(tables: RunTables, truth: DriveTruth) -> list[CueFrames]:
 def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth, ambiguous: int) -> CueFrames:
     looked, count = _largest(rows, cue)
     spans = [one for one in truth.truth.cues if one.cue == cue]
+    is_object = cue in CUES and CUES[cue].scored_as == "object"
     everywhere = cue_at(spans, frames)
     features = _feature_at(cue, frames, truth)
     at = np.searchsorted(frames, looked)
@@ -208,6 +212,7 @@ def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth, ambiguous
             "feature": twice | _reasons(features != NONE, was_looked, stated, crossing),
         },
         conditions={one.id: one.conditions for one in truth.truth.approaches},
+        is_open=bool(truth.truth.cues) and not spans and is_object,
     )
 
 
@@ -309,7 +314,9 @@ def _score(cue: str, rows: Sequence[CueFrames], bins_m: Sequence[float]) -> CueS
     }
     wanted: Reading = CUES[cue].scored_as if cue in CUES else "object"
     other: Reading = "feature" if wanted == "object" else "object"
-    leading = wanted if readings[wanted].scored or not readings[other].scored else other
+    is_open = all(one.is_open for one in rows)
+    is_wanted = readings[wanted].scored or not readings[other].scored or is_open
+    leading = wanted if is_wanted else other
     return CueScore(
         reading=leading,
         is_sources_reading=leading == wanted,

@@ -13,16 +13,11 @@ from hypothesis import strategies as st
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
-from crosscue.detectors.cues.car_tracks import (
-    CAR_HEIGHT_M,
-    CarMotion,
-    CarTracks,
-    crossing,
-    judge,
-    parked,
-)
+from crosscue.detectors.cues.car_judge import cars_past, crossing, judge, parked
+from crosscue.detectors.cues.car_motion import CAR_HEIGHT_M, CarMotion
+from crosscue.detectors.cues.car_tracks import CarTracks, are_hidden
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import Place, Seen, Sides
+from crosscue.detectors.cues.observed import Place, Seen, Sides, Ways
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Cars, Vehicle
 
@@ -48,11 +43,16 @@ class Car:
 
 
 def drive(
-    cars: Sequence[Car], steps: Sequence[Motion], *, jitter_px: float = 0.0, seed: int = 0
+    cars: Sequence[Car],
+    steps: Sequence[Motion],
+    *,
+    jitter_px: float = 0.0,
+    seed: int = 0,
+    tracks: CarTracks | None = None,
 ) -> Iterator[list[CarMotion]]:
     """What is known of the cars after each frame of a drive."""
     rng = np.random.default_rng(seed)
-    tracks = CarTracks(CAMERA, RULES)
+    tracks = tracks or CarTracks(CAMERA, RULES)
     x = y = heading = time_s = 0.0
     for step in steps:
         middle = heading + 0.5 * step.turned_rad
@@ -207,9 +207,52 @@ def test_a_parked_car_counts_at_the_intersection_alone(nose: int) -> None:
 def test_a_car_along_the_street_is_not_parked_across_it(bearing: float) -> None:
     # Its length is foreshortened, its width is not: what its outline is long at this bearing.
     long = (CAR_LENGTH_M * abs(bearing) + 1.8) / CAR_HEIGHT_M
-    car = CarMotion(10, 30.0, bearing, 0.0, 0.1, 0.0, 0.5, True, long, 1.0)
+    car = CarMotion(1, 10, 30.0, bearing, 0.0, 0.1, 0.0, 0.5, True, long, 1.0)
 
     assert not parked([car], RULES)
+
+
+def past(car: Car, steps: Sequence[Motion], place: Place | None) -> Ways | None:
+    """What counts past the intersection after the last step."""
+    tracks = CarTracks(CAMERA, RULES)
+    for _ in drive([car], steps, tracks=tracks):
+        pass
+    return cars_past(tracks.longer(), CAMERA, RULES, place)
+
+
+@pytest.mark.parametrize("way_m", [0.0, 0.5])
+@pytest.mark.parametrize("height_m", [1.4, CAR_HEIGHT_M, 1.8])
+@pytest.mark.parametrize("ahead_mps", [-12.0, 12.0])
+def test_oncoming_and_outgoing_cars_count_past_the_intersection_alone(
+    ahead_mps: float, height_m: float, way_m: float
+) -> None:
+    car = Car(80.0 - 2.0 * ahead_mps, -3.5, 0.0, ahead_mps, height_m=height_m)
+    steps = steady(20, way_m)
+    ways = Ways(ahead_mps < 0, ahead_mps > 0)
+
+    assert past(car, steps, Place(15.0, 30.0, 2.0)) == ways
+    assert past(car, steps, Place(65.0, 80.0, 2.0)) == Ways(0, 0)
+    assert past(car, steps, Place(15.0, 30.0, 80.0)) == Ways(0, 0)
+    assert past(car, steps, Place(-30.0, -1.0, 1.0)) is None
+    assert past(car, steps, None) is None
+
+
+@settings(max_examples=100, deadline=None)
+@given(steps=ego_motions, car=standing)
+def test_a_standing_car_neither_comes_nor_goes(steps: list[Motion], car: Car) -> None:
+    assert not sum(past(car, steps, Place(1.0, 2.0, 0.1)) or ())
+
+
+def test_a_car_that_turns_off_or_drives_on_another_road_shows_nothing() -> None:
+    for car in (Car(60.0, -5.0, 8.0, -8.0), Car(60.0, 20.0, 0.0, -10.0), Car(50.0, 0.0, 9.0)):
+        assert past(car, steady(15), Place(5.0, 10.0, 1.0)) == Ways(0, 0)
+
+
+def test_a_car_behind_another_is_not_further_away_than_it_seems() -> None:
+    near, behind, aside = (600, 350, 680, 400), (640, 352, 700, 380), (690, 352, 740, 380)
+
+    assert are_hidden(np.array([near, behind, aside], np.float64)) == [False, True, False]
+    assert are_hidden(np.empty((0, 4))) == []
 
 
 def cues(steps: Sequence[Motion | None], vehicle: Vehicle = VEHICLE) -> CuePass:

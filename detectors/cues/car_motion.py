@@ -1,0 +1,171 @@
+"""How a car moves in the plane of the road, from its boxes while the camera moves, too.
+
+Every observation becomes a position: its bearing from the picture, its distance from its height
+(``focal_px * CAR_HEIGHT_M / height``), the camera's place and heading from odometry. A standing car
+stays where it is, whatever the camera does: its motion in the image is thereby removed. Fitted is a
+steady motion by generalised least squares, with errors along the line of sight that are much larger
+than those across it. A car taller or lower than assumed only seems to move along the camera's own
+way, never across it.
+
+Both ends of a car are followed apart, and it moves sideways as little as either does: a car that
+comes out from behind another one grows to one side only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from crosscue.replay.columns import Floats
+
+CAR_HEIGHT_M: Final = 1.55
+"""Of a usual car; between 1.4 (sports car) and 1.8 (van), so 15 % either way."""
+HEIGHT_FRACTION: Final = 0.15
+USUAL_MPS: Final = 10.0
+"""Standard deviation of a car's speed, before anything is known of it."""
+MAX_MISFIT: Final = 4.0
+"""Of residuals, squared, per degree of freedom: beyond it the motion is not steady."""
+
+
+class Observation(NamedTuple):
+    """One box of a car.
+
+    Attributes:
+        t_s: Time.
+        pose: Of the camera: x, y, heading in the plane of the road.
+        edges_rad: Bearings of its left and right end, to the right of the camera's axis.
+        distance_m: From its height.
+        error: Standard deviation of the distance as a fraction, from the box alone.
+        long: Length over height.
+        nose: -1 left, 1 right, 0 unknown.
+        is_hidden: Another car's box covers its lower end, so it may be higher and nearer.
+    """
+
+    t_s: float
+    pose: tuple[float, float, float]
+    edges_rad: tuple[float, float]
+    distance_m: float
+    error: float
+    long: float
+    nose: int
+    is_hidden: bool = False
+
+
+class CarMotion(NamedTuple):
+    """What is known of one car in the newest frame.
+
+    Attributes:
+        number: Of its track, from 1.
+        frames: In how many it was seen.
+        distance_m: From the camera along its axis.
+        bearing: Tangent, to the right.
+        right_mps: Speed across the ego vehicle's heading, to the right; 0 where its ends disagree.
+        right_sd_mps: Its standard deviation.
+        ahead_mps: Speed along it.
+        ahead_sd_mps: Its standard deviation.
+        is_steady: One speed fits all frames.
+        long: Length over height, median.
+        nose: Mean of the noses seen, -1 to 1.
+        is_hidden: Another car covers its lower end in this frame.
+        box_px: x0, y0, x1, y1.
+        step_px: How its middle moved since it was seen last.
+    """
+
+    number: int
+    frames: int
+    distance_m: float
+    bearing: float
+    right_mps: float
+    right_sd_mps: float
+    ahead_mps: float
+    ahead_sd_mps: float
+    is_steady: bool
+    long: float
+    nose: float
+    is_hidden: bool = False
+    box_px: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    step_px: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def center_px(self) -> tuple[float, float]:
+        """Middle of its box."""
+        x0, y0, x1, y1 = self.box_px
+        return 0.5 * (x0 + x1), 0.5 * (y0 + y1)
+
+
+def motion_of(seen: Sequence[Observation]) -> CarMotion:
+    """Fit a steady motion to a car's observations, of which there is at least one."""
+    newest = seen[-1]
+    ends = [_fit(seen, side) for side in (0, 1)]
+    (left, left_sd, *_), (right, right_sd, *_) = ends
+    agree = left * right > 0.0
+    right_mps = math.copysign(min(abs(left), abs(right)), left) if agree else 0.0
+    ahead_mps, ahead_sd = (0.5 * (ends[0][k] + ends[1][k]) for k in (2, 3))
+    passed_s = newest.t_s - seen[0].t_s
+    way_m = math.dist(newest.pose[:2], seen[0].pose[:2])
+    scale_sd = HEIGHT_FRACTION * way_m / passed_s if passed_s > 0.0 else USUAL_MPS
+    noses = [one.nose for one in seen if one.nose]
+    return CarMotion(
+        number=0,
+        frames=len(seen),
+        distance_m=newest.distance_m,
+        bearing=0.5 * sum(map(math.tan, newest.edges_rad)),
+        right_mps=right_mps,
+        right_sd_mps=max(left_sd, right_sd),
+        ahead_mps=ahead_mps,
+        ahead_sd_mps=math.hypot(ahead_sd, scale_sd),
+        is_steady=max(ends[0][4], ends[1][4]) <= MAX_MISFIT,
+        long=float(np.median([one.long for one in seen])),
+        nose=sum(noses) / len(noses) if noses else 0.0,
+        is_hidden=newest.is_hidden,
+    )
+
+
+def _fit(seen: Sequence[Observation], side: int) -> tuple[float, float, float, float, float]:
+    """Speed to the right and its s.d., speed ahead and its s.d., misfit; of one end of a car."""
+    newest = seen[-1]
+    places = np.array([place_of_end(one, side, newest) for one in seen])
+    weights = _weights(seen, side, newest)
+    late_s = np.array([one.t_s - newest.t_s for one in seen])
+    models = np.concatenate(
+        [np.tile(np.eye(2), (len(seen), 1, 1)), late_s[:, None, None] * np.eye(2)], axis=2
+    )
+    weighted = np.swapaxes(models, 1, 2) @ weights
+    prior = np.diag([0.0, 0.0, USUAL_MPS**-2, USUAL_MPS**-2])
+    covariance = np.linalg.inv(prior + (weighted @ models).sum(axis=0))
+    state = covariance @ np.einsum("nij,nj->i", weighted, places)
+    off = places - models @ state
+    misfit = float(np.einsum("ni,nij,nj->", off, weights, off)) / max(2 * len(seen) - 4, 1)
+    sd = np.sqrt(np.diagonal(covariance))
+    return float(state[3]), float(sd[3]), float(state[2]), float(sd[2]), misfit
+
+
+def place_of_end(one: Observation, side: int, newest: Observation) -> tuple[float, float]:
+    """Where an end of the car was, ahead and to the right of the newest camera."""
+    x, y, heading = one.pose
+    sight = heading - one.edges_rad[side]
+    far_m = one.distance_m / math.cos(one.edges_rad[side])
+    east = x - newest.pose[0] + far_m * math.cos(sight)
+    north = y - newest.pose[1] + far_m * math.sin(sight)
+    cos, sin = math.cos(newest.pose[2]), math.sin(newest.pose[2])
+    return east * cos + north * sin, east * sin - north * cos
+
+
+def _weights(seen: Sequence[Observation], side: int, newest: Observation) -> Floats:
+    """Inverse covariances of ``place_of_end``, shape (N, 2, 2): large along the line of sight."""
+    rows = [
+        (newest.pose[2] - one.pose[2] + one.edges_rad[side], one.error, one.distance_m)
+        for one in seen
+    ]
+    angle, error, distance_m = np.array(rows).T
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    along_sd = error * distance_m / np.cos([one.edges_rad[side] for one in seen])
+    across_sd = error * CAR_HEIGHT_M
+    return np.asarray(
+        along[:, :, None] * along[:, None, :] / along_sd[:, None, None] ** 2
+        + across[:, :, None] * across[:, None, :] / across_sd[:, None, None] ** 2
+    )
